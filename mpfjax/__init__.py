@@ -1,0 +1,28 @@
+"""mpfjax: particle filters that keep many hypotheses alive, in JAX."""
+
+from mpfjax.filters import Filter as Filter
+from mpfjax.filters import FilterRun as FilterRun
+from mpfjax.filters import StepInfo as StepInfo
+from mpfjax.filters import mixture_particle_filter as mixture_particle_filter
+from mpfjax.filters import monte_carlo as monte_carlo
+from mpfjax.filters import particle_filter as particle_filter
+from mpfjax.filters import run_filter as run_filter
+from mpfjax.mixture import ParticleMixture as ParticleMixture
+from mpfjax.models import AbstractStateSpaceModel as AbstractStateSpaceModel
+from mpfjax.models import LinearGaussianModel as LinearGaussianModel
+from mpfjax.models import QuadraticModel as QuadraticModel
+from mpfjax.models import per_particle as per_particle
+from mpfjax.moves import AbstractMove as AbstractMove
+from mpfjax.moves import AbstractPropagation as AbstractPropagation
+from mpfjax.moves import AbstractRegrouping as AbstractRegrouping
+from mpfjax.moves import AbstractRejuvenation as AbstractRejuvenation
+from mpfjax.moves import Exclusion as Exclusion
+from mpfjax.moves import KMeans as KMeans
+from mpfjax.moves import Merge as Merge
+from mpfjax.moves import Propagate as Propagate
+from mpfjax.moves import Resample as Resample
+from mpfjax.moves import Split as Split
+from mpfjax.proposals import AbstractProposal as AbstractProposal
+from mpfjax.proposals import GaussNewtonProposal as GaussNewtonProposal
+
+__version__ = "0.1.0"

@@ -1,0 +1,13 @@
+"""The moves that filters are chains of: regrouping, rejuvenating, propagating."""
+
+from mpfjax.moves.base import AbstractMove as AbstractMove
+from mpfjax.moves.base import AbstractPropagation as AbstractPropagation
+from mpfjax.moves.base import AbstractRegrouping as AbstractRegrouping
+from mpfjax.moves.base import AbstractRejuvenation as AbstractRejuvenation
+from mpfjax.moves.exclusion import Exclusion as Exclusion
+from mpfjax.moves.features import Features as Features
+from mpfjax.moves.propagation import Propagate as Propagate
+from mpfjax.moves.regrouping import KMeans as KMeans
+from mpfjax.moves.regrouping import Merge as Merge
+from mpfjax.moves.regrouping import Split as Split
+from mpfjax.moves.resampling import Resample as Resample

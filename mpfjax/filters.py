@@ -1,0 +1,457 @@
+"""A filter as a chain of moves, its runners, and the filters of the literature."""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key, PyTree
+
+from mpfjax.mixture import ParticleMixture, single_component
+from mpfjax.models.base import AbstractStateSpaceModel, require
+from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
+from mpfjax.moves.propagation import Propagate
+from mpfjax.moves.regrouping import KMeans, Merge, Split
+from mpfjax.moves.resampling import Resample
+from mpfjax.proposals import AbstractProposal
+
+
+class StepInfo(eqx.Module):
+    """What a step reports beside the mixture it returns."""
+
+    log_likelihood_increment: Float[Array, ""]
+    """log p(y_t | y_1..y_{t-1}), estimated; -inf where every particle has zero likelihood."""
+    effective_sample_sizes: Float[Array, " m"]
+    """of each component of the new mixture, zero for a dead one."""
+    mixture_weights: Float[Array, " m"]
+    """the mass of each component of the new mixture."""
+    resampled: Bool[Array, " m"]
+    """which components of the mixture that the step was given were resampled."""
+    degenerate: Bool[Array, ""]
+    """whether every particle had zero likelihood: the weights are then those of the prediction."""
+
+
+class FilterRun(eqx.Module):
+    """The result of running a filter over observations y_1..y_t."""
+
+    log_marginal_likelihood: Float[Array, ""]
+    """log p(y_1..y_t), estimated: the sum of the increments."""
+    log_likelihood_increments: Float[Array, " t"]
+    collected: PyTree
+    """what `collect` made of each step's mixture, stacked over t."""
+    final: ParticleMixture
+    resampled: Bool[Array, "t m"]
+    """which components each step resampled."""
+    degenerate: Bool[Array, " t"]
+    """the steps at which every particle had zero likelihood."""
+
+
+class _Tied(eqx.Module):
+    """Stands in a move where the filter's own model belongs, so that it is stored only once."""
+
+
+class Filter(eqx.Module):
+    """A particle filter: a chain of moves on a particle mixture.
+
+    One step applies the moves in order and normalises. The growth of the total mass is the
+    increment of the marginal likelihood, whatever the moves are.
+
+    - `model`: draws x_0. Moves that hold the very same model share it: the filter is a pytree
+      with one copy of the model's parameters, so that its gradient is the gradient.
+    - `moves`: callables `(key, mixture, observation) -> mixture`, usually `AbstractMove`s.
+    - `num_particles`, `num_components`: N slots, and M, the most components.
+    - `initial_moves`: regrouping of x_0, such as `KMeans(reseed=True)`.
+
+    Raises `ValueError` for N < 1, M < 1, N < M, no moves, or fewer slots than
+    `particles_per_component` asks for.
+    """
+
+    model: AbstractStateSpaceModel
+    _moves: tuple[Any, ...]
+    _initial_moves: tuple[Any, ...]
+    num_particles: int = eqx.field(static=True)
+    num_components: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        model: AbstractStateSpaceModel,
+        moves: Iterable[Callable[..., ParticleMixture]],
+        num_particles: int,
+        num_components: int = 1,
+        initial_moves: Iterable[AbstractRegrouping] = (),
+    ) -> None:
+        moves = tuple(moves)
+        _check_sizes(num_particles, num_components)
+        if not moves:
+            raise ValueError("moves: a filter needs at least one")
+        for method in ("sample_initial", "sample_transition", "log_likelihood"):
+            require(model, method, "Filter")
+        for move in moves:
+            per_component = getattr(move, "particles_per_component", None)
+            if per_component is not None and per_component * num_components > num_particles:
+                raise ValueError(
+                    f"particles_per_component: {per_component} for each of {num_components}"
+                    f" components needs more than num_particles, {num_particles}"
+                )
+        self.model = model
+        self._moves = _tie(moves, model)
+        self._initial_moves = _tie(tuple(initial_moves), model)
+        self.num_particles = num_particles
+        self.num_components = num_components
+
+    @property
+    def moves(self) -> tuple[Any, ...]:
+        """The moves of one step, each with the filter's model where it shares it."""
+        return _untie(self._moves, self.model)
+
+    @property
+    def approximate(self) -> bool:
+        """Whether any move departs from the exact recursion."""
+        return any(getattr(move, "approximate", True) for move in self.moves)
+
+    def init(self, key: Key[Array, ""]) -> ParticleMixture:
+        """The mixture at time 0: draws of x_0 with equal weights, grouped by the initial moves."""
+        keys = _split(key, 1 + len(self._initial_moves))
+        particles = self.model.sample_initial(keys[0], self.num_particles)
+        for leaf in jax.tree.leaves(particles):
+            if jnp.shape(leaf)[:1] != (self.num_particles,):
+                raise ValueError(
+                    f"model: {type(self.model).__name__}.sample_initial returned a leaf of shape"
+                    f" {jnp.shape(leaf)}; its leading axis is not num_particles,"
+                    f" {self.num_particles}"
+                )
+        memory = {}
+        for move in (*self._moves, *self._initial_moves):
+            if isinstance(move, AbstractMove):
+                memory |= move.initial_memory(self.num_components)
+        mixture = single_component(particles, self.num_components).replace(memory=memory)
+        for move_key, move in zip(keys[1:], _untie(self._initial_moves, self.model), strict=True):
+            mixture = move(move_key, mixture)
+        return mixture
+
+    @eqx.filter_jit
+    def step(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> tuple[ParticleMixture, StepInfo]:
+        """The mixture at t and a report, from the mixture at t-1 and y_t.
+
+        A NaN or infinite observation is an error; a step that has none is `predict`'s. Where
+        every particle has zero likelihood the increment is -inf, the particles move on with the
+        weights that they had before, and `degenerate` is true.
+        """
+        observation = jax.tree.map(
+            lambda leaf: (
+                eqx.error_if(
+                    leaf, ~_all_finite(leaf), "observation: NaN or infinite; use predict to skip it"
+                )
+                if eqx.is_inexact_array_like(leaf)
+                else leaf
+            ),
+            observation,
+        )
+        return self._step(key, mixture, observation)
+
+    @eqx.filter_jit
+    def predict(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[ParticleMixture, StepInfo]:
+        """One step without an observation: the particles propagate, the weights stay.
+
+        For a missing y_t, or to forecast. The increment is zero. Raises `ValueError` for a move
+        that does not say what it does without an observation.
+        """
+        return self._predict(key, mixture)
+
+    def _step(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> tuple[ParticleMixture, StepInfo]:
+        mixture = _own_ancestors(mixture)
+        resampled = jnp.zeros(self.num_components, bool)
+        increment = jnp.zeros((), mixture.log_weights.dtype)
+        for move_key, move in zip(_split(key, len(self._moves)), self.moves, strict=True):
+            if isinstance(move, Resample):
+                resampled |= move.is_due(mixture)
+            moved = move(move_key, mixture, observation)
+            if not isinstance(move, AbstractRegrouping | AbstractRejuvenation):
+                moved, log_growth = _normalise(moved, mixture.log_weights)
+                increment += log_growth
+            mixture = moved
+        return mixture, _report(mixture, increment, resampled)
+
+    def _predict(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[ParticleMixture, StepInfo]:
+        mixture = _own_ancestors(mixture)
+        for move_key, move in zip(_split(key, len(self._moves)), self.moves, strict=True):
+            if not isinstance(move, AbstractMove):
+                raise ValueError(f"moves: {move!r} does not define predict, for a missing y_t")
+            mixture = move.predict(move_key, mixture)
+        increment = jnp.zeros((), mixture.log_weights.dtype)
+        return mixture, _report(mixture, increment, jnp.zeros(self.num_components, bool))
+
+
+def run_filter(
+    key: Key[Array, ""],
+    filter: Filter,
+    observations: PyTree,
+    collect: Callable[[ParticleMixture], PyTree] | None = None,
+    *,
+    missing: str = "error",
+) -> FilterRun:
+    """Run a filter over observations y_1..y_t in one scan.
+
+    - `observations`: a pytree whose leaves have a leading axis t.
+    - `collect`: what to keep of the mixture after each step, stacked over t; None keeps all of
+      it. The same function object compiles once; a new lambda at every call compiles anew.
+    - `missing`: "error" raises a `ValueError` that names the first step whose observation holds a
+      NaN or an infinity; "skip" takes such steps as missing, and only predicts.
+
+    Raises `ValueError` for no observations, leaves of different lengths, or an unknown `missing`,
+    before anything compiles, and a RuntimeError where the model's densities give NaN.
+    """
+    present = _present(observations, missing)
+    run = _run(key, filter, observations, present, collect)
+    return _checked(run)
+
+
+def monte_carlo(
+    keys: Key[Array, " seeds"],
+    filter: Filter,
+    observations: PyTree,
+    collect: Callable[[ParticleMixture], PyTree] | None = None,
+    *,
+    missing: str = "error",
+) -> FilterRun:
+    """Run a filter once for each key, all on the same observations, under one `vmap`.
+
+    Every field of the result has a leading axis of seeds. Arguments and errors are those of
+    `run_filter`; run k equals `run_filter(keys[k], ...)`.
+    """
+    if jnp.ndim(keys) != 1 or keys.shape[0] < 1:
+        raise ValueError(f"keys: shape {jnp.shape(keys)} is not that of one key a run, (seeds,)")
+    present = _present(observations, missing)
+    run = _run_all(keys, filter, observations, present, collect)
+    return _checked(run)
+
+
+def particle_filter(
+    model: AbstractStateSpaceModel,
+    num_particles: int,
+    *,
+    proposal: AbstractProposal | None = None,
+    scheme: str = "systematic",
+    ess_threshold: float = 1.0,
+) -> Filter:
+    """The standard particle filter: resample, propagate.
+
+    Vermaak et al. (2003), section 3, with one component; bootstrap unless a proposal is given.
+    The right filter for a filtering distribution of one mode; it loses all but one of several.
+    """
+    return Filter(
+        model,
+        moves=[Resample(scheme, ess_threshold), Propagate(model, proposal)],
+        num_particles=num_particles,
+    )
+
+
+def mixture_particle_filter(
+    model: AbstractStateSpaceModel,
+    num_particles: int,
+    max_components: int,
+    *,
+    proposal: AbstractProposal | None = None,
+    scheme: str = "systematic",
+    ess_threshold: float = 1.0,
+    particles_per_component: int | None = None,
+    merge: Merge | None = None,
+    split: Split | None = None,
+    kmeans: KMeans | None = None,
+    initial_kmeans: KMeans | None = None,
+) -> Filter:
+    """The mixture particle filter: resample within components, propagate, regroup.
+
+    Vermaak et al. (2003), sections 3 and 4. Components are resampled independently and meet only
+    in their mixture weights, so that none can starve another; at every step those that overlap
+    merge, diffuse ones split, and K-means refines the rest. All of it is exact. `merge`, `split`
+    and `kmeans` set thresholds, features and scale; see those moves for the defaults. Use it
+    where the filtering distribution has several modes that must all be kept.
+    """
+    kmeans = KMeans() if kmeans is None else kmeans
+    reseeded = KMeans(
+        10, reseed=True, features=kmeans.features.function, scale=kmeans.features.scale
+    )
+    return Filter(
+        model,
+        moves=[
+            Resample(scheme, ess_threshold, particles_per_component),
+            Propagate(model, proposal),
+            Merge() if merge is None else merge,
+            Split() if split is None else split,
+            kmeans,
+        ],
+        num_particles=num_particles,
+        num_components=max_components,
+        initial_moves=[reseeded if initial_kmeans is None else initial_kmeans],
+    )
+
+
+@eqx.filter_jit
+def _run(key, filter, observations, present, collect):
+    return _scan(key, filter, observations, present, collect)
+
+
+@eqx.filter_jit
+def _run_all(keys, filter, observations, present, collect):
+    run_one = jax.vmap(lambda key: _scan(key, filter, observations, present, collect))
+    return run_one(keys)
+
+
+def _scan(
+    key: Key[Array, ""],
+    filter: Filter,
+    observations: PyTree,
+    present: Bool[Array, " t"] | None,
+    collect: Callable[[ParticleMixture], PyTree] | None,
+) -> FilterRun:
+    key_initial, key_steps = _split(key, 2)
+    length = jax.tree.leaves(observations)[0].shape[0]
+
+    def advance(mixture: ParticleMixture, inputs: PyTree) -> tuple[ParticleMixture, PyTree]:
+        step_key, observation, is_present = inputs
+        if is_present is None:
+            mixture, info = filter._step(step_key, mixture, observation)
+        else:
+            mixture, info = jax.lax.cond(
+                is_present,
+                lambda: filter._step(step_key, mixture, observation),
+                lambda: filter._predict(step_key, mixture),
+            )
+        kept = mixture if collect is None else collect(mixture)
+        return mixture, (kept, info.log_likelihood_increment, info.resampled, info.degenerate)
+
+    inputs = (jax.random.split(key_steps, length), observations, present)
+    final, outputs = jax.lax.scan(advance, filter.init(key_initial), inputs)
+    collected, increments, resampled, degenerate = outputs
+    return FilterRun(
+        log_marginal_likelihood=jnp.sum(increments),
+        log_likelihood_increments=increments,
+        collected=collected,
+        final=final,
+        resampled=resampled,
+        degenerate=degenerate,
+    )
+
+
+def _normalise(
+    mixture: ParticleMixture, previous_log_weights: Float[Array, " n"]
+) -> tuple[ParticleMixture, Float[Array, ""]]:
+    """Remove the mass's growth; where no mass is left, go on with the weights of before."""
+    log_growth = mixture.log_mass
+    has_mass = log_growth > -jnp.inf
+    normalised = mixture.log_weights - jnp.where(has_mass, log_growth, 0.0)
+    # NaN compares false, and must not be taken for a step of zero likelihood.
+    keep = has_mass | jnp.isnan(log_growth)
+    return mixture.replace(log_weights=jnp.where(keep, normalised, previous_log_weights)), (
+        log_growth
+    )
+
+
+def _report(
+    mixture: ParticleMixture, increment: Float[Array, ""], resampled: Bool[Array, " m"]
+) -> StepInfo:
+    return StepInfo(
+        log_likelihood_increment=increment,
+        effective_sample_sizes=mixture.component_effective_sample_sizes,
+        mixture_weights=mixture.mixture_weights,
+        resampled=resampled,
+        degenerate=increment == -jnp.inf,
+    )
+
+
+def _own_ancestors(mixture: ParticleMixture) -> ParticleMixture:
+    return mixture.replace(ancestor_indices=jnp.arange(mixture.num_particles, dtype=jnp.int32))
+
+
+def _split(key: Key[Array, ""], num: int) -> list[Key[Array, ""]]:
+    """Keys that do not depend on how many are asked for, so that a longer chain draws alike."""
+    return [jax.random.fold_in(key, i) for i in range(num)]
+
+
+def _tie(moves: tuple[Any, ...], model: Any) -> tuple[Any, ...]:
+    is_model = lambda node: node is model  # noqa: E731
+    return jax.tree.map(lambda node: _Tied() if node is model else node, moves, is_leaf=is_model)
+
+
+def _untie(moves: tuple[Any, ...], model: Any) -> tuple[Any, ...]:
+    is_tied = lambda node: isinstance(node, _Tied)  # noqa: E731
+    return jax.tree.map(lambda node: model if is_tied(node) else node, moves, is_leaf=is_tied)
+
+
+def _all_finite(leaf: Array) -> Bool[Array, ""]:
+    return jnp.all(jnp.isfinite(leaf))
+
+
+def _present(observations: PyTree, missing: str) -> Bool[Array, " t"] | None:
+    """Which observations are there, or None where all are; raises for what cannot be run."""
+    if missing not in ("error", "skip"):
+        raise ValueError(f"missing: {missing!r} is neither 'error' nor 'skip'")
+    leaves = jax.tree.leaves(observations)
+    if not leaves:
+        raise ValueError("observations: there are none")
+    lengths = {jnp.shape(leaf)[0] if jnp.ndim(leaf) else None for leaf in leaves}
+    if len(lengths) > 1 or None in lengths:
+        shapes = [jnp.shape(leaf) for leaf in leaves]
+        raise ValueError(f"observations: shapes {shapes} do not share a leading axis t")
+    if lengths == {0}:
+        raise ValueError("observations: the leading axis t is empty")
+    inexact = [leaf for leaf in leaves if jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)]
+    if not inexact:
+        return None
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in inexact):
+        return _present_traced(inexact, missing)
+    finite = [np.isfinite(leaf).reshape(len(leaf), -1).all(axis=1) for leaf in inexact]
+    present = np.logical_and.reduce(finite)
+    if present.all():
+        return None
+    if missing == "error":
+        raise ValueError(
+            f"observations: NaN or infinite at index {int(np.argmin(present))}"
+            " of the leading axis; missing='skip' takes such steps as missing"
+        )
+    return jnp.asarray(present)
+
+
+def _present_traced(leaves: list[Array], missing: str) -> Bool[Array, " t"] | None:
+    """Under the caller's jit the values are not there to name: the check runs with the rest."""
+    finite = [jnp.all(jnp.isfinite(leaf).reshape(leaf.shape[0], -1), axis=1) for leaf in leaves]
+    present = jnp.stack(finite).all(axis=0)
+    if missing == "skip":
+        return present
+    return eqx.error_if(present, ~present, "observations: NaN or infinite")
+
+
+def _checked(run: FilterRun) -> FilterRun:
+    """The run, or an error where a density of the model was NaN for some particle."""
+    increments = run.log_likelihood_increments
+    if isinstance(increments, jax.core.Tracer):
+        bad = jnp.isnan(increments)
+        return eqx.error_if(run, bad, "model: a density was NaN for some particle")
+    bad = np.isnan(increments).any(axis=tuple(range(increments.ndim - 1)))
+    if bad.any():
+        raise RuntimeError(
+            f"model: a density was NaN for some particle, first at step {int(np.argmax(bad))}"
+        )
+    return run
+
+
+def _check_sizes(num_particles: int, num_components: int) -> None:
+    for name, value in (("num_particles", num_particles), ("num_components", num_components)):
+        if not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"{name}: {value} is not a whole number of at least 1")
+    if num_particles < num_components:
+        raise ValueError(
+            f"num_particles: {num_particles} is less than num_components, {num_components};"
+            " every component needs a particle"
+        )

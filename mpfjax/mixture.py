@@ -1,0 +1,160 @@
+"""The particle mixture: one set of joint weights, and all that is derived from it."""
+
+from typing import Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from mpfjax.operations import (
+    default_float,
+    log_sum_exp,
+    segment_counts,
+    segment_log_sum_exp,
+    segment_sum,
+    take,
+)
+
+
+class ParticleMixture(eqx.Module):
+    """P_t = {N, M, Π, X, W, C}, the particles of a mixture (Vermaak et al. 2003, section 3).
+
+    It holds ONE set of joint log-weights ℓ_i = log(π_{c_i} w_i), normalised over all particles.
+    Mixture weights π_m = Σ_{c_i = m} exp ℓ_i and particle weights w_i = exp(ℓ_i) / π_{c_i} are
+    derived and never stored, so that the exact re-weighting after a reclustering (section 4) is
+    nothing but new indicators. Shapes are fixed: a slot of weight zero (ℓ = -inf) is empty, and a
+    component without a filled slot is dead.
+
+    - `particles`: a pytree whose leaves have a leading axis n, the states X.
+    - `log_weights`: ℓ, shape (n,), -inf in an empty slot.
+    - `component_indicators`: C, shape (n,), in [0, num_components).
+    - `ancestor_indices`: shape (n,), which slot of the previous step's mixture each came from.
+    - `num_components`: M, the most components there can be; static.
+    - `memory`: what moves with a memory carry from step to step, by the move's name.
+    """
+
+    particles: PyTree
+    log_weights: Float[Array, " n"]
+    component_indicators: Int[Array, " n"]
+    ancestor_indices: Int[Array, " n"]
+    num_components: int = eqx.field(static=True)
+    memory: dict[str, PyTree] = eqx.field(default_factory=dict)
+
+    @property
+    def num_particles(self) -> int:
+        """N, the number of slots, filled or not."""
+        return self.log_weights.shape[0]
+
+    @property
+    def occupied(self) -> Bool[Array, " n"]:
+        """Which slots hold a particle of positive weight."""
+        return self.log_weights > -jnp.inf
+
+    @property
+    def weights(self) -> Float[Array, " n"]:
+        """exp ℓ, the joint weights; they sum to one over all particles."""
+        return jnp.exp(self.log_weights)
+
+    @property
+    def log_mass(self) -> Float[Array, ""]:
+        """log Σ exp ℓ: zero once normalised, and the step's growth of mass before."""
+        return log_sum_exp(self.log_weights)
+
+    @property
+    def log_mixture_weights(self) -> Float[Array, " m"]:
+        """log π_m, -inf for a dead component."""
+        return segment_log_sum_exp(self.log_weights, self.component_indicators, self.num_components)
+
+    @property
+    def mixture_weights(self) -> Float[Array, " m"]:
+        """π_m, zero for a dead component."""
+        return jnp.exp(self.log_mixture_weights)
+
+    @property
+    def component_counts(self) -> Int[Array, " m"]:
+        """How many filled slots each component has."""
+        return segment_counts(self.occupied, self.component_indicators, self.num_components)
+
+    @property
+    def active(self) -> Bool[Array, " m"]:
+        """Which components are alive."""
+        return self.component_counts > 0
+
+    @property
+    def log_component_weights(self) -> Float[Array, " n"]:
+        """log w_i, the weights within each component; they sum to one in each living one."""
+        log_mass = take(self.log_mixture_weights, self.component_indicators)
+        return jnp.where(
+            self.occupied, self.log_weights - jnp.where(self.occupied, log_mass, 0.0), -jnp.inf
+        )
+
+    @property
+    def component_effective_sample_sizes(self) -> Float[Array, " m"]:
+        """1 / Σ w_i² of each component, zero for a dead one."""
+        squares = self.component_sums(jnp.exp(2 * self.log_component_weights))
+        return jnp.where(squares > 0, 1 / jnp.where(squares > 0, squares, 1.0), 0.0)
+
+    @property
+    def effective_sample_size(self) -> Float[Array, ""]:
+        """(Σ exp ℓ)² / Σ exp 2ℓ over all particles, zero where there is none."""
+        log_mass = self.log_mass
+        log_size = 2 * log_mass - log_sum_exp(2 * self.log_weights)
+        return jnp.where(log_mass > -jnp.inf, jnp.exp(log_size), 0.0)
+
+    def component_sums(self, values: Float[Array, "n *rest"]) -> Float[Array, "m *rest"]:
+        """Σ_{c_i = m} v_i over each component's slots."""
+        return segment_sum(values, self.component_indicators, self.num_components)
+
+    def component_averages(self, values: Float[Array, "n *rest"]) -> Float[Array, "m *rest"]:
+        """Σ_{c_i = m} w_i v_i, the weighted average of `values` in each component, zero if dead."""
+        weights = jnp.exp(self.log_component_weights).astype(values.dtype)
+        filled = jnp.where(_rows(self.occupied, values), values, jnp.zeros((), values.dtype))
+        return self.component_sums(_rows(weights, values) * filled)
+
+    def component_means(self) -> PyTree:
+        """The weighted mean of each component: every leaf (m, ...), zero for a dead one."""
+        return jax.tree.map(self.component_averages, self.particles)
+
+    def component_covariances(self) -> Float[Array, "m d d"]:
+        """The weighted covariance of each component over the flattened state, zero for a dead one."""
+        states = flatten_states(self.particles)
+        centred = states - take(self.component_averages(states), self.component_indicators)
+        return self.component_averages(centred[:, :, None] * centred[:, None, :])
+
+    def mean(self) -> PyTree:
+        """E[x_t | y_1..y_t], leaf by leaf, over the whole mixture."""
+        return jax.tree.map(self.average, self.particles)
+
+    def average(self, values: Float[Array, "n *rest"]) -> Float[Array, " *rest"]:
+        """Σ_i exp(ℓ_i) v_i, the estimate of an expectation under the filtering distribution."""
+        filled = jnp.where(_rows(self.occupied, values), values, jnp.zeros((), values.dtype))
+        return jnp.sum(_rows(self.weights.astype(values.dtype), values) * filled, axis=0)
+
+    def replace(self, **fields: PyTree) -> Self:
+        """A copy with some fields changed."""
+        return type(self)(
+            **{name: fields.get(name, getattr(self, name)) for name in self.__dataclass_fields__}
+        )
+
+
+def single_component(particles: PyTree, num_components: int = 1) -> ParticleMixture:
+    """Equally weighted particles, all in component 0, each its own ancestor."""
+    num_particles = jax.tree.leaves(particles)[0].shape[0]
+    return ParticleMixture(
+        particles=particles,
+        log_weights=jnp.full(num_particles, -jnp.log(num_particles), default_float()),
+        component_indicators=jnp.zeros(num_particles, jnp.int32),
+        ancestor_indices=jnp.arange(num_particles, dtype=jnp.int32),
+        num_components=num_components,
+    )
+
+
+def flatten_states(particles: PyTree) -> Float[Array, "n d"]:
+    """All leaves of the particles side by side, one row a particle."""
+    leaves = [leaf.reshape(leaf.shape[0], -1) for leaf in jax.tree.leaves(particles)]
+    return jnp.concatenate([leaf.astype(jnp.result_type(leaf, 0.0)) for leaf in leaves], axis=1)
+
+
+def _rows(per_particle: Array, values: Array) -> Array:
+    return per_particle.reshape(per_particle.shape + (1,) * (values.ndim - 1))

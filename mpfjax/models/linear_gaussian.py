@@ -1,0 +1,96 @@
+"""The linear-Gaussian model, whose filtering distribution the Kalman filter gives exactly."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from mpfjax.models.base import AbstractStateSpaceModel
+
+
+class LinearGaussianModel(AbstractStateSpaceModel):
+    """x_t = A x_{t-1} + N(0, Q), y_t = H x_t + N(0, R), x_0 ~ N(m0, P0).
+
+    - `A`, `Q`: (d, d); `H`: (p, d); `R`: (p, p); `m0`: (d,); `P0`: (d, d). Covariances are
+      positive definite. States have shape (n, d), observations (p,).
+
+    Raises `ValueError` for shapes that do not fit together. Use it to hold a filter against the
+    Kalman filter, or where the system is linear.
+    """
+
+    A: Float[Array, "d d"] = eqx.field(converter=jnp.asarray)
+    Q: Float[Array, "d d"] = eqx.field(converter=jnp.asarray)
+    H: Float[Array, "p d"] = eqx.field(converter=jnp.asarray)
+    R: Float[Array, "p p"] = eqx.field(converter=jnp.asarray)
+    m0: Float[Array, " d"] = eqx.field(converter=jnp.asarray)
+    P0: Float[Array, "d d"] = eqx.field(converter=jnp.asarray)
+
+    def __check_init__(self) -> None:
+        d = self.m0.shape[-1] if self.m0.ndim == 1 else None
+        p = self.H.shape[0] if self.H.ndim == 2 else None
+        expected = {
+            "m0": (d,), "A": (d, d), "Q": (d, d), "P0": (d, d), "H": (p, d), "R": (p, p)
+        }  # fmt: skip
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name}: shape {getattr(self, name).shape} is not {shape}")
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n d"]:
+        """x_0 ~ N(m0, P0)."""
+        noise = jax.random.normal(key, (num_particles, self.m0.shape[0]), self.m0.dtype)
+        return self.m0[None] + noise @ jnp.linalg.cholesky(self.P0).T
+
+    def sample_transition(
+        self, key: Key[Array, ""], states: Float[Array, "n d"]
+    ) -> Float[Array, "n d"]:
+        """x_t ~ N(A x_{t-1}, Q)."""
+        noise = jax.random.normal(key, states.shape, states.dtype)
+        return self.transition_mean(states) + noise @ jnp.linalg.cholesky(self.Q).T
+
+    def log_likelihood(
+        self, observation: Float[Array, " p"], states: Float[Array, "n d"]
+    ) -> Float[Array, " n"]:
+        """log N(y_t; H x_t, R)."""
+        if jnp.shape(observation) != (self.H.shape[0],):
+            raise ValueError(
+                f"observation: shape {jnp.shape(observation)} is not ({self.H.shape[0]},),"
+                " the rows of H"
+            )
+        return _log_normal(observation[None] - self.observation_mean(states), self.R)
+
+    def log_transition(
+        self, states: Float[Array, "n d"], previous_states: Float[Array, "n d"]
+    ) -> Float[Array, " n"]:
+        """log N(x_t; A x_{t-1}, Q)."""
+        return _log_normal(states - self.transition_mean(previous_states), self.Q)
+
+    def transition_mean(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
+        """A x_{t-1}."""
+        return states @ self.A.T
+
+    def observation_mean(self, states: Float[Array, "n d"]) -> Float[Array, "n p"]:
+        """H x_t."""
+        return states @ self.H.T
+
+    @property
+    def transition_covariance(self) -> Float[Array, "d d"]:
+        """Q."""
+        return self.Q
+
+    @property
+    def observation_covariance(self) -> Float[Array, "p p"]:
+        """R."""
+        return self.R
+
+
+def _log_normal(
+    residuals: Float[Array, "n d"], covariance: Float[Array, "d d"]
+) -> Float[Array, " n"]:
+    factor = jnp.linalg.cholesky(covariance)
+    white = jax.scipy.linalg.solve_triangular(factor, residuals.T, lower=True)
+    log_scale = jnp.sum(jnp.log(jnp.diagonal(factor)))
+    return (
+        -0.5 * jnp.sum(white**2, axis=0)
+        - log_scale
+        - 0.5 * covariance.shape[0] * jnp.log(2 * jnp.pi)
+    )

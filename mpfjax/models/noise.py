@@ -1,0 +1,50 @@
+"""Standard normal and uniform draws: independent, or spread evenly over all particles."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+
+def independent_normal(
+    key: Key[Array, ""], shape: tuple[int, int], dtype: jnp.dtype
+) -> Float[Array, "n d"]:
+    """Independent standard normal draws."""
+    return jax.random.normal(key, shape, dtype)
+
+
+def stratified_normal(
+    key: Key[Array, ""], shape: tuple[int, int], dtype: jnp.dtype
+) -> Float[Array, "n d"]:
+    """Standard normal draws, one row a particle, that together cover the normal evenly.
+
+    Row i is the Gaussian quantile of the fractional part of i α + U, a lattice shifted by one
+    uniform U a dimension; α_j = φ_d^{-j} with φ_d the root of x^{d+1} = x + 1, the golden ratio
+    for d = 1. Every row on its own is exactly normal and independent of the past, so a sum over
+    particles keeps its expectation; rows are negatively dependent, so it loses variance, most of
+    it between the offspring of one parent, which stand side by side after resampling.
+    """
+    n, d = shape
+    # Fractions of 2^32 in integers: floating point would lose the fraction of i α for large i.
+    multipliers = jnp.array([int(2**32 * alpha) | 1 for alpha in _lattice(d)], jnp.uint32)
+    shift = jax.random.bits(key, (d,), jnp.uint32)
+    points = jnp.arange(n, dtype=jnp.uint32)[:, None] * multipliers[None] + shift[None]
+    # The top 23 bits, at the middle of their cells, keep clear of 0 and 1 in float32 as well.
+    uniform = ((points >> 9).astype(dtype) + 0.5) * jnp.array(2.0**-23, dtype)
+    return jax.scipy.special.ndtri(uniform)
+
+
+def stratified_uniform(key: Key[Array, ""], num_points: int) -> Float[Array, " n"]:
+    """Uniform draws on [0, 1), one in each of n equal cells.
+
+    As a set they are uniform, whatever the order; for draws that all carry the same weight, as
+    those of x_0 do, they leave no gap wider than two cells.
+    """
+    cells = jnp.arange(num_points).astype(jnp.result_type(float))
+    return (cells + jax.random.uniform(key, (num_points,))) / num_points
+
+
+def _lattice(dimension: int) -> list[float]:
+    root = 2.0
+    for _ in range(64):
+        root = (1 + root) ** (1 / (dimension + 1))
+    return [root ** -(j + 1) for j in range(dimension)]

@@ -1,0 +1,88 @@
+"""The scalar model with two symmetric modes, Vermaak et al. (2003), section 5.1."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.noise import stratified_uniform
+
+
+class QuadraticModel(AbstractStateSpaceModel):
+    """A random walk seen through its square: D = N(x_{t-1}, σ_x²), L = N(y_t; x_t², σ_y²).
+
+    Vermaak et al. (2003), section 5.1. The sign of x_t cannot be seen, so that with the symmetric
+    prior the filtering distribution has two modes of exactly equal mass, at about ± sqrt(y_t).
+
+    - `sigma_x`, `sigma_y`: standard deviations, positive.
+    - `low`, `high`: x_0 is uniform on [low, high].
+    - `initial_draw`: "stratified" puts one x_0 in each of n equal cells, still uniform but
+      without the gaps of "independent" draws, which at small n can leave a mode uncovered before
+      the first observation.
+
+    States have shape (n,), observations are scalars. Raises `ValueError` for an empty range or
+    an unknown draw. Use it to see whether a filter keeps both modes.
+    """
+
+    sigma_x: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.1)
+    sigma_y: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.1)
+    low: float = eqx.field(static=True, default=-2.5)
+    high: float = eqx.field(static=True, default=2.5)
+    initial_draw: str = eqx.field(static=True, default="stratified")
+
+    def __check_init__(self) -> None:
+        if not self.low < self.high:
+            raise ValueError(f"high: {self.high} is not above low, {self.low}")
+        if self.initial_draw not in ("stratified", "independent"):
+            raise ValueError(
+                f"initial_draw: {self.initial_draw!r} is neither 'stratified' nor 'independent'"
+            )
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, " n"]:
+        """x_0, uniform on [low, high]."""
+        if self.initial_draw == "stratified":
+            uniform = stratified_uniform(key, num_particles)
+        else:
+            uniform = jax.random.uniform(key, (num_particles,))
+        return self.low + (self.high - self.low) * uniform
+
+    def sample_transition(
+        self, key: Key[Array, ""], states: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """x_t ~ N(x_{t-1}, σ_x²)."""
+        return states + self.sigma_x * jax.random.normal(key, states.shape, states.dtype)
+
+    def log_likelihood(
+        self, observation: Float[Array, ""], states: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """log N(y_t; x_t², σ_y²)."""
+        return _log_normal(observation - states**2, self.sigma_y)
+
+    def log_transition(
+        self, states: Float[Array, " n"], previous_states: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """log N(x_t; x_{t-1}, σ_x²)."""
+        return _log_normal(states - previous_states, self.sigma_x)
+
+    def transition_mean(self, states: Float[Array, " n"]) -> Float[Array, " n"]:
+        """x_{t-1}."""
+        return states
+
+    def observation_mean(self, states: Float[Array, " n"]) -> Float[Array, " n"]:
+        """x_t²."""
+        return states**2
+
+    @property
+    def transition_covariance(self) -> Float[Array, "1 1"]:
+        """σ_x²."""
+        return (self.sigma_x**2).reshape(1, 1)
+
+    @property
+    def observation_covariance(self) -> Float[Array, "1 1"]:
+        """σ_y²."""
+        return (self.sigma_y**2).reshape(1, 1)
+
+
+def _log_normal(residuals: Float[Array, " n"], sigma: Float[Array, ""]) -> Float[Array, " n"]:
+    return -0.5 * (residuals / sigma) ** 2 - jnp.log(sigma) - 0.5 * jnp.log(2 * jnp.pi)

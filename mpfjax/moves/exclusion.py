@@ -1,0 +1,76 @@
+"""Exclusion: components push each other away, so that no two slide onto one object."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.features import Features, summarise
+
+
+class Exclusion(AbstractPropagation):
+    """Lower the weights of particles near the predicted means of the other components.
+
+    log-weight_i -= strength · Σ_{m ≠ c_i} exp(-|x_i - μ_m|² / (2 radius²)), summed over living
+    components, with μ_m the plain mean of the propagated particles of component m: the mean of
+    its prediction when every step resamples. Distances are in units of `scale`.
+
+    This is NOT part of the exact recursion of any paper here. It makes components interact, as a
+    Markov random field between objects does, through their means and not their states; the
+    filtering distribution is no longer that of the model and the marginal likelihood is biased
+    (`approximate` is true). Use it, after `Propagate`, where components stand for objects that
+    cannot share a place and look-alikes would otherwise collect several components; a mixture
+    of hypotheses about ONE object must not have it.
+
+    Raises `ValueError` for a strength or radius that is not positive.
+    """
+
+    strength: float = eqx.field(static=True)
+    radius: float = eqx.field(static=True)
+    features: Features
+
+    def __init__(
+        self,
+        strength: float = 10.0,
+        radius: float = 0.5,
+        *,
+        features: Callable[[PyTree], Array] | None = None,
+        scale: float | Array = 1.0,
+    ) -> None:
+        for name, value in (("strength", strength), ("radius", radius)):
+            if not value > 0:
+                raise ValueError(f"{name}: {value} is not positive")
+        self.strength = strength
+        self.radius = radius
+        self.features = Features(features, scale)
+
+    @property
+    def approximate(self) -> bool:
+        """True: an interaction between components, on top of the model."""
+        return True
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Weigh down every particle by the other components' nearness."""
+        del key, observation
+        if mixture.num_components == 1:
+            return mixture
+        nearness = self._nearness(mixture).astype(mixture.log_weights.dtype)
+        return mixture.replace(log_weights=mixture.log_weights - self.strength * nearness)
+
+    def _nearness(self, mixture: ParticleMixture) -> Float[Array, " n"]:
+        features = self.features(mixture)
+        own = mixture.component_indicators
+        groups = summarise(
+            features, mixture.occupied.astype(features.dtype), own, mixture.num_components
+        )
+        total = jnp.zeros(mixture.num_particles, features.dtype)
+        for m in range(mixture.num_components):
+            square = jnp.sum((features - groups.means[m][None]) ** 2, axis=1)
+            bump = jnp.exp(-square / (2 * self.radius**2))
+            total += jnp.where((own != m) & groups.alive[m], bump, 0.0)
+        return total

@@ -1,0 +1,94 @@
+"""What regrouping looks at: chosen features of the state, in chosen units."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from mpfjax.mixture import ParticleMixture, flatten_states
+from mpfjax.operations import segment_sum, take
+
+
+class Features(eqx.Module):
+    """The coordinates in which particles are near or far, (n, k), measured in `scale`.
+
+    - `function`: maps the particles to (n,) or (n, k) features; None takes the whole state,
+      flattened.
+    - `scale`: a number, or one a feature: the unit of each, such as the width and height of a box
+      in pixels. Distances, and with them all thresholds of distance, are in this unit.
+
+    Raises `ValueError` for a scale that is not positive.
+    """
+
+    function: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None)
+    scale: tuple[float, ...] = eqx.field(
+        static=True, default=(1.0,), converter=lambda scale: tuple(map(float, np.ravel(scale)))
+    )
+
+    def __check_init__(self) -> None:
+        if not all(unit > 0 for unit in self.scale):
+            raise ValueError(f"scale: {self.scale} is not positive")
+
+    def __call__(self, mixture: ParticleMixture) -> Float[Array, "n k"]:
+        """The features of every particle, zero in an empty slot."""
+        particles = mixture.particles
+        values = flatten_states(particles) if self.function is None else self.function(particles)
+        values = values.reshape(mixture.num_particles, -1)
+        if len(self.scale) not in (1, values.shape[1]):
+            raise ValueError(f"scale: {len(self.scale)} units for {values.shape[1]} features")
+        values = values / jnp.array(self.scale, values.dtype)[None]
+        return jnp.where(mixture.occupied[:, None], values, 0.0)
+
+
+class Groups(eqx.Module):
+    """The mass, mean and covariance of each group of particles, zero for an empty one."""
+
+    masses: Float[Array, " g"]
+    means: Float[Array, "g k"]
+    covariances: Float[Array, "g k k"]
+
+    @property
+    def alive(self) -> Bool[Array, " g"]:
+        """Which groups hold mass."""
+        return self.masses > 0
+
+
+def summarise(
+    features: Float[Array, "n k"],
+    weights: Float[Array, " n"],
+    labels: Int[Array, " n"],
+    num_groups: int,
+) -> Groups:
+    """Weighted mass, mean and covariance of the particles under each label."""
+    masses = segment_sum(weights, labels, num_groups)
+    safe = jnp.where(masses > 0, masses, 1.0)
+    shares = (weights / take(safe, labels)).astype(features.dtype)
+    means = segment_sum(shares[:, None] * features, labels, num_groups)
+    centred = features - take(means, labels)
+    squares = shares[:, None, None] * centred[:, :, None] * centred[:, None, :]
+    return Groups(masses, means, segment_sum(squares, labels, num_groups))
+
+
+def separation(
+    means_a: Float[Array, "*g k"],
+    covariances_a: Float[Array, "*g k k"],
+    means_b: Float[Array, "*g k"],
+    covariances_b: Float[Array, "*g k k"],
+) -> tuple[Float[Array, "*g"], Float[Array, "*g"]]:
+    """How far apart two groups are: the distance of their means, and the same in deviations.
+
+    The second is |μ_a - μ_b| over the pooled standard deviation along the line that joins them,
+    sqrt(uᵀ (Σ_a + Σ_b) u / 2): Ashman's D, of which 2 is the usual border below which two
+    Gaussians of equal mass show no clean gap. Two points apart are infinitely many deviations
+    apart; two on the same spot none.
+    """
+    gap = means_a - means_b
+    distance = jnp.sqrt(jnp.sum(gap**2, axis=-1))
+    pooled = (covariances_a + covariances_b) / 2
+    spread = jnp.sqrt(jnp.maximum(jnp.einsum("...i,...ij,...j->...", gap, pooled, gap), 0.0))
+    deviations = distance**2 / jnp.where(spread > 0, spread, 1.0)
+    return distance, jnp.where(
+        spread > 0, deviations, jnp.where(distance > 0, jnp.inf, jnp.zeros_like(distance))
+    )

@@ -1,0 +1,334 @@
+"""Regrouping: K-means, merging of overlapping components, splitting of diffuse ones."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractRegrouping
+from mpfjax.moves.features import Features, separation, summarise
+from mpfjax.operations import segment_counts, segment_sum, take
+
+
+class KMeans(AbstractRegrouping):
+    """A fixed number of K-means iterations, from the components as they are.
+
+    Vermaak et al. (2003), section 4. Each particle counts the same whatever its weight: the
+    groups are to cover the places that hold particles, and on the quadratic model weighting
+    loses modes. A component without a particle is dead and stays so; a component keeps its label.
+
+    - `num_iterations`: assignments of all particles; the centroids move in between.
+    - `reseed`: start from all M components instead, seeded by farthest-first traversal from the
+      particle farthest from the mean. For the grouping of x_0.
+    - `features`, `scale`: see `Features`.
+
+    Raises `ValueError` for fewer than one iteration.
+    """
+
+    num_iterations: int = eqx.field(static=True)
+    reseed: bool = eqx.field(static=True)
+    features: Features
+
+    def __init__(
+        self,
+        num_iterations: int = 5,
+        *,
+        reseed: bool = False,
+        features: Callable[[PyTree], Array] | None = None,
+        scale: float | Array = 1.0,
+    ) -> None:
+        if num_iterations < 1:
+            raise ValueError(f"num_iterations: {num_iterations} is less than 1")
+        self.num_iterations = num_iterations
+        self.reseed = reseed
+        self.features = Features(features, scale)
+
+    def regroup(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+        """Each particle to the component whose centroid is nearest."""
+        del key
+        features, occupied, m = self.features(mixture), mixture.occupied, mixture.num_components
+        if self.reseed:
+            alive = jnp.ones(m, bool)
+            labels = nearest(features, farthest_first(features, occupied, m), alive)
+        else:
+            labels = mixture.component_indicators
+
+        def iterate(_: int, labels: Int[Array, " n"]) -> Int[Array, " n"]:
+            centroids, alive = _centroids(features, occupied, labels, m)
+            return nearest(features, centroids, alive)
+
+        labels = jax.lax.fori_loop(0, self.num_iterations, iterate, labels)
+        return labels, mixture.memory
+
+
+class Merge(AbstractRegrouping):
+    """Merge components that overlap, for as many steps as patience asks.
+
+    Vermaak et al. (2003), section 4, leaves the criterion open. Here two components overlap
+    when both hold:
+
+    - their means are less than `max_deviations` pooled standard deviations apart, along the line
+      that joins them (Ashman's D; 2 is where two equal Gaussians stop showing two peaks);
+    - their means are less than `max_distance` apart, in units of `scale`.
+
+    None leaves out a condition. `patience` is for how many steps in a row (frames) they must
+    overlap before they merge, so that two objects that pass each other are not made one. Chains
+    of overlapping components merge into one, which keeps the lowest label.
+
+    Raises `ValueError` where both conditions are None, for a threshold that is not positive, or
+    for a patience below 1. Exact: a relabelling only.
+    """
+
+    max_deviations: float | None = eqx.field(static=True)
+    max_distance: float | None = eqx.field(static=True)
+    patience: int = eqx.field(static=True)
+    features: Features
+
+    def __init__(
+        self,
+        max_deviations: float | None = 2.0,
+        max_distance: float | None = None,
+        *,
+        patience: int = 1,
+        features: Callable[[PyTree], Array] | None = None,
+        scale: float | Array = 1.0,
+    ) -> None:
+        if max_deviations is None and max_distance is None:
+            raise ValueError("max_deviations, max_distance: at least one must be given")
+        _require_positive(max_deviations=max_deviations, max_distance=max_distance)
+        if patience < 1:
+            raise ValueError(f"patience: {patience} is less than 1")
+        self.max_deviations = max_deviations
+        self.max_distance = max_distance
+        self.patience = patience
+        self.features = Features(features, scale)
+
+    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
+        """For how many steps each pair of components has overlapped, where patience counts."""
+        if self.patience == 1:
+            return {}
+        return {"overlap_durations": jnp.zeros((num_components, num_components), jnp.int32)}
+
+    def regroup(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+        """Every particle to the lowest label that its component is chained to by overlap."""
+        del key
+        overlap = self._overlap(mixture)
+        memory = mixture.memory
+        if self.patience > 1:
+            durations = jnp.where(overlap, memory["overlap_durations"] + 1, 0)
+            overlap = durations >= self.patience
+            # A merged label is free for another component, which starts a count of its own.
+            memory = memory | {"overlap_durations": jnp.where(overlap, 0, durations)}
+        return take(lowest_connected(overlap), mixture.component_indicators), memory
+
+    def _overlap(self, mixture: ParticleMixture) -> Bool[Array, "m m"]:
+        groups = summarise(
+            self.features(mixture),
+            jnp.exp(mixture.log_component_weights),
+            mixture.component_indicators,
+            mixture.num_components,
+        )
+        distance, deviations = separation(
+            groups.means[:, None], groups.covariances[:, None],
+            groups.means[None], groups.covariances[None],
+        )  # fmt: skip
+        overlap = groups.alive[:, None] & groups.alive[None]
+        if self.max_deviations is not None:
+            overlap &= deviations < self.max_deviations
+        if self.max_distance is not None:
+            overlap &= distance < self.max_distance
+        return overlap
+
+
+class Split(AbstractRegrouping):
+    """Split a component in two where it has become too diffuse.
+
+    Vermaak et al. (2003), section 4, leaves the criterion open. Here each component is parted
+    by weighted 2-means, started from its two ends, and splits where all of these hold:
+
+    - the halves' means are more than `min_deviations` pooled standard deviations apart (a
+      Gaussian cut in the middle gives 2.6, a uniform cut in the middle 3.5, so that neither
+      splits below 4);
+    - they are more than `min_distance` apart, in units of `scale`;
+    - the lighter half holds at least `min_share` of the component's mass.
+
+    The lighter half takes a free label, the clearest splits first; without a free label nothing
+    splits. Raises `ValueError` for a threshold that is negative or a share not in [0, 0.5].
+    Exact: a relabelling only.
+    """
+
+    min_deviations: float = eqx.field(static=True)
+    min_distance: float = eqx.field(static=True)
+    min_share: float = eqx.field(static=True)
+    num_iterations: int = eqx.field(static=True)
+    features: Features
+
+    def __init__(
+        self,
+        min_deviations: float = 4.0,
+        min_distance: float = 0.0,
+        *,
+        min_share: float = 0.05,
+        num_iterations: int = 3,
+        features: Callable[[PyTree], Array] | None = None,
+        scale: float | Array = 1.0,
+    ) -> None:
+        for name, value in (("min_deviations", min_deviations), ("min_distance", min_distance)):
+            if value < 0:
+                raise ValueError(f"{name}: {value} is negative")
+        if not 0 <= min_share <= 0.5:
+            raise ValueError(f"min_share: {min_share} is not in [0, 0.5]")
+        if num_iterations < 1:
+            raise ValueError(f"num_iterations: {num_iterations} is less than 1")
+        self.min_deviations = min_deviations
+        self.min_distance = min_distance
+        self.min_share = min_share
+        self.num_iterations = num_iterations
+        self.features = Features(features, scale)
+
+    def regroup(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+        """The lighter half of every component that is too diffuse, to a free label."""
+        del key
+        features, m = self.features(mixture), mixture.num_components
+        weights = jnp.exp(mixture.log_component_weights)
+        parent = mixture.component_indicators
+        side = self._halve(features, weights, mixture)
+        halves = summarise(features, weights, parent + m * side, 2 * m)
+        masses = halves.masses.reshape(2, m)
+        distance, deviations = separation(
+            halves.means[:m], halves.covariances[:m], halves.means[m:], halves.covariances[m:]
+        )
+        splits = (
+            (jnp.min(masses, axis=0) >= self.min_share)
+            & (jnp.min(masses, axis=0) > 0)
+            & (deviations > self.min_deviations)
+            & (distance > self.min_distance)
+        )
+        lighter = jnp.where(masses[1] <= masses[0], 1, 0)
+        labels = free_labels(splits, deviations, mixture.active)
+        moves = (side == take(lighter, parent)) & mixture.occupied
+        return jnp.where(moves, take(labels, parent), parent), mixture.memory
+
+    def _halve(
+        self, features: Float[Array, "n k"], weights: Float[Array, " n"], mixture: ParticleMixture
+    ) -> Int[Array, " n"]:
+        """0 or 1 for each particle: which half of its component it belongs to."""
+        m, parent = mixture.num_components, mixture.component_indicators
+        mean = mixture.component_averages(features)
+        one_end = _farthest_members(features, mean, mixture)
+        centroids = jnp.concatenate([one_end, _farthest_members(features, one_end, mixture)])
+
+        def iterate(_: int, centroids: Float[Array, "g k"]) -> Float[Array, "g k"]:
+            labels = parent + m * _nearer(features, centroids, parent)
+            masses = segment_sum(weights, labels, 2 * m)[:, None]
+            sums = segment_sum(weights[:, None] * features, labels, 2 * m)
+            return jnp.where(masses > 0, sums / jnp.where(masses > 0, masses, 1.0), centroids)
+
+        centroids = jax.lax.fori_loop(0, self.num_iterations, iterate, centroids)
+        return _nearer(features, centroids, parent)
+
+
+def nearest(
+    features: Float[Array, "n k"], centroids: Float[Array, "m k"], alive: Bool[Array, " m"]
+) -> Int[Array, " n"]:
+    """The living centroid nearest to each particle, the lowest of equals.
+
+    A running minimum over the centroids: no (m, n) array is made.
+    """
+    best = jnp.full(features.shape[0], jnp.inf, features.dtype)
+    labels = jnp.zeros(features.shape[0], jnp.int32)
+    for m in range(centroids.shape[0]):
+        distance = jnp.sum((features - centroids[m][None]) ** 2, axis=1)
+        closer = alive[m] & (distance < best)
+        best = jnp.where(closer, distance, best)
+        labels = jnp.where(closer, m, labels)
+    return labels
+
+
+def farthest_first(
+    features: Float[Array, "n k"], occupied: Bool[Array, " n"], num_seeds: int
+) -> Float[Array, "num_seeds k"]:
+    """Seeds for K-means: the particle farthest from the mean, then each farthest from all."""
+    weight = occupied.astype(features.dtype)[:, None]
+    mean = jnp.sum(weight * features, axis=0) / jnp.maximum(jnp.sum(weight), 1.0)
+    distance = jnp.sum((features - mean[None]) ** 2, axis=1)
+    seeds = []
+    for m in range(num_seeds):
+        seed = features[jnp.argmax(jnp.where(occupied, distance, -1.0))]
+        to_seed = jnp.sum((features - seed[None]) ** 2, axis=1)
+        distance = to_seed if m == 0 else jnp.minimum(distance, to_seed)
+        seeds.append(seed)
+    return jnp.stack(seeds)
+
+
+def lowest_connected(adjacent: Bool[Array, "m m"]) -> Int[Array, " m"]:
+    """The lowest label in the connected component of each node of a symmetric graph."""
+    m = adjacent.shape[0]
+    reach = adjacent | jnp.eye(m, dtype=bool)
+    for _ in range(max(m - 1, 1).bit_length()):
+        reach = (reach.astype(jnp.float32) @ reach.astype(jnp.float32)) > 0
+    return jnp.argmax(reach, axis=1).astype(jnp.int32)
+
+
+def free_labels(
+    wanted: Bool[Array, " m"], priority: Float[Array, " m"], active: Bool[Array, " m"]
+) -> Int[Array, " m"]:
+    """A free label for each component that wants one, by priority; its own where none is left."""
+    m = active.shape[0]
+    own = jnp.arange(m, dtype=jnp.int32)
+    by_priority = jnp.argsort(jnp.where(wanted, -priority, jnp.inf))
+    free = jnp.argsort(active, stable=True).astype(jnp.int32)
+    rank = jnp.zeros(m, jnp.int32).at[by_priority].set(own)
+    granted = wanted & (rank < m - jnp.sum(active.astype(jnp.int32)))
+    return jnp.where(granted, take(free, rank), own)
+
+
+def _centroids(
+    features: Float[Array, "n k"],
+    occupied: Bool[Array, " n"],
+    labels: Int[Array, " n"],
+    num_components: int,
+) -> tuple[Float[Array, "m k"], Bool[Array, " m"]]:
+    counts = segment_counts(occupied, labels, num_components)
+    sums = segment_sum(jnp.where(occupied[:, None], features, 0.0), labels, num_components)
+    return sums / jnp.maximum(counts, 1).astype(features.dtype)[:, None], counts > 0
+
+
+def _nearer(
+    features: Float[Array, "n k"], centroids: Float[Array, "g k"], parent: Int[Array, " n"]
+) -> Int[Array, " n"]:
+    """Which of its own component's two centroids each particle is nearer to."""
+    m = centroids.shape[0] // 2
+    first = jnp.sum((features - take(centroids, parent)) ** 2, axis=1)
+    second = jnp.sum((features - take(centroids, parent + m)) ** 2, axis=1)
+    return (second < first).astype(jnp.int32)
+
+
+def _farthest_members(
+    features: Float[Array, "n k"], points: Float[Array, "m k"], mixture: ParticleMixture
+) -> Float[Array, "m k"]:
+    """In each component, the particle farthest from the component's point."""
+    parent, m, n = mixture.component_indicators, mixture.num_components, mixture.num_particles
+    distance = jnp.sum((features - take(points, parent)) ** 2, axis=1)
+    distance = jnp.where(mixture.occupied, distance, -1.0)
+    largest = jax.ops.segment_max(distance, parent, m)
+    is_largest = distance >= take(largest, parent)
+    index = jax.ops.segment_min(
+        jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1), parent, m
+    )
+    return take(features, jnp.clip(index, 0, n - 1))
+
+
+def _require_positive(**thresholds: float | None) -> None:
+    for name, value in thresholds.items():
+        if value is not None and not value > 0:
+            raise ValueError(f"{name}: {value} is not positive")
