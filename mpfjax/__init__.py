@@ -1,5 +1,7 @@
 """mpfjax: particle filters that keep many hypotheses alive, in JAX."""
 
+from mpfjax import exact as exact
+from mpfjax import metrics as metrics
 from mpfjax.filters import Filter as Filter
 from mpfjax.filters import FilterRun as FilterRun
 from mpfjax.filters import StepInfo as StepInfo

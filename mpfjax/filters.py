@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture, single_component
@@ -409,7 +410,7 @@ def _present(observations: PyTree, missing: str) -> Bool[Array, " t"] | None:
     inexact = [leaf for leaf in leaves if jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)]
     if not inexact:
         return None
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in inexact):
+    if any(isinstance(leaf, Tracer) for leaf in inexact):
         return _present_traced(inexact, missing)
     finite = [np.isfinite(leaf).reshape(len(leaf), -1).all(axis=1) for leaf in inexact]
     present = np.logical_and.reduce(finite)
@@ -435,7 +436,7 @@ def _present_traced(leaves: list[Array], missing: str) -> Bool[Array, " t"] | No
 def _checked(run: FilterRun) -> FilterRun:
     """The run, or an error where a density of the model was NaN for some particle."""
     increments = run.log_likelihood_increments
-    if isinstance(increments, jax.core.Tracer):
+    if isinstance(increments, Tracer):
         bad = jnp.isnan(increments)
         return eqx.error_if(run, bad, "model: a density was NaN for some particle")
     bad = np.isnan(increments).any(axis=tuple(range(increments.ndim - 1)))

@@ -117,7 +117,7 @@ class ParticleMixture(eqx.Module):
         return jax.tree.map(self.component_averages, self.particles)
 
     def component_covariances(self) -> Float[Array, "m d d"]:
-        """The weighted covariance of each component over the flattened state, zero for a dead one."""
+        """The weighted covariance of each component's flattened state, zero for a dead one."""
         states = flatten_states(self.particles)
         centred = states - take(self.component_averages(states), self.component_indicators)
         return self.component_averages(centred[:, :, None] * centred[:, None, :])

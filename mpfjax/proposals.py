@@ -1,13 +1,14 @@
 """Proposals q(x_t | x_{t-1}, y_t) with a density of their own."""
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.models.base import AbstractStateSpaceModel, require
+from mpfjax.models.base import require
 from mpfjax.models.noise import independent_normal, stratified_normal
 
 
@@ -40,7 +41,7 @@ class GaussNewtonProposal(AbstractProposal):
     Use it where bootstrap particles mostly miss the likelihood.
     """
 
-    model: AbstractStateSpaceModel
+    model: Any
     num_iterations: int = eqx.field(static=True, default=4)
     inflation: float = eqx.field(static=True, default=1.1)
     noise: str = eqx.field(static=True, default="independent")
@@ -108,28 +109,39 @@ class GaussNewtonProposal(AbstractProposal):
 _NOISES = {"independent": independent_normal, "stratified": stratified_normal}
 
 
-# Batched LAPACK calls cost far more than the arithmetic of a scalar state, hence the one-by-one
-# case of each.
+# Batched LAPACK calls on thousands of tiny matrices cost far more than their arithmetic: written
+# out over the d columns, all particles go through each operation at once.
 
 
 def _cholesky(matrices: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
-    return jnp.sqrt(matrices) if matrices.shape[-1] == 1 else jnp.linalg.cholesky(matrices)
+    """The lower triangular factors F with F Fᵀ = matrix."""
+    d = matrices.shape[-1]
+    factors = jnp.zeros_like(matrices)
+    for j in range(d):
+        rest = matrices[:, :, j] - jnp.einsum("nik,nk->ni", factors, factors[:, j])
+        column = rest / jnp.sqrt(rest[:, j : j + 1])
+        factors = factors.at[:, j:, j].set(column[:, j:])
+    return factors
 
 
 def _solve(factors: Float[Array, "n d d"], vectors: Float[Array, "n d"]) -> Float[Array, "n d"]:
-    if factors.shape[-1] == 1:
-        return vectors / factors[:, 0]
-    return jax.scipy.linalg.solve_triangular(factors, vectors[..., None], lower=True)[..., 0]
+    """F⁻¹ v, by forward substitution."""
+    solved = jnp.zeros_like(vectors)
+    for i in range(vectors.shape[1]):
+        rest = vectors[:, i] - jnp.sum(factors[:, i] * solved, axis=1)
+        solved = solved.at[:, i].set(rest / factors[:, i, i])
+    return solved
 
 
 def _solve_transposed(
     factors: Float[Array, "n d d"], vectors: Float[Array, "n d"]
 ) -> Float[Array, "n d"]:
-    if factors.shape[-1] == 1:
-        return vectors / factors[:, 0]
-    return jax.scipy.linalg.solve_triangular(factors, vectors[..., None], lower=True, trans=1)[
-        ..., 0
-    ]
+    """F⁻ᵀ v, by backward substitution."""
+    solved = jnp.zeros_like(vectors)
+    for i in reversed(range(vectors.shape[1])):
+        rest = vectors[:, i] - jnp.sum(factors[:, :, i] * solved, axis=1)
+        solved = solved.at[:, i].set(rest / factors[:, i, i])
+    return solved
 
 
 def _diagonals(factors: Float[Array, "n d d"]) -> Float[Array, "n d"]:

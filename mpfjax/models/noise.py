@@ -6,14 +6,14 @@ from jaxtyping import Array, Float, Key
 
 
 def independent_normal(
-    key: Key[Array, ""], shape: tuple[int, int], dtype: jnp.dtype
+    key: Key[Array, ""], shape: tuple[int, ...], dtype: jnp.dtype
 ) -> Float[Array, "n d"]:
     """Independent standard normal draws."""
     return jax.random.normal(key, shape, dtype)
 
 
 def stratified_normal(
-    key: Key[Array, ""], shape: tuple[int, int], dtype: jnp.dtype
+    key: Key[Array, ""], shape: tuple[int, ...], dtype: jnp.dtype
 ) -> Float[Array, "n d"]:
     """Standard normal draws, one row a particle, that together cover the normal evenly.
 

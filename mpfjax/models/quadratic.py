@@ -65,6 +65,11 @@ class QuadraticModel(AbstractStateSpaceModel):
         """log N(x_t; x_{t-1}, σ_x²)."""
         return _log_normal(states - previous_states, self.sigma_x)
 
+    def log_initial(self, states: Float[Array, " n"]) -> Float[Array, " n"]:
+        """log p(x_0), uniform on [low, high]."""
+        inside = (states >= self.low) & (states <= self.high)
+        return jnp.where(inside, -jnp.log(self.high - self.low), -jnp.inf)
+
     def transition_mean(self, states: Float[Array, " n"]) -> Float[Array, " n"]:
         """x_{t-1}."""
         return states

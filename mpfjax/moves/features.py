@@ -1,6 +1,7 @@
 """What regrouping looks at: chosen features of the state, in chosen units."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,6 +10,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations import segment_sum, take
+
+
+def _as_units(scale: Any) -> tuple[float, ...]:
+    return tuple(map(float, np.ravel(scale)))
 
 
 class Features(eqx.Module):
@@ -23,9 +28,7 @@ class Features(eqx.Module):
     """
 
     function: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None)
-    scale: tuple[float, ...] = eqx.field(
-        static=True, default=(1.0,), converter=lambda scale: tuple(map(float, np.ravel(scale)))
-    )
+    scale: tuple[float, ...] = eqx.field(static=True, default=(1.0,), converter=_as_units)
 
     def __check_init__(self) -> None:
         if not all(unit > 0 for unit in self.scale):

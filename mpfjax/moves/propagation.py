@@ -1,11 +1,12 @@
 """Propagation from t-1 to t: the bootstrap proposal, and any proposal with its own density."""
 
-import equinox as eqx
+from typing import cast
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, require
+from mpfjax.models.base import AbstractStateSpaceModel, HasTransitionDensity, require
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.proposals import AbstractProposal
 
@@ -39,7 +40,8 @@ class Propagate(AbstractPropagation):
         else:
             states, log_density = self.proposal.propose(key, observation, previous)
             log_factors = self._log_likelihood(observation, states, mixture)
-            log_factors += self.model.log_transition(states, previous) - log_density
+            dynamics = cast(HasTransitionDensity, self.model)
+            log_factors += dynamics.log_transition(states, previous) - log_density
         log_factors = log_factors.astype(mixture.log_weights.dtype)
         # An empty slot stays empty whatever the model makes of its stale state.
         log_weights = jnp.where(mixture.occupied, mixture.log_weights + log_factors, -jnp.inf)
