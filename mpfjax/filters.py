@@ -147,7 +147,7 @@ class Filter(eqx.Module):
                 eqx.error_if(
                     leaf, ~_all_finite(leaf), "observation: NaN or infinite; use predict to skip it"
                 )
-                if eqx.is_inexact_array_like(leaf)
+                if jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)
                 else leaf
             ),
             observation,

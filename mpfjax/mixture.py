@@ -1,7 +1,5 @@
 """The particle mixture: one set of joint weights, and all that is derived from it."""
 
-from typing import Self
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -131,7 +129,7 @@ class ParticleMixture(eqx.Module):
         filled = jnp.where(_rows(self.occupied, values), values, jnp.zeros((), values.dtype))
         return jnp.sum(_rows(self.weights.astype(values.dtype), values) * filled, axis=0)
 
-    def replace(self, **fields: PyTree) -> Self:
+    def replace(self, **fields: PyTree) -> "ParticleMixture":
         """A copy with some fields changed."""
         return type(self)(
             **{name: fields.get(name, getattr(self, name)) for name in self.__dataclass_fields__}

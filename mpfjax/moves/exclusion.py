@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
-from mpfjax.moves.features import Features, summarise
+from mpfjax.moves.features import Features, Scale, summarise
 
 
 class Exclusion(AbstractPropagation):
@@ -38,7 +38,7 @@ class Exclusion(AbstractPropagation):
         radius: float = 0.5,
         *,
         features: Callable[[PyTree], Array] | None = None,
-        scale: float | Array = 1.0,
+        scale: Scale = 1.0,
     ) -> None:
         for name, value in (("strength", strength), ("radius", radius)):
             if not value > 0:

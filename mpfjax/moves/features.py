@@ -1,15 +1,17 @@
 """What regrouping looks at: chosen features of the state, in chosen units."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations import segment_sum, take
+
+Scale = ArrayLike | Sequence[float]
 
 
 def _as_units(scale: Any) -> tuple[float, ...]:
@@ -75,11 +77,11 @@ def summarise(
 
 
 def separation(
-    means_a: Float[Array, "*g k"],
-    covariances_a: Float[Array, "*g k k"],
-    means_b: Float[Array, "*g k"],
-    covariances_b: Float[Array, "*g k k"],
-) -> tuple[Float[Array, "*g"], Float[Array, "*g"]]:
+    means_a: Float[Array, "*#g k"],
+    covariances_a: Float[Array, "*#g k k"],
+    means_b: Float[Array, "*#g k"],
+    covariances_b: Float[Array, "*#g k k"],
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """How far apart two groups are: the distance of their means, and the same in deviations.
 
     The second is |μ_a - μ_b| over the pooled standard deviation along the line that joins them,

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
-from mpfjax.moves.features import Features, separation, summarise
+from mpfjax.moves.features import Features, Scale, separation, summarise
 from mpfjax.operations import segment_counts, segment_sum, take
 
 
@@ -38,7 +38,7 @@ class KMeans(AbstractRegrouping):
         *,
         reseed: bool = False,
         features: Callable[[PyTree], Array] | None = None,
-        scale: float | Array = 1.0,
+        scale: Scale = 1.0,
     ) -> None:
         if num_iterations < 1:
             raise ValueError(f"num_iterations: {num_iterations} is less than 1")
@@ -58,7 +58,7 @@ class KMeans(AbstractRegrouping):
         else:
             labels = mixture.component_indicators
 
-        def iterate(_: int, labels: Int[Array, " n"]) -> Int[Array, " n"]:
+        def iterate(_: int | Int[Array, ""], labels: Int[Array, " n"]) -> Int[Array, " n"]:
             centroids, alive = _centroids(features, occupied, labels, m)
             return nearest(features, centroids, alive)
 
@@ -96,7 +96,7 @@ class Merge(AbstractRegrouping):
         *,
         patience: int = 1,
         features: Callable[[PyTree], Array] | None = None,
-        scale: float | Array = 1.0,
+        scale: Scale = 1.0,
     ) -> None:
         if max_deviations is None and max_distance is None:
             raise ValueError("max_deviations, max_distance: at least one must be given")
@@ -178,7 +178,7 @@ class Split(AbstractRegrouping):
         min_share: float = 0.05,
         num_iterations: int = 3,
         features: Callable[[PyTree], Array] | None = None,
-        scale: float | Array = 1.0,
+        scale: Scale = 1.0,
     ) -> None:
         for name, value in (("min_deviations", min_deviations), ("min_distance", min_distance)):
             if value < 0:
@@ -227,7 +227,7 @@ class Split(AbstractRegrouping):
         one_end = _farthest_members(features, mean, mixture)
         centroids = jnp.concatenate([one_end, _farthest_members(features, one_end, mixture)])
 
-        def iterate(_: int, centroids: Float[Array, "g k"]) -> Float[Array, "g k"]:
+        def iterate(_: int | Int[Array, ""], centroids: Float[Array, "g k"]) -> Float[Array, "g k"]:
             labels = parent + m * _nearer(features, centroids, parent)
             masses = segment_sum(weights, labels, 2 * m)[:, None]
             sums = segment_sum(weights[:, None] * features, labels, 2 * m)

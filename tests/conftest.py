@@ -1,0 +1,32 @@
+"""What every test runs under: checked shapes and types, strict promotion, no display."""
+
+import os
+import sys
+from pathlib import Path
+
+import matplotlib
+import pytest
+from jaxtyping import install_import_hook
+
+from tests import typechecking
+
+assert "mpfjax" not in sys.modules, "the import hook must be there before mpfjax is imported"
+install_import_hook("mpfjax", f"{typechecking.__name__}.typechecker")
+matplotlib.use("Agg")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import jax  # noqa: E402
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The folder of real sequences; the test is skipped where there is none."""
+    folder = Path(os.environ.get("MPFJAX_DATA", REPOSITORY.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no real sequences at {folder}: set MPFJAX_DATA to the folder that has them")
+    return folder
