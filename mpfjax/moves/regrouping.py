@@ -73,7 +73,7 @@ class Merge(AbstractRegrouping):
     when both hold:
 
     - their means are less than `max_deviations` pooled standard deviations apart, along the line
-      that joins them (Ashman's D; 2 is where two equal Gaussians stop showing two peaks);
+      that joins them (Ashman's D; at 1 two equal Gaussians share 62% of their mass, at 2 still 32%);
     - their means are less than `max_distance` apart, in units of `scale`.
 
     None leaves out a condition. `patience` is for how many steps in a row (frames) they must
@@ -91,7 +91,7 @@ class Merge(AbstractRegrouping):
 
     def __init__(
         self,
-        max_deviations: float | None = 2.0,
+        max_deviations: float | None = 1.0,
         max_distance: float | None = None,
         *,
         patience: int = 1,

@@ -1,0 +1,234 @@
+"""Figures 1 and 2 of Vermaak et al. (2003), section 5.1: who keeps both modes, and with how many
+particles. Run with `python -m benchmarks.score_vs_particles`; `--help` lists the options.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from tqdm import tqdm
+
+import mpfjax
+from benchmarks.results import format_table, write_json
+from mpfjax import plotting
+from mpfjax.exact import grid_filter
+from mpfjax.metrics import mass_above, modes_represented
+
+PERIOD = 100
+AMPLITUDE = 2.0
+NUM_STEPS = 100
+RADIUS = 0.3
+SIGMA = 0.1
+LOW, HIGH = -2.5, 2.5
+GRID = (-4.0, 4.0, 1601)
+TYPICAL_NUM_PARTICLES = 100
+SEEDS_AT_ONCE = 100
+
+LABELS = {
+    "pf": "particle filter",
+    "mpf": "mixture particle filter",
+    "guided_mpf": "guided mixture particle filter",
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the study, print its table, and write its results and figures."""
+    options = parse(arguments)
+    out = Path(options.out)
+    model = mpfjax.QuadraticModel(SIGMA, SIGMA, LOW, HIGH)
+    truth, observations = simulate(options.seed)
+    exact_mass = np.asarray(grid_filter(model, observations, jnp.linspace(*GRID)).mass_above(0.0))
+
+    settings = settings_of(options)
+    results: list[dict[str, Any]] = []
+    typical: dict[str, plotting.Trace] = {}
+    cells = [(name, n) for n in options.particles for name in options.filters]
+    try:
+        for name, num_particles in tqdm(cells, disable=not sys.stderr.isatty(), unit="cell"):
+            runs = run_cell(name, num_particles, model, truth, observations, options)
+            results.append(summarise(name, num_particles, runs, exact_mass))
+            write_json(
+                out / "score_vs_particles.json", {"settings": settings, "results": results}
+            )
+            if num_particles == typical_size(options.particles):
+                typical[name] = typical_run(runs)
+    except KeyboardInterrupt:
+        print(f"interrupted: {len(results)} of {len(cells)} cells are in {out}", file=sys.stderr)
+        return 130
+    print(as_table(results))
+    figures = {
+        "typical_run": plotting.draw_typical_run(
+            typical, np.asarray(truth), np.asarray(observations), LABELS
+        ),
+        "score_vs_particles": plotting.draw_scores(results, LABELS),
+    }
+    for stem, figure in figures.items():
+        figure.savefig(out / f"{stem}.png", dpi=150)
+    print(f"results and figures: {out}/")
+    return 0
+
+
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    """The options, or a message that names the one that cannot be run."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.score_vs_particles")
+    parser.add_argument("--seeds", type=int, default=20, help="runs of each filter at each size")
+    parser.add_argument(
+        "--particles", type=int, nargs="+", default=[20, 50, 100, 200, 500, 1000], metavar="N"
+    )
+    parser.add_argument("--filters", nargs="+", choices=list(LABELS), default=list(LABELS))
+    parser.add_argument("--out", default="results/score_vs_particles", metavar="DIR")
+    parser.add_argument("--seed", type=int, default=0, help="of the data and of all the runs")
+    options = parser.parse_args(arguments)
+    if options.seeds < 1:
+        parser.error(f"--seeds: {options.seeds} is less than 1")
+    too_few = [n for n in options.particles if n < 2]
+    if too_few:
+        parser.error(f"--particles: {too_few[0]} is less than 2, one for each component")
+    return options
+
+
+def simulate(seed: int) -> tuple[Float[Array, " t"], Float[Array, " t"]]:
+    """The true state, a sinusoid that the model did not draw, and y_1..y_t, one set for all."""
+    times = jnp.arange(1.0, NUM_STEPS + 1)
+    truth = AMPLITUDE * jnp.sin(2 * jnp.pi * times / PERIOD)
+    noise = jax.random.normal(jax.random.fold_in(jax.random.key(seed), 0), truth.shape)
+    return truth, truth**2 + SIGMA * noise
+
+
+def build(name: str, model: mpfjax.QuadraticModel, num_particles: int) -> mpfjax.Filter:
+    """The filter of that name; both mixtures have at most two components."""
+    if name == "pf":
+        return mpfjax.particle_filter(model, num_particles)
+    guided = mpfjax.GaussNewtonProposal(model, noise="stratified")
+    return mpfjax.mixture_particle_filter(
+        model, num_particles, max_components=2, proposal=guided if name == "guided_mpf" else None
+    )
+
+
+def collect(mixture: mpfjax.ParticleMixture) -> dict[str, Array]:
+    """What the scores and figures are computed from, after each step."""
+    return {
+        "positions": mixture.particles,
+        "occupied": mixture.occupied,
+        "component_indicators": mixture.component_indicators,
+        "weight": mixture.mixture_weights[0],
+        "components": jnp.sum(mixture.active.astype(jnp.int32)),
+        "mass_above": mass_above(mixture, 0.0),
+    }
+
+
+def run_cell(
+    name: str,
+    num_particles: int,
+    model: mpfjax.QuadraticModel,
+    truth: Float[Array, " t"],
+    observations: Float[Array, " t"],
+    options: argparse.Namespace,
+) -> dict[str, np.ndarray]:
+    """All seeds of one filter at one size, a bounded number of them at once."""
+    filter = build(name, model, num_particles)
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(options.seed), 1), options.seeds)
+    size = min(SEEDS_AT_ONCE, options.seeds)
+    parts = []
+    for start in range(0, options.seeds, size):
+        # The last batch is filled up, so that it does not compile anew.
+        batch = keys[np.clip(np.arange(start, start + size), 0, options.seeds - 1)]
+        kept = mpfjax.monte_carlo(batch, filter, observations, collect).collected
+        kept["both"] = both_represented(kept["positions"], kept["occupied"], truth)
+        if num_particles != typical_size(options.particles):
+            kept = {k: kept[k] for k in ("both", "weight", "components", "mass_above")}
+        parts.append(jax.tree.map(np.asarray, kept))
+    return {k: np.concatenate([part[k] for part in parts])[: options.seeds] for k in parts[0]}
+
+
+@jax.jit
+def both_represented(
+    positions: Float[Array, "s t n"], occupied: Bool[Array, "s t n"], truth: Float[Array, " t"]
+) -> Bool[Array, "s t"]:
+    """Whether both modes, at x*_t and -x*_t, are represented, at every step of every run."""
+    modes = jnp.broadcast_to(jnp.stack([truth, -truth], axis=1)[None], (*positions.shape[:2], 2))
+    return modes_represented(positions, occupied, modes, RADIUS).all(axis=-1)
+
+
+def summarise(
+    name: str, num_particles: int, runs: dict[str, np.ndarray], exact_mass: np.ndarray
+) -> dict[str, Any]:
+    """One entry of the results: scores, component one's weight, and the error of the modes' mass.
+
+    The weight is taken over the steps at which a second component lives, where there are any: a
+    merged mixture has a weight of one whatever the filter does.
+    """
+    two = runs["components"] > 1
+    weights = runs["weight"][two] if two.any() else runs["weight"].ravel()
+    error = runs["mass_above"] - exact_mass[None]
+    return {
+        "filter": name,
+        "particles": num_particles,
+        "scores": [float(score) for score in runs["both"].mean(axis=1)],
+        "weight_mean": float(weights.mean()),
+        "weight_std": float(weights.std()),
+        "mode_mass_error": float(np.sqrt((error**2).mean())),
+    }
+
+
+def typical_size(sizes: list[int]) -> int:
+    """The size of figure 1, or the one nearest to it."""
+    return min(sizes, key=lambda n: abs(n - TYPICAL_NUM_PARTICLES))
+
+
+def typical_run(runs: dict[str, np.ndarray]) -> "plotting.Trace":
+    """The particles of the run whose score is the median one."""
+    scores = runs["both"].mean(axis=1)
+    index = int(np.argsort(scores, kind="stable")[(len(scores) - 1) // 2])
+    return plotting.Trace(
+        positions=runs["positions"][index],
+        occupied=runs["occupied"][index],
+        component_indicators=runs["component_indicators"][index],
+        score=float(scores[index]),
+    )
+
+
+def as_table(results: list[dict[str, Any]]) -> str:
+    """The results in a table for the terminal."""
+    rows = [
+        [
+            LABELS[entry["filter"]],
+            str(entry["particles"]),
+            f"{np.mean(entry['scores']):.3f} ± {np.std(entry['scores']):.3f}",
+            f"{np.mean(np.array(entry['scores']) == 1):.3f}",
+            f"{entry['weight_mean']:.2f} ± {entry['weight_std']:.2f}",
+            f"{entry['mode_mass_error']:.3f}",
+        ]
+        for entry in sorted(results, key=lambda entry: list(LABELS).index(entry["filter"]))
+    ]
+    header = ["filter", "N", "score", "runs with score 1", "weight of one", "mode mass error"]
+    return format_table(header, rows)
+
+
+def settings_of(options: argparse.Namespace) -> dict[str, Any]:
+    """Everything that a second run needs to be the same."""
+    return {
+        "steps": NUM_STEPS,
+        "amplitude": AMPLITUDE,
+        "period": PERIOD,
+        "sigma_x": SIGMA,
+        "sigma_y": SIGMA,
+        "initial": [LOW, HIGH],
+        "radius": RADIUS,
+        "max_components": 2,
+        "seeds": options.seeds,
+        "particles": options.particles,
+        "filters": options.filters,
+        "seed": options.seed,
+        "jax": jax.__version__,
+        "mpfjax": mpfjax.__version__,
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""Figures of the papers; the only file that imports matplotlib."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+# Okabe and Ito's palette (2008), told apart with every common kind of colour blindness.
+COLOURS = (
+    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00",
+    "#56B4E9", "#F0E442", "#8B4513", "#5E3C99", "#666666",
+)  # fmt: skip
+MARKERS = "osD^vP*X<>"
+
+
+@dataclass(frozen=True)
+class Trace:
+    """The particles of one run over time, (t, n), of a scalar state."""
+
+    positions: np.ndarray
+    occupied: np.ndarray
+    component_indicators: np.ndarray
+    score: float
+
+
+def draw_typical_run(
+    traces: Mapping[str, Trace],
+    truth: np.ndarray,
+    observations: np.ndarray,
+    labels: Mapping[str, str],
+) -> Figure:
+    """Figure 1 of Vermaak et al. (2003): the data, and every filter's particles over time."""
+    num_rows = 1 + len(traces)
+    figure = Figure(figsize=(7.0, 1.6 + 2.1 * len(traces)), layout="constrained")
+    axes = figure.subplots(
+        num_rows, 1, sharex=True, squeeze=False, height_ratios=[1.3] + [2.0] * len(traces)
+    )[:, 0]
+    times = np.arange(1, len(truth) + 1)
+    axes[0].plot(times, truth, color="black", label="true state $x^*_t$")
+    axes[0].plot(times, observations, ".", color=COLOURS[4], ms=4, label="observations $y_t$")
+    axes[0].set_ylabel("data")
+    axes[0].legend(loc="lower left", fontsize=8, ncols=2, framealpha=0.9)
+    for axis, (name, trace) in zip(axes[1:], traces.items(), strict=True):
+        _draw_trace(axis, trace, truth)
+        num_particles = trace.positions.shape[1]
+        axis.set_title(
+            f"{labels[name]}, N = {num_particles}: both modes at"
+            f" {100 * trace.score:.0f}% of the steps",
+            fontsize=10,
+        )
+    axes[-1].set_xlabel("time step $t$")
+    return figure
+
+
+def _draw_trace(axis: Axes, trace: Trace, truth: np.ndarray) -> None:
+    times = np.broadcast_to(np.arange(1, len(truth) + 1)[:, None], trace.positions.shape)
+    for component in np.unique(trace.component_indicators):
+        chosen = trace.occupied & (trace.component_indicators == component)
+        axis.plot(
+            times[chosen], trace.positions[chosen], MARKERS[component % len(MARKERS)], ms=2.0,
+            mew=0, alpha=0.5, color=COLOURS[component % len(COLOURS)],
+            label=f"particles of component {component + 1}",
+        )  # fmt: skip
+    for sign in (1, -1):
+        axis.plot(
+            np.arange(1, len(truth) + 1), sign * truth, color="black", lw=0.9,
+            ls="-" if sign == 1 else "--",
+            label=r"mode at $x^*_t$" if sign == 1 else r"mode at $-x^*_t$",
+        )  # fmt: skip
+    axis.set_ylabel("state $x_t$")
+    axis.set_ylim(-2.9, 2.9)
+    axis.legend(
+        loc="upper center", bbox_to_anchor=(0.5, 0.985), fontsize=7, ncols=4, markerscale=2.5,
+        framealpha=0.9, borderpad=0.3, columnspacing=1.0,
+    )  # fmt: skip
+
+
+def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str]) -> Figure:
+    """Figure 2 of Vermaak et al. (2003), and the error of the modes' mass beside it."""
+    figure = Figure(figsize=(10.5, 3.4), layout="constrained")
+    score, weight, mass = figure.subplots(1, 3)
+    names = [name for name in labels if any(entry["filter"] == name for entry in results)]
+    for index, name in enumerate(names):
+        entries = sorted(
+            (entry for entry in results if entry["filter"] == name),
+            key=lambda entry: entry["particles"],
+        )
+        style = {"color": COLOURS[index], "marker": MARKERS[index], "ms": 4, "label": labels[name]}
+        sizes = np.array([entry["particles"] for entry in entries])
+        means = np.array([np.mean(entry["scores"]) for entry in entries])
+        stds = np.array([np.std(entry["scores"]) for entry in entries])
+        # A score lies in [0, 1]: the bars end there too.
+        bars = np.minimum(stds, [means, 1 - means])
+        # A few per cent apart, so that bars at the same N can be told from each other.
+        score.errorbar(sizes * 1.04 ** (index - 1), means, yerr=bars, capsize=2, **style)
+        mass.plot(sizes, [entry["mode_mass_error"] for entry in entries], **style)
+        if name != "pf":
+            mean = np.array([entry["weight_mean"] for entry in entries])
+            std = np.array([entry["weight_std"] for entry in entries])
+            weight.plot(sizes, mean, **style)
+            for sign in (1, -1):
+                weight.plot(sizes, mean + sign * std, ls="--", lw=1, color=COLOURS[index])
+    all_sizes = sorted({entry["particles"] for entry in results})
+    for axis in (score, weight, mass):
+        axis.set_xscale("log")
+        axis.set_xticks(all_sizes, [str(size) for size in all_sizes])
+        axis.minorticks_off()
+        axis.set_xlabel("number of particles $N$")
+        axis.grid(alpha=0.25)
+    num_seeds = len(results[0]["scores"])
+    score.set_ylabel("share of steps with both modes")
+    score.set_title(f"score, mean ± std of {num_seeds} runs", fontsize=10)
+    score.set_ylim(-0.03, 1.06)
+    weight.set_ylabel(r"mixture weight $\pi_1$")
+    weight.set_title("weight of component one, mean ± std", fontsize=10)
+    weight.set_ylim(-0.03, 1.06)
+    mass.set_ylabel(r"error of $P(x_t > 0 \mid y_1 \ldots y_t)$")
+    mass.set_title("RMS error of the upper mode's mass", fontsize=10)
+    mass.set_ylim(bottom=0)
+    score.legend(loc="lower right", fontsize=8)
+    return figure
