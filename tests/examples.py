@@ -1,0 +1,63 @@
+"""Mixtures made by hand, each with something that goes wrong easily, and weighted sums of them."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from mpfjax import ParticleMixture
+
+NUM_PARTICLES = 40
+NUM_COMPONENTS = 6
+
+
+def make_mixture(states, log_weights, labels, num_components, memory=None) -> ParticleMixture:
+    """A normalised mixture from arrays of numpy, each slot its own ancestor."""
+    log_weights = np.asarray(log_weights, float)
+    log_weights = log_weights - np.logaddexp.reduce(log_weights)
+    return ParticleMixture(
+        particles=jnp.asarray(states, float),
+        log_weights=jnp.asarray(log_weights, float),
+        component_indicators=jnp.asarray(labels, jnp.int32),
+        ancestor_indices=jnp.arange(len(log_weights), dtype=jnp.int32),
+        num_components=num_components,
+        memory={} if memory is None else memory,
+    )
+
+
+def example_mixtures() -> dict[str, ParticleMixture]:
+    """Forty particles in the plane with up to six components."""
+    rng = np.random.default_rng(0)
+    n, m = NUM_PARTICLES, NUM_COMPONENTS
+    labels = rng.integers(0, m, n)
+    centres = 4 * rng.normal(size=(m, 2))
+    states = centres[labels] + rng.normal(size=(n, 2))
+    ordinary = rng.normal(size=n)
+    empty = rng.random(n) < 0.3
+    two_dead = np.where(np.isin(labels, [2, 5]), -np.inf, ordinary)
+    lonely = np.full(n, -np.inf)
+    lonely[17] = 0.0
+    stale = np.where(empty[:, None], np.nan, states)
+    return {
+        "ordinary": make_mixture(states, ordinary, labels, m),
+        "equal weights": make_mixture(states, np.zeros(n), labels, m),
+        "one component": make_mixture(states, ordinary, np.full(n, 3), m),
+        "dead components": make_mixture(states, two_dead, labels, m),
+        "empty slots with stale states": make_mixture(
+            stale, np.where(empty, -np.inf, ordinary), labels, m
+        ),
+        "all mass in one particle": make_mixture(states, lonely, labels, m),
+        "masses 200 nats apart": make_mixture(states, ordinary - 200.0 * labels, labels, m),
+        "weights 100 nats apart": make_mixture(states, 30 * ordinary, labels, m),
+        "identical particles": make_mixture(np.ones((n, 2)), ordinary, labels, m),
+    }
+
+
+def log_masses(mixture: ParticleMixture) -> np.ndarray:
+    """log π_m by numpy in double precision, -inf for a dead component."""
+    log_weights = np.asarray(mixture.log_weights, float)
+    labels = np.asarray(mixture.component_indicators)
+    return np.array(
+        [
+            np.logaddexp.reduce(log_weights[labels == m], initial=-np.inf)
+            for m in range(mixture.num_components)
+        ]
+    )

@@ -1,0 +1,156 @@
+"""The contracts of every move in the registry, on every mixture of the examples."""
+
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.examples import example_mixtures, log_masses
+from tests.registry import REGROUPINGS, REJUVENATIONS
+
+MIXTURES = example_mixtures()
+NUM_DRAWS = 4000
+
+over_mixtures = pytest.mark.parametrize("mixture", MIXTURES.values(), ids=MIXTURES)
+over_regroupings = pytest.mark.parametrize("name", REGROUPINGS)
+over_rejuvenations = pytest.mark.parametrize("name", REJUVENATIONS)
+
+
+@cache
+def compiled(name):
+    return eqx.filter_jit(REGROUPINGS[name])
+
+
+@cache
+def redraw(name):
+    """The move, compiled for many keys at once and one mixture."""
+    move = REJUVENATIONS[name]
+    return eqx.filter_jit(jax.vmap(lambda key, mixture: move(key, mixture), in_axes=(0, None)))
+
+
+@cache
+def draws(name, example):
+    """What `NUM_DRAWS` keys make of an example, as numpy."""
+    keys = jax.random.split(jax.random.key(1), NUM_DRAWS)
+    return jax.tree.map(np.asarray, redraw(name)(keys, MIXTURES[example]))
+
+
+def with_memory(move, mixture):
+    return mixture.replace(memory=move.initial_memory(mixture.num_components))
+
+
+@over_mixtures
+@over_regroupings
+def test_regrouping_changes_nothing_but_indicators_and_memory(name, mixture):
+    mixture = with_memory(REGROUPINGS[name], mixture)
+    moved = compiled(name)(jax.random.key(0), mixture)
+    kept = ("particles", "log_weights", "ancestor_indices")
+    for field in kept:
+        np.testing.assert_array_equal(getattr(moved, field), getattr(mixture, field))
+    assert float(moved.log_mass) == float(mixture.log_mass)
+    labels = np.asarray(moved.component_indicators)
+    assert labels.min() >= 0
+    assert labels.max() < mixture.num_components
+    assert jax.tree.structure(moved) == jax.tree.structure(mixture)
+
+
+@over_mixtures
+@over_regroupings
+def test_regrouping_leaves_a_mixture_whose_summaries_are_finite(name, mixture):
+    moved = compiled(name)(jax.random.key(0), with_memory(REGROUPINGS[name], mixture))
+    summaries = (moved.component_means(), moved.component_covariances(), moved.mean())
+    for summary in (*summaries, moved.component_effective_sample_sizes):
+        assert np.isfinite(summary).all()
+    np.testing.assert_allclose(float(moved.mixture_weights.sum()), 1.0, rtol=1e-5)
+
+
+@pytest.mark.parametrize("example", MIXTURES)
+@over_rejuvenations
+class TestRejuvenation:
+    def test_leaves_each_components_mass_unchanged(self, name, example):
+        before, after = log_masses(MIXTURES[example]), draws(name, example)
+        for draw in range(0, NUM_DRAWS, 100):
+            one = jax.tree.map(lambda leaf, draw=draw: leaf[draw], after)
+            np.testing.assert_allclose(log_masses(one), before, rtol=1e-6, atol=2e-5)
+
+    def test_lets_no_offspring_change_component(self, name, example):
+        after, before = draws(name, example), MIXTURES[example]
+        filled = after.log_weights > -np.inf
+        parents = np.asarray(before.component_indicators)[after.ancestor_indices]
+        assert (after.component_indicators == parents)[filled].all()
+
+    def test_ancestors_point_at_the_particles_that_were_copied(self, name, example):
+        after, before = draws(name, example), MIXTURES[example]
+        copied = np.asarray(before.particles)[after.ancestor_indices]
+        filled = after.log_weights > -np.inf
+        np.testing.assert_array_equal(after.particles[filled], copied[filled])
+
+    def test_feeds_no_slot_from_a_particle_without_weight(self, name, example):
+        after, before = draws(name, example), MIXTURES[example]
+        # Below e^-87 a weight is nothing in float32, though its logarithm is not -inf.
+        weightless = np.asarray(before.log_component_weights) < -88
+        filled = after.log_weights > -np.inf
+        parents = after.ancestor_indices[filled]
+        assert np.asarray(before.occupied)[parents].all()
+        if REJUVENATIONS[name].ess_threshold == 1.0:
+            assert not weightless[parents].any()
+
+    def test_fills_the_slots_that_it_should(self, name, example):
+        after, before = draws(name, example), MIXTURES[example]
+        move, counts = REJUVENATIONS[name], np.asarray(before.component_counts)
+        filled = (after.log_weights > -np.inf).sum(axis=1)
+        if move.particles_per_component is not None:
+            assert (filled == move.particles_per_component * (counts > 0).sum()).all()
+        elif move.is_due(before).any():
+            assert (filled == before.num_particles).all()
+        else:
+            assert (filled == counts.sum()).all()
+
+    def test_offspring_are_unbiased_where_resampled(self, name, example):
+        """E[weight of i's offspring] is i's weight, the definition of unbiased resampling."""
+        after, before = draws(name, example), MIXTURES[example]
+        slots = np.arange(NUM_DRAWS)[:, None] * before.num_particles + after.ancestor_indices
+        offspring = np.bincount(
+            slots.ravel(),
+            weights=(after.log_weights > -np.inf).ravel(),
+            minlength=NUM_DRAWS * before.num_particles,
+        ).reshape(NUM_DRAWS, -1)
+        due = np.asarray(move_due(name, before))
+        labels = np.asarray(before.component_indicators)
+        targets = new_counts(after, before.num_components)
+        expected = targets[labels] * np.exp(np.asarray(before.log_component_weights, float))
+        standard_error = offspring.std(axis=0) / np.sqrt(NUM_DRAWS)
+        error = np.abs(offspring.mean(axis=0) - expected)
+        # Particles that should have offspring once in thousands of draws: their counts are few.
+        rare = 4 / NUM_DRAWS
+        checked = due[labels] & np.asarray(before.occupied)
+        assert (error <= 4.5 * standard_error + rare)[checked].all()
+        assert (offspring == 1)[:, ~due[labels] & np.asarray(before.occupied)].all()
+
+
+def move_due(name, mixture):
+    return REJUVENATIONS[name].is_due(mixture)
+
+
+def new_counts(after, num_components):
+    """How many particles each component has after the move: the same at every draw."""
+    filled = after.log_weights > -np.inf
+    counts = np.stack(
+        [((after.component_indicators == m) & filled).sum(axis=1) for m in range(num_components)]
+    )
+    assert (counts == counts[:, :1]).all()
+    return counts[:, 0]
+
+
+@over_rejuvenations
+def test_rejuvenation_works_with_any_pytree_of_particles(name):
+    mixture = MIXTURES["ordinary"]
+    leaves = {"box": mixture.particles, "age": (jnp.arange(40), jnp.zeros((40, 2, 3)))}
+    after = REJUVENATIONS[name](jax.random.key(2), mixture.replace(particles=leaves))
+    filled = np.asarray(after.occupied)
+    copied = np.asarray(after.ancestor_indices)[filled]
+    np.testing.assert_array_equal(np.asarray(after.particles["age"][0])[filled], copied)
+    assert after.particles["age"][1].shape == (40, 2, 3)

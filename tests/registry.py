@@ -1,0 +1,101 @@
+"""Every move and every chain of moves, by name: what is listed here inherits the contracts.
+
+`REGROUPINGS` and `REJUVENATIONS` are held to the contracts of their kind by
+`tests/moves/test_contracts.py`, `CHAINS` to those of filters by `tests/test_chains.py`. A new
+move or filter is one new line below; the tests then find it.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+import mpfjax
+from mpfjax import (
+    AbstractRegrouping,
+    AbstractRejuvenation,
+    Exclusion,
+    Filter,
+    GaussNewtonProposal,
+    KMeans,
+    Merge,
+    Propagate,
+    Resample,
+    Split,
+)
+
+NUM_PARTICLES = 48
+NUM_COMPONENTS = 3
+
+
+class RandomLabels(AbstractRegrouping):
+    """A regrouping of our own: every particle to a component drawn at random."""
+
+    def regroup(self, key, mixture):
+        labels = jax.random.randint(key, (mixture.num_particles,), 0, mixture.num_components)
+        return labels.astype(jnp.int32), mixture.memory
+
+
+REGROUPINGS: dict[str, AbstractRegrouping] = {
+    "kmeans": KMeans(),
+    "kmeans reseeded": KMeans(3, reseed=True),
+    "kmeans on one feature": KMeans(features=lambda states: states[:, 0], scale=0.5),
+    "merge by deviations": Merge(),
+    "merge by distance": Merge(None, 1.0, scale=(1.0, 2.0)),
+    "patient merge": Merge(2.0, 1.0, patience=2),
+    "split": Split(),
+    "eager split": Split(1.0, 0.1, min_share=0.0),
+    "random labels": RandomLabels(),
+}
+
+REJUVENATIONS: dict[str, AbstractRejuvenation] = {
+    "systematic": Resample(),
+    "stratified": Resample("stratified"),
+    "multinomial": Resample("multinomial"),
+    "residual": Resample("residual"),
+    "systematic, adaptive": Resample(ess_threshold=0.5),
+    "multinomial, adaptive": Resample("multinomial", ess_threshold=0.5),
+    "systematic, fixed number": Resample(particles_per_component=5),
+    "residual, fixed number, adaptive": Resample("residual", 0.5, 5),
+}
+
+
+def _pf(**options) -> Callable[..., Filter]:
+    return lambda model: mpfjax.particle_filter(model, NUM_PARTICLES, **options)
+
+
+def _mpf(**options) -> Callable[..., Filter]:
+    return lambda model: mpfjax.mixture_particle_filter(
+        model, NUM_PARTICLES, NUM_COMPONENTS, **options
+    )
+
+
+def _guided(noise: str) -> Callable[..., Filter]:
+    return lambda model: _mpf(proposal=GaussNewtonProposal(model, noise=noise))(model)
+
+
+def _chain(*before, then=()) -> Callable[..., Filter]:
+    return lambda model: Filter(
+        model, [*before, Propagate(model), *then], NUM_PARTICLES, NUM_COMPONENTS
+    )
+
+
+CHAINS: dict[str, Callable[..., Filter]] = {
+    "pf": _pf(),
+    "pf stratified": _pf(scheme="stratified"),
+    "pf multinomial": _pf(scheme="multinomial"),
+    "pf residual": _pf(scheme="residual"),
+    "pf adaptive": _pf(ess_threshold=0.5),
+    "guided pf": lambda model: _pf(proposal=GaussNewtonProposal(model))(model),
+    "mpf": _mpf(),
+    "mpf adaptive": _mpf(ess_threshold=0.5),
+    "mpf fixed number": _mpf(particles_per_component=12),
+    "guided mpf": _guided("independent"),
+    "guided mpf, stratified noise": _guided("stratified"),
+    "patient mpf": _mpf(merge=Merge(2.0, 1.0, patience=2)),
+    "kmeans only": _chain(Resample(), then=[KMeans()]),
+    "random labels, multinomial": _chain(Resample("multinomial"), then=[RandomLabels()]),
+    "random labels, residual": _chain(RandomLabels(), Resample("residual")),
+    "never resampled": _chain(then=[Split(2.0)]),
+    "exclusion": _chain(Resample("stratified"), then=[Exclusion(2.0, 0.5), KMeans(3, reseed=True)]),
+}

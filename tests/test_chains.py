@@ -1,0 +1,202 @@
+"""The contracts of every chain of moves in the registry.
+
+Two programs are compiled for each chain and shared by the tests: thousands of runs of the chain
+at once, and its single step.
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax.exact import grid_filter, kalman_filter
+from tests.registry import CHAINS, NUM_PARTICLES
+from tests.user_models import (
+    BLINDED,
+    BROKEN,
+    DRIFT_AS_LINEAR_GAUSSIAN,
+    EXPLODING,
+    TRACES,
+    Drift,
+    TrickyQuadraticModel,
+)
+
+NUM_RUNS = 4000
+OBSERVATIONS = jnp.array([1.5, 1.0, 0.4, 0.9])
+GRID = jnp.linspace(-5.0, 5.0, 1001)
+MODELS = {"quadratic": TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0), "drift": Drift()}
+
+over_chains = pytest.mark.parametrize("chain", CHAINS)
+over_models = pytest.mark.parametrize("model", MODELS)
+
+
+class Truth(NamedTuple):
+    """The exact answer: log p(y_1..y_s) and E[x_s], E[x_s²] at each step s."""
+
+    log_evidence: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+
+
+@cache
+def truth(model):
+    if model == "quadratic":
+        run = grid_filter(MODELS[model], OBSERVATIONS, GRID)
+        first, second = run.means[:, None], (run.variances + run.means**2)[:, None]
+    else:
+        run = kalman_filter(DRIFT_AS_LINEAR_GAUSSIAN, OBSERVATIONS[:, None])
+        first = run.means
+        second = jnp.diagonal(run.covariances, axis1=1, axis2=2) + first**2
+    return Truth(*map(np.asarray, (jnp.cumsum(run.log_likelihood_increments), first, second)))
+
+
+def moments(mixture):
+    states = mixture.particles.reshape(mixture.num_particles, -1)
+    return mixture.average(states), mixture.average(states**2), mixture.particles
+
+
+@cache
+def chain_filter(chain, model):
+    return CHAINS[chain](MODELS[model])
+
+
+@cache
+def runs(chain, model):
+    keys = jax.random.split(jax.random.key(3), NUM_RUNS)
+    run = mpfjax.monte_carlo(keys, chain_filter(chain, model), OBSERVATIONS, moments)
+    return jax.tree.map(np.asarray, run)
+
+
+@over_models
+@over_chains
+class TestExactness:
+    def test_evidence_and_moments_are_unbiased(self, chain, model):
+        """E[Ẑ/Z] = 1, and E[Ẑ/Z φ̂] = E[φ | y], at every step, within 4 standard errors.
+
+        A particle filter's estimate of E[φ | y] is biased, but times its evidence it is not.
+        """
+        if chain_filter(chain, model).approximate:
+            pytest.skip("declared approximate")
+        run, exact = runs(chain, model), truth(model)
+        log_evidence = np.cumsum(run.log_likelihood_increments, axis=1)
+        ratios = np.exp(log_evidence - exact.log_evidence)
+        first, second, _ = run.collected
+        # Loose estimates would prove nothing.
+        assert (ratios.std(axis=0) / np.sqrt(NUM_RUNS) < 0.04).all()
+        assert_unbiased(ratios, 1.0)
+        assert_unbiased(ratios[..., None] * first, exact.first)
+        assert_unbiased(ratios[..., None] * second, exact.second)
+
+    def test_increments_add_up(self, chain, model):
+        run = runs(chain, model)
+        total = run.log_likelihood_increments.sum(axis=1)
+        np.testing.assert_allclose(run.log_marginal_likelihood, total, rtol=1e-5, atol=1e-5)
+
+    def test_final_mixture_is_normalised_and_finite(self, chain, model):
+        final = runs(chain, model).final
+        assert not np.isnan(final.log_weights).any()
+        np.testing.assert_allclose(np.exp(final.log_weights).sum(axis=1), 1.0, rtol=1e-5)
+        assert (final.component_indicators >= 0).all()
+        assert (final.component_indicators < chain_filter(chain, model).num_components).all()
+        assert (final.ancestor_indices >= 0).all()
+        assert (final.ancestor_indices < NUM_PARTICLES).all()
+
+
+def assert_unbiased(estimates, expected):
+    """The mean over runs is within 4 standard errors of what is expected, in every entry."""
+    standard_error = estimates.std(axis=0) / np.sqrt(NUM_RUNS)
+    z = (estimates.mean(axis=0) - expected) / standard_error
+    assert np.abs(z).max() < 4, f"standard errors away: {z}"
+
+
+def test_exclusion_is_declared_approximate_and_nothing_else_is():
+    declared = {chain for chain in CHAINS if chain_filter(chain, "quadratic").approximate}
+    assert declared == {"exclusion"}
+
+
+def step_keys(key, length):
+    """The keys that `run_filter` gives to `init` and to each step."""
+    return jax.random.fold_in(key, 0), jax.random.split(jax.random.fold_in(key, 1), length)
+
+
+@over_chains
+class TestOnline:
+    """The chain's single step, on the tricky quadratic model."""
+
+    def test_step_by_step_equals_the_scan_and_a_loop_equals_vmap(self, chain):
+        run, filter = runs(chain, "quadratic"), chain_filter(chain, "quadratic")
+        for k, key in enumerate(jax.random.split(jax.random.key(3), NUM_RUNS)[:3]):
+            initial, keys = step_keys(key, len(OBSERVATIONS))
+            mixture = filter.init(initial)
+            for t, observation in enumerate(OBSERVATIONS):
+                mixture, info = filter.step(keys[t], mixture, observation)
+                increment = run.log_likelihood_increments[k, t]
+                np.testing.assert_allclose(info.log_likelihood_increment, increment, rtol=1e-3)
+                np.testing.assert_allclose(
+                    mixture.particles, run.collected[2][k, t], rtol=1e-4, atol=1e-4
+                )
+                np.testing.assert_array_equal(info.resampled, run.resampled[k, t])
+            np.testing.assert_array_equal(
+                mixture.component_indicators, run.final.component_indicators[k]
+            )
+            np.testing.assert_array_equal(mixture.ancestor_indices, run.final.ancestor_indices[k])
+
+    def test_a_step_of_zero_likelihood_is_flagged_and_the_filter_goes_on(self, chain):
+        filter = chain_filter(chain, "quadratic")
+        mixture = started(filter)
+        blinded, info = filter.step(jax.random.key(6), mixture, jnp.array(BLINDED))
+        assert float(info.log_likelihood_increment) == -np.inf
+        assert bool(info.degenerate)
+        np.testing.assert_allclose(float(blinded.mixture_weights.sum()), 1.0, rtol=1e-5)
+        assert np.isfinite(blinded.particles).all()
+        after, info = filter.step(jax.random.key(7), blinded, OBSERVATIONS[0])
+        assert np.isfinite(info.log_likelihood_increment)
+        assert not bool(info.degenerate)
+        assert np.isfinite(after.mean())
+
+    def test_a_missing_observation_moves_the_particles_and_leaves_the_masses(self, chain):
+        filter = chain_filter(chain, "quadratic")
+        mixture = started(filter)
+        predicted, info = filter.predict(jax.random.key(6), mixture)
+        assert float(info.log_likelihood_increment) == 0.0
+        assert not np.array_equal(predicted.particles, mixture.particles)
+        np.testing.assert_allclose(predicted.mixture_weights, mixture.mixture_weights, rtol=1e-5)
+
+    def test_a_nan_observation_is_an_error(self, chain):
+        filter = chain_filter(chain, "quadratic")
+        with pytest.raises(RuntimeError, match="observation"):
+            filter.step(jax.random.key(6), started(filter), jnp.array(jnp.nan))
+
+    def test_a_nan_density_is_never_taken_for_zero_likelihood(self, chain):
+        filter = chain_filter(chain, "quadratic")
+        for observation in (BROKEN, EXPLODING):
+            _, info = filter.step(jax.random.key(6), started(filter), jnp.array(observation))
+            assert not bool(info.degenerate)
+            assert not np.isfinite(info.log_likelihood_increment)
+
+    def test_nothing_compiles_again_as_components_come_and_go(self, chain):
+        filter = chain_filter(chain, "quadratic")
+        mixture = started(filter)
+        filter.step(jax.random.key(6), mixture, OBSERVATIONS[0])
+        traced = len(TRACES)
+        for t, observation in enumerate((2.0, 1.0, 0.0, 0.0, 0.0, 3.0, BLINDED, 1.0)):
+            mixture, _ = filter.step(jax.random.key(t), mixture, jnp.array(observation))
+        assert len(TRACES) == traced
+
+    def test_another_filter_of_the_same_shape_compiles_nothing(self, chain):
+        filter = chain_filter(chain, "quadratic")
+        mixture = started(filter)
+        filter.step(jax.random.key(6), mixture, OBSERVATIONS[0])
+        traced = len(TRACES)
+        other = CHAINS[chain](TrickyQuadraticModel(0.4, 0.2, -2.0, 2.0))
+        other.step(jax.random.key(6), mixture, OBSERVATIONS[1])
+        assert len(TRACES) == traced
+
+
+def started(filter):
+    mixture = filter.init(jax.random.key(4))
+    return filter.step(jax.random.key(5), mixture, OBSERVATIONS[0])[0]

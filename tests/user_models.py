@@ -1,0 +1,94 @@
+"""Models that a user would write, from nothing but the interface; the tests run on them too.
+
+`Drift` is batched, `DriftOfOne` is the same model written for one particle. Both are
+linear-Gaussian, so that the Kalman filter gives the truth (`DRIFT_AS_LINEAR_GAUSSIAN`).
+"""
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.stats import norm
+
+import mpfjax
+
+DRIFT_AS_LINEAR_GAUSSIAN = mpfjax.LinearGaussianModel(
+    A=jnp.array([[1.0, 0.5], [0.0, 0.8]]),
+    Q=0.25 * jnp.eye(2),
+    H=jnp.array([[1.0, 0.0]]),
+    R=jnp.array([[0.49]]),
+    m0=jnp.zeros(2),
+    P0=jnp.eye(2),
+)
+
+
+class Drift(mpfjax.AbstractStateSpaceModel):
+    """A position that is pushed by a second coordinate, and seen with noise."""
+
+    def sample_initial(self, key, num_particles):
+        return jax.random.normal(key, (num_particles, 2))
+
+    def sample_transition(self, key, states):
+        return self.transition_mean(states) + 0.5 * jax.random.normal(key, states.shape)
+
+    def log_likelihood(self, observation, states):
+        return norm.logpdf(observation - states[:, 0], scale=0.7)
+
+    def log_transition(self, states, previous_states):
+        return norm.logpdf(states - self.transition_mean(previous_states), scale=0.5).sum(axis=1)
+
+    # What the Gauss-Newton proposal asks for on top:
+
+    def transition_mean(self, states):
+        return jnp.stack([states[:, 0] + 0.5 * states[:, 1], 0.8 * states[:, 1]], axis=1)
+
+    def observation_mean(self, states):
+        return states[:, 0]
+
+    transition_covariance = property(lambda self: 0.25 * jnp.eye(2))
+    observation_covariance = property(lambda self: jnp.array([[0.49]]))
+
+
+class DriftOfOne:
+    """The same, of one particle; not even a module."""
+
+    def sample_initial(self, key):
+        return jax.random.normal(key, (2,))
+
+    def sample_transition(self, key, state):
+        return self.transition_mean(state) + 0.5 * jax.random.normal(key, (2,))
+
+    def log_likelihood(self, observation, state):
+        return norm.logpdf(observation - state[0], scale=0.7)
+
+    def log_transition(self, state, previous_state):
+        return norm.logpdf(state - self.transition_mean(previous_state), scale=0.5).sum()
+
+    def transition_mean(self, state):
+        return jnp.stack([state[0] + 0.5 * state[1], 0.8 * state[1]])
+
+    def observation_mean(self, state):
+        return state[:1]
+
+    transition_covariance = property(lambda self: 0.25 * jnp.eye(2))
+    observation_covariance = property(lambda self: jnp.array([[0.49]]))
+
+
+# Observations at which the model below misbehaves, as a broken model would.
+BLINDED, BROKEN, EXPLODING = -99.0, -98.0, -97.0
+
+
+class TrickyQuadraticModel(mpfjax.QuadraticModel):
+    """The quadratic model, with a zero, a NaN and an infinite likelihood on demand.
+
+    It also counts how often it is traced, in `TRACES`.
+    """
+
+    def log_likelihood(self, observation, states):
+        TRACES.append(states.shape)
+        honest = super().log_likelihood(observation, states)
+        first = jnp.arange(states.shape[0]) == 0
+        honest = jnp.where(observation == BLINDED, -jnp.inf, honest)
+        honest = jnp.where((observation == BROKEN) & first, jnp.nan, honest)
+        return jnp.where((observation == EXPLODING) & first, jnp.inf, honest)
+
+
+TRACES: list[tuple[int, ...]] = []
