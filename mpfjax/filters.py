@@ -49,6 +49,9 @@ class FilterRun(eqx.Module):
     """the steps at which every particle had zero likelihood."""
 
 
+_BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
+
+
 class _Tied(eqx.Module):
     """Stands in a move where the filter's own model belongs, so that it is stored only once."""
 
@@ -152,7 +155,9 @@ class Filter(eqx.Module):
             ),
             observation,
         )
-        return self._step(key, mixture, observation)
+        moved, info = self._step(key, mixture, observation)
+        broken = ~(info.log_likelihood_increment < jnp.inf)
+        return eqx.error_if((moved, info), broken, _BROKEN_DENSITY)
 
     @eqx.filter_jit
     def predict(
@@ -434,16 +439,13 @@ def _present_traced(leaves: list[Array], missing: str) -> Bool[Array, " t"] | No
 
 
 def _checked(run: FilterRun) -> FilterRun:
-    """The run, or an error where a density of the model was NaN for some particle."""
+    """The run, or an error where a density of the model was NaN or infinite."""
     increments = run.log_likelihood_increments
     if isinstance(increments, Tracer):
-        bad = jnp.isnan(increments)
-        return eqx.error_if(run, bad, "model: a density was NaN for some particle")
-    bad = np.isnan(increments).any(axis=tuple(range(increments.ndim - 1)))
+        return eqx.error_if(run, ~(increments < jnp.inf), _BROKEN_DENSITY)
+    bad = ~(np.asarray(increments) < np.inf).all(axis=tuple(range(increments.ndim - 1)))
     if bad.any():
-        raise RuntimeError(
-            f"model: a density was NaN for some particle, first at step {int(np.argmax(bad))}"
-        )
+        raise RuntimeError(f"{_BROKEN_DENSITY}, first at index {int(np.argmax(bad))} of the steps")
     return run
 
 

@@ -91,8 +91,8 @@ def segment_log_sum_exp(
     largest = segment_max(jax.lax.stop_gradient(log_values), segments, num_segments)
     shift = jnp.where(jnp.isfinite(largest), largest, 0.0)
     total = segment_sum(jnp.exp(log_values - take(shift, segments)), segments, num_segments)
-    positive = total > 0
-    return jnp.where(positive, jnp.log(jnp.where(positive, total, 1.0)) + shift, -jnp.inf)
+    empty = total == 0  # NaN is not: it must come out as NaN
+    return jnp.where(empty, -jnp.inf, jnp.log(jnp.where(empty, 1.0, total)) + shift)
 
 
 def order_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " n"]:
