@@ -1,0 +1,448 @@
+"""Section 5.2 of Vermaak et al. (2003): the PF against the MPF on several look-alike objects.
+
+    python -m benchmarks.visual_tracking                                  # a rendered scene
+    python -m benchmarks.visual_tracking --sequence DIR --ids 2 3 4       # frames with gt.txt
+    python -m benchmarks.visual_tracking --video FILE --box 10,20,30,60 --box 80,25,30,60
+
+Both filters have the same model and the same particles at the start: 200 for the PF, at most 10
+components of 20 for the MPF. Into --out DIR go an annotated video, a contact sheet as the paper's
+figure 3, the tracks in MOTChallenge form, and the scores, null where there is no truth.
+"""
+
+import argparse
+import json
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from jaxtyping import Array
+from tqdm import tqdm
+
+import mpfjax
+from mpfjax.metrics.coverage import coverage, covers
+from mpfjax.vision import boxes as box_files
+from mpfjax.vision import drawing, frames
+from mpfjax.vision.colour_model import BoxState, ColourModel
+from mpfjax.vision.scenes import football_scene
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+NUM_PARTICLES, MAX_COMPONENTS, PARTICLES_PER_COMPONENT = 200, 10, 20
+NAMES = {"pf": "Particle filter", "mpf": "Mixture particle filter"}
+KEY_FRAMES = 5
+
+
+class Source(NamedTuple):
+    """Where the frames come from, and what is known of the objects in them."""
+
+    name: str
+    read: Callable[[], Iterable[np.ndarray]]
+    first: int  # the number of the first frame
+    num_frames: int | None  # None where only reading on will tell
+    boxes: np.ndarray  # (k, 4), where the objects start
+    truth: np.ndarray | None  # rows of the objects to score against
+    all_labelled: bool  # whether the truth knows every object that was started
+
+
+class Snapshot(NamedTuple):
+    """What one run keeps of one frame, and the same with a leading axis of runs."""
+
+    means: Any  # (m, 4), mean box of each component, centre and size
+    active: Any  # (m,)
+    points: Any  # (n, 2), centres of the particles
+    labels: Any  # (n,), the component of each, -1 in an empty slot
+
+
+# --- the two presets --------------------------------------------------------------------------
+
+
+def paper_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Filter]:
+    """The model with the paper's parameters; the rest of the MPF in units of the mean box."""
+    model = ColourModel.from_frame(
+        frame, boxes, num_bins=30, sigma=0.15, deviations=None, share_reference=True
+    )
+    where: dict[str, Any] = {"features": _centre, "scale": boxes[:, 2:].mean(axis=0)}
+    mixture = mpfjax.mixture_particle_filter(
+        model,
+        NUM_PARTICLES,
+        MAX_COMPONENTS,
+        particles_per_component=PARTICLES_PER_COMPONENT,
+        merge=mpfjax.Merge(None, 0.5, **where),
+        split=mpfjax.Split(4.0, 0.5, min_share=0.15, **where),
+        kmeans=mpfjax.KMeans(5, **where),
+    )
+    return {"pf": mpfjax.particle_filter(model, NUM_PARTICLES), "mpf": mixture}
+
+
+def default_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Filter]:
+    """The best recipe found for real video: every box keeps its own reference."""
+    width, height = boxes[:, 2], boxes[:, 3]
+    still = np.full(len(boxes), 0.02)
+    model = ColourModel.from_frame(
+        frame,
+        boxes,
+        num_bins=30,
+        sigma=0.15,
+        deviations=np.stack([0.25 * width, 0.08 * height, still, still], axis=1),
+        num_parts=3,
+        weigh_colours=True,
+    )
+    # A unit of 1e-5 for the reference holds particles of different references apart.
+    apart: dict[str, Any] = {
+        "features": _centre_and_reference,
+        "scale": (*boxes[:, 2:].mean(axis=0), 1e-5),
+    }
+    mixture = mpfjax.Filter(
+        model,
+        moves=[
+            mpfjax.Resample(particles_per_component=PARTICLES_PER_COMPONENT),
+            mpfjax.Propagate(model),
+            mpfjax.Merge(None, 0.25, patience=10, **apart),
+        ],
+        num_particles=NUM_PARTICLES,
+        num_components=MAX_COMPONENTS,
+        initial_moves=[
+            mpfjax.KMeans(10, reseed=True, **apart),
+            mpfjax.Merge(None, 0.5, features=_reference),
+        ],
+    )
+    return {"pf": mpfjax.particle_filter(model, NUM_PARTICLES), "mpf": mixture}
+
+
+PRESETS = {
+    "default": default_filters,
+    "paper": paper_filters,
+}
+
+
+def _centre(states: BoxState) -> Array:
+    return states.box[:, :2]
+
+
+def _reference(states: BoxState) -> Array:
+    return states.reference[:, None].astype(states.box.dtype)
+
+
+def _centre_and_reference(states: BoxState) -> Array:
+    return jnp.concatenate([_centre(states), _reference(states)], axis=1)
+
+
+# --- tracking ---------------------------------------------------------------------------------
+
+
+def track(
+    filter: mpfjax.Filter, keys: Array, stills: Iterable[np.ndarray], bar: tqdm
+) -> Iterator[tuple[Snapshot, float]]:
+    """Run a filter online, once for each key, and yield each frame's snapshot and seconds."""
+    mixtures = jax.vmap(filter.init)(keys)
+    for t, still in enumerate(stills):
+        start = time.perf_counter()
+        step = jnp.asarray(t)  # an array, since a new Python number would compile anew
+        mixtures, snapshot = _advance(filter, keys, step, mixtures, jnp.asarray(still))
+        snapshot = jax.tree.map(np.asarray, snapshot)
+        bar.update()
+        yield snapshot, time.perf_counter() - start
+
+
+@eqx.filter_jit
+def _advance(filter, keys, t, mixtures, frame):
+    def step(key, mixture):
+        mixture, _ = filter.step(jax.random.fold_in(key, t), mixture, frame)
+        places = filter.model.boxes(mixture.particles)
+        labels = jnp.where(mixture.occupied, mixture.component_indicators, -1)
+        means = mixture.component_averages(places)
+        return mixture, Snapshot(means, mixture.active, places[:, :2], labels)
+
+    # The frame is not mapped over, so that its histogram is built once for all runs.
+    return jax.vmap(step)(keys, mixtures)
+
+
+def track_rows(snapshots: list[Snapshot], run: int, first: int) -> np.ndarray:
+    """Rows (frame, id, x, y, w, h) of one run: an id for each life of each component."""
+    rows, alive, next_id = [], {}, 1
+    for frame, snapshot in enumerate(snapshots, first):
+        for m, (mean, active) in enumerate(
+            zip(snapshot.means[run], snapshot.active[run], strict=True)
+        ):
+            if not active:
+                alive.pop(m, None)
+                continue
+            if m not in alive:
+                alive[m], next_id = next_id, next_id + 1
+            rows.append([frame, alive[m], *box_files.top_left(mean[None])[0]])
+    # Rounded as the file is, so that scores from the file are the scores.
+    return np.round(np.array(rows).reshape(-1, 6), 3)
+
+
+def score(
+    name: str, snapshots: list[Snapshot], seconds: list[float], source: Source
+) -> dict[str, Any]:
+    """One entry of the results: means over the runs, null where the truth is not known."""
+    result = {"filter": name, "all_covered": None, "per_object": None, "on_object": None}
+    result |= {"id_swaps": None, "ms_per_frame": _milliseconds(seconds)}
+    truth = source.truth
+    if truth is not None:
+        truth = truth[truth[:, 0] < source.first + len(snapshots)]
+    if truth is None or len(truth) == 0:
+        return result
+    runs = range(len(snapshots[0].means))
+    scores = [coverage(track_rows(snapshots, run, source.first), truth) for run in runs]
+    result["all_covered"] = _mean([s.all_covered for s in scores])
+    result["per_object"] = {
+        str(id): _mean([s.per_object[id] for s in scores]) for id in scores[0].per_object
+    }
+    result["id_swaps"] = _mean([s.id_swaps for s in scores])
+    if source.all_labelled:
+        result["on_object"] = _mean([s.on_object for s in scores])
+    return result
+
+
+def _mean(values: list[float]) -> float:
+    return float(np.mean(values))
+
+
+def _milliseconds(seconds: list[float]) -> float:
+    """The median over the frames but the first, which compiles."""
+    return 1000 * float(np.median(seconds[1:] or seconds))
+
+
+# --- pictures ---------------------------------------------------------------------------------
+
+
+def annotate(still: np.ndarray, snapshot: Snapshot, zoom: int) -> np.ndarray:
+    """A frame, enlarged, with one run's particles and mean boxes in their components' colours."""
+    canvas = still.repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
+    labels, palette = snapshot.labels[0], drawing.PALETTE
+    filled = labels >= 0
+    drawing.draw_points(
+        canvas, zoom * snapshot.points[0][filled], palette[labels[filled] % len(palette)]
+    )
+    for m in np.flatnonzero(snapshot.active[0]):
+        box = box_files.top_left(snapshot.means[0][m][None])[0]
+        drawing.draw_box(canvas, zoom * box, palette[m % len(palette)], thickness=2)
+    return np.clip(canvas, 0, 255).astype(np.uint8)
+
+
+def write_video(path: Path, source: Source, tracked: dict[str, list[Snapshot]]) -> None:
+    """The annotated frames of the filters side by side, PF to the left."""
+    frames.write_video(path, _panels(source, tracked))
+
+
+def _panels(source: Source, tracked: dict[str, list[Snapshot]]) -> Iterator[np.ndarray]:
+    for still, *snapshots in zip(source.read(), *tracked.values(), strict=False):
+        zoom = _zoom(still)
+        yield np.concatenate([annotate(still, s, zoom) for s in snapshots], axis=1)
+
+
+def write_contact_sheet(path: Path, source: Source, tracked: dict[str, list[Snapshot]]) -> None:
+    """Key frames in the manner of the paper's figure 3: a row for each filter."""
+    length = min(len(snapshots) for snapshots in tracked.values())
+    chosen = np.unique(np.linspace(0, length - 1, KEY_FRAMES).round().astype(int))
+    stills = {t: still for t, still in zip(range(length), source.read(), strict=False)
+              if t in chosen}  # fmt: skip
+    height, width, _ = stills[0].shape
+    panel = 3.2
+    figure, axes = plt.subplots(
+        len(tracked), len(chosen), squeeze=False, layout="constrained",
+        figsize=(panel * len(chosen), (panel * height / width + 0.25) * len(tracked)),
+    )  # fmt: skip
+    for row, (name, snapshots) in zip(axes, tracked.items(), strict=True):
+        for axis, t in zip(row, chosen, strict=True):
+            axis.imshow(annotate(stills[t], snapshots[t], 2 * _zoom(stills[t])))
+            axis.set(xticks=[], yticks=[])
+            axis.set_title(f"frame {source.first + t}", fontsize=11)
+        row[0].set_ylabel(NAMES[name], fontsize=12)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _zoom(still: np.ndarray) -> int:
+    return max(1, round(640 / still.shape[1]))
+
+
+# --- the command line -------------------------------------------------------------------------
+
+
+def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
+    """The arguments, each checked as far as it can be without the frames."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.visual_tracking",
+        description="Track several objects with the PF and the MPF (Vermaak et al. 2003, 5.2).",
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--sequence", type=Path, metavar="DIR", help="img/ and, if any, gt.txt")
+    where.add_argument("--video", type=Path, metavar="FILE", help="a video file")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--box", action="append", metavar="x,y,w,h", help="an object, in frame A")
+    what.add_argument("--ids", type=int, nargs="+", metavar="ID", help="objects of gt.txt")
+    parser.add_argument("--frames", metavar="A:B", help="frames A to B, counted from 1, both in")
+    parser.add_argument("--preset", choices=sorted(PRESETS), default="default")
+    parser.add_argument("--out", type=Path, default=Path("results/visual_tracking"))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", type=int, default=1, help="runs; scores are their means")
+    parser.add_argument("--gif", action="store_true", help="an animated GIF in place of an MP4")
+    return parser.parse_args(arguments)
+
+
+def open_source(options: argparse.Namespace) -> Source:
+    """The frames and the objects, or a `ValueError` that names the argument."""
+    first, last = parse_range(options.frames)
+    if options.seeds < 1:
+        raise ValueError(f"--seeds: {options.seeds} is less than 1")
+    if options.sequence is None and options.video is None:
+        return _rendered(options, first, last)
+    path = options.sequence or options.video
+    name = "--sequence" if options.sequence else "--video"
+    if options.sequence is not None and not path.is_dir():
+        raise ValueError(f"--sequence: {path} is not a folder")
+    if options.video is not None and not path.is_file():
+        raise ValueError(f"--video: {path} is not a file")
+    still = next(frames.read_frames(path, first, first), None)
+    if still is None:
+        raise ValueError(f"{name}: {path} has no frame {first}")
+    count = None
+    if options.sequence is not None:
+        count = min(last or 10**9, frames.num_images(path)) - first + 1
+    elif last is not None:
+        count = last - first + 1
+    truth_path = path / "gt.txt"
+    rows = box_files.read_tracks(truth_path) if truth_path.is_file() else None
+    read = lambda: frames.read_frames(path, first, last)  # noqa: E731
+    return _with_objects(options, str(path), read, first, last, count, rows, still)
+
+
+def _rendered(options: argparse.Namespace, first: int, last: int | None) -> Source:
+    scene = football_scene(jax.random.key(options.seed), last or max(first + 119, 120))
+    stills = scene.frames[first - 1 :]
+    if options.ids is None and options.box is None:
+        options.ids = [id for id, kit in scene.kits.items() if kit == 0]
+    return _with_objects(
+        options, "rendered scene", lambda: stills, first, last, len(stills), scene.tracks, stills[0]
+    )
+
+
+def _with_objects(options, name, read, first, last, count, rows, still) -> Source:
+    """Settle which objects are started where, and which are scored."""
+    if rows is not None:
+        rows = rows[(rows[:, 0] >= first) & (rows[:, 0] <= (last or np.inf))]
+    started = {} if rows is None else box_files.boxes_of_frame(rows, first)
+    if options.box is not None:
+        boxes = np.stack([box_files.parse_box(text, "--box") for text in options.box])
+        ids = [id for id, box in started.items() if covers(boxes, box[None]).any()]
+        argument = "--box"
+    else:
+        ids, argument = _chosen_ids(options, started, rows, first), "--ids"
+        boxes = np.stack([started[id] for id in ids])
+    if len(boxes) > MAX_COMPONENTS:
+        raise ValueError(f"{argument}: {len(boxes)} objects are more than {MAX_COMPONENTS}")
+    box_files.check_boxes(boxes, still.shape[0], still.shape[1], argument)
+    truth = rows[np.isin(rows[:, 1], ids)] if rows is not None and ids else None
+    return Source(name, read, first, count, boxes, truth, len(ids) == len(boxes))
+
+
+def _chosen_ids(options, started: dict, rows: np.ndarray | None, first: int) -> list[int]:
+    if rows is None:
+        raise ValueError("--box: without a gt.txt every object needs its box in the first frame")
+    ids = sorted(started) if options.ids is None else list(dict.fromkeys(options.ids))
+    missing = [id for id in ids if id not in started]
+    if missing or not ids:
+        raise ValueError(f"--ids: gt.txt has no box of {missing or 'any object'} in frame {first}")
+    return ids
+
+
+def parse_range(text: str | None) -> tuple[int, int | None]:
+    """A and B of "A:B"; B is None where it is left out."""
+    if text is None:
+        return 1, None
+    a, colon, b = text.partition(":")
+    try:
+        first, last = int(a), int(b) if b else None
+    except ValueError:
+        first, last = 0, None
+    if not colon or first < 1 or (last is not None and last < first):
+        raise ValueError(f"--frames: {text!r} is not A:B with 1 <= A <= B")
+    return first, last
+
+
+def run(options: argparse.Namespace) -> None:
+    """Track with both filters, writing each one's results as soon as it has finished."""
+    source = open_source(options)
+    first_frame = next(iter(source.read()))
+    filters = PRESETS[options.preset](first_frame, source.boxes)
+    keys = jax.random.split(jax.random.key(options.seed), options.seeds)
+    options.out.mkdir(parents=True, exist_ok=True)
+    tracked: dict[str, list[Snapshot]] = {}
+    results: list[dict[str, Any]] = []
+    for name, filter in filters.items():
+        tracked[name], seconds = [], []
+        try:
+            with tqdm(total=source.num_frames, desc=NAMES[name], unit="frame", disable=None) as bar:
+                for snapshot, elapsed in track(filter, keys, source.read(), bar):
+                    tracked[name].append(snapshot)
+                    seconds.append(elapsed)
+        finally:
+            # Also on the way out of an interrupted run.
+            if tracked[name]:
+                results.append(score(name, tracked[name], seconds, source))
+                _write_scores(options, source, name, tracked[name], results)
+    write_contact_sheet(options.out / "contact_sheet.png", source, tracked)
+    write_video(options.out / f"tracking.{'gif' if options.gif else 'mp4'}", source, tracked)
+    print(table(results))
+    print(f"written to {options.out}")
+
+
+def _write_scores(options, source, name, snapshots, results) -> None:
+    rows = track_rows(snapshots, 0, source.first)
+    box_files.write_tracks(options.out / f"tracks_{name}.txt", rows)
+    settings = {
+        "source": source.name,
+        "preset": options.preset,
+        "frames": [source.first, source.first + len(snapshots) - 1],
+        "boxes": source.boxes.tolist(),
+        "ids": None if source.truth is None else np.unique(source.truth[:, 1]).astype(int).tolist(),
+        "seed": options.seed,
+        "seeds": options.seeds,
+        "num_particles": NUM_PARTICLES,
+        "max_components": MAX_COMPONENTS,
+        "particles_per_component": PARTICLES_PER_COMPONENT,
+    }
+    text = json.dumps({"settings": settings, "results": results}, indent=2)
+    (options.out / "visual_tracking.json").write_text(text + "\n", encoding="utf-8")
+
+
+def table(results: list[dict[str, Any]]) -> str:
+    """The results as text."""
+    lines = [f"{'filter':8}{'all covered':>12}{'on object':>11}{'id swaps':>10}{'ms/frame':>10}"]
+    for r in results:
+        cells = [r["all_covered"], r["on_object"], r["id_swaps"], r["ms_per_frame"]]
+        texts = ["-" if cell is None else f"{cell:.3g}" for cell in cells]
+        lines.append(f"{r['filter']:8}{texts[0]:>12}{texts[1]:>11}{texts[2]:>10}{texts[3]:>10}")
+    return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the benchmark; bad input is one line on the error stream and exit status 2."""
+    # Writing a video starts an encoder, whose fork and exec JAX's threads do not touch.
+    warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
+    try:
+        run(parse_arguments(arguments))
+    except (ValueError, OSError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted; what was finished is written", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

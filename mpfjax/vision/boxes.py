@@ -1,0 +1,88 @@
+"""Boxes as users and MOTChallenge files write them: (x, y) of the top-left corner, w, h."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+_COLUMNS = range(7, 11)
+
+
+def parse_box(text: str, argument: str = "box") -> Float[np.ndarray, "4"]:
+    """Read "x,y,w,h" in pixels. Raises `ValueError` naming `argument` where it is not that."""
+    try:
+        box = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        box = np.zeros(0)
+    if box.shape != (4,) or not np.all(np.isfinite(box)):
+        raise ValueError(f"{argument}: {text!r} is not four numbers x,y,w,h")
+    return box
+
+
+def check_boxes(
+    boxes: Float[np.ndarray, "k 4"], height: int, width: int, argument: str = "boxes"
+) -> None:
+    """Raise `ValueError` for a box without area, or wholly outside a frame of this size."""
+    for x, y, w, h in np.asarray(boxes).tolist():
+        named = f"{argument}: {x:g},{y:g},{w:g},{h:g}"
+        if not (w > 0 and h > 0):
+            raise ValueError(f"{named} has no area")
+        # Less than a pixel inside may hold no pixel's centre, and so no colour to track.
+        if not (x + w >= 1 and y + h >= 1 and x <= width - 1 and y <= height - 1):
+            raise ValueError(f"{named} lies outside the first frame, {width} x {height}")
+
+
+def centred(boxes: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k 4"]:
+    """(x, y, w, h) with (x, y) moved from the top-left corner to the centre."""
+    boxes = np.asarray(boxes, float)
+    return np.concatenate([boxes[:, :2] + boxes[:, 2:] / 2, boxes[:, 2:]], axis=1)
+
+
+def top_left(boxes: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k 4"]:
+    """(x, y, w, h) with (x, y) moved from the centre to the top-left corner."""
+    boxes = np.asarray(boxes, float)
+    return np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, 2:]], axis=1)
+
+
+def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
+    """Read a MOTChallenge file into rows (frame, id, x, y, w, h), (x, y) the top-left corner.
+
+    Frames count from 1. Raises `ValueError` naming the file and the line where one does not
+    parse, and where the file holds no box at all.
+    """
+    lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
+    rows = [_parse_row(path, i, line) for i, line in enumerate(lines, 1) if line.strip()]
+    if not rows:
+        raise ValueError(f"{path}: holds no boxes")
+    return np.array(rows)
+
+
+def write_tracks(path: str | Path, rows: Float[np.ndarray, "rows 6"]) -> None:
+    """Write rows (frame, id, x, y, w, h) in MOTChallenge form, in the order of the frames."""
+    rows = np.asarray(rows, float).reshape(-1, 6)
+    ordered = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+    lines = [
+        f"{int(frame)},{int(track)},{x:.3f},{y:.3f},{w:.3f},{h:.3f},1,-1,-1,-1\n"
+        for frame, track, x, y, w, h in ordered
+    ]
+    Path(path).write_text("".join(lines), encoding="utf-8")
+
+
+def boxes_of_frame(rows: Float[np.ndarray, "rows 6"], frame: int) -> dict[int, np.ndarray]:
+    """The boxes of one frame by their id."""
+    return {int(row[1]): row[2:6] for row in rows if row[0] == frame}
+
+
+def _parse_row(path: str | Path, number: int, line: str) -> list[float]:
+    fields = line.split(",")
+    try:
+        values = [float(field) for field in fields[:6]]
+        whole = all(value == int(value) and value >= 0 for value in values[:2])
+    except (ValueError, OverflowError):
+        values, whole = [], False
+    if len(fields) not in _COLUMNS or not whole or not np.all(np.isfinite(values)):
+        raise ValueError(
+            f"{path}, line {number}: {line.strip()!r} is not frame,id,x,y,w,h and one to four"
+            " more columns"
+        )
+    return values

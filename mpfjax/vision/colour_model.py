@@ -1,0 +1,190 @@
+"""The colour tracking model of Vermaak et al. (2003), section 5.2."""
+
+from typing import Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key, UInt8
+
+from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.vision.boxes import centred, check_boxes
+from mpfjax.vision.histograms import (
+    IntegralHistogram,
+    bhattacharyya,
+    integral_histogram,
+    normalise,
+)
+
+PAPER_VARIANCES = (2.5, 1.5, 0.05, 0.05)
+_SURROUND = 2.0
+
+
+class BoxState(eqx.Module):
+    """Where a box is, how large, and which of the reference boxes it is taken for.
+
+    - `box`: (x, y, s_x, s_y), the centre in pixels and the size in units of the reference box.
+    - `reference`: r, the reference box it is compared with, in [0, number of references).
+    """
+
+    box: Float[Array, "n 4"]
+    reference: Int[Array, " n"]
+
+
+class ColourModel(AbstractStateSpaceModel):
+    """Boxes that move at random and are known by the colours that they hold.
+
+    Vermaak et al. (2003), section 5.2: (x, y, s_x, s_y) follow independent Gaussian random walks,
+    and L(y | x) ∝ exp(-Σ_c B²(h^c, h_ref^c) / 2σ²) with B the Bhattacharyya distance of the
+    normalised histograms of the colours c = R, G, B in the hypothesised and in the reference box.
+    Two extensions, both off in the paper:
+
+    - several references: r, which one a particle is taken for, is part of the state and never
+      changes, so that the recursion stays exact; x_0 is spread equally over all of them;
+    - boxes cut into bands from top to bottom, whose B² are averaged, so that a shirt is not taken
+      for trousers; and colours weighted by how much more of them a reference box holds than its
+      surround does, so that grass within a box counts for little.
+
+    An observation is an RGB frame, uint8 of shape (h, w, 3), or its `IntegralHistogram`. A box
+    outside the frame holds no colour and lies at the largest distance, B = 1. Make one with
+    `from_frame`. Use it for objects that keep their colours, among other colours.
+
+    - `reference_boxes`: (k, 4), centre and size in pixels; x_0 scatters about them.
+    - `references`, `colour_weights`: h_ref and the weights of its colours, (k, parts, 3, bins).
+    - `deviations`, `initial_deviations`: of the random walk in a frame and of x_0, (k, 4), in
+      pixels for x and y and in units of the reference box for s_x and s_y.
+    - `sigma`: σ, the width of the likelihood.
+    - `wide_counts`: count pixels in 32 bits; see `integral_histogram`.
+    """
+
+    reference_boxes: Float[Array, "k 4"]
+    references: Float[Array, "k parts 3 bins"]
+    colour_weights: Float[Array, "k parts 3 bins"]
+    deviations: Float[Array, "k 4"]
+    initial_deviations: Float[Array, "k 4"]
+    sigma: Float[Array, ""]
+    wide_counts: bool = eqx.field(static=True, default=False)
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: UInt8[np.ndarray, "h w 3"],
+        boxes: Float[np.ndarray, "k 4"],
+        *,
+        num_bins: int = 30,
+        sigma: float = 0.15,
+        deviations: Float[np.ndarray, "*k 4"] | None = None,
+        num_parts: int = 1,
+        weigh_colours: bool = False,
+        share_reference: bool = False,
+    ) -> Self:
+        """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
+
+        - `num_bins`: N_b, bins a channel.
+        - `deviations`: of the random walk, (4,) or one row a box; None takes the paper's, the
+          roots of (2.5, 1.5, 0.05, 0.05).
+        - `num_parts`: bands from top to bottom.
+        - `weigh_colours`: weigh each colour by its share in the box against that in a surround
+          of twice the width and height.
+        - `share_reference`: all particles are taken for one reference, the mean of all boxes, as
+          in the paper, which has one B_ref for all players.
+
+        Raises `ValueError` naming the argument for a box of no area or outside the frame, and for
+        a number that is not positive.
+        """
+        boxes = np.asarray(boxes, float).reshape(-1, 4)
+        if len(boxes) == 0:
+            raise ValueError("boxes: there are none")
+        check_boxes(boxes, *frame.shape[:2])
+        deviations = np.sqrt(PAPER_VARIANCES) if deviations is None else np.asarray(deviations)
+        if not sigma > 0:
+            raise ValueError(f"sigma: {sigma} is not positive")
+        if num_parts < 1:
+            raise ValueError(f"num_parts: {num_parts} is less than 1")
+        if deviations.shape not in ((4,), (len(boxes), 4)) or not np.all(deviations > 0):
+            raise ValueError(f"deviations: {deviations} are not four positive numbers a box")
+        # Room for boxes to grow to twice the area of the largest reference.
+        wide_counts = bool(2 * np.prod(boxes[:, 2:], axis=1).max() >= 2**16)
+        table = integral_histogram(jnp.asarray(frame), num_bins, wide_counts)
+        places = jnp.asarray(centred(boxes), float)
+        references, weights = _references(table, places, num_parts, weigh_colours)
+        if share_reference:
+            references = jnp.broadcast_to(references.mean(0, keepdims=True), references.shape)
+            size = places[:, 2:].mean(0, keepdims=True)
+            places = places.at[:, 2:].set(jnp.broadcast_to(size, (len(boxes), 2)))
+        steps = jnp.broadcast_to(jnp.asarray(deviations, float), (len(boxes), 4))
+        return cls(
+            reference_boxes=places,
+            references=references,
+            colour_weights=weights,
+            deviations=steps,
+            initial_deviations=steps,
+            sigma=jnp.asarray(sigma, float),
+            wide_counts=wide_counts,
+        )
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> BoxState:
+        """x_0 about the reference boxes, equally many for each, at scale one."""
+        k = self.reference_boxes.shape[0]
+        key_offset, key_noise = jax.random.split(key)
+        offset = jax.random.randint(key_offset, (), 0, num_particles)
+        reference = (jnp.arange(num_particles) * k + offset) // num_particles % k
+        centre = jnp.concatenate(
+            [self.reference_boxes[:, :2], jnp.ones_like(self.reference_boxes[:, :2])], axis=1
+        )
+        noise = jax.random.normal(key_noise, (num_particles, 4), centre.dtype)
+        return BoxState(centre[reference] + self.initial_deviations[reference] * noise, reference)
+
+    def sample_transition(self, key: Key[Array, ""], states: BoxState) -> BoxState:
+        """x_t ~ N(x_{t-1}, diag σ²); the reference stays."""
+        noise = jax.random.normal(key, states.box.shape, states.box.dtype)
+        return BoxState(states.box + self.deviations[states.reference] * noise, states.reference)
+
+    def log_transition(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
+        """log N(x_t; x_{t-1}, diag σ²), -inf where the reference has changed."""
+        deviations = self.deviations[previous_states.reference]
+        residuals = (states.box - previous_states.box) / deviations
+        log_density = jnp.sum(
+            -0.5 * residuals**2 - jnp.log(deviations) - 0.5 * jnp.log(2 * jnp.pi), axis=1
+        )
+        return jnp.where(states.reference == previous_states.reference, log_density, -jnp.inf)
+
+    def log_likelihood(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
+    ) -> Float[Array, " n"]:
+        """-Σ_c B²(h^c, h_ref^c) / 2σ², B² averaged over the bands."""
+        return -0.5 * self.squared_distances(observation, states) / self.sigma**2
+
+    def squared_distances(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
+    ) -> Float[Array, " n"]:
+        """Σ_c B² of each box from its reference, averaged over the bands: between 0 and 3."""
+        num_parts, num_bins = self.references.shape[1], self.references.shape[3]
+        if not isinstance(observation, IntegralHistogram):
+            observation = integral_histogram(observation, num_bins, self.wide_counts)
+        counts = observation.counts(self.boxes(states), num_parts)
+        histograms = normalise(counts, self.colour_weights[states.reference])
+        distances = bhattacharyya(histograms, self.references[states.reference])
+        return jnp.mean(jnp.sum(distances, axis=2), axis=1)
+
+    def boxes(self, states: BoxState) -> Float[Array, "n 4"]:
+        """(x, y, s_x l_x, s_y l_y): the hypothesised boxes, centre and size in pixels."""
+        size = self.reference_boxes[states.reference, 2:]
+        return jnp.concatenate([states.box[:, :2], states.box[:, 2:] * size], axis=1)
+
+
+def _references(
+    table: IntegralHistogram, places: Float[Array, "k 4"], num_parts: int, weigh_colours: bool
+) -> tuple[Float[Array, "k parts 3 bins"], Float[Array, "k parts 3 bins"]]:
+    """The normalised histograms of the reference boxes, and the weights of their colours."""
+    counts = table.counts(places, num_parts)
+    if not weigh_colours:
+        return normalise(counts), jnp.ones_like(counts)
+    around = places * jnp.array([[1.0, 1.0, _SURROUND, _SURROUND]], places.dtype)
+    ring = table.counts(around)[:, 0, None] - jnp.sum(counts, axis=1, keepdims=True)
+    inside, outside = normalise(counts), normalise(ring)
+    share = inside + outside
+    # A colour that neither holds tells nothing of the box, and nothing against it either.
+    weights = jnp.where(share > 0, inside / jnp.where(share > 0, share, 1.0), 0.5)
+    return normalise(counts, weights), weights

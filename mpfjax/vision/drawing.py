@@ -1,0 +1,126 @@
+"""Drawing on RGB frames: strokes, boxes, points and numbers, with smooth edges.
+
+Every function draws in place on a float frame with values in [0, 255], and clips what it draws at
+the frame's border. Coordinates are in pixels, the centre of the first pixel at (0.5, 0.5).
+"""
+
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+
+# Okabe and Ito's palette, told apart by people of any colour vision, in the order of use.
+PALETTE = np.array(
+    [
+        [230, 159, 0], [86, 180, 233], [240, 228, 66], [204, 121, 167], [0, 114, 178],
+        [213, 94, 0], [0, 158, 115], [255, 255, 255], [153, 153, 153], [20, 20, 20],
+    ],
+    dtype=float,
+)  # fmt: skip
+
+# Five rows of three bits for each digit, a row in an octal figure.
+_DIGITS = ("75557", "26227", "71747", "71717", "55711", "74717", "74757", "71122", "75757", "75717")
+
+
+def draw_stroke(
+    frame: Float[np.ndarray, "h w 3"],
+    start: tuple[float, float],
+    end: tuple[float, float],
+    radius: float,
+    colour: Float[np.ndarray, "3"],
+    opacity: float = 1.0,
+) -> None:
+    """Draw a line with round ends, `radius` half its width; a dot where the ends coincide."""
+    (x0, y0), (x1, y1) = start, end
+    reach = radius + 1
+    window = _window(frame, min(x0, x1) - reach, min(y0, y1) - reach,
+                     max(x0, x1) + reach, max(y0, y1) + reach)  # fmt: skip
+    if window is None:
+        return
+    part, x, y = window
+    dx, dy = x1 - x0, y1 - y0
+    along = ((x - x0) * dx + (y - y0) * dy) / max(dx * dx + dy * dy, 1e-9)
+    along = np.clip(along, 0, 1)
+    distance = np.hypot(x - x0 - along * dx, y - y0 - along * dy)
+    _blend(part, np.clip(radius + 0.5 - distance, 0, 1) * opacity, colour)
+
+
+def draw_ellipse(
+    frame: Float[np.ndarray, "h w 3"],
+    centre: tuple[float, float],
+    radii: tuple[float, float],
+    colour: Float[np.ndarray, "3"],
+    opacity: float = 1.0,
+) -> None:
+    """Draw a filled ellipse along the axes."""
+    (cx, cy), (rx, ry) = centre, radii
+    window = _window(frame, cx - rx - 1, cy - ry - 1, cx + rx + 1, cy + ry + 1)
+    if window is None:
+        return
+    part, x, y = window
+    inside = (1 - np.hypot((x - cx) / rx, (y - cy) / ry)) * min(rx, ry)
+    _blend(part, np.clip(inside + 0.5, 0, 1) * opacity, colour)
+
+
+def draw_box(
+    frame: Float[np.ndarray, "h w 3"],
+    box: Float[np.ndarray, "4"],
+    colour: Float[np.ndarray, "3"],
+    thickness: float = 1.5,
+) -> None:
+    """Outline a box (x, y, w, h), (x, y) its top-left corner."""
+    x, y, w, h = (float(value) for value in box)
+    corners = [(x, y), (x + w, y), (x + w, y + h), (x, y + h), (x, y)]
+    for start, end in pairwise(corners):
+        draw_stroke(frame, start, end, thickness / 2, colour)
+
+
+def draw_points(
+    frame: Float[np.ndarray, "h w 3"],
+    points: Float[np.ndarray, "n 2"],
+    colours: Float[np.ndarray, "n 3"],
+    radius: float = 1.5,
+) -> None:
+    """Draw a dot with a dark rim at each (x, y), so that it shows on any ground."""
+    for (x, y), colour in zip(points.tolist(), colours, strict=True):
+        draw_stroke(frame, (x, y), (x, y), radius + 0.7, np.zeros(3), opacity=0.5)
+        draw_stroke(frame, (x, y), (x, y), radius, colour)
+
+
+def draw_number(
+    frame: Float[np.ndarray, "h w 3"],
+    number: int,
+    corner: tuple[float, float],
+    colour: Float[np.ndarray, "3"],
+    size: int = 2,
+) -> None:
+    """Write a number with its top-left corner at (x, y), `size` pixels a dot, on a dark plate."""
+    rows = [" ".join(f"{int(_DIGITS[int(d)][i]):03b}" for d in str(number)) for i in range(5)]
+    dots = np.array([[character == "1" for character in row] for row in rows])
+    plate = np.pad(np.kron(dots, np.ones((size, size), bool)), 2)
+    x, y = round(corner[0]), round(corner[1])
+    window = _window(frame, x, y, x + plate.shape[1], y + plate.shape[0])
+    if window is None:
+        return
+    part, columns, lines = window
+    plate = plate[lines[:, 0].astype(int) - y][:, columns[0].astype(int) - x]
+    _blend(part, np.full(plate.shape, 0.6), np.zeros(3))
+    _blend(part, plate.astype(float), colour)
+
+
+def _window(
+    frame: np.ndarray, left: float, top: float, right: float, bottom: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """The part of the frame between these edges, and the centres of its pixels."""
+    height, width, _ = frame.shape
+    if not np.all(np.isfinite([left, top, right, bottom])):
+        return None
+    x0, x1 = int(max(np.floor(left), 0)), int(min(np.ceil(right), width))
+    y0, y1 = int(max(np.floor(top), 0)), int(min(np.ceil(bottom), height))
+    if x0 >= x1 or y0 >= y1:
+        return None
+    return frame[y0:y1, x0:x1], np.arange(x0, x1)[None] + 0.5, np.arange(y0, y1)[:, None] + 0.5
+
+
+def _blend(part: np.ndarray, opacity: np.ndarray, colour: np.ndarray) -> None:
+    part += opacity[:, :, None] * (np.asarray(colour, float) - part)

@@ -1,0 +1,131 @@
+"""Frames in and out: folders of images, video files, animated GIFs, all through imageio."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from jaxtyping import UInt8
+
+_IMAGES = (".jpg", ".jpeg", ".png", ".bmp")
+
+
+def read_frames(
+    path: str | Path, first: int = 1, last: int | None = None
+) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """Read frames `first` to `last` in RGB, counted from 1 and both ends in, one at a time.
+
+    `path` is a video file, a folder of images in the order of their names, or a folder with
+    such a folder `img`. Raises `ImportError` where imageio is missing, `FileNotFoundError` where
+    `path` is, and `ValueError` naming `path` where it cannot be read, holds no frames, or its
+    frames differ in size.
+    """
+    if first < 1 or (last is not None and last < first):
+        raise ValueError(f"first, last: {first}, {last} is not a range of frames from 1 on")
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such video or folder of images")
+    frames = _read_images(path, first, last) if path.is_dir() else _read_video(path, first, last)
+    return _of_one_size(path, frames)
+
+
+def num_images(path: str | Path) -> int:
+    """How many frames a folder of images holds."""
+    return len(_image_paths(Path(path)))
+
+
+def write_video(
+    path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], frames_per_second: float = 10.0
+) -> None:
+    """Write RGB frames to an MP4 or, by the ending of `path`, a GIF that loops.
+
+    Raises `ValueError` for another ending, `ImportError` where imageio is missing.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".gif", ".mp4"):
+        raise ValueError(f"path: {path} ends in neither .mp4 nor .gif")
+    _imageio()
+    # The older interface is the one that takes frames as they come, without holding them all.
+    from imageio.v2 import get_writer
+
+    if suffix == ".gif":
+        writer = get_writer(path, mode="I", duration=1000 / frames_per_second, loop=0)
+    else:
+        writer = get_writer(path, fps=frames_per_second, quality=6, macro_block_size=1)
+    with writer:
+        for frame in frames:
+            writer.append_data(_even(frame) if suffix == ".mp4" else frame)
+
+
+def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Write one RGB image, its format chosen by the ending of `path`."""
+    _imageio().imwrite(path, image)
+
+
+def _even(frame: np.ndarray) -> np.ndarray:
+    """Pad to an even height and width, which the pixel format of an MP4 needs."""
+    height, width, _ = frame.shape
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+def _image_paths(folder: Path) -> list[Path]:
+    inner = folder / "img"
+    folder = inner if inner.is_dir() else folder
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in _IMAGES)
+
+
+def _read_images(folder: Path, first: int, last: int | None) -> Iterator[np.ndarray]:
+    imageio, paths = _imageio(), _image_paths(folder)
+    if first > len(paths):
+        raise ValueError(f"{folder}: holds {len(paths)} images, frame {first} is not among them")
+    for path in paths[first - 1 : last]:
+        try:
+            yield _rgb(imageio.imread(path))
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{path}: cannot be read as an image ({error})") from error
+
+
+def _read_video(path: Path, first: int, last: int | None) -> Iterator[np.ndarray]:
+    imageio, number = _imageio(), 0
+    plugin = "pillow" if path.suffix.lower() == ".gif" else "FFMPEG"
+    try:
+        for number, frame in enumerate(imageio.imiter(path, plugin=plugin), 1):
+            if last is not None and number > last:
+                return
+            if number >= first:
+                yield _rgb(frame)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{path}: cannot be read as a video ({error})") from error
+    if number < first:
+        raise ValueError(f"{path}: holds {number} frames, frame {first} is not among them")
+
+
+def _of_one_size(path: Path, frames: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+    shape = None
+    for frame in frames:
+        shape = shape or frame.shape
+        if frame.shape != shape:
+            raise ValueError(
+                f"{path}: frames of different sizes, {shape[:2]} and {frame.shape[:2]}"
+            )
+        yield frame
+
+
+def _rgb(image: np.ndarray) -> np.ndarray:
+    """Three channels of eight bits, whatever the file had: grey, a palette, transparency."""
+    image = np.asarray(image)
+    if image.ndim == 2:
+        image = np.repeat(image[:, :, None], 3, axis=2)
+    if image.dtype == np.uint16:
+        image = image // 257
+    return np.ascontiguousarray(image[:, :, :3]).astype(np.uint8)
+
+
+def _imageio() -> ModuleType:
+    try:
+        import imageio.v3 as imageio
+    except ImportError as error:
+        raise ImportError(
+            'imageio is needed to read and write video: pip install "mpfjax[video]"'
+        ) from error
+    return imageio

@@ -1,0 +1,134 @@
+"""Colour histograms of many boxes at once, from one integral histogram a frame."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Shaped, UInt8
+
+_BLOCK = 32
+_CHANNELS = 3
+
+
+class IntegralHistogram(eqx.Module):
+    """How many pixels of each colour lie above and to the left of every corner of a frame.
+
+    Entry (r, c, k) counts the pixels in rows < r and columns < c whose channel k // num_bins falls
+    into bin k % num_bins, so that any box is counted exactly from its corners, at a cost that does
+    not depend on its size (Porikli 2005). Build it once a frame, for all particles and all runs.
+
+    - `table`: shape (h + 1, at least w + 1, 3 num_bins). Counts wrap around in 16 bits, which
+      cancels in the difference of corners as long as a box holds fewer than 65 536 pixels.
+    - `num_bins`: N_b, bins a channel; static.
+    - `height`, `width`: of the frame in pixels; static.
+    """
+
+    table: Shaped[Array, "rows columns k"]
+    num_bins: int = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+    width: int = eqx.field(static=True)
+
+    @property
+    def largest_box(self) -> int:
+        """The most pixels a box may hold and still be counted exactly."""
+        return int(np.iinfo(self.table.dtype).max)
+
+    def counts(
+        self, boxes: Float[Array, "n 4"], num_parts: int = 1
+    ) -> Float[Array, "n parts 3 bins"]:
+        """Pixels of each colour in each box, cut into `num_parts` bands from top to bottom.
+
+        Boxes are (x, y, w, h) about their centre, in pixels, the frame spanning [0, width] x
+        [0, height]; a pixel belongs to a box that covers its centre. Boxes that leave the frame
+        are clipped to it, and one that lies wholly outside, has no area, is not finite or holds
+        more than `largest_box` pixels counts nothing.
+        """
+        rows, columns = self._edges(boxes, num_parts)
+        corners = self.table.at[rows[:, :, None], columns[:, None, :]].get(mode="clip")
+        bands = jnp.diff(corners[:, :, 1] - corners[:, :, 0], axis=1)
+        pixels = (rows[:, -1] - rows[:, 0]) * (columns[:, 1] - columns[:, 0])
+        # An unsigned count is never negative, so an inverted box must be silenced by its edges.
+        valid = (columns[:, 1] > columns[:, 0]) & (rows[:, -1] > rows[:, 0])
+        valid &= pixels <= self.largest_box
+        counts = jnp.where(valid[:, None, None], bands, jnp.zeros((), bands.dtype))
+        shape = (boxes.shape[0], num_parts, _CHANNELS, self.num_bins)
+        return counts.reshape(shape).astype(boxes.dtype)
+
+    def _edges(
+        self, boxes: Float[Array, "n 4"], num_parts: int
+    ) -> tuple[Int[Array, "n rows"], Int[Array, "n 2"]]:
+        x, y, w, h = (boxes[:, i, None] for i in range(4))
+        across = jnp.array([[-0.5, 0.5]], boxes.dtype)
+        down = jnp.linspace(-0.5, 0.5, num_parts + 1, dtype=boxes.dtype)[None]
+        return _pixel(y + h * down, self.height), _pixel(x + w * across, self.width)
+
+
+def integral_histogram(
+    frame: UInt8[Array, "h w 3"], num_bins: int, wide_counts: bool = False
+) -> IntegralHistogram:
+    """Build the integral histogram of an RGB frame, `num_bins` equal bins a channel.
+
+    `wide_counts` counts in 32 bits, two to four times slower, for boxes of 65 536 pixels or more.
+    Raises `ValueError` for a number of bins outside 1 to 256.
+    """
+    if not 1 <= num_bins <= 256:
+        raise ValueError(f"num_bins: {num_bins} is not between 1 and 256")
+    height, width, _ = frame.shape
+    dtype = jnp.dtype(jnp.uint32 if wide_counts else jnp.uint16)
+    bins = frame.astype(jnp.int32) * num_bins // 256
+    columns = -(-(width + 1) // _BLOCK) * _BLOCK
+    # Pixels of no colour fill the row above, the column to the left and the last block.
+    bins = jnp.pad(bins, ((1, 0), (1, columns - width - 1), (0, 0)), constant_values=-1)
+    above = jnp.zeros((columns, _CHANNELS * num_bins), dtype)
+
+    def add_row(above: Array, row: Array) -> tuple[Array, Array]:
+        below = above + _row_counts(row, num_bins, dtype)
+        return below, below
+
+    table = jax.lax.scan(add_row, above, bins)[1]
+    return IntegralHistogram(table, num_bins, height, width)
+
+
+def normalise(
+    counts: Float[Array, "... bins"], bin_weights: Float[Array, "... bins"] | None = None
+) -> Float[Array, "... bins"]:
+    """Counts as shares that sum to one over the bins; all zero where nothing was counted."""
+    if bin_weights is not None:
+        counts = counts * jnp.broadcast_to(bin_weights, counts.shape)
+    total = jnp.sum(counts, axis=-1, keepdims=True)
+    return jnp.where(total > 0, counts / jnp.where(total > 0, total, 1.0), 0.0)
+
+
+def bhattacharyya(
+    histograms: Float[Array, "*batch bins"], references: Float[Array, "*batch bins"]
+) -> Float[Array, "*batch"]:
+    """B² = 1 - Σ_b sqrt(h_b r_b), the squared Bhattacharyya distance of normalised histograms.
+
+    Vermaak et al. (2003), section 5.2. Between 0, for equal histograms, and 1, for histograms
+    that share no colour; an empty histogram shares none. The square is what the likelihood needs.
+    """
+    return jnp.clip(1 - jnp.sum(jnp.sqrt(histograms * references), axis=-1), 0.0, 1.0)
+
+
+def _row_counts(row: Int[Array, "w 3"], num_bins: int, dtype: jnp.dtype) -> Array:
+    """Prefix sums along one row. Blocks unrolled in full: XLA's cumsum takes five times longer."""
+    width = row.shape[0]
+    one_hot = (row[:, :, None] == jnp.arange(num_bins)[None, None]).astype(dtype)
+    blocks = one_hot.reshape(width // _BLOCK, _BLOCK, _CHANNELS * num_bins)
+    within = _running_sums([blocks[:, i] for i in range(_BLOCK)])
+    before = _running_sums([jnp.zeros_like(within[-1][0]), *within[-1][:-1]])
+    sums = jnp.stack(within, axis=1) + jnp.stack(before)[:, None]
+    return sums.reshape(width, _CHANNELS * num_bins)
+
+
+def _running_sums(terms: list[Array]) -> list[Array]:
+    sums = terms[:1]
+    for term in terms[1:]:
+        sums.append(sums[-1] + term)
+    return sums
+
+
+def _pixel(edges: Float[Array, "n e"], size: int) -> Int[Array, "n e"]:
+    """The first pixel whose centre lies at or past each edge, within [0, size]."""
+    inside = jnp.clip(jnp.nan_to_num(edges, nan=0.0), -1.0, size + 1.0)
+    return jnp.clip(jnp.ceil(inside - 0.5).astype(jnp.int32), 0, size)
