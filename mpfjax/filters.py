@@ -249,6 +249,7 @@ def particle_filter(
     proposal: AbstractProposal | None = None,
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
+    sort_by: Callable[[PyTree], Array] | None = None,
 ) -> Filter:
     """The standard particle filter: resample, propagate.
 
@@ -257,7 +258,7 @@ def particle_filter(
     """
     return Filter(
         model,
-        moves=[Resample(scheme, ess_threshold), Propagate(model, proposal)],
+        moves=[Resample(scheme, ess_threshold, sort_by=sort_by), Propagate(model, proposal)],
         num_particles=num_particles,
     )
 
@@ -271,6 +272,7 @@ def mixture_particle_filter(
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
     particles_per_component: int | None = None,
+    sort_by: Callable[[PyTree], Array] | None = None,
     merge: Merge | None = None,
     split: Split | None = None,
     kmeans: KMeans | None = None,
@@ -291,7 +293,7 @@ def mixture_particle_filter(
     return Filter(
         model,
         moves=[
-            Resample(scheme, ess_threshold, particles_per_component),
+            Resample(scheme, ess_threshold, particles_per_component, sort_by),
             Propagate(model, proposal),
             Merge() if merge is None else merge,
             Split() if split is None else split,
