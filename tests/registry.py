@@ -70,13 +70,13 @@ def _mpf(**options) -> Callable[..., Filter]:
     )
 
 
-def _guided(noise: str) -> Callable[..., Filter]:
-    return lambda model: _mpf(proposal=GaussNewtonProposal(model, noise=noise))(model)
-
-
-def _chain(*before, then=()) -> Callable[..., Filter]:
+def _chain(*before, then=(), proposal=lambda model: None) -> Callable[..., Filter]:
     return lambda model: Filter(
-        model, [*before, Propagate(model), *then], NUM_PARTICLES, NUM_COMPONENTS
+        model,
+        [*before, Propagate(model, proposal(model)), *then],
+        NUM_PARTICLES,
+        NUM_COMPONENTS,
+        initial_moves=[KMeans(3, reseed=True)],
     )
 
 
@@ -90,9 +90,13 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "mpf": _mpf(),
     "mpf adaptive": _mpf(ess_threshold=0.5),
     "mpf fixed number": _mpf(particles_per_component=12),
-    "guided mpf": _guided("independent"),
-    "guided mpf, stratified noise": _guided("stratified"),
-    "patient mpf": _mpf(merge=Merge(2.0, 1.0, patience=2)),
+    "guided mpf": lambda model: _mpf(proposal=GaussNewtonProposal(model))(model),
+    "guided, stratified noise": _chain(
+        Resample(),
+        proposal=lambda model: GaussNewtonProposal(model, noise="stratified"),
+        then=[KMeans(2)],
+    ),
+    "patient merge": _chain(Resample(), then=[Merge(2.0, 1.0, patience=2)]),
     "kmeans only": _chain(Resample(), then=[KMeans()]),
     "random labels, multinomial": _chain(Resample("multinomial"), then=[RandomLabels()]),
     "random labels, residual": _chain(RandomLabels(), Resample("residual")),

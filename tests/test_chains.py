@@ -148,7 +148,7 @@ class TestOnline:
     def test_a_step_of_zero_likelihood_is_flagged_and_the_filter_goes_on(self, chain):
         filter = chain_filter(chain, "quadratic")
         mixture = started(filter)
-        blinded, info = filter.step(jax.random.key(6), mixture, jnp.array(BLINDED))
+        blinded, info = filter.step(jax.random.key(6), mixture, observed(BLINDED))
         assert float(info.log_likelihood_increment) == -np.inf
         assert bool(info.degenerate)
         np.testing.assert_allclose(float(blinded.mixture_weights.sum()), 1.0, rtol=1e-5)
@@ -169,13 +169,13 @@ class TestOnline:
     def test_a_nan_observation_is_an_error(self, chain):
         filter = chain_filter(chain, "quadratic")
         with pytest.raises(RuntimeError, match="observation"):
-            filter.step(jax.random.key(6), started(filter), jnp.array(jnp.nan))
+            filter.step(jax.random.key(6), started(filter), observed(jnp.nan))
 
     def test_a_nan_or_infinite_density_is_an_error(self, chain):
         filter = chain_filter(chain, "quadratic")
         for observation in (BROKEN, EXPLODING):
             with pytest.raises(RuntimeError, match="model: a density was NaN or infinite"):
-                filter.step(jax.random.key(6), started(filter), jnp.array(observation))
+                filter.step(jax.random.key(6), started(filter), observed(observation))
 
     def test_nothing_compiles_again_as_components_come_and_go(self, chain):
         filter = chain_filter(chain, "quadratic")
@@ -183,7 +183,7 @@ class TestOnline:
         filter.step(jax.random.key(6), mixture, OBSERVATIONS[0])
         traced = len(TRACES)
         for t, observation in enumerate((2.0, 1.0, 0.0, 0.0, 0.0, 3.0, BLINDED, 1.0)):
-            mixture, _ = filter.step(jax.random.key(t), mixture, jnp.array(observation))
+            mixture, _ = filter.step(jax.random.key(t), mixture, observed(observation))
         assert len(TRACES) == traced
 
     def test_another_filter_of_the_same_shape_compiles_nothing(self, chain):
@@ -194,6 +194,11 @@ class TestOnline:
         other = CHAINS[chain](TrickyQuadraticModel(0.4, 0.2, -2.0, 2.0))
         other.step(jax.random.key(6), mixture, OBSERVATIONS[1])
         assert len(TRACES) == traced
+
+
+def observed(value):
+    """A strongly typed observation: a weakly typed one would be another program to JAX."""
+    return jnp.asarray(value, jnp.float32)
 
 
 def started(filter):
