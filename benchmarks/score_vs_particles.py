@@ -4,6 +4,8 @@ particles. Run with `python -m benchmarks.score_vs_particles`; `--help` lists th
 
 import argparse
 import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +51,8 @@ def main(arguments: list[str] | None = None) -> int:
     typical: dict[str, plotting.Trace] = {}
     cells = [(name, n) for n in options.particles for name in options.filters]
     try:
-        for name, num_particles in tqdm(cells, disable=not sys.stderr.isatty(), unit="cell"):
-            runs = run_cell(name, num_particles, model, truth, observations, options)
+        finished = run_cells(cells, model, truth, observations, options)
+        for (name, num_particles), runs in zip(cells, finished, strict=True):
             results.append(summarise(name, num_particles, runs, exact_mass))
             write_json(out / "score_vs_particles.json", {"settings": settings, "results": results})
             if num_particles == typical_size(options.particles):
@@ -134,6 +136,25 @@ def collect(mixture: mpfjax.ParticleMixture) -> dict[str, Array]:
         "components": jnp.sum(mixture.active.astype(jnp.int32)),
         "mass_above": mass_above(mixture, 0.0),
     }
+
+
+def run_cells(
+    cells: list[tuple[str, int]],
+    model: mpfjax.QuadraticModel,
+    truth: Float[Array, " t"],
+    observations: Float[Array, " t"],
+    options: argparse.Namespace,
+) -> Iterator[dict[str, np.ndarray]]:
+    """The runs of every cell in turn, one cell compiling while the one before it runs."""
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        futures = [
+            pool.submit(run_cell, name, n, model, truth, observations, options) for name, n in cells
+        ]
+        try:
+            for future in tqdm(futures, disable=not sys.stderr.isatty(), unit="cell"):
+                yield future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def run_cell(

@@ -383,8 +383,10 @@ def _own_ancestors(mixture: ParticleMixture) -> ParticleMixture:
 
 
 def _split(key: Key[Array, ""], num: int) -> list[Key[Array, ""]]:
-    """Keys that do not depend on how many are asked for, so that a longer chain draws alike."""
-    return [jax.random.fold_in(key, i) for i in range(num)]
+    """One key for each move; the first ones are the same whatever their number, so that a longer
+    chain draws alike.
+    """
+    return list(jax.random.split(key, num))
 
 
 def _tie(moves: tuple[Any, ...], model: Any) -> tuple[Any, ...]:

@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 _FEW_SEGMENTS = 4
 _BLOCK = 32
+_EXACT_IN_FLOAT32 = 2**24
 
 
 def prefix_sum(values: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -42,9 +43,15 @@ def count_starts(starts: Int[Array, " n"], num_slots: int) -> Int[Array, " num_s
     offspring start where the next one does and are passed over. Starts at or past `num_slots`
     are dropped; a slot before the first start gets -1.
     """
-    ones = jnp.ones(starts.shape, default_float())
-    at_start = jnp.zeros(num_slots, default_float()).at[starts].add(ones, mode="drop")
-    return prefix_sum(at_start).astype(jnp.int32) - 1
+    at_start = jnp.zeros(num_slots, jnp.int32).at[starts].add(1, mode="drop")
+    return count(at_start) - 1
+
+
+def count(values: Int[Array, " n"]) -> Int[Array, " n"]:
+    """The inclusive prefix sum of small whole numbers, exact."""
+    if values.shape[0] >= _EXACT_IN_FLOAT32:
+        return jnp.cumsum(values)
+    return prefix_sum(values.astype(jnp.float32)).astype(jnp.int32)
 
 
 def segment_sum(
@@ -95,17 +102,39 @@ def segment_log_sum_exp(
     return jnp.where(empty, -jnp.inf, jnp.log(jnp.where(empty, 1.0, total)) + shift)
 
 
+def segment_argmax(
+    values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Int[Array, " num_segments"]:
+    """The index of the largest value in each segment, some index where it is empty."""
+    n = values.shape[0]
+    if num_segments <= _FEW_SEGMENTS:
+        low = jnp.array(-jnp.inf, values.dtype)
+        rows = [jnp.argmax(jnp.where(segments == m, values, low)) for m in range(num_segments)]
+        return jnp.stack(rows).astype(jnp.int32)
+    is_largest = values >= take(segment_max(values, segments, num_segments), segments)
+    index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
+    return jnp.clip(jax.ops.segment_min(index, segments, num_segments), 0, n - 1)
+
+
 def order_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " n"]:
     """The indices that make segments contiguous and ascending, original order kept within each.
 
-    Label and index are packed into one integer where they fit, since sorting one array is several
-    times faster than sorting pairs.
+    A label equal to `num_segments` comes last. Few segments are counted, one prefix sum each; for
+    more, label and index are packed into one integer where they fit, since sorting one array is
+    several times faster than sorting pairs.
     """
     n = segments.shape[0]
+    index = jnp.arange(n, dtype=jnp.int32)
+    if num_segments <= _FEW_SEGMENTS:
+        place, filled = jnp.zeros(n, jnp.int32), jnp.zeros((), jnp.int32)
+        for m in range(num_segments + 1):
+            upto = filled + count((segments == m).astype(jnp.int32))
+            place = jnp.where(segments == m, upto - 1, place)
+            filled = upto[-1]
+        return jnp.zeros(n, jnp.int32).at[place].set(index, unique_indices=True)
     if (num_segments + 1) * n >= 2**31:
         return jnp.argsort(segments, stable=True).astype(jnp.int32)
-    packed = segments.astype(jnp.int32) * n + jnp.arange(n, dtype=jnp.int32)
-    return jax.lax.sort(packed) % n
+    return jax.lax.sort(segments.astype(jnp.int32) * n + index) % n
 
 
 def take(values: Array, indices: Int[Array, " n"]) -> Array:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.features import Features, Scale, separation, summarise
-from mpfjax.operations import segment_counts, segment_sum, take
+from mpfjax.operations import segment_argmax, segment_counts, segment_sum, take
 
 
 class KMeans(AbstractRegrouping):
@@ -73,7 +73,7 @@ class Merge(AbstractRegrouping):
     when both hold:
 
     - their means are less than `max_deviations` pooled standard deviations apart, along the line
-      that joins them (Ashman's D; at 1 two equal Gaussians share 62% of their mass, at 2 still 32%);
+      that joins them (Ashman's D; at 1 two equal Gaussians share 62% of their mass, at 2 32%);
     - their means are less than `max_distance` apart, in units of `scale`.
 
     None leaves out a condition. `patience` is for how many steps in a row (frames) they must
@@ -283,13 +283,15 @@ def free_labels(
     wanted: Bool[Array, " m"], priority: Float[Array, " m"], active: Bool[Array, " m"]
 ) -> Int[Array, " m"]:
     """A free label for each component that wants one, by priority; its own where none is left."""
-    m = active.shape[0]
-    own = jnp.arange(m, dtype=jnp.int32)
-    by_priority = jnp.argsort(jnp.where(wanted, -priority, jnp.inf))
-    free = jnp.argsort(active, stable=True).astype(jnp.int32)
-    rank = jnp.zeros(m, jnp.int32).at[by_priority].set(own)
-    granted = wanted & (rank < m - jnp.sum(active.astype(jnp.int32)))
-    return jnp.where(granted, take(free, rank), own)
+    own = jnp.arange(active.shape[0], dtype=jnp.int32)
+    earlier = own[:, None] < own[None]
+    ties = (priority[:, None] == priority[None]) & earlier
+    goes_first = wanted[:, None] & ((priority[:, None] > priority[None]) | ties)
+    rank = jnp.sum(goes_first.astype(jnp.int32), axis=0)
+    free_rank = jnp.cumsum((~active).astype(jnp.int32)) - 1
+    matches = ~active[None] & (rank[:, None] == free_rank[None])
+    granted = wanted & jnp.any(matches, axis=1)
+    return jnp.where(granted, jnp.argmax(matches, axis=1).astype(jnp.int32), own)
 
 
 def _centroids(
@@ -317,15 +319,10 @@ def _farthest_members(
     features: Float[Array, "n k"], points: Float[Array, "m k"], mixture: ParticleMixture
 ) -> Float[Array, "m k"]:
     """In each component, the particle farthest from the component's point."""
-    parent, m, n = mixture.component_indicators, mixture.num_components, mixture.num_particles
+    parent = mixture.component_indicators
     distance = jnp.sum((features - take(points, parent)) ** 2, axis=1)
     distance = jnp.where(mixture.occupied, distance, -1.0)
-    largest = jax.ops.segment_max(distance, parent, m)
-    is_largest = distance >= take(largest, parent)
-    index = jax.ops.segment_min(
-        jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1), parent, m
-    )
-    return take(features, jnp.clip(index, 0, n - 1))
+    return take(features, segment_argmax(distance, parent, mixture.num_components))
 
 
 def _require_positive(**thresholds: float | None) -> None:

@@ -94,8 +94,8 @@ class Resample(AbstractRejuvenation):
                 counts > 0, jnp.minimum(self.particles_per_component, num_particles), 0
             )
         kept = jnp.where(due, 0, counts)
-        pool = num_particles - jnp.sum(kept)
-        sharers = jnp.maximum(jnp.sum(due.astype(jnp.int32)), 1)
+        pool = num_particles - jnp.sum(kept, dtype=jnp.int32)
+        sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
         rank = jnp.cumsum(due.astype(jnp.int32)) - 1
         share = pool // sharers + (rank < pool % sharers).astype(jnp.int32)
         return jnp.where(due, share, kept)
@@ -161,7 +161,7 @@ def _slots(targets: Int[Array, " m"], num_particles: int) -> _Slots:
         components=components,
         ranks=slot - take(firsts, components),
         firsts=firsts,
-        filled=slot < jnp.sum(targets),
+        filled=slot < jnp.sum(targets, dtype=jnp.int32),
     )
 
 
@@ -256,7 +256,8 @@ def _line_before(
     before = jnp.clip(
         _exclusive(expected), take(lows, layout.components), take(highs, layout.components)
     )
-    is_empty = jnp.arange(expected.shape[0]) >= jnp.sum(layout.counts)
+    place = jnp.arange(expected.shape[0], dtype=jnp.int32)
+    is_empty = place >= jnp.sum(layout.counts, dtype=jnp.int32)
     if targets.shape[0] == 1:
         return before
     return jnp.where(is_empty, jnp.array(expected.shape[0], expected.dtype), before)
