@@ -211,6 +211,8 @@ def run_filter(
     - `observations`: a pytree whose leaves have a leading axis t.
     - `collect`: what to keep of the mixture after each step, stacked over t; None keeps all of
       it. The same function object compiles once; a new lambda at every call compiles anew.
+      What is derived from a mixture is written for one: `jax.vmap(lambda m: m.mean())` maps it over
+      a collected stack.
     - `missing`: "error" raises a `ValueError` that names the first step whose observation holds a
       NaN or an infinity; "skip" takes such steps as missing, and only predicts.
 
