@@ -151,7 +151,14 @@ def single_component(particles: PyTree, num_components: int = 1) -> ParticleMixt
 def flatten_states(particles: PyTree) -> Float[Array, "n d"]:
     """All leaves of the particles side by side, one row a particle."""
     leaves = [leaf.reshape(leaf.shape[0], -1) for leaf in jax.tree.leaves(particles)]
-    return jnp.concatenate([leaf.astype(jnp.result_type(leaf, 0.0)) for leaf in leaves], axis=1)
+    is_float = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
+    return jnp.concatenate(
+        [
+            leaf if keep else leaf.astype(default_float())
+            for leaf, keep in zip(leaves, is_float, strict=True)
+        ],
+        axis=1,
+    )
 
 
 def _rows(per_particle: Array, values: Array) -> Array:

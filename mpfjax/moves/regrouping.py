@@ -287,7 +287,7 @@ def free_labels(
     earlier = own[:, None] < own[None]
     ties = (priority[:, None] == priority[None]) & earlier
     goes_first = wanted[:, None] & ((priority[:, None] > priority[None]) | ties)
-    rank = jnp.sum(goes_first.astype(jnp.int32), axis=0)
+    rank = jnp.sum(goes_first, axis=0, dtype=jnp.int32)
     free_rank = jnp.cumsum((~active).astype(jnp.int32)) - 1
     matches = ~active[None] & (rank[:, None] == free_rank[None])
     granted = wanted & jnp.any(matches, axis=1)

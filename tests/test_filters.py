@@ -1,0 +1,348 @@
+"""The runners, and the filters of the literature against references of their own."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax.exact import kalman_filter
+from tests.precision import float64
+from tests.registry import CHAINS
+from tests.user_models import (
+    BLINDED,
+    BROKEN,
+    DRIFT_AS_LINEAR_GAUSSIAN,
+    DriftOfOne,
+    TrickyQuadraticModel,
+)
+
+QUADRATIC = TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0)
+OBSERVATIONS = jnp.array([1.5, 1.0, 0.4, 0.9])
+LINEAR_1D = mpfjax.LinearGaussianModel(
+    A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.2]], m0=[0.5], P0=[[1.0]]
+)
+LINEAR_2D = mpfjax.LinearGaussianModel(
+    A=[[1.0, 0.5], [-0.1, 0.9]],
+    Q=[[0.2, 0.05], [0.05, 0.1]],
+    H=[[1.0, 0.0], [0.5, 1.0]],
+    R=[[0.3, 0.1], [0.1, 0.2]],
+    m0=[0.5, -0.5],
+    P0=[[1.0, 0.3], [0.3, 0.5]],
+)
+
+
+def mean(mixture):
+    return mixture.mean()
+
+
+def assert_same(run, other, **tolerance):
+    """Every leaf of two runs is the same, to the bit where no tolerance is given."""
+    assert jax.tree.structure(run) == jax.tree.structure(other)
+    for one, two in zip(jax.tree.leaves(run), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(one, two, **(tolerance or {"rtol": 0, "atol": 0}))
+
+
+class TestAgainstReferences:
+    def test_one_component_is_the_particle_filter_to_the_bit(self):
+        for options in ({}, {"ess_threshold": 0.5}):
+            plain = mpfjax.particle_filter(QUADRATIC, 48, **options)
+            mixture = mpfjax.mixture_particle_filter(QUADRATIC, 48, 1, **options)
+            key = jax.random.key(0)
+            assert_same(
+                mpfjax.run_filter(key, plain, OBSERVATIONS),
+                mpfjax.run_filter(key, mixture, OBSERVATIONS),
+            )
+
+    def test_agrees_with_a_bootstrap_filter_by_hand(self):
+        """Log evidence and means of a plain numpy filter, within what N = 4000 allows."""
+        rng, runs = np.random.default_rng(1), 40
+        by_hand = np.array([bootstrap_by_hand(rng, 4000) for _ in range(runs)])
+        keys = jax.random.split(jax.random.key(1), runs)
+        filter = mpfjax.particle_filter(LINEAR_1D, 4000)
+        run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS[:, None], mean)
+        ours = np.column_stack([run.log_marginal_likelihood, run.collected[:, :, 0]])
+        spread = np.sqrt((by_hand.var(axis=0) + ours.var(axis=0)) / runs)
+        assert (np.abs(by_hand.mean(axis=0) - ours.mean(axis=0)) < 4 * spread).all()
+
+    @pytest.mark.parametrize(
+        ("kind", "model"),
+        [("mpf", LINEAR_1D), ("pf", LINEAR_2D), ("guided mpf", LINEAR_2D)],
+        ids=["mpf in 1d", "pf in 2d", "guided mpf in 2d"],
+    )
+    def test_agrees_with_the_kalman_filter(self, kind, model):
+        """Filtering means, and the evidence, at N = 2000 over 50 runs."""
+        proposal = mpfjax.GaussNewtonProposal(model) if kind == "guided mpf" else None
+        if kind == "pf":
+            filter = mpfjax.particle_filter(model, 2000)
+        else:
+            filter = mpfjax.mixture_particle_filter(model, 2000, 3, proposal=proposal)
+        observations = jnp.stack([OBSERVATIONS, -OBSERVATIONS], axis=1)[:, : model.H.shape[0]]
+        exact = kalman_filter(model, observations)
+        keys = jax.random.split(jax.random.key(2), 50)
+        run = mpfjax.monte_carlo(keys, filter, observations, mean)
+        means = np.asarray(run.collected)
+        standard_error = means.std(axis=0) / np.sqrt(50)
+        assert (standard_error < 0.01).all()
+        assert (np.abs(means.mean(axis=0) - exact.means) < 4 * standard_error + 1e-3).all()
+        ratios = np.exp(run.log_marginal_likelihood - exact.log_marginal_likelihood)
+        assert abs(ratios.mean() - 1) < 4 * ratios.std() / np.sqrt(50)
+
+
+def bootstrap_by_hand(rng, n):
+    """Multinomial bootstrap filter on LINEAR_1D: log evidence and the filtering means."""
+    x, log_evidence, means = 0.5 + rng.normal(size=n), 0.0, []
+    weights = np.full(n, 1 / n)
+    for y in np.asarray(OBSERVATIONS, float):
+        x = rng.choice(x, n, p=weights)
+        x = 0.9 * x + np.sqrt(0.3) * rng.normal(size=n)
+        likelihood = np.exp(-0.5 * (y - x) ** 2 / 0.2) / np.sqrt(2 * np.pi * 0.2)
+        log_evidence += np.log(likelihood.mean())
+        weights = likelihood / likelihood.sum()
+        means.append(weights @ x)
+    return [log_evidence, *means]
+
+
+class TestRunners:
+    def test_without_jit_the_run_is_the_same(self):
+        filter, key = CHAINS["guided mpf"](QUADRATIC), jax.random.key(4)
+        compiled = mpfjax.run_filter(key, filter, OBSERVATIONS[:2])
+        with jax.disable_jit():
+            plain = mpfjax.run_filter(key, filter, OBSERVATIONS[:2])
+        assert_same(plain, compiled, rtol=1e-3, atol=1e-4)
+
+    def test_monte_carlo_is_run_filter_for_each_key(self):
+        filter = CHAINS["pf"](QUADRATIC)
+        keys = jax.random.split(jax.random.key(5), 3)
+        together = mpfjax.monte_carlo(keys, filter, OBSERVATIONS)
+        for k in range(3):
+            alone = mpfjax.run_filter(keys[k], filter, OBSERVATIONS)
+            one = jax.tree.map(lambda leaf, k=k: leaf[k], together)
+            assert_same(alone, one, rtol=1e-3, atol=1e-4)
+
+    def test_in_float64_every_array_is_float64_and_the_run_agrees(self):
+        chain = "guided mpf"
+        single = mpfjax.run_filter(jax.random.key(6), CHAINS[chain](QUADRATIC), OBSERVATIONS)
+        with float64():
+            model = TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0)
+            observations = jnp.asarray(np.asarray(OBSERVATIONS), jnp.float64)
+            run = mpfjax.run_filter(jax.random.key(6), CHAINS[chain](model), observations)
+            inexact = filter(eqx.is_inexact_array, jax.tree.leaves(run))
+            assert {leaf.dtype for leaf in inexact} == {np.dtype("float64")}
+            assert np.isfinite(run.log_marginal_likelihood)
+            # Other random bits at double precision: the same answer, not the same draws.
+            gap = float(run.log_marginal_likelihood) - float(single.log_marginal_likelihood)
+        assert abs(gap) < 1.5
+
+    def test_collect_decides_what_is_kept(self):
+        filter = CHAINS["mpf"](QUADRATIC)
+        whole = mpfjax.run_filter(jax.random.key(7), filter, OBSERVATIONS)
+        means = mpfjax.run_filter(jax.random.key(7), filter, OBSERVATIONS, mean)
+        assert whole.collected.particles.shape == (4, 48)
+        np.testing.assert_allclose(
+            jax.vmap(mean)(whole.collected), means.collected, rtol=1e-4, atol=1e-6
+        )
+        last = jax.tree.map(lambda leaf: leaf[-1], whole.collected)
+        assert_same(last, whole.final)
+
+    def test_observations_may_be_any_pytree(self):
+        class TwoViews(mpfjax.QuadraticModel):
+            def log_likelihood(self, observation, states):
+                square = super().log_likelihood(observation["square"], states)
+                return jnp.where(observation["seen"], square, 0.0)
+
+        filter = mpfjax.particle_filter(TwoViews(0.3, 0.5, -2.0, 2.0), 48)
+        seen = jnp.array([True, False, True, True])
+        run = mpfjax.run_filter(
+            jax.random.key(8), filter, {"square": OBSERVATIONS, "seen": seen}, mean
+        )
+        np.testing.assert_allclose(run.log_likelihood_increments[1], 0.0, atol=1e-6)
+        assert np.isfinite(run.log_marginal_likelihood)
+
+    def test_resampling_is_reported_where_it_happens(self):
+        filter = mpfjax.particle_filter(QUADRATIC, 48, ess_threshold=0.5)
+        run = mpfjax.run_filter(jax.random.key(9), filter, jnp.tile(OBSERVATIONS, 3))
+        assert run.resampled.shape == (12, 1)
+        assert 0 < run.resampled.sum() < 12
+        assert not run.resampled[0]
+        for t in range(1, 12):
+            before = jax.tree.map(lambda leaf, t=t: leaf[t - 1], run.collected)
+            assert run.resampled[t, 0] == (float(before.effective_sample_size) < 24)
+            moved = np.asarray(run.collected.ancestor_indices[t]) != np.arange(48)
+            assert moved.any() == bool(run.resampled[t, 0])
+
+
+class TestMissing:
+    HOLED = OBSERVATIONS.at[2].set(jnp.nan)
+
+    def test_a_nan_observation_is_an_error_that_names_its_index(self):
+        filter = CHAINS["mpf"](QUADRATIC)
+        for bad in (jnp.nan, jnp.inf):
+            with pytest.raises(ValueError, match="observations: NaN or infinite at index 2"):
+                mpfjax.run_filter(jax.random.key(0), filter, OBSERVATIONS.at[2].set(bad))
+        with pytest.raises(ValueError, match="index 2"):
+            mpfjax.monte_carlo(jax.random.split(jax.random.key(0), 2), filter, self.HOLED)
+
+    def test_skipping_is_predicting(self):
+        filter, key = CHAINS["kmeans only"](QUADRATIC), jax.random.key(10)
+        run = mpfjax.run_filter(key, filter, self.HOLED, missing="skip")
+        mixture = filter.init(jax.random.fold_in(key, 0))
+        keys = jax.random.split(jax.random.fold_in(key, 1), 4)
+        increments = []
+        for t in range(4):
+            if t == 2:
+                mixture, info = filter.predict(keys[t], mixture)
+            else:
+                mixture, info = filter.step(keys[t], mixture, self.HOLED[t])
+            increments.append(float(info.log_likelihood_increment))
+        np.testing.assert_allclose(run.log_likelihood_increments, increments, rtol=1e-3)
+        assert run.log_likelihood_increments[2] == 0.0
+        np.testing.assert_allclose(run.final.particles, mixture.particles, rtol=1e-3, atol=1e-4)
+        assert not run.resampled[2].any()
+
+    def test_skipping_with_nothing_missing_changes_nothing(self):
+        filter, key = CHAINS["pf"](QUADRATIC), jax.random.key(11)
+        assert_same(
+            mpfjax.run_filter(key, filter, OBSERVATIONS, missing="skip"),
+            mpfjax.run_filter(key, filter, OBSERVATIONS),
+        )
+
+    def test_skipping_agrees_with_the_kalman_filter_of_two_steps(self):
+        """Seeing nothing at step 2 is one step of twice the dynamics."""
+        observations = jnp.array([[1.0], [jnp.nan], [0.3]])
+        keys = jax.random.split(jax.random.key(12), 200)
+        filter = mpfjax.particle_filter(LINEAR_1D, 500)
+        run = mpfjax.monte_carlo(keys, filter, observations, missing="skip")
+        first = kalman_filter(LINEAR_1D, observations[:1])
+        skipped = mpfjax.LinearGaussianModel(
+            A=[[0.81]], Q=[[0.3 * 1.81]], H=[[1.0]], R=[[0.2]],
+            m0=first.means[0], P0=first.covariances[0],
+        )  # fmt: skip
+        exact = first.log_marginal_likelihood + (
+            kalman_filter(skipped, observations[2:]).log_marginal_likelihood
+        )
+        ratios = np.exp(run.log_marginal_likelihood - exact)
+        assert abs(ratios.mean() - 1) < 4 * ratios.std() / np.sqrt(200)
+
+
+class TestBrokenLikelihoods:
+    def test_a_run_goes_on_after_a_step_of_zero_likelihood(self):
+        filter = CHAINS["mpf"](QUADRATIC)
+        blinded = OBSERVATIONS.at[1].set(BLINDED)
+        run = mpfjax.run_filter(jax.random.key(13), filter, blinded)
+        assert run.log_marginal_likelihood == -jnp.inf
+        np.testing.assert_array_equal(run.degenerate, [False, True, False, False])
+        increments = np.asarray(run.log_likelihood_increments)
+        assert increments[1] == -np.inf
+        assert np.isfinite(np.delete(increments, 1)).all()
+        for leaf in jax.tree.leaves(run):
+            assert not np.isnan(leaf).any()
+
+    def test_a_nan_density_is_an_error_that_names_the_step(self):
+        filter = CHAINS["pf"](QUADRATIC)
+        broken = OBSERVATIONS.at[2].set(BROKEN)
+        with pytest.raises(RuntimeError, match=r"model: .* at index 2"):
+            mpfjax.run_filter(jax.random.key(14), filter, broken)
+        with pytest.raises(RuntimeError, match=r"model: .* at index 2"):
+            mpfjax.monte_carlo(jax.random.split(jax.random.key(14), 2), filter, broken)
+
+
+class TestUsersModel:
+    """The batched form runs through every chain in `test_chains.py`."""
+
+    @pytest.mark.parametrize("chain", ["pf", "guided mpf"])
+    def test_written_for_one_particle_it_agrees_with_the_kalman_filter(self, chain):
+        filter = CHAINS[chain](mpfjax.per_particle(DriftOfOne()))
+        keys = jax.random.split(jax.random.key(15), 2000)
+        run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean)
+        exact = kalman_filter(DRIFT_AS_LINEAR_GAUSSIAN, OBSERVATIONS[:, None])
+        evidence = np.cumsum(np.asarray(run.log_likelihood_increments), axis=1)
+        ratios = np.exp(evidence - np.cumsum(np.asarray(exact.log_likelihood_increments)))
+        for estimates, truth in (
+            (ratios, 1.0),
+            (ratios[..., None] * np.asarray(run.collected), np.asarray(exact.means)),
+        ):
+            standard_error = estimates.std(axis=0) / np.sqrt(2000)
+            assert (np.abs(estimates.mean(axis=0) - truth) < 4 * standard_error).all()
+
+    def test_three_methods_are_enough_for_a_bootstrap_filter(self):
+        class Minimal(mpfjax.AbstractStateSpaceModel):
+            def sample_initial(self, key, num_particles):
+                return {"x": jax.random.normal(key, (num_particles,))}
+
+            def sample_transition(self, key, states):
+                return {"x": states["x"] + jax.random.normal(key, states["x"].shape)}
+
+            def log_likelihood(self, observation, states):
+                return -0.5 * (observation - states["x"]) ** 2
+
+        filter = mpfjax.mixture_particle_filter(Minimal(), 30, 3)
+        run = mpfjax.run_filter(jax.random.key(16), filter, OBSERVATIONS, mean)
+        assert run.collected["x"].shape == (4,)
+        assert np.isfinite(run.log_marginal_likelihood)
+
+    def test_a_move_may_be_any_function(self):
+        def temper(key, mixture, observation):
+            return mixture.replace(log_weights=mixture.log_weights - 0.5)
+
+        propagate = mpfjax.Propagate(QUADRATIC)
+        plain = mpfjax.Filter(QUADRATIC, [mpfjax.Resample(), propagate], 48)
+        custom = mpfjax.Filter(QUADRATIC, [mpfjax.Resample(), propagate, temper], 48)
+        assert custom.approximate
+        key = jax.random.key(17)
+        np.testing.assert_allclose(
+            mpfjax.run_filter(key, custom, OBSERVATIONS).log_likelihood_increments,
+            mpfjax.run_filter(key, plain, OBSERVATIONS).log_likelihood_increments - 0.5,
+            rtol=1e-5,
+        )
+        with pytest.raises(ValueError, match=r"moves: .* does not define predict"):
+            custom.predict(key, custom.init(key))
+
+
+class TestGradients:
+    @pytest.mark.parametrize("chain", ["pf", "guided mpf"])
+    def test_of_the_log_evidence_is_finite(self, chain):
+        filter = CHAINS[chain](mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0))
+        gradient = eqx.filter_jit(eqx.filter_grad(log_evidence))(filter, OBSERVATIONS)
+        for leaf in jax.tree.leaves(gradient):
+            assert np.isfinite(leaf).all()
+        assert gradient.model.sigma_y != 0
+
+    def test_is_finite_with_a_step_of_zero_likelihood_left_out(self):
+        def evidence_of_the_rest(filter, observations):
+            run = mpfjax.run_filter(jax.random.key(18), filter, observations, mean)
+            increments = run.log_likelihood_increments
+            return jnp.sum(jnp.where(run.degenerate, 0.0, increments))
+
+        filter = CHAINS["kmeans only"](QUADRATIC)
+        blinded = OBSERVATIONS.at[1].set(BLINDED)
+        gradient = eqx.filter_jit(eqx.filter_grad(evidence_of_the_rest))(filter, blinded)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+    def test_is_that_of_the_exact_evidence_without_resampling(self):
+        """Weights alone are differentiable without bias; N is large enough to see it."""
+        filter = mpfjax.Filter(LINEAR_1D, [mpfjax.Propagate(LINEAR_1D)], 200_000)
+        one = jnp.array([[1.4]])
+        gradient = eqx.filter_grad(log_evidence)(filter, one).model
+        exact = eqx.filter_grad(lambda m: kalman_filter(m, one).log_marginal_likelihood)(LINEAR_1D)
+        np.testing.assert_allclose(gradient.R, exact.R, rtol=0.05, atol=0.01)
+        np.testing.assert_allclose(gradient.m0, exact.m0, rtol=0.05, atol=0.01)
+        np.testing.assert_allclose(gradient.A, exact.A, rtol=0.05, atol=0.01)
+
+    def test_there_is_one_copy_of_the_models_parameters(self):
+        for chain, build in CHAINS.items():
+            model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
+            assert len(jax.tree.leaves(build(model))) == len(jax.tree.leaves(model)) == 2, chain
+
+    def test_changing_the_filters_model_changes_its_moves(self):
+        filter = CHAINS["guided mpf"](mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0))
+        wider = eqx.tree_at(lambda f: f.model.sigma_x, filter, jnp.array(0.7))
+        propagate = next(move for move in wider.moves if isinstance(move, mpfjax.Propagate))
+        assert float(propagate.model.sigma_x) == pytest.approx(0.7)
+        assert float(propagate.proposal.model.sigma_x) == pytest.approx(0.7)
+
+
+def log_evidence(filter, observations):
+    run = mpfjax.run_filter(jax.random.key(18), filter, observations, mean)
+    return run.log_marginal_likelihood
