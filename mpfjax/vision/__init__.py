@@ -1,0 +1,15 @@
+"""Frames in and out, boxes, colour histograms, the colour tracking model, a rendered scene."""
+
+from mpfjax.vision.boxes import check_boxes as check_boxes
+from mpfjax.vision.boxes import parse_box as parse_box
+from mpfjax.vision.boxes import read_tracks as read_tracks
+from mpfjax.vision.boxes import write_tracks as write_tracks
+from mpfjax.vision.colour_model import BoxState as BoxState
+from mpfjax.vision.colour_model import ColourModel as ColourModel
+from mpfjax.vision.frames import read_frames as read_frames
+from mpfjax.vision.frames import write_video as write_video
+from mpfjax.vision.histograms import IntegralHistogram as IntegralHistogram
+from mpfjax.vision.histograms import bhattacharyya as bhattacharyya
+from mpfjax.vision.histograms import integral_histogram as integral_histogram
+from mpfjax.vision.scenes import Scene as Scene
+from mpfjax.vision.scenes import football_scene as football_scene

@@ -1,7 +1,5 @@
 """The colour tracking model of Vermaak et al. (2003), section 5.2."""
 
-from typing import Self
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -74,11 +72,11 @@ class ColourModel(AbstractStateSpaceModel):
         *,
         num_bins: int = 30,
         sigma: float = 0.15,
-        deviations: Float[np.ndarray, "*k 4"] | None = None,
+        deviations: Float[np.ndarray, "..."] | None = None,
         num_parts: int = 1,
         weigh_colours: bool = False,
         share_reference: bool = False,
-    ) -> Self:
+    ) -> "ColourModel":
         """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
 
         - `num_bins`: N_b, bins a channel.

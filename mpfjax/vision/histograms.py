@@ -1,5 +1,7 @@
 """Colour histograms of many boxes at once, from one integral histogram a frame."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -31,7 +33,7 @@ class IntegralHistogram(eqx.Module):
     @property
     def largest_box(self) -> int:
         """The most pixels a box may hold and still be counted exactly."""
-        return int(np.iinfo(self.table.dtype).max)
+        return int(min(np.iinfo(self.table.dtype).max, np.iinfo(np.int32).max))
 
     def counts(
         self, boxes: Float[Array, "n 4"], num_parts: int = 1
@@ -74,19 +76,7 @@ def integral_histogram(
     if not 1 <= num_bins <= 256:
         raise ValueError(f"num_bins: {num_bins} is not between 1 and 256")
     height, width, _ = frame.shape
-    dtype = jnp.dtype(jnp.uint32 if wide_counts else jnp.uint16)
-    bins = frame.astype(jnp.int32) * num_bins // 256
-    columns = -(-(width + 1) // _BLOCK) * _BLOCK
-    # Pixels of no colour fill the row above, the column to the left and the last block.
-    bins = jnp.pad(bins, ((1, 0), (1, columns - width - 1), (0, 0)), constant_values=-1)
-    above = jnp.zeros((columns, _CHANNELS * num_bins), dtype)
-
-    def add_row(above: Array, row: Array) -> tuple[Array, Array]:
-        below = above + _row_counts(row, num_bins, dtype)
-        return below, below
-
-    table = jax.lax.scan(add_row, above, bins)[1]
-    return IntegralHistogram(table, num_bins, height, width)
+    return IntegralHistogram(_table(frame, num_bins, wide_counts), num_bins, height, width)
 
 
 def normalise(
@@ -108,6 +98,23 @@ def bhattacharyya(
     that share no colour; an empty histogram shares none. The square is what the likelihood needs.
     """
     return jnp.clip(1 - jnp.sum(jnp.sqrt(histograms * references), axis=-1), 0.0, 1.0)
+
+
+@partial(jax.jit, static_argnames=("num_bins", "wide_counts"))
+def _table(frame: UInt8[Array, "h w 3"], num_bins: int, wide_counts: bool) -> Array:
+    width = frame.shape[1]
+    dtype = jnp.dtype(jnp.uint32 if wide_counts else jnp.uint16)
+    bins = frame.astype(jnp.int32) * num_bins // 256
+    columns = -(-(width + 1) // _BLOCK) * _BLOCK
+    # Pixels of no colour fill the row above, the column to the left and the last block.
+    bins = jnp.pad(bins, ((1, 0), (1, columns - width - 1), (0, 0)), constant_values=-1)
+    above = jnp.zeros((columns, _CHANNELS * num_bins), dtype)
+
+    def add_row(above: Array, row: Array) -> tuple[Array, Array]:
+        below = above + _row_counts(row, num_bins, dtype)
+        return below, below
+
+    return jax.lax.scan(add_row, above, bins)[1]
 
 
 def _row_counts(row: Int[Array, "w 3"], num_bins: int, dtype: jnp.dtype) -> Array:

@@ -213,7 +213,8 @@ def _draw_players(
         gait = min(speed / 0.22, 1.0)
         _draw_player(frame, where, scale, kits[i], int(i), phase, gait, heading)
         tall, wide = _PLAYER_HEIGHT * scale, 0.82 * scale
-        rows[i] = [t, i + 1, where[0] - wide / 2, where[1] - 0.98 * tall, wide, tall]
+        corner = np.array([where[0] - wide / 2, where[1] - 0.98 * tall])
+        rows[i] = [float(t), float(i + 1), *corner.tolist(), float(wide), float(tall)]
     return [rows[i] for i in sorted(rows)]
 
 

@@ -1,0 +1,186 @@
+"""The colour model of section 5.2, against its formulas."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax.vision.colour_model import BoxState, ColourModel
+from mpfjax.vision.histograms import integral_histogram
+
+BOXES = np.array([[10.0, 10, 12, 20], [50, 20, 16, 24]])
+DEVIATIONS = np.array([2.0, 1.0, 0.1, 0.05])
+
+
+@pytest.fixture(scope="module")
+def frame():
+    """A red box and a blue box, each with dark legs, on noisy grey."""
+    image = np.random.default_rng(0).integers(90, 160, (70, 90, 3), dtype=np.uint8)
+    for (x, y, w, h), colour in zip(BOXES.astype(int), [(220, 20, 20), (20, 20, 220)], strict=True):
+        image[y : y + h // 2, x : x + w] = colour
+        image[y + h // 2 : y + h, x : x + w] = 5
+    return image
+
+
+def model_of(frame, **options):
+    return ColourModel.from_frame(frame, BOXES, **{"deviations": DEVIATIONS} | options)
+
+
+def states(*rows):
+    """(x, y, s_x, s_y, reference) a row."""
+    rows = np.array(rows, np.float32)
+    return BoxState(jnp.asarray(rows[:, :4]), jnp.asarray(rows[:, 4].astype(np.int32)))
+
+
+def at_references(model):
+    return states(*[(x + w / 2, y + h / 2, 1, 1, r) for r, (x, y, w, h) in enumerate(BOXES)])
+
+
+def test_the_likelihood_is_the_papers_formula(frame):
+    model = model_of(frame, num_bins=8, sigma=0.2)
+    state = states((30.0, 30.0, 1.5, 0.75, 1))
+
+    def histogram(x, y, w, h):
+        patch = frame[int(y) : int(y + h), int(x) : int(x + w)].reshape(-1, 3)
+        counts = np.stack([np.histogram(patch[:, c], np.arange(9) * 32)[0] for c in range(3)])
+        return counts / counts.sum(axis=1, keepdims=True)
+
+    here, reference = histogram(30 - 12, 30 - 9, 24, 18), histogram(*BOXES[1])
+    squares = 1 - np.sqrt(here * reference).sum(axis=1)
+    expected = -squares.sum() / (2 * 0.2**2)
+    assert 0.5 < squares.sum() < 2.5
+    np.testing.assert_allclose(
+        float(model.log_likelihood(jnp.asarray(frame), state)[0]), expected, rtol=1e-4
+    )
+
+
+@pytest.mark.parametrize("options", [{}, {"num_parts": 3}, {"num_parts": 3, "weigh_colours": True}])
+def test_the_reference_itself_is_most_likely(frame, options):
+    model, observation = model_of(frame, **options), jnp.asarray(frame)
+    true = at_references(model)
+    np.testing.assert_allclose(
+        np.asarray(model.squared_distances(observation, true)), 0.0, atol=1e-5
+    )
+    shifted = BoxState(true.box + jnp.array([[6.0, 5.0, 0.0, 0.0]]), true.reference)
+    swapped = BoxState(true.box, true.reference[::-1])
+    assert (model.squared_distances(observation, shifted) > 0.05).all()
+    assert (model.squared_distances(observation, swapped) > 0.5).all()
+
+
+def test_bands_tell_a_box_from_its_mirror_image(frame):
+    """Trousers above a shirt: the same colours in all, but not in each band."""
+    upside_down = jnp.asarray(frame.copy())
+    x, y, w, h = BOXES[0].astype(int)
+    upside_down = upside_down.at[y : y + h, x : x + w].set(frame[y : y + h, x : x + w][::-1])
+    whole, bands = model_of(frame), model_of(frame, num_parts=2)
+    true = at_references(whole)
+    assert whole.squared_distances(upside_down, true)[0] < 1e-5
+    assert bands.squared_distances(upside_down, true)[0] > 1
+
+
+def test_weighted_colours_ignore_the_surround(frame):
+    """A box with a rim of grey is nearer to its reference where grey counts for little."""
+    wide = BOXES + np.array([-3.0, -3, 6, 6])
+    plain = ColourModel.from_frame(frame, wide)
+    weighted = ColourModel.from_frame(frame, wide, weigh_colours=True)
+    tight = states((16.0, 20.0, 12 / 18, 20 / 26, 0))
+    image = jnp.asarray(frame)
+    assert (
+        weighted.squared_distances(image, tight)[0] < 0.5 * plain.squared_distances(image, tight)[0]
+    )
+
+
+def test_a_box_outside_lies_at_the_largest_distance(frame):
+    model = model_of(frame, num_parts=3)
+    outside = states((-50.0, 20, 1, 1, 0), (20.0, 20, -1, 1, 1), (20.0, 20, 1, 0, 1))
+    distances = model.squared_distances(jnp.asarray(frame), outside)
+    np.testing.assert_array_equal(np.asarray(distances), 3.0)
+
+
+def test_a_built_histogram_is_as_good_as_its_frame(frame):
+    model, image = model_of(frame), jnp.asarray(frame)
+    some = model.sample_initial(jax.random.key(1), 30)
+    built = integral_histogram(image, 30)
+    np.testing.assert_array_equal(
+        np.asarray(model.log_likelihood(built, some)), np.asarray(model.log_likelihood(image, some))
+    )
+
+
+def test_x0_scatters_equally_about_all_references(frame):
+    model = model_of(frame)
+    start = model.sample_initial(jax.random.key(0), 4001)
+    counts = np.bincount(np.asarray(start.reference))
+    assert abs(counts[0] - counts[1]) <= 1
+    for r, (x, y, w, h) in enumerate(BOXES):
+        boxes = np.asarray(start.box)[np.asarray(start.reference) == r]
+        error = DEVIATIONS / np.sqrt(len(boxes))
+        assert (np.abs(boxes.mean(axis=0) - [x + w / 2, y + h / 2, 1, 1]) < 5 * error).all()
+        np.testing.assert_allclose(boxes.std(axis=0), DEVIATIONS, rtol=0.1)
+
+
+def test_the_transition_draws_from_its_own_density(frame):
+    """E[p(x) / p(x)] aside, the mean log density is minus the entropy of the Gaussian."""
+    model = model_of(frame)
+    before = BoxState(jnp.tile(jnp.array([[30.0, 30, 1, 1]]), (8000, 1)), jnp.ones(8000, jnp.int32))
+    after = model.sample_transition(jax.random.key(0), before)
+    np.testing.assert_array_equal(np.asarray(after.reference), np.asarray(before.reference))
+    entropy = np.sum(0.5 * np.log(2 * np.pi * np.e * DEVIATIONS**2))
+    mean = float(model.log_transition(after, before).mean())
+    assert abs(mean + entropy) < 5 * np.sqrt(2 / 8000)
+    other = BoxState(after.box, 1 - after.reference)
+    assert (model.log_transition(other, before) == -jnp.inf).all()
+
+
+def test_deviations_of_each_box_are_used(frame):
+    rows = np.stack([DEVIATIONS, 3 * DEVIATIONS])
+    model = model_of(frame, deviations=rows)
+    before = states(*[(30, 30, 1, 1, i % 2) for i in range(4000)])
+    moved = np.asarray(model.sample_transition(jax.random.key(0), before).box - before.box)
+    np.testing.assert_allclose(moved[0::2].std(axis=0), rows[0], rtol=0.1)
+    np.testing.assert_allclose(moved[1::2].std(axis=0), rows[1], rtol=0.1)
+
+
+def test_a_shared_reference_is_the_mean_of_all(frame):
+    own, shared = model_of(frame), model_of(frame, share_reference=True)
+    mean = np.asarray(own.references).mean(axis=0)
+    np.testing.assert_allclose(np.asarray(shared.references), np.stack([mean, mean]), atol=1e-6)
+    np.testing.assert_allclose(np.asarray(shared.reference_boxes[:, 2:]), [[14, 22], [14, 22]])
+
+
+def test_the_papers_variances_are_the_default(frame):
+    model = ColourModel.from_frame(frame, BOXES)
+    np.testing.assert_allclose(
+        np.asarray(model.deviations[0]) ** 2, [2.5, 1.5, 0.05, 0.05], rtol=1e-6
+    )
+    assert model.references.shape == (2, 1, 3, 30)
+    assert float(model.sigma) == pytest.approx(0.15)
+
+
+def test_it_runs_through_a_filter_and_keeps_both_boxes(frame):
+    model = model_of(frame, sigma=0.1)
+    filter = mpfjax.mixture_particle_filter(model, 40, 2, particles_per_component=20)
+    run = mpfjax.run_filter(jax.random.key(0), filter, jnp.asarray(np.stack([frame] * 6)))
+    assert np.isfinite(float(run.log_marginal_likelihood))
+    means = np.asarray(run.final.component_averages(run.final.particles.box))
+    centres = BOXES[:, :2] + BOXES[:, 2:] / 2
+    gaps = np.linalg.norm(means[None, :, :2] - centres[:, None], axis=-1).min(axis=1)
+    assert (gaps < 3).all()
+
+
+@pytest.mark.parametrize(
+    ("message", "boxes", "options"),
+    [
+        ("boxes: there are none", np.zeros((0, 4)), {}),
+        ("boxes: .* no area", [[10, 10, 0, 5]], {}),
+        ("boxes: .* outside", [[500, 10, 5, 5]], {}),
+        ("sigma: 0", BOXES, {"sigma": 0.0}),
+        ("num_parts: 0", BOXES, {"num_parts": 0}),
+        ("num_bins: 0", BOXES, {"num_bins": 0}),
+        ("deviations: ", BOXES, {"deviations": np.ones(3)}),
+        ("deviations: ", BOXES, {"deviations": np.array([1.0, 1, 1, 0])}),
+    ],
+)
+def test_misuse_is_named(frame, message, boxes, options):
+    with pytest.raises(ValueError, match=message):
+        ColourModel.from_frame(frame, np.asarray(boxes, float), **options)

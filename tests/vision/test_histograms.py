@@ -1,0 +1,123 @@
+"""Integral histograms against NumPy's own, on boxes inside, across and outside the frame."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpfjax.vision.histograms import bhattacharyya, integral_histogram, normalise
+
+HEIGHT, WIDTH = 41, 67
+
+
+@pytest.fixture(scope="module")
+def frame():
+    return np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+def numpy_counts(frame, box, num_bins, num_parts):
+    """The same counts by NumPy: pixels whose centres the box covers, band by band."""
+    x, y, w, h = (float(value) for value in box)
+    columns, rows = np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5
+    across = (columns >= x - w / 2) & (columns < x + w / 2)
+    counts = np.zeros((num_parts, 3, num_bins))
+    for part in range(num_parts):
+        top, bottom = (y + h * ((part + i) / num_parts - 0.5) for i in (0, 1))
+        pixels = frame[(rows >= top) & (rows < bottom)][:, across].reshape(-1, 3)
+        for channel in range(3):
+            edges = np.arange(num_bins + 1) * 256 / num_bins
+            counts[part, channel] = np.histogram(pixels[:, channel], edges)[0]
+    return counts
+
+
+def random_boxes(num):
+    """Eighths of a pixel, so that both sides round the same edges alike."""
+    rng = np.random.default_rng(1)
+    boxes = rng.uniform((-20, -20, 1, 1), (WIDTH + 20, HEIGHT + 20, 60, 60), (num, 4))
+    return (np.round(boxes * 8) / 8).astype(np.float32)
+
+
+@pytest.mark.parametrize(("num_bins", "num_parts"), [(30, 1), (16, 1), (7, 2), (256, 1)])
+@pytest.mark.parametrize("wide_counts", [False, True])
+def test_counts_are_numpys(frame, num_bins, num_parts, wide_counts):
+    boxes = random_boxes(60)
+    boxes[:, 3] = np.round(boxes[:, 3])
+    table = integral_histogram(jnp.asarray(frame), num_bins, wide_counts)
+    counts = table.counts(jnp.asarray(boxes), num_parts)
+    assert counts.shape == (60, num_parts, 3, num_bins)
+    expected = np.stack([numpy_counts(frame, box, num_bins, num_parts) for box in boxes])
+    assert expected.sum() > 0
+    np.testing.assert_array_equal(np.asarray(counts), expected)
+
+
+def test_bands_make_up_the_box(frame):
+    table = integral_histogram(jnp.asarray(frame), 30)
+    boxes = jnp.asarray(random_boxes(40))
+    whole, bands = table.counts(boxes), table.counts(boxes, 3)
+    np.testing.assert_array_equal(np.asarray(bands.sum(axis=1)), np.asarray(whole[:, 0]))
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        (-30.0, 20.0, 20.0, 20.0),
+        (WIDTH + 30.0, 20.0, 20.0, 20.0),
+        (30.0, -30.0, 20.0, 20.0),
+        (30.0, HEIGHT + 30.0, 20.0, 20.0),
+        (30.0, 20.0, 0.0, 20.0),
+        (30.0, 20.0, 20.0, -5.0),
+        (30.0, 20.0, -20.0, -20.0),
+        (np.nan, 20.0, 20.0, 20.0),
+        (30.0, np.inf, 20.0, 20.0),
+    ],
+)
+def test_a_box_without_pixels_is_empty_and_lies_farthest(frame, box):
+    table = integral_histogram(jnp.asarray(frame), 30)
+    counts = table.counts(jnp.asarray([box]), 2)
+    np.testing.assert_array_equal(np.asarray(counts), 0)
+    reference = normalise(table.counts(jnp.asarray([(30.0, 20.0, 20.0, 20.0)]), 2))
+    np.testing.assert_array_equal(np.asarray(bhattacharyya(normalise(counts), reference)), 1.0)
+
+
+def test_a_box_too_large_for_its_counter_is_empty_and_exact_in_a_wide_one():
+    frame = jnp.zeros((300, 300, 3), jnp.uint8)
+    box = jnp.asarray([(150.0, 150.0, 290.0, 290.0)])
+    assert integral_histogram(frame, 4).counts(box).sum() == 0
+    assert integral_histogram(frame, 4, wide_counts=True).counts(box)[0, 0, 0, 0] == 290**2
+
+
+def test_counts_survive_the_counter_wrapping_around():
+    frame = jnp.zeros((300, 300, 3), jnp.uint8)
+    box = jnp.asarray([(280.0, 280.0, 40.0, 40.0)])
+    assert integral_histogram(frame, 4).counts(box)[0, 0, 0, 0] == 1600
+
+
+def test_the_table_is_built_once_for_all_runs(frame):
+    boxes = jnp.asarray(random_boxes(6)).reshape(2, 3, 4)
+
+    def count(frame, boxes):
+        return integral_histogram(frame, 8).counts(boxes)
+
+    program = jax.make_jaxpr(jax.vmap(count, in_axes=(None, 0)))(jnp.asarray(frame), boxes)
+    (build,) = [e for e in program.jaxpr.eqns if "table" in str(e.params.get("name"))]
+    # Rows, columns and colours, without an axis of runs.
+    assert [len(variable.aval.shape) for variable in build.outvars] == [3]
+
+
+def test_bhattacharyya_against_its_formula():
+    rng = np.random.default_rng(2)
+    a, b = rng.dirichlet(np.ones(30), size=(2, 5))
+    expected = 1 - np.sqrt(a * b).sum(axis=1)
+    np.testing.assert_allclose(
+        np.asarray(bhattacharyya(jnp.asarray(a, jnp.float32), jnp.asarray(b, jnp.float32))),
+        expected,
+        atol=1e-6,
+    )
+    same = jnp.asarray(a, jnp.float32)
+    np.testing.assert_allclose(np.asarray(bhattacharyya(same, same)), 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("num_bins", [0, -3, 257])
+def test_a_wrong_number_of_bins_is_named(frame, num_bins):
+    with pytest.raises(ValueError, match=f"num_bins: {num_bins}"):
+        integral_histogram(jnp.asarray(frame), num_bins)
