@@ -173,6 +173,11 @@ class Filter(eqx.Module):
     def _step(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> tuple[ParticleMixture, StepInfo]:
+        if mixture.num_components != self.num_components:
+            raise ValueError(
+                f"mixture: its num_components, {mixture.num_components}, is not the filter's,"
+                f" {self.num_components}"
+            )
         mixture = _own_ancestors(mixture)
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)

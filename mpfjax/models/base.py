@@ -5,6 +5,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Key, PyTree
 
 
@@ -49,6 +51,13 @@ def require(model: Any, method: str, needed_by: str) -> None:
         raise ValueError(
             f"model: {type(model).__name__} defines no {method}, which {needed_by} needs"
         )
+
+
+def require_positive(**parameters: Any) -> None:
+    """Raise a `ValueError` for a parameter that is known not to be positive."""
+    for name, value in parameters.items():
+        if not isinstance(value, Tracer) and not np.all(np.asarray(value) > 0):
+            raise ValueError(f"{name}: {value} is not positive")
 
 
 class _PerParticleModel(AbstractStateSpaceModel):

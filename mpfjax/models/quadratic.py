@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.base import AbstractStateSpaceModel, require_positive
 from mpfjax.models.noise import stratified_uniform
 
 
@@ -21,8 +21,8 @@ class QuadraticModel(AbstractStateSpaceModel):
       without the gaps of "independent" draws, which at small n can leave a mode uncovered before
       the first observation.
 
-    States have shape (n,), observations are scalars. Raises `ValueError` for an empty range or
-    an unknown draw. Use it to see whether a filter keeps both modes.
+    States have shape (n,), observations are scalars. Raises `ValueError` for a deviation that is
+    not positive, an empty range or an unknown draw. Use it to see who keeps both modes.
     """
 
     sigma_x: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.1)
@@ -32,6 +32,7 @@ class QuadraticModel(AbstractStateSpaceModel):
     initial_draw: str = eqx.field(static=True, default="stratified")
 
     def __check_init__(self) -> None:
+        require_positive(sigma_x=self.sigma_x, sigma_y=self.sigma_y)
         if not self.low < self.high:
             raise ValueError(f"high: {self.high} is not above low, {self.low}")
         if self.initial_draw not in ("stratified", "independent"):
@@ -56,7 +57,9 @@ class QuadraticModel(AbstractStateSpaceModel):
     def log_likelihood(
         self, observation: Float[Array, ""], states: Float[Array, " n"]
     ) -> Float[Array, " n"]:
-        """log N(y_t; x_t², σ_y²)."""
+        """log N(y_t; x_t², σ_y²); raises `ValueError` for an observation that is no scalar."""
+        if jnp.ndim(observation) != 0:
+            raise ValueError(f"observation: shape {jnp.shape(observation)} is not that of a scalar")
         return _log_normal(observation - states**2, self.sigma_y)
 
     def log_transition(
