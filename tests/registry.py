@@ -55,6 +55,7 @@ REJUVENATIONS: dict[str, AbstractRejuvenation] = {
     "residual": Resample("residual"),
     "systematic, adaptive": Resample(ess_threshold=0.5),
     "multinomial, adaptive": Resample("multinomial", ess_threshold=0.5),
+    "systematic, sorted": Resample(sort_by=lambda states: states[:, 0]),
     "systematic, fixed number": Resample(particles_per_component=5),
     "residual, fixed number, adaptive": Resample("residual", 0.5, 5),
 }
@@ -91,8 +92,8 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "mpf adaptive": _mpf(ess_threshold=0.5),
     "mpf fixed number": _mpf(particles_per_component=12),
     "guided mpf": lambda model: _mpf(proposal=GaussNewtonProposal(model))(model),
-    "guided, stratified noise": _chain(
-        Resample(),
+    "guided, sorted, stratified noise": _chain(
+        Resample(sort_by=lambda states: states.reshape(NUM_PARTICLES, -1)[:, 0]),
         proposal=lambda model: GaussNewtonProposal(model, noise="stratified"),
         then=[KMeans(2)],
     ),

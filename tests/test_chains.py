@@ -120,7 +120,8 @@ def test_exclusion_is_declared_approximate_and_nothing_else_is():
 
 def step_keys(key, length):
     """The keys that `run_filter` gives to `init` and to each step."""
-    return jax.random.fold_in(key, 0), jax.random.split(jax.random.fold_in(key, 1), length)
+    key_initial, key_steps = jax.random.split(key)
+    return key_initial, jax.random.split(key_steps, length)
 
 
 @over_chains

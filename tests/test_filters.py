@@ -187,8 +187,8 @@ class TestMissing:
     def test_skipping_is_predicting(self):
         filter, key = CHAINS["kmeans only"](QUADRATIC), jax.random.key(10)
         run = mpfjax.run_filter(key, filter, self.HOLED, missing="skip")
-        mixture = filter.init(jax.random.fold_in(key, 0))
-        keys = jax.random.split(jax.random.fold_in(key, 1), 4)
+        key_initial, key_steps = jax.random.split(key)
+        mixture, keys = filter.init(key_initial), jax.random.split(key_steps, 4)
         increments = []
         for t in range(4):
             if t == 2:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRejuvenation
-from mpfjax.operations import count_starts, order_by_segment, prefix_sum, take
+from mpfjax.operations import count_starts, order_by_segment, prefix_sum, segment_counts, take
 
 
 class Resample(AbstractRejuvenation):
@@ -73,7 +73,7 @@ class Resample(AbstractRejuvenation):
         if mixture.num_components == 1 and self.sort_by is None:
             layout = _as_they_stand(mixture)
         else:
-            layout = _contiguous(mixture, self.sort_by)
+            layout = _contiguous(mixture, due, self.sort_by)
         targets = self._target_counts(layout.counts, due, mixture.num_particles)
         slots = _slots(targets, mixture.num_particles)
         expected = layout.weights * take(targets, layout.components).astype(layout.weights.dtype)
@@ -132,19 +132,29 @@ def _as_they_stand(mixture: ParticleMixture) -> _Layout:
 
 
 def _contiguous(
-    mixture: ParticleMixture, sort_by: Callable[[PyTree], Float[Array, " n"]] | None
+    mixture: ParticleMixture,
+    due: Bool[Array, " m"],
+    sort_by: Callable[[PyTree], Float[Array, " n"]] | None,
 ) -> _Layout:
+    """Components side by side, without particles that could only be drawn by a rounding error.
+
+    A weight may underflow to zero where its logarithm does not. Such a particle is left out of
+    the line of a component that is resampled, and kept with one that is not.
+    """
     m = mixture.num_components
-    labels = jnp.where(mixture.occupied, mixture.component_indicators, m)
+    weights = jnp.exp(mixture.log_component_weights)
+    stays = ~take(due, mixture.component_indicators)
+    in_line = mixture.occupied & ((weights > 0) | stays)
+    labels = jnp.where(in_line, mixture.component_indicators, m)
     if sort_by is None:
         order = order_by_segment(labels, m)
     else:
         order = jnp.lexsort((sort_by(mixture.particles), labels)).astype(jnp.int32)
-    counts = mixture.component_counts
+    counts = segment_counts(in_line, mixture.component_indicators, m)
     return _Layout(
         order=order,
         components=take(mixture.component_indicators, order),
-        weights=take(jnp.exp(mixture.log_component_weights), order),
+        weights=take(weights, order),
         counts=counts,
         firsts=jnp.cumsum(counts) - counts,
     )
@@ -236,13 +246,14 @@ def _multinomial(key, expected, targets, slots, layout):
 
 
 def _residual(key, expected, targets, slots, layout):
-    whole = jnp.floor(expected)
+    # A weight of 1 / k comes out as a hair less in floating point, and is meant to be certain.
+    whole = jnp.floor(expected * (1 + 16 * jnp.finfo(expected.dtype).eps))
     certain = _exclusive(whole)
     per_component = jax.ops.segment_sum(whole, layout.components, targets.shape[0])
     left = jnp.maximum(targets - per_component.astype(jnp.int32), 0)
     rest = _slots(left, expected.shape[0])
     points = _sorted_points(key, rest.components, rest.filled, left, expected.dtype)
-    before = _line_before(expected - whole, left, rest, layout)
+    before = _line_before(jnp.maximum(expected - whole, 0.0), left, rest, layout)
     drawn = jnp.searchsorted(points, before, side="left")
     return certain.astype(jnp.int32) + drawn.astype(jnp.int32)
 

@@ -1,0 +1,219 @@
+"""Resampling at its edges; what every scheme must keep is in `test_contracts.py`."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpfjax import Resample
+from tests.examples import make_mixture
+
+SCHEMES = ("systematic", "stratified", "multinomial", "residual")
+NEARLY_ONE = 1 - 2.0**-24
+
+over_schemes = pytest.mark.parametrize("scheme", SCHEMES)
+
+
+def offspring(mixture, moved):
+    """How many slots each particle got, from filled slots only."""
+    filled = np.asarray(moved.occupied)
+    ancestors = np.asarray(moved.ancestor_indices)[filled]
+    return np.bincount(ancestors, minlength=mixture.num_particles)
+
+
+def assert_sound(mixture, moved):
+    """No slot fed from a particle of zero weight, no border crossed, no mass moved."""
+    weights = np.exp(np.asarray(mixture.log_component_weights))
+    filled = np.asarray(moved.occupied)
+    parents = np.asarray(moved.ancestor_indices)[filled]
+    assert (weights[parents] > 0).all()
+    labels = np.asarray(mixture.component_indicators)[parents]
+    np.testing.assert_array_equal(np.asarray(moved.component_indicators)[filled], labels)
+    # Thousands of equal shares in float32 add up to their whole but for rounding.
+    np.testing.assert_allclose(
+        moved.log_mixture_weights, mixture.log_mixture_weights, rtol=1e-5, atol=1e-3
+    )
+
+
+def large_mixture(kind, n, m):
+    rng = np.random.default_rng(7)
+    labels = rng.integers(0, m, n)
+    log_weights = rng.normal(size=n)
+    if kind == "empty slots":
+        log_weights[rng.random(n) < 0.5] = -np.inf
+    elif kind == "underflowing weights":
+        log_weights[rng.random(n) < 0.5] -= 200.0
+    elif kind == "masses 200 nats apart":
+        log_weights -= 200.0 * labels
+    elif kind == "dead components":
+        log_weights[labels % 2 == 1] = -np.inf
+    elif kind == "no weight at the ends":
+        for label in range(m):
+            members = np.flatnonzero(labels == label)
+            log_weights[members[:3]] -= 200.0
+            log_weights[members[-3:]] -= 200.0
+    return make_mixture(rng.normal(size=n), log_weights, labels, m)
+
+
+KINDS = (
+    "random weights",
+    "empty slots",
+    "underflowing weights",
+    "masses 200 nats apart",
+    "dead components",
+    "no weight at the ends",
+)
+
+
+class TestAtScale:
+    """float32 has no room for a hundred thousand exact cumulative weights: guards must hold."""
+
+    @over_schemes
+    @pytest.mark.parametrize("num_components", [1, 4, 9])
+    def test_no_particle_of_zero_weight_is_ever_fed(self, scheme, num_components):
+        move = jax.jit(Resample(scheme))
+        for kind in KINDS:
+            mixture = large_mixture(kind, 100_000, num_components)
+            for seed in range(3):
+                assert_sound(mixture, move(jax.random.key(seed), mixture, None))
+
+    @over_schemes
+    @pytest.mark.parametrize("uniform", [0.0, 0.5, NEARLY_ONE])
+    @pytest.mark.parametrize("num_components", [1, 4])
+    def test_holds_for_uniform_draws_at_their_ends(
+        self, scheme, uniform, num_components, monkeypatch
+    ):
+        def constant(key, shape=(), dtype=float, **_):
+            return jnp.full(shape, uniform, dtype)
+
+        monkeypatch.setattr(jax.random, "uniform", constant)
+        move = jax.jit(lambda mixture: Resample(scheme)(jax.random.key(0), mixture))
+        for kind in KINDS:
+            mixture = large_mixture(kind, 10_000, num_components)
+            assert_sound(mixture, move(mixture))
+
+    def test_systematic_offspring_are_proportional_to_the_weights(self):
+        mixture = large_mixture("random weights", 100_000, 4)
+        counts = offspring(mixture, Resample()(jax.random.key(0), mixture))
+        expected = expected_offspring(mixture, 25_000)
+        # The cumulative weights are off by up to their rounding, the counts by one more.
+        assert np.abs(counts - expected).max() < 1.05
+        halves = np.arange(100_000) < 50_000
+        assert abs(counts[halves].sum() - expected[halves].sum()) < 10
+
+
+def expected_offspring(mixture, per_component):
+    return per_component * np.exp(np.asarray(mixture.log_component_weights, float))
+
+
+class TestSystematic:
+    @pytest.mark.parametrize("num_components", [1, 3])
+    def test_offspring_are_the_floor_or_the_ceiling_of_what_is_expected(self, num_components):
+        rng = np.random.default_rng(8)
+        labels = rng.permutation(np.arange(60) % num_components)
+        mixture = make_mixture(rng.normal(size=60), rng.normal(size=60), labels, num_components)
+        expected = expected_offspring(mixture, 60 // num_components)
+        for seed in range(50):
+            counts = offspring(mixture, Resample()(jax.random.key(seed), mixture))
+            assert (counts >= np.floor(expected - 1e-4)).all()
+            assert (counts <= np.ceil(expected + 1e-4)).all()
+
+    def test_components_draw_their_offsets_independently(self):
+        labels = np.repeat([0, 1], 10)
+        log_weights = np.tile(np.log([0.05, 0.95] * 5), 2)
+        mixture = make_mixture(np.arange(20.0), log_weights, labels, 2)
+        keys = jax.random.split(jax.random.key(0), 2000)
+        moved = jax.jit(jax.vmap(lambda key: Resample()(key, mixture)))(keys)
+        first = np.asarray(moved.ancestor_indices == 0).any(axis=1)
+        second = np.asarray(moved.ancestor_indices == 10).any(axis=1)
+        correlation = np.corrcoef(first, second)[0, 1]
+        assert abs(correlation) < 4 / np.sqrt(2000)
+
+
+class TestResidual:
+    def test_every_particle_gets_the_whole_part_of_what_is_expected(self):
+        rng = np.random.default_rng(9)
+        mixture = make_mixture(rng.normal(size=60), rng.normal(size=60), np.arange(60) % 3, 3)
+        expected = expected_offspring(mixture, 20)
+        for seed in range(20):
+            counts = offspring(mixture, Resample("residual")(jax.random.key(seed), mixture))
+            assert (counts >= np.floor(expected - 1e-4)).all()
+
+    @pytest.mark.parametrize("size", [7, 30, 48, 99])
+    def test_equal_weights_leave_nothing_to_chance(self, size):
+        mixture = make_mixture(np.arange(size), np.zeros(size), np.zeros(size), 1)
+        for seed in range(5):
+            counts = offspring(mixture, Resample("residual")(jax.random.key(seed), mixture))
+            assert (counts == 1).all()
+
+
+class TestAllocation:
+    def test_equal_shares_differ_by_at_most_one(self):
+        rng = np.random.default_rng(10)
+        labels = rng.choice([0, 2, 3], 50, p=[0.8, 0.15, 0.05])
+        mixture = make_mixture(rng.normal(size=50), rng.normal(size=50), labels, 5)
+        counts = np.asarray(Resample()(jax.random.key(0), mixture).component_counts)
+        assert counts.sum() == 50
+        assert (counts[[1, 4]] == 0).all()
+        living = counts[[0, 2, 3]]
+        assert living.max() - living.min() <= 1
+
+    def test_a_fixed_number_leaves_the_other_slots_empty(self):
+        rng = np.random.default_rng(11)
+        labels = rng.choice([0, 2], 50)
+        mixture = make_mixture(rng.normal(size=50), rng.normal(size=50), labels, 4)
+        moved = Resample(particles_per_component=8)(jax.random.key(0), mixture)
+        np.testing.assert_array_equal(moved.component_counts, [8, 0, 8, 0])
+        assert (np.asarray(moved.log_weights) == -np.inf).sum() == 50 - 16
+        again = Resample(particles_per_component=20)(jax.random.key(1), moved)
+        np.testing.assert_array_equal(again.component_counts, [20, 0, 20, 0])
+
+    def test_a_component_that_is_not_due_keeps_its_particles_and_weights(self):
+        log_weights = np.concatenate([np.zeros(10), [5.0] + [0.0] * 9])
+        mixture = make_mixture(np.arange(20.0), log_weights, np.repeat([0, 1], 10), 2)
+        move = Resample(ess_threshold=0.5)
+        np.testing.assert_array_equal(move.is_due(mixture), [False, True])
+        moved = move(jax.random.key(0), mixture)
+        np.testing.assert_array_equal(moved.ancestor_indices[:10], np.arange(10))
+        np.testing.assert_array_equal(moved.log_weights[:10], mixture.log_weights[:10])
+        assert float(moved.component_effective_sample_sizes[1]) == pytest.approx(10, rel=1e-4)
+
+    def test_is_due_compares_each_components_own_sample_size(self):
+        rng = np.random.default_rng(12)
+        mixture = make_mixture(rng.normal(size=90), 2 * rng.normal(size=90), np.arange(90) % 3, 4)
+        sizes, counts = mixture.component_effective_sample_sizes, mixture.component_counts
+        for threshold in (0.1, 0.2, 0.3, 0.9):
+            expected = (np.asarray(sizes) < threshold * np.asarray(counts)) & (counts > 0)
+            np.testing.assert_array_equal(
+                Resample(ess_threshold=threshold).is_due(mixture), expected
+            )
+        assert not Resample(ess_threshold=0.0).is_due(mixture).any()
+        np.testing.assert_array_equal(Resample().is_due(mixture), [True, True, True, False])
+
+
+class TestSorted:
+    def test_neighbours_in_line_are_neighbours_in_space(self):
+        rng = np.random.default_rng(13)
+        mixture = make_mixture(rng.normal(size=60), rng.normal(size=60), np.arange(60) % 3, 3)
+        moved = Resample(sort_by=lambda states: states)(jax.random.key(0), mixture)
+        for m in range(3):
+            members = np.asarray(moved.particles)[np.asarray(moved.component_indicators) == m]
+            assert (np.diff(members) >= 0).all()
+
+
+@over_schemes
+def test_one_living_component_of_several_is_resampled_like_one_alone(scheme):
+    """The fast path for M = 1 and the general one follow the same law."""
+    rng = np.random.default_rng(14)
+    states, log_weights = rng.normal(size=30), rng.normal(size=30)
+    plain = make_mixture(states, log_weights, np.zeros(30), 1)
+    general = make_mixture(states, log_weights, np.zeros(30), 3)
+    keys = jax.random.split(jax.random.key(0), 4000)
+    counts = []
+    for mixture in (plain, general):
+        moved = jax.jit(jax.vmap(lambda key, mixture=mixture: Resample(scheme)(key, mixture)))(keys)
+        ancestors = np.asarray(moved.ancestor_indices)
+        counts.append(np.stack([np.bincount(row, minlength=30) for row in ancestors]))
+    gap = counts[0].mean(axis=0) - counts[1].mean(axis=0)
+    standard_error = np.sqrt((counts[0].var(axis=0) + counts[1].var(axis=0)) / 4000)
+    assert (np.abs(gap) < 4.5 * standard_error + 1e-3).all()
