@@ -36,7 +36,7 @@ def test_a_box_of_no_area_is_named(box):
     "box", [(200, 10, 9, 9), (-9, 10, 9, 9), (10, 100, 9, 9), (10, -9.5, 9, 9)]
 )
 def test_a_box_outside_the_first_frame_is_named(box):
-    with pytest.raises(ValueError, match="boxes: .* outside the first frame, 200 x 100"):
+    with pytest.raises(ValueError, match=r"boxes: .* outside the first frame, 200 x 100"):
         check_boxes(np.array([box], float), 100, 200)
 
 
