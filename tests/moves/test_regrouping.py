@@ -1,0 +1,216 @@
+"""K-means, merging and splitting on clouds made by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpfjax import KMeans, Merge, Split
+from mpfjax.moves.regrouping import farthest_first, free_labels, lowest_connected
+from tests.examples import make_mixture
+
+KEY = jax.random.key(0)
+RNG = np.random.default_rng(0)
+
+
+def clouds(centres, sizes, scale=1.0, num_components=6, weights=None, labels=None):
+    """Gaussian clouds around the centres, each its own component."""
+    own = np.repeat(np.arange(len(sizes)), sizes)
+    centres = np.asarray(centres, float)
+    spread = np.broadcast_to(scale, len(sizes))[own]
+    states = centres[own] + spread[:, None] * RNG.normal(size=(len(own), centres.shape[1]))
+    log_weights = np.zeros(len(own)) if weights is None else np.log(weights)[own]
+    return make_mixture(states, log_weights, own if labels is None else labels, num_components)
+
+
+def labels_after(move, mixture):
+    return np.asarray(move(KEY, mixture).component_indicators)
+
+
+class TestKMeans:
+    def test_equals_lloyds_algorithm(self):
+        states = RNG.normal(size=(200, 3))
+        start = RNG.integers(0, 5, 200)
+        mixture = make_mixture(states, RNG.normal(size=200), start, 6)
+        for iterations in (1, 4):
+            expected = lloyd(states, start, 6, iterations)
+            found = labels_after(KMeans(iterations), mixture)
+            np.testing.assert_array_equal(found, expected)
+
+    def test_empty_slots_pull_no_centroid(self):
+        states = np.array([[0.0], [1.0], [1000.0], [10.0], [11.0], [-1000.0]])
+        log_weights = np.array([0, 0, -np.inf, 0, 0, -np.inf])
+        mixture = make_mixture(states, log_weights, [0, 1, 0, 1, 1, 1], 3)
+        found = labels_after(KMeans(5), mixture)
+        np.testing.assert_array_equal(found[[0, 1, 3, 4]], [0, 0, 1, 1])
+
+    def test_a_dead_component_stays_dead(self):
+        mixture = clouds([[0, 0], [9, 9]], [20, 20])
+        moved = KMeans()(KEY, mixture)
+        np.testing.assert_array_equal(moved.active, [True, True, False, False, False, False])
+
+    def test_weights_play_no_part(self):
+        states, start = RNG.normal(size=(60, 2)), RNG.integers(0, 3, 60)
+        light = make_mixture(states, np.zeros(60), start, 3)
+        heavy = make_mixture(states, 5 * RNG.normal(size=60), start, 3)
+        np.testing.assert_array_equal(labels_after(KMeans(), light), labels_after(KMeans(), heavy))
+
+    def test_reseeding_finds_clouds_that_share_a_label(self):
+        mixture = clouds([[0, 0], [20, 0], [0, 20]], [15, 30, 45], num_components=3)
+        mixture = mixture.replace(component_indicators=jnp.zeros(90, jnp.int32))
+        found = labels_after(KMeans(10, reseed=True), mixture)
+        groups = [set(found[:15]), set(found[15:45]), set(found[45:])]
+        assert all(len(group) == 1 for group in groups)
+        assert len(set.union(*groups)) == 3
+
+    def test_features_and_scale_decide_what_is_near(self):
+        states = np.array([[0.0, 0.0], [0.0, 10.0], [1.0, 0.0], [1.0, 10.0]])
+        mixture = make_mixture(states, np.zeros(4), [0, 0, 1, 1], 2)
+        np.testing.assert_array_equal(labels_after(KMeans(1), mixture), [0, 0, 1, 1])
+        mixture = make_mixture(states, np.zeros(4), [0, 1, 0, 1], 2)
+        apart = KMeans(5, scale=(0.01, 100.0))
+        # In these units the first coordinate is all that matters, though the labels differ in the
+        # second; on the second alone nothing changes.
+        by_second = KMeans(5, features=lambda states: states[:, 1])
+        np.testing.assert_array_equal(labels_after(by_second, mixture), [0, 1, 0, 1])
+        tilted = make_mixture(states, np.zeros(4), [0, 0, 0, 1], 2)
+        assert labels_after(apart, tilted)[2] == 1
+        assert labels_after(apart, tilted)[1] == 0
+
+    def test_farthest_first_starts_far_out_and_spreads(self):
+        points = jnp.array([[0.0], [1.0], [2.0], [10.0], [-50.0]])
+        occupied = jnp.array([True, True, True, True, False])
+        seeds = farthest_first(points, occupied, 3)
+        np.testing.assert_array_equal(seeds.ravel(), [10.0, 0.0, 2.0])
+
+
+def lloyd(states, labels, num_components, iterations):
+    """The textbook's: centroids of the groups, then each point to the nearest."""
+    for _ in range(iterations):
+        distances = np.full((len(states), num_components), np.inf)
+        for m in set(labels):
+            distances[:, m] = ((states - states[labels == m].mean(axis=0)) ** 2).sum(axis=1)
+        labels = distances.argmin(axis=1)
+    return labels
+
+
+class TestMerge:
+    def test_clouds_that_overlap_merge_and_those_apart_do_not(self):
+        mixture = clouds([[0, 0], [0.2, 0], [10, 0], [10, 8]], [40, 40, 40, 40])
+        found = labels_after(Merge(1.0), mixture)
+        np.testing.assert_array_equal(found, np.repeat([0, 0, 2, 3], 40))
+
+    @pytest.mark.parametrize(("gap", "merges"), [(1.8, True), (2.2, False)])
+    def test_the_border_is_max_deviations_pooled_deviations(self, gap, merges):
+        mixture = clouds([[0.0], [gap]], [4000, 4000])
+        assert (labels_after(Merge(2.0), mixture)[-1] == 0) == merges
+
+    @pytest.mark.parametrize(("gap", "merges"), [(0.9, True), (1.1, False)])
+    def test_the_border_is_max_distance_in_units_of_scale(self, gap, merges):
+        states = np.array([[0.0, 0.0], [3.0 * gap, 0.0]])
+        mixture = make_mixture(states, np.zeros(2), [0, 1], 2)
+        merged = Merge(None, 1.0, scale=(3.0, 1.0))
+        assert (labels_after(merged, mixture)[1] == 0) == merges
+
+    def test_both_conditions_must_hold_where_both_are_given(self):
+        mixture = clouds([[0.0], [3.0]], [50, 50], scale=10.0)
+        assert labels_after(Merge(2.0), mixture)[-1] == 0
+        assert labels_after(Merge(2.0, 1.0), mixture)[-1] == 1
+
+    def test_chains_of_overlap_become_one_with_the_lowest_label(self):
+        mixture = clouds([[3.0], [1.5], [0.0], [40.0]], [200] * 4)
+        found = labels_after(Merge(2.0), mixture)
+        np.testing.assert_array_equal(found, np.repeat([0, 0, 0, 3], 200))
+
+    def test_means_are_weighted(self):
+        states = np.array([[0.0], [10.0], [10.0], [0.0]])
+        log_weights = np.log([0.999, 0.001, 0.001, 0.999])
+        mixture = make_mixture(states, log_weights, [0, 0, 1, 1], 2)
+        assert labels_after(Merge(None, 1.0), mixture)[-1] == 0
+
+    def test_dead_components_merge_with_nothing(self):
+        mixture = clouds([[0.0], [30.0]], [20, 20], labels=np.repeat([2, 4], 20))
+        np.testing.assert_array_equal(labels_after(Merge(), mixture), np.repeat([2, 4], 20))
+
+    def test_patience_counts_steps_in_a_row(self):
+        near, far = clouds([[0.0], [0.1]], [30, 30]), clouds([[0.0], [50.0]], [30, 30])
+        merge = Merge(2.0, patience=3)
+        memory = merge.initial_memory(6)
+        merged = []
+        for mixture in (near, near, far, near, near, near, near):
+            moved = merge(KEY, mixture.replace(memory=memory))
+            memory = moved.memory
+            merged.append(int(moved.component_indicators[-1]) == 0)
+        # After a merge both labels start a count of their own.
+        assert merged == [False, False, False, False, False, True, False]
+
+    def test_connected_components_of_a_graph(self):
+        adjacent = np.zeros((7, 7), bool)
+        for i, j in ((6, 5), (5, 4), (4, 3), (1, 2)):
+            adjacent[i, j] = adjacent[j, i] = True
+        np.testing.assert_array_equal(
+            lowest_connected(jnp.asarray(adjacent)), [0, 1, 1, 3, 3, 3, 3]
+        )
+
+
+class TestSplit:
+    def one(self, states, num_components=4, log_weights=None):
+        states = np.asarray(states, float)
+        log_weights = np.zeros(len(states)) if log_weights is None else log_weights
+        return make_mixture(states, log_weights, np.zeros(len(states)), num_components)
+
+    def test_a_diffuse_component_splits_at_the_gap(self):
+        states = np.concatenate([RNG.normal(size=70), 12 + RNG.normal(size=30)])
+        found = labels_after(Split(), self.one(states[:, None]))
+        # The lighter part takes the free label.
+        np.testing.assert_array_equal(found, np.repeat([0, 1], [70, 30]))
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_a_gaussian_and_a_uniform_do_not_split(self, seed):
+        rng = np.random.default_rng(seed)
+        for states in (rng.normal(size=(500, 1)), rng.random((500, 1)), rng.normal(size=(500, 3))):
+            assert (labels_after(Split(), self.one(states)) == 0).all()
+
+    def test_the_halves_must_be_min_distance_apart_in_units_of_scale(self):
+        states = np.concatenate([RNG.normal(size=50), 12 + RNG.normal(size=50)])[:, None]
+        assert labels_after(Split(4.0, 2.0, scale=5.0), self.one(states)).max() == 1
+        assert labels_after(Split(4.0, 3.0, scale=5.0), self.one(states)).max() == 0
+
+    def test_the_lighter_half_must_hold_min_share_of_the_mass(self):
+        states = np.concatenate([RNG.normal(size=50), 12 + RNG.normal(size=50)])[:, None]
+        log_weights = np.log(np.repeat([0.9, 0.1], 50))
+        mixture = self.one(states, log_weights=log_weights)
+        assert labels_after(Split(min_share=0.05), mixture).max() == 1
+        assert labels_after(Split(min_share=0.2), mixture).max() == 0
+
+    def test_there_are_never_more_than_m_components_and_the_clearest_splits(self):
+        parts = [RNG.normal(size=40) + centre for centre in (0, 12, 200, 260)]
+        states = np.concatenate(parts)[:, None]
+        mixture = make_mixture(states, np.zeros(160), np.repeat([0, 1], 80), 3)
+        found = labels_after(Split(), mixture)
+        assert (found[:80] == 0).all()
+        assert set(found[80:]) == {1, 2}
+        full = mixture.replace(num_components=2)
+        np.testing.assert_array_equal(labels_after(Split(), full), np.repeat([0, 1], 80))
+
+    def test_two_splits_at_once_take_different_labels(self):
+        parts = [RNG.normal(size=40) + centre for centre in (0, 12, 200, 260)]
+        mixture = make_mixture(
+            np.concatenate(parts)[:, None], np.zeros(160), np.repeat([1, 3], 80), 6
+        )
+        found = labels_after(Split(), mixture)
+        groups = [set(found[40 * i : 40 * i + 40]) for i in range(4)]
+        assert all(len(group) == 1 for group in groups)
+        assert len(set.union(*groups)) == 4
+
+    def test_two_points_split_and_one_does_not(self):
+        assert labels_after(Split(), self.one([[0.0], [0.0], [5.0], [5.0]])).max() == 1
+        assert labels_after(Split(), self.one([[5.0]] * 4)).max() == 0
+
+    def test_free_labels_go_to_the_highest_priority(self):
+        found = free_labels(
+            jnp.array([True, False, True, True, False]),
+            jnp.array([1.0, 9.0, 3.0, 2.0, 0.0]),
+            jnp.array([True, False, True, True, False]),
+        )
+        np.testing.assert_array_equal(found, [0, 1, 1, 4, 4])

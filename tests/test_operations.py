@@ -1,0 +1,140 @@
+"""Each inner operation against its plain numpy definition."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpfjax import operations
+from tests.precision import float64
+
+RNG = np.random.default_rng(0)
+SIZES = (1, 2, 31, 32, 33, 100, 1024, 1025, 33_000)
+# On either side of the number of segments up to which sums are unrolled.
+FEW_AND_MANY = (1, 3, 4, 5, 17)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_prefix_sum(n):
+    values = RNG.random(n).astype(np.float32)
+    expected = np.cumsum(values.astype(float))
+    np.testing.assert_allclose(operations.prefix_sum(jnp.asarray(values)), expected, rtol=1e-5)
+
+
+def test_prefix_sum_in_float64_and_under_vmap():
+    values = RNG.random((3, 70))
+    with float64():
+        sums = jax.vmap(operations.prefix_sum)(jnp.asarray(values))
+        assert sums.dtype == np.float64
+        np.testing.assert_allclose(sums, np.cumsum(values, axis=1), rtol=1e-13)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_count_is_exact(n):
+    ones = RNG.integers(0, 2, n)
+    np.testing.assert_array_equal(operations.count(jnp.asarray(ones, jnp.int32)), np.cumsum(ones))
+
+
+@pytest.mark.parametrize("n", [1, 7, 200])
+def test_count_starts_is_a_search_for_the_last_start(n):
+    starts = np.sort(RNG.integers(0, n + 3, n))
+    expected = np.searchsorted(starts, np.arange(n), side="right") - 1
+    found = operations.count_starts(jnp.asarray(starts, jnp.int32), n)
+    np.testing.assert_array_equal(found, expected)
+
+
+def labelled(n, m):
+    """Values with an empty segment where there is more than one."""
+    labels = RNG.integers(0, m, n)
+    labels[labels == m - 2] = m - 1
+    return RNG.normal(size=n).astype(np.float32), labels
+
+
+@pytest.mark.parametrize("m", FEW_AND_MANY)
+class TestSegments:
+    def test_sum(self, m):
+        values, labels = labelled(90, m)
+        rows = np.stack([values, values**2], axis=1)
+        expected = np.stack([rows[labels == s].sum(axis=0) for s in range(m)])
+        found = operations.segment_sum(jnp.asarray(rows), jnp.asarray(labels, jnp.int32), m)
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+    def test_labels_out_of_range_are_left_out(self, m):
+        labels = jnp.array([0, m, m - 1], jnp.int32)
+        total = operations.segment_sum(jnp.ones(3), labels, m)
+        assert float(total.sum()) == 2
+
+    def test_max_and_argmax(self, m):
+        values, labels = labelled(90, m)
+        arrays = jnp.asarray(values), jnp.asarray(labels, jnp.int32)
+        largest = operations.segment_max(*arrays, m)
+        index = np.asarray(operations.segment_argmax(*arrays, m))
+        for s in range(m):
+            members = values[labels == s]
+            if members.size:
+                assert largest[s] == members.max() == values[index[s]]
+                assert labels[index[s]] == s
+            else:
+                assert largest[s] == -np.inf
+                assert 0 <= index[s] < 90
+
+    def test_counts(self, m):
+        values, labels = labelled(90, m)
+        found = operations.segment_counts(
+            jnp.asarray(values > 0), jnp.asarray(labels, jnp.int32), m
+        )
+        np.testing.assert_array_equal(
+            found, [((labels == s) & (values > 0)).sum() for s in range(m)]
+        )
+
+    def test_log_sum_exp(self, m):
+        values, labels = labelled(90, m)
+        values = 100 * values
+        values[::7] = -np.inf
+        found = operations.segment_log_sum_exp(
+            jnp.asarray(values), jnp.asarray(labels, jnp.int32), m
+        )
+        expected = [
+            np.logaddexp.reduce(values[labels == s].astype(float), initial=-np.inf)
+            for s in range(m)
+        ]
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+    def test_order_by_segment_is_a_stable_argsort(self, m):
+        _, labels = labelled(90, m)
+        labels[::5] = m  # the empty slots, which come last
+        order = operations.order_by_segment(jnp.asarray(labels, jnp.int32), m)
+        np.testing.assert_array_equal(order, np.argsort(labels, kind="stable"))
+
+
+class TestLogSumExp:
+    def test_of_nothing_but_minus_infinity_is_minus_infinity_with_a_finite_gradient(self):
+        values = jnp.full(5, -jnp.inf)
+        assert operations.log_sum_exp(values) == -jnp.inf
+        assert np.isfinite(jax.grad(operations.log_sum_exp)(values)).all()
+
+    def test_its_gradient_is_the_softmax(self):
+        values = jnp.array([1.0, -jnp.inf, 3.0, -200.0])
+        gradient = jax.grad(operations.log_sum_exp)(values)
+        np.testing.assert_allclose(gradient, jax.nn.softmax(values), rtol=1e-6)
+
+    @pytest.mark.parametrize("scale", [1e4, -1e4])
+    def test_neither_overflows_nor_underflows(self, scale):
+        values = jnp.array([scale, scale + 1.0])
+        expected = scale + np.log(1 + np.e)
+        np.testing.assert_allclose(operations.log_sum_exp(values), expected, rtol=1e-6)
+
+    def test_lets_nan_and_infinity_through(self):
+        assert np.isnan(operations.log_sum_exp(jnp.array([0.0, jnp.nan])))
+        assert operations.log_sum_exp(jnp.array([0.0, jnp.inf])) == jnp.inf
+
+
+def test_take_is_indexing():
+    values, indices = jnp.arange(12.0).reshape(6, 2), jnp.array([5, 0, 5], jnp.int32)
+    np.testing.assert_array_equal(operations.take(values, indices), np.asarray(values)[[5, 0, 5]])
+
+
+def test_default_float_follows_the_precision():
+    assert operations.default_float() == np.float32
+    with float64():
+        assert operations.default_float() == np.float64
