@@ -99,6 +99,9 @@ class Filter(eqx.Module):
                     f"particles_per_component: {per_component} for each of {num_components}"
                     f" components needs more than num_particles, {num_particles}"
                 )
+        names = [n for move in moves if isinstance(move, AbstractMove) for n in _memory_of(move)]
+        if len(set(names)) < len(names):
+            raise ValueError(f"moves: two of them would share one memory, of {sorted(names)}")
         self.model = model
         self._moves = _tie(moves, model)
         self._initial_moves = _tie(tuple(initial_moves), model)
@@ -127,7 +130,7 @@ class Filter(eqx.Module):
                     f" {self.num_particles}"
                 )
         memory = {}
-        for move in (*self._moves, *self._initial_moves):
+        for move in self._moves:
             if isinstance(move, AbstractMove):
                 memory |= move.initial_memory(self.num_components)
         mixture = single_component(particles, self.num_components).replace(memory=memory)
@@ -394,6 +397,10 @@ def _split(key: Key[Array, ""], num: int) -> list[Key[Array, ""]]:
     chain draws alike.
     """
     return list(jax.random.split(key, num))
+
+
+def _memory_of(move: AbstractMove) -> list[str]:
+    return list(move.initial_memory(1))
 
 
 def _tie(moves: tuple[Any, ...], model: Any) -> tuple[Any, ...]:
