@@ -32,10 +32,9 @@ class GridFilterRun(eqx.Module):
         return self.probabilities @ self.grid**2 - self.means**2
 
     def mass_above(self, threshold: float) -> Float[Array, " t"]:
-        """P(x_t > threshold | y_1..y_t); a cell at the threshold counts half."""
-        above = (self.grid > threshold).astype(self.grid.dtype)
-        at = (self.grid == threshold).astype(self.grid.dtype)
-        return self.probabilities @ (above + 0.5 * at)
+        """P(x_t > threshold | y_1..y_t); the cell across the threshold counts in part."""
+        cell = self.grid[1] - self.grid[0]
+        return self.probabilities @ jnp.clip((self.grid - threshold) / cell + 0.5, 0.0, 1.0)
 
 
 @eqx.filter_jit
