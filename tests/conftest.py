@@ -4,6 +4,7 @@ import os
 import sys
 from pathlib import Path
 
+import jaxtyping
 import matplotlib
 import pytest
 from jaxtyping import install_import_hook
@@ -30,3 +31,11 @@ def data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real sequences at {folder}: set MPFJAX_DATA to the folder that has them")
     return folder
+
+
+@pytest.fixture
+def as_installed():
+    """Without the type checker, which would find some bad input before the library does."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

@@ -19,7 +19,9 @@ def members(mixture):
 
 @over_mixtures
 def test_mixture_weights_are_the_masses_and_sum_to_one(mixture):
-    np.testing.assert_allclose(mixture.log_mixture_weights, log_masses(mixture), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        mixture.log_mixture_weights, log_masses(mixture), rtol=1e-5, atol=1e-6
+    )
     assert float(mixture.mixture_weights.sum()) == pytest.approx(1, rel=1e-5)
     assert float(mixture.log_mass) == pytest.approx(0, abs=1e-5)
 

@@ -1,0 +1,144 @@
+"""Bad input to the core is an error that names the argument, before anything compiles."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax import Filter, KMeans, Merge, Propagate, Resample, Split
+from tests.user_models import TRACES, TrickyQuadraticModel
+
+MODEL = TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0)
+FILTER = mpfjax.particle_filter(MODEL, 20)
+KEY = jax.random.key(0)
+
+pytestmark = pytest.mark.usefixtures("as_installed")
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_traced():
+    """No error here may wait for the model to be traced."""
+    before = len(TRACES)
+    yield
+    assert len(TRACES) == before
+
+
+@pytest.mark.parametrize("num_particles", [0, -3, 2.5])
+def test_too_few_particles(num_particles):
+    with pytest.raises(ValueError, match="num_particles: "):
+        Filter(MODEL, [Propagate(MODEL)], num_particles)
+
+
+@pytest.mark.parametrize("num_components", [0, -1])
+def test_too_few_components(num_components):
+    with pytest.raises(ValueError, match="num_components: "):
+        Filter(MODEL, [Propagate(MODEL)], 10, num_components)
+
+
+def test_fewer_particles_than_components():
+    with pytest.raises(ValueError, match="num_particles: 3 is less than num_components, 4"):
+        mpfjax.mixture_particle_filter(MODEL, 3, 4)
+
+
+def test_fewer_slots_than_a_fixed_number_each_needs():
+    with pytest.raises(ValueError, match="particles_per_component: 20 for each of 10"):
+        mpfjax.mixture_particle_filter(MODEL, 199, 10, particles_per_component=20)
+
+
+def test_no_moves():
+    with pytest.raises(ValueError, match="moves: "):
+        Filter(MODEL, [], 10)
+
+
+@pytest.mark.parametrize(
+    ("move", "options", "name"),
+    [
+        (Resample, {"scheme": "optimal"}, "scheme"),
+        (Resample, {"ess_threshold": 1.5}, "ess_threshold"),
+        (Resample, {"ess_threshold": -0.1}, "ess_threshold"),
+        (Resample, {"particles_per_component": 0}, "particles_per_component"),
+        (KMeans, {"num_iterations": 0}, "num_iterations"),
+        (KMeans, {"scale": 0.0}, "scale"),
+        (KMeans, {"scale": [1.0, -1.0]}, "scale"),
+        (Merge, {"max_deviations": None}, "max_deviations, max_distance"),
+        (Merge, {"max_deviations": 0.0}, "max_deviations"),
+        (Merge, {"max_distance": -1.0}, "max_distance"),
+        (Merge, {"patience": 0}, "patience"),
+        (Split, {"min_deviations": -1.0}, "min_deviations"),
+        (Split, {"min_distance": -1.0}, "min_distance"),
+        (Split, {"min_share": 0.6}, "min_share"),
+        (Split, {"num_iterations": 0}, "num_iterations"),
+    ],
+)
+def test_an_option_of_a_move_that_is_out_of_range(move, options, name):
+    with pytest.raises(ValueError, match=f"{name}: "):
+        move(**options)
+
+
+def test_as_many_units_as_features():
+    filter = mpfjax.mixture_particle_filter(MODEL, 20, 2, kmeans=KMeans(scale=[1.0, 2.0]))
+    with pytest.raises(ValueError, match="scale: 2 units for 1 features"):
+        filter.init(KEY)
+
+
+@pytest.mark.parametrize(
+    ("observations", "message"),
+    [
+        (jnp.zeros((0,)), "observations: the leading axis t is empty"),
+        (jnp.array(1.0), "observations: shapes"),
+        ({"a": jnp.zeros(3), "b": jnp.zeros(4)}, "observations: shapes"),
+        ({}, "observations: there are none"),
+        (np.array([0.0, np.nan, 1.0]), "observations: NaN or infinite at index 1"),
+        (np.array([0.0, 1.0, -np.inf]), "observations: NaN or infinite at index 2"),
+    ],
+)
+def test_observations_that_cannot_be_run(observations, message):
+    with pytest.raises(ValueError, match=message):
+        mpfjax.run_filter(KEY, FILTER, observations)
+    with pytest.raises(ValueError, match=message):
+        mpfjax.monte_carlo(jax.random.split(KEY, 2), FILTER, observations)
+
+
+def test_an_unknown_way_with_missing_observations():
+    with pytest.raises(ValueError, match="missing: 'ignore'"):
+        mpfjax.run_filter(KEY, FILTER, jnp.zeros(3), missing="ignore")
+
+
+def test_keys_that_are_not_one_each_run():
+    with pytest.raises(ValueError, match="keys: shape"):
+        mpfjax.monte_carlo(KEY, FILTER, jnp.zeros(3))
+    with pytest.raises(ValueError, match="keys: shape"):
+        mpfjax.monte_carlo(jax.random.split(KEY, 2)[:0], FILTER, jnp.zeros(3))
+
+
+class TestAModelThatIsNotOne:
+    def test_a_missing_method(self):
+        class Half:
+            def sample_initial(self, key, num_particles):
+                return jnp.zeros(num_particles)
+
+        with pytest.raises(ValueError, match="model: Half defines no sample_transition"):
+            mpfjax.particle_filter(Half(), 10)
+
+    def test_states_without_an_axis_of_particles(self):
+        class Wrong(mpfjax.QuadraticModel):
+            def sample_initial(self, key, num_particles):
+                return jnp.zeros((3, num_particles))
+
+        with pytest.raises(ValueError, match=r"model: Wrong.sample_initial returned a leaf"):
+            mpfjax.particle_filter(Wrong(), 10).init(KEY)
+
+    def test_a_likelihood_that_is_not_one_number_each_particle(self):
+        class Wrong(mpfjax.QuadraticModel):
+            def log_likelihood(self, observation, states):
+                return jnp.zeros((states.shape[0], 1))
+
+        with pytest.raises(ValueError, match=r"model: Wrong.log_likelihood returned shape \(10, 1"):
+            mpfjax.run_filter(KEY, mpfjax.particle_filter(Wrong(), 10), jnp.zeros(3))
+
+
+def test_observations_of_the_wrong_shape():
+    filter = mpfjax.particle_filter(mpfjax.QuadraticModel(), 10)
+    with pytest.raises(ValueError, match=r"observation: shape \(2,\)"):
+        mpfjax.run_filter(KEY, filter, jnp.zeros((3, 2)))

@@ -1,0 +1,128 @@
+"""The references themselves, against computations that share nothing with them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+import mpfjax
+from mpfjax.exact import grid_filter, kalman_filter
+
+OBSERVATIONS = np.array([[0.4, -0.2], [1.0, 0.3], [0.1, 0.8]])
+MODEL = {
+    "A": np.array([[1.0, 0.5], [-0.2, 0.9]]),
+    "Q": np.array([[0.3, 0.1], [0.1, 0.2]]),
+    "H": np.array([[1.0, 0.0], [0.5, 1.0]]),
+    "R": np.array([[0.3, 0.1], [0.1, 0.4]]),
+    "m0": np.array([0.5, -1.0]),
+    "P0": np.array([[1.0, 0.2], [0.2, 0.5]]),
+}
+SCALAR = {"A": [[0.8]], "Q": [[0.2]], "H": [[1.5]], "R": [[0.3]], "m0": [0.4], "P0": [[0.6]]}
+
+
+def joint_gaussian(A, Q, H, R, m0, P0, length):
+    """Mean and covariance of (x_1..x_T, y_1..y_T), from the definition of the model."""
+    A, Q, H, R, m0, P0 = (np.asarray(part, float) for part in (A, Q, H, R, m0, P0))
+    d, p = len(m0), len(H)
+    # (x_0, w_1..w_T, v_1..v_T), independent, to (x_1..x_T, y_1..y_T).
+    source = scipy.linalg.block_diag(P0, *[Q] * length, *[R] * length)
+    matrix = np.zeros((length * (d + p), len(source)))
+    for t in range(length):
+        rows = slice(t * d, (t + 1) * d)
+        for s in range(t + 2):
+            matrix[rows, s * d : (s + 1) * d] = np.linalg.matrix_power(A, t + 1 - s if s else t + 1)
+        seen = slice(length * d + t * p, length * d + (t + 1) * p)
+        matrix[seen] = H @ matrix[rows]
+        noise = d * (length + 1) + t * p
+        matrix[seen, noise : noise + p] = np.eye(p)
+    mean = matrix[:, :d] @ m0
+    return mean, matrix @ source @ matrix.T
+
+
+@pytest.mark.parametrize("parts", [MODEL, SCALAR], ids=["2d", "1d"])
+def test_kalman_filter_conditions_the_joint_gaussian(parts):
+    d, p = len(parts["m0"]), len(parts["H"])
+    observations = OBSERVATIONS[:, :p]
+    run = kalman_filter(mpfjax.LinearGaussianModel(**parts), jnp.asarray(observations))
+    mean, covariance = joint_gaussian(**parts, length=3)
+    seen = mean[3 * d :], covariance[3 * d :, 3 * d :]
+    expected = scipy.stats.multivariate_normal(*seen).logpdf(observations.ravel())
+    np.testing.assert_allclose(run.log_marginal_likelihood, expected, rtol=1e-4)
+    np.testing.assert_allclose(run.log_likelihood_increments.sum(), expected, rtol=1e-4)
+    for t in range(3):
+        x, y = slice(t * d, (t + 1) * d), slice(3 * d, 3 * d + (t + 1) * p)
+        gain = covariance[x, y] @ np.linalg.inv(covariance[y, y])
+        residual = observations.ravel()[: (t + 1) * p] - mean[y]
+        np.testing.assert_allclose(run.means[t], mean[x] + gain @ residual, rtol=1e-3, atol=1e-4)
+        posterior = covariance[x, x] - gain @ covariance[y, x]
+        np.testing.assert_allclose(run.covariances[t], posterior, rtol=1e-3, atol=1e-4)
+
+
+def test_grid_filter_agrees_with_the_kalman_filter():
+    model = mpfjax.LinearGaussianModel(**SCALAR)
+    observations = jnp.asarray(OBSERVATIONS[:, :1])
+    grid = jnp.linspace(-8.0, 8.0, 1601)
+    log_initial = jnp.asarray(scipy.stats.norm(0.4, np.sqrt(0.6)).logpdf(grid), jnp.float32)
+    run = grid_filter(model, observations, grid, log_initial, state_shape=(1,))
+    exact = kalman_filter(model, observations)
+    increments = exact.log_likelihood_increments
+    np.testing.assert_allclose(run.log_likelihood_increments, increments, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(run.means, exact.means[:, 0], atol=1e-3)
+    np.testing.assert_allclose(run.variances, exact.covariances[:, 0, 0], atol=1e-3)
+    expected = scipy.stats.norm(exact.means[:, 0], np.sqrt(exact.covariances[:, 0, 0])).sf(0.3)
+    np.testing.assert_allclose(run.mass_above(0.3), expected, atol=1e-3)
+
+
+def test_grid_filter_agrees_with_quadrature_on_the_quadratic_model():
+    """Two steps of eqs. 1 and 2 by sums in numpy, in double precision."""
+    grid = np.linspace(-5, 5, 2001)
+    cell, normal = grid[1] - grid[0], scipy.stats.norm.pdf
+    density = np.where(np.abs(grid) <= 2, 0.25, 0.0)
+    density /= density.sum() * cell
+    log_evidence = 0.0
+    for y in (1.2, 0.7):
+        predicted = normal(grid[:, None], grid[None], 0.3) @ density * cell
+        joint = predicted * normal(y, grid**2, 0.5)
+        evidence = joint.sum() * cell
+        density, log_evidence = joint / evidence, log_evidence + np.log(evidence)
+    model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
+    run = grid_filter(model, jnp.array([1.2, 0.7]), jnp.asarray(grid))
+    np.testing.assert_allclose(run.log_marginal_likelihood, log_evidence, rtol=1e-4)
+    np.testing.assert_allclose(run.probabilities[-1] / cell, density, atol=1e-3)
+
+
+def test_the_modes_of_the_quadratic_model_have_equal_mass():
+    model = mpfjax.QuadraticModel(0.1, 0.1)
+    observations = (2 * jnp.sin(jnp.arange(1.0, 30.0) / 8)) ** 2
+    run = grid_filter(model, observations, jnp.linspace(-4.0, 4.0, 801))
+    np.testing.assert_allclose(run.mass_above(0.0), 0.5, atol=1e-4)
+
+
+def test_both_are_differentiable():
+    def by_kalman(variance):
+        parts = {name: jnp.asarray(part) for name, part in SCALAR.items()}
+        model = mpfjax.LinearGaussianModel(**(parts | {"R": variance.reshape(1, 1)}))
+        return kalman_filter(model, jnp.asarray(OBSERVATIONS[:, :1])).log_marginal_likelihood
+
+    step = 1e-2
+    slope = (by_kalman(jnp.array(0.3 + step)) - by_kalman(jnp.array(0.3 - step))) / (2 * step)
+    np.testing.assert_allclose(jax.grad(by_kalman)(jnp.array(0.3)), slope, rtol=1e-2)
+
+    def by_grid(sigma):
+        model = mpfjax.QuadraticModel(0.3, sigma, -2.0, 2.0)
+        grid = jnp.linspace(-4.0, 4.0, 401)
+        return grid_filter(model, jnp.array([1.2, 0.7]), grid).log_marginal_likelihood
+
+    slope = (by_grid(jnp.array(0.5 + step)) - by_grid(jnp.array(0.5 - step))) / (2 * step)
+    np.testing.assert_allclose(jax.grad(by_grid)(jnp.array(0.5)), slope, rtol=1e-2)
+
+
+def test_bad_input_is_named():
+    model = mpfjax.LinearGaussianModel(**MODEL)
+    with pytest.raises(ValueError, match=r"observations: shape \(3, 1\) is not \(t, 2\)"):
+        kalman_filter(model, jnp.zeros((3, 1)))
+    with pytest.raises(ValueError, match="grid: shape"):
+        grid_filter(mpfjax.QuadraticModel(), jnp.zeros(2), jnp.zeros(1))
+    with pytest.raises(ValueError, match="model: LinearGaussianModel defines no log_initial"):
+        grid_filter(model, jnp.zeros(2), jnp.linspace(-1.0, 1.0, 9))
