@@ -60,13 +60,8 @@ def segment_sum(
     """The sum of the values in each segment; a label outside [0, num_segments) is left out."""
     if num_segments > _FEW_SEGMENTS:
         return jax.ops.segment_sum(values, segments, num_segments)
-    zero = jnp.zeros((), values.dtype)
-    return jnp.stack(
-        [
-            jnp.sum(jnp.where(_like(segments == m, values), values, zero), axis=0)
-            for m in range(num_segments)
-        ]
-    )
+    member = _members(segments, num_segments, values.ndim - 1)
+    return jnp.sum(jnp.where(member, values[None], jnp.zeros((), values.dtype)), axis=1)
 
 
 def segment_max(
@@ -75,8 +70,8 @@ def segment_max(
     """The largest value in each segment, -inf in an empty one."""
     if num_segments > _FEW_SEGMENTS:
         return jax.ops.segment_max(values, segments, num_segments)
-    low = jnp.array(-jnp.inf, values.dtype)
-    return jnp.stack([jnp.max(jnp.where(segments == m, values, low)) for m in range(num_segments)])
+    member = _members(segments, num_segments)
+    return jnp.max(jnp.where(member, values[None], jnp.array(-jnp.inf, values.dtype)), axis=1)
 
 
 def segment_counts(
@@ -109,8 +104,8 @@ def segment_argmax(
     n = values.shape[0]
     if num_segments <= _FEW_SEGMENTS:
         low = jnp.array(-jnp.inf, values.dtype)
-        rows = [jnp.argmax(jnp.where(segments == m, values, low)) for m in range(num_segments)]
-        return jnp.stack(rows).astype(jnp.int32)
+        chosen = jnp.where(_members(segments, num_segments), values[None], low)
+        return jnp.argmax(chosen, axis=1).astype(jnp.int32)
     is_largest = values >= take(segment_max(values, segments, num_segments), segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
     return jnp.clip(jax.ops.segment_min(index, segments, num_segments), 0, n - 1)
@@ -147,5 +142,10 @@ def default_float() -> jnp.dtype:
     return jnp.result_type(float)
 
 
-def _like(mask: Bool[Array, " n"], values: Array) -> Bool[Array, "n ..."]:
-    return mask.reshape(mask.shape + (1,) * (values.ndim - 1))
+def _members(
+    segments: Int[Array, " n"], num_segments: int, trailing: int = 0
+) -> Bool[Array, "num_segments n ..."]:
+    """Who belongs to which segment; XLA fuses the mask into its reduction and never stores it."""
+    labels = jnp.arange(num_segments, dtype=segments.dtype)
+    member = segments[None] == labels[:, None]
+    return member.reshape(member.shape + (1,) * trailing)
