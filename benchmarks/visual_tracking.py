@@ -21,24 +21,22 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
 from mpfjax.metrics.coverage import coverage, covers
+from mpfjax.plotting import draw_contact_sheet
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import drawing, frames
 from mpfjax.vision.colour_model import BoxState, ColourModel
+from mpfjax.vision.object_moves import ObjectExclusion, PruneHypotheses
 from mpfjax.vision.scenes import football_scene
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 NUM_PARTICLES, MAX_COMPONENTS, PARTICLES_PER_COMPONENT = 200, 10, 20
 NAMES = {"pf": "Particle filter", "mpf": "Mixture particle filter"}
-KEY_FRAMES = 5
+KEY_FRAMES = 4
 
 
 class Source(NamedTuple):
@@ -84,29 +82,38 @@ def paper_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Filt
 
 
 def default_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Filter]:
-    """The best recipe found for real video: every box keeps its own reference."""
+    """The best recipe found for real video.
+
+    Every particle carries which box it was started from and is compared with that one alone, so
+    that the components of an object are rival hypotheses about it: only those merge, a component
+    splits where they part, and those that came to nothing are pruned. Objects exclude each other.
+    """
+    size = boxes[:, 2:].mean(axis=0)
     width, height = boxes[:, 2], boxes[:, 3]
-    still = np.full(len(boxes), 0.02)
+    still = np.full(len(boxes), 0.01)
     model = ColourModel.from_frame(
         frame,
         boxes,
         num_bins=30,
         sigma=0.15,
-        deviations=np.stack([0.25 * width, 0.08 * height, still, still], axis=1),
-        num_parts=3,
+        deviations=np.stack([0.4 * width, 0.08 * height, still, still], axis=1),
+        num_parts=5,
         weigh_colours=True,
     )
     # A unit of 1e-5 for the reference holds particles of different references apart.
     apart: dict[str, Any] = {
         "features": _centre_and_reference,
-        "scale": (*boxes[:, 2:].mean(axis=0), 1e-5),
+        "scale": (*size, 1e-5),
     }
     mixture = mpfjax.Filter(
         model,
         moves=[
             mpfjax.Resample(particles_per_component=PARTICLES_PER_COMPONENT),
             mpfjax.Propagate(model),
+            ObjectExclusion(strength=3.0, radius=0.5, scale=(float(size[0]), float(size[1]))),
             mpfjax.Merge(None, 0.25, patience=10, **apart),
+            PruneHypotheses(least_share=1e-6),
+            mpfjax.Split(4.0, 0.5, min_share=0.15, **apart),
         ],
         num_particles=NUM_PARTICLES,
         num_components=MAX_COMPONENTS,
@@ -218,17 +225,25 @@ def _milliseconds(seconds: list[float]) -> float:
 # --- pictures ---------------------------------------------------------------------------------
 
 
-def annotate(still: np.ndarray, snapshot: Snapshot, zoom: int) -> np.ndarray:
-    """A frame, enlarged, with one run's particles and mean boxes in their components' colours."""
-    canvas = still.repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
+def annotate(
+    still: np.ndarray,
+    snapshot: Snapshot,
+    zoom: int,
+    crop: tuple[slice, slice] = (slice(None), slice(None)),
+) -> np.ndarray:
+    """A frame, cropped and enlarged, with one run's particles and mean boxes.
+
+    Both are drawn in the colour of their component.
+    """
+    canvas = still[crop].repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
+    corner = np.array([crop[1].start or 0, crop[0].start or 0], float)
     labels, palette = snapshot.labels[0], drawing.PALETTE
-    filled = labels >= 0
-    drawing.draw_points(
-        canvas, zoom * snapshot.points[0][filled], palette[labels[filled] % len(palette)]
-    )
     for m in np.flatnonzero(snapshot.active[0]):
-        box = box_files.top_left(snapshot.means[0][m][None])[0]
+        box = box_files.top_left(snapshot.means[0][m][None])[0] - [*corner, 0, 0]
         drawing.draw_box(canvas, zoom * box, palette[m % len(palette)], thickness=2)
+    filled = labels >= 0
+    points = zoom * (snapshot.points[0][filled] - corner)
+    drawing.draw_points(canvas, points, palette[labels[filled] % len(palette)], 0.9 * zoom)
     return np.clip(canvas, 0, 255).astype(np.uint8)
 
 
@@ -244,25 +259,35 @@ def _panels(source: Source, tracked: dict[str, list[Snapshot]]) -> Iterator[np.n
 
 
 def write_contact_sheet(path: Path, source: Source, tracked: dict[str, list[Snapshot]]) -> None:
-    """Key frames in the manner of the paper's figure 3: a row for each filter."""
+    """Key frames in the manner of the paper's figure 3: a row for each filter, cropped to both."""
     length = min(len(snapshots) for snapshots in tracked.values())
     chosen = np.unique(np.linspace(0, length - 1, KEY_FRAMES).round().astype(int))
-    stills = {t: still for t, still in zip(range(length), source.read(), strict=False)
-              if t in chosen}  # fmt: skip
-    height, width, _ = stills[0].shape
-    panel = 3.2
-    figure, axes = plt.subplots(
-        len(tracked), len(chosen), squeeze=False, layout="constrained",
-        figsize=(panel * len(chosen), (panel * height / width + 0.25) * len(tracked)),
-    )  # fmt: skip
-    for row, (name, snapshots) in zip(axes, tracked.items(), strict=True):
-        for axis, t in zip(row, chosen, strict=True):
-            axis.imshow(annotate(stills[t], snapshots[t], 2 * _zoom(stills[t])))
-            axis.set(xticks=[], yticks=[])
-            axis.set_title(f"frame {source.first + t}", fontsize=11)
-        row[0].set_ylabel(NAMES[name], fontsize=12)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    stills = {
+        t: still for t, still in zip(range(length), source.read(), strict=False) if t in chosen
+    }
+    shown = [snapshots[t] for snapshots in tracked.values() for t in chosen]
+    crop = _region(shown, source.boxes, stills[0].shape)
+    zoom = max(1, round(900 / (crop[1].stop - crop[1].start)))
+    rows = [
+        (
+            NAMES[name].replace(" ", "\n", 1),
+            [annotate(stills[t], snapshots[t], zoom, crop) for t in chosen],
+        )
+        for name, snapshots in tracked.items()
+    ]
+    titles = [f"frame {source.first + t}" for t in chosen]
+    draw_contact_sheet(rows, titles).savefig(path, dpi=110)
+
+
+def _region(shown: list[Snapshot], boxes: np.ndarray, shape: tuple) -> tuple[slice, slice]:
+    """The rows and columns of the frame in which anything happens, with room around."""
+    points = np.concatenate([s.points[0][s.labels[0] >= 0] for s in shown])
+    centres = np.concatenate([points, box_files.centred(boxes)[:, :2]])
+    margin = 1.2 * boxes[:, 2:].max(axis=0)
+    low, high = centres.min(axis=0) - margin, centres.max(axis=0) + margin
+    (left, top), (right, bottom) = low.astype(int), high.astype(int)
+    height, width, _ = shape
+    return slice(max(top, 0), min(bottom, height)), slice(max(left, 0), min(right, width))
 
 
 def _zoom(still: np.ndarray) -> int:

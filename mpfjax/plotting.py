@@ -122,3 +122,27 @@ def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str])
     mass.set_ylim(bottom=0)
     score.legend(loc="lower right", fontsize=8)
     return figure
+
+
+def draw_contact_sheet(
+    rows: Sequence[tuple[str, Sequence[np.ndarray]]], titles: Sequence[str]
+) -> Figure:
+    """Figure 3 of Vermaak et al. (2003): a named row of pictures for each filter.
+
+    `rows` holds a name and as many RGB pictures, all of one size, as there are `titles`, which
+    stand above every picture.
+    """
+    height, width, _ = rows[0][1][0].shape
+    panel = 3.2
+    figure = Figure(
+        figsize=(panel * len(titles), (panel * height / width + 0.3) * len(rows)),
+        layout="constrained",
+    )
+    axes = figure.subplots(len(rows), len(titles), squeeze=False)
+    for row, (name, pictures) in zip(axes, rows, strict=True):
+        row[0].set_ylabel(name, fontsize=13)
+        for axis, picture, title in zip(row, pictures, titles, strict=True):
+            axis.imshow(picture)
+            axis.set(xticks=[], yticks=[])
+            axis.set_title(title, fontsize=12)
+    return figure

@@ -11,5 +11,7 @@ from mpfjax.vision.frames import write_video as write_video
 from mpfjax.vision.histograms import IntegralHistogram as IntegralHistogram
 from mpfjax.vision.histograms import bhattacharyya as bhattacharyya
 from mpfjax.vision.histograms import integral_histogram as integral_histogram
+from mpfjax.vision.object_moves import ObjectExclusion as ObjectExclusion
+from mpfjax.vision.object_moves import PruneHypotheses as PruneHypotheses
 from mpfjax.vision.scenes import Scene as Scene
 from mpfjax.vision.scenes import football_scene as football_scene

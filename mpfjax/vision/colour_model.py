@@ -38,8 +38,9 @@ class ColourModel(AbstractStateSpaceModel):
     normalised histograms of the colours c = R, G, B in the hypothesised and in the reference box.
     Two extensions, both off in the paper:
 
-    - several references: r, which one a particle is taken for, is part of the state and never
-      changes, so that the recursion stays exact; x_0 is spread equally over all of them;
+    - several references: r, which one a particle is taken for, is part of the state, so that the
+      recursion stays exact; x_0 is spread equally over all of them, and r either never changes or
+      is drawn anew with a small probability in every frame, for objects whose looks do not last;
     - boxes cut into bands from top to bottom, whose B² are averaged, so that a shirt is not taken
       for trousers; and colours weighted by how much more of them a reference box holds than its
       surround does, so that grass within a box counts for little.
@@ -53,6 +54,7 @@ class ColourModel(AbstractStateSpaceModel):
     - `deviations`, `initial_deviations`: of the random walk in a frame and of x_0, (k, 4), in
       pixels for x and y and in units of the reference box for s_x and s_y.
     - `sigma`: σ, the width of the likelihood.
+    - `switch_probability`: with which r is drawn anew, from all references, in a frame.
     - `wide_counts`: count pixels in 32 bits; see `integral_histogram`.
     """
 
@@ -62,6 +64,7 @@ class ColourModel(AbstractStateSpaceModel):
     deviations: Float[Array, "k 4"]
     initial_deviations: Float[Array, "k 4"]
     sigma: Float[Array, ""]
+    switch_probability: float = eqx.field(static=True, default=0.0)
     wide_counts: bool = eqx.field(static=True, default=False)
 
     @classmethod
@@ -76,6 +79,7 @@ class ColourModel(AbstractStateSpaceModel):
         num_parts: int = 1,
         weigh_colours: bool = False,
         share_reference: bool = False,
+        switch_probability: float = 0.0,
     ) -> "ColourModel":
         """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
 
@@ -87,9 +91,10 @@ class ColourModel(AbstractStateSpaceModel):
           of twice the width and height.
         - `share_reference`: all particles are taken for one reference, the mean of all boxes, as
           in the paper, which has one B_ref for all players.
+        - `switch_probability`: with which a particle's reference is drawn anew in a frame.
 
-        Raises `ValueError` naming the argument for a box of no area or outside the frame, and for
-        a number that is not positive.
+        Raises `ValueError` naming the argument for a box of no area or outside the frame, for a
+        number that is not positive, and for a probability outside [0, 1].
         """
         boxes = np.asarray(boxes, float).reshape(-1, 4)
         if len(boxes) == 0:
@@ -100,6 +105,8 @@ class ColourModel(AbstractStateSpaceModel):
             raise ValueError(f"sigma: {sigma} is not positive")
         if num_parts < 1:
             raise ValueError(f"num_parts: {num_parts} is less than 1")
+        if not 0 <= switch_probability <= 1:
+            raise ValueError(f"switch_probability: {switch_probability} is not in [0, 1]")
         if deviations.shape not in ((4,), (len(boxes), 4)) or not np.all(deviations > 0):
             raise ValueError(f"deviations: {deviations} are not four positive numbers a box")
         # Room for boxes to grow to twice the area of the largest reference.
@@ -119,6 +126,7 @@ class ColourModel(AbstractStateSpaceModel):
             deviations=steps,
             initial_deviations=steps,
             sigma=jnp.asarray(sigma, float),
+            switch_probability=switch_probability,
             wide_counts=wide_counts,
         )
 
@@ -135,18 +143,29 @@ class ColourModel(AbstractStateSpaceModel):
         return BoxState(centre[reference] + self.initial_deviations[reference] * noise, reference)
 
     def sample_transition(self, key: Key[Array, ""], states: BoxState) -> BoxState:
-        """x_t ~ N(x_{t-1}, diag σ²); the reference stays."""
-        noise = jax.random.normal(key, states.box.shape, states.box.dtype)
-        return BoxState(states.box + self.deviations[states.reference] * noise, states.reference)
+        """x_t ~ N(x_{t-1}, diag σ²), and r drawn anew with the switch probability."""
+        key_noise, key_switch, key_reference = jax.random.split(key, 3)
+        reference = states.reference
+        if self.switch_probability > 0:
+            k = self.reference_boxes.shape[0]
+            switches = jax.random.bernoulli(key_switch, self.switch_probability, reference.shape)
+            drawn = jax.random.randint(key_reference, reference.shape, 0, k, reference.dtype)
+            reference = jnp.where(switches, drawn, reference)
+        noise = jax.random.normal(key_noise, states.box.shape, states.box.dtype)
+        return BoxState(states.box + self.deviations[states.reference] * noise, reference)
 
     def log_transition(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
-        """log N(x_t; x_{t-1}, diag σ²), -inf where the reference has changed."""
+        """log N(x_t; x_{t-1}, diag σ²) + log P(r_t | r_{t-1}), -inf where r cannot have changed."""
         deviations = self.deviations[previous_states.reference]
         residuals = (states.box - previous_states.box) / deviations
         log_density = jnp.sum(
             -0.5 * residuals**2 - jnp.log(deviations) - 0.5 * jnp.log(2 * jnp.pi), axis=1
         )
-        return jnp.where(states.reference == previous_states.reference, log_density, -jnp.inf)
+        drawn = self.switch_probability / self.reference_boxes.shape[0]
+        stays = states.reference == previous_states.reference
+        return log_density + jnp.log(
+            jnp.where(stays, 1 - self.switch_probability + drawn, drawn).astype(log_density.dtype)
+        )
 
     def log_likelihood(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState

@@ -132,6 +132,17 @@ def test_the_transition_draws_from_its_own_density(frame):
     assert (model.log_transition(other, before) == -jnp.inf).all()
 
 
+def test_references_switch_as_often_as_they_should(frame):
+    model = model_of(frame, switch_probability=0.3)
+    before = BoxState(jnp.ones((20000, 4)), jnp.zeros(20000, jnp.int32))
+    after = model.sample_transition(jax.random.key(0), before)
+    assert abs(float(after.reference.mean()) - 0.15) < 5 * np.sqrt(0.15 * 0.85 / 20000)
+    one = states((30, 30, 1, 1, 0), (30, 30, 1, 1, 0))
+    moved = BoxState(one.box, jnp.array([0, 1], jnp.int32))
+    stayed, switched = np.exp(np.asarray(model.log_transition(moved, one)))
+    assert stayed / switched == pytest.approx(0.85 / 0.15, rel=1e-4)
+
+
 def test_deviations_of_each_box_are_used(frame):
     rows = np.stack([DEVIATIONS, 3 * DEVIATIONS])
     model = model_of(frame, deviations=rows)
@@ -176,6 +187,7 @@ def test_it_runs_through_a_filter_and_keeps_both_boxes(frame):
         ("boxes: .* outside", [[500, 10, 5, 5]], {}),
         ("sigma: 0", BOXES, {"sigma": 0.0}),
         ("num_parts: 0", BOXES, {"num_parts": 0}),
+        ("switch_probability: 2", BOXES, {"switch_probability": 2.0}),
         ("num_bins: 0", BOXES, {"num_bins": 0}),
         ("deviations: ", BOXES, {"deviations": np.ones(3)}),
         ("deviations: ", BOXES, {"deviations": np.array([1.0, 1, 1, 0])}),

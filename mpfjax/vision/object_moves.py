@@ -1,0 +1,117 @@
+"""Moves for mixtures whose components stand for objects, told apart by their references."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractPropagation
+
+
+class ObjectExclusion(AbstractPropagation):
+    """Lower the weights of particles near where the other objects probably are.
+
+    log-weight_i -= strength · Σ_m s_m exp(-|x_i - μ_m|² / (2 radius²)) over the components m of
+    other objects, μ_m the mean of the propagated particles and s_m the component's share of its
+    object's mass. The object of a component is the reference that its particles carry
+    (`BoxState`); components of one object are rival hypotheses about it, and do not push each
+    other. Distances are in units of `scale`, the width and height of a box in pixels.
+
+    This is NOT part of the exact recursion: it makes objects interact through their means, as a
+    Markov random field would through their states, and biases the marginal likelihood
+    (`approximate` is true). Use it after `Propagate`, where look-alikes cross.
+
+    Raises `ValueError` for a strength, radius or scale that is not positive.
+    """
+
+    strength: float = eqx.field(static=True, default=3.0)
+    radius: float = eqx.field(static=True, default=0.5)
+    scale: tuple[float, float] = eqx.field(static=True, default=(1.0, 1.0))
+
+    def __check_init__(self) -> None:
+        for name, value in (("strength", self.strength), ("radius", self.radius)):
+            if not value > 0:
+                raise ValueError(f"{name}: {value} is not positive")
+        if not all(unit > 0 for unit in self.scale):
+            raise ValueError(f"scale: {self.scale} is not positive")
+
+    @property
+    def approximate(self) -> bool:
+        """True: an interaction between objects, on top of the model."""
+        return True
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Weigh down every particle by the other objects' nearness."""
+        del key, observation
+        states, owners = mixture.particles, _objects(mixture)
+        centres = states.box[:, :2] / jnp.array([self.scale], states.box.dtype)
+        filled = mixture.occupied.astype(centres.dtype)[:, None]
+        counts = jnp.maximum(mixture.component_sums(filled), 1.0)
+        means = mixture.component_sums(filled * centres) / counts
+        shares = jnp.exp(_log_shares(mixture, owners)).astype(centres.dtype)
+        squares = jnp.sum((centres[:, None] - means[None]) ** 2, axis=-1)
+        nearness = shares[None] * jnp.exp(-squares / (2 * self.radius**2))
+        others = states.reference[:, None] != owners[None]
+        total = jnp.sum(jnp.where(others, nearness, 0.0), axis=1)
+        penalty = self.strength * total.astype(mixture.log_weights.dtype)
+        return mixture.replace(log_weights=mixture.log_weights - penalty)
+
+
+class PruneHypotheses(AbstractPropagation):
+    """Empty the components that have become hopeless hypotheses about their object.
+
+    A component dies where its mass is less than `least_share` of the heaviest component's with
+    the same reference. Within one object the mixture weights are the posterior odds of its
+    hypotheses (Vermaak et al. 2003, eq. 4), so that what is thrown away is at most that share of
+    each object's mass, a component at a time: an approximation, with a bound that you choose.
+    Use it with `Split`, so that hypotheses that came to nothing do not linger.
+
+    Raises `ValueError` for a share outside (0, 1).
+    """
+
+    least_share: float = eqx.field(static=True, default=1e-6)
+
+    def __check_init__(self) -> None:
+        if not 0 < self.least_share < 1:
+            raise ValueError(f"least_share: {self.least_share} is not in (0, 1)")
+
+    @property
+    def approximate(self) -> bool:
+        """True: a little mass is thrown away."""
+        return True
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Take all weight from the hopeless components."""
+        del key, observation
+        masses = mixture.log_mixture_weights
+        rivals = _same_object(mixture, _objects(mixture))
+        heaviest = jnp.max(jnp.where(rivals, masses[None], -jnp.inf), axis=1)
+        hopeless = mixture.active & (masses < heaviest + jnp.log(self.least_share))
+        dies = hopeless[mixture.component_indicators]
+        return mixture.replace(log_weights=jnp.where(dies, -jnp.inf, mixture.log_weights))
+
+
+def _objects(mixture: ParticleMixture) -> Int[Array, " m"]:
+    """The reference that each component's particles carry, the nearest to their mean."""
+    reference = mixture.particles.reference.astype(mixture.log_weights.dtype)
+    return jnp.round(mixture.component_averages(reference)).astype(jnp.int32)
+
+
+def _same_object(mixture: ParticleMixture, owners: Int[Array, " m"]) -> Bool[Array, "m m"]:
+    alive = mixture.active
+    return (owners[:, None] == owners[None]) & alive[:, None] & alive[None]
+
+
+def _log_shares(mixture: ParticleMixture, owners: Int[Array, " m"]) -> Float[Array, " m"]:
+    """log of each component's share of the mass of its object, -inf for a dead one."""
+    masses = mixture.log_mixture_weights
+    rivals = jnp.where(_same_object(mixture, owners), masses[None], -jnp.inf)
+    heaviest = jnp.max(rivals, axis=1)
+    shift = jnp.where(jnp.isfinite(heaviest), heaviest, 0.0)
+    total = jnp.sum(jnp.exp(rivals - shift[:, None]), axis=1)
+    log_total = shift + jnp.log(jnp.where(total > 0, total, 1.0))
+    return jnp.where(mixture.active, masses - log_total, -jnp.inf)
