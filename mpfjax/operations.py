@@ -132,6 +132,26 @@ def order_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array
     return jax.lax.sort(segments.astype(jnp.int32) * n + index) % n
 
 
+def cholesky(matrices: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
+    """Lower triangular factors F with F Fᵀ = matrix, for positive semidefinite matrices.
+
+    A direction of no variance gets a column of zeros. Batched LAPACK calls on thousands of tiny
+    matrices cost far more than their arithmetic; here all of them go through each of the d
+    columns at once.
+    """
+    d = matrices.shape[-1]
+    scale = jnp.max(jnp.diagonal(matrices, axis1=1, axis2=2), axis=1)
+    tiny = 8 * d * jnp.finfo(matrices.dtype).eps * scale
+    factors = jnp.zeros_like(matrices)
+    for j in range(d):
+        rest = matrices[:, :, j] - jnp.einsum("nik,nk->ni", factors, factors[:, j])
+        positive = rest[:, j] > tiny
+        pivot = jnp.sqrt(jnp.where(positive, rest[:, j], 1.0))
+        column = jnp.where(positive[:, None], rest / pivot[:, None], 0.0)
+        factors = factors.at[:, j:, j].set(column[:, j:])
+    return factors
+
+
 def take(values: Array, indices: Int[Array, " n"]) -> Array:
     """values[indices] for indices that are known to lie in range."""
     return values.at[indices].get(mode="promise_in_bounds")

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.models.base import require
-from mpfjax.models.noise import independent_normal, stratified_normal
+from mpfjax.models.noise import NOISES
+from mpfjax.operations import cholesky
 
 
 class AbstractProposal(eqx.Module):
@@ -59,8 +60,8 @@ class GaussNewtonProposal(AbstractProposal):
             raise ValueError(f"num_iterations: {self.num_iterations} is less than 1")
         if not self.inflation > 0:
             raise ValueError(f"inflation: {self.inflation} is not positive")
-        if self.noise not in _NOISES:
-            raise ValueError(f"noise: {self.noise!r} is not one of {sorted(_NOISES)}")
+        if self.noise not in NOISES:
+            raise ValueError(f"noise: {self.noise!r} is not one of {sorted(NOISES)}")
 
     def propose(
         self, key: Key[Array, ""], observation: PyTree, previous_states: Float[Array, "n ..."]
@@ -68,7 +69,7 @@ class GaussNewtonProposal(AbstractProposal):
         """x_t from the fitted Gaussian of every particle, and its log density."""
         prior_means = self.model.transition_mean(previous_states)
         means, factors = self._fit(observation, prior_means)
-        noise = _NOISES[self.noise](key, means.shape, means.dtype)
+        noise = NOISES[self.noise](key, means.shape, means.dtype)
         states = means + self.inflation * _solve_transposed(factors, noise)
         dimension = means.shape[1]
         log_scale = jnp.sum(jnp.log(_diagonals(factors)), axis=1)
@@ -101,27 +102,13 @@ class GaussNewtonProposal(AbstractProposal):
             precisions = prior_precision[None] + jnp.einsum("ndq,nqe->nde", gains, jacobians)
             residuals = target[None] - values + jnp.einsum("npd,nd->np", jacobians, means)
             information = prior @ prior_precision + jnp.einsum("ndq,nq->nd", gains, residuals)
-            factors = _cholesky(precisions)
+            factors = cholesky(precisions)
             means = _solve_transposed(factors, _solve(factors, information))
         return means, factors
 
 
-_NOISES = {"independent": independent_normal, "stratified": stratified_normal}
-
-
 # Batched LAPACK calls on thousands of tiny matrices cost far more than their arithmetic: written
 # out over the d columns, all particles go through each operation at once.
-
-
-def _cholesky(matrices: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
-    """The lower triangular factors F with F Fᵀ = matrix."""
-    d = matrices.shape[-1]
-    factors = jnp.zeros_like(matrices)
-    for j in range(d):
-        rest = matrices[:, :, j] - jnp.einsum("nik,nk->ni", factors, factors[:, j])
-        column = rest / jnp.sqrt(rest[:, j : j + 1])
-        factors = factors.at[:, j:, j].set(column[:, j:])
-    return factors
 
 
 def _solve(factors: Float[Array, "n d d"], vectors: Float[Array, "n d"]) -> Float[Array, "n d"]:

@@ -48,3 +48,6 @@ def _lattice(dimension: int) -> list[float]:
     for _ in range(64):
         root = (1 + root) ** (1 / (dimension + 1))
     return [root ** -(j + 1) for j in range(dimension)]
+
+
+NOISES = {"independent": independent_normal, "stratified": stratified_normal}

@@ -10,6 +10,12 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRejuvenation
+from mpfjax.moves.slots import (
+    Slots,
+    check_particles_per_component,
+    deal_slots,
+    place_slots,
+)
 from mpfjax.operations import count_starts, order_by_segment, prefix_sum, segment_counts, take
 
 
@@ -49,10 +55,7 @@ class Resample(AbstractRejuvenation):
             raise ValueError(f"scheme: {self.scheme!r} is not one of {sorted(SCHEMES)}")
         if not 0.0 <= self.ess_threshold <= 1.0:
             raise ValueError(f"ess_threshold: {self.ess_threshold} is not in [0, 1]")
-        if self.particles_per_component is not None and self.particles_per_component < 1:
-            raise ValueError(
-                f"particles_per_component: {self.particles_per_component} is less than 1"
-            )
+        check_particles_per_component(self.particles_per_component)
 
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
@@ -74,8 +77,10 @@ class Resample(AbstractRejuvenation):
             layout = _as_they_stand(mixture)
         else:
             layout = _contiguous(mixture, due, self.sort_by)
-        targets = self._target_counts(layout.counts, due, mixture.num_particles)
-        slots = _slots(targets, mixture.num_particles)
+        targets = deal_slots(
+            layout.counts, due, mixture.num_particles, self.particles_per_component
+        )
+        slots = place_slots(targets, mixture.num_particles)
         expected = layout.weights * take(targets, layout.components).astype(layout.weights.dtype)
         starts = SCHEMES[self.scheme](key, expected, targets, slots, layout)
         parents = _within_component(count_starts(starts, mixture.num_particles), slots, layout)
@@ -86,20 +91,6 @@ class Resample(AbstractRejuvenation):
         kept_weights = None if self.ess_threshold == 1.0 else ~due
         return _redrawn(mixture, take(layout.order, parents), slots, targets, kept_weights)
 
-    def _target_counts(
-        self, counts: Int[Array, " m"], due: Bool[Array, " m"], num_particles: int
-    ) -> Int[Array, " m"]:
-        if self.particles_per_component is not None:
-            return jnp.where(
-                counts > 0, jnp.minimum(self.particles_per_component, num_particles), 0
-            )
-        kept = jnp.where(due, 0, counts)
-        pool = num_particles - jnp.sum(kept, dtype=jnp.int32)
-        sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
-        rank = jnp.cumsum(due.astype(jnp.int32)) - 1
-        share = pool // sharers + (rank < pool % sharers).astype(jnp.int32)
-        return jnp.where(due, share, kept)
-
 
 class _Layout(NamedTuple):
     """The particles made contiguous by component, the empty slots last."""
@@ -109,15 +100,6 @@ class _Layout(NamedTuple):
     weights: Float[Array, " n"]  # within the component, zero in an empty slot
     counts: Int[Array, " m"]
     firsts: Int[Array, " m"]  # the place of each component's first particle
-
-
-class _Slots(NamedTuple):
-    """Where the new particles of each component will stand."""
-
-    components: Int[Array, " n"]
-    ranks: Int[Array, " n"]  # within the component
-    firsts: Int[Array, " m"]
-    filled: Bool[Array, " n"]
 
 
 def _as_they_stand(mixture: ParticleMixture) -> _Layout:
@@ -160,24 +142,7 @@ def _contiguous(
     )
 
 
-def _slots(targets: Int[Array, " m"], num_particles: int) -> _Slots:
-    firsts = jnp.cumsum(targets) - targets
-    slot = jnp.arange(num_particles, dtype=jnp.int32)
-    if targets.shape[0] == 1:
-        components = jnp.zeros(num_particles, jnp.int32)
-    else:
-        components = count_starts(firsts, num_particles)
-    return _Slots(
-        components=components,
-        ranks=slot - take(firsts, components),
-        firsts=firsts,
-        filled=slot < jnp.sum(targets, dtype=jnp.int32),
-    )
-
-
-def _within_component(
-    parents: Int[Array, " n"], slots: _Slots, layout: _Layout
-) -> Int[Array, " n"]:
+def _within_component(parents: Int[Array, " n"], slots: Slots, layout: _Layout) -> Int[Array, " n"]:
     """Keep rounding of the prefix sums from crossing a border or feeding an empty slot."""
     if layout.counts.shape[0] == 1:
         parents = jnp.maximum(parents, 0)
@@ -190,7 +155,7 @@ def _within_component(
 def _redrawn(
     mixture: ParticleMixture,
     parents: Int[Array, " n"],
-    slots: _Slots,
+    slots: Slots,
     targets: Int[Array, " m"],
     kept: Bool[Array, " m"] | None,
 ) -> ParticleMixture:
@@ -228,7 +193,7 @@ def _starts(
     expected: Float[Array, " n"],
     shift: Float[Array, " n"],
     targets: Int[Array, " m"],
-    slots: _Slots,
+    slots: Slots,
     layout: _Layout,
 ) -> Int[Array, " n"]:
     """How many of the points s + shift_s lie before each particle's stretch of the line."""
@@ -251,7 +216,7 @@ def _residual(key, expected, targets, slots, layout):
     certain = _exclusive(whole)
     per_component = jax.ops.segment_sum(whole, layout.components, targets.shape[0])
     left = jnp.maximum(targets - per_component.astype(jnp.int32), 0)
-    rest = _slots(left, expected.shape[0])
+    rest = place_slots(left, expected.shape[0])
     points = _sorted_points(key, rest.components, rest.filled, left, expected.dtype)
     before = _line_before(jnp.maximum(expected - whole, 0.0), left, rest, layout)
     drawn = jnp.searchsorted(points, before, side="left")
@@ -259,7 +224,7 @@ def _residual(key, expected, targets, slots, layout):
 
 
 def _line_before(
-    expected: Float[Array, " n"], targets: Int[Array, " m"], slots: _Slots, layout: _Layout
+    expected: Float[Array, " n"], targets: Int[Array, " m"], slots: Slots, layout: _Layout
 ) -> Float[Array, " n"]:
     """The expected offspring before each particle, held to its component's stretch of the line."""
     lows = slots.firsts.astype(expected.dtype)

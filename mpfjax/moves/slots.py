@@ -1,0 +1,60 @@
+"""Which slots a rejuvenating move gives to which component."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from mpfjax.operations import count_starts, take
+
+
+class Slots(NamedTuple):
+    """Where the new particles of each component will stand: side by side, empty slots last."""
+
+    components: Int[Array, " n"]
+    ranks: Int[Array, " n"]  # within the component
+    firsts: Int[Array, " m"]
+    filled: Bool[Array, " n"]
+
+
+def deal_slots(
+    counts: Int[Array, " m"],
+    due: Bool[Array, " m"],
+    num_particles: int,
+    particles_per_component: int | None,
+) -> Int[Array, " m"]:
+    """How many slots each component gets.
+
+    Those that are not due keep what they have; the others share the rest of the slots equally, or
+    get `particles_per_component` each where that is a number.
+    """
+    if particles_per_component is not None:
+        return jnp.where(counts > 0, min(particles_per_component, num_particles), 0)
+    kept = jnp.where(due, 0, counts)
+    pool = num_particles - jnp.sum(kept, dtype=jnp.int32)
+    sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
+    rank = jnp.cumsum(due.astype(jnp.int32)) - 1
+    share = pool // sharers + (rank < pool % sharers).astype(jnp.int32)
+    return jnp.where(due, share, kept)
+
+
+def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:
+    """The slots of each component, given how many it gets."""
+    firsts = jnp.cumsum(targets) - targets
+    slot = jnp.arange(num_particles, dtype=jnp.int32)
+    if targets.shape[0] == 1:
+        components = jnp.zeros(num_particles, jnp.int32)
+    else:
+        components = count_starts(firsts, num_particles)
+    return Slots(
+        components=components,
+        ranks=slot - take(firsts, components),
+        firsts=firsts,
+        filled=slot < jnp.sum(targets, dtype=jnp.int32),
+    )
+
+
+def check_particles_per_component(value: int | None) -> None:
+    """Raise a `ValueError` for a number below one."""
+    if value is not None and value < 1:
+        raise ValueError(f"particles_per_component: {value} is less than 1")
