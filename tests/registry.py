@@ -83,13 +83,10 @@ def _chain(*before, then=(), proposal=lambda model: None) -> Callable[..., Filte
 
 CHAINS: dict[str, Callable[..., Filter]] = {
     "pf": _pf(),
-    "pf stratified": _pf(scheme="stratified"),
     "pf multinomial": _pf(scheme="multinomial"),
-    "pf residual": _pf(scheme="residual"),
     "pf adaptive": _pf(ess_threshold=0.5),
     "guided pf": lambda model: _pf(proposal=GaussNewtonProposal(model))(model),
     "mpf": _mpf(),
-    "mpf adaptive": _mpf(ess_threshold=0.5),
     "mpf fixed number": _mpf(particles_per_component=12),
     "guided mpf": lambda model: _mpf(proposal=GaussNewtonProposal(model))(model),
     "guided, sorted, stratified noise": _chain(
@@ -98,9 +95,10 @@ CHAINS: dict[str, Callable[..., Filter]] = {
         then=[KMeans(2)],
     ),
     "patient merge": _chain(Resample(), then=[Merge(2.0, 1.0, patience=2)]),
-    "kmeans only": _chain(Resample(), then=[KMeans()]),
+    "kmeans only": _chain(Resample("stratified"), then=[KMeans()]),
+    "split only, adaptive": _chain(Resample(ess_threshold=0.5), then=[Split(2.0)]),
     "random labels, multinomial": _chain(Resample("multinomial"), then=[RandomLabels()]),
     "random labels, residual": _chain(RandomLabels(), Resample("residual")),
-    "never resampled": _chain(then=[Split(2.0)]),
+    "never resampled": _chain(),
     "exclusion": _chain(Resample("stratified"), then=[Exclusion(2.0, 0.5), KMeans(3, reseed=True)]),
 }

@@ -159,14 +159,6 @@ class TestOnline:
         assert not bool(info.degenerate)
         assert np.isfinite(after.mean())
 
-    def test_a_missing_observation_moves_the_particles_and_leaves_the_masses(self, chain):
-        filter = chain_filter(chain, "quadratic")
-        mixture = started(filter)
-        predicted, info = filter.predict(jax.random.key(6), mixture)
-        assert float(info.log_likelihood_increment) == 0.0
-        assert not np.array_equal(predicted.particles, mixture.particles)
-        np.testing.assert_allclose(predicted.mixture_weights, mixture.mixture_weights, rtol=1e-5)
-
     def test_a_nan_observation_is_an_error(self, chain):
         filter = chain_filter(chain, "quadratic")
         with pytest.raises(RuntimeError, match="observation"):
@@ -205,3 +197,13 @@ def observed(value):
 def started(filter):
     mixture = filter.init(jax.random.key(4))
     return filter.step(jax.random.key(5), mixture, OBSERVATIONS[0])[0]
+
+
+@pytest.mark.parametrize("chain", ["pf adaptive", "mpf"])
+def test_a_missing_observation_moves_the_particles_and_leaves_the_masses(chain):
+    filter = chain_filter(chain, "quadratic")
+    mixture = started(filter)
+    predicted, info = filter.predict(jax.random.key(6), mixture)
+    assert float(info.log_likelihood_increment) == 0.0
+    assert not np.array_equal(predicted.particles, mixture.particles)
+    np.testing.assert_allclose(predicted.mixture_weights, mixture.mixture_weights, rtol=1e-5)

@@ -1,5 +1,6 @@
 """The Gauss-Newton proposal and its noise."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +25,11 @@ FLOAT = np.dtype("float32")
 OBSERVATION = jnp.array([1.0, -0.3])
 
 
+@eqx.filter_jit
+def propose(proposal, key, observation, previous):
+    return proposal.propose(key, observation, previous)
+
+
 def gaussian_fit(model, previous, observation):
     """Mean and covariance of p(x_t | x_{t-1}, y_t) on the linear model, by numpy."""
     A, Q, H, R = (np.asarray(part, float) for part in (model.A, model.Q, model.H, model.R))
@@ -39,7 +45,7 @@ def gaussian_fit(model, previous, observation):
 def test_the_log_density_is_that_of_the_gaussian_it_draws_from(inflation, noise):
     proposal = GaussNewtonProposal(LINEAR, inflation=inflation, noise=noise)
     previous = LINEAR.sample_initial(jax.random.key(0), 20)
-    states, log_density = proposal.propose(jax.random.key(1), OBSERVATION, previous)
+    states, log_density = propose(proposal, jax.random.key(1), OBSERVATION, previous)
     means, covariance = gaussian_fit(LINEAR, previous, OBSERVATION)
     expected = [
         scipy.stats.multivariate_normal(mean, inflation**2 * covariance).logpdf(state)
@@ -51,7 +57,7 @@ def test_the_log_density_is_that_of_the_gaussian_it_draws_from(inflation, noise)
 def test_draws_have_the_mean_and_covariance_of_that_gaussian():
     previous = jnp.broadcast_to(jnp.array([[0.4, 0.1, -0.2]]), (20_000, 3))
     proposal = GaussNewtonProposal(LINEAR, inflation=1.2)
-    states, _ = proposal.propose(jax.random.key(2), OBSERVATION, previous)
+    states, _ = propose(proposal, jax.random.key(2), OBSERVATION, previous)
     mean, covariance = gaussian_fit(LINEAR, previous[0], OBSERVATION)
     standard_error = np.sqrt(1.44 * np.diag(covariance) / 20_000)
     assert (np.abs(np.mean(states, axis=0) - mean) < 4 * standard_error).all()
@@ -64,7 +70,7 @@ def test_on_a_linear_model_without_inflation_the_weight_does_not_depend_on_the_d
     previous = LINEAR.sample_initial(jax.random.key(3), 30)
     factors = []
     for seed in range(3):
-        states, log_density = proposal.propose(jax.random.key(seed), OBSERVATION, previous)
+        states, log_density = propose(proposal, jax.random.key(seed), OBSERVATION, previous)
         factors.append(
             LINEAR.log_likelihood(OBSERVATION, states)
             + LINEAR.log_transition(states, previous)
@@ -97,7 +103,7 @@ def test_on_the_quadratic_model_it_finds_the_mode_of_each_particles_own_side():
     model = mpfjax.QuadraticModel(0.5, 0.1)
     proposal = GaussNewtonProposal(model, num_iterations=8, inflation=0.01)
     previous = jnp.array([1.2, -1.2, 0.8, -0.8])
-    states, _ = proposal.propose(jax.random.key(5), jnp.array(1.0), previous)
+    states, _ = propose(proposal, jax.random.key(5), jnp.array(1.0), previous)
     np.testing.assert_allclose(states, [1.0, -1.0, 1.0, -1.0], atol=0.05)
 
 
@@ -106,9 +112,8 @@ def test_works_in_float64():
         model = mpfjax.QuadraticModel(0.5, 0.1)
         previous = jnp.array([1.2, -1.2])
         for noise in ("independent", "stratified"):
-            states, log_density = GaussNewtonProposal(model, noise=noise).propose(
-                jax.random.key(6), jnp.array(1.0), previous
-            )
+            proposal = GaussNewtonProposal(model, noise=noise)
+            states, log_density = propose(proposal, jax.random.key(6), jnp.array(1.0), previous)
             assert states.dtype == log_density.dtype == np.float64
 
 

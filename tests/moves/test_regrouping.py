@@ -1,5 +1,6 @@
 """K-means, merging and splitting on clouds made by hand."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +25,7 @@ def clouds(centres, sizes, scale=1.0, num_components=6, weights=None, labels=Non
 
 
 def labels_after(move, mixture):
-    return np.asarray(move(KEY, mixture).component_indicators)
+    return np.asarray(eqx.filter_jit(move)(KEY, mixture).component_indicators)
 
 
 class TestKMeans:
@@ -46,7 +47,7 @@ class TestKMeans:
 
     def test_a_dead_component_stays_dead(self):
         mixture = clouds([[0, 0], [9, 9]], [20, 20])
-        moved = KMeans()(KEY, mixture)
+        moved = eqx.filter_jit(KMeans())(KEY, mixture)
         np.testing.assert_array_equal(moved.active, [True, True, False, False, False, False])
 
     def test_weights_play_no_part(self):
@@ -138,7 +139,7 @@ class TestMerge:
         memory = merge.initial_memory(6)
         merged = []
         for mixture in (near, near, far, near, near, near, near):
-            moved = merge(KEY, mixture.replace(memory=memory))
+            moved = eqx.filter_jit(merge)(KEY, mixture.replace(memory=memory))
             memory = moved.memory
             merged.append(int(moved.component_indicators[-1]) == 0)
         # After a merge both labels start a count of their own.
