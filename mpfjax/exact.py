@@ -62,12 +62,14 @@ def grid_filter(
         raise ValueError(f"grid: shape {grid.shape} is not one row of at least two points")
     for density in ("log_transition", "log_likelihood"):
         require(model, density, "grid_filter")
-    if log_initial is None:
-        require(model, "log_initial", "grid_filter without log_initial")
-        log_initial = model.log_initial(grid.reshape(-1, *state_shape))
-    log_cell = jnp.log(grid[1] - grid[0])
     num_points = grid.shape[0]
     states = grid.reshape(-1, *state_shape)
+    if log_initial is None:
+        require(model, "log_initial", "grid_filter without log_initial")
+        log_prior: Float[Array, " g"] = model.log_initial(states)
+    else:
+        log_prior = log_initial
+    log_cell = jnp.log(grid[1] - grid[0])
     kernel = jnp.exp(
         log_cell
         + jax.vmap(
@@ -88,7 +90,7 @@ def grid_filter(
         updated = jnp.exp(log_joint - increment)
         return updated, (updated, increment)
 
-    initial = jnp.exp(log_initial - log_sum_exp(log_initial))
+    initial = jnp.exp(log_prior - log_sum_exp(log_prior))
     _, (probabilities, increments) = jax.lax.scan(advance, initial, observations)
     return GridFilterRun(grid, probabilities, increments, jnp.sum(increments))
 

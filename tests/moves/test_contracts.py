@@ -110,7 +110,7 @@ class TestRejuvenation:
         else:
             assert (filled == counts.sum()).all()
 
-    def test_offspring_are_unbiased_where_resampled(self, name, example):
+    def test_offspring_are_unbiased_where_resampled_and_kept_elsewhere(self, name, example):
         """E[weight of i's offspring] is i's weight, the definition of unbiased resampling."""
         after, before = draws(name, example), MIXTURES[example]
         slots = np.arange(NUM_DRAWS)[:, None] * before.num_particles + after.ancestor_indices
@@ -129,7 +129,11 @@ class TestRejuvenation:
         rare = 4 / NUM_DRAWS
         checked = due[labels] & np.asarray(before.occupied)
         assert (error <= 4.5 * standard_error + rare)[checked].all()
-        assert (offspring == 1)[:, ~due[labels] & np.asarray(before.occupied)].all()
+        kept = ~due[labels] & np.asarray(before.occupied)
+        assert (offspring == 1)[:, kept].all()
+        from_kept = kept[after.ancestor_indices] & (after.log_weights > -np.inf)
+        own = np.asarray(before.log_weights)[after.ancestor_indices]
+        np.testing.assert_array_equal(after.log_weights[from_kept], own[from_kept])
 
 
 def move_due(name, mixture):

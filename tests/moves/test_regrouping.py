@@ -39,7 +39,7 @@ class TestKMeans:
             np.testing.assert_array_equal(found, expected)
 
     def test_empty_slots_pull_no_centroid(self):
-        states = np.array([[0.0], [1.0], [1000.0], [10.0], [11.0], [-1000.0]])
+        states = np.array([[100.0], [101.0], [1000.0], [110.0], [111.0], [-1000.0]])
         log_weights = np.array([0, 0, -np.inf, 0, 0, -np.inf])
         mixture = make_mixture(states, log_weights, [0, 1, 0, 1, 1, 1], 3)
         found = labels_after(KMeans(5), mixture)

@@ -179,7 +179,7 @@ class TestAllocation:
         np.testing.assert_array_equal(again.component_counts, [20, 0, 20, 0])
 
     def test_a_component_that_is_not_due_keeps_its_particles_and_weights(self):
-        log_weights = np.concatenate([np.zeros(10), [5.0] + [0.0] * 9])
+        log_weights = np.concatenate([np.arange(10) / 10, [5.0] + [0.0] * 9])
         mixture = make_mixture(np.arange(20.0), log_weights, np.repeat([0, 1], 10), 2)
         move = Resample(ess_threshold=0.5)
         np.testing.assert_array_equal(move.is_due(mixture), [False, True])

@@ -1,0 +1,149 @@
+"""Gaussian regeneration redraws each component with its own moments, and keeps its mass."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax import GaussianRegeneration
+from mpfjax.exact import kalman_filter
+from mpfjax.mixture import ParticleMixture
+
+NUM_DRAWS = 2000
+
+
+def a_mixture(num_particles=30, num_components=4):
+    """Two ordinary components, one of a single particle, and a dead one; some slots empty."""
+    keys = jax.random.split(jax.random.key(0), 2)
+    labels = jnp.where(jnp.arange(num_particles) % 3 == 0, 2, 0).at[5].set(1)
+    spread = jnp.array([[1.0, 0.4], [0.0, 0.5]])
+    particles = 3.0 * labels[:, None] + jax.random.normal(keys[0], (num_particles, 2)) @ spread
+    log_weights = jax.nn.log_softmax(jax.random.normal(keys[1], (num_particles,)))
+    log_weights = jax.nn.log_softmax(log_weights.at[7].set(-jnp.inf))
+    ancestors = jnp.arange(num_particles)
+    return ParticleMixture(particles, log_weights, labels, ancestors, num_components)
+
+
+def draw_many(move, mixture, num_draws=NUM_DRAWS):
+    keys = jax.random.split(jax.random.key(1), num_draws)
+    return jax.jit(jax.vmap(lambda key: move(key, mixture)))(keys)
+
+
+@pytest.mark.parametrize("noise", ["independent", "stratified"])
+def test_draws_have_the_moments_of_their_component(noise):
+    mixture = a_mixture()
+    after = draw_many(GaussianRegeneration(noise=noise), mixture)
+    means = np.asarray(mixture.component_means())
+    covariances = np.asarray(mixture.component_covariances())
+    for m in (0, 2):
+        members = np.asarray(after.component_indicators[0]) == m
+        draws = np.asarray(after.particles)[:, members]
+        one_each = draws[:, 0]  # independent over keys, whatever the noise within a draw
+        np.testing.assert_array_less(
+            np.abs(one_each.mean(0) - means[m]), 4 * one_each.std(0) / NUM_DRAWS**0.5
+        )
+        centred = one_each - means[m]
+        products = centred[:, :, None] * centred[:, None, :]
+        np.testing.assert_array_less(
+            np.abs(products.mean(0) - covariances[m]), 4 * products.std(0) / NUM_DRAWS**0.5
+        )
+
+
+def test_every_component_keeps_its_mass_and_the_slots_are_dealt_equally():
+    mixture = a_mixture()
+    after = GaussianRegeneration()(jax.random.key(0), mixture)
+    np.testing.assert_allclose(after.mixture_weights, mixture.mixture_weights, rtol=1e-5)
+    np.testing.assert_array_equal(after.component_counts, [10, 10, 10, 0])
+    labels = np.asarray(mixture.component_indicators)[np.asarray(after.ancestor_indices)]
+    np.testing.assert_array_equal(labels, after.component_indicators)
+
+
+def test_a_fixed_number_leaves_the_other_slots_empty():
+    after = GaussianRegeneration(particles_per_component=4)(jax.random.key(0), a_mixture())
+    np.testing.assert_array_equal(after.component_counts, [4, 4, 4, 0])
+    assert np.isfinite(after.particles).all()
+
+
+def test_a_component_of_one_particle_stays_where_it_is():
+    mixture = a_mixture()
+    after = GaussianRegeneration()(jax.random.key(3), mixture)
+    alone = np.asarray(after.particles)[np.asarray(after.component_indicators) == 1]
+    np.testing.assert_array_equal(alone, np.broadcast_to(mixture.particles[5], alone.shape))
+
+
+def test_a_singular_covariance_draws_within_its_plane():
+    mixture = a_mixture()
+    flat = mixture.replace(particles=mixture.particles[:, :1] * jnp.array([[1.0, 2.0]]))
+    after = draw_many(GaussianRegeneration(), flat, 50)
+    np.testing.assert_allclose(after.particles[..., 1], 2 * after.particles[..., 0], atol=1e-4)
+
+
+def test_where_leaves_the_rest_to_resampling():
+    mixture = a_mixture()
+    states = {"box": mixture.particles, "kind": mixture.component_indicators * 10}
+    move = GaussianRegeneration(where=lambda states: states["box"])
+    after = move(jax.random.key(0), mixture.replace(particles=states))
+    np.testing.assert_array_equal(after.particles["kind"], 10 * after.component_indicators)
+    assert len(np.unique(after.particles["box"][:, 0])) == 21  # two redrawn tens, and one stayed
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"inflation": 0.0}, "inflation"),
+        ({"noise": "pink"}, "noise"),
+        ({"particles_per_component": 0}, "particles_per_component"),
+    ],
+)
+def test_bad_options_are_named(options, named):
+    with pytest.raises(ValueError, match=named):
+        GaussianRegeneration(**options)
+
+
+@pytest.mark.parametrize("max_components", [1, 3])
+def test_moments_are_the_kalman_filters(max_components):
+    """On a linear-Gaussian model one component is exact, and any number close to it."""
+    model = mpfjax.LinearGaussianModel(
+        A=0.9 * jnp.eye(2), Q=jnp.array([[0.6, 0.1], [0.1, 0.6]]), H=jnp.ones((1, 2)),
+        R=0.3 * jnp.eye(1), m0=jnp.zeros(2), P0=jnp.eye(2),
+    )  # fmt: skip
+    observations = jnp.array([[0.3], [1.2], [-0.5], [2.0], [0.1]])
+    exact = kalman_filter(model, observations)
+    if max_components == 1:
+        filter = mpfjax.gaussian_particle_filter(model, 2000)
+    else:
+        filter = mpfjax.gaussian_mixture_particle_filter(model, 2000, max_components)
+
+    def collect(mixture):
+        centred = mixture.particles - mixture.mean()[None]
+        return mixture.mean(), mixture.average(centred[:, :, None] * centred[:, None])
+
+    keys = jax.random.split(jax.random.key(0), 100)
+    run = mpfjax.monte_carlo(keys, filter, observations, collect)
+    # Cut into three, a Gaussian's parts are not Gaussian: a bias of a few hundredths is theirs.
+    slack = 0.0 if max_components == 1 else 0.03
+    truth = (np.asarray(exact.means), np.asarray(exact.covariances))
+    for estimate, expected in zip(run.collected, truth, strict=True):
+        found = np.asarray(estimate)
+        bound = 4 * found.std(0) / 10 + slack
+        np.testing.assert_array_less(np.abs(found.mean(0) - expected), bound)
+
+
+def test_only_the_mixture_keeps_both_modes():
+    model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
+    times = jnp.arange(1.0, 61.0)
+    observations = (2 * jnp.sin(2 * jnp.pi * times / 100)) ** 2
+    keys = jax.random.split(jax.random.key(0), 40)
+
+    def sides(mixture):
+        return jnp.stack([mixture.particles > 0.3, mixture.particles < -0.3]).any(axis=1)
+
+    def share(filter):
+        both = mpfjax.monte_carlo(keys, filter, observations, sides).collected.all(axis=-1)
+        return float(both[:, 15:35].mean())
+
+    regeneration = GaussianRegeneration(noise="stratified")
+    assert share(mpfjax.gaussian_particle_filter(model, 100, regeneration=regeneration)) < 0.3
+    mixture = mpfjax.gaussian_mixture_particle_filter(model, 100, 2, regeneration=regeneration)
+    assert share(mixture) > 0.95
