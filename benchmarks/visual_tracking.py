@@ -10,7 +10,6 @@ figure 3, the tracks in MOTChallenge form, and the scores, null where there is n
 """
 
 import argparse
-import json
 import sys
 import time
 import warnings
@@ -26,6 +25,7 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
+from benchmarks.results import format_table, write_json
 from mpfjax.metrics.coverage import coverage, covers
 from mpfjax.plotting import draw_contact_sheet
 from mpfjax.vision import boxes as box_files
@@ -440,18 +440,18 @@ def _write_scores(options, source, name, snapshots, results) -> None:
         "max_components": MAX_COMPONENTS,
         "particles_per_component": PARTICLES_PER_COMPONENT,
     }
-    text = json.dumps({"settings": settings, "results": results}, indent=2)
-    (options.out / "visual_tracking.json").write_text(text + "\n", encoding="utf-8")
+    write_json(options.out / "visual_tracking.json", {"settings": settings, "results": results})
 
 
 def table(results: list[dict[str, Any]]) -> str:
     """The results as text."""
-    lines = [f"{'filter':8}{'all covered':>12}{'on object':>11}{'id swaps':>10}{'ms/frame':>10}"]
+    rows = []
     for r in results:
         cells = [r["all_covered"], r["on_object"], r["id_swaps"], r["ms_per_frame"]]
-        texts = ["-" if cell is None else f"{cell:.3g}" for cell in cells]
-        lines.append(f"{r['filter']:8}{texts[0]:>12}{texts[1]:>11}{texts[2]:>10}{texts[3]:>10}")
-    return "\n".join(lines)
+        rows.append(
+            [NAMES[r["filter"]], *("-" if cell is None else f"{cell:.3g}" for cell in cells)]
+        )
+    return format_table(["filter", "all covered", "on object", "id swaps", "ms a frame"], rows)
 
 
 def main(arguments: list[str] | None = None) -> int:

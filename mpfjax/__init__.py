@@ -5,6 +5,8 @@ from mpfjax import metrics as metrics
 from mpfjax.filters import Filter as Filter
 from mpfjax.filters import FilterRun as FilterRun
 from mpfjax.filters import StepInfo as StepInfo
+from mpfjax.filters import gaussian_mixture_particle_filter as gaussian_mixture_particle_filter
+from mpfjax.filters import gaussian_particle_filter as gaussian_particle_filter
 from mpfjax.filters import mixture_particle_filter as mixture_particle_filter
 from mpfjax.filters import monte_carlo as monte_carlo
 from mpfjax.filters import particle_filter as particle_filter
@@ -19,6 +21,7 @@ from mpfjax.moves import AbstractPropagation as AbstractPropagation
 from mpfjax.moves import AbstractRegrouping as AbstractRegrouping
 from mpfjax.moves import AbstractRejuvenation as AbstractRejuvenation
 from mpfjax.moves import Exclusion as Exclusion
+from mpfjax.moves import GaussianRegeneration as GaussianRegeneration
 from mpfjax.moves import KMeans as KMeans
 from mpfjax.moves import Merge as Merge
 from mpfjax.moves import Propagate as Propagate

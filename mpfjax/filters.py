@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, require
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
+from mpfjax.moves.gaussian import GaussianRegeneration
 from mpfjax.moves.propagation import Propagate
 from mpfjax.moves.regrouping import KMeans, Merge, Split
 from mpfjax.moves.resampling import Resample
@@ -296,6 +297,68 @@ def mixture_particle_filter(
     and `kmeans` set thresholds, features and scale; see those moves for the defaults. Use it
     where the filtering distribution has several modes that must all be kept.
     """
+    rejuvenate = Resample(scheme, ess_threshold, particles_per_component, sort_by)
+    return _mixture_filter(
+        model, num_particles, max_components, rejuvenate, proposal, merge, split, kmeans,
+        initial_kmeans,
+    )  # fmt: skip
+
+
+def gaussian_particle_filter(
+    model: AbstractStateSpaceModel,
+    num_particles: int,
+    *,
+    proposal: AbstractProposal | None = None,
+    regeneration: GaussianRegeneration | None = None,
+) -> Filter:
+    """The Gaussian particle filter: redraw from the Gaussian of the moments, propagate.
+
+    Kotecha and Djuric (2003); Lin et al. (2012), section 3. An approximation, for a filtering
+    distribution that is close to one Gaussian; it cannot keep two modes.
+    """
+    regeneration = GaussianRegeneration() if regeneration is None else regeneration
+    return Filter(
+        model, moves=[regeneration, Propagate(model, proposal)], num_particles=num_particles
+    )
+
+
+def gaussian_mixture_particle_filter(
+    model: AbstractStateSpaceModel,
+    num_particles: int,
+    max_components: int,
+    *,
+    proposal: AbstractProposal | None = None,
+    regeneration: GaussianRegeneration | None = None,
+    merge: Merge | None = None,
+    split: Split | None = None,
+    kmeans: KMeans | None = None,
+    initial_kmeans: KMeans | None = None,
+) -> Filter:
+    """GM-MPF: each component redrawn from the Gaussian of its moments, propagated, regrouped.
+
+    Lin et al. (2012), section 4: the mixture particle filter with Gaussian regeneration in place
+    of resampling, the propagated particles being the sample of the importance function (eqs. 8
+    and 9). An approximation, good where each mode is close to a Gaussian.
+    """
+    regeneration = GaussianRegeneration() if regeneration is None else regeneration
+    return _mixture_filter(
+        model, num_particles, max_components, regeneration, proposal, merge, split, kmeans,
+        initial_kmeans,
+    )  # fmt: skip
+
+
+def _mixture_filter(
+    model: AbstractStateSpaceModel,
+    num_particles: int,
+    max_components: int,
+    rejuvenate: AbstractRejuvenation,
+    proposal: AbstractProposal | None,
+    merge: Merge | None,
+    split: Split | None,
+    kmeans: KMeans | None,
+    initial_kmeans: KMeans | None,
+) -> Filter:
+    """Rejuvenate within components, propagate, regroup; x_0 grouped by K-means from seeds."""
     kmeans = KMeans() if kmeans is None else kmeans
     reseeded = KMeans(
         10, reseed=True, features=kmeans.features.function, scale=kmeans.features.scale
@@ -303,7 +366,7 @@ def mixture_particle_filter(
     return Filter(
         model,
         moves=[
-            Resample(scheme, ess_threshold, particles_per_component, sort_by),
+            rejuvenate,
             Propagate(model, proposal),
             Merge() if merge is None else merge,
             Split() if split is None else split,

@@ -1,0 +1,108 @@
+"""Gaussian regeneration: redraw each component from the Gaussian of its own moments."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Key, PyTree
+
+from mpfjax.mixture import ParticleMixture, flatten_states
+from mpfjax.models.noise import NOISES
+from mpfjax.moves.base import AbstractRejuvenation
+from mpfjax.moves.features import summarise
+from mpfjax.moves.resampling import Resample
+from mpfjax.moves.slots import check_particles_per_component, deal_slots, place_slots
+from mpfjax.operations import cholesky, segment_argmax, take
+
+
+class GaussianRegeneration(AbstractRejuvenation):
+    """Replace each component's particles by draws from N(μ_m, Σ_m), its own mean and covariance.
+
+    μ_m = Σ w_i x_i and Σ_m = Σ w_i (x_i - μ_m)(x_i - μ_m)ᵀ, over the particles of component m
+    (Lin et al. 2012, eqs. 10 and 11; Kotecha and Djuric 2003 for one component). The component
+    keeps its mass, which its new particles share equally. An approximation unless the component
+    is Gaussian (`approximate` is true): what lies between the points of the state space is
+    filled in, and any shape but the ellipse is lost. Use it where components are unimodal and
+    resampling would leave too few distinct particles.
+
+    - `particles_per_component`: as for `Resample`.
+    - `where`: chooses from the states what is regenerated, such as `lambda state: state.box`; the
+      rest (angles, bounded or whole numbers) comes along from resampled particles. None is all.
+    - `inflation`: of the standard deviations; above 1 it counters the loss of spread.
+    - `noise`: "independent" or "stratified", see `stratified_normal`.
+
+    A singular Σ_m draws within its own plane, and a component of one particle, or of copies of
+    one, draws that particle again. Ancestors are resampled particles where `where` is given, and
+    the heaviest of the component, as its representative, where it is not. Raises `ValueError`
+    for an inflation that is not positive, an unknown noise or particles_per_component < 1.
+    """
+
+    particles_per_component: int | None = eqx.field(static=True, default=None)
+    where: Callable[[PyTree], PyTree] | None = eqx.field(static=True, default=None)
+    inflation: float = eqx.field(static=True, default=1.0)
+    noise: str = eqx.field(static=True, default="independent")
+
+    def __check_init__(self) -> None:
+        check_particles_per_component(self.particles_per_component)
+        if not self.inflation > 0:
+            raise ValueError(f"inflation: {self.inflation} is not positive")
+        if self.noise not in NOISES:
+            raise ValueError(f"noise: {self.noise!r} is not one of {sorted(NOISES)}")
+
+    @property
+    def approximate(self) -> bool:
+        """True: a component is taken for a Gaussian."""
+        return True
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+    ) -> ParticleMixture:
+        """Redraw every living component."""
+        del observation
+        key_noise, key_rest = jax.random.split(key)
+        if self.where is None:
+            vacated = self._vacated(mixture)
+            drawn = self._draw(key_noise, mixture.particles, mixture, vacated)
+            return vacated.replace(particles=drawn)
+        resample = Resample(particles_per_component=self.particles_per_component)
+        vacated = resample(key_rest, mixture)
+        drawn = self._draw(key_noise, self.where(mixture.particles), mixture, vacated)
+        return vacated.replace(particles=eqx.tree_at(self.where, vacated.particles, drawn))
+
+    def _vacated(self, mixture: ParticleMixture) -> ParticleMixture:
+        """The slots dealt anew, each holding its component's heaviest particle."""
+        m, counts = mixture.num_components, mixture.component_counts
+        targets = deal_slots(
+            counts, counts > 0, mixture.num_particles, self.particles_per_component
+        )
+        slots = place_slots(targets, mixture.num_particles)
+        shares = jnp.maximum(targets, 1).astype(mixture.log_weights.dtype)
+        log_weights = take(mixture.log_mixture_weights - jnp.log(shares), slots.components)
+        heaviest = segment_argmax(mixture.log_weights, mixture.component_indicators, m)
+        parents = take(heaviest, slots.components)
+        return mixture.replace(
+            particles=jax.tree.map(lambda leaf: take(leaf, parents), mixture.particles),
+            log_weights=jnp.where(slots.filled, log_weights, -jnp.inf),
+            component_indicators=slots.components,
+            ancestor_indices=take(mixture.ancestor_indices, parents),
+        )
+
+    def _draw(
+        self,
+        key: Key[Array, ""],
+        chosen: PyTree,
+        mixture: ParticleMixture,
+        vacated: ParticleMixture,
+    ) -> PyTree:
+        """Draws for the new slots, with the moments of `mixture`'s components."""
+        states = jnp.where(mixture.occupied[:, None], flatten_states(chosen), 0.0)
+        weights = jnp.exp(mixture.log_component_weights).astype(states.dtype)
+        moments = summarise(states, weights, mixture.component_indicators, mixture.num_components)
+        factors = take(self.inflation * cholesky(moments.covariances), vacated.component_indicators)
+        noise = NOISES[self.noise](key, states.shape, states.dtype)
+        spread = jnp.einsum("nij,nj->ni", factors, noise)
+        means = take(moments.means, vacated.component_indicators)
+        unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], chosen))[1]
+        return jax.vmap(unravel)(means + spread)
