@@ -16,6 +16,7 @@ from mpfjax import (
     AbstractRejuvenation,
     Exclusion,
     Filter,
+    GaussianRegeneration,
     GaussNewtonProposal,
     KMeans,
     Merge,
@@ -58,6 +59,8 @@ REJUVENATIONS: dict[str, AbstractRejuvenation] = {
     "systematic, sorted": Resample(sort_by=lambda states: states[:, 0]),
     "systematic, fixed number": Resample(particles_per_component=5),
     "residual, fixed number, adaptive": Resample("residual", 0.5, 5),
+    "gaussian": GaussianRegeneration(),
+    "gaussian, fixed number, stratified": GaussianRegeneration(5, noise="stratified"),
 }
 
 
@@ -100,5 +103,6 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "random labels, multinomial": _chain(Resample("multinomial"), then=[RandomLabels()]),
     "random labels, residual": _chain(RandomLabels(), Resample("residual")),
     "never resampled": _chain(),
+    "gaussian mixture": _chain(GaussianRegeneration(), then=[KMeans()]),
     "exclusion": _chain(Resample("stratified"), then=[Exclusion(2.0, 0.5), KMeans(3, reseed=True)]),
 }

@@ -18,6 +18,8 @@ NUM_DRAWS = 4000
 over_mixtures = pytest.mark.parametrize("mixture", MIXTURES.values(), ids=MIXTURES)
 over_regroupings = pytest.mark.parametrize("name", REGROUPINGS)
 over_rejuvenations = pytest.mark.parametrize("name", REJUVENATIONS)
+RESAMPLINGS = [name for name, move in REJUVENATIONS.items() if isinstance(move, Resample)]
+over_resamplings = pytest.mark.parametrize("name", RESAMPLINGS)
 
 
 @cache
@@ -83,12 +85,6 @@ class TestRejuvenation:
         parents = np.asarray(before.component_indicators)[after.ancestor_indices]
         assert (after.component_indicators == parents)[filled].all()
 
-    def test_ancestors_point_at_the_particles_that_were_copied(self, name, example):
-        after, before = draws(name, example), MIXTURES[example]
-        copied = np.asarray(before.particles)[after.ancestor_indices]
-        filled = after.log_weights > -np.inf
-        np.testing.assert_array_equal(after.particles[filled], copied[filled])
-
     def test_feeds_no_slot_from_a_particle_without_weight(self, name, example):
         after, before = draws(name, example), MIXTURES[example]
         # Below e^-87 a weight is nothing in float32, though its logarithm is not -inf.
@@ -96,19 +92,30 @@ class TestRejuvenation:
         filled = after.log_weights > -np.inf
         parents = after.ancestor_indices[filled]
         assert np.asarray(before.occupied)[parents].all()
-        if REJUVENATIONS[name].ess_threshold == 1.0:
+        if all_due(name, before):
             assert not weightless[parents].any()
 
     def test_fills_the_slots_that_it_should(self, name, example):
         after, before = draws(name, example), MIXTURES[example]
-        move, counts = REJUVENATIONS[name], np.asarray(before.component_counts)
+        number = REJUVENATIONS[name].particles_per_component
+        counts = np.asarray(before.component_counts)
         filled = (after.log_weights > -np.inf).sum(axis=1)
-        if move.particles_per_component is not None:
-            assert (filled == move.particles_per_component * (counts > 0).sum()).all()
-        elif move.is_due(before).any():
+        if number is not None:
+            assert (filled == number * (counts > 0).sum()).all()
+        elif move_due(name, before).any():
             assert (filled == before.num_particles).all()
         else:
             assert (filled == counts.sum()).all()
+
+
+@pytest.mark.parametrize("example", MIXTURES)
+@over_resamplings
+class TestResampling:
+    def test_ancestors_point_at_the_particles_that_were_copied(self, name, example):
+        after, before = draws(name, example), MIXTURES[example]
+        copied = np.asarray(before.particles)[after.ancestor_indices]
+        filled = after.log_weights > -np.inf
+        np.testing.assert_array_equal(after.particles[filled], copied[filled])
 
     def test_offspring_are_unbiased_where_resampled_and_kept_elsewhere(self, name, example):
         """E[weight of i's offspring] is i's weight, the definition of unbiased resampling."""
@@ -119,7 +126,7 @@ class TestRejuvenation:
             weights=(after.log_weights > -np.inf).ravel(),
             minlength=NUM_DRAWS * before.num_particles,
         ).reshape(NUM_DRAWS, -1)
-        due = np.asarray(move_due(name, before))
+        due = move_due(name, before)
         labels = np.asarray(before.component_indicators)
         targets = new_counts(after, before.num_components)
         expected = targets[labels] * np.exp(np.asarray(before.log_component_weights, float))
@@ -137,7 +144,13 @@ class TestRejuvenation:
 
 
 def move_due(name, mixture):
-    return REJUVENATIONS[name].is_due(mixture)
+    """Which components the move redraws."""
+    move = REJUVENATIONS[name]
+    return np.asarray(move.is_due(mixture) if isinstance(move, Resample) else mixture.active)
+
+
+def all_due(name, mixture):
+    return (move_due(name, mixture) == np.asarray(mixture.active)).all()
 
 
 def new_counts(after, num_components):
@@ -150,8 +163,8 @@ def new_counts(after, num_components):
     return counts[:, 0]
 
 
-@over_rejuvenations
-def test_rejuvenation_works_with_any_pytree_of_particles(name):
+@over_resamplings
+def test_resampling_works_with_any_pytree_of_particles(name):
     mixture = MIXTURES["ordinary"]
     leaves = {"box": mixture.particles, "age": (jnp.arange(40), jnp.zeros((40, 2, 3)))}
     move = REJUVENATIONS[name]

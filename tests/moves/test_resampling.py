@@ -93,7 +93,7 @@ class TestAtScale:
     """float32 has no room for a hundred thousand exact cumulative weights: guards must hold."""
 
     @over_schemes
-    @pytest.mark.parametrize("num_components", [1, 4, 9])
+    @pytest.mark.parametrize("num_components", [1, 9])
     def test_no_particle_of_zero_weight_is_ever_fed(self, scheme, num_components):
         """Not with random draws, nor with uniform draws at their ends."""
         for kind in KINDS:
