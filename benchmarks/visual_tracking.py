@@ -60,7 +60,7 @@ class Snapshot(NamedTuple):
     labels: Any  # (n,), the component of each, -1 in an empty slot
 
 
-# --- the two presets --------------------------------------------------------------------------
+# --- the presets --------------------------------------------------------------------------
 
 
 def paper_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Filter]:
@@ -82,16 +82,46 @@ def paper_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Filt
 
 
 def default_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Filter]:
-    """The best recipe found for real video.
+    """The recipe that covers most on real video: any component may come to stand for any object.
+
+    A particle is compared with one of the given boxes, and now and then with another; components
+    exclude each other, part where they straddle two places, and merge only after ten frames on
+    the same one.
+    """
+    size = boxes[:, 2:].mean(axis=0)
+    model = _own_references(frame, boxes, contrast=0.25, switch_probability=0.05)
+    where: dict[str, Any] = {"features": _centre, "scale": size}
+    moves = [
+        mpfjax.Exclusion(strength=10.0, radius=0.5, **where),
+        mpfjax.Merge(None, 0.25, patience=10, **where),
+        mpfjax.Split(4.0, 0.5, min_share=0.15, **where),
+    ]
+    return _started_at_the_boxes(model, moves, size)
+
+
+def objects_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Filter]:
+    """The recipe with the fewest strays and swaps: every component keeps to its object.
 
     Every particle carries which box it was started from and is compared with that one alone, so
     that the components of an object are rival hypotheses about it: only those merge, a component
     splits where they part, and those that came to nothing are pruned. Objects exclude each other.
     """
     size = boxes[:, 2:].mean(axis=0)
+    model = _own_references(frame, boxes, contrast=0.25)
+    apart = _apart(size)
+    moves = [
+        ObjectExclusion(strength=3.0, radius=0.5, scale=(float(size[0]), float(size[1]))),
+        mpfjax.Merge(None, 0.25, patience=10, **apart),
+        PruneHypotheses(least_share=1e-6),
+        mpfjax.Split(4.0, 0.5, min_share=0.15, **apart),
+    ]
+    return _started_at_the_boxes(model, moves, size)
+
+
+def _own_references(frame: np.ndarray, boxes: np.ndarray, **options: Any) -> ColourModel:
     width, height = boxes[:, 2], boxes[:, 3]
     still = np.full(len(boxes), 0.01)
-    model = ColourModel.from_frame(
+    return ColourModel.from_frame(
         frame,
         boxes,
         num_bins=30,
@@ -99,34 +129,39 @@ def default_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Fi
         deviations=np.stack([0.4 * width, 0.08 * height, still, still], axis=1),
         num_parts=5,
         weigh_colours=True,
+        **options,
     )
-    # A unit of 1e-5 for the reference holds particles of different references apart.
-    apart: dict[str, Any] = {
-        "features": _centre_and_reference,
-        "scale": (*size, 1e-5),
-    }
+
+
+def _started_at_the_boxes(
+    model: ColourModel, moves: list[mpfjax.AbstractMove], size: np.ndarray
+) -> dict[str, mpfjax.Filter]:
+    """Both filters; the mixture starts with one component for each box."""
     mixture = mpfjax.Filter(
         model,
         moves=[
             mpfjax.Resample(particles_per_component=PARTICLES_PER_COMPONENT),
             mpfjax.Propagate(model),
-            ObjectExclusion(strength=3.0, radius=0.5, scale=(float(size[0]), float(size[1]))),
-            mpfjax.Merge(None, 0.25, patience=10, **apart),
-            PruneHypotheses(least_share=1e-6),
-            mpfjax.Split(4.0, 0.5, min_share=0.15, **apart),
+            *moves,
         ],
         num_particles=NUM_PARTICLES,
         num_components=MAX_COMPONENTS,
         initial_moves=[
-            mpfjax.KMeans(10, reseed=True, **apart),
+            mpfjax.KMeans(10, reseed=True, **_apart(size)),
             mpfjax.Merge(None, 0.5, features=_reference),
         ],
     )
     return {"pf": mpfjax.particle_filter(model, NUM_PARTICLES), "mpf": mixture}
 
 
+def _apart(size: np.ndarray) -> dict[str, Any]:
+    """Features by which particles of different references are never near each other."""
+    return {"features": _centre_and_reference, "scale": (*size, 1e-5)}
+
+
 PRESETS = {
     "default": default_filters,
+    "objects": objects_filters,
     "paper": paper_filters,
 }
 

@@ -55,6 +55,8 @@ class ColourModel(AbstractStateSpaceModel):
       pixels for x and y and in units of the reference box for s_x and s_y.
     - `sigma`: σ, the width of the likelihood.
     - `switch_probability`: with which r is drawn anew, from all references, in a frame.
+    - `contrast`: how much it speaks for a box that what lies to its sides, half a width each, does
+      not have the reference's colours; 0, as in the paper, looks at the box alone.
     - `wide_counts`: count pixels in 32 bits; see `integral_histogram`.
     """
 
@@ -65,6 +67,7 @@ class ColourModel(AbstractStateSpaceModel):
     initial_deviations: Float[Array, "k 4"]
     sigma: Float[Array, ""]
     switch_probability: float = eqx.field(static=True, default=0.0)
+    contrast: float = eqx.field(static=True, default=0.0)
     wide_counts: bool = eqx.field(static=True, default=False)
 
     @classmethod
@@ -80,6 +83,7 @@ class ColourModel(AbstractStateSpaceModel):
         weigh_colours: bool = False,
         share_reference: bool = False,
         switch_probability: float = 0.0,
+        contrast: float = 0.0,
     ) -> "ColourModel":
         """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
 
@@ -92,6 +96,7 @@ class ColourModel(AbstractStateSpaceModel):
         - `share_reference`: all particles are taken for one reference, the mean of all boxes, as
           in the paper, which has one B_ref for all players.
         - `switch_probability`: with which a particle's reference is drawn anew in a frame.
+        - `contrast`: the weight of the unlikeness of a box's two sides.
 
         Raises `ValueError` naming the argument for a box of no area or outside the frame, for a
         number that is not positive, and for a probability outside [0, 1].
@@ -107,6 +112,8 @@ class ColourModel(AbstractStateSpaceModel):
             raise ValueError(f"num_parts: {num_parts} is less than 1")
         if not 0 <= switch_probability <= 1:
             raise ValueError(f"switch_probability: {switch_probability} is not in [0, 1]")
+        if contrast < 0:
+            raise ValueError(f"contrast: {contrast} is negative")
         if deviations.shape not in ((4,), (len(boxes), 4)) or not np.all(deviations > 0):
             raise ValueError(f"deviations: {deviations} are not four positive numbers a box")
         # Room for boxes to grow to twice the area of the largest reference.
@@ -127,6 +134,7 @@ class ColourModel(AbstractStateSpaceModel):
             initial_deviations=steps,
             sigma=jnp.asarray(sigma, float),
             switch_probability=switch_probability,
+            contrast=contrast,
             wide_counts=wide_counts,
         )
 
@@ -170,8 +178,17 @@ class ColourModel(AbstractStateSpaceModel):
     def log_likelihood(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
     ) -> Float[Array, " n"]:
-        """-Σ_c B²(h^c, h_ref^c) / 2σ², B² averaged over the bands."""
-        return -0.5 * self.squared_distances(observation, states) / self.sigma**2
+        """-(Σ_c B² - contrast Σ_c B²_around) / 2σ², each B² averaged over the bands."""
+        num_parts, num_bins = self.references.shape[1], self.references.shape[3]
+        if not isinstance(observation, IntegralHistogram):
+            observation = integral_histogram(observation, num_bins, self.wide_counts)
+        distances = self.squared_distances(observation, states)
+        if self.contrast > 0:
+            boxes = self.boxes(states)
+            wide = boxes * jnp.array([[1.0, 1.0, _SURROUND, 1.0]], boxes.dtype)
+            sides = observation.counts(wide, num_parts) - observation.counts(boxes, num_parts)
+            distances -= self.contrast * self._to_reference(sides, states)
+        return -0.5 * distances / self.sigma**2
 
     def squared_distances(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
@@ -180,7 +197,11 @@ class ColourModel(AbstractStateSpaceModel):
         num_parts, num_bins = self.references.shape[1], self.references.shape[3]
         if not isinstance(observation, IntegralHistogram):
             observation = integral_histogram(observation, num_bins, self.wide_counts)
-        counts = observation.counts(self.boxes(states), num_parts)
+        return self._to_reference(observation.counts(self.boxes(states), num_parts), states)
+
+    def _to_reference(
+        self, counts: Float[Array, "n parts 3 bins"], states: BoxState
+    ) -> Float[Array, " n"]:
         histograms = normalise(counts, self.colour_weights[states.reference])
         distances = bhattacharyya(histograms, self.references[states.reference])
         return jnp.mean(jnp.sum(distances, axis=2), axis=1)

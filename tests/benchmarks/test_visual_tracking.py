@@ -38,7 +38,7 @@ def sequence(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module", params=["default", "paper"])
+@pytest.fixture(scope="module", params=["default", "objects", "paper"])
 def finished(request, sequence, tmp_path_factory):
     out = tmp_path_factory.mktemp(request.param)
     arguments = ["--sequence", sequence, "--ids", 1, 2, 3, "--frames", "3:8"]

@@ -68,6 +68,26 @@ def test_the_reference_itself_is_most_likely(frame, options):
     assert (model.squared_distances(observation, swapped) > 0.5).all()
 
 
+def test_contrast_subtracts_what_lies_to_the_sides(frame):
+    """Half a box's width to each side, against numpy."""
+    options = {"num_bins": 8, "sigma": 0.2}
+    state = states((54.0, 32.0, 1.0, 1.0, 1))  # columns 46 to 62, rows 20 to 44
+
+    def histogram(columns):
+        patch = frame[20:44, columns].reshape(-1, 3)
+        counts = np.stack([np.histogram(patch[:, c], np.arange(9) * 32)[0] for c in range(3)])
+        return counts / counts.sum(axis=1, keepdims=True)
+
+    shared = np.sqrt(histogram(np.r_[38:46, 62:70]) * histogram(np.r_[50:66]))
+    sides = (1 - shared.sum(axis=1)).sum()
+    plain, contrasted = (
+        float(model_of(frame, contrast=c, **options).log_likelihood(jnp.asarray(frame), state)[0])
+        for c in (0.0, 0.5)
+    )
+    assert 0.5 < sides < 2.5
+    np.testing.assert_allclose(contrasted - plain, 0.5 * sides / (2 * 0.2**2), rtol=1e-3)
+
+
 def test_bands_tell_a_box_from_its_mirror_image(frame):
     """Trousers above a shirt: the same colours in all, but not in each band."""
     upside_down = jnp.asarray(frame.copy())
@@ -188,6 +208,7 @@ def test_it_runs_through_a_filter_and_keeps_both_boxes(frame):
         ("sigma: 0", BOXES, {"sigma": 0.0}),
         ("num_parts: 0", BOXES, {"num_parts": 0}),
         ("switch_probability: 2", BOXES, {"switch_probability": 2.0}),
+        ("contrast: -1", BOXES, {"contrast": -1.0}),
         ("num_bins: 0", BOXES, {"num_bins": 0}),
         ("deviations: ", BOXES, {"deviations": np.ones(3)}),
         ("deviations: ", BOXES, {"deviations": np.array([1.0, 1, 1, 0])}),
