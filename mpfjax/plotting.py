@@ -71,7 +71,7 @@ def _draw_trace(axis: Axes, trace: Trace, truth: np.ndarray) -> None:
             label=r"mode at $x^*_t$" if sign == 1 else r"mode at $-x^*_t$",
         )  # fmt: skip
     axis.set_ylabel("state $x_t$")
-    axis.set_ylim(-2.9, 2.9)
+    axis.set_ylim(-2.9, 3.6)  # the legend stands above the modes
     axis.legend(
         loc="upper center", bbox_to_anchor=(0.5, 0.985), fontsize=7, ncols=4, markerscale=2.5,
         framealpha=0.9, borderpad=0.3, columnspacing=1.0,
