@@ -1,5 +1,6 @@
 """What every test runs under: checked shapes and types, strict promotion, no display."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -39,3 +40,15 @@ def as_installed():
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def release_compiled_programs():
+    """Drop each module's programs when it ends.
+
+    Every compiled program keeps memory maps, and thousands of them in one process reach the
+    kernel's limit, at which the compiler crashes.
+    """
+    yield
+    jax.clear_caches()
+    gc.collect()
