@@ -65,9 +65,7 @@ class Snapshot(NamedTuple):
 
 def paper_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Filter]:
     """The model with the paper's parameters; the rest of the MPF in units of the mean box."""
-    model = ColourModel.from_frame(
-        frame, boxes, num_bins=30, sigma=0.15, deviations=None, share_reference=True
-    )
+    model = ColourModel.from_frame(frame, boxes, sigma=0.15, deviations=None, share_reference=True)
     where: dict[str, Any] = {"features": _centre, "scale": boxes[:, 2:].mean(axis=0)}
     mixture = mpfjax.mixture_particle_filter(
         model,
@@ -124,7 +122,6 @@ def _own_references(frame: np.ndarray, boxes: np.ndarray, **options: Any) -> Col
     return ColourModel.from_frame(
         frame,
         boxes,
-        num_bins=30,
         sigma=0.15,
         deviations=np.stack([0.4 * width, 0.08 * height, still, still], axis=1),
         num_parts=5,

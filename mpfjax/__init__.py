@@ -12,9 +12,12 @@ from mpfjax.filters import monte_carlo as monte_carlo
 from mpfjax.filters import particle_filter as particle_filter
 from mpfjax.filters import run_filter as run_filter
 from mpfjax.mixture import ParticleMixture as ParticleMixture
+from mpfjax.models import AbstractDynamics as AbstractDynamics
 from mpfjax.models import AbstractStateSpaceModel as AbstractStateSpaceModel
+from mpfjax.models import Autoregression as Autoregression
 from mpfjax.models import LinearGaussianModel as LinearGaussianModel
 from mpfjax.models import QuadraticModel as QuadraticModel
+from mpfjax.models import RandomWalk as RandomWalk
 from mpfjax.models import per_particle as per_particle
 from mpfjax.moves import AbstractMove as AbstractMove
 from mpfjax.moves import AbstractPropagation as AbstractPropagation
@@ -24,9 +27,11 @@ from mpfjax.moves import Exclusion as Exclusion
 from mpfjax.moves import GaussianRegeneration as GaussianRegeneration
 from mpfjax.moves import KMeans as KMeans
 from mpfjax.moves import Merge as Merge
+from mpfjax.moves import Predict as Predict
 from mpfjax.moves import Propagate as Propagate
 from mpfjax.moves import Resample as Resample
 from mpfjax.moves import Split as Split
+from mpfjax.moves import Weigh as Weigh
 from mpfjax.proposals import AbstractProposal as AbstractProposal
 from mpfjax.proposals import GaussNewtonProposal as GaussNewtonProposal
 

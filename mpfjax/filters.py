@@ -14,7 +14,7 @@ from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, require
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
 from mpfjax.moves.gaussian import GaussianRegeneration
-from mpfjax.moves.propagation import Propagate
+from mpfjax.moves.propagation import Predict, Propagate, Weigh
 from mpfjax.moves.regrouping import KMeans, Merge, Split
 from mpfjax.moves.resampling import Resample
 from mpfjax.proposals import AbstractProposal
@@ -297,10 +297,10 @@ def mixture_particle_filter(
     and `kmeans` set thresholds, features and scale; see those moves for the defaults. Use it
     where the filtering distribution has several modes that must all be kept.
     """
-    rejuvenate = Resample(scheme, ess_threshold, particles_per_component, sort_by)
+    resample = Resample(scheme, ess_threshold, particles_per_component, sort_by)
     return _mixture_filter(
-        model, num_particles, max_components, rejuvenate, proposal, merge, split, kmeans,
-        initial_kmeans,
+        model, num_particles, max_components, [resample, Propagate(model, proposal)],
+        merge, split, kmeans, initial_kmeans,
     )  # fmt: skip
 
 
@@ -310,15 +310,18 @@ def gaussian_particle_filter(
     *,
     proposal: AbstractProposal | None = None,
     regeneration: GaussianRegeneration | None = None,
+    importance: str = "propagated",
 ) -> Filter:
     """The Gaussian particle filter: redraw from the Gaussian of the moments, propagate.
 
     Kotecha and Djuric (2003); Lin et al. (2012), section 3. An approximation, for a filtering
-    distribution that is close to one Gaussian; it cannot keep two modes.
+    distribution that is close to one Gaussian; it cannot keep two modes. `importance` is that of
+    `gaussian_mixture_particle_filter`.
     """
-    regeneration = GaussianRegeneration() if regeneration is None else regeneration
     return Filter(
-        model, moves=[regeneration, Propagate(model, proposal)], num_particles=num_particles
+        model,
+        moves=_gaussian_moves(model, proposal, regeneration, importance),
+        num_particles=num_particles,
     )
 
 
@@ -329,6 +332,7 @@ def gaussian_mixture_particle_filter(
     *,
     proposal: AbstractProposal | None = None,
     regeneration: GaussianRegeneration | None = None,
+    importance: str = "propagated",
     merge: Merge | None = None,
     split: Split | None = None,
     kmeans: KMeans | None = None,
@@ -337,28 +341,53 @@ def gaussian_mixture_particle_filter(
     """GM-MPF: each component redrawn from the Gaussian of its moments, propagated, regrouped.
 
     Lin et al. (2012), section 4: the mixture particle filter with Gaussian regeneration in place
-    of resampling, the propagated particles being the sample of the importance function (eqs. 8
-    and 9). An approximation, good where each mode is close to a Gaussian.
+    of resampling. The paper leaves open what the sample of the importance function q of eqs. 8
+    and 9 is, and `importance` offers both readings. "propagated": draws from the Gaussian of the
+    filtering distribution, moved by the dynamics (or by `proposal`), are the sample, and weighed
+    by L (or L D / q). "predictive_gaussian": those draws only give the moments of the prediction
+    (eqs. 12 and 13), and the sample is drawn afresh from its Gaussian, N(μ̄, Σ̄), which stands in
+    numerator and denominator of eq. 8 and cancels; one more approximation and one more draw.
+
+    An approximation, good where each mode is close to a Gaussian. Raises `ValueError` for another
+    `importance`, and for the second with a `proposal`, which it has no use for.
     """
-    regeneration = GaussianRegeneration() if regeneration is None else regeneration
     return _mixture_filter(
-        model, num_particles, max_components, regeneration, proposal, merge, split, kmeans,
-        initial_kmeans,
+        model, num_particles, max_components,
+        _gaussian_moves(model, proposal, regeneration, importance),
+        merge, split, kmeans, initial_kmeans,
     )  # fmt: skip
+
+
+def _gaussian_moves(
+    model: AbstractStateSpaceModel,
+    proposal: AbstractProposal | None,
+    regeneration: GaussianRegeneration | None,
+    importance: str,
+) -> list[AbstractMove]:
+    """Redraw, propagate and weigh, with or without a second redraw between the last two."""
+    redraw = GaussianRegeneration() if regeneration is None else regeneration
+    if importance == "propagated":
+        return [redraw, Propagate(model, proposal)]
+    if importance != "predictive_gaussian":
+        raise ValueError(
+            f"importance: {importance!r} is neither 'propagated' nor 'predictive_gaussian'"
+        )
+    if proposal is not None:
+        raise ValueError(f"importance: {importance!r} draws from no proposal, but one was given")
+    return [redraw, Predict(model), redraw, Weigh(model)]
 
 
 def _mixture_filter(
     model: AbstractStateSpaceModel,
     num_particles: int,
     max_components: int,
-    rejuvenate: AbstractRejuvenation,
-    proposal: AbstractProposal | None,
+    moves: list[AbstractMove],
     merge: Merge | None,
     split: Split | None,
     kmeans: KMeans | None,
     initial_kmeans: KMeans | None,
 ) -> Filter:
-    """Rejuvenate within components, propagate, regroup; x_0 grouped by K-means from seeds."""
+    """The given moves, then regrouping; x_0 grouped by K-means from seeds."""
     kmeans = KMeans() if kmeans is None else kmeans
     reseeded = KMeans(
         10, reseed=True, features=kmeans.features.function, scale=kmeans.features.scale
@@ -366,8 +395,7 @@ def _mixture_filter(
     return Filter(
         model,
         moves=[
-            rejuvenate,
-            Propagate(model, proposal),
+            *moves,
             Merge() if merge is None else merge,
             Split() if split is None else split,
             kmeans,

@@ -20,9 +20,11 @@ from mpfjax import (
     GaussNewtonProposal,
     KMeans,
     Merge,
+    Predict,
     Propagate,
     Resample,
     Split,
+    Weigh,
 )
 
 NUM_PARTICLES = 48
@@ -103,6 +105,12 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "random labels, multinomial": _chain(Resample("multinomial"), then=[RandomLabels()]),
     "random labels, residual": _chain(RandomLabels(), Resample("residual")),
     "never resampled": _chain(),
+    "predict and weigh": lambda model: Filter(
+        model, [Resample(), Predict(model), Weigh(model)], NUM_PARTICLES
+    ),
     "gaussian mixture": _chain(GaussianRegeneration(), then=[KMeans()]),
+    "predictive Gaussian": lambda model: mpfjax.gaussian_mixture_particle_filter(
+        model, NUM_PARTICLES, NUM_COMPONENTS, importance="predictive_gaussian"
+    ),
     "exclusion": _chain(Resample("stratified"), then=[Exclusion(2.0, 0.5), KMeans(3, reseed=True)]),
 }

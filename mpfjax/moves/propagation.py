@@ -33,31 +33,74 @@ class Propagate(AbstractPropagation):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
-        previous = mixture.particles
         if self.proposal is None:
-            states = self.model.sample_transition(key, previous)
-            log_factors = self._log_likelihood(observation, states, mixture)
-        else:
-            states, log_density = self.proposal.propose(key, observation, previous)
-            log_factors = self._log_likelihood(observation, states, mixture)
-            dynamics = cast(HasTransitionDensity, self.model)
-            log_factors += dynamics.log_transition(states, previous) - log_density
-        log_factors = log_factors.astype(mixture.log_weights.dtype)
-        # An empty slot stays empty whatever the model makes of its stale state.
-        log_weights = jnp.where(mixture.occupied, mixture.log_weights + log_factors, -jnp.inf)
-        return mixture.replace(particles=states, log_weights=log_weights)
+            return _weigh(self.model, self.predict(key, mixture), observation)
+        previous = mixture.particles
+        states, log_density = self.proposal.propose(key, observation, previous)
+        dynamics = cast(HasTransitionDensity, self.model)
+        log_ratio = dynamics.log_transition(states, previous) - log_density
+        return _weigh(self.model, mixture.replace(particles=states), observation, log_ratio)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
         return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
 
-    def _log_likelihood(
-        self, observation: PyTree, states: PyTree, mixture: ParticleMixture
-    ) -> Float[Array, " n"]:
-        values = self.model.log_likelihood(observation, states)
-        if values.shape != (mixture.num_particles,):
-            raise ValueError(
-                f"model: {type(self.model).__name__}.log_likelihood returned shape {values.shape},"
-                f" not one value a particle, ({mixture.num_particles},)"
-            )
-        return values
+
+class Predict(AbstractPropagation):
+    """Draw x_t ~ D(. | x_{t-1}) and leave the weights: the first half of a bootstrap `Propagate`.
+
+    With `Weigh` as the second half, for chains that do something between the two, such as
+    redrawing the prediction from its Gaussian (Lin et al. 2012, section 4, step 3).
+    """
+
+    model: AbstractStateSpaceModel
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Propagate every particle; the observation plays no part."""
+        del observation
+        return self.predict(key, mixture)
+
+    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """The same without an observation."""
+        return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
+
+
+class Weigh(AbstractPropagation):
+    """Multiply the weights by L(y_t | x_t): the second half of a bootstrap `Propagate`."""
+
+    model: AbstractStateSpaceModel
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Weigh every particle by y_t."""
+        del key
+        return _weigh(self.model, mixture, observation)
+
+    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """The mixture as it is: there is nothing to weigh by."""
+        del key
+        return mixture
+
+
+def _weigh(
+    model: AbstractStateSpaceModel,
+    mixture: ParticleMixture,
+    observation: PyTree,
+    log_ratio: Float[Array, " n"] | None = None,
+) -> ParticleMixture:
+    """The weights times L, and times D / q where the draw was not from D."""
+    log_factors = model.log_likelihood(observation, mixture.particles)
+    if log_factors.shape != (mixture.num_particles,):
+        raise ValueError(
+            f"model: {type(model).__name__}.log_likelihood returned shape {log_factors.shape},"
+            f" not one value a particle, ({mixture.num_particles},)"
+        )
+    if log_ratio is not None:
+        log_factors += log_ratio
+    log_factors = log_factors.astype(mixture.log_weights.dtype)
+    # An empty slot stays empty whatever the model makes of its stale state.
+    log_weights = jnp.where(mixture.occupied, mixture.log_weights + log_factors, -jnp.inf)
+    return mixture.replace(log_weights=log_weights)

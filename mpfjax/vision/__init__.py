@@ -6,6 +6,9 @@ from mpfjax.vision.boxes import read_tracks as read_tracks
 from mpfjax.vision.boxes import write_tracks as write_tracks
 from mpfjax.vision.colour_model import BoxState as BoxState
 from mpfjax.vision.colour_model import ColourModel as ColourModel
+from mpfjax.vision.colours import AbstractColours as AbstractColours
+from mpfjax.vision.colours import HSVColours as HSVColours
+from mpfjax.vision.colours import RGBColours as RGBColours
 from mpfjax.vision.frames import read_frames as read_frames
 from mpfjax.vision.frames import write_video as write_video
 from mpfjax.vision.histograms import IntegralHistogram as IntegralHistogram

@@ -1,4 +1,4 @@
-"""The colour tracking model of Vermaak et al. (2003), section 5.2."""
+"""The colour tracking model of Vermaak et al. (2003), section 5.2, and Lin et al. (2012), 2."""
 
 import equinox as eqx
 import jax
@@ -7,7 +7,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt8
 
 from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
 from mpfjax.vision.boxes import centred, check_boxes
+from mpfjax.vision.colours import AbstractColours, RGBColours
 from mpfjax.vision.histograms import (
     IntegralHistogram,
     bhattacharyya,
@@ -24,10 +26,12 @@ class BoxState(eqx.Module):
 
     - `box`: (x, y, s_x, s_y), the centre in pixels and the size in units of the reference box.
     - `reference`: r, the reference box it is compared with, in [0, number of references).
+    - `previous`: the box one frame before, where the dynamics are of second order.
     """
 
     box: Float[Array, "n 4"]
     reference: Int[Array, " n"]
+    previous: Float[Array, "n 4"] | None = None
 
 
 class ColourModel(AbstractStateSpaceModel):
@@ -36,7 +40,8 @@ class ColourModel(AbstractStateSpaceModel):
     Vermaak et al. (2003), section 5.2: (x, y, s_x, s_y) follow independent Gaussian random walks,
     and L(y | x) ∝ exp(-Σ_c B²(h^c, h_ref^c) / 2σ²) with B the Bhattacharyya distance of the
     normalised histograms of the colours c = R, G, B in the hypothesised and in the reference box.
-    Two extensions, both off in the paper:
+    Lin et al. (2012), section 2, is the same with one `HSVColours` histogram (eqs. 1 to 3) and an
+    `Autoregression` (eq. 4). Two extensions are in neither paper, and off unless asked for:
 
     - several references: r, which one a particle is taken for, is part of the state, so that the
       recursion stays exact; x_0 is spread equally over all of them, and r either never changes or
@@ -50,10 +55,13 @@ class ColourModel(AbstractStateSpaceModel):
     `from_frame`. Use it for objects that keep their colours, among other colours.
 
     - `reference_boxes`: (k, 4), centre and size in pixels; x_0 scatters about them.
-    - `references`, `colour_weights`: h_ref and the weights of its colours, (k, parts, 3, bins).
-    - `deviations`, `initial_deviations`: of the random walk in a frame and of x_0, (k, 4), in
-      pixels for x and y and in units of the reference box for s_x and s_y.
+    - `references`, `colour_weights`: h_ref and the weights of its colours, (k, parts, channels,
+      bins).
+    - `dynamics`: of (x, y, s_x, s_y), in pixels for x and y and in units of the reference box for
+      s_x and s_y; its parameters have a leading axis k.
+    - `initial_deviations`: of x_0, (k, 4), in the same units.
     - `sigma`: σ, the width of the likelihood.
+    - `colours`: the bins of the histograms.
     - `switch_probability`: with which r is drawn anew, from all references, in a frame.
     - `contrast`: how much it speaks for a box that what lies to its sides, half a width each, does
       not have the reference's colours; 0, as in the paper, looks at the box alone.
@@ -61,11 +69,12 @@ class ColourModel(AbstractStateSpaceModel):
     """
 
     reference_boxes: Float[Array, "k 4"]
-    references: Float[Array, "k parts 3 bins"]
-    colour_weights: Float[Array, "k parts 3 bins"]
-    deviations: Float[Array, "k 4"]
+    references: Float[Array, "k parts channels bins"]
+    colour_weights: Float[Array, "k parts channels bins"]
+    dynamics: AbstractDynamics
     initial_deviations: Float[Array, "k 4"]
     sigma: Float[Array, ""]
+    colours: AbstractColours
     switch_probability: float = eqx.field(static=True, default=0.0)
     contrast: float = eqx.field(static=True, default=0.0)
     wide_counts: bool = eqx.field(static=True, default=False)
@@ -76,9 +85,10 @@ class ColourModel(AbstractStateSpaceModel):
         frame: UInt8[np.ndarray, "h w 3"],
         boxes: Float[np.ndarray, "k 4"],
         *,
-        num_bins: int = 30,
+        colours: AbstractColours | None = None,
         sigma: float = 0.15,
         deviations: Float[np.ndarray, "..."] | None = None,
+        dynamics: AbstractDynamics | None = None,
         num_parts: int = 1,
         weigh_colours: bool = False,
         share_reference: bool = False,
@@ -87,9 +97,10 @@ class ColourModel(AbstractStateSpaceModel):
     ) -> "ColourModel":
         """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
 
-        - `num_bins`: N_b, bins a channel.
-        - `deviations`: of the random walk, (4,) or one row a box; None takes the paper's, the
-          roots of (2.5, 1.5, 0.05, 0.05).
+        - `colours`: the bins of the histograms; None takes `RGBColours()`.
+        - `deviations`: of x_0 and of the random walk, (4,) or one row a box; None takes the
+          paper's, the roots of (2.5, 1.5, 0.05, 0.05).
+        - `dynamics`: in place of the random walk, one for all boxes or with a row for each.
         - `num_parts`: bands from top to bottom.
         - `weigh_colours`: weigh each colour by its share in the box against that in a surround
           of twice the width and height.
@@ -105,6 +116,7 @@ class ColourModel(AbstractStateSpaceModel):
         if len(boxes) == 0:
             raise ValueError("boxes: there are none")
         check_boxes(boxes, *frame.shape[:2])
+        colours = RGBColours() if colours is None else colours
         deviations = np.sqrt(PAPER_VARIANCES) if deviations is None else np.asarray(deviations)
         if not sigma > 0:
             raise ValueError(f"sigma: {sigma} is not positive")
@@ -118,7 +130,7 @@ class ColourModel(AbstractStateSpaceModel):
             raise ValueError(f"deviations: {deviations} are not four positive numbers a box")
         # Room for boxes to grow to twice the area of the largest reference.
         wide_counts = bool(2 * np.prod(boxes[:, 2:], axis=1).max() >= 2**16)
-        table = integral_histogram(jnp.asarray(frame), num_bins, wide_counts)
+        table = integral_histogram(jnp.asarray(frame), colours, wide_counts)
         places = jnp.asarray(centred(boxes), float)
         references, weights = _references(table, places, num_parts, weigh_colours)
         if share_reference:
@@ -130,9 +142,10 @@ class ColourModel(AbstractStateSpaceModel):
             reference_boxes=places,
             references=references,
             colour_weights=weights,
-            deviations=steps,
+            dynamics=_for_each(RandomWalk(steps) if dynamics is None else dynamics, len(boxes)),
             initial_deviations=steps,
             sigma=jnp.asarray(sigma, float),
+            colours=colours,
             switch_probability=switch_probability,
             contrast=contrast,
             wide_counts=wide_counts,
@@ -148,10 +161,11 @@ class ColourModel(AbstractStateSpaceModel):
             [self.reference_boxes[:, :2], jnp.ones_like(self.reference_boxes[:, :2])], axis=1
         )
         noise = jax.random.normal(key_noise, (num_particles, 4), centre.dtype)
-        return BoxState(centre[reference] + self.initial_deviations[reference] * noise, reference)
+        box = centre[reference] + self.initial_deviations[reference] * noise
+        return BoxState(box, reference, self._remembered(box))
 
     def sample_transition(self, key: Key[Array, ""], states: BoxState) -> BoxState:
-        """x_t ~ N(x_{t-1}, diag σ²), and r drawn anew with the switch probability."""
+        """x_t from the dynamics, and r drawn anew with the switch probability."""
         key_noise, key_switch, key_reference = jax.random.split(key, 3)
         reference = states.reference
         if self.switch_probability > 0:
@@ -159,15 +173,15 @@ class ColourModel(AbstractStateSpaceModel):
             switches = jax.random.bernoulli(key_switch, self.switch_probability, reference.shape)
             drawn = jax.random.randint(key_reference, reference.shape, 0, k, reference.dtype)
             reference = jnp.where(switches, drawn, reference)
-        noise = jax.random.normal(key_noise, states.box.shape, states.box.dtype)
-        return BoxState(states.box + self.deviations[states.reference] * noise, reference)
+        dynamics = self._dynamics_of(states)
+        box = dynamics.sample(key_noise, states.box, states.previous)
+        return BoxState(box, reference, self._remembered(states.box))
 
     def log_transition(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
-        """log N(x_t; x_{t-1}, diag σ²) + log P(r_t | r_{t-1}), -inf where r cannot have changed."""
-        deviations = self.deviations[previous_states.reference]
-        residuals = (states.box - previous_states.box) / deviations
-        log_density = jnp.sum(
-            -0.5 * residuals**2 - jnp.log(deviations) - 0.5 * jnp.log(2 * jnp.pi), axis=1
+        """log D(x_t | x_{t-1}) + log P(r_t | r_{t-1}), -inf where r cannot have changed."""
+        dynamics = self._dynamics_of(previous_states)
+        log_density = dynamics.log_density(
+            states.box, previous_states.box, previous_states.previous
         )
         drawn = self.switch_probability / self.reference_boxes.shape[0]
         stays = states.reference == previous_states.reference
@@ -179,9 +193,8 @@ class ColourModel(AbstractStateSpaceModel):
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
     ) -> Float[Array, " n"]:
         """-(Σ_c B² - contrast Σ_c B²_around) / 2σ², each B² averaged over the bands."""
-        num_parts, num_bins = self.references.shape[1], self.references.shape[3]
-        if not isinstance(observation, IntegralHistogram):
-            observation = integral_histogram(observation, num_bins, self.wide_counts)
+        num_parts = self.references.shape[1]
+        observation = self._counted(observation)
         distances = self.squared_distances(observation, states)
         if self.contrast > 0:
             boxes = self.boxes(states)
@@ -193,18 +206,30 @@ class ColourModel(AbstractStateSpaceModel):
     def squared_distances(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
     ) -> Float[Array, " n"]:
-        """Σ_c B² of each box from its reference, averaged over the bands: between 0 and 3."""
-        num_parts, num_bins = self.references.shape[1], self.references.shape[3]
-        if not isinstance(observation, IntegralHistogram):
-            observation = integral_histogram(observation, num_bins, self.wide_counts)
-        return self._to_reference(observation.counts(self.boxes(states), num_parts), states)
+        """Σ_c B² of each box from its reference, averaged over the bands: between 0 and the
+        number of channels.
+        """
+        counts = self._counted(observation).counts(self.boxes(states), self.references.shape[1])
+        return self._to_reference(counts, states)
+
+    def _counted(self, observation: IntegralHistogram | UInt8[Array, "h w 3"]) -> IntegralHistogram:
+        if isinstance(observation, IntegralHistogram):
+            return observation
+        return integral_histogram(observation, self.colours, self.wide_counts)
 
     def _to_reference(
-        self, counts: Float[Array, "n parts 3 bins"], states: BoxState
+        self, counts: Float[Array, "n parts channels bins"], states: BoxState
     ) -> Float[Array, " n"]:
         histograms = normalise(counts, self.colour_weights[states.reference])
         distances = bhattacharyya(histograms, self.references[states.reference])
         return jnp.mean(jnp.sum(distances, axis=2), axis=1)
+
+    def _dynamics_of(self, states: BoxState) -> AbstractDynamics:
+        """The dynamics of each particle's own reference."""
+        return jax.tree.map(lambda leaf: leaf[states.reference], self.dynamics)
+
+    def _remembered(self, box: Float[Array, "n 4"]) -> Float[Array, "n 4"] | None:
+        return box if self.dynamics.order == 2 else None
 
     def boxes(self, states: BoxState) -> Float[Array, "n 4"]:
         """(x, y, s_x l_x, s_y l_y): the hypothesised boxes, centre and size in pixels."""
@@ -212,9 +237,19 @@ class ColourModel(AbstractStateSpaceModel):
         return jnp.concatenate([states.box[:, :2], states.box[:, 2:] * size], axis=1)
 
 
+def _for_each(dynamics: AbstractDynamics, num_boxes: int) -> AbstractDynamics:
+    """The dynamics with a row of parameters for each box."""
+    if dynamics.is_shared:
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_boxes, *leaf.shape)), dynamics)
+    rows = {leaf.shape[0] for leaf in jax.tree.leaves(dynamics)}
+    if rows != {num_boxes}:
+        raise ValueError(f"dynamics: parameters for {rows} boxes, not for {num_boxes}")
+    return dynamics
+
+
 def _references(
     table: IntegralHistogram, places: Float[Array, "k 4"], num_parts: int, weigh_colours: bool
-) -> tuple[Float[Array, "k parts 3 bins"], Float[Array, "k parts 3 bins"]]:
+) -> tuple[Float[Array, "k parts channels bins"], Float[Array, "k parts channels bins"]]:
     """The normalised histograms of the reference boxes, and the weights of their colours."""
     counts = table.counts(places, num_parts)
     if not weigh_colours:

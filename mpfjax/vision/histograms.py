@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped, UInt8
 
+from mpfjax.vision.colours import AbstractColours
+
 _BLOCK = 32
-_CHANNELS = 3
 
 
 class IntegralHistogram(eqx.Module):
@@ -19,13 +20,14 @@ class IntegralHistogram(eqx.Module):
     into bin k % num_bins, so that any box is counted exactly from its corners, at a cost that does
     not depend on its size (Porikli 2005). Build it once a frame, for all particles and all runs.
 
-    - `table`: shape (h + 1, at least w + 1, 3 num_bins). Counts wrap around in 16 bits, which
-      cancels in the difference of corners as long as a box holds fewer than 65 536 pixels.
-    - `num_bins`: N_b, bins a channel; static.
+    - `table`: shape (h + 1, at least w + 1, num_channels num_bins). Counts wrap around in 16 bits,
+      which cancels in the difference of corners as long as a box holds fewer than 65 536 pixels.
+    - `num_channels`, `num_bins`: of the colours that were counted; static.
     - `height`, `width`: of the frame in pixels; static.
     """
 
     table: Shaped[Array, "rows columns k"]
+    num_channels: int = eqx.field(static=True)
     num_bins: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
     width: int = eqx.field(static=True)
@@ -37,7 +39,7 @@ class IntegralHistogram(eqx.Module):
 
     def counts(
         self, boxes: Float[Array, "n 4"], num_parts: int = 1
-    ) -> Float[Array, "n parts 3 bins"]:
+    ) -> Float[Array, "n parts channels bins"]:
         """Pixels of each colour in each box, cut into `num_parts` bands from top to bottom.
 
         Boxes are (x, y, w, h) about their centre, in pixels, the frame spanning [0, width] x
@@ -53,7 +55,7 @@ class IntegralHistogram(eqx.Module):
         valid = (columns[:, 1] > columns[:, 0]) & (rows[:, -1] > rows[:, 0])
         valid &= pixels <= self.largest_box
         counts = jnp.where(valid[:, None, None], bands, jnp.zeros((), bands.dtype))
-        shape = (boxes.shape[0], num_parts, _CHANNELS, self.num_bins)
+        shape = (boxes.shape[0], num_parts, self.num_channels, self.num_bins)
         return counts.reshape(shape).astype(boxes.dtype)
 
     def _edges(
@@ -66,17 +68,15 @@ class IntegralHistogram(eqx.Module):
 
 
 def integral_histogram(
-    frame: UInt8[Array, "h w 3"], num_bins: int, wide_counts: bool = False
+    frame: UInt8[Array, "h w 3"], colours: AbstractColours, wide_counts: bool = False
 ) -> IntegralHistogram:
-    """Build the integral histogram of an RGB frame, `num_bins` equal bins a channel.
+    """Build the integral histogram of an RGB frame, whose pixels `colours` sorts into bins.
 
     `wide_counts` counts in 32 bits, two to four times slower, for boxes of 65 536 pixels or more.
-    Raises `ValueError` for a number of bins outside 1 to 256.
     """
-    if not 1 <= num_bins <= 256:
-        raise ValueError(f"num_bins: {num_bins} is not between 1 and 256")
     height, width, _ = frame.shape
-    return IntegralHistogram(_table(frame, num_bins, wide_counts), num_bins, height, width)
+    table = _table(frame, colours, wide_counts)
+    return IntegralHistogram(table, colours.num_channels, colours.num_bins, height, width)
 
 
 def normalise(
@@ -100,32 +100,32 @@ def bhattacharyya(
     return jnp.clip(1 - jnp.sum(jnp.sqrt(histograms * references), axis=-1), 0.0, 1.0)
 
 
-@partial(jax.jit, static_argnames=("num_bins", "wide_counts"))
-def _table(frame: UInt8[Array, "h w 3"], num_bins: int, wide_counts: bool) -> Array:
+@partial(jax.jit, static_argnames=("wide_counts",))
+def _table(frame: UInt8[Array, "h w 3"], colours: AbstractColours, wide_counts: bool) -> Array:
     width = frame.shape[1]
     dtype = jnp.dtype(jnp.uint32 if wide_counts else jnp.uint16)
-    bins = frame.astype(jnp.int32) * num_bins // 256
     columns = -(-(width + 1) // _BLOCK) * _BLOCK
     # Pixels of no colour fill the row above, the column to the left and the last block.
-    bins = jnp.pad(bins, ((1, 0), (1, columns - width - 1), (0, 0)), constant_values=-1)
-    above = jnp.zeros((columns, _CHANNELS * num_bins), dtype)
+    padding = ((1, 0), (1, columns - width - 1), (0, 0))
+    bins = jnp.pad(colours.bins(frame), padding, constant_values=-1)
+    above = jnp.zeros((columns, colours.num_channels * colours.num_bins), dtype)
 
     def add_row(above: Array, row: Array) -> tuple[Array, Array]:
-        below = above + _row_counts(row, num_bins, dtype)
+        below = above + _row_counts(row, colours.num_bins, dtype)
         return below, below
 
     return jax.lax.scan(add_row, above, bins)[1]
 
 
-def _row_counts(row: Int[Array, "w 3"], num_bins: int, dtype: jnp.dtype) -> Array:
+def _row_counts(row: Int[Array, "w channels"], num_bins: int, dtype: jnp.dtype) -> Array:
     """Prefix sums along one row. Blocks unrolled in full: XLA's cumsum takes five times longer."""
-    width = row.shape[0]
+    width, num_channels = row.shape
     one_hot = (row[:, :, None] == jnp.arange(num_bins)[None, None]).astype(dtype)
-    blocks = one_hot.reshape(width // _BLOCK, _BLOCK, _CHANNELS * num_bins)
+    blocks = one_hot.reshape(width // _BLOCK, _BLOCK, num_channels * num_bins)
     within = _running_sums([blocks[:, i] for i in range(_BLOCK)])
     before = _running_sums([jnp.zeros_like(within[-1][0]), *within[-1][:-1]])
     sums = jnp.stack(within, axis=1) + jnp.stack(before)[:, None]
-    return sums.reshape(width, _CHANNELS * num_bins)
+    return sums.reshape(width, num_channels * num_bins)
 
 
 def _running_sums(terms: list[Array]) -> list[Array]:

@@ -101,8 +101,37 @@ def test_bad_options_are_named(options, named):
         GaussianRegeneration(**options)
 
 
+def test_the_predictive_gaussian_is_another_sample_of_the_same():
+    """Redrawn once more between prediction and weighing, the particles are nobody's offspring."""
+    model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
+    filters = [
+        mpfjax.gaussian_particle_filter(model, 50, importance=importance)
+        for importance in ("propagated", "predictive_gaussian")
+    ]
+    start = filters[0].init(jax.random.key(0))
+    ends = [filter.step(jax.random.key(1), start, jnp.array(1.0))[0] for filter in filters]
+    assert len(filters[1].moves) == 4
+    assert not np.intersect1d(ends[0].particles, ends[1].particles).size
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"importance": "prior"}, "importance: 'prior'"),
+        ({"importance": "predictive_gaussian", "proposal": True}, "importance: .* no proposal"),
+    ],
+)
+def test_misread_importance_is_named(options, named):
+    model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
+    if "proposal" in options:
+        options = options | {"proposal": mpfjax.GaussNewtonProposal(model)}
+    with pytest.raises(ValueError, match=named):
+        mpfjax.gaussian_mixture_particle_filter(model, 50, 2, **options)
+
+
+@pytest.mark.parametrize("importance", ["propagated", "predictive_gaussian"])
 @pytest.mark.parametrize("max_components", [1, 3])
-def test_moments_are_the_kalman_filters(max_components):
+def test_moments_are_the_kalman_filters(max_components, importance):
     """On a linear-Gaussian model one component is exact, and any number close to it."""
     model = mpfjax.LinearGaussianModel(
         A=0.9 * jnp.eye(2), Q=jnp.array([[0.6, 0.1], [0.1, 0.6]]), H=jnp.ones((1, 2)),
@@ -111,9 +140,11 @@ def test_moments_are_the_kalman_filters(max_components):
     observations = jnp.array([[0.3], [1.2], [-0.5], [2.0], [0.1]])
     exact = kalman_filter(model, observations)
     if max_components == 1:
-        filter = mpfjax.gaussian_particle_filter(model, 2000)
+        filter = mpfjax.gaussian_particle_filter(model, 2000, importance=importance)
     else:
-        filter = mpfjax.gaussian_mixture_particle_filter(model, 2000, max_components)
+        filter = mpfjax.gaussian_mixture_particle_filter(
+            model, 2000, max_components, importance=importance
+        )
 
     def collect(mixture):
         centred = mixture.particles - mixture.mean()[None]

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import mpfjax
+from mpfjax import Autoregression, RandomWalk
 from mpfjax.vision.colour_model import BoxState, ColourModel
+from mpfjax.vision.colours import HSVColours, RGBColours
 from mpfjax.vision.histograms import integral_histogram
 
 BOXES = np.array([[10.0, 10, 12, 20], [50, 20, 16, 24]])
@@ -38,7 +40,7 @@ def at_references(model):
 
 
 def test_the_likelihood_is_the_papers_formula(frame):
-    model = model_of(frame, num_bins=8, sigma=0.2)
+    model = model_of(frame, colours=RGBColours(8), sigma=0.2)
     state = states((30.0, 30.0, 1.5, 0.75, 1))
 
     def histogram(x, y, w, h):
@@ -70,7 +72,7 @@ def test_the_reference_itself_is_most_likely(frame, options):
 
 def test_contrast_subtracts_what_lies_to_the_sides(frame):
     """Half a box's width to each side, against numpy."""
-    options = {"num_bins": 8, "sigma": 0.2}
+    options = {"colours": RGBColours(8), "sigma": 0.2}
     state = states((54.0, 32.0, 1.0, 1.0, 1))  # columns 46 to 62, rows 20 to 44
 
     def histogram(columns):
@@ -121,7 +123,7 @@ def test_a_box_outside_lies_at_the_largest_distance(frame):
 def test_a_built_histogram_is_as_good_as_its_frame(frame):
     model, image = model_of(frame), jnp.asarray(frame)
     some = model.sample_initial(jax.random.key(1), 30)
-    built = integral_histogram(image, 30)
+    built = integral_histogram(image, RGBColours())
     np.testing.assert_array_equal(
         np.asarray(model.log_likelihood(built, some)), np.asarray(model.log_likelihood(image, some))
     )
@@ -172,6 +174,41 @@ def test_deviations_of_each_box_are_used(frame):
     np.testing.assert_allclose(moved[1::2].std(axis=0), rows[1], rtol=0.1)
 
 
+def test_hsv_likelihood_is_the_papers_formula(frame):
+    """Lin et al. (2012), eqs. 1 to 3: one histogram of N_h N_s + N_v bins."""
+    colours = HSVColours(6, 3, 4)
+    model = model_of(frame, colours=colours, sigma=0.2)
+    state = states((30.0, 30.0, 1.5, 0.75, 1))
+
+    def histogram(x, y, w, h):
+        patch = frame[int(y) : int(y + h), int(x) : int(x + w)]
+        counts = np.bincount(np.asarray(colours.bins(jnp.asarray(patch))).ravel(), minlength=22)
+        return counts / counts.sum()
+
+    shared = np.sqrt(histogram(30 - 12, 30 - 9, 24, 18) * histogram(*BOXES[1])).sum()
+    assert 0.05 < shared < 0.95
+    found = float(model.log_likelihood(jnp.asarray(frame), state)[0])
+    np.testing.assert_allclose(found, -(1 - shared) / (2 * 0.2**2), rtol=1e-4)
+
+
+def test_second_order_dynamics_carry_the_last_box_along(frame):
+    dynamics = Autoregression.with_momentum(0.5, jnp.asarray(DEVIATIONS))
+    model = model_of(frame, dynamics=dynamics)
+    start = model.sample_initial(jax.random.key(0), 4000)
+    np.testing.assert_array_equal(start.previous, start.box)
+    before = BoxState(start.box, start.reference, start.box - jnp.array([[4.0, 2.0, 0, 0]]))
+    after = model.sample_transition(jax.random.key(1), before)
+    np.testing.assert_array_equal(after.previous, before.box)
+    moved = np.asarray(after.box - before.box)
+    bound = 5 * DEVIATIONS / np.sqrt(4000)
+    assert (np.abs(moved.mean(axis=0) - [2.0, 1.0, 0, 0]) < bound).all()
+    entropy = np.sum(0.5 * np.log(2 * np.pi * np.e * DEVIATIONS**2))
+    assert abs(float(model.log_transition(after, before).mean()) + entropy) < 0.1
+    filter = mpfjax.particle_filter(model, 40)
+    run = mpfjax.run_filter(jax.random.key(0), filter, jnp.asarray(np.stack([frame] * 3)))
+    assert np.isfinite(float(run.log_marginal_likelihood))
+
+
 def test_a_shared_reference_is_the_mean_of_all(frame):
     own, shared = model_of(frame), model_of(frame, share_reference=True)
     mean = np.asarray(own.references).mean(axis=0)
@@ -182,7 +219,7 @@ def test_a_shared_reference_is_the_mean_of_all(frame):
 def test_the_papers_variances_are_the_default(frame):
     model = ColourModel.from_frame(frame, BOXES)
     np.testing.assert_allclose(
-        np.asarray(model.deviations[0]) ** 2, [2.5, 1.5, 0.05, 0.05], rtol=1e-6
+        np.asarray(model.dynamics.deviations[0]) ** 2, [2.5, 1.5, 0.05, 0.05], rtol=1e-6
     )
     assert model.references.shape == (2, 1, 3, 30)
     assert float(model.sigma) == pytest.approx(0.15)
@@ -208,8 +245,8 @@ def test_it_runs_through_a_filter_and_keeps_both_boxes(frame):
         ("sigma: 0", BOXES, {"sigma": 0.0}),
         ("num_parts: 0", BOXES, {"num_parts": 0}),
         ("switch_probability: 2", BOXES, {"switch_probability": 2.0}),
+        ("dynamics: ", BOXES, {"dynamics": RandomWalk(jnp.ones((3, 4)))}),
         ("contrast: -1", BOXES, {"contrast": -1.0}),
-        ("num_bins: 0", BOXES, {"num_bins": 0}),
         ("deviations: ", BOXES, {"deviations": np.ones(3)}),
         ("deviations: ", BOXES, {"deviations": np.array([1.0, 1, 1, 0])}),
     ],

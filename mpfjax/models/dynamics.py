@@ -1,0 +1,186 @@
+"""How a vector moves from frame to frame: random walk, second-order autoregression."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from mpfjax.models.base import require_positive
+
+
+class AbstractDynamics(eqx.Module):
+    """D(x_t | x_{t-1}, x_{t-2}) of a vector: a part that models are made of, no model itself.
+
+    Parameters are one set for all particles, or carry a leading axis with one set for each. A
+    model keeps x_{t-1} beside x_t in its state where `order` is 2.
+    """
+
+    @property
+    @abc.abstractmethod
+    def order(self) -> int:
+        """How many past values x_t depends on, 1 or 2."""
+
+    @property
+    @abc.abstractmethod
+    def is_shared(self) -> bool:
+        """Whether there is one set of parameters for all particles."""
+
+    @abc.abstractmethod
+    def sample(
+        self,
+        key: Key[Array, ""],
+        current: Float[Array, "n d"],
+        previous: Float[Array, "n d"] | None = None,
+    ) -> Float[Array, "n d"]:
+        """x_t given x_{t-1}, and x_{t-2} where the order is 2."""
+
+    @abc.abstractmethod
+    def log_density(
+        self,
+        following: Float[Array, "n d"],
+        current: Float[Array, "n d"],
+        previous: Float[Array, "n d"] | None = None,
+    ) -> Float[Array, " n"]:
+        """log D(x_t | x_{t-1}, x_{t-2}), with x_t in `following`."""
+
+
+class RandomWalk(AbstractDynamics):
+    """x_t = x_{t-1} + diag(deviations) ω_t, ω_t ~ N(0, I).
+
+    Vermaak et al. (2003), section 5.2. `deviations`: (d,), or (n, d) with a row for each
+    particle, in units of the state a frame. Raises `ValueError` where one is not positive. Use
+    it where motion is too erratic to be carried over from the last frame.
+    """
+
+    deviations: Float[Array, "*n d"] = eqx.field(converter=jnp.asarray)
+
+    def __check_init__(self) -> None:
+        require_positive(deviations=self.deviations)
+
+    @property
+    def order(self) -> int:
+        """1."""
+        return 1
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether `deviations` is one row for all."""
+        return self.deviations.ndim == 1
+
+    def sample(
+        self,
+        key: Key[Array, ""],
+        current: Float[Array, "n d"],
+        previous: Float[Array, "n d"] | None = None,
+    ) -> Float[Array, "n d"]:
+        """x_{t-1} plus noise."""
+        del previous
+        noise = jax.random.normal(key, current.shape, current.dtype)
+        return current + jnp.broadcast_to(self.deviations, current.shape) * noise
+
+    def log_density(
+        self,
+        following: Float[Array, "n d"],
+        current: Float[Array, "n d"],
+        previous: Float[Array, "n d"] | None = None,
+    ) -> Float[Array, " n"]:
+        """log N(x_t; x_{t-1}, diag(deviations²))."""
+        del previous
+        deviations = jnp.broadcast_to(self.deviations, current.shape)
+        noise = (following - current) / deviations
+        return _log_standard_normal(noise) - jnp.sum(jnp.log(deviations), axis=1)
+
+
+class Autoregression(AbstractDynamics):
+    """x_t - x̄ = A1 (x_{t-1} - x̄) + A2 (x_{t-2} - x̄) + B ω_t, ω_t ~ N(0, I).
+
+    Lin et al. (2012), eq. 4. With A1 + A2 = I, as in `with_momentum`, x̄ cancels and nothing pulls
+    the state anywhere; otherwise it is what the state returns to.
+
+    - `A1`, `A2`, `B`: (d, d); `mean`: x̄, (d,); or each with a leading axis, a set for each
+      particle. `log_density` needs an invertible B.
+
+    Raises `ValueError` for shapes that do not fit together. Use it for objects whose speed and
+    direction last over several frames.
+    """
+
+    A1: Float[Array, "*n d d"] = eqx.field(converter=jnp.asarray)
+    A2: Float[Array, "*n d d"] = eqx.field(converter=jnp.asarray)
+    B: Float[Array, "*n d d"] = eqx.field(converter=jnp.asarray)
+    mean: Float[Array, "*n d"] = eqx.field(converter=jnp.asarray)
+
+    def __check_init__(self) -> None:
+        expected = (*self.mean.shape, self.mean.shape[-1])
+        for name in ("A1", "A2", "B"):
+            if getattr(self, name).shape != expected:
+                raise ValueError(
+                    f"{name}: shape {getattr(self, name).shape} is not {expected},"
+                    f" for a mean of shape {self.mean.shape}"
+                )
+
+    @classmethod
+    def with_momentum(cls, momentum: float, deviations: Float[Array, " d"]) -> "Autoregression":
+        """x_t = x_{t-1} + momentum (x_{t-1} - x_{t-2}) + diag(deviations) ω_t.
+
+        Momentum 1 is constant velocity, 0 the random walk; Smith and Gatica-Perez (2004) have 0.5.
+        """
+        deviations = jnp.asarray(deviations)
+        require_positive(deviations=deviations)
+        eye = jnp.eye(len(deviations), dtype=deviations.dtype)
+        return cls(
+            (1 + momentum) * eye, -momentum * eye, jnp.diag(deviations), jnp.zeros_like(deviations)
+        )
+
+    @property
+    def order(self) -> int:
+        """2."""
+        return 2
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether there is one set of matrices for all."""
+        return self.mean.ndim == 1
+
+    def sample(
+        self,
+        key: Key[Array, ""],
+        current: Float[Array, "n d"],
+        previous: Float[Array, "n d"] | None = None,
+    ) -> Float[Array, "n d"]:
+        """The expected x_t plus B ω_t."""
+        noise = jax.random.normal(key, current.shape, current.dtype)
+        return self._expected(current, previous) + _times(self.B, noise)
+
+    def log_density(
+        self,
+        following: Float[Array, "n d"],
+        current: Float[Array, "n d"],
+        previous: Float[Array, "n d"] | None = None,
+    ) -> Float[Array, " n"]:
+        """log N(x_t; the expected x_t, B Bᵀ)."""
+        residuals = following - self._expected(current, previous)
+        scales = jnp.broadcast_to(self.B, (*current.shape, current.shape[1]))
+        noise = jnp.linalg.solve(scales, residuals[:, :, None])[:, :, 0]
+        log_volume = jnp.broadcast_to(jnp.linalg.slogdet(self.B)[1], noise.shape[:1])
+        return _log_standard_normal(noise) - log_volume
+
+    def _expected(
+        self, current: Float[Array, "n d"], previous: Float[Array, "n d"] | None
+    ) -> Float[Array, "n d"]:
+        if previous is None:
+            raise ValueError("previous: an Autoregression needs x_{t-2}")
+        mean = jnp.broadcast_to(self.mean, current.shape)
+        return mean + _times(self.A1, current - mean) + _times(self.A2, previous - mean)
+
+
+def _times(matrices: Float[Array, "*n d d"], vectors: Float[Array, "n d"]) -> Float[Array, "n d"]:
+    """A x of every row, as sums that fuse: a batch of tiny matrix products does not."""
+    if matrices.ndim == 2:
+        return vectors @ matrices.T
+    return jnp.sum(matrices * vectors[:, None, :], axis=2)
+
+
+def _log_standard_normal(noise: Float[Array, "n d"]) -> Float[Array, " n"]:
+    return jnp.sum(-0.5 * noise**2 - 0.5 * jnp.log(2 * jnp.pi), axis=1)

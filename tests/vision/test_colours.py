@@ -1,0 +1,69 @@
+"""The bins of pixels, against NumPy and matplotlib's own conversion."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.colors import rgb_to_hsv
+
+from mpfjax.vision.colours import HSVColours, RGBColours, hue_saturation_value
+from mpfjax.vision.histograms import integral_histogram
+
+
+@pytest.fixture(scope="module")
+def frame():
+    """Every kind of pixel: random ones, pure colours, greys, black and white."""
+    image = np.random.default_rng(0).integers(0, 256, (40, 50, 3), dtype=np.uint8)
+    corners = [[r, g, b] for r in (0, 255) for g in (0, 255) for b in (0, 255)]
+    image[0, : len(corners)] = corners
+    image[1] = np.linspace(0, 255, 50).astype(np.uint8)[:, None]
+    return image
+
+
+def test_hue_saturation_and_value_are_matplotlibs(frame):
+    expected = rgb_to_hsv(frame / 255.0)
+    found = np.stack(
+        [np.asarray(part) for part in hue_saturation_value(jnp.asarray(frame))], axis=-1
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_hsv_counts_by_colour_or_by_value(frame):
+    """N_h N_s + N_v bins in one histogram, filled by a loop over the pixels."""
+    colours = HSVColours(5, 4, 3, least_saturation=0.3, least_value=0.4)
+    hue, saturation, value = np.moveaxis(rgb_to_hsv(frame / 255.0), -1, 0)
+    expected = np.zeros(5 * 4 + 3)
+    for h, s, v in zip(hue.ravel(), saturation.ravel(), value.ravel(), strict=True):
+        if s >= 0.3 and v >= 0.4:
+            expected[min(int(h * 5), 4) * 4 + min(int(s * 4), 3)] += 1
+        else:
+            expected[20 + min(int(v * 3), 2)] += 1
+    table = integral_histogram(jnp.asarray(frame), colours)
+    counts = table.counts(jnp.array([[25.0, 20.0, 50.0, 40.0]]))
+    assert counts.shape == (1, 1, 1, 23)
+    # Float32 may put a pixel on the border of two bins into the other one.
+    assert np.abs(np.asarray(counts[0, 0, 0]) - expected).sum() <= 10
+    assert expected[20:].min() > 0
+    assert expected[:20].min() > 0
+
+
+def test_bins_cover_their_range(frame):
+    for colours in (RGBColours(7), HSVColours(3, 5, 4), HSVColours(1, 1, 1)):
+        bins = np.asarray(colours.bins(jnp.asarray(frame)))
+        assert bins.shape == (40, 50, colours.num_channels)
+        np.testing.assert_array_equal(np.unique(bins), np.arange(colours.num_bins))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: RGBColours(0), "num_bins: 0"),
+        (lambda: RGBColours(257), "num_bins: 257"),
+        (lambda: HSVColours(num_hues=0), "num_hues: 0"),
+        (lambda: HSVColours(num_values=-1), "num_values: -1"),
+        (lambda: HSVColours(least_saturation=1.5), "least_saturation: 1.5"),
+        (lambda: HSVColours(least_value=-0.1), "least_value: -0.1"),
+    ],
+)
+def test_misuse_is_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
