@@ -352,7 +352,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
 
 def open_source(options: argparse.Namespace) -> Source:
     """The frames and the objects, or a `ValueError` that names the argument."""
-    first, last = parse_range(options.frames)
+    first, last = frames.parse_range(options.frames, "--frames")
     if options.seeds < 1:
         raise ValueError(f"--seeds: {options.seeds} is less than 1")
     if options.sequence is None and options.video is None:
@@ -414,20 +414,6 @@ def _chosen_ids(options, started: dict, rows: np.ndarray | None, first: int) -> 
     if missing or not ids:
         raise ValueError(f"--ids: gt.txt has no box of {missing or 'any object'} in frame {first}")
     return ids
-
-
-def parse_range(text: str | None) -> tuple[int, int | None]:
-    """A and B of "A:B"; B is None where it is left out."""
-    if text is None:
-        return 1, None
-    a, colon, b = text.partition(":")
-    try:
-        first, last = int(a), int(b) if b else None
-    except ValueError:
-        first, last = 0, None
-    if not colon or first < 1 or (last is not None and last < first):
-        raise ValueError(f"--frames: {text!r} is not A:B with 1 <= A <= B")
-    return first, last
 
 
 def run(options: argparse.Namespace) -> None:

@@ -146,3 +146,53 @@ def draw_contact_sheet(
             axis.set(xticks=[], yticks=[])
             axis.set_title(title, fontsize=12)
     return figure
+
+
+def draw_curves(
+    curves: Mapping[str, np.ndarray], first: int, *, xlabel: str, ylabel: str, title: str
+) -> Figure:
+    """Named curves over frames, (seeds, t) each: the mean over seeds, and a band of one std."""
+    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
+    axis = figure.subplots()
+    for index, (name, values) in enumerate(curves.items()):
+        frames = first + np.arange(values.shape[1])
+        mean, std = values.mean(axis=0), values.std(axis=0)
+        style = {"color": COLOURS[index], "marker": MARKERS[index], "markevery": (3 * index, 12)}
+        axis.plot(frames, mean, label=name, lw=1.4, ms=5, **style)
+        axis.fill_between(frames, mean - std, mean + std, color=COLOURS[index], alpha=0.15, lw=0)
+    axis.set(xlabel=xlabel, ylabel=ylabel)
+    axis.set_ylim(bottom=0)
+    axis.set_title(title, fontsize=10)
+    axis.grid(alpha=0.25)
+    axis.legend(fontsize=8, ncols=len(curves), loc="upper right")
+    return figure
+
+
+def draw_errors_by_size(
+    panels: Sequence[tuple[str, Mapping[str, Mapping[int, np.ndarray]]]], ylabel: str
+) -> Figure:
+    """Figures 5 and 6 of Lin et al. (2012): errors of several runs against N, a panel a target.
+
+    Each panel has a title and, for each filter by name, the errors of its runs by N.
+    """
+    figure = Figure(figsize=(3.9 * len(panels), 3.4), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+    for axis, (title, lines) in zip(axes, panels, strict=True):
+        for index, (name, by_size) in enumerate(lines.items()):
+            sizes = np.array(sorted(by_size))
+            mean = np.array([by_size[size].mean() for size in sizes])
+            error = np.array([by_size[size].std() / len(by_size[size]) ** 0.5 for size in sizes])
+            # Shifted a little, so that bars of equal heights stay apart.
+            shift = 1 + 0.012 * (index - (len(lines) - 1) / 2)
+            axis.errorbar(
+                sizes * shift, mean, error, label=name, color=COLOURS[index],
+                marker=MARKERS[index], ms=5, lw=1.4, capsize=3,
+            )  # fmt: skip
+        axis.set_yscale("log")
+        axis.set_xticks(sizes)
+        axis.set_xlabel("number of particles $N$")
+        axis.set_title(title, fontsize=10)
+        axis.grid(alpha=0.25, which="both")
+    axes[0].set_ylabel(ylabel)
+    axes[-1].legend(fontsize=8)
+    return figure

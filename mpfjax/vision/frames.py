@@ -29,6 +29,23 @@ def read_frames(
     return _of_one_size(path, frames)
 
 
+def parse_range(text: str | None, argument: str = "frames") -> tuple[int, int | None]:
+    """A and B of "A:B", frames counted from 1; B is None where it is left out, for the last.
+
+    Raises `ValueError` naming `argument` where it is not that.
+    """
+    if text is None:
+        return 1, None
+    a, colon, b = text.partition(":")
+    try:
+        first, last = int(a), int(b) if b else None
+    except ValueError:
+        first, last = 0, None
+    if not colon or first < 1 or (last is not None and last < first):
+        raise ValueError(f"{argument}: {text!r} is not A:B with 1 <= A <= B")
+    return first, last
+
+
 def num_images(path: str | Path) -> int:
     """How many frames a folder of images holds."""
     return len(_image_paths(Path(path)))
