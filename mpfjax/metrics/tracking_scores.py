@@ -1,0 +1,105 @@
+"""The scores that trackers are compared by: HOTA, MOTA and IDF1, counted by TrackEval."""
+
+from types import ModuleType
+
+import numpy as np
+from jaxtyping import Float
+
+_SETTINGS = {"THRESHOLD": 0.5, "PRINT_CONFIG": False}
+
+
+def multi_object_scores(
+    tracks: Float[np.ndarray, "r 6"],
+    truth: Float[np.ndarray, "s 6"],
+    frames: tuple[int, int] | None = None,
+) -> dict[str, float]:
+    """Score tracks against the true boxes as TrackEval does, by the overlap of boxes (IoU).
+
+    Both are rows (frame, id, x, y, w, h) as MOTChallenge files have them, (x, y) the top-left
+    corner, in pixels. `frames` is the first and the last frame to score; rows outside are left
+    out. Without it every frame in which either has a box counts. The scores:
+
+    - "HOTA", "DetA" and "AssA", Luiten et al. (2021), each the mean over IoU thresholds of 0.05
+      to 0.95;
+    - "MOTA", "MOTP" (the mean IoU of the matches), "id_switches", "false_positives" and "misses",
+      Bernardin and Stiefelhagen (2008), at an IoU of 0.5;
+    - "IDF1", Ristani et al. (2016), at an IoU of 0.5.
+
+    Without tracks every object is a miss and every ratio 0. A box without area overlaps nothing.
+    Raises `ValueError` where an id has two boxes in one frame, where a number is not finite,
+    where `frames` ends before it begins, and where there are no true boxes to score against;
+    `ImportError` without the extra "trackeval". Use it to compare with published trackers;
+    `coverage` is looser about the boxes' size.
+    """
+    tracks, truth = _checked(tracks, "tracks"), _checked(truth, "truth")
+    if frames is not None:
+        first, last = frames
+        if first > last:
+            raise ValueError(f"frames: {last}, the last, comes before {first}, the first")
+        tracks, truth = (
+            rows[(first <= rows[:, 0]) & (rows[:, 0] <= last)] for rows in (tracks, truth)
+        )
+    if len(truth) == 0:
+        raise ValueError("truth: there are no true boxes to score against")
+    metrics = _trackeval_metrics()
+    sequence = _sequence(tracks, truth)
+    hota = metrics.HOTA().eval_sequence(sequence)
+    clear = metrics.CLEAR(_SETTINGS).eval_sequence(sequence)
+    identity = metrics.Identity(_SETTINGS).eval_sequence(sequence)
+    scores = {name: np.mean(hota[name]) for name in ("HOTA", "DetA", "AssA")}
+    scores |= {name: clear[name] for name in ("MOTA", "MOTP")}
+    scores |= {
+        "IDF1": identity["IDF1"],
+        "id_switches": clear["IDSW"],
+        "false_positives": clear["CLR_FP"],
+        "misses": clear["CLR_FN"],
+    }
+    return {name: float(score) for name, score in scores.items()}
+
+
+def overlap(
+    boxes: Float[np.ndarray, "r 4"], objects: Float[np.ndarray, "s 4"]
+) -> Float[np.ndarray, "r s"]:
+    """Intersection over union of boxes (x, y, w, h); 0 where either has no area."""
+    near = np.maximum(boxes[:, None, :2], objects[None, :, :2])
+    far = np.minimum(*(part[..., :2] + part[..., 2:] for part in (boxes[:, None], objects[None])))
+    shared = np.prod(np.maximum(far - near, 0.0), axis=-1)
+    areas = [np.prod(np.maximum(part[:, 2:], 0.0), axis=-1) for part in (boxes, objects)]
+    union = areas[0][:, None] + areas[1][None] - shared
+    return np.where(shared > 0, shared / np.where(shared > 0, union, 1.0), 0.0)
+
+
+def _checked(rows: np.ndarray, argument: str) -> np.ndarray:
+    rows = np.asarray(rows, float).reshape(-1, 6)
+    if not np.all(np.isfinite(rows)):
+        raise ValueError(f"{argument}: holds numbers that are not finite")
+    keys, counts = np.unique(rows[:, :2], axis=0, return_counts=True)
+    for frame, id in keys[counts > 1].tolist():
+        raise ValueError(f"{argument}: id {id:g} has more than one box in frame {frame:g}")
+    return rows
+
+
+def _sequence(tracks: np.ndarray, truth: np.ndarray) -> dict[str, object]:
+    """One sequence in the form that TrackEval's metrics read: ids from 0, lists over frames."""
+    frames = np.union1d(tracks[:, 0], truth[:, 0])
+    sequence: dict[str, object] = {"num_timesteps": len(frames)}
+    boxes = []
+    for name, rows in (("gt", truth), ("tracker", tracks)):
+        names, ids = np.unique(rows[:, 1], return_inverse=True)
+        in_frames = [rows[:, 0] == frame for frame in frames]
+        boxes.append([rows[here, 2:] for here in in_frames])
+        sequence[f"{name}_ids"] = [ids[here] for here in in_frames]
+        sequence[f"num_{name}_ids"] = len(names)
+        sequence[f"num_{name}_dets"] = len(rows)
+    sequence["similarity_scores"] = [overlap(*pair) for pair in zip(*boxes, strict=True)]
+    return sequence
+
+
+def _trackeval_metrics() -> ModuleType:
+    try:
+        from trackeval import metrics
+    except ImportError as error:
+        raise ImportError(
+            'trackeval is needed to score tracks: pip install "mpfjax[trackeval]"'
+        ) from error
+    return metrics

@@ -1,0 +1,235 @@
+"""OSPA and GOSPA against Stone Soup, and against every pairing where the sets are small."""
+
+import datetime
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpfjax.metrics import gospa, ospa
+from tests.precision import float64
+
+CUTOFF = 20.0
+SIZES = list(itertools.product(range(5), range(5)))
+
+
+def random_sets(seed, num_estimates, num_truths):
+    """Close enough together that pairs lie on both sides of the cutoff, and pairings compete."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0, 40, (num_estimates, 2)), rng.uniform(0, 40, (num_truths, 2))
+
+
+def tracked_sets(seed, num_estimates, num_truths):
+    """Objects far apart and estimates near them, so that no two pairings compete."""
+    rng = np.random.default_rng(seed)
+    objects = 100.0 * rng.permutation(max(num_estimates, num_truths))[:, None] + np.zeros(2)
+    errors = rng.uniform(-25, 25, (num_estimates, 2))
+    order = rng.permutation(num_estimates)
+    return objects[:num_estimates][order] + errors, objects[:num_truths]
+
+
+def padded(sets, size):
+    """Points at the front of arrays of `size`, and NaN in the places that the masks leave out."""
+    rows = np.full((len(sets), size, 2), np.nan)
+    for row, points in zip(rows, sets, strict=True):
+        row[: len(points)] = points
+    present = np.arange(size)[None] < np.array([[len(points)] for points in sets])
+    return jnp.asarray(rows), jnp.asarray(present)
+
+
+def all_padded(pairs):
+    estimates, truths = zip(*pairs, strict=True)
+    return padded(estimates, 5), padded(truths, 6)
+
+
+def masked(metric, pairs, **settings):
+    """The metric of every pair of sets at once."""
+    (x, x_mask), (y, y_mask) = all_padded(pairs)
+    return jax.jit(jax.vmap(one_frame(metric, **settings)))(x, y, x_mask, y_mask)
+
+
+def one_frame(metric, **settings):
+    def call(x, y, x_mask, y_mask):
+        return metric(x, y, estimate_mask=x_mask, truth_mask=y_mask, **settings)
+
+    return call
+
+
+def stone_soup(name, estimates, truths, **settings):
+    reference = pytest.importorskip(
+        "stonesoup.metricgenerator.ospametric",
+        reason="stonesoup, the reference, is not installed",
+    )
+    from stonesoup.types.state import State
+
+    time = datetime.datetime(2020, 1, 1)
+    x, y = ([State(point[:, None], timestamp=time) for point in set] for set in (estimates, truths))
+    metric = getattr(reference, name)(**settings)
+    if name == "OSPAMetric":
+        return metric.compute_OSPA_distance(x, y).value
+    return metric.compute_gospa_metric(x, y)[0].value
+
+
+def every_pairing(estimates, truths, cutoff, order, cost_alone):
+    """The least of sum min(d, c)^p + cost_alone * (number left over), over all pairings."""
+    if len(estimates) > len(truths):
+        estimates, truths = truths, estimates
+    distance = np.linalg.norm(estimates[:, None] - truths[None], axis=-1)
+    costs = np.minimum(distance, cutoff) ** order
+    return cost_alone * (len(truths) - len(estimates)) + min(
+        sum(costs[i, j] for i, j in enumerate(pairing))
+        for pairing in itertools.permutations(range(len(truths)), len(estimates))
+    )
+
+
+@pytest.mark.parametrize("order", [1.0, 2.0, 3.5])
+def test_gospa_is_that_of_stone_soup(order):
+    pairs = [random_sets(seed, *sizes) for sizes in SIZES if any(sizes) for seed in range(3)]
+    expected = [stone_soup("GOSPAMetric", *pair, c=CUTOFF, p=order) for pair in pairs]
+    found = masked(gospa, pairs, cutoff=CUTOFF, order=order)
+    for name in ("distance", "localisation", "missed", "false"):
+        np.testing.assert_allclose(
+            getattr(found, name),
+            [value[name] for value in expected],
+            rtol=2e-5,
+            atol=1e-5 * CUTOFF**order,
+        )
+
+
+@pytest.mark.parametrize("order", [1.0, 2.0, 3.5])
+def test_ospa_is_that_of_stone_soup(order):
+    """On sets whose pairings compete only at order 1: above it Stone Soup pairs by plain distance,
+    which is not always the least sum of powers, and its value is then too large."""
+    some_sets = random_sets if order == 1 else tracked_sets
+    pairs = [some_sets(seed, *sizes) for sizes in SIZES if any(sizes) for seed in range(3)]
+    expected = [stone_soup("OSPAMetric", *pair, c=CUTOFF, p=order) for pair in pairs]
+    found = masked(ospa, pairs, cutoff=CUTOFF, order=order)
+    np.testing.assert_allclose(found, expected, rtol=2e-5)
+
+
+@pytest.mark.parametrize("order", [1.0, 2.0, 3.5])
+def test_ospa_is_the_least_over_every_pairing(order):
+    pairs = [random_sets(seed, *sizes) for sizes in SIZES for seed in range(3)]
+    best = [every_pairing(*pair, CUTOFF, order, CUTOFF**order) for pair in pairs]
+    sizes = [max(*map(len, pair), 1) for pair in pairs]
+    found = masked(ospa, pairs, cutoff=CUTOFF, order=order)
+    np.testing.assert_allclose(found, np.divide(best, sizes) ** (1 / order), rtol=2e-5)
+
+
+@pytest.mark.parametrize("alpha", [0.5, 1.0, 2.0])
+def test_gospa_is_the_least_over_every_pairing(alpha):
+    pairs = [random_sets(seed, *sizes) for sizes in SIZES for seed in range(3)]
+    best = [every_pairing(*pair, CUTOFF, 2.0, CUTOFF**2 / alpha) for pair in pairs]
+    found = masked(gospa, pairs, cutoff=CUTOFF, order=2.0, alpha=alpha)
+    np.testing.assert_allclose(found.distance, np.sqrt(best), rtol=2e-5)
+    parts = found.localisation + found.missed + found.false
+    np.testing.assert_allclose(parts, best, rtol=2e-5)
+
+
+def test_the_pairing_of_least_powers_is_not_that_of_least_distances():
+    """Pairing 6 + 6 beats 0.5 + 11 by squares, not by distances, and so differs from order 1."""
+    matrix = jnp.array([[0.5, 6.0], [6.0, 11.0]])
+    settings = {"cutoff": 20.0, "base_distance": lambda x, y: matrix}
+    points = jnp.zeros((2, 2))
+    assert ospa(points, points, order=2.0, **settings) == pytest.approx(6.0)
+    assert ospa(points, points, order=1.0, **settings) == pytest.approx(11.5 / 2)
+
+
+def test_parts_by_hand():
+    """An object found 3 pixels off, one missed, one at the cutoff exactly, a false estimate."""
+    truths = jnp.array([[0.0, 0.0], [100.0, 0.0], [200.0, 0.0]])
+    estimates = jnp.array([[3.0, 0.0], [210.0, 0.0], [400.0, 0.0]])
+    found = gospa(estimates, truths, cutoff=10.0, order=2.0)
+    assert found.localisation == pytest.approx(9.0)
+    assert found.missed == pytest.approx(2 * 50.0)
+    assert found.false == pytest.approx(2 * 50.0)
+    assert found.distance == pytest.approx(209.0**0.5)
+
+
+def test_empty_sets():
+    none, two = jnp.zeros((0, 2)), jnp.zeros((2, 2))
+    assert ospa(none, none, cutoff=7.0) == 0
+    assert ospa(none, two, cutoff=7.0) == pytest.approx(7.0)
+    assert ospa(two, none, cutoff=7.0) == pytest.approx(7.0)
+    assert gospa(none, none, cutoff=7.0) == (0, 0, 0, 0)
+    missed = gospa(none, two, cutoff=7.0, order=2.0)
+    np.testing.assert_allclose(missed, [7.0, 0, 49.0, 0], rtol=1e-6)
+    false = gospa(two, none, cutoff=7.0, order=1.0, alpha=1.0)
+    np.testing.assert_allclose(false, [14.0, 0, 0, 14.0], rtol=1e-6)
+
+
+def test_equal_sets_in_any_order_are_at_distance_zero():
+    points = jnp.asarray(random_sets(0, 5, 0)[0])
+    assert ospa(points, points[::-1], cutoff=7.0) == 0
+    assert gospa(points, points[::-1], cutoff=7.0) == (0, 0, 0, 0)
+
+
+@pytest.mark.parametrize("metric", [ospa, gospa])
+def test_vmap_is_a_loop_and_jit_no_jit(metric):
+    """And a mask is the same as an array without what it leaves out."""
+    settings = {"cutoff": CUTOFF, "order": 2.0}
+    pairs = [random_sets(seed, *sizes) for seed, sizes in enumerate([(0, 3), (2, 2), (4, 1)])]
+    call = one_frame(metric, **settings)
+    (x, x_mask), (y, y_mask) = all_padded(pairs)
+    frames = list(zip(x, y, x_mask, y_mask, strict=True))
+    together = masked(metric, pairs, **settings)
+    for each in (
+        [call(*frame) for frame in frames],
+        [jax.jit(call)(*frame) for frame in frames],
+        [metric(jnp.asarray(x), jnp.asarray(y), **settings) for x, y in pairs],
+    ):
+        stacked = jax.tree.map(lambda *values: jnp.stack(values), *each)
+        jax.tree.map(
+            functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-3), together, stacked
+        )
+
+
+@pytest.mark.parametrize("where", ["estimate", "truth"])
+def test_a_nan_that_counts_ends_in_a_nan(where):
+    bad = jnp.array([[0.0, jnp.nan], [1.0, 1.0]])
+    good = jnp.ones((3, 2))
+    pair = (bad, good) if where == "estimate" else (good, bad)
+    assert jnp.isnan(ospa(*pair, cutoff=5.0))
+    assert jnp.isnan(gospa(*pair, cutoff=5.0).distance)
+
+
+def test_large_cutoffs_and_orders_do_not_overflow():
+    """1e5^10 is beyond float32."""
+    far = jnp.array([[3e4, 4e4]])
+    assert ospa(far, jnp.zeros((1, 2)), cutoff=1e5, order=10.0) == pytest.approx(5e4)
+    assert ospa(far, jnp.full((1, 2), jnp.inf), cutoff=1e5, order=10.0) == pytest.approx(1e5)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_both_precisions(dtype):
+    with float64():
+        sets = [jnp.asarray(set, dtype) for set in random_sets(3, 4, 3)]
+        found = gospa(*sets, cutoff=CUTOFF)
+        assert {part.dtype for part in found} == {jnp.dtype(dtype)}
+        assert ospa(*sets, cutoff=CUTOFF).dtype == dtype
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"cutoff": 0.0}, "cutoff: 0.0"),
+        ({"cutoff": -1.0}, "cutoff: -1.0"),
+        ({"cutoff": float("nan")}, "cutoff: nan"),
+        ({"cutoff": float("inf")}, "cutoff: inf"),
+        ({"cutoff": 1.0, "order": 0.5}, "order: 0.5"),
+        ({"cutoff": 1.0, "order": float("inf")}, "order: inf"),
+    ],
+)
+@pytest.mark.parametrize("metric", [ospa, gospa])
+def test_bad_settings(metric, settings, message):
+    with pytest.raises(ValueError, match=message):
+        metric(jnp.zeros((1, 2)), jnp.zeros((1, 2)), **settings)
+
+
+@pytest.mark.parametrize("alpha", [0.0, -1.0, 2.5])
+def test_bad_alpha(alpha):
+    with pytest.raises(ValueError, match=f"alpha: {alpha}"):
+        gospa(jnp.zeros((1, 2)), jnp.zeros((1, 2)), cutoff=1.0, alpha=alpha)

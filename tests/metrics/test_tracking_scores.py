@@ -1,0 +1,138 @@
+"""Scores of tracks so small that each can be worked out by hand."""
+
+import importlib.util
+import sys
+
+import numpy as np
+import pytest
+
+from mpfjax.metrics.tracking_scores import multi_object_scores, overlap
+
+needs_trackeval = pytest.mark.skipif(
+    importlib.util.find_spec("trackeval") is None,
+    reason="scoring tracks needs the extra 'trackeval'",
+)
+
+
+def row(frame, id, x, y=0.0, w=10.0, h=20.0):
+    return [frame, id, x, y, w, h]
+
+
+# Two objects over four frames: eight boxes.
+TRUTH = np.array([row(t, id, 100.0 * id) for t in (1, 2, 3, 4) for id in (1, 2)])
+NONE = np.zeros((0, 6))
+RATIOS = ("HOTA", "DetA", "AssA", "MOTA", "MOTP", "IDF1")
+COUNTS = ("id_switches", "false_positives", "misses")
+
+
+def check(scores, **expected):
+    """Every ratio is 1 and every count 0, but for those given."""
+    perfect = dict.fromkeys(RATIOS, 1.0) | dict.fromkeys(COUNTS, 0.0)
+    assert scores == pytest.approx(perfect | expected)
+
+
+@needs_trackeval
+def test_perfect_tracks():
+    renamed = TRUTH[::-1].copy()
+    renamed[:, 1] = 40 - 7 * renamed[:, 1]
+    check(multi_object_scores(renamed, TRUTH))
+
+
+@needs_trackeval
+def test_tracks_that_change_objects_half_way():
+    """Each match shares 2 of the 2 + 2 + 2 boxes that its object and its track have."""
+    swapped = TRUTH.copy()
+    late = swapped[:, 0] > 2
+    swapped[late, 1] = 3 - swapped[late, 1]
+    check(
+        multi_object_scores(swapped, TRUTH),
+        AssA=1 / 3,
+        HOTA=(1 / 3) ** 0.5,
+        MOTA=(8 - 2) / 8,
+        IDF1=4 / 8,
+        id_switches=2,
+    )
+
+
+@needs_trackeval
+def test_one_miss():
+    """Four matches of a whole track, and three whose track has 3 of its object's 4 boxes."""
+    association = (4 * 1 + 3 * (3 / 4)) / 7
+    check(
+        multi_object_scores(TRUTH[:-1], TRUTH),
+        DetA=7 / 8,
+        AssA=association,
+        HOTA=(7 / 8 * association) ** 0.5,
+        MOTA=7 / 8,
+        IDF1=7 / 7.5,
+        misses=1,
+    )
+
+
+@needs_trackeval
+@pytest.mark.parametrize("frame", [2, 9])
+def test_one_false_positive(frame):
+    """In a frame of its own as well, where there is no object."""
+    check(
+        multi_object_scores(np.vstack([TRUTH, row(frame, 9, 500.0)]), TRUTH),
+        DetA=8 / 9,
+        HOTA=(8 / 9) ** 0.5,
+        MOTA=7 / 8,
+        IDF1=8 / 8.5,
+        false_positives=1,
+    )
+
+
+@needs_trackeval
+def test_boxes_that_are_off():
+    """An overlap of 0.62 is a match at 12 of the 19 thresholds of HOTA, and at 0.5."""
+    truth = np.array([row(t, 1, 0.0, w=81.0) for t in (1, 2, 3)])
+    off = np.array([row(t, 1, 19.0, w=81.0) for t in (1, 2, 3)])
+    check(multi_object_scores(off, truth), DetA=12 / 19, AssA=12 / 19, HOTA=12 / 19, MOTP=0.62)
+
+
+@needs_trackeval
+@pytest.mark.parametrize("tracks", [NONE, np.array([row(t, 1, 100.0, w=0.0) for t in (1, 2)])])
+def test_tracks_that_find_nothing(tracks):
+    """None at all, and boxes without area."""
+    nothing = dict.fromkeys(RATIOS, 0.0)
+    nothing["MOTA"] = -len(tracks) / 8
+    check(multi_object_scores(tracks, TRUTH), **nothing, misses=8, false_positives=len(tracks))
+
+
+@needs_trackeval
+def test_only_the_stretch_counts():
+    """Outside frames 2 and 3 there are a miss, a false positive and a frame without tracks."""
+    tracks = np.vstack([TRUTH[1:6], row(4, 9, 500.0), row(7, 1, 100.0)])
+    check(multi_object_scores(tracks, TRUTH, frames=(2, 3)))
+
+
+def test_overlap_by_hand():
+    boxes = np.array([[0.0, 0, 10, 10], [5, 5, 10, 10], [2, 2, -4, 3], [3, 3, 0, 0]])
+    objects = np.array([[0.0, 0, 10, 10], [2, 2, 5, 5], [20, 20, 1, 1]])
+    expected = [[1, 0.25, 0], [25 / 175, 4 / 121, 0], [0, 0, 0], [0, 0, 0]]
+    np.testing.assert_allclose(overlap(boxes, objects), expected)
+    assert overlap(np.zeros((0, 4)), objects).shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("tracks", "truth", "frames", "message"),
+    [
+        (TRUTH, NONE, None, "truth: there are no true boxes"),
+        (TRUTH, TRUTH, (5, 9), "truth: there are no true boxes"),
+        (TRUTH, TRUTH, (3, 2), "frames: 2, the last, comes before 3"),
+        (TRUTH[[0, 1, 0]], TRUTH, None, "tracks: id 1 has more than one box in frame 1"),
+        (TRUTH, TRUTH[[2, 3, 3]], None, "truth: id 2 has more than one box in frame 2"),
+        (TRUTH + np.nan, TRUTH, None, "tracks: holds numbers that are not finite"),
+        (TRUTH, TRUTH + np.inf, None, "truth: holds numbers that are not finite"),
+    ],
+)
+def test_input_without_a_score(tracks, truth, frames, message):
+    with pytest.raises(ValueError, match=message):
+        multi_object_scores(tracks, truth, frames)
+
+
+def test_a_missing_trackeval_says_how_to_install_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "trackeval", None)
+    with pytest.raises(ImportError, match=r"mpfjax\[trackeval\]"):
+        multi_object_scores(TRUTH, TRUTH)
