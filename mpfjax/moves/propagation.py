@@ -68,7 +68,10 @@ class Predict(AbstractPropagation):
 
 
 class Weigh(AbstractPropagation):
-    """Multiply the weights by L(y_t | x_t): the second half of a bootstrap `Propagate`."""
+    """Multiply the weights by L(y_t | x_t): the second half of a bootstrap `Propagate`.
+
+    After `Predict`, and whatever a chain does to the prediction.
+    """
 
     model: AbstractStateSpaceModel
 
