@@ -1,4 +1,4 @@
-"""Frames in and out, boxes, colour histograms, the colour tracking model, a rendered scene."""
+"""Frames, boxes, colour histograms, the colour tracking model, detection, a rendered scene."""
 
 from mpfjax.vision.boxes import check_boxes as check_boxes
 from mpfjax.vision.boxes import parse_box as parse_box
@@ -9,6 +9,7 @@ from mpfjax.vision.colour_model import ColourModel as ColourModel
 from mpfjax.vision.colours import AbstractColours as AbstractColours
 from mpfjax.vision.colours import HSVColours as HSVColours
 from mpfjax.vision.colours import RGBColours as RGBColours
+from mpfjax.vision.detection import BackgroundSubtraction as BackgroundSubtraction
 from mpfjax.vision.frames import read_frames as read_frames
 from mpfjax.vision.frames import write_video as write_video
 from mpfjax.vision.histograms import IntegralHistogram as IntegralHistogram

@@ -1,0 +1,210 @@
+"""Moving objects found by background subtraction, which start a tracker without a drawn box."""
+
+from collections.abc import Iterable
+from types import ModuleType
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+# What OpenCV's mask holds where a pixel is foreground; a shadow has another value.
+_FOREGROUND = 255
+
+
+class BackgroundSubtraction:
+    """Boxes of what moves before a still camera: an adaptive Gaussian mixture for each pixel.
+
+    Lin et al. (2012), section 5, detect their targets like this; the mixture is OpenCV's MOG2
+    (Zivkovic 2004). Pixels that fit none of the background's Gaussians and are no shadow make
+    blobs, gaps in a blob's height are closed, a blob of people side by side is cut between their
+    heads, and what does not have the size or the shape of a person is dropped. Two people one
+    behind the other stay one blob, and whoever stands still long enough becomes background.
+
+    - `history`: frames over which the background is forgotten.
+    - `threshold`: how many standard deviations from a Gaussian a pixel still belongs to it.
+    - `background_share`: share of a pixel's history, in (0, 1), that is background. Someone who
+      stands still becomes background after about log(1 / share) · history frames, or half as
+      many as came before where those are fewer. A larger share takes people for background
+      sooner; a smaller one keeps ghosts, where someone stood from the first frame on, for longer.
+    - `shadow_brightness`: darkest shadow, as a share of the background's brightness, in (0, 1);
+      None where shadows count as foreground.
+    - `warm_up`: first frames that only teach the background, at least 1, the first of all.
+    - `area`: least and most area of a box, as shares of the frame's.
+    - `aspect`: least and most height of a box, in widths.
+    - `largest_gap`: height of the gaps that are closed, as a share of the frame's height.
+    - `cut_aspect`: a blob lower than this many widths may be cut; None cuts none.
+    - `cut_depth`: how high the outline may reach between two heads, as a share of the lower one's
+      height above the blob's foot, in (0, 1).
+
+    Defaults are tuned on people before a street camera. One object serves one video, since it
+    keeps that video's background; colours may come in any fixed order of the three channels. Use
+    it to start tracks; where the camera moves, all is foreground and nothing is found.
+
+    Raises `ValueError` for a setting outside its range, `ImportError` where OpenCV is missing.
+    """
+
+    def __init__(
+        self,
+        *,
+        history: int = 500,
+        threshold: float = 6.0,
+        background_share: float = 0.6,
+        shadow_brightness: float | None = 0.6,
+        warm_up: int = 1,
+        area: tuple[float, float] = (0.0015, 0.3),
+        aspect: tuple[float, float] = (1.0, 6.0),
+        largest_gap: float = 0.02,
+        cut_aspect: float | None = 2.5,
+        cut_depth: float = 0.9,
+    ) -> None:
+        for name, count in (("history", history), ("warm_up", warm_up)):
+            if not (1 <= count < np.inf and count == int(count)):
+                raise ValueError(f"{name}: {count} is not a whole number from 1 on")
+        for name, value in (("threshold", threshold), ("cut_aspect", cut_aspect)):
+            if value is not None and not 0 < value < np.inf:
+                raise ValueError(f"{name}: {value} is not positive and finite")
+        for name, value in (
+            ("background_share", background_share),
+            ("shadow_brightness", shadow_brightness),
+            ("cut_depth", cut_depth),
+        ):
+            if value is not None and not 0 < value < 1:
+                raise ValueError(f"{name}: {value} is not in (0, 1)")
+        if not 0 <= largest_gap < 1:
+            raise ValueError(f"largest_gap: {largest_gap} is not in [0, 1)")
+        if not 0 <= area[0] < area[1] <= 1:
+            raise ValueError(f"area: {area} is not a range within [0, 1]")
+        if not 0 < aspect[0] < aspect[1] < np.inf:
+            raise ValueError(f"aspect: {aspect} is not a range of positive numbers")
+        self._cv2 = _cv2()
+        self.history = int(history)
+        self.threshold = threshold
+        self.background_share = background_share
+        self.shadow_brightness = shadow_brightness
+        self.warm_up = int(warm_up)
+        self.area = area
+        self.aspect = aspect
+        self.largest_gap = largest_gap
+        self.cut_aspect = cut_aspect
+        self.cut_depth = cut_depth
+        self._forget()
+
+    def learn(self, frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
+        """Learn the background afresh from frames of the video, all with the same weight.
+
+        A hundred, spread evenly over the video, show the places that people leave, so that
+        `detect` finds them from its first frame on. Use it where the whole video is at hand.
+        Raises `ValueError` where there are no frames, and for frames as `detect` does.
+        """
+        self._forget()
+        for number, frame in enumerate(frames, 1):
+            self._subtract(frame, rate=1 / number)
+        if self._shape is None:
+            raise ValueError("frames: there are none to learn the background from")
+        self._frames_seen = max(self.history, self.warm_up)
+
+    def detect(self, frame: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "k 4"]:
+        """The boxes (x, y, w, h) in pixels of what moves, (x, y) the top-left corner.
+
+        Boxes lie inside the frame, ordered from left to right; there are none in the first
+        `warm_up` frames. The frame joins the background, with more weight the fewer came before.
+        Raises `ValueError` for a frame that is not (h, w, 3) of type uint8, or differs in size
+        from those before it.
+        """
+        # The schedule of OpenCV itself: the young background leans to what is new, so that who
+        # was there in the first frame leaves no ghost behind.
+        rate = 1 / min(2 * (self._frames_seen + 1), self.history)
+        foreground = self._subtract(frame, rate)
+        self._frames_seen += 1
+        if self._frames_seen <= self.warm_up:
+            return np.zeros((0, 4))
+        boxes = np.array(self._blobs(foreground), float).reshape(-1, 4)
+        boxes = boxes[self._like_a_person(boxes, foreground.size)]
+        return boxes[np.lexsort((boxes[:, 1], boxes[:, 0]))]
+
+    def _forget(self) -> None:
+        shadows = self.shadow_brightness is not None
+        self._background = self._cv2.createBackgroundSubtractorMOG2(
+            self.history, self.threshold**2, shadows
+        )
+        self._background.setBackgroundRatio(self.background_share)
+        if self.shadow_brightness is not None:
+            self._background.setShadowThreshold(self.shadow_brightness)
+        self._frames_seen, self._shape = 0, None
+
+    def _subtract(self, frame: np.ndarray, rate: float) -> np.ndarray:
+        """1 where a pixel is foreground; the frame joins the background with weight `rate`."""
+        frame = np.asarray(frame)
+        if frame.ndim != 3 or frame.shape[2] != 3 or frame.size == 0:
+            raise ValueError(f"frame: {frame.shape} is not the shape (h, w, 3) of a colour image")
+        if frame.dtype != np.uint8:
+            raise ValueError(f"frame: {frame.dtype} is not uint8")
+        # OpenCV would silently start a new background.
+        if self._shape is not None and frame.shape != self._shape:
+            raise ValueError(
+                f"frame: {_size(frame.shape)} differs from the size of the frames before it, "
+                f"{_size(self._shape)}"
+            )
+        self._shape = frame.shape
+        mask = self._background.apply(np.ascontiguousarray(frame), learningRate=rate)
+        return (mask == _FOREGROUND).astype(np.uint8)
+
+    def _blobs(self, foreground: np.ndarray) -> list[tuple[int, int, int, int]]:
+        gap = round(self.largest_gap * len(foreground))
+        if gap > 0:
+            # Only upward and downward: who walks side by side must not be joined.
+            line = np.ones((gap + 1, 1), np.uint8)
+            foreground = self._cv2.morphologyEx(foreground, self._cv2.MORPH_CLOSE, line)
+        _, labels, found, _ = self._cv2.connectedComponentsWithStats(foreground, connectivity=8)
+        boxes = []
+        for label, (x, y, w, h, _) in enumerate(found[1:].tolist(), 1):
+            # No part of a blob can be larger than the blob.
+            if w * h >= self.area[0] * foreground.size:
+                blob = labels[y : y + h, x : x + w] == label
+                boxes += [(x + i, y + j, *size) for i, j, *size in self._cut(blob)]
+        return boxes
+
+    def _cut(self, blob: Bool[np.ndarray, "h w"]) -> list[tuple[int, int, int, int]]:
+        """The boxes of the people side by side in a blob that fills its array."""
+        height, width = blob.shape
+        narrowest = max(int(np.ceil(height / self.aspect[1])), 1)
+        if self.cut_aspect is None or height >= self.cut_aspect * width or width <= 2 * narrowest:
+            return [(0, 0, width, height)]
+        # How high the blob reaches in each column. It dips between two heads; the legs of one
+        # person who strides do not show.
+        outline = np.where(blob.any(axis=0), height - blob.argmax(axis=0), 0)
+        outline = np.convolve(np.pad(outline, 1, mode="edge"), np.full(3, 1 / 3), "valid")
+        left = np.maximum.accumulate(outline)
+        right = np.maximum.accumulate(outline[::-1])[::-1]
+        depths = outline / np.maximum(np.minimum(left, right), 1)
+        cut = narrowest + int(np.argmin(depths[narrowest : width - narrowest]))
+        if depths[cut] > self.cut_depth:
+            return [(0, 0, width, height)]
+        return self._cut_part(blob[:, :cut], 0) + self._cut_part(blob[:, cut:], cut)
+
+    def _cut_part(self, part: np.ndarray, start: int) -> list[tuple[int, int, int, int]]:
+        rows, columns = (np.flatnonzero(part.any(axis=axis)) for axis in (1, 0))
+        if len(rows) == 0:
+            return []
+        tight = part[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        x, y = start + int(columns[0]), int(rows[0])
+        return [(x + i, y + j, w, h) for i, j, w, h in self._cut(tight)]
+
+    def _like_a_person(self, boxes: np.ndarray, pixels: int) -> np.ndarray:
+        width, height = boxes[:, 2], boxes[:, 3]
+        shares = width * height / pixels
+        sized = (shares >= self.area[0]) & (shares <= self.area[1])
+        return sized & (height >= self.aspect[0] * width) & (height <= self.aspect[1] * width)
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]} x {shape[0]}"
+
+
+def _cv2() -> ModuleType:
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError(
+            'OpenCV is needed to detect what moves: pip install "mpfjax[video]"'
+        ) from error
+    return cv2
