@@ -91,8 +91,9 @@ class BackgroundSubtraction:
     def learn(self, frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
         """Learn the background afresh from frames of the video, all with the same weight.
 
-        A hundred, spread evenly over the video, show the places that people leave, so that
-        `detect` finds them from its first frame on. Use it where the whole video is at hand.
+        A hundred, spread evenly over a long video, are enough. `detect` then finds people from its
+        first frame on, but where somebody stands in 1 - `background_share` of these frames he
+        is background himself. Use it where the whole video is at hand.
         Raises `ValueError` where there are no frames, and for frames as `detect` does.
         """
         self._forget()

@@ -1,6 +1,7 @@
 """Detection against what was drawn, and on real video against boxes drawn by hand."""
 
 import sys
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -53,7 +54,7 @@ def overlaps(boxes, others):
         masks.append(np.zeros((len(group), 400, 400), bool))
         for mask, (x, y, w, h) in zip(masks[-1], np.round(group).astype(int), strict=True):
             mask[max(y, 0) : y + h, max(x, 0) : x + w] = True
-    first, second = (mask.reshape(len(mask), -1).astype(float) for mask in masks)
+    first, second = (mask.reshape(len(mask), 400 * 400).astype(float) for mask in masks)
     shared = first @ second.T
     return shared / (first.sum(1)[:, None] + second.sum(1)[None] - shared)
 
@@ -252,13 +253,11 @@ def test_people_on_a_real_street_are_found(data, learned):
     """Frames 1 to 120, with people from the first on, pairs, and an unlabelled walker."""
     folder = data / "pets09_s2l1"
     tracks = read_tracks(folder / "gt.txt")
-    frames = list(read_frames(folder, 1, 120))
     detector = BackgroundSubtraction()
     if learned:
-        detector.learn(frames[::2])
-    found = [detector.detect(frame) for frame in frames]
+        detector.learn(islice(read_frames(folder), 0, None, 8))
+    found = [detector.detect(frame) for frame in read_frames(folder, 1, 120)]
     true = [tracks[tracks[:, 0] == t][:, 2:] for t in range(1, 121)]
     recall, precision = recall_and_precision(true, found)
-    print('REC',recall,precision)
-    assert recall > 0.72
-    assert precision > 0.78
+    assert recall > 0.77
+    assert precision > 0.82
