@@ -92,8 +92,8 @@ class BackgroundSubtraction:
         """Learn the background afresh from frames of the video, all with the same weight.
 
         A hundred, spread evenly over a long video, are enough. `detect` then finds people from its
-        first frame on, but where somebody stands in 1 - `background_share` of these frames he
-        is background himself. Use it where the whole video is at hand.
+        first frame on, but a spot that is taken in 1 - `background_share` of these frames, by
+        someone who stands still, counts as background. Use it where the whole video is at hand.
         Raises `ValueError` where there are no frames, and for frames as `detect` does.
         """
         self._forget()
