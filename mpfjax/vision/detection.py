@@ -22,9 +22,9 @@ class BackgroundSubtraction:
     - `history`: frames over which the background is forgotten.
     - `threshold`: how many standard deviations from a Gaussian a pixel still belongs to it.
     - `background_share`: share of a pixel's history, in (0, 1), that is background. Someone who
-      stands still becomes background after about log(1 / share) · history frames, or half as
-      many as came before where those are fewer. A larger share takes people for background
-      sooner; a smaller one keeps ghosts, where someone stood from the first frame on, for longer.
+      stands still becomes background after about log(1 / share) · history frames, or sooner in a
+      young video: (1 / share² - 1) times as many frames as came before. The larger, the sooner;
+      and ghosts, where someone stood from the first frame on, vanish by the same rule.
     - `shadow_brightness`: darkest shadow, as a share of the background's brightness, in (0, 1);
       None where shadows count as foreground.
     - `warm_up`: first frames that only teach the background, at least 1, the first of all.
