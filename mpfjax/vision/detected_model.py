@@ -1,11 +1,14 @@
 """Colour and detections together: what a detector says of a box, as a likelihood."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, UInt8
 
 from mpfjax.models.base import AbstractStateSpaceModel, require_positive
+from mpfjax.operations import take
+from mpfjax.proposals import AbstractProposal
 from mpfjax.vision.boxes import centred
 from mpfjax.vision.colour_model import BoxState, ColourModel
 from mpfjax.vision.histograms import IntegralHistogram
@@ -37,7 +40,10 @@ class Detections(eqx.Module):
 
 
 class DetectedFrame(eqx.Module):
-    """A frame and what was detected in it: the observation of a `DetectedColourModel`."""
+    """A frame and what was detected in it: the observation of a `DetectedColourModel`.
+
+    `detections` has a row for each of the model's references: the detection that is taken for it.
+    """
 
     frame: IntegralHistogram | UInt8[Array, "h w 3"]
     detections: Detections
@@ -46,22 +52,23 @@ class DetectedFrame(eqx.Module):
 class DetectedColourModel(AbstractStateSpaceModel):
     """A `ColourModel` whose boxes are seen by a detector as well.
 
-    L(y | x) = L_colour(y | x) (miss + Σ_d exp(-½ |(x - d) / deviations|²)), with the box x and the
-    detections d as (centre, log size), the centre in units of the box: two cues that are taken
-    for independent, as by Pérez, Vermaak and Blake (2004), the second a Gaussian about each
-    detection over a floor for what the detector misses or lumps together.
+    L(y | x) = L_colour(y | x) (miss + exp(-½ |(d_r - x) / deviations|²)), with d_r the detection
+    that is taken for the box's reference r, and differences in (x, y, log w, log h), the first
+    two in units of the box: two cues that are taken for independent, as by Pérez, Vermaak and
+    Blake (2004), the second a Gaussian over a floor, for a detection of something else. Where
+    there is no d_r, colour alone speaks.
 
     - `colour`: the model of the boxes' motion and colours.
     - `deviations`: of a detection from the box that it sees, (x, y, log w, log h).
-    - `miss`: the floor, against 1 at the middle of a detection.
+    - `miss`: the floor, against 1 where detection and box agree.
 
-    Raises `ValueError` for a deviation or a floor that is not positive. Use it where the camera
-    stands still and a detector tells where something is, but not who.
+    Raises `ValueError` for a deviation or a floor that is not positive. Use it where a detector
+    tells where something is, but not who.
     """
 
     colour: ColourModel
     deviations: Float[Array, "4"] = eqx.field(
-        converter=jnp.asarray, default_factory=lambda: jnp.array([0.2, 0.1, 0.2, 0.15])
+        converter=jnp.asarray, default_factory=lambda: jnp.array([0.12, 0.06, 0.15, 0.1])
     )
     miss: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.02)
 
@@ -81,17 +88,72 @@ class DetectedColourModel(AbstractStateSpaceModel):
         return self.colour.log_transition(states, previous_states)
 
     def log_likelihood(self, observation: DetectedFrame, states: BoxState) -> Float[Array, " n"]:
-        """log L_colour + log(miss + Σ_d ...)."""
+        """log L_colour + log(miss + exp(-½ ...))."""
         log_colour = self.colour.log_likelihood(observation.frame, states)
-        return log_colour + self._log_detected(observation.detections, self.colour.boxes(states))
+        own = take(observation.detections.boxes, states.reference)
+        gaps = box_differences(own, self.colour.boxes(states)) / self.deviations[None]
+        nearness = jnp.exp(-0.5 * jnp.sum(gaps**2, axis=1))
+        detected = take(observation.detections.valid, states.reference)
+        return log_colour + jnp.log(self.miss + jnp.where(detected, nearness, 0.0))
 
-    def _log_detected(
-        self, detections: Detections, boxes: Float[Array, "n 4"]
-    ) -> Float[Array, " n"]:
-        # A box that shrank to nothing is seen by no detector, and must not become a NaN.
-        size = jnp.maximum(boxes[:, None, 2:], 1e-3)
-        offset = (detections.boxes[None, :, :2] - boxes[:, None, :2]) / size
-        growth = jnp.log(jnp.maximum(detections.boxes[None, :, 2:], 1e-3) / size)
-        gaps = jnp.concatenate([offset, growth], axis=2) / self.deviations[None, None]
-        nearness = jnp.exp(-0.5 * jnp.sum(gaps**2, axis=2))
-        return jnp.log(self.miss + jnp.sum(nearness * detections.valid[None], axis=1))
+
+class DetectionProposal(AbstractProposal):
+    """Draw boxes about their detection as well as from the dynamics.
+
+    q(x_t | x_{t-1}, y_t) = share N(x_t; d_r, deviations²) + (1 - share) D(x_t | x_{t-1}), the
+    proposal of the boosted particle filter (Okuma et al. 2004, section 4.2), with the Gaussian
+    in (x, y, s_x, s_y) and as wide as `DetectedColourModel` takes detections to be. The weights
+    L D / q are exact. Where a reference has no detection q is D.
+
+    Raises `ValueError` for a share outside [0, 1). Use it with few particles, which the dynamics
+    alone would seldom put on a detection.
+    """
+
+    model: DetectedColourModel
+    share: float = eqx.field(static=True, default=0.5)
+
+    def __check_init__(self) -> None:
+        if not 0 <= self.share < 1:
+            raise ValueError(f"share: {self.share} is not in [0, 1)")
+
+    def propose(
+        self, key: Key[Array, ""], observation: DetectedFrame, previous_states: BoxState
+    ) -> tuple[BoxState, Float[Array, " n"]]:
+        """x_t from the mixture, and its log density."""
+        key_moved, key_noise, key_which = jax.random.split(key, 3)
+        moved = self.model.sample_transition(key_moved, previous_states)
+        reference = moved.reference
+        own = take(observation.detections.boxes, reference)
+        size = take(self.model.colour.reference_boxes, reference)[:, 2:]
+        centre = jnp.concatenate([own[:, :2], own[:, 2:] / size], axis=1)
+        # A small change of log w is that of w in shares of itself.
+        deviations = self.model.deviations[None] * jnp.concatenate(
+            [own[:, 2:], centre[:, 2:]], axis=1
+        )
+        noise = jax.random.normal(key_noise, centre.shape, centre.dtype)
+        detected = take(observation.detections.valid, reference)
+        share = jnp.where(detected, self.share, 0.0)
+        from_detection = jax.random.uniform(key_which, share.shape) < share
+        box = jnp.where(from_detection[:, None], centre + deviations * noise, moved.box)
+        states = BoxState(box, reference, moved.previous)
+        log_detection = jnp.sum(
+            -0.5 * ((box - centre) / deviations) ** 2
+            - jnp.log(deviations)
+            - 0.5 * jnp.log(2 * jnp.pi),
+            axis=1,
+        )
+        log_dynamics = self.model.log_transition(states, previous_states)
+        return states, jnp.logaddexp(
+            jnp.log(share) + log_detection, jnp.log(1 - share) + log_dynamics
+        )
+
+
+def box_differences(
+    boxes: Float[Array, "*n 4"], others: Float[Array, "*n 4"]
+) -> Float[Array, "*n 4"]:
+    """How boxes differ from others: x and y in units of the others' size, and log w and log h."""
+    # A box that shrank to nothing must not become a NaN.
+    size = jnp.maximum(others[..., 2:], 1e-3)
+    offset = (boxes[..., :2] - others[..., :2]) / size
+    growth = jnp.log(jnp.maximum(boxes[..., 2:], 1e-3) / size)
+    return jnp.concatenate([offset, growth], axis=-1)

@@ -6,18 +6,34 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
+from optax.assignment import hungarian_algorithm
 
 from mpfjax.filters import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.dynamics import RandomWalk
+from mpfjax.models.dynamics import Autoregression
 from mpfjax.moves.base import AbstractRejuvenation
 from mpfjax.moves.gaussian import GaussianRegeneration
 from mpfjax.moves.propagation import Propagate
 from mpfjax.operations import default_float, take
 from mpfjax.vision.colour_model import BoxState, ColourModel
 from mpfjax.vision.colours import AbstractColours, HSVColours
-from mpfjax.vision.detected_model import DetectedColourModel, DetectedFrame, Detections
-from mpfjax.vision.histograms import IntegralHistogram, integral_histogram, normalise
+from mpfjax.vision.detected_model import (
+    DetectedColourModel,
+    DetectedFrame,
+    DetectionProposal,
+    Detections,
+    box_differences,
+)
+from mpfjax.vision.histograms import (
+    IntegralHistogram,
+    bhattacharyya,
+    integral_histogram,
+    normalise,
+)
+
+# How far a detection may lie from the box that it is taken for: (x, y, log w, log h).
+GATE = (1.2, 0.5, 1.2, 0.8)
+COLOUR_COST, IMPOSSIBLE = 1.0, 1e3
 
 
 class Tracks(NamedTuple):
@@ -83,8 +99,10 @@ class ObjectTracker(eqx.Module):
     particles_per_object: int = eqx.field(static=True)
     colours: AbstractColours
     sigma: float = eqx.field(static=True)
+    momentum: float = eqx.field(static=True)
     num_parts: int = eqx.field(static=True)
     step_deviations: tuple[float, ...] = eqx.field(static=True)
+    detection_deviations: tuple[float, ...] = eqx.field(static=True)
     confirmation: int = eqx.field(static=True)
     patience: int = eqx.field(static=True)
     crowding: int = eqx.field(static=True)
@@ -98,8 +116,10 @@ class ObjectTracker(eqx.Module):
         rejuvenation: AbstractRejuvenation | None = None,
         colours: AbstractColours | None = None,
         sigma: float = 0.15,
+        momentum: float = 0.8,
         num_parts: int = 3,
         step_deviations: tuple[float, float, float, float] = (0.15, 0.05, 0.02, 0.02),
+        detection_deviations: tuple[float, float, float, float] = (0.12, 0.06, 0.15, 0.1),
         confirmation: int = 3,
         patience: int = 10,
         crowding: int = 8,
@@ -123,14 +143,16 @@ class ObjectTracker(eqx.Module):
         if not 0 <= adaptation < 1:
             raise ValueError(f"adaptation: {adaptation} is not in [0, 1)")
         if rejuvenation is None:
-            rejuvenation = GaussianRegeneration(particles_per_object, where=_box)
+            rejuvenation = GaussianRegeneration(particles_per_object, where=_motion)
         self.rejuvenation = rejuvenation
         self.max_objects = max_objects
         self.particles_per_object = particles_per_object
         self.colours = HSVColours() if colours is None else colours
         self.sigma = sigma
+        self.momentum = momentum
         self.num_parts = num_parts
         self.step_deviations = tuple(step_deviations)
+        self.detection_deviations = tuple(detection_deviations)
         self.confirmation = confirmation
         self.patience = patience
         self.crowding = crowding
@@ -144,13 +166,13 @@ class ObjectTracker(eqx.Module):
             reference_boxes=jnp.ones((m, 4)),
             references=jnp.zeros(shape),
             colour_weights=jnp.ones(shape),
-            dynamics=RandomWalk(jnp.ones((m, 4))),
+            dynamics=self._dynamics(jnp.ones((m, 4))),
             initial_deviations=jnp.ones((m, 4)),
             sigma=jnp.asarray(self.sigma, float),
             colours=self.colours,
         )
         mixture = ParticleMixture(
-            particles=BoxState(jnp.ones((n, 4)), jnp.zeros(n, jnp.int32)),
+            particles=BoxState(jnp.ones((n, 4)), jnp.zeros(n, jnp.int32), jnp.ones((n, 4))),
             log_weights=jnp.full(n, -jnp.inf, default_float()),
             component_indicators=jnp.zeros(n, jnp.int32),
             ancestor_indices=jnp.arange(n, dtype=jnp.int32),
@@ -170,22 +192,48 @@ class ObjectTracker(eqx.Module):
         """The state after a frame and its detections, and what is tracked in it."""
         key_filter, key_births = jax.random.split(key)
         table = integral_histogram(frame, self.colours)
-        state = self._filtered(key_filter, state, DetectedFrame(table, detections))
+        own, taken = self._assigned(state, detections, table)
+        state = self._filtered(key_filter, state, DetectedFrame(table, own))
         boxes = _mean_boxes(state)
-        state = self._bury(state, boxes, detections, table)
-        state = self._learn(state, boxes, detections, table)
-        state = self._bear(key_births, state, boxes, detections, table)
+        state = self._bury(state, boxes, own, table)
+        state = self._learn(state, boxes, own, table)
+        unexplained = Detections(detections.boxes, detections.valid & ~taken)
+        state = self._bear(key_births, state, boxes, unexplained, table)
         confirmed = (state.identities > 0) & (state.seen >= self.confirmation)
         return state, Tracks(_mean_boxes(state), state.identities, confirmed)
+
+    def _assigned(
+        self, state: TrackerState, detections: Detections, table: IntegralHistogram
+    ) -> tuple[Detections, Bool[Array, " d"]]:
+        """The detection of each component, and which detections are taken.
+
+        The assignment of least total cost, where a pair costs how far the detection lies from the
+        component's last mean box, in `GATE`s, and how unlike the colours are.
+        """
+        boxes = _mean_boxes(state)
+        gaps = box_differences(detections.boxes[None], boxes[:, None]) / jnp.array([[GATE]])
+        seen = normalise(table.counts(detections.boxes, self.num_parts))
+        unlike = jnp.mean(
+            jnp.sum(bhattacharyya(seen[None], state.colour.references[:, None]), axis=3), axis=2
+        )
+        far = jnp.sum(gaps**2, axis=2)
+        possible = (state.identities > 0)[:, None] & detections.valid[None] & (far < 1)
+        cost = jnp.where(possible, far + COLOUR_COST * unlike, IMPOSSIBLE)
+        rows, columns = hungarian_algorithm(cost)
+        pair = possible[rows, columns]
+        source = jnp.zeros(self.max_objects, jnp.int32).at[rows].set(columns.astype(jnp.int32))
+        assigned = jnp.zeros(self.max_objects, bool).at[rows].set(pair)
+        taken = jnp.zeros(detections.valid.shape, bool).at[columns].set(pair)
+        return Detections(take(detections.boxes, source), assigned), taken
 
     def _filtered(
         self, key: Key[Array, ""], state: TrackerState, observation: DetectedFrame
     ) -> TrackerState:
         """Redraw, propagate, weigh; then the same mass for every component."""
-        model = DetectedColourModel(state.colour)
+        model = DetectedColourModel(state.colour, jnp.array(self.detection_deviations))
         filter = Filter(
             model,
-            [self.rejuvenation, Propagate(model)],
+            [self.rejuvenation, Propagate(model, DetectionProposal(model))],
             self.max_objects * self.particles_per_object,
             self.max_objects,
         )
@@ -198,12 +246,12 @@ class ObjectTracker(eqx.Module):
         self,
         state: TrackerState,
         boxes: Float[Array, "m 4"],
-        detections: Detections,
+        own: Detections,
         table: IntegralHistogram,
     ) -> TrackerState:
         """End what no detection bears out, what has left the frame, and doubles."""
         alive = state.identities > 0
-        borne_out = jnp.any(_inside(boxes, detections.boxes) & detections.valid[None], axis=1)
+        borne_out = own.valid
         seen = jnp.where(alive & borne_out, state.seen + 1, state.seen)
         unseen = jnp.where(borne_out, 0, state.unseen + 1)
         older = (state.identities[None] < state.identities[:, None]) & alive[None]
@@ -230,17 +278,16 @@ class ObjectTracker(eqx.Module):
         self,
         state: TrackerState,
         boxes: Float[Array, "m 4"],
-        detections: Detections,
+        own: Detections,
         table: IntegralHistogram,
     ) -> TrackerState:
         """Move the references of well seen components towards what they see now."""
         if self.adaptation == 0:
             return state
         alive = state.identities > 0
-        agrees = (_overlap(boxes, detections.boxes) > 0.5) & detections.valid[None]
         others = ~jnp.eye(self.max_objects, dtype=bool) & alive[None]
         alone = ~jnp.any((_overlap(boxes, boxes) > 0.05) & others, axis=1)
-        rate = jnp.where(alive & alone & jnp.any(agrees, axis=1), self.adaptation, 0.0)
+        rate = jnp.where(own.valid & alone, self.adaptation, 0.0)
         rate = rate[:, None, None, None]
         histograms = normalise(table.counts(boxes, self.num_parts))
         references = (1 - rate) * state.colour.references + rate * histograms
@@ -264,18 +311,20 @@ class ObjectTracker(eqx.Module):
         seats, filled = self._seats(mixture, born)
         unit = jnp.concatenate([places[:, 2:], jnp.ones_like(places[:, 2:])], axis=1)
         deviations = unit * jnp.array([self.step_deviations], unit.dtype)
+        step = _where(born, deviations, colour.initial_deviations)
         colour = _replace(
             colour,
             reference_boxes=_where(born, places, colour.reference_boxes),
             references=_where(
                 born, normalise(table.counts(places, self.num_parts)), colour.references
             ),
-            dynamics=RandomWalk(_where(born, deviations, colour.dynamics.deviations)),
-            initial_deviations=_where(born, deviations, colour.initial_deviations),
+            dynamics=self._dynamics(step),
+            initial_deviations=step,
         )
         centre = jnp.concatenate([places[:, :2], jnp.ones_like(places[:, 2:])], axis=1)
-        noise = jax.random.normal(key, mixture.particles.box.shape, centre.dtype)
-        drawn = take(centre, seats) + take(deviations, seats) * noise
+        # The box of the frame before is as uncertain as a step: so is the speed at birth.
+        noise = jax.random.normal(key, (2, *mixture.particles.box.shape), centre.dtype)
+        drawn = take(centre, seats)[None] + take(deviations, seats)[None] * noise
         num_alive = jnp.maximum(jnp.sum(alive | born), 1)
         log_share = -jnp.log((num_alive * self.particles_per_object).astype(centre.dtype))
         log_old = mixture.log_component_weights - jnp.log(num_alive.astype(centre.dtype))
@@ -284,8 +333,9 @@ class ObjectTracker(eqx.Module):
             colour=colour,
             mixture=mixture.replace(
                 particles=BoxState(
-                    _where(filled, drawn, mixture.particles.box),
+                    _where(filled, drawn[0], mixture.particles.box),
                     jnp.where(filled, seats, mixture.particles.reference),
+                    _where(filled, drawn[1], mixture.particles.previous),
                 ),
                 log_weights=jnp.where(filled, log_share, log_old),
                 component_indicators=jnp.where(filled, seats, mixture.component_indicators),
@@ -295,6 +345,17 @@ class ObjectTracker(eqx.Module):
             ),
             last_identity=state.last_identity + jnp.sum(born, dtype=jnp.int32),
             seen=jnp.where(born, 1, state.seen),
+        )
+
+    def _dynamics(self, deviations: Float[Array, "m 4"]) -> Autoregression:
+        """Momentum of the centre; the size only diffuses."""
+        momentum = jnp.diag(jnp.array([self.momentum, self.momentum, 0.0, 0.0]))
+        rows = (len(deviations), 4, 4)
+        return Autoregression(
+            jnp.broadcast_to(jnp.eye(4) + momentum, rows),
+            jnp.broadcast_to(-momentum, rows),
+            jax.vmap(jnp.diag)(deviations),
+            jnp.zeros((len(deviations), 4)),
         )
 
     def _seats(
@@ -352,5 +413,5 @@ def _replace(module, **fields):
     )
 
 
-def _box(states: BoxState) -> Float[Array, "n 4"]:
-    return states.box
+def _motion(states: BoxState) -> tuple[Float[Array, "n 4"], Float[Array, "n 4"] | None]:
+    return states.box, states.previous
