@@ -31,6 +31,7 @@ from mpfjax.plotting import draw_contact_sheet
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import drawing, frames
 from mpfjax.vision.colour_model import BoxState, ColourModel
+from mpfjax.vision.colours import RGBColours
 from mpfjax.vision.object_moves import ObjectExclusion, PruneHypotheses
 from mpfjax.vision.scenes import football_scene
 
@@ -82,15 +83,25 @@ def paper_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Filt
 def default_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Filter]:
     """The recipe that covers most on real video: any component may come to stand for any object.
 
-    A particle is compared with one of the given boxes, and now and then with another; components
-    exclude each other, part where they straddle two places, and merge only after ten frames on
-    the same one.
+    A particle is compared with one of the given boxes, and now and then with another, and takes a
+    long step now and then; components exclude each other, part where they straddle two places,
+    and merge only after ten frames on the same one.
     """
     size = boxes[:, 2:].mean(axis=0)
-    model = _own_references(frame, boxes, contrast=0.25, switch_probability=0.05)
+    steps = _steps(boxes)
+    model = _own_references(
+        frame,
+        boxes,
+        colours=RGBColours(16),
+        sigma=0.2,
+        num_parts=8,
+        contrast=0.25,
+        switch_probability=0.05,
+        dynamics=mpfjax.RandomWalkWithJumps(steps, steps * np.array([6.0, 6.0, 1.0, 1.0]), 0.05),
+    )
     where: dict[str, Any] = {"features": _centre, "scale": size}
     moves = [
-        mpfjax.Exclusion(strength=10.0, radius=0.5, **where),
+        mpfjax.Exclusion(strength=4.0, radius=0.5, **where),
         mpfjax.Merge(None, 0.25, patience=10, **where),
         mpfjax.Split(4.0, 0.5, min_share=0.15, **where),
     ]
@@ -105,7 +116,7 @@ def objects_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Fi
     splits where they part, and those that came to nothing are pruned. Objects exclude each other.
     """
     size = boxes[:, 2:].mean(axis=0)
-    model = _own_references(frame, boxes, contrast=0.25)
+    model = _own_references(frame, boxes, sigma=0.15, num_parts=5, contrast=0.25)
     apart = _apart(size)
     moves = [
         ObjectExclusion(strength=3.0, radius=0.5, scale=(float(size[0]), float(size[1]))),
@@ -117,17 +128,15 @@ def objects_filters(frame: np.ndarray, boxes: np.ndarray) -> dict[str, mpfjax.Fi
 
 
 def _own_references(frame: np.ndarray, boxes: np.ndarray, **options: Any) -> ColourModel:
-    width, height = boxes[:, 2], boxes[:, 3]
-    still = np.full(len(boxes), 0.01)
     return ColourModel.from_frame(
-        frame,
-        boxes,
-        sigma=0.15,
-        deviations=np.stack([0.4 * width, 0.08 * height, still, still], axis=1),
-        num_parts=5,
-        weigh_colours=True,
-        **options,
+        frame, boxes, deviations=_steps(boxes), weigh_colours=True, **options
     )
+
+
+def _steps(boxes: np.ndarray) -> np.ndarray:
+    """Deviations of the random walk: 0.4 widths and 0.08 heights of each box, sizes hardly any."""
+    still = np.full(len(boxes), 0.01)
+    return np.stack([0.4 * boxes[:, 2], 0.08 * boxes[:, 3], still, still], axis=1)
 
 
 def _started_at_the_boxes(

@@ -5,5 +5,6 @@ from mpfjax.models.base import per_particle as per_particle
 from mpfjax.models.dynamics import AbstractDynamics as AbstractDynamics
 from mpfjax.models.dynamics import Autoregression as Autoregression
 from mpfjax.models.dynamics import RandomWalk as RandomWalk
+from mpfjax.models.jumps import RandomWalkWithJumps as RandomWalkWithJumps
 from mpfjax.models.linear_gaussian import LinearGaussianModel as LinearGaussianModel
 from mpfjax.models.quadratic import QuadraticModel as QuadraticModel

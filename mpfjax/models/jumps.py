@@ -1,0 +1,81 @@
+"""A random walk that now and then takes a long step."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from mpfjax.models.base import require_positive
+from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
+
+
+class RandomWalkWithJumps(AbstractDynamics):
+    """x_t = x_{t-1} + diag(s) ω_t, ω_t ~ N(0, I), s long with a small probability.
+
+    The contaminated normal of Tukey (1960) as dynamics: (1 - p) N(x_{t-1}, diag(deviations²))
+    + p N(x_{t-1}, diag(jump_deviations²)). The few particles that jump find an object again that
+    was hidden for some frames, or that a filter had lost to a look-alike; the recursion stays
+    exact.
+
+    - `deviations`, `jump_deviations`: of an ordinary and of a long step, (d,), or (n, d) with a
+      row for each particle, in units of the state a frame.
+    - `jump_probability`: p.
+
+    Raises `ValueError` for a deviation that is not positive, for deviations of different shapes,
+    and for a probability outside (0, 1). Use it where objects vanish and come back elsewhere.
+    """
+
+    deviations: Float[Array, "*n d"] = eqx.field(converter=jnp.asarray)
+    jump_deviations: Float[Array, "*n d"] = eqx.field(converter=jnp.asarray)
+    jump_probability: float = eqx.field(static=True, default=0.03)
+
+    def __check_init__(self) -> None:
+        require_positive(deviations=self.deviations, jump_deviations=self.jump_deviations)
+        if self.jump_deviations.shape != self.deviations.shape:
+            raise ValueError(
+                f"jump_deviations: shape {self.jump_deviations.shape} is not that of deviations,"
+                f" {self.deviations.shape}"
+            )
+        if not 0 < self.jump_probability < 1:
+            raise ValueError(f"jump_probability: {self.jump_probability} is not in (0, 1)")
+
+    @property
+    def order(self) -> int:
+        """1."""
+        return 1
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether `deviations` is one row for all."""
+        return self.deviations.ndim == 1
+
+    def sample(
+        self,
+        key: Key[Array, ""],
+        current: Float[Array, "n d"],
+        previous: Float[Array, "n d"] | None = None,
+    ) -> Float[Array, "n d"]:
+        """x_{t-1} plus a step, long for the particles that jump."""
+        del previous
+        key_noise, key_jump = jax.random.split(key)
+        jumps = jax.random.bernoulli(key_jump, self.jump_probability, (current.shape[0], 1))
+        steps = jnp.where(
+            jumps,
+            jnp.broadcast_to(self.jump_deviations, current.shape),
+            jnp.broadcast_to(self.deviations, current.shape),
+        )
+        return current + steps * jax.random.normal(key_noise, current.shape, current.dtype)
+
+    def log_density(
+        self,
+        following: Float[Array, "n d"],
+        current: Float[Array, "n d"],
+        previous: Float[Array, "n d"] | None = None,
+    ) -> Float[Array, " n"]:
+        """log of the mixture of the two normal densities."""
+        del previous
+        stays = RandomWalk(self.deviations).log_density(following, current)
+        jumps = RandomWalk(self.jump_deviations).log_density(following, current)
+        log_odds = jnp.log(jnp.array([1 - self.jump_probability, self.jump_probability]))
+        log_odds = log_odds.astype(stays.dtype)
+        return jnp.logaddexp(log_odds[0] + stays, log_odds[1] + jumps)
