@@ -1,6 +1,6 @@
 """Lin et al. (2012), figures 1 to 6 and table 1: PF, GPF, MPF and GM-MPF on two targets.
 
-    python -m benchmarks.gm_mpf                                    # pets09_s2l1, or a rendered scene
+    python -m benchmarks.gm_mpf                       # pets09_s2l1, or a rendered scene
     python -m benchmarks.gm_mpf --sequence DIR --ids 3 5 --frames 1:80
 
 All four have the same model and start from the same boxes: HSV histograms (eqs. 1 to 3) and
@@ -146,7 +146,7 @@ def held(step: Step, truth: np.ndarray) -> np.ndarray:
 
 
 def study(
-    targets: Targets, sizes: list[int], num_seeds: int, seed: int, show: Callable[[], None]
+    targets: Targets, sizes: list[int], num_seeds: int, seed: int, show: Callable[[], Any]
 ) -> dict[str, dict[int, Step]]:
     """Every filter at every number of particles, `num_seeds` runs of each under one vmap."""
     model = make_model(targets.stills[0], box_files.top_left(targets.truth[0]))
@@ -155,9 +155,7 @@ def study(
     found: dict[str, dict[int, Step]] = {}
     for name in NAMES:
         for size in sizes:
-            run = mpfjax.monte_carlo(
-                keys, make_filter(name, model, size), stills, collector(model)
-            )
+            run = mpfjax.monte_carlo(keys, make_filter(name, model, size), stills, collector(model))
             found.setdefault(name, {})[size] = jax.tree.map(np.asarray, run.collected)
             show()
     return found
@@ -238,15 +236,9 @@ def profile(targets: Targets, seed: int) -> dict[str, float]:
         "likelihood of all boxes": eqx.Partial(
             eqx.filter_jit(model.log_likelihood), table, mixture.particles
         ),
-        "dynamics": eqx.Partial(
-            eqx.filter_jit(model.sample_transition), key, mixture.particles
-        ),
-        "resampling, two components": eqx.Partial(
-            eqx.filter_jit(mpfjax.Resample()), key, mixture
-        ),
-        "Gaussian regeneration, two components": eqx.Partial(
-            eqx.filter_jit(redraw), key, mixture
-        ),
+        "dynamics": eqx.Partial(eqx.filter_jit(model.sample_transition), key, mixture.particles),
+        "resampling, two components": eqx.Partial(eqx.filter_jit(mpfjax.Resample()), key, mixture),
+        "Gaussian regeneration, two components": eqx.Partial(eqx.filter_jit(redraw), key, mixture),
     }
     elapsed: dict[str, list[float]] = {name: [] for name in parts}
     for repeat in range(WARM_UP + TIMED_FRAMES):

@@ -3,10 +3,14 @@
     python -m benchmarks.visual_tracking                                  # a rendered scene
     python -m benchmarks.visual_tracking --sequence DIR --ids 2 3 4       # frames with gt.txt
     python -m benchmarks.visual_tracking --video FILE --box 10,20,30,60 --box 80,25,30,60
+    python -m benchmarks.visual_tracking --sequence DIR --detect          # nobody draws a box
 
 Both filters have the same model and the same particles at the start: 200 for the PF, at most 10
 components of 20 for the MPF. Into --out DIR go an annotated video, a contact sheet as the paper's
-figure 3, the tracks in MOTChallenge form, and the scores, null where there is no truth.
+figure 3, the tracks in MOTChallenge form, and the scores, null where there is no truth. With
+--detect, for a camera that stands still, objects are found by background subtraction: the PF
+starts at those of the first frame that has any, and in the MPF and the GM-MPF a component is born
+for every new one and dies when its object is gone (Lin et al. 2012, section 5).
 """
 
 import argparse
@@ -15,7 +19,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -25,40 +29,25 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
+from benchmarks.detected_tracking import detect_all, make_trackers, track_detected
 from benchmarks.results import format_table, write_json
+from benchmarks.tracking_pictures import (
+    NAMES,
+    Snapshot,
+    Source,
+    write_contact_sheet,
+    write_video,
+)
+from mpfjax.metrics import multi_object_scores
 from mpfjax.metrics.coverage import coverage, covers
-from mpfjax.plotting import draw_contact_sheet
 from mpfjax.vision import boxes as box_files
-from mpfjax.vision import drawing, frames
+from mpfjax.vision import frames
 from mpfjax.vision.colour_model import BoxState, ColourModel
 from mpfjax.vision.colours import RGBColours
 from mpfjax.vision.object_moves import ObjectExclusion, PruneHypotheses
 from mpfjax.vision.scenes import football_scene
 
 NUM_PARTICLES, MAX_COMPONENTS, PARTICLES_PER_COMPONENT = 200, 10, 20
-NAMES = {"pf": "Particle filter", "mpf": "Mixture particle filter"}
-KEY_FRAMES = 4
-
-
-class Source(NamedTuple):
-    """Where the frames come from, and what is known of the objects in them."""
-
-    name: str
-    read: Callable[[], Iterable[np.ndarray]]
-    first: int  # the number of the first frame
-    num_frames: int | None  # None where only reading on will tell
-    boxes: np.ndarray  # (k, 4), where the objects start
-    truth: np.ndarray | None  # rows of the objects to score against
-    all_labelled: bool  # whether the truth knows every object that was started
-
-
-class Snapshot(NamedTuple):
-    """What one run keeps of one frame, and the same with a leading axis of runs."""
-
-    means: Any  # (m, 4), mean box of each component, centre and size
-    active: Any  # (m,)
-    points: Any  # (n, 2), centres of the particles
-    labels: Any  # (n,), the component of each, -1 in an empty slot
 
 
 # --- the presets --------------------------------------------------------------------------
@@ -232,18 +221,17 @@ def track_rows(snapshots: list[Snapshot], run: int, first: int) -> np.ndarray:
 
 
 def score(
-    name: str, snapshots: list[Snapshot], seconds: list[float], source: Source
+    name: str, tracks: list[np.ndarray], num_frames: int, seconds: list[float], source: Source
 ) -> dict[str, Any]:
-    """One entry of the results: means over the runs, null where the truth is not known."""
+    """One entry of the results: means over the runs' tracks, null where there is no truth."""
     result = {"filter": name, "all_covered": None, "per_object": None, "on_object": None}
     result |= {"id_swaps": None, "ms_per_frame": _milliseconds(seconds)}
     truth = source.truth
     if truth is not None:
-        truth = truth[truth[:, 0] < source.first + len(snapshots)]
+        truth = truth[truth[:, 0] < source.first + num_frames]
     if truth is None or len(truth) == 0:
         return result
-    runs = range(len(snapshots[0].means))
-    scores = [coverage(track_rows(snapshots, run, source.first), truth) for run in runs]
+    scores = [coverage(rows, truth) for rows in tracks]
     result["all_covered"] = _mean([s.all_covered for s in scores])
     result["per_object"] = {
         str(id): _mean([s.per_object[id] for s in scores]) for id in scores[0].per_object
@@ -263,78 +251,6 @@ def _milliseconds(seconds: list[float]) -> float:
     return 1000 * float(np.median(seconds[1:] or seconds))
 
 
-# --- pictures ---------------------------------------------------------------------------------
-
-
-def annotate(
-    still: np.ndarray,
-    snapshot: Snapshot,
-    zoom: int,
-    crop: tuple[slice, slice] = (slice(None), slice(None)),
-) -> np.ndarray:
-    """A frame, cropped and enlarged, with one run's particles and mean boxes.
-
-    Both are drawn in the colour of their component.
-    """
-    canvas = still[crop].repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
-    corner = np.array([crop[1].start or 0, crop[0].start or 0], float)
-    labels, palette = snapshot.labels[0], drawing.PALETTE
-    for m in np.flatnonzero(snapshot.active[0]):
-        box = box_files.top_left(snapshot.means[0][m][None])[0] - [*corner, 0, 0]
-        drawing.draw_box(canvas, zoom * box, palette[m % len(palette)], thickness=2)
-    filled = labels >= 0
-    points = zoom * (snapshot.points[0][filled] - corner)
-    drawing.draw_points(canvas, points, palette[labels[filled] % len(palette)], 0.9 * zoom)
-    return np.clip(canvas, 0, 255).astype(np.uint8)
-
-
-def write_video(path: Path, source: Source, tracked: dict[str, list[Snapshot]]) -> None:
-    """The annotated frames of the filters side by side, PF to the left."""
-    frames.write_video(path, _panels(source, tracked))
-
-
-def _panels(source: Source, tracked: dict[str, list[Snapshot]]) -> Iterator[np.ndarray]:
-    for still, *snapshots in zip(source.read(), *tracked.values(), strict=False):
-        zoom = _zoom(still)
-        yield np.concatenate([annotate(still, s, zoom) for s in snapshots], axis=1)
-
-
-def write_contact_sheet(path: Path, source: Source, tracked: dict[str, list[Snapshot]]) -> None:
-    """Key frames in the manner of the paper's figure 3: a row for each filter, cropped to both."""
-    length = min(len(snapshots) for snapshots in tracked.values())
-    chosen = np.unique(np.linspace(0, length - 1, KEY_FRAMES).round().astype(int))
-    stills = {
-        t: still for t, still in zip(range(length), source.read(), strict=False) if t in chosen
-    }
-    shown = [snapshots[t] for snapshots in tracked.values() for t in chosen]
-    crop = _region(shown, source.boxes, stills[0].shape)
-    zoom = max(1, round(900 / (crop[1].stop - crop[1].start)))
-    rows = [
-        (
-            NAMES[name].replace(" ", "\n", 1),
-            [annotate(stills[t], snapshots[t], zoom, crop) for t in chosen],
-        )
-        for name, snapshots in tracked.items()
-    ]
-    titles = [f"frame {source.first + t}" for t in chosen]
-    draw_contact_sheet(rows, titles).savefig(path, dpi=110)
-
-
-def _region(shown: list[Snapshot], boxes: np.ndarray, shape: tuple) -> tuple[slice, slice]:
-    """The rows and columns of the frame in which anything happens, with room around."""
-    points = np.concatenate([s.points[0][s.labels[0] >= 0] for s in shown])
-    centres = np.concatenate([points, box_files.centred(boxes)[:, :2]])
-    margin = 1.2 * boxes[:, 2:].max(axis=0)
-    low, high = centres.min(axis=0) - margin, centres.max(axis=0) + margin
-    (left, top), (right, bottom) = low.astype(int), high.astype(int)
-    height, width, _ = shape
-    return slice(max(top, 0), min(bottom, height)), slice(max(left, 0), min(right, width))
-
-
-def _zoom(still: np.ndarray) -> int:
-    return max(1, round(640 / still.shape[1]))
-
-
 # --- the command line -------------------------------------------------------------------------
 
 
@@ -350,6 +266,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--box", action="append", metavar="x,y,w,h", help="an object, in frame A")
     what.add_argument("--ids", type=int, nargs="+", metavar="ID", help="objects of gt.txt")
+    what.add_argument("--detect", action="store_true", help="find what moves; a still camera")
     parser.add_argument("--frames", metavar="A:B", help="frames A to B, counted from 1, both in")
     parser.add_argument("--preset", choices=sorted(PRESETS), default="default")
     parser.add_argument("--out", type=Path, default=Path("results/visual_tracking"))
@@ -400,6 +317,8 @@ def _with_objects(options, name, read, first, last, count, rows, still) -> Sourc
     """Settle which objects are started where, and which are scored."""
     if rows is not None:
         rows = rows[(rows[:, 0] >= first) & (rows[:, 0] <= (last or np.inf))]
+    if options.detect:
+        return Source(name, read, first, count, np.zeros((0, 4)), rows, rows is not None)
     started = {} if rows is None else box_files.boxes_of_frame(rows, first)
     if options.box is not None:
         boxes = np.stack([box_files.parse_box(text, "--box") for text in options.box])
@@ -426,39 +345,87 @@ def _chosen_ids(options, started: dict, rows: np.ndarray | None, first: int) -> 
 
 
 def run(options: argparse.Namespace) -> None:
-    """Track with both filters, writing each one's results as soon as it has finished."""
+    """Track with every filter, writing each one's results as soon as it has finished."""
     source = open_source(options)
-    first_frame = next(iter(source.read()))
-    filters = PRESETS[options.preset](first_frame, source.boxes)
     keys = jax.random.split(jax.random.key(options.seed), options.seeds)
     options.out.mkdir(parents=True, exist_ok=True)
+    runs, source = (_detected_runs if options.detect else _drawn_runs)(options, source, keys)
     tracked: dict[str, list[Snapshot]] = {}
     results: list[dict[str, Any]] = []
-    for name, filter in filters.items():
+    for name, (frames_of_run, rows_of_run) in runs.items():
         tracked[name], seconds = [], []
         try:
             with tqdm(total=source.num_frames, desc=NAMES[name], unit="frame", disable=None) as bar:
-                for snapshot, elapsed in track(filter, keys, source.read(), bar):
+                for snapshot, elapsed in frames_of_run(bar):
                     tracked[name].append(snapshot)
                     seconds.append(elapsed)
         finally:
             # Also on the way out of an interrupted run.
             if tracked[name]:
-                results.append(score(name, tracked[name], seconds, source))
-                _write_scores(options, source, name, tracked[name], results)
+                tracks = rows_of_run(tracked[name])
+                result = score(name, tracks, len(tracked[name]), seconds, source)
+                if options.detect:
+                    result |= _tracking_scores(tracks, source, len(tracked[name]))
+                results.append(result)
+                box_files.write_tracks(options.out / f"tracks_{name}.txt", tracks[0])
+                _write_scores(options, source, len(tracked[name]), results)
     write_contact_sheet(options.out / "contact_sheet.png", source, tracked)
     write_video(options.out / f"tracking.{'gif' if options.gif else 'mp4'}", source, tracked)
     print(table(results))
     print(f"written to {options.out}")
 
 
-def _write_scores(options, source, name, snapshots, results) -> None:
-    rows = track_rows(snapshots, 0, source.first)
-    box_files.write_tracks(options.out / f"tracks_{name}.txt", rows)
+def _drawn_runs(options, source: Source, keys: Array) -> tuple[dict[str, Any], Source]:
+    """The filters of the preset, started at the given boxes."""
+    first_frame = next(iter(source.read()))
+    filters = PRESETS[options.preset](first_frame, source.boxes)
+    return {name: _plain_run(filter, source, keys) for name, filter in filters.items()}, source
+
+
+def _plain_run(filter: mpfjax.Filter, source: Source, keys: Array) -> tuple[Callable, Callable]:
+    """What yields the frames of a filter's runs, and what makes tracks of them."""
+    return (
+        lambda bar: track(filter, keys, source.read(), bar),
+        lambda snapshots: [track_rows(snapshots, run, source.first) for run in range(len(keys))],
+    )
+
+
+def _detected_runs(options, source: Source, keys: Array) -> tuple[dict[str, Any], Source]:
+    """The PF of the preset, started at the first detections, and the two trackers."""
+    detected = detect_all(source)
+    first = next((t for t, boxes in enumerate(detected.boxes) if len(boxes)), None)
+    if first is None:
+        raise ValueError("--detect: nothing moves before a still camera in these frames")
+    boxes = detected.boxes[first][:MAX_COMPONENTS]
+    source = source._replace(boxes=boxes, num_frames=len(detected.boxes))
+    still = next(frame for t, frame in enumerate(source.read()) if t == first)
+    filter = PRESETS[options.preset](still, boxes)["pf"]
+    runs: dict[str, Any] = {"pf": _plain_run(filter, source, keys)}
+    for name, tracker in make_trackers().items():
+        runs[name] = track_detected(tracker, keys, source, detected)
+    return runs, source
+
+
+def _tracking_scores(tracks: list[np.ndarray], source: Source, num_frames: int) -> dict[str, Any]:
+    """HOTA, MOTA and IDF1, means over the runs; null without a truth or without TrackEval."""
+    names = ("HOTA", "MOTA", "IDF1")
+    span = (source.first, source.first + num_frames - 1)
+    if source.truth is None or not np.any(source.truth[:, 0] <= span[1]):
+        return dict.fromkeys(names)
+    try:
+        scores = [multi_object_scores(rows, source.truth, span) for rows in tracks]
+    except ImportError as error:
+        print(f"no HOTA, MOTA and IDF1: {error}", file=sys.stderr)
+        return dict.fromkeys(names)
+    return {name: _mean([score[name] for score in scores]) for name in names}
+
+
+def _write_scores(options, source: Source, num_frames: int, results) -> None:
     settings = {
         "source": source.name,
         "preset": options.preset,
-        "frames": [source.first, source.first + len(snapshots) - 1],
+        "detect": options.detect,
+        "frames": [source.first, source.first + num_frames - 1],
         "boxes": source.boxes.tolist(),
         "ids": None if source.truth is None else np.unique(source.truth[:, 1]).astype(int).tolist(),
         "seed": options.seed,
@@ -472,13 +439,20 @@ def _write_scores(options, source, name, snapshots, results) -> None:
 
 def table(results: list[dict[str, Any]]) -> str:
     """The results as text."""
+    columns = {
+        "all_covered": "all covered",
+        "on_object": "on object",
+        "id_swaps": "id swaps",
+        "ms_per_frame": "ms a frame",
+    }
+    columns |= {name: name for name in ("HOTA", "MOTA", "IDF1") if name in results[-1]}
     rows = []
-    for r in results:
-        cells = [r["all_covered"], r["on_object"], r["id_swaps"], r["ms_per_frame"]]
+    for result in results:
+        cells = [result.get(name) for name in columns]
         rows.append(
-            [NAMES[r["filter"]], *("-" if cell is None else f"{cell:.3g}" for cell in cells)]
+            [NAMES[result["filter"]], *("-" if cell is None else f"{cell:.3g}" for cell in cells)]
         )
-    return format_table(["filter", "all covered", "on object", "id swaps", "ms a frame"], rows)
+    return format_table(["filter", *columns.values()], rows)
 
 
 def main(arguments: list[str] | None = None) -> int:

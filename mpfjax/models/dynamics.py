@@ -45,6 +45,12 @@ class AbstractDynamics(eqx.Module):
     ) -> Float[Array, " n"]:
         """log D(x_t | x_{t-1}, x_{t-2}), with x_t in `following`."""
 
+    @abc.abstractmethod
+    def moments(
+        self, current: Float[Array, "n d"], previous: Float[Array, "n d"] | None = None
+    ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
+        """Mean and standard deviation of every coordinate of x_t."""
+
 
 class RandomWalk(AbstractDynamics):
     """x_t = x_{t-1} + diag(deviations) ω_t, ω_t ~ N(0, I).
@@ -91,6 +97,13 @@ class RandomWalk(AbstractDynamics):
         deviations = jnp.broadcast_to(self.deviations, current.shape)
         noise = (following - current) / deviations
         return _log_standard_normal(noise) - jnp.sum(jnp.log(deviations), axis=1)
+
+    def moments(
+        self, current: Float[Array, "n d"], previous: Float[Array, "n d"] | None = None
+    ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
+        """x_{t-1}, and `deviations`."""
+        del previous
+        return current, jnp.broadcast_to(self.deviations, current.shape)
 
 
 class Autoregression(AbstractDynamics):
@@ -151,7 +164,7 @@ class Autoregression(AbstractDynamics):
     ) -> Float[Array, "n d"]:
         """The expected x_t plus B ω_t."""
         noise = jax.random.normal(key, current.shape, current.dtype)
-        return self._expected(current, previous) + _times(self.B, noise)
+        return self.moments(current, previous)[0] + _times(self.B, noise)
 
     def log_density(
         self,
@@ -160,19 +173,22 @@ class Autoregression(AbstractDynamics):
         previous: Float[Array, "n d"] | None = None,
     ) -> Float[Array, " n"]:
         """log N(x_t; the expected x_t, B Bᵀ)."""
-        residuals = following - self._expected(current, previous)
+        residuals = following - self.moments(current, previous)[0]
         scales = jnp.broadcast_to(self.B, (*current.shape, current.shape[1]))
         noise = jnp.linalg.solve(scales, residuals[:, :, None])[:, :, 0]
         log_volume = jnp.broadcast_to(jnp.linalg.slogdet(self.B)[1], noise.shape[:1])
         return _log_standard_normal(noise) - log_volume
 
-    def _expected(
-        self, current: Float[Array, "n d"], previous: Float[Array, "n d"] | None
-    ) -> Float[Array, "n d"]:
+    def moments(
+        self, current: Float[Array, "n d"], previous: Float[Array, "n d"] | None = None
+    ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
+        """x̄ + A1 (x_{t-1} - x̄) + A2 (x_{t-2} - x̄), and the roots of the diagonal of B Bᵀ."""
         if previous is None:
             raise ValueError("previous: an Autoregression needs x_{t-2}")
         mean = jnp.broadcast_to(self.mean, current.shape)
-        return mean + _times(self.A1, current - mean) + _times(self.A2, previous - mean)
+        expected = mean + _times(self.A1, current - mean) + _times(self.A2, previous - mean)
+        deviations = jnp.sqrt(jnp.sum(self.B**2, axis=-1))
+        return expected, jnp.broadcast_to(deviations, current.shape)
 
 
 def _times(matrices: Float[Array, "*n d d"], vectors: Float[Array, "n d"]) -> Float[Array, "n d"]:

@@ -79,3 +79,12 @@ class RandomWalkWithJumps(AbstractDynamics):
         log_odds = jnp.log(jnp.array([1 - self.jump_probability, self.jump_probability]))
         log_odds = log_odds.astype(stays.dtype)
         return jnp.logaddexp(log_odds[0] + stays, log_odds[1] + jumps)
+
+    def moments(
+        self, current: Float[Array, "n d"], previous: Float[Array, "n d"] | None = None
+    ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
+        """x_{t-1}, and the deviation of short and long steps together."""
+        del previous
+        p = self.jump_probability
+        variances = (1 - p) * self.deviations**2 + p * self.jump_deviations**2
+        return current, jnp.broadcast_to(jnp.sqrt(variances), current.shape)

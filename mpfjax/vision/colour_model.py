@@ -173,13 +173,13 @@ class ColourModel(AbstractStateSpaceModel):
             switches = jax.random.bernoulli(key_switch, self.switch_probability, reference.shape)
             drawn = jax.random.randint(key_reference, reference.shape, 0, k, reference.dtype)
             reference = jnp.where(switches, drawn, reference)
-        dynamics = self._dynamics_of(states)
+        dynamics = self.dynamics_of(states)
         box = dynamics.sample(key_noise, states.box, states.previous)
         return BoxState(box, reference, self._remembered(states.box))
 
     def log_transition(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
         """log D(x_t | x_{t-1}) + log P(r_t | r_{t-1}), -inf where r cannot have changed."""
-        dynamics = self._dynamics_of(previous_states)
+        dynamics = self.dynamics_of(previous_states)
         log_density = dynamics.log_density(
             states.box, previous_states.box, previous_states.previous
         )
@@ -224,7 +224,7 @@ class ColourModel(AbstractStateSpaceModel):
         distances = bhattacharyya(histograms, self.references[states.reference])
         return jnp.mean(jnp.sum(distances, axis=2), axis=1)
 
-    def _dynamics_of(self, states: BoxState) -> AbstractDynamics:
+    def dynamics_of(self, states: BoxState) -> AbstractDynamics:
         """The dynamics of each particle's own reference."""
         return jax.tree.map(lambda leaf: leaf[states.reference], self.dynamics)
 

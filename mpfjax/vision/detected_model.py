@@ -68,7 +68,7 @@ class DetectedColourModel(AbstractStateSpaceModel):
 
     colour: ColourModel
     deviations: Float[Array, "4"] = eqx.field(
-        converter=jnp.asarray, default_factory=lambda: jnp.array([0.12, 0.06, 0.15, 0.1])
+        converter=jnp.asarray, default_factory=lambda: jnp.array([0.2, 0.1, 0.25, 0.15])
     )
     miss: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.02)
 
@@ -98,19 +98,20 @@ class DetectedColourModel(AbstractStateSpaceModel):
 
 
 class DetectionProposal(AbstractProposal):
-    """Draw boxes about their detection as well as from the dynamics.
+    """Draw boxes from where dynamics and detection agree, as well as from the dynamics alone.
 
-    q(x_t | x_{t-1}, y_t) = share N(x_t; d_r, deviations²) + (1 - share) D(x_t | x_{t-1}), the
-    proposal of the boosted particle filter (Okuma et al. 2004, section 4.2), with the Gaussian
-    in (x, y, s_x, s_y) and as wide as `DetectedColourModel` takes detections to be. The weights
-    L D / q are exact. Where a reference has no detection q is D.
+    q(x_t | x_{t-1}, y_t) = share N(x_t; μ, s²) + (1 - share) D(x_t | x_{t-1}), with N(μ, s²) the
+    product of the Gaussians of the detection and of the prediction, coordinate by coordinate in
+    (x, y, s_x, s_y), both weighed by their precision: a mixture like that of the boosted particle
+    filter (Okuma et al. 2004, section 4.2), drawn as narrow as its target. The weights L D / q
+    are exact. Where a reference has no detection q is D.
 
     Raises `ValueError` for a share outside [0, 1). Use it with few particles, which the dynamics
     alone would seldom put on a detection.
     """
 
     model: DetectedColourModel
-    share: float = eqx.field(static=True, default=0.5)
+    share: float = eqx.field(static=True, default=0.8)
 
     def __check_init__(self) -> None:
         if not 0 <= self.share < 1:
@@ -122,30 +123,41 @@ class DetectionProposal(AbstractProposal):
         """x_t from the mixture, and its log density."""
         key_moved, key_noise, key_which = jax.random.split(key, 3)
         moved = self.model.sample_transition(key_moved, previous_states)
-        reference = moved.reference
-        own = take(observation.detections.boxes, reference)
-        size = take(self.model.colour.reference_boxes, reference)[:, 2:]
-        centre = jnp.concatenate([own[:, :2], own[:, 2:] / size], axis=1)
-        # A small change of log w is that of w in shares of itself.
-        deviations = self.model.deviations[None] * jnp.concatenate(
-            [own[:, 2:], centre[:, 2:]], axis=1
-        )
-        noise = jax.random.normal(key_noise, centre.shape, centre.dtype)
-        detected = take(observation.detections.valid, reference)
+        mean, deviations = self._agreement(observation.detections, previous_states)
+        noise = jax.random.normal(key_noise, mean.shape, mean.dtype)
+        detected = take(observation.detections.valid, previous_states.reference)
         share = jnp.where(detected, self.share, 0.0)
-        from_detection = jax.random.uniform(key_which, share.shape) < share
-        box = jnp.where(from_detection[:, None], centre + deviations * noise, moved.box)
-        states = BoxState(box, reference, moved.previous)
-        log_detection = jnp.sum(
-            -0.5 * ((box - centre) / deviations) ** 2
+        from_agreement = jax.random.uniform(key_which, share.shape) < share
+        box = jnp.where(from_agreement[:, None], mean + deviations * noise, moved.box)
+        states = BoxState(box, moved.reference, moved.previous)
+        log_agreement = jnp.sum(
+            -0.5 * ((box - mean) / deviations) ** 2
             - jnp.log(deviations)
             - 0.5 * jnp.log(2 * jnp.pi),
             axis=1,
         )
         log_dynamics = self.model.log_transition(states, previous_states)
         return states, jnp.logaddexp(
-            jnp.log(share) + log_detection, jnp.log(1 - share) + log_dynamics
+            jnp.log(share) + log_agreement, jnp.log(1 - share) + log_dynamics
         )
+
+    def _agreement(
+        self, detections: Detections, previous: BoxState
+    ) -> tuple[Float[Array, "n 4"], Float[Array, "n 4"]]:
+        """Mean and deviation of the product of the detection's and the prediction's Gaussian."""
+        colour = self.model.colour
+        own = take(detections.boxes, previous.reference)
+        size = take(colour.reference_boxes, previous.reference)[:, 2:]
+        detected = jnp.concatenate([own[:, :2], own[:, 2:] / size], axis=1)
+        # A small change of log w is that of w in shares of itself.
+        unit = jnp.concatenate([own[:, 2:], detected[:, 2:]], axis=1)
+        precision = 1 / (self.model.deviations[None] * unit) ** 2
+        predicted, deviations = colour.dynamics_of(previous).moments(
+            previous.box, previous.previous
+        )
+        prior = 1 / deviations**2
+        total = precision + prior
+        return (precision * detected + prior * predicted) / total, 1 / jnp.sqrt(total)
 
 
 def box_differences(

@@ -42,11 +42,13 @@ class Tracks(NamedTuple):
     - `boxes`: (m, 4), the mean box of each, centre and size in pixels.
     - `identities`: (m,), a number that an object keeps for life, 0 for a dead component.
     - `confirmed`: (m,), whether detections have borne it out often enough to be believed.
+    - `unseen`: (m,), for how many frames none has.
     """
 
     boxes: Float[Array, "m 4"]
     identities: Int[Array, " m"]
     confirmed: Bool[Array, " m"]
+    unseen: Int[Array, " m"]
 
 
 class TrackerState(eqx.Module):
@@ -111,15 +113,15 @@ class ObjectTracker(eqx.Module):
     def __init__(
         self,
         max_objects: int = 24,
-        particles_per_object: int = 25,
+        particles_per_object: int = 50,
         *,
         rejuvenation: AbstractRejuvenation | None = None,
         colours: AbstractColours | None = None,
-        sigma: float = 0.15,
-        momentum: float = 0.8,
+        sigma: float = 0.2,
+        momentum: float = 1.0,
         num_parts: int = 3,
-        step_deviations: tuple[float, float, float, float] = (0.15, 0.05, 0.02, 0.02),
-        detection_deviations: tuple[float, float, float, float] = (0.12, 0.06, 0.15, 0.1),
+        step_deviations: tuple[float, float, float, float] = (0.08, 0.03, 0.02, 0.02),
+        detection_deviations: tuple[float, float, float, float] = (0.2, 0.1, 0.25, 0.15),
         confirmation: int = 3,
         patience: int = 10,
         crowding: int = 8,
@@ -200,7 +202,7 @@ class ObjectTracker(eqx.Module):
         unexplained = Detections(detections.boxes, detections.valid & ~taken)
         state = self._bear(key_births, state, boxes, unexplained, table)
         confirmed = (state.identities > 0) & (state.seen >= self.confirmation)
-        return state, Tracks(_mean_boxes(state), state.identities, confirmed)
+        return state, Tracks(_mean_boxes(state), state.identities, confirmed, state.unseen)
 
     def _assigned(
         self, state: TrackerState, detections: Detections, table: IntegralHistogram
@@ -391,12 +393,8 @@ def _inside(boxes: Float[Array, "m 4"], around: Float[Array, "d 4"]) -> Bool[Arr
 
 def _overlap(a: Float[Array, "m 4"], b: Float[Array, "d 4"]) -> Float[Array, "m d"]:
     """Intersection over union of every box with every other, 0 where one has no area."""
-    low = jnp.maximum(
-        a[:, None, :2] - a[:, None, 2:] / 2, b[None, :, :2] - b[None, :, 2:] / 2
-    )
-    high = jnp.minimum(
-        a[:, None, :2] + a[:, None, 2:] / 2, b[None, :, :2] + b[None, :, 2:] / 2
-    )
+    low = jnp.maximum(a[:, None, :2] - a[:, None, 2:] / 2, b[None, :, :2] - b[None, :, 2:] / 2)
+    high = jnp.minimum(a[:, None, :2] + a[:, None, 2:] / 2, b[None, :, :2] + b[None, :, 2:] / 2)
     common = jnp.prod(jnp.maximum(high - low, 0.0), axis=2)
     union = jnp.prod(a[:, 2:], axis=1)[:, None] + jnp.prod(b[:, 2:], axis=1)[None] - common
     return jnp.where(union > 0, common / jnp.where(union > 0, union, 1.0), 0.0)

@@ -1,0 +1,110 @@
+"""Tracking without a drawn box: detections, and the trackers that are born of them."""
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from tqdm import tqdm
+
+import mpfjax
+from benchmarks.tracking_pictures import Snapshot, Source
+from mpfjax.vision import boxes as box_files
+from mpfjax.vision.detected_model import Detections
+from mpfjax.vision.detection import BackgroundSubtraction
+from mpfjax.vision.tracker import ObjectTracker, Tracks
+
+MAX_DETECTIONS = 32
+# A box that no detection has borne out for longer than this is a guess, and not written.
+LONGEST_GUESS = 3
+
+
+class Detected(NamedTuple):
+    """The boxes (k, 4) of every frame, top-left corner first, and the seconds that each took."""
+
+    boxes: list[np.ndarray]
+    seconds: list[float]
+
+
+def detect_all(source: Source) -> Detected:
+    """What moves in each frame; the background is learned on the way. Reading is timed too."""
+    detector = BackgroundSubtraction()
+    boxes, seconds = [], []
+    start = time.perf_counter()
+    for still in tqdm(source.read(), total=source.num_frames, desc="Detection", disable=None):
+        boxes.append(detector.detect(still))
+        seconds.append(time.perf_counter() - start)
+        start = time.perf_counter()
+    return Detected(boxes, seconds)
+
+
+def make_trackers() -> dict[str, ObjectTracker]:
+    """The same tracker with resampling and with Gaussian regeneration."""
+    gaussian = ObjectTracker()
+    resample = mpfjax.Resample(particles_per_component=gaussian.particles_per_object)
+    return {"mpf": ObjectTracker(rejuvenation=resample), "gm_mpf": gaussian}
+
+
+def track_detected(
+    tracker: ObjectTracker, keys: Array, source: Source, detected: Detected
+) -> tuple[Callable, Callable]:
+    """What yields the frames of a tracker's runs, and what makes tracks of them.
+
+    The seconds of a frame are those of reading, detecting and tracking.
+    """
+    kept: list[Tracks] = []
+
+    def frames_of_run(bar: tqdm) -> Iterator[tuple[Snapshot, float]]:
+        states = jax.tree.map(lambda leaf: jnp.stack([leaf] * len(keys)), tracker.init())
+        for t, (still, boxes) in enumerate(zip(source.read(), detected.boxes, strict=True)):
+            start = time.perf_counter()
+            found = Detections.from_boxes(boxes, MAX_DETECTIONS)
+            states, tracks, snapshot = _advance(
+                tracker, keys, jnp.asarray(t), states, jnp.asarray(still), found
+            )
+            kept.append(jax.tree.map(np.asarray, tracks))
+            snapshot = jax.tree.map(np.asarray, snapshot)
+            bar.update()
+            yield snapshot, time.perf_counter() - start + detected.seconds[t]
+
+    def rows_of_run(snapshots: list[Snapshot]) -> list[np.ndarray]:
+        return [_rows(kept[: len(snapshots)], run, source.first) for run in range(len(keys))]
+
+    return frames_of_run, rows_of_run
+
+
+@eqx.filter_jit
+def _advance(tracker, keys, t, states, frame, found):
+    def step(key, state):
+        state, tracks = tracker.step(jax.random.fold_in(key, t), state, frame, found)
+        mixture = state.mixture
+        labels = jnp.where(mixture.occupied, mixture.component_indicators, -1)
+        points = state.colour.boxes(mixture.particles)[:, :2]
+        believed = tracks.confirmed & (tracks.unseen <= LONGEST_GUESS)
+        return state, tracks, Snapshot(tracks.boxes, believed, points, labels)
+
+    # The frame is not mapped over, so that its histogram is built once for all runs.
+    return jax.vmap(step)(keys, states)
+
+
+def _rows(kept: list[Tracks], run: int, first: int) -> np.ndarray:
+    """Rows (frame, id, x, y, w, h) of the objects that were believed in at some time.
+
+    Their first frames, before they were, are among them.
+    """
+    believed: set[int] = set()
+    rows: list[list[Any]] = []
+    for frame, tracks in enumerate(kept, first):
+        boxes = box_files.top_left(np.asarray(tracks.boxes[run]))
+        for m in np.flatnonzero(tracks.identities[run]):
+            identity = int(tracks.identities[run][m])
+            if tracks.confirmed[run][m]:
+                believed.add(identity)
+            if tracks.unseen[run][m] <= LONGEST_GUESS:
+                rows.append([frame, identity, *boxes[m]])
+    chosen = np.array([row for row in rows if row[1] in believed]).reshape(-1, 6)
+    return np.round(chosen, 3)
