@@ -398,7 +398,11 @@ def partitioned_sampling(
     interaction as well. `ess_threshold` is that of the resampling between steps and objects.
     """
     require_multi_object(model, "partitioned_sampling")
-    orders = order if order == "random" else check_orders(order, model.num_objects, "order")
+    orders: Any = order
+    if not (isinstance(order, str) and order == "random"):
+        orders = check_orders(order, model.num_objects, "order")
+        if orders.shape[0] != 1:
+            raise ValueError(f"order: {orders.shape[0]} orders where there is one component")
     return Filter(
         model,
         moves=[
@@ -431,20 +435,18 @@ def distributed_partitioned_sampling(
     require_multi_object(model, "distributed_partitioned_sampling")
     if orders is None:
         orders = "circular"
+    num_sets = model.num_objects
     if not isinstance(orders, str):
         orders = check_orders(orders, model.num_objects)
+        num_sets = orders.shape[0]
+    partitioned = Partitioned(
+        model, orders, scheme=scheme, ess_threshold=ess_threshold, reassembly=reassembly
+    )
     return Filter(
         model,
-        moves=[
-            Pool(),
-            Resample(scheme, ess_threshold),
-            RandomPartition(),
-            Partitioned(
-                model, orders, scheme=scheme, ess_threshold=ess_threshold, reassembly=reassembly
-            ),
-        ],
+        moves=[Pool(), Resample(scheme, ess_threshold), RandomPartition(), partitioned],
         num_particles=num_particles,
-        num_components=model.num_objects if isinstance(orders, str) else orders.shape[0],
+        num_components=num_sets,
     )
 
 

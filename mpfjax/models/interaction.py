@@ -40,10 +40,7 @@ class PairwiseRepulsion(eqx.Module):
         """log ψ of each row of the states with the same row of the other states."""
         gaps = self._positions(states) - self._positions(other_states)
         squares = jnp.sum((gaps / self.radius.astype(gaps.dtype)) ** 2, axis=1)
-        if self.compact:
-            nearness = jnp.maximum(1 - squares, 0.0) ** 2
-        else:
-            nearness = jnp.exp(-squares / 2)
+        nearness = jnp.maximum(1 - squares, 0.0) ** 2 if self.compact else jnp.exp(-squares / 2)
         return -self.strength.astype(gaps.dtype) * nearness
 
     def _positions(self, states: PyTree) -> Float[Array, "n k"]:

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.models.base import AbstractStateSpaceModel, require
-from mpfjax.operations import take
 
 # A number of particles that no parameter has by chance as the length of an axis.
 _TRIAL = 1_000_003
@@ -137,7 +136,8 @@ class MultiObjectModel(AbstractStateSpaceModel):
                 lambda leaf: jax.lax.dynamic_index_in_dim(leaf, objects, 1, keepdims=False),
                 particles,
             )
-        pick = lambda leaf: jax.vmap(take)(leaf, objects)  # noqa: E731
+        rows = jnp.arange(objects.shape[0], dtype=jnp.int32)
+        pick = lambda leaf: leaf.at[rows, objects].get(mode="promise_in_bounds")  # noqa: E731
         return jax.tree.map(pick, particles)
 
     def replace_object(
@@ -158,7 +158,9 @@ class MultiObjectModel(AbstractStateSpaceModel):
         self, key: Key[Array, ""], states: PyTree, objects: Int[Array, "*n"]
     ) -> PyTree:
         """x_t of one object of each particle."""
-        if objects.ndim == 0 or not self.per_object:
+        if not self.per_object:
+            return self.object_model.sample_transition(key, states)
+        if objects.ndim == 0:
             return self.object_at(objects).sample_transition(key, states)
 
         def draw(key: Key[Array, ""], state: PyTree, j: Int[Array, ""]) -> PyTree:
@@ -183,7 +185,9 @@ class MultiObjectModel(AbstractStateSpaceModel):
         self, observation: PyTree, states: PyTree, objects: Int[Array, "*n"]
     ) -> Float[Array, " n"]:
         """log L(y_t | x_t^j) of one object of each particle; y_t as prepared."""
-        if objects.ndim == 0 or not (self.per_object or not self.shared_observation):
+        if self.shared_observation and not self.per_object:
+            return self.object_model.log_likelihood(observation, states)
+        if objects.ndim == 0:
             seen = self._seen_by(observation, objects)
             return self.object_at(objects).log_likelihood(seen, states)
 
@@ -193,7 +197,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
 
         return jax.vmap(weigh)(states, objects)
 
-    def _seen_by(self, observation: PyTree, index: Int[Array, "*n"]) -> PyTree:
+    def _seen_by(self, observation: PyTree, index: Int[Array, ""]) -> PyTree:
         if self.shared_observation:
             return observation
         return jax.tree.map(lambda leaf: leaf[index], observation)
