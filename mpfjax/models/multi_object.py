@@ -78,9 +78,18 @@ class MultiObjectModel(AbstractStateSpaceModel):
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         """x_0 of every object, independent: every leaf (n, J, ...)."""
-        keys = jax.random.split(key, self.num_objects)
-        draw = lambda key, j: self.object_at(j).sample_initial(key, num_particles)  # noqa: E731
-        return jax.vmap(draw, out_axes=1)(keys, self._indices)
+        keys = jax.random.split(key, 2 * self.num_objects).reshape(2, self.num_objects)
+
+        def draw(key: Key[Array, ""], key_order: Key[Array, ""], j: Int[Array, ""]) -> PyTree:
+            states = self.object_at(j).sample_initial(key, num_particles)
+            if self.num_objects == 1:
+                return states
+            # Draws that are spread out evenly, as stratified ones are, may stand in line: side
+            # by side as they come, objects would not be independent.
+            order = jax.random.permutation(key_order, num_particles)
+            return jax.tree.map(lambda leaf: leaf[order], states)
+
+        return jax.vmap(draw, out_axes=1)(keys[0], keys[1], self._indices)
 
     def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """x_t of every object, independent of each other given x_{t-1}."""

@@ -391,12 +391,8 @@ def _inside(boxes: Float[Array, "m 4"], around: Float[Array, "d 4"]) -> Bool[Arr
 
 def _overlap(a: Float[Array, "m 4"], b: Float[Array, "d 4"]) -> Float[Array, "m d"]:
     """Intersection over union of every box with every other, 0 where one has no area."""
-    low = jnp.maximum(
-        a[:, None, :2] - a[:, None, 2:] / 2, b[None, :, :2] - b[None, :, 2:] / 2
-    )
-    high = jnp.minimum(
-        a[:, None, :2] + a[:, None, 2:] / 2, b[None, :, :2] + b[None, :, 2:] / 2
-    )
+    low = jnp.maximum(a[:, None, :2] - a[:, None, 2:] / 2, b[None, :, :2] - b[None, :, 2:] / 2)
+    high = jnp.minimum(a[:, None, :2] + a[:, None, 2:] / 2, b[None, :, :2] + b[None, :, 2:] / 2)
     common = jnp.prod(jnp.maximum(high - low, 0.0), axis=2)
     union = jnp.prod(a[:, 2:], axis=1)[:, None] + jnp.prod(b[:, 2:], axis=1)[None] - common
     return jnp.where(union > 0, common / jnp.where(union > 0, union, 1.0), 0.0)

@@ -51,6 +51,13 @@ class TestDensities:
         noise = np.asarray(residuals).reshape(4000, -1)
         np.testing.assert_allclose(np.corrcoef(noise.T), np.eye(6), atol=5 / np.sqrt(4000))
 
+    def test_objects_are_independent_though_their_draws_stand_in_line(self):
+        """The quadratic model's x_0 are stratified, and come in ascending order."""
+        model = MultiObjectModel(mpfjax.QuadraticModel(), 3)
+        states = np.asarray(model.sample_initial(KEY, 4000))
+        np.testing.assert_allclose(np.corrcoef(states.T), np.eye(3), atol=5 / np.sqrt(4000))
+        np.testing.assert_allclose(np.diff(np.sort(states, axis=0), axis=0).max(), 0, atol=0.003)
+
     def test_log_likelihood_is_the_sum_over_objects_and_pairs(self):
         expected = np.zeros(5)
         for j, model in enumerate(OBJECTS):
