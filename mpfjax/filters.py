@@ -1,6 +1,6 @@
 """A filter as a chain of moves, its runners, and the filters of the literature."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -12,10 +12,13 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, require
+from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
 from mpfjax.moves.gaussian import GaussianRegeneration
+from mpfjax.moves.independent import PropagateIndependently
+from mpfjax.moves.partitioned import Partitioned, check_orders
 from mpfjax.moves.propagation import Predict, Propagate, Weigh
-from mpfjax.moves.regrouping import KMeans, Merge, Split
+from mpfjax.moves.regrouping import KMeans, Merge, Pool, RandomPartition, Split
 from mpfjax.moves.resampling import Resample
 from mpfjax.proposals import AbstractProposal
 
@@ -375,6 +378,89 @@ def _gaussian_moves(
     if proposal is not None:
         raise ValueError(f"importance: {importance!r} draws from no proposal, but one was given")
     return [redraw, Predict(model), redraw, Weigh(model)]
+
+
+def partitioned_sampling(
+    model: MultiObjectModel,
+    num_particles: int,
+    order: str | Sequence[int] | Array | None = None,
+    *,
+    scheme: str = "systematic",
+    ess_threshold: float = 1.0,
+) -> Filter:
+    """Partitioned sampling: resample, then move one object after the other.
+
+    MacCormick and Blake (1999); Smith and Gatica-Perez (2004), section 3. `order` is a
+    permutation of the objects 0, ..., J-1, their own order for None, or "random" for a new one
+    at every step. Needs far fewer particles than the joint particle filter, which is
+    `particle_filter` on the same model; but the early objects of the order keep only a few
+    distinct hypotheses, and hardly recover from an occlusion. Unbiased in every order, with an
+    interaction as well. `ess_threshold` is that of the resampling between steps and objects.
+    """
+    require_multi_object(model, "partitioned_sampling")
+    orders: Any = order
+    if not (isinstance(order, str) and order == "random"):
+        orders = check_orders(order, model.num_objects, "order")
+        if orders.shape[0] != 1:
+            raise ValueError(f"order: {orders.shape[0]} orders where there is one component")
+    return Filter(
+        model,
+        moves=[
+            Resample(scheme, ess_threshold),
+            Partitioned(model, orders, scheme=scheme, ess_threshold=ess_threshold),
+        ],
+        num_particles=num_particles,
+    )
+
+
+def distributed_partitioned_sampling(
+    model: MultiObjectModel,
+    num_particles: int,
+    orders: str | Sequence[Sequence[int]] | Array | None = None,
+    reassembly: str = "prior",
+    *,
+    scheme: str = "systematic",
+    ess_threshold: float = 1.0,
+) -> Filter:
+    """DPS: the particles dealt into C sets, in each of which the objects move in another order.
+
+    Smith and Gatica-Perez (2004), section 4: pool and resample, deal into C sets at random, do
+    partitioned sampling in each, reassemble. The impoverishment that a fixed order puts on its
+    first objects falls on all alike. `orders` are C permutations of the objects, the J circular
+    shifts for None, or "random" for J new ones at every step. `reassembly` is "prior", the
+    paper's, where every set returns to its mass (an approximation: the marginal likelihood is
+    biased), or "evidence", which is exact; see `Partitioned`. Use it where it is not known
+    which object will be hard, and with enough particles for each set of N/C to track.
+    """
+    require_multi_object(model, "distributed_partitioned_sampling")
+    if orders is None:
+        orders = "circular"
+    num_sets = model.num_objects
+    if not isinstance(orders, str):
+        orders = check_orders(orders, model.num_objects)
+        num_sets = orders.shape[0]
+    partitioned = Partitioned(
+        model, orders, scheme=scheme, ess_threshold=ess_threshold, reassembly=reassembly
+    )
+    return Filter(
+        model,
+        moves=[Pool(), Resample(scheme, ess_threshold), RandomPartition(), partitioned],
+        num_particles=num_particles,
+        num_components=num_sets,
+    )
+
+
+def independent_particle_filters(
+    model: MultiObjectModel, num_particles: int, *, scheme: str = "systematic"
+) -> Filter:
+    """A small particle filter for each object, as if there were no other.
+
+    N particles an object, so the cost of a joint filter of N. Exact where the objects do not
+    interact, and then the one to beat; an interaction is left out, and look-alikes that cross
+    end on the same object. Estimates are after resampling; see `PropagateIndependently`.
+    """
+    require_multi_object(model, "independent_particle_filters")
+    return Filter(model, moves=[PropagateIndependently(model, scheme)], num_particles=num_particles)
 
 
 def _mixture_filter(

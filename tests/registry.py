@@ -20,8 +20,12 @@ from mpfjax import (
     GaussNewtonProposal,
     KMeans,
     Merge,
+    MultiObjectModel,
+    Partitioned,
+    Pool,
     Predict,
     Propagate,
+    RandomPartition,
     Resample,
     Split,
     Weigh,
@@ -49,6 +53,9 @@ REGROUPINGS: dict[str, AbstractRegrouping] = {
     "split": Split(),
     "eager split": Split(1.0, 0.1, min_share=0.0),
     "random labels": RandomLabels(),
+    "pool": Pool(),
+    "random partition": RandomPartition(),
+    "random partition in two": RandomPartition(2),
 }
 
 REJUVENATIONS: dict[str, AbstractRejuvenation] = {
@@ -86,6 +93,11 @@ def _chain(*before, then=(), proposal=lambda model: None) -> Callable[..., Filte
     )
 
 
+def _joint(make: Callable[[MultiObjectModel], Filter]) -> Callable[..., Filter]:
+    """A filter of two objects, independent copies that give rise to the same observations."""
+    return lambda model: make(MultiObjectModel(model, 2, shared_observation=True))
+
+
 CHAINS: dict[str, Callable[..., Filter]] = {
     "pf": _pf(),
     "pf multinomial": _pf(scheme="multinomial"),
@@ -113,4 +125,31 @@ CHAINS: dict[str, Callable[..., Filter]] = {
         model, NUM_PARTICLES, NUM_COMPONENTS, importance="predictive_gaussian"
     ),
     "exclusion": _chain(Resample("stratified"), then=[Exclusion(2.0, 0.5), KMeans(3, reseed=True)]),
+    "joint pf": _joint(_pf()),
+    "ps": _joint(lambda joint: mpfjax.partitioned_sampling(joint, NUM_PARTICLES, (1, 0))),
+    "ps adaptive, random order": _joint(
+        lambda joint: mpfjax.partitioned_sampling(
+            joint, NUM_PARTICLES, "random", scheme="multinomial", ess_threshold=0.5
+        )
+    ),
+    "dps": _joint(
+        lambda joint: mpfjax.distributed_partitioned_sampling(
+            joint, NUM_PARTICLES, reassembly="evidence"
+        )
+    ),
+    "dps prior": _joint(
+        lambda joint: mpfjax.distributed_partitioned_sampling(joint, NUM_PARTICLES)
+    ),
+    "partitioned in clusters": _joint(
+        lambda joint: Filter(
+            joint,
+            [Resample(), KMeans(), Partitioned(joint, "circular")],
+            NUM_PARTICLES,
+            NUM_COMPONENTS,
+            initial_moves=[KMeans(3, reseed=True)],
+        )
+    ),
+    "independent filters": _joint(
+        lambda joint: mpfjax.independent_particle_filters(joint, NUM_PARTICLES)
+    ),
 }

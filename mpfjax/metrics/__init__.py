@@ -3,4 +3,8 @@ from mpfjax.metrics.modes import modes_represented as modes_represented
 from mpfjax.metrics.set_distances import GOSPA as GOSPA
 from mpfjax.metrics.set_distances import gospa as gospa
 from mpfjax.metrics.set_distances import ospa as ospa
+from mpfjax.metrics.tracking_quality import TrackingQuality as TrackingQuality
+from mpfjax.metrics.tracking_quality import tracking_quality as tracking_quality
 from mpfjax.metrics.tracking_scores import multi_object_scores as multi_object_scores
+from mpfjax.metrics.uniqueness import effective_dynamics as effective_dynamics
+from mpfjax.metrics.uniqueness import uniqueness as uniqueness

@@ -7,10 +7,14 @@ from mpfjax.moves.base import AbstractRejuvenation as AbstractRejuvenation
 from mpfjax.moves.exclusion import Exclusion as Exclusion
 from mpfjax.moves.features import Features as Features
 from mpfjax.moves.gaussian import GaussianRegeneration as GaussianRegeneration
+from mpfjax.moves.independent import PropagateIndependently as PropagateIndependently
+from mpfjax.moves.partitioned import Partitioned as Partitioned
 from mpfjax.moves.propagation import Predict as Predict
 from mpfjax.moves.propagation import Propagate as Propagate
 from mpfjax.moves.propagation import Weigh as Weigh
 from mpfjax.moves.regrouping import KMeans as KMeans
 from mpfjax.moves.regrouping import Merge as Merge
+from mpfjax.moves.regrouping import Pool as Pool
+from mpfjax.moves.regrouping import RandomPartition as RandomPartition
 from mpfjax.moves.regrouping import Split as Split
 from mpfjax.moves.resampling import Resample as Resample

@@ -1,4 +1,4 @@
-"""Regrouping: K-means, merging of overlapping components, splitting of diffuse ones."""
+"""Regrouping: K-means, merging, splitting, random partition, and pooling into one."""
 
 from collections.abc import Callable
 
@@ -235,6 +235,56 @@ class Split(AbstractRegrouping):
 
         centroids = jax.lax.fori_loop(0, self.num_iterations, iterate, centroids)
         return _nearer(features, centroids, parent)
+
+
+class Pool(AbstractRegrouping):
+    """All particles into component 0, the mixture as one particle set.
+
+    The left-hand side of eq. 3 of Smith and Gatica-Perez (2004), read from right to left. Use it
+    before a `Resample` in which the components are to compete. Exact: a relabelling only.
+    """
+
+    def regroup(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+        """Component 0 for every particle."""
+        del key
+        return jnp.zeros_like(mixture.component_indicators), mixture.memory
+
+
+class RandomPartition(AbstractRegrouping):
+    """The particles dealt at random into sets of equal size, without replacement.
+
+    Smith and Gatica-Perez (2004), section 4: C sets of N/C particles each, sizes differing by one
+    where C does not divide N; empty slots are dealt after the filled ones. A set's mass is that
+    of its particles (eq. 5), so that the distribution stays as it is.
+
+    - `num_sets`: C; None takes as many as the mixture has components.
+
+    Raises `ValueError` for C < 1, or more sets than components. Use it where components are to
+    stand for the same distribution, such as `Partitioned` in one order each.
+    """
+
+    num_sets: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        if self.num_sets is not None and self.num_sets < 1:
+            raise ValueError(f"num_sets: {self.num_sets} is less than 1")
+
+    def regroup(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+        """A random set for every particle."""
+        n = mixture.num_particles
+        num_sets = mixture.num_components if self.num_sets is None else self.num_sets
+        if num_sets > mixture.num_components:
+            raise ValueError(
+                f"num_sets: {num_sets} is more than num_components, {mixture.num_components}"
+            )
+        draw = jax.random.uniform(key, (n,), mixture.log_weights.dtype)
+        place = jnp.argsort(jnp.where(mixture.occupied, draw, 1.0))
+        ranks = jnp.zeros(n, jnp.int32).at[place].set(jnp.arange(n, dtype=jnp.int32))
+        return ranks % num_sets, mixture.memory
 
 
 def nearest(

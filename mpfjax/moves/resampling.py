@@ -73,13 +73,17 @@ class Resample(AbstractRejuvenation):
     ) -> ParticleMixture:
         """Resample every component that is due."""
         due = self.is_due(mixture)
-        if mixture.num_components == 1 and self.sort_by is None:
+        as_they_stand = mixture.num_components == 1 and self.sort_by is None
+        if as_they_stand:
             layout = _as_they_stand(mixture)
         else:
             layout = _contiguous(mixture, due, self.sort_by)
         targets = deal_slots(
             layout.counts, due, mixture.num_particles, self.particles_per_component
         )
+        if as_they_stand:
+            # What is not redrawn keeps its place, and there may be empty slots before it.
+            targets = jnp.where(due, targets, mixture.num_particles)
         slots = place_slots(targets, mixture.num_particles)
         expected = layout.weights * take(targets, layout.components).astype(layout.weights.dtype)
         starts = SCHEMES[self.scheme](key, expected, targets, slots, layout)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax import KMeans, Merge, Split
+from mpfjax import KMeans, Merge, Pool, RandomPartition, Split
 from mpfjax.moves.regrouping import farthest_first, free_labels, lowest_connected
 from tests.examples import make_mixture
 
@@ -215,3 +215,38 @@ class TestSplit:
             jnp.array([True, False, True, True, False]),
         )
         np.testing.assert_array_equal(found, [0, 1, 1, 4, 4])
+
+
+class TestPoolAndRandomPartition:
+    MIXTURE = clouds([[0, 0], [5, 5]], [10, 13])
+
+    def test_pool_puts_everything_into_one_component(self):
+        assert (labels_after(Pool(), self.MIXTURE) == 0).all()
+
+    @pytest.mark.parametrize(("num_sets", "sizes"), [(None, [4, 4, 4, 4, 4, 3]), (2, [12, 11])])
+    def test_sets_are_of_equal_size_and_without_replacement(self, num_sets, sizes):
+        labels = labels_after(RandomPartition(num_sets), self.MIXTURE)
+        assert np.bincount(labels).tolist() == sizes
+
+    def test_filled_slots_are_dealt_before_empty_ones(self):
+        log_weights = np.where(np.arange(30) % 3 == 0, 0.0, -np.inf)
+        mixture = make_mixture(np.zeros(30), log_weights, np.zeros(30), 5)
+        labels = labels_after(RandomPartition(), mixture)
+        assert np.bincount(labels[::3]).tolist() == [2] * 5
+
+    def test_every_particle_comes_into_every_set_equally_often(self):
+        move = RandomPartition(2)
+        draw = jax.jit(jax.vmap(lambda key: move(key, self.MIXTURE).component_indicators))
+        labels = np.asarray(draw(jax.random.split(KEY, 4000)))
+        share = labels.mean(axis=0)
+        assert np.abs(share - 11 / 23).max() < 4.5 * 0.5 / np.sqrt(4000)
+        together = np.mean(labels[:, :1] == labels[:, 1:], axis=0)
+        expected = (12 * 11 + 11 * 10) / (23 * 22)
+        assert np.abs(together - expected).max() < 4.5 * 0.5 / np.sqrt(4000)
+
+    @pytest.mark.usefixtures("as_installed")
+    def test_bad_input(self):
+        with pytest.raises(ValueError, match="num_sets: 0 is less than 1"):
+            RandomPartition(0)
+        with pytest.raises(ValueError, match="num_sets: 7 is more than num_components, 6"):
+            RandomPartition(7)(KEY, self.MIXTURE)

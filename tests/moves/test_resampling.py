@@ -223,3 +223,16 @@ def test_the_offspring_of_a_single_component_are_unbiased(scheme):
     )
     gap = counts.mean(axis=0) - expected_offspring(mixture, 60)
     assert (np.abs(gap) < 4.5 * counts.std(axis=0) / np.sqrt(4000) + 1e-3).all()
+
+
+@pytest.mark.parametrize("particles_per_component", [None, 30])
+def test_one_component_that_is_not_due_keeps_its_particles_among_empty_slots(
+    particles_per_component,
+):
+    empty = np.arange(40) % 4 == 1
+    mixture = make_mixture(np.arange(40.0), np.where(empty, -np.inf, 0.0), np.zeros(40), 1)
+    move = Resample("systematic", 0.5, particles_per_component)
+    assert not np.asarray(move.is_due(mixture)).any()
+    moved = draw(move, mixture)
+    np.testing.assert_array_equal(moved.log_weights, mixture.log_weights)
+    np.testing.assert_array_equal(moved.particles, mixture.particles)

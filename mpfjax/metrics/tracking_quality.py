@@ -1,0 +1,136 @@
+"""Track state, precision, recall, success and recovery rates of boxes, over many runs.
+
+The measures of Smith and Gatica-Perez (2004), section 3.1, for one box of each object in each
+frame, E the estimated box and G the true one. Boxes are (x, y, w, h) with (x, y) the top-left
+corner, in pixels. All of it works under jit and vmap.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+class TrackingQuality(NamedTuple):
+    """What `tracking_quality` found, each of shape (objects,), rates and shares in [0, 1].
+
+    - `success_rate`: the share of runs in which the object is tracked in every frame.
+    - `recovery_rate`: the share of runs in which it is tracked throughout, or again at the end.
+    - `precision`, `recall`: means over all frames of all runs in which it is tracked, zero
+      where there is none.
+    - `tracked`: the share of frames in which it is tracked.
+    """
+
+    success_rate: Float[Array, " objects"]
+    recovery_rate: Float[Array, " objects"]
+    precision: Float[Array, " objects"]
+    recall: Float[Array, " objects"]
+    tracked: Float[Array, " objects"]
+
+
+def intersection_area(
+    estimates: Float[Array, "*#batch 4"], truth: Float[Array, "*#batch 4"]
+) -> Float[Array, "*batch"]:
+    """|E ∩ G| in square pixels; zero for a box without area or with a coordinate that is NaN."""
+    low = jnp.maximum(estimates[..., :2], truth[..., :2])
+    high = jnp.minimum(estimates[..., :2] + estimates[..., 2:], truth[..., :2] + truth[..., 2:])
+    sides = high - low
+    area = sides[..., 0] * sides[..., 1]
+    return jnp.where(jnp.all(sides > 0, axis=-1), area, jnp.zeros((), area.dtype))
+
+
+def track_state(
+    estimates: Float[Array, "*#batch 4"], truth: Float[Array, "*#batch 4"]
+) -> Bool[Array, "*batch"]:
+    """T: whether E ∩ G is not empty. Boxes that only touch have an empty intersection."""
+    return intersection_area(estimates, truth) > 0
+
+
+def precision(
+    estimates: Float[Array, "*#batch 4"], truth: Float[Array, "*#batch 4"]
+) -> Float[Array, "*batch"]:
+    """P = |E ∩ G| / |E|, zero where they do not meet."""
+    return _share(intersection_area(estimates, truth), estimates)
+
+
+def recall(
+    estimates: Float[Array, "*#batch 4"], truth: Float[Array, "*#batch 4"]
+) -> Float[Array, "*batch"]:
+    """R = |E ∩ G| / |G|, zero where they do not meet."""
+    return _share(intersection_area(estimates, truth), truth)
+
+
+def success_rate(
+    track_states: Bool[Array, "runs t *objects"], present: Bool[Array, "t *objects"] | None = None
+) -> Float[Array, "*objects"]:
+    """The share of runs with T = 1 for all t; frames without a true box (`present`) do not count.
+
+    Raises `ValueError` for no runs or no frames.
+    """
+    _check(track_states)
+    fine = track_states if present is None else track_states | ~present[None]
+    return jnp.mean(jnp.all(fine, axis=1).astype(jnp.result_type(float)), axis=0)
+
+
+def recovery_rate(
+    track_states: Bool[Array, "runs t *objects"],
+    present: Bool[Array, "t *objects"] | None = None,
+    *,
+    num_last: int = 1,
+) -> Float[Array, "*objects"]:
+    """The share of runs that are tracked throughout or have recovered from a loss.
+
+    The paper leaves open when a loss is over. Here it is when T = 1 in each of the last
+    `num_last` frames that have a true box; who is tracked throughout is so there as well.
+    Raises `ValueError` for no runs or no frames, or `num_last` below 1.
+    """
+    _check(track_states)
+    if num_last < 1:
+        raise ValueError(f"num_last: {num_last} is less than 1")
+    if present is None:
+        present = jnp.ones(track_states.shape[1:], bool)
+    to_come = jnp.cumsum(present[::-1].astype(jnp.int32), axis=0)[::-1]
+    fine = track_states | ~(present & (to_come <= num_last))[None]
+    return jnp.mean(jnp.all(fine, axis=1).astype(jnp.result_type(float)), axis=0)
+
+
+def tracking_quality(
+    estimates: Float[Array, "runs t objects 4"],
+    truth: Float[Array, "t objects 4"],
+    *,
+    num_last: int = 1,
+) -> TrackingQuality:
+    """All measures of section 3.1 for each object, over runs.
+
+    A frame in which an object's true box holds a NaN has no such object and does not count for
+    it. `num_last` is that of `recovery_rate`. Raises `ValueError` for no runs or no frames.
+    """
+    present = jnp.all(jnp.isfinite(truth), axis=-1)
+    states = track_state(estimates, truth[None])
+    _check(states)
+    tracked = states.astype(estimates.dtype)
+    count = jnp.sum(tracked, axis=(0, 1))
+
+    def over_tracked(values: Float[Array, "runs t objects"]) -> Float[Array, " objects"]:
+        return jnp.sum(values * tracked, axis=(0, 1)) / jnp.maximum(count, 1.0)
+
+    frames = estimates.shape[0] * jnp.sum(present.astype(estimates.dtype), axis=0)
+    return TrackingQuality(
+        success_rate=success_rate(states, present),
+        recovery_rate=recovery_rate(states, present, num_last=num_last),
+        precision=over_tracked(precision(estimates, truth[None])),
+        recall=over_tracked(recall(estimates, truth[None])),
+        tracked=count / jnp.maximum(frames, 1.0),
+    )
+
+
+def _share(area: Float[Array, "*batch"], boxes: Float[Array, "*#batch 4"]) -> Float[Array, "..."]:
+    whole = boxes[..., 2] * boxes[..., 3]
+    # A part of a box has no more area than the box, but for rounding.
+    meets = area > 0
+    return jnp.where(meets, jnp.minimum(area / jnp.where(meets, whole, 1.0), 1.0), 0.0)
+
+
+def _check(track_states: Bool[Array, "runs t *objects"]) -> None:
+    if 0 in track_states.shape[:2]:
+        raise ValueError(f"track_states: shape {track_states.shape} holds no runs or no frames")

@@ -1,0 +1,281 @@
+"""The joint state of several objects: independent dynamics and likelihoods, and interaction."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key, PyTree
+
+from mpfjax.models.base import AbstractStateSpaceModel, require
+
+# A number of particles that no parameter has by chance as the length of an axis.
+_TRIAL = 1_000_003
+
+
+class MultiObjectModel(AbstractStateSpaceModel):
+    """x_t = (x_t^1, ..., x_t^J): J objects, each with its own dynamics and likelihood.
+
+    Smith and Gatica-Perez (2004), section 2: D factorises over the objects, and so does
+    L(y_t | x_t) = Π_j L(y_t | x_t^j), unless an interaction is given: the target of every step
+    then has the further factor Π_{i<j} ψ(x_t^i, x_t^j), a Markov random field (Khan, Balch and
+    Dellaert 2004). It counts as part of L, so that every filter treats it alike and Ẑ estimates
+    the same number; a step without an observation has neither.
+
+    - `object_model`: one model for all objects, or one whose arrays all carry a leading object
+      axis, as `jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)` makes it.
+    - `num_objects`: J.
+    - `interaction`: log ψ of the states of two objects, `(states, other_states) -> (n,)`,
+      symmetric; such as `PairwiseRepulsion`.
+    - `shared_observation`: object j sees `observation[j]`, every leaf indexed by j, or with True
+      all see the whole observation, an image. If `object_model` then has a method
+      `prepare_observation(observation)`, it is called once a step for all particles and all
+      objects, and `log_likelihood` is given what it returns.
+    - `per_object`: whether the arrays carry an object axis. None finds out by tracing the
+      model's draws both ways, which costs no arithmetic.
+
+    Particles have leaves (n, J, ...). Raises `ValueError` for J < 1, an object model that works
+    neither way or, for `per_object=None`, both ways, and one that lacks a method. Use it where
+    objects interact or share particles; without interaction `independent_particle_filters` is
+    better.
+    """
+
+    object_model: AbstractStateSpaceModel
+    num_objects: int = eqx.field(static=True)
+    interaction: Callable[[PyTree, PyTree], Float[Array, " n"]] | None
+    shared_observation: bool = eqx.field(static=True)
+    per_object: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        object_model: AbstractStateSpaceModel,
+        num_objects: int,
+        interaction: Callable[[PyTree, PyTree], Float[Array, " n"]] | None = None,
+        shared_observation: bool = False,
+        *,
+        per_object: bool | None = None,
+    ) -> None:
+        if not isinstance(num_objects, int | np.integer) or num_objects < 1:
+            raise ValueError(f"num_objects: {num_objects} is not a whole number of at least 1")
+        for method in ("sample_initial", "sample_transition", "log_likelihood"):
+            require(object_model, method, "MultiObjectModel")
+        if interaction is not None and not callable(interaction):
+            raise ValueError(f"interaction: {interaction!r} is not callable")
+        self.object_model = object_model
+        self.num_objects = int(num_objects)
+        self.interaction = interaction
+        self.shared_observation = shared_observation
+        if per_object is None:
+            per_object = _finds_object_axis(object_model, self.num_objects)
+        elif per_object and not _has_axis(object_model, self.num_objects):
+            raise ValueError(
+                f"object_model: not every array of {type(object_model).__name__} has a leading"
+                f" axis of num_objects, {num_objects}"
+            )
+        self.per_object = per_object
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
+        """x_0 of every object, independent: every leaf (n, J, ...)."""
+        keys = jax.random.split(key, 2 * self.num_objects).reshape(2, self.num_objects)
+
+        def draw(key: Key[Array, ""], key_order: Key[Array, ""], j: Int[Array, ""]) -> PyTree:
+            states = self.object_at(j).sample_initial(key, num_particles)
+            if self.num_objects == 1:
+                return states
+            # Draws that are spread out evenly, as stratified ones are, may stand in line: side
+            # by side as they come, objects would not be independent.
+            order = jax.random.permutation(key_order, num_particles)
+            return jax.tree.map(lambda leaf: leaf[order], states)
+
+        return jax.vmap(draw, out_axes=1)(keys[0], keys[1], self._indices)
+
+    def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
+        """x_t of every object, independent of each other given x_{t-1}."""
+        keys = jax.random.split(key, self.num_objects)
+        draw = lambda key, states, j: self.object_at(j).sample_transition(key, states)  # noqa: E731
+        return jax.vmap(draw, in_axes=(0, 1, 0), out_axes=1)(keys, states, self._indices)
+
+    def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
+        """Σ_j log L(y_t | x_t^j) + Σ_{i<j} log ψ(x_t^i, x_t^j)."""
+        observation = self.prepare_observation(observation)
+        weigh = lambda states, j: self.object_log_likelihood(observation, states, j)  # noqa: E731
+        total = jnp.sum(jax.vmap(weigh, in_axes=(1, 0))(states, self._indices), axis=0)
+        if self.interaction is None or self.num_objects == 1:
+            return total
+        first, second = np.triu_indices(self.num_objects, 1)
+        potentials = jax.vmap(self.interaction, in_axes=1, out_axes=1)(
+            jax.tree.map(lambda leaf: leaf[:, first], states),
+            jax.tree.map(lambda leaf: leaf[:, second], states),
+        )
+        return total + jnp.sum(potentials, axis=1).astype(total.dtype)
+
+    def __getattr__(self, name: str) -> Any:
+        # Only reached for names that the class lacks: the joint density is there exactly when
+        # the objects' is.
+        if name == "log_transition" and hasattr(self.object_model, name):
+            return self._log_transition
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+    def _log_transition(self, states: PyTree, previous_states: PyTree) -> Float[Array, " n"]:
+        """Σ_j log D(x_t^j | x_{t-1}^j)."""
+
+        def weigh(states: PyTree, previous: PyTree, j: Int[Array, ""]) -> Float[Array, " n"]:
+            return self.object_at(j).log_transition(states, previous)  # pyright: ignore
+
+        per_object = jax.vmap(weigh, in_axes=(1, 1, 0))(states, previous_states, self._indices)
+        return jnp.sum(per_object, axis=0)
+
+    # One object at a time. `objects` is the same object for all particles, (), or one of its
+    # own for each, (n,); `states` are those of that object, leaves (n, ...).
+
+    def object_at(self, index: int | Int[Array, ""]) -> AbstractStateSpaceModel:
+        """The model of one object."""
+        if not self.per_object:
+            return self.object_model
+        return jax.tree.map(
+            lambda leaf: leaf[index] if _is_array(leaf) else leaf, self.object_model
+        )
+
+    def object_states(self, particles: PyTree, objects: Int[Array, "*n"]) -> PyTree:
+        """The states of one object of each particle: every leaf (n, ...)."""
+        if objects.ndim == 0:
+            return jax.tree.map(
+                lambda leaf: jax.lax.dynamic_index_in_dim(leaf, objects, 1, keepdims=False),
+                particles,
+            )
+        rows = jnp.arange(objects.shape[0], dtype=jnp.int32)
+        pick = lambda leaf: leaf.at[rows, objects].get(mode="promise_in_bounds")  # noqa: E731
+        return jax.tree.map(pick, particles)
+
+    def replace_object(
+        self, particles: PyTree, objects: Int[Array, "*n"], states: PyTree
+    ) -> PyTree:
+        """The particles with one object of each in a new state."""
+        num_particles = jax.tree.leaves(particles)[0].shape[0]
+        objects = jnp.broadcast_to(objects, (num_particles,))
+        chosen = objects[:, None] == self._indices[None]
+
+        def put(leaf: Array, new: Array) -> Array:
+            where = chosen.reshape(chosen.shape + (1,) * (leaf.ndim - 2))
+            return jnp.where(where, new[:, None], leaf)
+
+        return jax.tree.map(put, particles, states)
+
+    def sample_object_transition(
+        self, key: Key[Array, ""], states: PyTree, objects: Int[Array, "*n"]
+    ) -> PyTree:
+        """x_t of one object of each particle."""
+        if not self.per_object:
+            return self.object_model.sample_transition(key, states)
+        if objects.ndim == 0:
+            return self.object_at(objects).sample_transition(key, states)
+
+        def draw(key: Key[Array, ""], state: PyTree, j: Int[Array, ""]) -> PyTree:
+            return _one(self.object_at(j).sample_transition(key, _many(state)))
+
+        return jax.vmap(draw)(jax.random.split(key, objects.shape[0]), states, objects)
+
+    def prepare_observation(self, observation: PyTree) -> PyTree:
+        """What the objects' likelihoods look at: y_t, or what the object model makes of it."""
+        if not self.shared_observation:
+            for leaf in jax.tree.leaves(observation):
+                if jnp.shape(leaf)[:1] != (self.num_objects,):
+                    raise ValueError(
+                        f"observation: shape {jnp.shape(leaf)} has no leading axis of"
+                        f" num_objects, {self.num_objects}; is it shared by all objects?"
+                    )
+            return observation
+        prepare = getattr(self.object_at(0), "prepare_observation", None)
+        return observation if prepare is None else prepare(observation)
+
+    def object_log_likelihood(
+        self, observation: PyTree, states: PyTree, objects: Int[Array, "*n"]
+    ) -> Float[Array, " n"]:
+        """log L(y_t | x_t^j) of one object of each particle; y_t as prepared."""
+        if self.shared_observation and not self.per_object:
+            return self.object_model.log_likelihood(observation, states)
+        if objects.ndim == 0:
+            seen = self._seen_by(observation, objects)
+            return self.object_at(objects).log_likelihood(seen, states)
+
+        def weigh(state: PyTree, j: Int[Array, ""]) -> Float[Array, ""]:
+            seen = self._seen_by(observation, j)
+            return self.object_at(j).log_likelihood(seen, _many(state))[0]
+
+        return jax.vmap(weigh)(states, objects)
+
+    def _seen_by(self, observation: PyTree, index: Int[Array, ""]) -> PyTree:
+        if self.shared_observation:
+            return observation
+        return jax.tree.map(lambda leaf: leaf[index], observation)
+
+    @property
+    def _indices(self) -> Int[Array, " objects"]:
+        return jnp.arange(self.num_objects, dtype=jnp.int32)
+
+
+def require_multi_object(model: Any, needed_by: str) -> None:
+    """Raise a `ValueError` where `model` is not of several objects."""
+    if not isinstance(model, MultiObjectModel):
+        raise ValueError(
+            f"model: {type(model).__name__} is no MultiObjectModel, which {needed_by} needs"
+        )
+
+
+def _is_array(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array | np.ndarray)
+
+
+def _many(state: PyTree) -> PyTree:
+    return jax.tree.map(lambda leaf: leaf[None], state)
+
+
+def _one(states: PyTree) -> PyTree:
+    return jax.tree.map(lambda leaf: leaf[0], states)
+
+
+def _has_axis(model: Any, num_objects: int) -> bool:
+    """Whether the model has arrays, and all of them a leading axis of this length."""
+    shapes = [leaf.shape[:1] for leaf in jax.tree.leaves(model) if _is_array(leaf)]
+    return bool(shapes) and all(shape == (num_objects,) for shape in shapes)
+
+
+def _finds_object_axis(model: Any, num_objects: int) -> bool:
+    """Whether the model's arrays carry an object axis, by trying to draw from it both ways."""
+    if not _has_axis(model, num_objects):
+        return False
+    one_for_all = _error_of_draws(model)
+    one_each = _error_of_draws(
+        jax.tree.map(lambda leaf: leaf[0] if _is_array(leaf) else leaf, model)
+    )
+    if one_for_all is not None and one_each is not None:
+        raise ValueError(
+            f"object_model: {type(model).__name__} cannot be drawn from, neither as one model for"
+            f" all objects nor as {num_objects} models side by side"
+        ) from one_for_all
+    if one_for_all is None and one_each is None and num_objects > 1:
+        raise ValueError(
+            f"object_model: {type(model).__name__} can be read as one model for all objects and"
+            f" as {num_objects} models side by side; say which with per_object"
+        )
+    return one_for_all is not None
+
+
+def _error_of_draws(model: Any) -> Exception | None:
+    """What goes wrong where x_0 and x_1 are drawn from the model, traced without arithmetic."""
+
+    def draw() -> PyTree:
+        key = jax.random.key(0)
+        states = model.sample_initial(key, _TRIAL)
+        return states, model.sample_transition(key, states)
+
+    try:
+        before, after = eqx.filter_eval_shape(draw)
+        shapes = [[leaf.shape for leaf in jax.tree.leaves(states)] for states in (before, after)]
+        if shapes[0] != shapes[1] or any(shape[:1] != (_TRIAL,) for shape in shapes[0]):
+            raise ValueError(f"draws of {_TRIAL} particles have shapes {shapes}")
+    except Exception as error:
+        return error
+    return None

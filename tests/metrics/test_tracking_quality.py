@@ -1,0 +1,123 @@
+"""The measures of section 3.1, on boxes and runs small enough to count by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpfjax.metrics.tracking_quality import (
+    precision,
+    recall,
+    recovery_rate,
+    success_rate,
+    track_state,
+    tracking_quality,
+)
+
+G = jnp.array([10.0, 20.0, 40.0, 20.0])
+
+
+def box(x, y, w, h):
+    return jnp.array([x, y, w, h], float)
+
+
+@pytest.mark.parametrize(
+    ("estimate", "expected"),
+    [
+        (G, (True, 1.0, 1.0)),
+        (box(30, 30, 40, 20), (True, 0.25, 0.25)),
+        (box(20, 25, 10, 10), (True, 1.0, 0.125)),
+        (box(0, 0, 100, 100), (True, 0.08, 1.0)),
+        (box(50, 20, 10, 10), (False, 0.0, 0.0)),
+        (box(200, 200, 10, 10), (False, 0.0, 0.0)),
+        (box(20, 25, 0, 10), (False, 0.0, 0.0)),
+        (box(20, 25, -10, -10), (False, 0.0, 0.0)),
+        (box(jnp.nan, 25, 10, 10), (False, 0.0, 0.0)),
+    ],
+)
+def test_a_box_against_the_truth(estimate, expected):
+    assert bool(track_state(estimate, G)) == expected[0]
+    np.testing.assert_allclose(precision(estimate, G), expected[1], rtol=1e-6)
+    np.testing.assert_allclose(recall(estimate, G), expected[2], rtol=1e-6)
+
+
+def test_areas_are_those_of_counted_pixels():
+    rng = np.random.default_rng(0)
+    corners, sizes = rng.integers(0, 30, (50, 2, 2)), rng.integers(1, 25, (50, 2, 2))
+    boxes = np.concatenate([corners, sizes], axis=2)
+    masks = np.zeros((50, 2, 60, 60), bool)
+    for k in range(50):
+        for i in range(2):
+            x, y, w, h = boxes[k, i]
+            masks[k, i, y : y + h, x : x + w] = True
+    shared = (masks[:, 0] & masks[:, 1]).sum(axis=(1, 2))
+    estimates, truth = jnp.asarray(boxes[:, 0], float), jnp.asarray(boxes[:, 1], float)
+    area = masks.sum(axis=(2, 3))
+    np.testing.assert_array_equal(track_state(estimates, truth), shared > 0)
+    np.testing.assert_allclose(precision(estimates, truth), shared / area[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(recall(estimates, truth), shared / area[:, 1], rtol=1e-6)
+
+
+# Four runs of five frames: throughout, lost and back, lost for good, back only just.
+STATES = jnp.array([[1, 1, 1, 1, 1], [1, 0, 0, 1, 1], [1, 1, 0, 0, 0], [1, 0, 0, 0, 1]], bool)
+
+
+def test_rates_by_hand():
+    assert float(success_rate(STATES)) == 0.25
+    assert float(recovery_rate(STATES)) == 0.75
+    assert float(recovery_rate(STATES, num_last=2)) == 0.5
+    both = jnp.stack([STATES, ~STATES], axis=2)
+    np.testing.assert_array_equal(success_rate(both), [0.25, 0.0])
+    np.testing.assert_array_equal(recovery_rate(both), [0.75, 0.25])
+
+
+def test_frames_without_the_object_do_not_count():
+    present = jnp.array([1, 0, 0, 1, 0], bool)
+    assert float(success_rate(STATES, present)) == 0.5
+    assert float(recovery_rate(STATES, present)) == 0.5
+    assert float(recovery_rate(STATES, present, num_last=3)) == 0.5
+
+
+def test_all_measures_of_two_objects():
+    """Object 0 is tracked in half, one run only; object 1 is not there in the second frame."""
+    truth = jnp.broadcast_to(G, (2, 2, 4)).at[1, 1].set(jnp.nan)
+    away = box(500, 500, 40, 20)
+    quarter = box(30, 30, 40, 20)
+    estimates = jnp.stack(
+        [jnp.stack([jnp.stack([G, G]), jnp.stack([quarter, away])]),
+         jnp.stack([jnp.stack([G, away]), jnp.stack([away, away])])]
+    )  # fmt: skip
+    for quality in (
+        tracking_quality(estimates, truth),
+        jax.jit(tracking_quality)(estimates, truth),
+    ):
+        np.testing.assert_allclose(quality.success_rate, [0.5, 0.5])
+        np.testing.assert_allclose(quality.recovery_rate, [0.5, 0.5])
+        np.testing.assert_allclose(quality.precision, [2.25 / 3, 1.0], rtol=1e-6)
+        np.testing.assert_allclose(quality.recall, [2.25 / 3, 1.0], rtol=1e-6)
+        np.testing.assert_allclose(quality.tracked, [0.75, 0.5])
+
+
+def test_an_object_that_is_never_tracked_has_zeros():
+    truth, estimates = jnp.broadcast_to(G, (3, 1, 4)), jnp.full((2, 3, 1, 4), 500.0)
+    quality = tracking_quality(estimates, truth)
+    np.testing.assert_array_equal(jnp.stack(quality), 0.0)
+
+
+def test_vmap_is_a_loop():
+    rng = np.random.default_rng(1)
+    estimates = jnp.asarray(rng.uniform(0, 40, (3, 4, 5, 2, 4)))
+    truth = jnp.asarray(rng.uniform(0, 40, (5, 2, 4)))
+    together = jax.vmap(tracking_quality, in_axes=(0, None))(estimates, truth)
+    for k in range(3):
+        for one, many in zip(tracking_quality(estimates[k], truth), together, strict=True):
+            np.testing.assert_allclose(many[k], one, rtol=1e-5)
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match=r"track_states: shape \(0, 5\)"):
+        success_rate(STATES[:0])
+    with pytest.raises(ValueError, match=r"track_states: shape \(4, 0\)"):
+        recovery_rate(STATES[:, :0])
+    with pytest.raises(ValueError, match="num_last: 0"):
+        recovery_rate(STATES, num_last=0)

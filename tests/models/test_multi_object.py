@@ -1,0 +1,247 @@
+"""The joint model of several objects, against its objects one by one and against scipy."""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+import mpfjax
+from mpfjax import MultiObjectModel, PairwiseRepulsion
+from tests.user_models import Drift
+
+KEY = jax.random.key(0)
+NUM_OBJECTS = 3
+
+
+def linear_gaussian(mean, noise):
+    return mpfjax.LinearGaussianModel(
+        A=jnp.array([[0.9, 0.1], [0.0, 0.8]]),
+        Q=0.3 * jnp.eye(2),
+        H=jnp.array([[1.0, 0.5]]),
+        R=jnp.array([[noise]]),
+        m0=jnp.array([mean, -mean]),
+        P0=jnp.eye(2),
+    )
+
+
+def stack(models):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
+
+
+OBJECTS = [linear_gaussian(m, r) for m, r in ((0.0, 0.5), (3.0, 0.8), (-4.0, 1.5))]
+REPULSION = PairwiseRepulsion(2.0, 4.0)
+MODEL = MultiObjectModel(stack(OBJECTS), NUM_OBJECTS, REPULSION)
+STATES = MODEL.sample_initial(KEY, 5)
+OBSERVATION = jnp.array([[0.3], [-1.0], [2.0]])
+
+
+class TestDensities:
+    def test_draws_have_an_axis_of_objects_and_the_objects_own_moments(self):
+        states = MODEL.sample_initial(KEY, 4000)
+        assert states.shape == (4000, NUM_OBJECTS, 2)
+        means = np.stack([model.m0 for model in OBJECTS])
+        np.testing.assert_allclose(states.mean(axis=0), means, atol=4 / np.sqrt(4000))
+        moved = MODEL.sample_transition(KEY, states)
+        residuals = moved - jnp.einsum("dk,njk->njd", OBJECTS[0].A, states)
+        np.testing.assert_allclose(residuals.mean(axis=0), 0.0, atol=4 * np.sqrt(0.3 / 4000))
+        noise = np.asarray(residuals).reshape(4000, -1)
+        np.testing.assert_allclose(np.corrcoef(noise.T), np.eye(6), atol=5 / np.sqrt(4000))
+
+    def test_objects_are_independent_though_their_draws_stand_in_line(self):
+        """The quadratic model's x_0 are stratified, and come in ascending order."""
+        model = MultiObjectModel(mpfjax.QuadraticModel(), 3)
+        states = np.asarray(model.sample_initial(KEY, 4000))
+        np.testing.assert_allclose(np.corrcoef(states.T), np.eye(3), atol=5 / np.sqrt(4000))
+        np.testing.assert_allclose(np.diff(np.sort(states, axis=0), axis=0).max(), 0, atol=0.003)
+
+    def test_log_likelihood_is_the_sum_over_objects_and_pairs(self):
+        expected = np.zeros(5)
+        for j, model in enumerate(OBJECTS):
+            means = np.asarray(STATES[:, j] @ model.H.T)[:, 0]
+            scale = np.sqrt(float(model.R[0, 0]))
+            expected += scipy.stats.norm.logpdf(float(OBSERVATION[j, 0]), means, scale)
+        for i, j in itertools.combinations(range(NUM_OBJECTS), 2):
+            squares = np.sum(np.asarray(STATES[:, i] - STATES[:, j]) ** 2, axis=1) / 16
+            expected -= 2.0 * np.maximum(1 - squares, 0) ** 2
+        actual = MODEL.log_likelihood(OBSERVATION, STATES)
+        np.testing.assert_allclose(actual, expected, rtol=1e-5)
+
+    def test_log_transition_is_the_sum_over_objects(self):
+        moved = MODEL.sample_transition(KEY, STATES)
+        expected = sum(
+            model.log_transition(moved[:, j], STATES[:, j]) for j, model in enumerate(OBJECTS)
+        )
+        np.testing.assert_allclose(MODEL.log_transition(moved, STATES), expected, rtol=1e-5)
+
+    def test_log_transition_is_there_only_where_the_objects_have_it(self):
+        class Bare(mpfjax.AbstractStateSpaceModel):
+            sample_initial = Drift.sample_initial
+            sample_transition = Drift.sample_transition
+            log_likelihood = Drift.log_likelihood
+            transition_mean = Drift.transition_mean
+
+        assert hasattr(MultiObjectModel(Drift(), 2), "log_transition")
+        assert not hasattr(MultiObjectModel(Bare(), 2), "log_transition")
+
+
+class TestOneObjectAtATime:
+    """The same for one object of all particles, and for one of its own of each."""
+
+    OBJECTS_OF_PARTICLES = jnp.array([2, 0, 1, 1, 0], jnp.int32)
+
+    def test_states_come_out_and_go_in(self):
+        chosen = MODEL.object_states(STATES, self.OBJECTS_OF_PARTICLES)
+        for i, j in enumerate(self.OBJECTS_OF_PARTICLES):
+            np.testing.assert_array_equal(chosen[i], STATES[i, j])
+        marked = MODEL.replace_object(STATES, self.OBJECTS_OF_PARTICLES, chosen + 100)
+        expected = np.array(STATES)
+        expected[np.arange(5), self.OBJECTS_OF_PARTICLES] += 100
+        np.testing.assert_array_equal(marked, expected)
+        one = jnp.asarray(1, jnp.int32)
+        np.testing.assert_array_equal(MODEL.object_states(STATES, one), STATES[:, 1])
+        marked = MODEL.replace_object(STATES, one, STATES[:, 0])
+        np.testing.assert_array_equal(marked[:, 1], STATES[:, 0])
+        np.testing.assert_array_equal(marked[:, ::2], STATES[:, ::2])
+
+    @pytest.mark.parametrize("shared_observation", [False, True])
+    @pytest.mark.parametrize("object_model", [stack(OBJECTS), OBJECTS[0]], ids=["each", "one"])
+    def test_likelihoods_and_draws(self, object_model, shared_observation):
+        model = MultiObjectModel(object_model, NUM_OBJECTS, shared_observation=shared_observation)
+        observation = OBSERVATION[0] if shared_observation else OBSERVATION
+        chosen = model.object_states(STATES, self.OBJECTS_OF_PARTICLES)
+        values = model.object_log_likelihood(observation, chosen, self.OBJECTS_OF_PARTICLES)
+        moved = model.sample_object_transition(KEY, chosen, self.OBJECTS_OF_PARTICLES)
+        assert moved.shape == chosen.shape
+        for i, j in enumerate(self.OBJECTS_OF_PARTICLES.tolist()):
+            single = OBJECTS[j] if model.per_object else OBJECTS[0]
+            seen = observation if shared_observation else observation[j]
+            expected = single.log_likelihood(seen, chosen[i][None])[0]
+            np.testing.assert_allclose(values[i], expected, rtol=1e-5)
+
+    def test_draws_follow_each_particles_own_object(self):
+        """With next to no noise the draw is A_j x."""
+        quiet = [
+            eqx.tree_at(lambda m: (m.A, m.Q), model, (float(j) * jnp.eye(2), 1e-12 * jnp.eye(2)))
+            for j, model in enumerate(OBJECTS)
+        ]
+        model = MultiObjectModel(stack(quiet), NUM_OBJECTS)
+        chosen = model.object_states(STATES, self.OBJECTS_OF_PARTICLES)
+        moved = model.sample_object_transition(KEY, chosen, self.OBJECTS_OF_PARTICLES)
+        expected = self.OBJECTS_OF_PARTICLES[:, None].astype(chosen.dtype) * chosen
+        np.testing.assert_allclose(moved, expected, atol=1e-4)
+
+
+class TestASharedObservation:
+    def test_is_prepared_once_for_all_objects(self):
+        calls = []
+
+        class Image(Drift):
+            def prepare_observation(self, observation):
+                calls.append(observation.shape)
+                return observation.sum()
+
+            def log_likelihood(self, observation, states):
+                assert observation.ndim == 0
+                return super().log_likelihood(observation, states)
+
+        model = MultiObjectModel(Image(), 3, shared_observation=True)
+        image = jnp.full((4, 6), 0.01)
+        values = model.log_likelihood(image, STATES)
+        assert calls == [(4, 6)]
+        expected = sum(Drift().log_likelihood(0.24, STATES[:, j]) for j in range(3))
+        np.testing.assert_allclose(values, expected, rtol=1e-5)
+        calls.clear()
+        filter = mpfjax.partitioned_sampling(model, 20)
+        filter.step(KEY, filter.init(KEY), image)
+        assert calls == [(4, 6)]
+
+
+class TestWhetherParametersAreEachObjectsOwn:
+    def test_is_found_out(self):
+        assert MODEL.per_object
+        assert not MultiObjectModel(OBJECTS[0], 3).per_object
+        # Two dimensions and two objects: every array has a leading axis of two.
+        square = mpfjax.LinearGaussianModel(*[jnp.eye(2)] * 4, jnp.zeros(2), jnp.eye(2))
+        assert not MultiObjectModel(square, 2).per_object
+        assert MultiObjectModel(stack([square, square]), 2).per_object
+        assert not MultiObjectModel(Drift(), 3).per_object
+        assert MultiObjectModel(stack([OBJECTS[0]]), 1).per_object
+        deviations = jnp.array([0.1, 0.2, 0.3])
+        scalars = eqx.filter_vmap(mpfjax.QuadraticModel)(deviations, deviations)
+        assert MultiObjectModel(scalars, 3).per_object
+
+    def test_is_asked_for_where_both_would_work(self):
+        class Walk(mpfjax.AbstractStateSpaceModel):
+            deviations: jax.Array
+
+            def sample_initial(self, key, num_particles):
+                return jax.random.normal(key, (num_particles, 2))
+
+            def sample_transition(self, key, states):
+                return states + self.deviations * jax.random.normal(key, states.shape)
+
+            def log_likelihood(self, observation, states):
+                return -jnp.sum((observation - states) ** 2, axis=1)
+
+        walk = Walk(jnp.array([[0.1, 0.2]]))
+        assert not MultiObjectModel(walk, 3).per_object
+        ambiguous = Walk(jnp.array([[0.1], [0.2]]).reshape(2))
+        with jax.numpy_rank_promotion("allow"):
+            with pytest.raises(ValueError, match="object_model: Walk can be read"):
+                MultiObjectModel(ambiguous, 2)
+            for per_object in (True, False):
+                model = MultiObjectModel(ambiguous, 2, per_object=per_object)
+                assert model.per_object == per_object
+
+    @pytest.mark.usefixtures("as_installed")
+    def test_bad_models(self):
+        broken = eqx.tree_at(lambda m: m.Q, stack(OBJECTS), jnp.ones((3, 5, 5)))
+        with pytest.raises(ValueError, match="object_model: LinearGaussianModel cannot be drawn"):
+            MultiObjectModel(broken, 3)
+        with pytest.raises(ValueError, match="object_model: not every array"):
+            MultiObjectModel(OBJECTS[0], 3, per_object=True)
+        with pytest.raises(ValueError, match="num_objects: 0"):
+            MultiObjectModel(OBJECTS[0], 0)
+        with pytest.raises(ValueError, match="model: object defines no sample_initial"):
+            MultiObjectModel(object(), 2)
+        with pytest.raises(ValueError, match=r"interaction: 3\.0 is not callable"):
+            MultiObjectModel(OBJECTS[0], 2, 3.0)
+        with pytest.raises(ValueError, match=r"observation: shape \(2, 1\) has no leading axis"):
+            MODEL.log_likelihood(OBSERVATION[:2], STATES)
+
+
+class TestPairwiseRepulsion:
+    PLACES = jnp.array([[0.0, 0.0], [1.0, 0.0], [3.0, 4.0], [30.0, 40.0]])
+
+    def test_values(self):
+        here = jnp.zeros((4, 2))
+        compact = PairwiseRepulsion(2.0, 10.0)(here, self.PLACES)
+        np.testing.assert_allclose(compact, [-2, -2 * 0.99**2, -2 * 0.75**2, 0.0], rtol=1e-5)
+        assert float(compact[3]) == 0.0
+        smooth = PairwiseRepulsion(2.0, 5.0, compact=False)(self.PLACES, here)
+        np.testing.assert_allclose(smooth, -2 * np.exp([0, -1 / 50, -0.5, -50]), rtol=1e-5)
+
+    def test_sees_the_positions_that_it_is_given(self):
+        first = PairwiseRepulsion(1.0, 4.0, position=lambda states: states["box"][:, 0])
+        states = {"box": self.PLACES, "age": jnp.arange(4)}
+        other = {"box": jnp.zeros((4, 2)), "age": jnp.arange(4)}
+        squares = np.array([0, 1, 9, 900]) / 16
+        np.testing.assert_allclose(
+            first(states, other), -(np.maximum(1 - squares, 0) ** 2), rtol=1e-5
+        )
+
+    @pytest.mark.parametrize("compact", [True, False])
+    def test_has_a_gradient_on_the_same_spot(self, compact):
+        repulsion = PairwiseRepulsion(2.0, 1.0, compact=compact)
+        slope = jax.grad(lambda x: repulsion(x, jnp.zeros((1, 2))).sum())(jnp.zeros((1, 2)))
+        np.testing.assert_array_equal(slope, 0.0)
+
+    def test_bad_input(self):
+        with pytest.raises(ValueError, match=r"strength: 0\.0 is not positive"):
+            PairwiseRepulsion(0.0, 1.0)
+        with pytest.raises(ValueError, match=r"radius: -1\.0 is not positive"):
+            PairwiseRepulsion(1.0, -1.0)
