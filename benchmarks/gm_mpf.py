@@ -297,7 +297,9 @@ def study_table(found: dict[str, dict[int, Step]], targets: Targets) -> str:
 
 
 def _summary(step: Step, targets: Targets) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation over seeds of each target's error, averaged over frames."""
+    """Mean and standard deviation over seeds of each target's RMSE as section 5 defines it: the
+    mean over frames of the distance between the estimate and the target.
+    """
     by_seed = errors(step.estimates, targets.truth).mean(axis=1)
     return by_seed.mean(axis=0), by_seed.std(axis=0)
 

@@ -35,7 +35,10 @@ LABELS = {
     "pf": "particle filter",
     "mpf": "mixture particle filter",
     "guided_mpf": "guided mixture particle filter",
+    "gpf": "Gaussian particle filter",
+    "gm_mpf": "Gaussian mixture particle filter",
 }
+OF_THE_PAPER = ["pf", "mpf", "guided_mpf"]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -80,7 +83,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--particles", type=int, nargs="+", default=[20, 50, 100, 200, 500, 1000], metavar="N"
     )
-    parser.add_argument("--filters", nargs="+", choices=list(LABELS), default=list(LABELS))
+    parser.add_argument("--filters", nargs="+", choices=list(LABELS), default=OF_THE_PAPER)
     parser.add_argument("--out", default="results/score_vs_particles", metavar="DIR")
     parser.add_argument("--seed", type=int, default=0, help="of all the runs")
     parser.add_argument(
@@ -107,11 +110,18 @@ def simulate(seed: int) -> tuple[Float[Array, " t"], Float[Array, " t"]]:
 
 
 def build(name: str, model: mpfjax.QuadraticModel, num_particles: int) -> mpfjax.Filter:
-    """The filter of that name; both mixtures have at most two components."""
+    """The filter of that name; all mixtures have at most two components."""
     if name == "pf":
         return mpfjax.particle_filter(model, num_particles)
     if name == "mpf":
         return mpfjax.mixture_particle_filter(model, num_particles, max_components=2)
+    regeneration = mpfjax.GaussianRegeneration(noise="stratified")
+    if name == "gpf":
+        return mpfjax.gaussian_particle_filter(model, num_particles, regeneration=regeneration)
+    if name == "gm_mpf":
+        return mpfjax.gaussian_mixture_particle_filter(
+            model, num_particles, max_components=2, regeneration=regeneration
+        )
     return mpfjax.mixture_particle_filter(
         model,
         num_particles,
