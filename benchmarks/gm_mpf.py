@@ -15,7 +15,7 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,12 +42,13 @@ NAMES = {"pf": "PF", "gpf": "GPF", "mpf": "MPF", "gm_mpf": "GM-MPF"}
 PAPER_MILLISECONDS = {
     "pf": (1.68, 0.046), "gpf": (1.52, 0.028), "mpf": (1.82, 0.034), "gm_mpf": (1.75, 0.019)
 }  # fmt: skip
-DEFAULT_IDS, DEFAULT_FRAMES = [12, 13], "110:180"
+DEFAULT_IDS, DEFAULT_FRAMES = [11, 13], "129:199"
 MOMENTUM = 0.5
 STEP_DEVIATIONS = (0.12, 0.04, 0.01, 0.01)  # a frame, in widths, heights, and shares of the size
 SIGMA, NUM_PARTS = 0.1, 3
 TIMED_PARTICLES, TIMED_FRAMES, WARM_UP = 1000, 50, 5
 LAST_FRAMES, LEAST_SHARE = 10, 0.1
+REFERENCE_PARTICLES, REFERENCE_RUNS = 5000, 4
 
 
 class Targets(NamedTuple):
@@ -113,14 +114,17 @@ class Step(NamedTuple):
     target: Any  # (n,), the reference of each particle
 
 
-def collector(model: ColourModel) -> Callable[[ParticleMixture], Step]:
-    """Reduce a mixture to a `Step`: a target's component is the one that its particles started.
+class Collect(eqx.Module):
+    """Reduces a mixture to a `Step`: a target's component is the one that its particles started.
 
     A filter of one component has the same estimate of both targets.
     """
 
-    def collect(mixture: ParticleMixture) -> Step:
-        means = mixture.component_averages(model.boxes(mixture.particles))[:, :2]
+    model: ColourModel
+
+    def __call__(self, mixture: ParticleMixture) -> Step:
+        """What is kept of one frame."""
+        means = mixture.component_averages(self.model.boxes(mixture.particles))[:, :2]
         owners = mixture.component_averages(mixture.particles.reference.astype(means.dtype))
         swapped = (mixture.num_components == 2) & (owners[0] > owners[-1])
         ends = jnp.stack([means[0], means[-1]])
@@ -130,8 +134,6 @@ def collector(model: ColourModel) -> Callable[[ParticleMixture], Step]:
             mixture.particles.box[:, :2],
             mixture.particles.reference,
         )
-
-    return collect
 
 
 def errors(estimates: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -150,19 +152,35 @@ def held(step: Step, truth: np.ndarray) -> np.ndarray:
 
 
 def study(
-    targets: Targets, sizes: list[int], num_seeds: int, seed: int, show: Callable[[], Any]
+    targets: Targets,
+    sizes: list[int],
+    num_seeds: int,
+    seed: int,
+    show: Callable[[], Any],
+    names: Iterable[str] = NAMES,
 ) -> dict[str, dict[int, Step]]:
     """Every filter at every number of particles, `num_seeds` runs of each under one vmap."""
     model = make_model(targets.stills[0], box_files.top_left(targets.truth[0]))
     keys = jax.random.split(jax.random.key(seed), num_seeds)
     stills = jnp.asarray(targets.stills)
     found: dict[str, dict[int, Step]] = {}
-    for name in NAMES:
+    for name in names:
         for size in sizes:
-            run = mpfjax.monte_carlo(keys, make_filter(name, model, size), stills, collector(model))
+            run = mpfjax.monte_carlo(keys, make_filter(name, model, size), stills, Collect(model))
             found.setdefault(name, {})[size] = jax.tree.map(np.asarray, run.collected)
             show()
     return found
+
+
+def reference_estimates(targets: Targets, seed: int, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """E(x_t | y_1..y_t) as each filter has it with a great many particles, (t, 2 targets, 2).
+
+    The distance from it is what more particles can mend; what is left of the distance from the
+    true box is the model's, or the annotation's.
+    """
+    size, num_runs = REFERENCE_PARTICLES, REFERENCE_RUNS
+    found = study(targets, [size], num_runs, seed + 1, lambda: None, names)
+    return {name: by_size[size].estimates.mean(axis=0) for name, by_size in found.items()}
 
 
 # --- time -------------------------------------------------------------------------------------
@@ -278,21 +296,30 @@ def timing_table(elapsed: dict[str, list[float]], paper: bool) -> str:
     return format_table(header + (["paper's ms", "paper's ratio"] if paper else []), rows)
 
 
-def study_table(found: dict[str, dict[int, Step]], targets: Targets) -> str:
-    """RMSE of each target, share of seeds that hold both, and mean N_eff."""
+def study_table(
+    found: dict[str, dict[int, Step]], targets: Targets, references: dict[str, np.ndarray]
+) -> str:
+    """RMSE of each target and what of it is Monte Carlo error, who holds both, and mean N_eff."""
     rows = []
     for name, by_size in found.items():
         for size, step in by_size.items():
             means, stds = _summary(step, targets)
+            own = ["", ""]
+            if name in references:
+                own = [f"{e:.2f}" for e in errors(step.estimates, references[name]).mean((0, 1))]
             rows.append(
                 [
                     f"{NAMES[name]}, N = {size}",
                     *(f"{m:.2f} ± {s:.2f}" for m, s in zip(means, stds, strict=True)),
+                    *own,
                     f"{held(step, targets.truth).mean():.2f}",
                     f"{step.effective_sample_size.mean():.1f}",
                 ]
             )
-    header = ["filter", "target 1 [px]", "target 2 [px]", "both held", "N_eff"]
+    far = f"from N = {REFERENCE_PARTICLES}"
+    header = [
+        "filter", "RMSE 1 [px]", "RMSE 2 [px]", f"1 {far}", f"2 {far}", "both held", "N_eff"
+    ]  # fmt: skip
     return format_table(header, rows)
 
 
@@ -345,26 +372,42 @@ def _region(targets: Targets) -> tuple[slice, slice]:
 
 def draw_effective_sample_sizes(found: dict[str, dict[int, Step]], size: int, first: int) -> Any:
     """Figures 3 and 4: N_eff of eq. 14 in every frame, mean and spread over the seeds."""
-    curves = {NAMES[name]: found[name][size].effective_sample_size for name in NAMES}
+    curves = {NAMES[name]: by_size[size].effective_sample_size for name, by_size in found.items()}
     return plotting.draw_curves(
         curves, first, xlabel="frame", ylabel=r"effective sample size $N_{eff}$",
         title=f"eq. 14, N = {size}, mean ± std over seeds",
     )  # fmt: skip
 
 
-def draw_errors(found: dict[str, dict[int, Step]], targets: Targets) -> Any:
-    """Figures 5 and 6: each target's error against the number of particles."""
-    panels = []
-    for target in (0, 1):
-        lines = {
-            NAMES[name]: {
-                size: errors(step.estimates, targets.truth)[..., target].mean(axis=1)
-                for size, step in by_size.items()
-            }
-            for name, by_size in found.items()
-        }
-        panels.append((f"target {target + 1}", lines))
-    return plotting.draw_errors_by_size(panels, "RMSE [pixels], mean ± s.e. over seeds")
+def draw_errors(
+    found: dict[str, dict[int, Step]], targets: Targets, references: dict[str, np.ndarray]
+) -> Any:
+    """Figures 5 and 6: each target's error against the number of particles.
+
+    Below, what of it is the Monte Carlo error of the mixtures.
+    """
+    lines = {name: _errors_by_size(by_size, targets.truth) for name, by_size in found.items()}
+    own = {name: _errors_by_size(found[name], truth) for name, truth in references.items()}
+    panels = [
+        (
+            f"target {target + 1}, from {what}",
+            {
+                NAMES[name]: {size: error[:, target] for size, error in by_size.items()}
+                for name, by_size in those.items()
+            },
+        )
+        for what, those in (
+            ("the true box", lines),
+            (f"the estimate with N = {REFERENCE_PARTICLES}", own),
+        )
+        for target in (0, 1)
+    ]
+    return plotting.draw_errors_by_size(panels, "RMSE [pixels], mean ± s.e.")
+
+
+def _errors_by_size(by_size: dict[int, Step], truth: np.ndarray) -> dict[int, np.ndarray]:
+    """The error of each run and target, (seeds, 2), averaged over frames."""
+    return {size: errors(step.estimates, truth).mean(axis=1) for size, step in by_size.items()}
 
 
 # --- the command line -------------------------------------------------------------------------
@@ -464,10 +507,18 @@ def run(options: argparse.Namespace) -> None:
     write_json(options.out / "gm_mpf.json", content)
     with tqdm(total=len(NAMES) * len(options.particles), unit="study", disable=None) as bar:
         found = study(targets, options.particles, options.seeds, options.seed, bar.update)
+    references = reference_estimates(targets, options.seed, ("mpf", "gm_mpf"))
     least = options.particles[0]
     content |= {
         "rmse": _by_size(found, lambda step: _summary(step, targets)[0].tolist()),
         "rmse_std": _by_size(found, lambda step: _summary(step, targets)[1].tolist()),
+        "monte_carlo_error": {
+            name: {
+                str(size): error.mean(axis=0).tolist()
+                for size, error in _errors_by_size(found[name], truth).items()
+            }
+            for name, truth in references.items()
+        },
         "n_eff": {
             name: by_size[least].effective_sample_size.mean(axis=0).tolist()
             for name, by_size in found.items()
@@ -479,11 +530,11 @@ def run(options: argparse.Namespace) -> None:
     }
     write_json(options.out / "gm_mpf.json", content)
     print(f"\ntwo targets of {targets.name}, {options.seeds} seeds")
-    print(study_table(found, targets))
+    print(study_table(found, targets, references))
     figures = {
         "particle_migration": draw_migration(found, least, targets),
         "effective_sample_size": draw_effective_sample_sizes(found, least, targets.first),
-        "rmse": draw_errors(found, targets),
+        "rmse": draw_errors(found, targets, references),
     }
     for name, figure in figures.items():
         figure.savefig(options.out / f"{name}.png", dpi=130)

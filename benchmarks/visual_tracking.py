@@ -304,7 +304,9 @@ def open_source(options: argparse.Namespace) -> Source:
 
 
 def _rendered(options: argparse.Namespace, first: int, last: int | None) -> Source:
-    scene = football_scene(jax.random.key(options.seed), last or max(first + 119, 120))
+    num_frames = last or max(first + 119, 120)
+    key = jax.random.key(options.seed)
+    scene = football_scene(key, num_frames, still_camera=options.detect)
     stills = scene.frames[first - 1 :]
     if options.ids is None and options.box is None:
         options.ids = [id for id, kit in scene.kits.items() if kit == 0]

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 
 # Okabe and Ito's palette (2008), told apart with every common kind of colour blindness.
 COLOURS = (
@@ -171,28 +172,36 @@ def draw_curves(
 def draw_errors_by_size(
     panels: Sequence[tuple[str, Mapping[str, Mapping[int, np.ndarray]]]], ylabel: str
 ) -> Figure:
-    """Figures 5 and 6 of Lin et al. (2012): errors of several runs against N, a panel a target.
+    """Figures 5 and 6 of Lin et al. (2012): errors of several runs against N, two panels a row.
 
-    Each panel has a title and, for each filter by name, the errors of its runs by N.
+    Each panel has a title and, for each filter by name, the errors of its runs by N. A filter has
+    the same colour in all of them, by its place in the first.
     """
-    figure = Figure(figsize=(3.9 * len(panels), 3.4), layout="constrained")
-    axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
-    for axis, (title, lines) in zip(axes, panels, strict=True):
-        for index, (name, by_size) in enumerate(lines.items()):
+    num_rows = -(-len(panels) // 2)
+    figure = Figure(figsize=(7.8, 2.9 * num_rows + 0.4), layout="constrained")
+    axes = figure.subplots(num_rows, 2, squeeze=False, sharex=True)
+    names = list(panels[0][1])
+    for axis, (title, lines) in zip(axes.ravel(), panels, strict=False):
+        for name, by_size in lines.items():
+            index = names.index(name)
             sizes = np.array(sorted(by_size))
             mean = np.array([by_size[size].mean() for size in sizes])
             error = np.array([by_size[size].std() / len(by_size[size]) ** 0.5 for size in sizes])
             # Shifted a little, so that bars of equal heights stay apart.
-            shift = 1 + 0.012 * (index - (len(lines) - 1) / 2)
+            shift = 1 + 0.012 * (index - (len(names) - 1) / 2)
             axis.errorbar(
                 sizes * shift, mean, error, label=name, color=COLOURS[index],
                 marker=MARKERS[index], ms=5, lw=1.4, capsize=3,
             )  # fmt: skip
+            axis.set_xticks(sizes)
         axis.set_yscale("log")
-        axis.set_xticks(sizes)
-        axis.set_xlabel("number of particles $N$")
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 1)))
         axis.set_title(title, fontsize=10)
         axis.grid(alpha=0.25, which="both")
-    axes[0].set_ylabel(ylabel)
-    axes[-1].legend(fontsize=8)
+    for axis in axes[-1]:
+        axis.set_xlabel("number of particles $N$")
+    for axis in axes[:, 0]:
+        axis.set_ylabel(ylabel)
+    axes[0, -1].legend(fontsize=8)
     return figure

@@ -9,6 +9,7 @@ from mpfjax.vision.colour_model import ColourModel as ColourModel
 from mpfjax.vision.colours import AbstractColours as AbstractColours
 from mpfjax.vision.colours import HSVColours as HSVColours
 from mpfjax.vision.colours import RGBColours as RGBColours
+from mpfjax.vision.detected_model import Detections as Detections
 from mpfjax.vision.detection import BackgroundSubtraction as BackgroundSubtraction
 from mpfjax.vision.frames import read_frames as read_frames
 from mpfjax.vision.frames import write_video as write_video
@@ -19,3 +20,4 @@ from mpfjax.vision.object_moves import ObjectExclusion as ObjectExclusion
 from mpfjax.vision.object_moves import PruneHypotheses as PruneHypotheses
 from mpfjax.vision.scenes import Scene as Scene
 from mpfjax.vision.scenes import football_scene as football_scene
+from mpfjax.vision.tracker import ObjectTracker as ObjectTracker

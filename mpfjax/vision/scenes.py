@@ -81,12 +81,14 @@ def football_scene(
     num_opponents: int = 4,
     height: int = 288,
     width: int = 512,
+    still_camera: bool = False,
 ) -> Scene:
     """Render players of two teams on a pitch, seen by a camera that pans with the play.
 
     Players of a team look alike but for skin and hair. Every couple of seconds, at 12 frames a
     second, two of a team change places and cross on the way. The players to be tracked, of kit 0,
-    have the ids from 1 on; their opponents follow. The same key gives the same scene.
+    have the ids from 1 on; their opponents follow. The same key gives the same scene. With
+    `still_camera` the camera stays where it first looks, as detection of what moves needs it.
 
     Raises `ValueError` for no frames, fewer than one player or a negative number of opponents.
     """
@@ -105,7 +107,10 @@ def football_scene(
     turf, crowd = (rng.random(size, dtype=np.float32) for size in ((256, 256), (64, 256)))
     strides = rng.random(len(kits))
     frames, rows = [], []
-    for t, camera in enumerate(_cameras(paths[:, :num_players], height, width)):
+    cameras = _cameras(paths[:, :num_players], height, width)
+    if still_camera:
+        cameras = cameras[:1] * num_frames
+    for t, camera in enumerate(cameras):
         frame = _background(camera, turf, crowd)
         rows += _draw_players(frame, camera, paths[: t + 1], kits, strides)
         noise = 2.5 * rng.standard_normal((height, width, 1), dtype=np.float32)
