@@ -334,9 +334,13 @@ def _summary(step: Step, targets: Targets) -> tuple[np.ndarray, np.ndarray]:
 def draw_migration(found: dict[str, dict[int, Step]], size: int, targets: Targets) -> Any:
     """Figures 1 and 2: where the particles of one run are, coloured by the target they stand for.
 
-    Four frames, spread evenly from the first to the last, cropped to where both targets are.
+    Four frames, among them the first, the one in which the targets are closest, and the last,
+    cropped to where both are.
     """
-    chosen = np.linspace(0, len(targets.stills) - 1, 4).round().astype(int)
+    gaps = np.linalg.norm(targets.truth[:, 0, :2] - targets.truth[:, 1, :2], axis=1)
+    closest, last = int(np.argmin(gaps)), len(gaps) - 1
+    middle = closest // 2 if 2 * closest > last else (closest + last) // 2
+    chosen = sorted({0, middle, closest, last})
     crop = _region(targets)
     height = crop[0].stop - crop[0].start
     zoom = max(1, round(360 / height))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import LogLocator, NullLocator
 
 # Okabe and Ito's palette (2008), told apart with every common kind of colour blindness.
 COLOURS = (
@@ -179,7 +179,7 @@ def draw_errors_by_size(
     """
     num_rows = -(-len(panels) // 2)
     figure = Figure(figsize=(7.8, 2.9 * num_rows + 0.4), layout="constrained")
-    axes = figure.subplots(num_rows, 2, squeeze=False, sharex=True)
+    axes = figure.subplots(num_rows, 2, squeeze=False, sharex=True, sharey="row")
     names = list(panels[0][1])
     for axis, (title, lines) in zip(axes.ravel(), panels, strict=False):
         for name, by_size in lines.items():
@@ -195,10 +195,11 @@ def draw_errors_by_size(
             )  # fmt: skip
             axis.set_xticks(sizes)
         axis.set_yscale("log")
+        axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0)))
         axis.yaxis.set_major_formatter("{x:g}")
-        axis.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 1)))
+        axis.yaxis.set_minor_locator(NullLocator())
         axis.set_title(title, fontsize=10)
-        axis.grid(alpha=0.25, which="both")
+        axis.grid(alpha=0.25)
     for axis in axes[-1]:
         axis.set_xlabel("number of particles $N$")
     for axis in axes[:, 0]:
