@@ -6,7 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt8
 from optax.assignment import hungarian_algorithm
 
 from mpfjax.filters import Filter
@@ -461,5 +461,5 @@ def _check_rejuvenation(rejuvenation: AbstractRejuvenation, particles_per_object
         )
 
 
-def _motion(states: BoxState) -> tuple[Float[Array, "n 4"], Float[Array, "n 4"] | None]:
+def _motion(states: BoxState) -> tuple[PyTree, PyTree]:
     return states.box, states.previous
