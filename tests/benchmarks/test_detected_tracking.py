@@ -11,6 +11,7 @@ from benchmarks import visual_tracking
 from benchmarks.detected_tracking import (
     LONGEST_GUESS,
     Detected,
+    detect_all,
     make_trackers,
     track_detected,
 )
@@ -136,20 +137,6 @@ def test_people_are_tracked_from_the_frames_they_appear_in(finished, name):
         assert 0 < score["IDF1"] <= 1
 
 
-def test_a_grey_video_without_a_truth_is_tracked_and_not_scored(tmp_path):
-    """Grey images in a folder: the colour models see three equal channels."""
-    folder = sequence_of(tmp_path / "grey", ())
-    for i, frame in enumerate(street(walkers), 1):
-        imageio.imwrite(folder / "img" / f"{i:06d}.png", frame[:, :, 0])
-    assert run("--sequence", folder, "--out", tmp_path, "--preset", "paper") == 0
-    results, tracks = written(tmp_path)
-    for result in results["results"]:
-        assert [result[score] for score in ("all_covered", "HOTA", "MOTA", "IDF1")] == [None] * 4
-    for name in ("mpf", "gm_mpf"):
-        assert np.isfinite(tracks[name]).all()
-        assert len(np.unique(tracks[name][:, 0])) > NUM / 2
-
-
 def tracked(sequence, boxes_of_frames, truth=None):
     """The rows of the Gaussian mixture's tracker with these detections, and their source."""
     frames = list(read_frames(sequence))
@@ -184,6 +171,17 @@ def test_detections_outside_the_image_are_nobody(sequence):
     np.testing.assert_allclose(rows, inside, atol=0.01)
     centres = rows[:, 2:4] + rows[:, 4:] / 2
     assert ((centres > 0) & (centres < [WIDTH, HEIGHT])).all()
+
+
+def test_a_grey_video_is_tracked_by_its_values(tmp_path):
+    """Images of one channel in a folder: the colour models see three equal ones."""
+    folder = sequence_of(tmp_path, ())
+    for i, frame in enumerate(street(walkers), 1):
+        imageio.imwrite(folder / "img" / f"{i:06d}.png", frame[:, :, 0])
+    source = Source("grey", lambda: read_frames(folder), 1, NUM, np.zeros((0, 4)), None, False)
+    rows, _ = tracked(folder, detect_all(source).boxes)
+    assert np.isfinite(rows).all()
+    assert len(np.unique(rows[:, 0])) > NUM / 2
 
 
 def test_who_is_seen_once_only_is_not_believed(sequence):
