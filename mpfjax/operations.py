@@ -135,21 +135,35 @@ def order_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array
 def cholesky(matrices: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
     """Lower triangular factors F with F Fᵀ = matrix, for positive semidefinite matrices.
 
-    A direction of no variance gets a column of zeros. Batched LAPACK calls on thousands of tiny
-    matrices cost far more than their arithmetic; here all of them go through each of the d
-    columns at once.
+    A direction of no variance gets a column of zeros; each coordinate is held against its own
+    variance, so that units do not matter. Batched LAPACK calls on thousands of tiny matrices cost
+    far more than their arithmetic; here all of them go through each of the d columns at once.
     """
     d = matrices.shape[-1]
-    scale = jnp.max(jnp.diagonal(matrices, axis1=1, axis2=2), axis=1)
-    tiny = 8 * d * jnp.finfo(matrices.dtype).eps * scale
+    tiny = 8 * d * jnp.finfo(matrices.dtype).eps * jnp.diagonal(matrices, axis1=1, axis2=2)
     factors = jnp.zeros_like(matrices)
     for j in range(d):
         rest = matrices[:, :, j] - jnp.einsum("nik,nk->ni", factors, factors[:, j])
-        positive = rest[:, j] > tiny
+        positive = rest[:, j] > tiny[:, j]
         pivot = jnp.sqrt(jnp.where(positive, rest[:, j], 1.0))
         column = jnp.where(positive[:, None], rest / pivot[:, None], 0.0)
         factors = factors.at[:, j:, j].set(column[:, j:])
     return factors
+
+
+def solve_lower(
+    factors: Float[Array, "#n d d"], vectors: Float[Array, "n d"]
+) -> Float[Array, "n d"]:
+    """F⁻¹ v of lower triangular F, by forward substitution; one F for all, or one for each.
+
+    Written out for the same reason as `cholesky`; LAPACK's own has also been seen to hang where
+    a program solves for several large batches at once.
+    """
+    solved = jnp.zeros_like(vectors)
+    for i in range(vectors.shape[1]):
+        rest = vectors[:, i] - jnp.sum(factors[:, i] * solved, axis=1)
+        solved = solved.at[:, i].set(rest / factors[:, i, i])
+    return solved
 
 
 def take(values: Array, indices: Int[Array, " n"]) -> Array:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.models.base import require
 from mpfjax.models.noise import NOISES
-from mpfjax.operations import cholesky
+from mpfjax.operations import cholesky, solve_lower
 
 
 class AbstractProposal(eqx.Module):
@@ -103,21 +103,8 @@ class GaussNewtonProposal(AbstractProposal):
             residuals = target[None] - values + jnp.einsum("npd,nd->np", jacobians, means)
             information = prior @ prior_precision + jnp.einsum("ndq,nq->nd", gains, residuals)
             factors = cholesky(precisions)
-            means = _solve_transposed(factors, _solve(factors, information))
+            means = _solve_transposed(factors, solve_lower(factors, information))
         return means, factors
-
-
-# Batched LAPACK calls on thousands of tiny matrices cost far more than their arithmetic: written
-# out over the d columns, all particles go through each operation at once.
-
-
-def _solve(factors: Float[Array, "n d d"], vectors: Float[Array, "n d"]) -> Float[Array, "n d"]:
-    """F⁻¹ v, by forward substitution."""
-    solved = jnp.zeros_like(vectors)
-    for i in range(vectors.shape[1]):
-        rest = vectors[:, i] - jnp.sum(factors[:, i] * solved, axis=1)
-        solved = solved.at[:, i].set(rest / factors[:, i, i])
-    return solved
 
 
 def _solve_transposed(

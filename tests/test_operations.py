@@ -138,3 +138,39 @@ def test_default_float_follows_the_precision():
     assert operations.default_float() == np.float32
     with float64():
         assert operations.default_float() == np.float64
+
+
+def test_cholesky_of_many_small_matrices():
+    factors = np.tril(RNG.normal(size=(50, 4, 4))).astype(np.float32)
+    matrices = factors @ np.swapaxes(factors, 1, 2)
+    found = np.asarray(operations.cholesky(jnp.asarray(matrices)))
+    np.testing.assert_array_equal(found, np.tril(found))
+    np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), matrices, rtol=1e-3, atol=1e-3)
+
+
+def test_cholesky_does_not_depend_on_the_units():
+    """A place in pixels beside a size in units of itself, whose variance is a millionth."""
+    units = np.array([30.0, 20.0, 0.02, 0.01])
+    correlations = np.full((4, 4), 0.5) + 0.5 * np.eye(4)
+    matrix = (units[:, None] * correlations * units).astype(np.float32)
+    found = np.asarray(operations.cholesky(jnp.asarray(matrix)[None])[0])
+    np.testing.assert_allclose(found, units[:, None] * np.linalg.cholesky(correlations), rtol=1e-4)
+
+
+def test_cholesky_of_a_singular_matrix_leaves_out_the_direction():
+    """Two coordinates that are one, in other units, and one that does not vary at all."""
+    direction = np.array([2.0, 6e-3, 0.0], np.float32)
+    matrix = np.outer(direction, direction)
+    found = np.asarray(operations.cholesky(jnp.asarray(matrix)[None])[0])
+    np.testing.assert_allclose(found, np.stack([direction, 0 * direction, 0 * direction], axis=1))
+
+
+def test_solve_lower_is_numpys():
+    factors = np.tril(RNG.normal(size=(20, 3, 3)) + 3 * np.eye(3)).astype(np.float32)
+    vectors = RNG.normal(size=(20, 3)).astype(np.float32)
+    expected = np.linalg.solve(factors, vectors[:, :, None])[:, :, 0]
+    found = operations.solve_lower(jnp.asarray(factors), jnp.asarray(vectors))
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    shared = operations.solve_lower(jnp.asarray(factors[:1]), jnp.asarray(vectors))
+    expected = np.linalg.solve(factors[0], vectors.T).T
+    np.testing.assert_allclose(shared, expected, rtol=1e-4, atol=1e-5)

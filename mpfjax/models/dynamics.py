@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from mpfjax.models.base import require_positive
+from mpfjax.operations import cholesky, solve_lower
 
 
 class AbstractDynamics(eqx.Module):
@@ -174,10 +175,10 @@ class Autoregression(AbstractDynamics):
     ) -> Float[Array, " n"]:
         """log N(x_t; the expected x_t, B Bᵀ)."""
         residuals = following - self.moments(current, previous)[0]
-        scales = jnp.broadcast_to(self.B, (*current.shape, current.shape[1]))
-        noise = jnp.linalg.solve(scales, residuals[:, :, None])[:, :, 0]
-        log_volume = jnp.broadcast_to(jnp.linalg.slogdet(self.B)[1], noise.shape[:1])
-        return _log_standard_normal(noise) - log_volume
+        B = self.B[None] if self.is_shared else self.B
+        factors = cholesky(jnp.sum(B[:, :, None] * B[:, None], axis=3))
+        log_volume = jnp.sum(jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)), axis=1)
+        return _log_standard_normal(solve_lower(factors, residuals)) - log_volume
 
     def moments(
         self, current: Float[Array, "n d"], previous: Float[Array, "n d"] | None = None

@@ -1,4 +1,4 @@
-"""Frames, boxes, colour histograms, the colour tracking model, detection, a rendered scene."""
+"""Frames, boxes, colour histograms and their model, detection, an object tracker, a scene."""
 
 from mpfjax.vision.boxes import check_boxes as check_boxes
 from mpfjax.vision.boxes import parse_box as parse_box
@@ -9,6 +9,9 @@ from mpfjax.vision.colour_model import ColourModel as ColourModel
 from mpfjax.vision.colours import AbstractColours as AbstractColours
 from mpfjax.vision.colours import HSVColours as HSVColours
 from mpfjax.vision.colours import RGBColours as RGBColours
+from mpfjax.vision.detected_model import DetectedColourModel as DetectedColourModel
+from mpfjax.vision.detected_model import DetectedFrame as DetectedFrame
+from mpfjax.vision.detected_model import DetectionProposal as DetectionProposal
 from mpfjax.vision.detected_model import Detections as Detections
 from mpfjax.vision.detection import BackgroundSubtraction as BackgroundSubtraction
 from mpfjax.vision.frames import read_frames as read_frames
@@ -21,3 +24,5 @@ from mpfjax.vision.object_moves import PruneHypotheses as PruneHypotheses
 from mpfjax.vision.scenes import Scene as Scene
 from mpfjax.vision.scenes import football_scene as football_scene
 from mpfjax.vision.tracker import ObjectTracker as ObjectTracker
+from mpfjax.vision.tracker import TrackerState as TrackerState
+from mpfjax.vision.tracker import Tracks as Tracks

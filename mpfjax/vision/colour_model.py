@@ -183,10 +183,14 @@ class ColourModel(AbstractStateSpaceModel):
         log_density = dynamics.log_density(
             states.box, previous_states.box, previous_states.previous
         )
+        return log_density + self.log_switch(states, previous_states)
+
+    def log_switch(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
+        """log P(r_t | r_{t-1}), the part of `log_transition` that is not of the box."""
         drawn = self.switch_probability / self.reference_boxes.shape[0]
         stays = states.reference == previous_states.reference
-        return log_density + jnp.log(
-            jnp.where(stays, 1 - self.switch_probability + drawn, drawn).astype(log_density.dtype)
+        return jnp.log(
+            jnp.where(stays, 1 - self.switch_probability + drawn, drawn).astype(states.box.dtype)
         )
 
     def log_likelihood(

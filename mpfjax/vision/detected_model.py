@@ -26,12 +26,20 @@ class Detections(eqx.Module):
 
     @classmethod
     def from_boxes(cls, boxes: Float[np.ndarray, "k 4"], max_detections: int) -> "Detections":
-        """Boxes (x, y, w, h), top-left corner first; of too many, the largest are kept."""
-        boxes = np.asarray(boxes, np.float32).reshape(-1, 4)
+        """Boxes (x, y, w, h), top-left corner first; of too many, the largest are kept.
+
+        They may leave the frame in part or as a whole. Raises `ValueError` for boxes that are not
+        four finite numbers each, or without area, and for room for less than one.
+        """
+        boxes = np.asarray(boxes, np.float32)
+        boxes = boxes.reshape(-1, 4) if boxes.size == 0 else boxes
         if max_detections < 1:
             raise ValueError(f"max_detections: {max_detections} is less than 1")
-        if not (np.isfinite(boxes).all() and (boxes[:, 2:] > 0).all()):
-            raise ValueError("boxes: a detection without area, or not finite")
+        if boxes.ndim != 2 or boxes.shape[1] != 4:
+            raise ValueError(f"boxes: {boxes.shape} is not the shape (k, 4) of boxes x,y,w,h")
+        for box in boxes:
+            if not (np.isfinite(box).all() and (box[2:] > 0).all()):
+                raise ValueError(f"boxes: {box.tolist()} has no area, or is not finite")
         largest = np.argsort(-boxes[:, 2] * boxes[:, 3], kind="stable")[:max_detections]
         kept = centred(boxes[largest])
         padded = np.ones((max_detections, 4), np.float32)
@@ -73,6 +81,8 @@ class DetectedColourModel(AbstractStateSpaceModel):
     miss: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.02)
 
     def __check_init__(self) -> None:
+        if self.deviations.shape != (4,):
+            raise ValueError(f"deviations: {self.deviations} are not four numbers")
         require_positive(deviations=self.deviations, miss=self.miss)
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> BoxState:
@@ -103,8 +113,9 @@ class DetectionProposal(AbstractProposal):
     q(x_t | x_{t-1}, y_t) = share N(x_t; μ, s²) + (1 - share) D(x_t | x_{t-1}), with N(μ, s²) the
     product of the Gaussians of the detection and of the prediction, coordinate by coordinate in
     (x, y, s_x, s_y), both weighed by their precision: a mixture like that of the boosted particle
-    filter (Okuma et al. 2004, section 4.2), drawn as narrow as its target. The weights L D / q
-    are exact. Where a reference has no detection q is D.
+    filter (Okuma et al. 2004, section 4.2), drawn as narrow as its target. Where the model's
+    references switch, they do so as in D. The weights L D / q are exact. Where a reference has no
+    detection q is D.
 
     Raises `ValueError` for a share outside [0, 1). Use it with few particles, which the dynamics
     alone would seldom put on a detection.
@@ -136,10 +147,14 @@ class DetectionProposal(AbstractProposal):
             - 0.5 * jnp.log(2 * jnp.pi),
             axis=1,
         )
-        log_dynamics = self.model.log_transition(states, previous_states)
-        return states, jnp.logaddexp(
+        colour = self.model.colour
+        log_dynamics = colour.dynamics_of(previous_states).log_density(
+            box, previous_states.box, previous_states.previous
+        )
+        log_density = jnp.logaddexp(
             jnp.log(share) + log_agreement, jnp.log(1 - share) + log_dynamics
         )
+        return states, log_density + colour.log_switch(states, previous_states)
 
     def _agreement(
         self, detections: Detections, previous: BoxState
@@ -161,7 +176,7 @@ class DetectionProposal(AbstractProposal):
 
 
 def box_differences(
-    boxes: Float[Array, "*n 4"], others: Float[Array, "*n 4"]
+    boxes: Float[Array, "*#n 4"], others: Float[Array, "*#n 4"]
 ) -> Float[Array, "*n 4"]:
     """How boxes differ from others: x and y in units of the others' size, and log w and log h."""
     # A box that shrank to nothing must not become a NaN.

@@ -132,9 +132,14 @@ def _rgb(image: np.ndarray) -> np.ndarray:
     """Three channels of eight bits, whatever the file had: grey, a palette, transparency."""
     image = np.asarray(image)
     if image.ndim == 2:
-        image = np.repeat(image[:, :, None], 3, axis=2)
+        image = image[:, :, None]
+    if image.shape[2] < 3:
+        # Grey, perhaps with transparency behind it.
+        image = np.repeat(image[:, :, :1], 3, axis=2)
     if image.dtype == np.uint16:
         image = image // 257
+    elif image.dtype == bool:
+        image = 255 * image.astype(np.uint8)
     return np.ascontiguousarray(image[:, :, :3]).astype(np.uint8)
 
 

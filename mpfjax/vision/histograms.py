@@ -73,7 +73,12 @@ def integral_histogram(
     """Build the integral histogram of an RGB frame, whose pixels `colours` sorts into bins.
 
     `wide_counts` counts in 32 bits, two to four times slower, for boxes of 65 536 pixels or more.
+    Raises `ValueError` for a frame of one channel or not of eight bits.
     """
+    if frame.ndim != 3 or frame.shape[2] != 3:
+        raise ValueError(f"frame: {frame.shape} is not the shape (h, w, 3) of a colour image")
+    if frame.dtype != jnp.uint8:
+        raise ValueError(f"frame: {frame.dtype} is not uint8")
     height, width, _ = frame.shape
     table = _table(frame, colours, wide_counts)
     return IntegralHistogram(table, colours.num_channels, colours.num_bins, height, width)
@@ -90,7 +95,7 @@ def normalise(
 
 
 def bhattacharyya(
-    histograms: Float[Array, "*batch bins"], references: Float[Array, "*batch bins"]
+    histograms: Float[Array, "*#batch bins"], references: Float[Array, "*#batch bins"]
 ) -> Float[Array, "*batch"]:
     """B² = 1 - Σ_b sqrt(h_b r_b), the squared Bhattacharyya distance of normalised histograms.
 

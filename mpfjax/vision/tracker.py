@@ -1,11 +1,12 @@
 """A tracker that starts and ends its components by itself, from detections."""
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt8
 from optax.assignment import hungarian_algorithm
 
 from mpfjax.filters import Filter
@@ -84,16 +85,26 @@ class ObjectTracker(eqx.Module):
     changing number of objects before a camera that stands still.
 
     - `max_objects`: M; `particles_per_object`: P.
-    - `rejuvenation`: `GaussianRegeneration` of the boxes, or `Resample` for an MPF; with
-      `particles_per_component` P.
-    - `colours`, `sigma`, `num_parts`: of the `ColourModel`.
-    - `step_deviations`: of the random walk in a frame, (x, y) in units of the box and (s_x, s_y).
+    - `rejuvenation`: `Resample(particles_per_component=P)` for an MPF, or
+      `GaussianRegeneration(P, where=lambda states: (states.box, states.previous))`, the default.
+    - `colours`, `sigma`, `num_parts`, `wide_counts`: of the `ColourModel`. Objects of 65 536 pixels
+      or more need the last.
+    - `momentum`: the share of a box centre's last step that it repeats in the next, in [0, 1]: 1 is
+      constant velocity, 0 a random walk. Sizes have none.
+    - `step_deviations`: of the noise of a step, (x, y) in units of the box and (s_x, s_y).
+    - `detection_deviations`: of a detection from the box that it sees, (x, y) in units of the box
+      and (log w, log h), as in `DetectedColourModel`.
     - `confirmation`: in how many frames detections must bear a component out before it is
       believed; until then it dies at the first frame in which they do not.
+    - `patience`: for how many frames in a row a believed component may go without a detection; it
+      dies in the next.
+    - `crowding`: in which frame in a row of covering an older component the younger one dies.
     - `adaptation`: the share of a reference that is learned anew in each frame in which one
-      detection, and no other component, bears it out.
+      detection, and no other component, bears it out, in [0, 1).
 
-    Raises `ValueError` for numbers that are not positive, or a share outside [0, 1).
+    Raises `ValueError` for a count that is not a whole number from 1 on, a deviation or σ that is
+    not positive and finite, a share outside its range, and a rejuvenation that does not give every
+    component P particles or would redraw the references.
     """
 
     rejuvenation: AbstractRejuvenation
@@ -109,6 +120,7 @@ class ObjectTracker(eqx.Module):
     patience: int = eqx.field(static=True)
     crowding: int = eqx.field(static=True)
     adaptation: float = eqx.field(static=True)
+    wide_counts: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -126,6 +138,7 @@ class ObjectTracker(eqx.Module):
         patience: int = 10,
         crowding: int = 8,
         adaptation: float = 0.05,
+        wide_counts: bool = False,
     ) -> None:
         whole = {
             "max_objects": max_objects,
@@ -136,16 +149,23 @@ class ObjectTracker(eqx.Module):
             "crowding": crowding,
         }
         for name, value in whole.items():
-            if value < 1:
-                raise ValueError(f"{name}: {value} is less than 1")
-        if not sigma > 0:
-            raise ValueError(f"sigma: {sigma} is not positive")
-        if len(step_deviations) != 4 or not all(value > 0 for value in step_deviations):
-            raise ValueError(f"step_deviations: {step_deviations} are not four positive numbers")
+            if not (1 <= value < math.inf and value == int(value)):
+                raise ValueError(f"{name}: {value} is not a whole number from 1 on")
+        if not 0 < sigma < math.inf:
+            raise ValueError(f"sigma: {sigma} is not positive and finite")
+        for name, values in (
+            ("step_deviations", step_deviations),
+            ("detection_deviations", detection_deviations),
+        ):
+            if len(values) != 4 or not all(0 < value < math.inf for value in values):
+                raise ValueError(f"{name}: {values} are not four positive numbers")
+        if not 0 <= momentum <= 1:
+            raise ValueError(f"momentum: {momentum} is not in [0, 1]")
         if not 0 <= adaptation < 1:
             raise ValueError(f"adaptation: {adaptation} is not in [0, 1)")
         if rejuvenation is None:
             rejuvenation = GaussianRegeneration(particles_per_object, where=_motion)
+        _check_rejuvenation(rejuvenation, particles_per_object)
         self.rejuvenation = rejuvenation
         self.max_objects = max_objects
         self.particles_per_object = particles_per_object
@@ -159,6 +179,7 @@ class ObjectTracker(eqx.Module):
         self.patience = patience
         self.crowding = crowding
         self.adaptation = adaptation
+        self.wide_counts = wide_counts
 
     def init(self) -> TrackerState:
         """Nothing tracked yet: every component dead, every slot empty."""
@@ -172,6 +193,7 @@ class ObjectTracker(eqx.Module):
             initial_deviations=jnp.ones((m, 4)),
             sigma=jnp.asarray(self.sigma, float),
             colours=self.colours,
+            wide_counts=self.wide_counts,
         )
         mixture = ParticleMixture(
             particles=BoxState(jnp.ones((n, 4)), jnp.zeros(n, jnp.int32), jnp.ones((n, 4))),
@@ -191,9 +213,14 @@ class ObjectTracker(eqx.Module):
         frame: UInt8[Array, "h w 3"],
         detections: Detections,
     ) -> tuple[TrackerState, Tracks]:
-        """The state after a frame and its detections, and what is tracked in it."""
+        """The state after a frame and its detections, and what is tracked in it.
+
+        Frames may have any size, which should not change: each new one compiles anew, and boxes
+        stay where they are in pixels. Raises `ValueError` for a frame that is not (h, w, 3) of
+        type uint8.
+        """
         key_filter, key_births = jax.random.split(key)
-        table = integral_histogram(frame, self.colours)
+        table = integral_histogram(frame, self.colours, self.wide_counts)
         own, taken = self._assigned(state, detections, table)
         state = self._filtered(key_filter, state, DetectedFrame(table, own))
         boxes = _mean_boxes(state)
@@ -259,10 +286,8 @@ class ObjectTracker(eqx.Module):
         older = (state.identities[None] < state.identities[:, None]) & alive[None]
         covered = jnp.any((_overlap(boxes, boxes) > 0.5) & older, axis=1)
         crowded = jnp.where(covered, state.crowded + 1, 0)
-        x, y = boxes[:, 0], boxes[:, 1]
-        inside = (x > 0) & (x < table.width) & (y > 0) & (y < table.height)
         patience = jnp.where(seen >= self.confirmation, self.patience, 0)
-        lives = alive & inside & (unseen <= patience) & (crowded < self.crowding)
+        lives = alive & _within(boxes, table) & (unseen <= patience) & (crowded < self.crowding)
         # A component may also have died in the filter, all its particles at zero likelihood.
         lives &= state.mixture.active
         dies = ~take(lives, state.mixture.component_indicators)
@@ -303,10 +328,15 @@ class ObjectTracker(eqx.Module):
         detections: Detections,
         table: IntegralHistogram,
     ) -> TrackerState:
-        """Found a component on every detection that none covers, as long as there is room."""
+        """Found a component on every detection in the frame that none covers, while there is room.
+
+        Of more detections than there is room for, the first are chosen.
+        """
         alive = state.identities > 0
         covered = _inside(boxes, detections.boxes) | (_overlap(boxes, detections.boxes) > 0.2)
-        new = detections.valid & ~jnp.any(covered & alive[:, None], axis=0)
+        # What lies outside would die in the next frame, again and again.
+        new = detections.valid & _within(detections.boxes, table)
+        new &= ~jnp.any(covered & alive[:, None], axis=0)
         source, born = _matched(new, ~alive)
         places = take(detections.boxes, source)
         mixture, colour = state.mixture, state.colour
@@ -385,6 +415,12 @@ def _mean_boxes(state: TrackerState) -> Float[Array, "m 4"]:
     return state.mixture.component_averages(state.colour.boxes(state.mixture.particles))
 
 
+def _within(boxes: Float[Array, "k 4"], table: IntegralHistogram) -> Bool[Array, " k"]:
+    """Whether the centre of each box lies in the frame."""
+    x, y = boxes[:, 0], boxes[:, 1]
+    return (x > 0) & (x < table.width) & (y > 0) & (y < table.height)
+
+
 def _inside(boxes: Float[Array, "m 4"], around: Float[Array, "d 4"]) -> Bool[Array, "m d"]:
     """Whether the centre of each box lies within each of the others."""
     gaps = jnp.abs(boxes[:, None, :2] - around[None, :, :2])
@@ -411,5 +447,19 @@ def _replace(module, **fields):
     )
 
 
-def _motion(states: BoxState) -> tuple[Float[Array, "n 4"], Float[Array, "n 4"] | None]:
+def _check_rejuvenation(rejuvenation: AbstractRejuvenation, particles_per_object: int) -> None:
+    number = getattr(rejuvenation, "particles_per_component", None)
+    # Another number would leave no empty slots for the newborn.
+    if number != particles_per_object:
+        raise ValueError(
+            f"rejuvenation: its particles_per_component, {number}, is not particles_per_object,"
+            f" {particles_per_object}"
+        )
+    if isinstance(rejuvenation, GaussianRegeneration) and rejuvenation.where is None:
+        raise ValueError(
+            "rejuvenation: where is None, but which reference a box is taken for is no Gaussian"
+        )
+
+
+def _motion(states: BoxState) -> tuple[PyTree, PyTree]:
     return states.box, states.previous

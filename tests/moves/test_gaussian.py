@@ -9,6 +9,7 @@ import mpfjax
 from mpfjax import GaussianRegeneration
 from mpfjax.exact import kalman_filter
 from mpfjax.mixture import ParticleMixture
+from mpfjax.vision import BoxState
 
 NUM_DRAWS = 2000
 
@@ -77,6 +78,69 @@ def test_a_singular_covariance_draws_within_its_plane():
     flat = mixture.replace(particles=mixture.particles[:, :1] * jnp.array([[1.0, 2.0]]))
     after = draw_many(GaussianRegeneration(), flat, 50)
     np.testing.assert_allclose(after.particles[..., 1], 2 * after.particles[..., 0], atol=1e-4)
+
+
+def motion(states):
+    return states.box, states.previous
+
+
+def box_states(spread):
+    """Three components of ten boxes with the boxes before them, in pixels and units of a box.
+
+    One varies by `spread`, one holds copies of a single state, one has all its weight on one.
+    """
+    labels = np.repeat(np.arange(3), 10)
+    centre = np.array([300.0, 200, 1, 1])
+    noise = np.random.default_rng(0).normal(size=(2, 30, 4)) * spread
+    noise[:, labels == 1] = 0
+    box, previous = (jnp.asarray(centre + part, jnp.float32) for part in noise)
+    states = BoxState(box, jnp.asarray(labels, jnp.int32), previous)
+    log_weights = np.full(30, -np.log(30.0), np.float32)
+    log_weights[21:30] = -np.inf
+    log_weights[20] = -np.log(3.0)
+    indices = jnp.arange(30, dtype=jnp.int32)
+    return ParticleMixture(states, jnp.asarray(log_weights), states.reference, indices, 4)
+
+
+def test_box_states_of_second_order_keep_the_spread_of_every_coordinate():
+    """A size's variance is a hundred-millionth of its place's, and must not be lost beside it."""
+    mixture = box_states(np.array([60.0, 40, 0.02, 0.01]))
+    move = GaussianRegeneration(10, where=motion)
+    after = draw_many(move, mixture, 400)
+    both = np.concatenate([mixture.particles.box[:10], mixture.particles.previous[:10]], axis=1)
+    draws = np.concatenate([after.particles.box, after.particles.previous], axis=2)[:, :10]
+    draws = draws.reshape(-1, 8).astype(float)
+    expected = np.cov(both.T.astype(float), bias=True)
+    found = np.cov(draws.T)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert (np.abs(found - expected) < 5 * scale * np.sqrt(2 / len(draws)) + 0.01 * scale).all()
+
+
+def test_identical_boxes_and_a_box_of_all_the_weight_are_drawn_again():
+    mixture = box_states(np.array([5.0, 5, 0.02, 0.02]))
+    after = GaussianRegeneration(10, where=motion)(jax.random.key(0), mixture)
+    np.testing.assert_array_equal(after.component_counts, [10, 10, 10, 0])
+    np.testing.assert_array_equal(after.particles.reference, after.component_indicators)
+    for labels, kept in ((1, 10), (2, 20)):
+        own = np.asarray(after.component_indicators) == labels
+        for name in ("box", "previous"):
+            drawn = np.asarray(getattr(after.particles, name))[own]
+            np.testing.assert_allclose(
+                drawn, np.tile(getattr(mixture.particles, name)[kept], (10, 1)), rtol=1e-6
+            )
+
+
+def test_a_box_that_always_moves_alike_is_drawn_within_that_plane():
+    """The box before is this one, shifted: a singular covariance of the pair."""
+    mixture = box_states(np.array([5.0, 5, 0.02, 0.02]))
+    states = mixture.particles
+    shifted = states.box - jnp.array([[3.0, 1.0, 0.0, 0.0]])
+    states = BoxState(states.box, states.reference, shifted)
+    move = GaussianRegeneration(10, where=motion)
+    after = move(jax.random.key(0), mixture.replace(particles=states)).particles
+    moved = np.asarray(after.box - after.previous)
+    np.testing.assert_allclose(moved, np.tile([3.0, 1, 0, 0], (30, 1)), atol=1e-2)
+    assert np.asarray(after.box)[:10].std(axis=0).min() > 0.005
 
 
 def test_where_leaves_the_rest_to_resampling():

@@ -8,6 +8,7 @@ import pytest
 from mpfjax.vision.frames import num_images, read_frames, write_image, write_video
 
 pytest.importorskip("imageio", reason="reading and writing frames needs the extra 'video'")
+pillow = pytest.importorskip("PIL.Image")
 
 
 def shades(num, height=32, width=48):
@@ -73,6 +74,36 @@ def test_frames_of_different_sizes_are_named(folder):
     write_image(folder / "img" / "000006.png", shades(1, 10, 10)[0])
     with pytest.raises(ValueError, match="different sizes"):
         list(read_frames(folder))
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "1", "I;16", "P", "RGBA"])
+def test_whatever_an_image_holds_it_becomes_three_channels_of_eight_bits(tmp_path, mode):
+    """Grey, grey with transparency, black and white, 16 bits, a palette, colours likewise."""
+    grey = np.tile(np.linspace(0, 255, 48).astype(np.uint8), (32, 1))
+    if mode == "1":
+        grey = np.where(grey > 127, 255, 0).astype(np.uint8)
+    image = pillow.fromarray(grey)
+    if mode == "I;16":
+        image = pillow.fromarray(grey.astype(np.uint16) * 257)
+    elif mode == "RGBA":
+        image = image.convert("RGB").convert(mode)
+    else:
+        image = image.convert(mode)
+    image.save(tmp_path / "1.png")
+    (frame,) = read_frames(tmp_path)
+    assert frame.dtype == np.uint8
+    assert frame.shape == (32, 48, 3)
+    np.testing.assert_array_equal(frame, np.repeat(grey[:, :, None], 3, axis=2))
+
+
+@pytest.mark.filterwarnings("ignore:os.fork")
+def test_a_video_of_a_single_grey_frame_comes_back(tmp_path):
+    for ending in ("mp4", "gif"):
+        path = tmp_path / f"single.{ending}"
+        write_video(path, shades(2)[1:])
+        (frame,) = read_frames(path)
+        assert frame.shape == (32, 48, 3)
+        assert np.abs(frame.astype(int) - 220).max() <= 8
 
 
 def test_another_ending_is_named(tmp_path):
