@@ -467,9 +467,10 @@ def open_targets(options: argparse.Namespace) -> Targets:
 
 
 def _rendered(options: argparse.Namespace) -> Targets:
-    """Two players of one team, who change places."""
+    """Two players of one team, who change places before a camera that stands still."""
     first, last = frames.parse_range(options.frames, "--frames")
-    scene = football_scene(jax.random.key(options.seed), last or 80, num_players=2)
+    key = jax.random.key(options.seed)
+    scene = football_scene(key, last or 80, num_players=2, still_camera=True)
     ids = [1, 2] if options.ids is None else options.ids
     return _with_truth("rendered scene", scene.frames[first - 1 :], first, scene.tracks, ids)
 
