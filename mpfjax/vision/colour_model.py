@@ -207,6 +207,12 @@ class ColourModel(AbstractStateSpaceModel):
             distances -= self.contrast * self._to_reference(sides, states)
         return -0.5 * distances / self.sigma**2
 
+    def prepare_observation(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"]
+    ) -> IntegralHistogram:
+        """The frame's integral histogram, which a model of several objects builds but once."""
+        return self._counted(observation)
+
     def squared_distances(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
     ) -> Float[Array, " n"]:

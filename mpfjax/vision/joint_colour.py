@@ -1,0 +1,104 @@
+"""Several objects known by their colours: the observation model of Smith and Gatica-Perez (2004)."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree, UInt8
+
+from mpfjax.models.dynamics import Autoregression
+from mpfjax.models.multi_object import MultiObjectModel
+from mpfjax.vision.boxes import centred
+from mpfjax.vision.colour_model import BoxState, ColourModel
+from mpfjax.vision.colours import AbstractColours, HSVColours
+
+_MOMENTUM = 0.5
+PAPER_DEVIATIONS = (2.0, 2.0, 0.001, 0.001)
+
+
+def joint_colour_model(
+    frame: UInt8[np.ndarray, "h w 3"],
+    boxes: Float[np.ndarray, "objects 4"],
+    *,
+    lambda_: float = 20.0,
+    num_parts: int = 2,
+    colours: AbstractColours | None = None,
+    deviations: Sequence[float] = PAPER_DEVIATIONS,
+    templates: Mapping[int, tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "4"]]]
+    | None = None,
+    interaction: Callable[[PyTree, PyTree], Float[Array, " n"]] | None = None,
+) -> MultiObjectModel:
+    """J boxes with second-order dynamics, each known by the histograms of its own template.
+
+    Smith and Gatica-Perez (2004), sections 2 and 3.2: L(y | x^j) ∝ exp(-λ d²), d² the squared
+    Bhattacharyya distance of HSV histograms, averaged over the bands into which a box is cut from
+    top to bottom, and x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + σ ω_t. It is a `ColourModel` for
+    each object, with its σ² = 1 / 2λ; in place of the paper's one scale α, width and height have
+    a scale each. An observation is an RGB frame that all objects share; its integral histogram
+    is built once a step, and once for all runs under `monte_carlo`.
+
+    - `boxes`: (x, y, w, h), top-left corner first, where the objects start; also where their
+      templates are, in `frame`.
+    - `lambda_`: λ.
+    - `num_parts`: bands.
+    - `colours`: the bins of the histograms; None takes `HSVColours()`.
+    - `deviations`: σ of x, y in pixels and of the scales of width and height; of x_0 as well.
+    - `templates`: the frame and box of an object, by its index, whose looks are learned elsewhere.
+    - `interaction`: that of `MultiObjectModel`, between `BoxState`s.
+
+    Raises `ValueError` naming the argument for no boxes, a box of no area or outside its frame,
+    an index in `templates` that is none, and numbers that are not positive. Use it where each
+    object has colours of its own.
+    """
+    boxes = np.asarray(boxes, float).reshape(-1, 4)
+    if not lambda_ > 0:
+        raise ValueError(f"lambda_: {lambda_} is not positive")
+    momentum = Autoregression.with_momentum(_MOMENTUM, jnp.asarray(deviations, float))
+
+    def learn(frame: np.ndarray, boxes: np.ndarray) -> ColourModel:
+        return ColourModel.from_frame(
+            frame,
+            boxes,
+            colours=HSVColours() if colours is None else colours,
+            sigma=float((2 * lambda_) ** -0.5),
+            deviations=np.asarray(deviations, float),
+            dynamics=momentum,
+            num_parts=num_parts,
+        )
+
+    model = learn(frame, boxes)
+    for j, (other_frame, box) in ({} if templates is None else templates).items():
+        if j not in range(len(boxes)):
+            raise ValueError(f"templates: {j} is none of the {len(boxes)} objects, from 0 on")
+        looks = learn(other_frame, np.asarray(box, float)[None]).references[0]
+        model = eqx.tree_at(lambda m: m.references, model, model.references.at[j].set(looks))
+    return MultiObjectModel(
+        _one_each(model),
+        len(boxes),
+        interaction,
+        shared_observation=True,
+        per_object=True,
+    )
+
+
+def object_boxes(model: MultiObjectModel, states: BoxState) -> Float[Array, "n objects 4"]:
+    """(x, y, w, h) of every object of every particle, (x, y) the top-left corner, in pixels.
+
+    For particles of a `joint_colour_model`, whose leaves are (n, J, ...).
+    """
+
+    def place(colour_model: ColourModel, states: BoxState) -> Float[Array, "n 4"]:
+        boxes = colour_model.boxes(states)
+        return jnp.concatenate([boxes[:, :2] - 0.5 * boxes[:, 2:], boxes[:, 2:]], axis=1)
+
+    return eqx.filter_vmap(place, in_axes=(0, 1), out_axes=1)(model.object_model, states)
+
+
+def _one_each(model: ColourModel) -> ColourModel:
+    """A model of k references as k models of one, side by side."""
+    num_objects = model.reference_boxes.shape[0]
+    sigma = jnp.broadcast_to(model.sigma, (num_objects,))
+    split = jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[:, None], model)
+    return eqx.tree_at(lambda m: m.sigma, split, sigma)
