@@ -230,8 +230,13 @@ class ColourModel(AbstractStateSpaceModel):
     def _to_reference(
         self, counts: Float[Array, "n parts channels bins"], states: BoxState
     ) -> Float[Array, " n"]:
-        histograms = normalise(counts, self.colour_weights[states.reference])
-        distances = bhattacharyya(histograms, self.references[states.reference])
+        weights, references = self.colour_weights, self.references
+        # To gather the one reference there is costs more than the distance, but for particles
+        # that each come with a model of their own under vmap, where two gathers fuse.
+        if references.shape[0] > 1 or counts.shape[0] == 1:
+            weights, references = weights[states.reference], references[states.reference]
+        histograms = normalise(counts, weights)
+        distances = bhattacharyya(histograms, jnp.broadcast_to(references, histograms.shape))
         return jnp.mean(jnp.sum(distances, axis=2), axis=1)
 
     def dynamics_of(self, states: BoxState) -> AbstractDynamics:
