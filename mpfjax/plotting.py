@@ -206,3 +206,55 @@ def draw_errors_by_size(
         axis.set_ylabel(ylabel)
     axes[0, -1].legend(fontsize=8)
     return figure
+
+
+def draw_object_bars(rows: Mapping[str, Sequence[np.ndarray]], titles: Sequence[str]) -> Figure:
+    """Figures 4 and 8 of Smith and Gatica-Perez (2004): a bar for each object.
+
+    A row for each filter by name, a panel in it for each of the `titles`, from an array of one
+    value an object; panels below each other share their axes.
+    """
+    figure = Figure(figsize=(3.1 * len(titles), 0.4 + 1.5 * len(rows)), layout="constrained")
+    axes = figure.subplots(len(rows), len(titles), squeeze=False, sharex=True, sharey="col")
+    for row, (name, panels) in zip(axes, rows.items(), strict=True):
+        row[0].set_ylabel(name.replace(" {", "\n{"), fontsize=8)
+        for index, (axis, values) in enumerate(zip(row, panels, strict=True)):
+            objects = np.arange(1, len(values) + 1)
+            bars = axis.bar(objects, values, color=COLOURS[index], width=0.7)
+            axis.bar_label(bars, fmt="%.0f", fontsize=7)
+            axis.set_xticks(objects)
+            axis.margins(y=0.18)
+    for axis, title in zip(axes[0], titles, strict=True):
+        axis.set_title(title, fontsize=9)
+    for axis in axes[-1]:
+        axis.set_xlabel("object")
+    return figure
+
+
+def draw_rates(
+    lines: Mapping[str, Sequence[tuple[float, float, float, float]]],
+    *,
+    xlabel: str,
+    ylabel: str,
+    title: str,
+) -> Figure:
+    """Named lines of rates, each point (x, rate, low, high) with its interval's ends."""
+    figure = Figure(figsize=(7.0, 3.8), layout="constrained")
+    axis = figure.subplots()
+    places = sorted({point[0] for points in lines.values() for point in points})
+    step = min(np.diff(places), default=1.0)
+    for index, (name, points) in enumerate(lines.items()):
+        x, rate, low, high = np.array(sorted(points)).T
+        # Shifted a little, so that intervals at the same place stay apart.
+        x = x + 0.06 * step * (index - (len(lines) - 1) / 2)
+        axis.errorbar(
+            x, rate, np.maximum([rate - low, high - rate], 0), label=name,
+            color=COLOURS[index % len(COLOURS)], marker=MARKERS[index % len(MARKERS)], ms=5,
+            lw=1.2, capsize=3,
+        )  # fmt: skip
+    axis.set_xticks(places)
+    axis.set(xlabel=xlabel, ylabel=ylabel, ylim=(-0.03, 1.03))
+    axis.set_title(title, fontsize=10)
+    axis.grid(alpha=0.25)
+    axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure

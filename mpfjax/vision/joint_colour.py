@@ -1,6 +1,7 @@
-"""Several objects known by their colours: the observation model of Smith and Gatica-Perez (2004)."""
+"""Several objects, each known by its colours, as in Smith and Gatica-Perez (2004)."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,7 +11,6 @@ from jaxtyping import Array, Float, PyTree, UInt8
 
 from mpfjax.models.dynamics import Autoregression
 from mpfjax.models.multi_object import MultiObjectModel
-from mpfjax.vision.boxes import centred
 from mpfjax.vision.colour_model import BoxState, ColourModel
 from mpfjax.vision.colours import AbstractColours, HSVColours
 
@@ -33,10 +33,11 @@ def joint_colour_model(
     """J boxes with second-order dynamics, each known by the histograms of its own template.
 
     Smith and Gatica-Perez (2004), sections 2 and 3.2: L(y | x^j) ∝ exp(-λ d²), d² the squared
-    Bhattacharyya distance of HSV histograms, averaged over the bands into which a box is cut from
-    top to bottom, and x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + σ ω_t. It is a `ColourModel` for
-    each object, with its σ² = 1 / 2λ; in place of the paper's one scale α, width and height have
-    a scale each. An observation is an RGB frame that all objects share; its integral histogram
+    Bhattacharyya distance of HSV histograms, summed over the P bands into which a box is cut from
+    top to bottom, as in Pérez, Hue, Vermaak and Gangnet (2002), whose λ is 20 as well; and
+    x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + σ ω_t. It is a `ColourModel` for each object, which
+    takes the mean over bands, so that its σ² is 1 / (2 λ P); in place of the paper's one scale α,
+    width and height have a scale each. An observation is an RGB frame that all objects share; its integral histogram
     is built once a step, and once for all runs under `monte_carlo`.
 
     - `boxes`: (x, y, w, h), top-left corner first, where the objects start; also where their
@@ -53,8 +54,7 @@ def joint_colour_model(
     object has colours of its own.
     """
     boxes = np.asarray(boxes, float).reshape(-1, 4)
-    if not lambda_ > 0:
-        raise ValueError(f"lambda_: {lambda_} is not positive")
+    sigma = _sigma(lambda_, num_parts)
     momentum = Autoregression.with_momentum(_MOMENTUM, jnp.asarray(deviations, float))
 
     def learn(frame: np.ndarray, boxes: np.ndarray) -> ColourModel:
@@ -62,7 +62,7 @@ def joint_colour_model(
             frame,
             boxes,
             colours=HSVColours() if colours is None else colours,
-            sigma=float((2 * lambda_) ** -0.5),
+            sigma=sigma,
             deviations=np.asarray(deviations, float),
             dynamics=momentum,
             num_parts=num_parts,
@@ -83,6 +83,17 @@ def joint_colour_model(
     )
 
 
+def with_lambda(model: MultiObjectModel, lambda_: float) -> MultiObjectModel:
+    """A `joint_colour_model` with another λ, whose filters compile to the same programs.
+
+    Raises `ValueError` for a λ that is not positive. Use it to go through several λ.
+    """
+    colour_model: Any = model.object_model
+    sigma = _sigma(lambda_, colour_model.references.shape[-3])
+    sigma = jnp.full_like(colour_model.sigma, sigma)
+    return eqx.tree_at(lambda m: m.object_model.sigma, model, sigma)
+
+
 def object_boxes(model: MultiObjectModel, states: BoxState) -> Float[Array, "n objects 4"]:
     """(x, y, w, h) of every object of every particle, (x, y) the top-left corner, in pixels.
 
@@ -94,6 +105,13 @@ def object_boxes(model: MultiObjectModel, states: BoxState) -> Float[Array, "n o
         return jnp.concatenate([boxes[:, :2] - 0.5 * boxes[:, 2:], boxes[:, 2:]], axis=1)
 
     return eqx.filter_vmap(place, in_axes=(0, 1), out_axes=1)(model.object_model, states)
+
+
+def _sigma(lambda_: float, num_parts: int) -> float:
+    """σ of exp(-(mean of d²) / 2σ²) for exp(-λ (sum of d²))."""
+    if not 0 < lambda_ < float("inf"):
+        raise ValueError(f"lambda_: {lambda_} is not positive")
+    return float((2 * lambda_ * num_parts) ** -0.5)
 
 
 def _one_each(model: ColourModel) -> ColourModel:
