@@ -13,9 +13,8 @@ _STARTS = np.array(
     [[180, 144], [60, 58], [180, 52], [300, 58], [60, 230], [180, 236], [300, 230]], float
 )
 _MARGIN = 8.0  # what objects keep free between each other and to the border
-# The distracter is over object 1 in its first frame, leads away at this speed, and is gone.
-_APPEARS, _VANISHES = 3, 9
-_VELOCITY = np.array([-8.0, 4.0])
+# The distracter is over object 1 in its first frame, leads away from it at this speed, and is gone.
+_APPEARS, _VANISHES, _SPEED = 3, 9, 10.0
 # Head, body and feet of each object; those of the distracter come last.
 _LOOKS = np.array(
     [
@@ -57,10 +56,10 @@ def distracter_scene(key: Key[Array, ""], num_frames: int = 25) -> DistracterSce
     Smith and Gatica-Perez (2004), section 3.2 and figures 2 and 3: 360 x 288 pixels; objects
     move by x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + 3 ω_t in both directions, drawn again where
     two would meet or one would leave the frame, and do not change in size. The distracter has
-    object 1's head and a body of warmer colours; it lies over object 1 in frame 3, moves away
-    from there at 9 pixels a frame, is last seen in frame 8, and object 1's histogram is learned
+    object 1's head and a body of warmer colours; it lies over object 1 in frame 3, gains 10 pixels a
+    frame on it, away from where object 1 goes, is last seen in frame 8, and object 1's histogram is learned
     from it (`template`). The paper prints none of the looks, places and speeds; these were chosen
-    once by how the frames look. The same key gives the same scene.
+    by how the frames look. The same key gives the same scene.
 
     Raises `ValueError` for fewer frames than the three up to the distracter.
     """
@@ -68,12 +67,11 @@ def distracter_scene(key: Key[Array, ""], num_frames: int = 25) -> DistracterSce
         raise ValueError(f"num_frames: {num_frames} is less than {_APPEARS}")
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
     corners = np.round(_paths(rng, num_frames) - _SIZE / 2)
-    sizes = np.broadcast_to(_SIZE, corners.shape)
-    boxes = np.concatenate([corners, sizes], axis=-1)
-    distracter = np.full((num_frames, 4), np.nan)
-    for t in range(_APPEARS - 1, min(_VANISHES - 1, num_frames)):
-        away = np.round((t + 1 - _APPEARS) * _VELOCITY)
-        distracter[t] = [*(corners[_APPEARS - 1, 0] + away), *_SIZE]
+    corners, bait = corners[:, :-1], corners[:, -1]
+    boxes = np.concatenate([corners, np.broadcast_to(_SIZE, corners.shape)], axis=-1)
+    distracter = np.concatenate([bait, np.broadcast_to(_SIZE, bait.shape)], axis=-1)
+    number = np.arange(1, num_frames + 1)
+    distracter[(number < _APPEARS) | (number >= _VANISHES)] = np.nan
     patches = [_patch(rng, looks) for looks in _LOOKS]
     frames = []
     for t in range(num_frames):
@@ -87,15 +85,25 @@ def distracter_scene(key: Key[Array, ""], num_frames: int = 25) -> DistracterSce
 
 
 def _paths(rng: np.random.Generator, num_frames: int) -> np.ndarray:
-    """(t, objects, 2): centres that keep inside the frame and apart from each other."""
+    """(t, objects and distracter, 2): centres that keep inside the frame and apart."""
     while True:
         paths = [_STARTS, _STARTS]
         for _ in range(num_frames):
             noise = _STEP_DEVIATION * rng.standard_normal(_STARTS.shape)
             paths.append(paths[-1] + _MOMENTUM * (paths[-1] - paths[-2]) + noise)
         centres = np.stack(paths[2:])
-        if _is_free(centres):
-            return centres
+        bait = _lure(centres[:, 0])
+        others = np.concatenate([centres[:, 1:], bait[:, None]], axis=1)
+        if _is_free(centres) and _is_free(others):
+            return np.concatenate([centres, bait[:, None]], axis=1)
+
+
+def _lure(path: np.ndarray) -> np.ndarray:
+    """Where the distracter is: from an object's place away from it and from where it goes."""
+    ahead = path[-1] - path[_APPEARS - 1]
+    away = -_SPEED * ahead / max(np.linalg.norm(ahead), 1e-9)
+    steps = np.clip(np.arange(1, len(path) + 1), _APPEARS, _VANISHES - 1) - _APPEARS
+    return path + steps[:, None] * away
 
 
 def _is_free(centres: np.ndarray) -> bool:
