@@ -1,4 +1,4 @@
-"""Frames, boxes, colour histograms and their model, detection, an object tracker, a scene."""
+"""Frames, boxes, colour histograms and their models, detection, an object tracker, scenes."""
 
 from mpfjax.vision.boxes import check_boxes as check_boxes
 from mpfjax.vision.boxes import parse_box as parse_box
@@ -14,11 +14,16 @@ from mpfjax.vision.detected_model import DetectedFrame as DetectedFrame
 from mpfjax.vision.detected_model import DetectionProposal as DetectionProposal
 from mpfjax.vision.detected_model import Detections as Detections
 from mpfjax.vision.detection import BackgroundSubtraction as BackgroundSubtraction
+from mpfjax.vision.distracter import DistracterScene as DistracterScene
+from mpfjax.vision.distracter import distracter_scene as distracter_scene
 from mpfjax.vision.frames import read_frames as read_frames
 from mpfjax.vision.frames import write_video as write_video
 from mpfjax.vision.histograms import IntegralHistogram as IntegralHistogram
 from mpfjax.vision.histograms import bhattacharyya as bhattacharyya
 from mpfjax.vision.histograms import integral_histogram as integral_histogram
+from mpfjax.vision.joint_colour import joint_colour_model as joint_colour_model
+from mpfjax.vision.joint_colour import object_boxes as object_boxes
+from mpfjax.vision.joint_colour import with_lambda as with_lambda
 from mpfjax.vision.object_moves import ObjectExclusion as ObjectExclusion
 from mpfjax.vision.object_moves import PruneHypotheses as PruneHypotheses
 from mpfjax.vision.scenes import Scene as Scene

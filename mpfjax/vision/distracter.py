@@ -56,10 +56,10 @@ def distracter_scene(key: Key[Array, ""], num_frames: int = 25) -> DistracterSce
     Smith and Gatica-Perez (2004), section 3.2 and figures 2 and 3: 360 x 288 pixels; objects
     move by x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + 3 ω_t in both directions, drawn again where
     two would meet or one would leave the frame, and do not change in size. The distracter has
-    object 1's head and a body of warmer colours; it lies over object 1 in frame 3, gains 10 pixels a
-    frame on it, away from where object 1 goes, is last seen in frame 8, and object 1's histogram is learned
-    from it (`template`). The paper prints none of the looks, places and speeds; these were chosen
-    by how the frames look. The same key gives the same scene.
+    object 1's head and a body of warmer colours. It lies over object 1 in frame 3, gains 10
+    pixels a frame on it, away from where object 1 goes, and is last seen in frame 8; object 1's
+    histogram is learned from it (`template`). The paper prints none of the looks, places and
+    speeds; these were chosen by how the frames look. The same key gives the same scene.
 
     Raises `ValueError` for fewer frames than the three up to the distracter.
     """

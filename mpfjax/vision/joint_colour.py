@@ -37,8 +37,8 @@ def joint_colour_model(
     top to bottom, as in Pérez, Hue, Vermaak and Gangnet (2002), whose λ is 20 as well; and
     x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + σ ω_t. It is a `ColourModel` for each object, which
     takes the mean over bands, so that its σ² is 1 / (2 λ P); in place of the paper's one scale α,
-    width and height have a scale each. An observation is an RGB frame that all objects share; its integral histogram
-    is built once a step, and once for all runs under `monte_carlo`.
+    width and height have a scale each. An observation is an RGB frame that all objects share;
+    its integral histogram is built once a step, and once for all runs under `monte_carlo`.
 
     - `boxes`: (x, y, w, h), top-left corner first, where the objects start; also where their
       templates are, in `frame`.
