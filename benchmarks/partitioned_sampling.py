@@ -63,6 +63,7 @@ METHODS: dict[str, Callable[[MultiObjectModel, int, Order], mpfjax.Filter]] = {
 ORDERED = ("ps",)
 
 LAMBDAS, NUM_PARTICLES = [20.0, 30.0, 40.0, 50.0], 300
+SCENE = 2  # of the first three keys, the one whose object 1 is neither nearest nor farthest
 REAL_LAMBDAS, REAL_NUM_PARTICLES = [20.0], 200
 PAPER_WIDTH = 360  # the frames in which a step deviates by two pixels
 ANIMATION_RATE = 5.0
@@ -413,7 +414,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         help=f"of {', '.join(METHODS)}; default: all",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of the filters")
-    parser.add_argument("--scene", type=int, default=0, help="key of the synthetic sequence")
+    parser.add_argument("--scene", type=int, default=SCENE, help="key of the synthetic sequence")
     parser.add_argument("--out", type=Path, default=Path("results/partitioned_sampling"))
     options = parser.parse_args(arguments)
     real = options.sequence is not None
@@ -447,7 +448,7 @@ def synthetic_scene(key: int) -> Scene:
     """The seven objects of section 3.2 and their distracter."""
     scene = distracter_scene(jax.random.key(key))
     model = joint_colour_model(scene.frames[0], scene.boxes[0], templates={0: scene.template})
-    name = "synthetic sequence" + (f" {key}" if key else "")
+    name = "synthetic sequence" + ("" if key == SCENE else f" of key {key}")
     return Scene(name, scene.frames, 1, scene.boxes, 0, model, np.array(PAPER_DEVIATIONS[:2]))
 
 

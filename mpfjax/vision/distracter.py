@@ -13,8 +13,8 @@ _STARTS = np.array(
     [[180, 144], [60, 58], [180, 52], [300, 58], [60, 230], [180, 236], [300, 230]], float
 )
 _MARGIN = 8.0  # what objects keep free between each other and to the border
-# The distracter is over object 1 in its first frame, leads away from it at this speed, and is gone.
-_APPEARS, _VANISHES, _SPEED = 3, 9, 10.0
+# The distracter is over object 1 in its first frame, leads away at this speed, and is gone.
+_APPEARS, _VANISHES, _SPEED = 3, 9, 6.0
 # Head, body and feet of each object; those of the distracter come last.
 _LOOKS = np.array(
     [
@@ -56,10 +56,12 @@ def distracter_scene(key: Key[Array, ""], num_frames: int = 25) -> DistracterSce
     Smith and Gatica-Perez (2004), section 3.2 and figures 2 and 3: 360 x 288 pixels; objects
     move by x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + 3 ω_t in both directions, drawn again where
     two would meet or one would leave the frame, and do not change in size. The distracter has
-    object 1's head and a body of warmer colours. It lies over object 1 in frame 3, gains 10
-    pixels a frame on it, away from where object 1 goes, and is last seen in frame 8; object 1's
-    histogram is learned from it (`template`). The paper prints none of the looks, places and
-    speeds; these were chosen by how the frames look. The same key gives the same scene.
+    object 1's head and a body of warmer colours. It lies over object 1 in frame 3, moves from
+    there at 6 pixels a frame against the way that object 1 takes, and is last seen in frame 8,
+    where paths are drawn again unless it is clear of object 1; object 1's histogram is learned
+    from it (`template`). The paper prints none of the looks, places and speeds. Ours were chosen
+    by how the frames look, the speed so that the exact posterior of object 1 goes along with the
+    distracter. The same key gives the same scene.
 
     Raises `ValueError` for fewer frames than the three up to the distracter.
     """
@@ -94,16 +96,19 @@ def _paths(rng: np.random.Generator, num_frames: int) -> np.ndarray:
         centres = np.stack(paths[2:])
         bait = _lure(centres[:, 0])
         others = np.concatenate([centres[:, 1:], bait[:, None]], axis=1)
-        if _is_free(centres) and _is_free(others):
+        last = min(_VANISHES - 2, num_frames - 1)
+        parted = (np.abs(bait - centres[:, 0])[last] > _SIZE).any() or last < _VANISHES - 2
+        if _is_free(centres) and _is_free(others) and parted:
             return np.concatenate([centres, bait[:, None]], axis=1)
 
 
 def _lure(path: np.ndarray) -> np.ndarray:
-    """Where the distracter is: from an object's place away from it and from where it goes."""
-    ahead = path[-1] - path[_APPEARS - 1]
+    """Where the distracter is: from an object's place straight away from where it goes."""
+    last = min(_VANISHES - 2, len(path) - 1)
+    ahead = path[last] - path[_APPEARS - 1]
     away = -_SPEED * ahead / max(np.linalg.norm(ahead), 1e-9)
     steps = np.clip(np.arange(1, len(path) + 1), _APPEARS, _VANISHES - 1) - _APPEARS
-    return path + steps[:, None] * away
+    return path[_APPEARS - 1] + steps[:, None] * away
 
 
 def _is_free(centres: np.ndarray) -> bool:
