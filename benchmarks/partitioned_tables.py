@@ -91,11 +91,11 @@ def measure(estimates: np.ndarray, truth: np.ndarray) -> Rates:
         return success_rate(states[None], present), recovery
 
     success, recovered = (np.asarray(found) > 0.5 for found in jax.vmap(outcomes)(states))
-    overlaps = (
-        np.asarray(share(jnp.asarray(estimates), jnp.asarray(truth[None]))).sum(axis=(1, 2))
-        for share in (precision, recall)
+    boxes, places = jnp.asarray(estimates), jnp.asarray(truth[None])
+    inside, covered = (
+        np.asarray(share(boxes, places)).sum(axis=(1, 2)) for share in (precision, recall)
     )
-    return Rates(success, recovered, *overlaps, np.asarray(states).sum(axis=(1, 2)))
+    return Rates(success, recovered, inside, covered, np.asarray(states).sum(axis=(1, 2)))
 
 
 def pool(rates: Sequence[Rates]) -> Rates:
@@ -283,19 +283,27 @@ def paper_of(table: str, hard: int, row: dict[str, Any]) -> str:
     """What the paper has in this place, or a dash."""
     method, order = row["method"], row["order"]
     if table in ("1", "2"):
-        key: Any = order if isinstance(order, str) else method
-        if table == "1":
-            key = "ps" if order == "mean" else None if isinstance(order, str) else method
-        if isinstance(order, list):
-            return "-"
+        places = {"1": {"mean": "ps"}, "2": {"mean": "mean", "worst": "worst"}}[table]
+        name = method if order is None else places.get(order) if isinstance(order, str) else None
         figures = {"1": PAPER_TABLE_1, "2": PAPER_TABLE_2}[table].get(round(row["lambda"]), {})
-        return " ".join(f"{value:3d}" for value in figures.get(key, ())) or "-"
-    key = order.index(hard + 1) if isinstance(order, list) else method if order is None else None
-    sequences = {"3": PAPER_TABLE_3, "4": PAPER_TABLE_4}[table].values()
-    if isinstance(key, int) and key == len(order) - 1:
-        key = {"3": 2, "4": 3}[table]  # last is last, of however many
-    found = [figures[key] for figures in sequences if key in figures]
+        found = [figures[name]] if name in figures else []
+    else:
+        found = [
+            figures[place]
+            for figures in {"3": PAPER_TABLE_3, "4": PAPER_TABLE_4}[table].values()
+            for place in [method if order is None else _place(figures, hard, order)]
+            if place in figures
+        ]
     return " | ".join(" ".join(f"{value:3d}" for value in line) for line in found) or "-"
+
+
+def _place(figures: dict, hard: int, order: list[int] | str) -> int | None:
+    """Where the hard object stands in an order; last is last, of however many."""
+    if isinstance(order, str):
+        return None
+    place = order.index(hard + 1)
+    last = max(key for key in figures if isinstance(key, int))
+    return last if place == len(order) - 1 else place
 
 
 def _with_interval(row: dict[str, Any], rate: str) -> str:

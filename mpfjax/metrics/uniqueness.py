@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, PyTree, Shaped
 
 from mpfjax.mixture import ParticleMixture, flatten_states
 
@@ -30,7 +30,9 @@ def effective_dynamics(mixture: ParticleMixture) -> PyTree:
     """
     occupied = mixture.occupied
 
-    def variance(leaf: Float[Array, "n objects *rest"]) -> Float[Array, "objects *rest"]:
+    def variance(leaf: Shaped[Array, "n objects *rest"]) -> Float[Array, "objects *rest"]:
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            leaf = leaf.astype(mixture.log_weights.dtype)
         filled = occupied.reshape(-1, *[1] * (leaf.ndim - 1))
         count = jnp.maximum(jnp.sum(occupied.astype(leaf.dtype)), 1.0)
         mean = jnp.sum(jnp.where(filled, leaf, 0.0), axis=0) / count

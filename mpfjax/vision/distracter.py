@@ -96,8 +96,8 @@ def _paths(rng: np.random.Generator, num_frames: int) -> np.ndarray:
         centres = np.stack(paths[2:])
         bait = _lure(centres[:, 0])
         others = np.concatenate([centres[:, 1:], bait[:, None]], axis=1)
-        last = min(_VANISHES - 2, num_frames - 1)
-        parted = (np.abs(bait - centres[:, 0])[last] > _SIZE).any() or last < _VANISHES - 2
+        seen_last = slice(_VANISHES - 2, _VANISHES - 1)
+        parted = np.all(np.max(np.abs(bait - centres[:, 0])[seen_last] - _SIZE, axis=1) > 0)
         if _is_free(centres) and _is_free(others) and parted:
             return np.concatenate([centres, bait[:, None]], axis=1)
 
@@ -116,7 +116,7 @@ def _is_free(centres: np.ndarray) -> bool:
     inside = (centres > room) & (centres < np.array([_WIDTH, _HEIGHT]) - room)
     gaps = np.abs(centres[:, :, None] - centres[:, None]) - _SIZE - _MARGIN
     first, second = np.triu_indices(centres.shape[1], 1)
-    apart = (gaps > 0).any(axis=-1)[:, first, second]
+    apart = np.max(gaps, axis=-1)[:, first, second] > 0
     return bool(inside.all() and apart.all())
 
 
