@@ -455,13 +455,13 @@ def real_scene(folder: Path, stretch: Stretch) -> Scene:
     first, last = frames.parse_range(stretch.frames, "--frames")
     if not folder.is_dir():
         raise ValueError(f"--sequence: {folder} is not a folder")
+    stills = np.stack(list(frames.read_frames(folder, first, last)))
     rows = box_files.read_tracks(folder / "gt.txt")
     started = box_files.boxes_of_frame(rows, first)
     ids = stretch.ids or tuple(sorted(started))
     missing = [id for id in ids if id not in started]
     if missing or not ids:
         raise ValueError(f"--ids: gt.txt has no box of {missing or 'any object'} in frame {first}")
-    stills = np.stack(list(frames.read_frames(folder, first, last)))
     truth = np.full((len(stills), len(ids), 4), np.nan)
     for t in range(len(stills)):
         own = box_files.boxes_of_frame(rows, first + t)

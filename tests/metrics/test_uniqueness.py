@@ -42,6 +42,13 @@ def test_effective_dynamics_is_the_variance_over_filled_slots_whatever_their_wei
     np.testing.assert_allclose(spread["x"], states[10:].var(axis=0), rtol=1e-5)
 
 
+def test_effective_dynamics_of_whole_numbers():
+    labels = np.random.default_rng(2).integers(0, 5, (40, 3))
+    mixture = make_mixture(labels.astype(float), np.zeros(40), np.zeros(40), 1)
+    mixture = mixture.replace(particles=jnp.asarray(labels, jnp.int32))
+    np.testing.assert_allclose(effective_dynamics(mixture), labels.var(axis=0), rtol=1e-5)
+
+
 class TestFigure4:
     """Seven objects that walk with a deviation of 2 and are seen to half a unit, N = 300."""
 
