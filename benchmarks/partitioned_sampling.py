@@ -68,7 +68,7 @@ LAMBDAS, NUM_PARTICLES = [20.0, 30.0, 40.0, 50.0], 300
 SCENE = 1
 REAL_LAMBDAS, REAL_NUM_PARTICLES = [20.0], 200
 PAPER_WIDTH = 360  # the frames in which a step deviates by two pixels
-ANIMATION_RATE = 5.0
+ANIMATION_RATE, MOST_DRAWN = 5.0, 100  # frames a second, particles
 
 
 class Stretch(NamedTuple):
@@ -346,7 +346,7 @@ def annotate(scene: Scene, kept: Kept, t: int) -> np.ndarray:
     """A frame with the particles and mean boxes of one run; the hard object's true box in white."""
     canvas, palette = scene.stills[t].astype(float), drawing.PALETTE
     for j in range(scene.truth.shape[1]):
-        centres = kept.centres[t, :, j]
+        centres = kept.centres[t, :: 1 + kept.centres.shape[1] // MOST_DRAWN, j]
         drawing.draw_points(canvas, centres, np.broadcast_to(palette[j], (len(centres), 3)), 1.2)
     drawing.draw_box(canvas, scene.truth[t, scene.hard], np.full(3, 255.0), 1.5)
     for j in range(scene.truth.shape[1]):
