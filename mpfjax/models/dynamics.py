@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from mpfjax.models.base import require_positive
+from mpfjax.operations import row_sums
 
 
 class AbstractDynamics(eqx.Module):
@@ -96,7 +97,7 @@ class RandomWalk(AbstractDynamics):
         del previous
         deviations = jnp.broadcast_to(self.deviations, current.shape)
         noise = (following - current) / deviations
-        return _log_standard_normal(noise) - jnp.sum(jnp.log(deviations), axis=1)
+        return _log_standard_normal(noise) - row_sums(jnp.log(deviations))
 
     def moments(
         self, current: Float[Array, "n d"], previous: Float[Array, "n d"] | None = None
@@ -174,8 +175,10 @@ class Autoregression(AbstractDynamics):
     ) -> Float[Array, " n"]:
         """log N(x_t; the expected x_t, B Bᵀ)."""
         residuals = following - self.moments(current, previous)[0]
-        scales = jnp.broadcast_to(self.B, (*current.shape, current.shape[1]))
-        noise = jnp.linalg.solve(scales, residuals[:, :, None])[:, :, 0]
+        if self.B.ndim == 2:
+            noise = _times(jnp.linalg.inv(self.B), residuals)
+        else:
+            noise = jnp.linalg.solve(self.B, residuals[:, :, None])[:, :, 0]
         log_volume = jnp.broadcast_to(jnp.linalg.slogdet(self.B)[1], noise.shape[:1])
         return _log_standard_normal(noise) - log_volume
 
@@ -199,4 +202,4 @@ def _times(matrices: Float[Array, "*n d d"], vectors: Float[Array, "n d"]) -> Fl
 
 
 def _log_standard_normal(noise: Float[Array, "n d"]) -> Float[Array, " n"]:
-    return jnp.sum(-0.5 * noise**2 - 0.5 * jnp.log(2 * jnp.pi), axis=1)
+    return row_sums(-0.5 * noise**2 - 0.5 * jnp.log(2 * jnp.pi))
