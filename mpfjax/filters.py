@@ -264,15 +264,18 @@ def particle_filter(
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
     sort_by: Callable[[PyTree], Array] | None = None,
+    gradient: str = "none",
 ) -> Filter:
     """The standard particle filter: resample, propagate.
 
     Vermaak et al. (2003), section 3, with one component; bootstrap unless a proposal is given.
     The right filter for a filtering distribution of one mode; it loses all but one of several.
+    `gradient` is that of `Resample`, and "stop" that of `Propagate` as well: the one to tune by.
     """
+    resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
     return Filter(
         model,
-        moves=[Resample(scheme, ess_threshold, sort_by=sort_by), Propagate(model, proposal)],
+        moves=[resample, Propagate(model, proposal, _of_draws(gradient))],
         num_particles=num_particles,
     )
 
@@ -287,6 +290,7 @@ def mixture_particle_filter(
     ess_threshold: float = 1.0,
     particles_per_component: int | None = None,
     sort_by: Callable[[PyTree], Array] | None = None,
+    gradient: str = "none",
     merge: Merge | None = None,
     split: Split | None = None,
     kmeans: KMeans | None = None,
@@ -297,12 +301,14 @@ def mixture_particle_filter(
     Vermaak et al. (2003), sections 3 and 4. Components are resampled independently and meet only
     in their mixture weights, so that none can starve another; at every step those that overlap
     merge, diffuse ones split, and K-means refines the rest. All of it is exact. `merge`, `split`
-    and `kmeans` set thresholds, features and scale; see those moves for the defaults. Use it
-    where the filtering distribution has several modes that must all be kept.
+    and `kmeans` set thresholds, features and scale; see those moves for the defaults. `gradient`
+    is that of `particle_filter`. Use it where the filtering distribution has several modes that
+    must all be kept.
     """
-    resample = Resample(scheme, ess_threshold, particles_per_component, sort_by)
+    resample = Resample(scheme, ess_threshold, particles_per_component, sort_by, gradient)
+    propagate = Propagate(model, proposal, _of_draws(gradient))
     return _mixture_filter(
-        model, num_particles, max_components, [resample, Propagate(model, proposal)],
+        model, num_particles, max_components, [resample, propagate],
         merge, split, kmeans, initial_kmeans,
     )  # fmt: skip
 
@@ -387,6 +393,7 @@ def partitioned_sampling(
     *,
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
+    gradient: str = "none",
 ) -> Filter:
     """Partitioned sampling: resample, then move one object after the other.
 
@@ -395,7 +402,8 @@ def partitioned_sampling(
     at every step. Needs far fewer particles than the joint particle filter, which is
     `particle_filter` on the same model; but the early objects of the order keep only a few
     distinct hypotheses, and hardly recover from an occlusion. Unbiased in every order, with an
-    interaction as well. `ess_threshold` is that of the resampling between steps and objects.
+    interaction as well. `ess_threshold` and `gradient` are those of the resampling between steps
+    and objects.
     """
     require_multi_object(model, "partitioned_sampling")
     orders: Any = order
@@ -406,8 +414,10 @@ def partitioned_sampling(
     return Filter(
         model,
         moves=[
-            Resample(scheme, ess_threshold),
-            Partitioned(model, orders, scheme=scheme, ess_threshold=ess_threshold),
+            Resample(scheme, ess_threshold, gradient=gradient),
+            Partitioned(
+                model, orders, scheme=scheme, ess_threshold=ess_threshold, gradient=gradient
+            ),
         ],
         num_particles=num_particles,
     )
@@ -421,6 +431,7 @@ def distributed_partitioned_sampling(
     *,
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
+    gradient: str = "none",
 ) -> Filter:
     """DPS: the particles dealt into C sets, in each of which the objects move in another order.
 
@@ -429,8 +440,9 @@ def distributed_partitioned_sampling(
     first objects falls on all alike. `orders` are C permutations of the objects, the J circular
     shifts for None, or "random" for J new ones at every step. `reassembly` is "prior", the
     paper's, where every set returns to its mass (an approximation: the marginal likelihood is
-    biased), or "evidence", which is exact; see `Partitioned`. Use it where it is not known
-    which object will be hard, and with enough particles for each set of N/C to track.
+    biased), or "evidence", which is exact, and whose gradient can be; see `Partitioned`, for
+    `gradient` as well. Use it where it is not known which object will be hard, and with enough
+    particles for each set of N/C to track.
     """
     require_multi_object(model, "distributed_partitioned_sampling")
     if orders is None:
@@ -439,12 +451,14 @@ def distributed_partitioned_sampling(
     if not isinstance(orders, str):
         orders = check_orders(orders, model.num_objects)
         num_sets = orders.shape[0]
+    resample = Resample(scheme, ess_threshold, gradient=gradient)
     partitioned = Partitioned(
-        model, orders, scheme=scheme, ess_threshold=ess_threshold, reassembly=reassembly
-    )
+        model, orders, scheme=scheme, ess_threshold=ess_threshold, reassembly=reassembly,
+        gradient=gradient,
+    )  # fmt: skip
     return Filter(
         model,
-        moves=[Pool(), Resample(scheme, ess_threshold), RandomPartition(), partitioned],
+        moves=[Pool(), resample, RandomPartition(), partitioned],
         num_particles=num_particles,
         num_components=num_sets,
     )
@@ -461,6 +475,11 @@ def independent_particle_filters(
     """
     require_multi_object(model, "independent_particle_filters")
     return Filter(model, moves=[PropagateIndependently(model, scheme)], num_particles=num_particles)
+
+
+def _of_draws(gradient: str) -> str:
+    """What propagation does where resampling has this gradient."""
+    return "stop" if gradient == "stop" else "none"
 
 
 def _mixture_filter(
