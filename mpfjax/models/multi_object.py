@@ -211,7 +211,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
     ) -> Float[Array, " n"]:
         """log D(x_t^j | x_{t-1}^j) of one object of each particle."""
         if not self.per_object or objects.ndim == 0:
-            model: Any = self.object_at(objects)
+            model: Any = self.object_at(objects) if self.per_object else self.object_model
             return model.log_transition(states, previous_states)
 
         def weigh(state: PyTree, previous: PyTree, j: Int[Array, ""]) -> Float[Array, ""]:
