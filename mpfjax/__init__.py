@@ -2,6 +2,7 @@
 
 from mpfjax import exact as exact
 from mpfjax import metrics as metrics
+from mpfjax import tuning as tuning
 from mpfjax.filters import Filter as Filter
 from mpfjax.filters import FilterRun as FilterRun
 from mpfjax.filters import StepInfo as StepInfo

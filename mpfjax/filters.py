@@ -231,7 +231,7 @@ def run_filter(
     Raises `ValueError` for no observations, leaves of different lengths, or an unknown `missing`,
     before anything compiles, and a RuntimeError where the model's densities give NaN.
     """
-    present = _present(observations, missing)
+    present = present_steps(observations, missing)
     run = _run(key, filter, observations, present, collect)
     return _checked(run)
 
@@ -251,7 +251,7 @@ def monte_carlo(
     """
     if jnp.ndim(keys) != 1 or keys.shape[0] < 1:
         raise ValueError(f"keys: shape {jnp.shape(keys)} is not that of one key a run, (seeds,)")
-    present = _present(observations, missing)
+    present = present_steps(observations, missing)
     run = _run_all(keys, filter, observations, present, collect)
     return _checked(run)
 
@@ -513,22 +513,23 @@ def _mixture_filter(
 
 @eqx.filter_jit
 def _run(key, filter, observations, present, collect):
-    return _scan(key, filter, observations, present, collect)
+    return scan_filter(key, filter, observations, present, collect)
 
 
 @eqx.filter_jit
 def _run_all(keys, filter, observations, present, collect):
-    run_one = jax.vmap(lambda key: _scan(key, filter, observations, present, collect))
+    run_one = jax.vmap(lambda key: scan_filter(key, filter, observations, present, collect))
     return run_one(keys)
 
 
-def _scan(
+def scan_filter(
     key: Key[Array, ""],
     filter: Filter,
     observations: PyTree,
     present: Bool[Array, " t"] | None,
     collect: Callable[[ParticleMixture], PyTree] | None,
 ) -> FilterRun:
+    """`run_filter` under the caller's jit, unchecked; `present` is what `present_steps` gives."""
     key_initial, key_steps = _split(key, 2)
     length = jax.tree.leaves(observations)[0].shape[0]
 
@@ -613,7 +614,7 @@ def _all_finite(leaf: Array) -> Bool[Array, ""]:
     return jnp.all(jnp.isfinite(leaf))
 
 
-def _present(observations: PyTree, missing: str) -> Bool[Array, " t"] | None:
+def present_steps(observations: PyTree, missing: str) -> Bool[Array, " t"] | None:
     """Which observations are there, or None where all are; raises for what cannot be run."""
     if missing not in ("error", "skip"):
         raise ValueError(f"missing: {missing!r} is neither 'error' nor 'skip'")

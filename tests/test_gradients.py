@@ -8,62 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.scipy.stats import norm
 
 import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.resampling import GRADIENTS
-from tests.user_models import BLINDED
+from tests.examples import example_mixtures
+from tests.user_models import BLINDED, ScalarLinear
 
 NUM_PARTICLES = 48
 NUM_RUNS = 1000
-
-
-class Scalar(mpfjax.AbstractStateSpaceModel):
-    """x_t = a x_{t-1} + N(0, q²), y_t = h x_t + N(0, r²), x_0 ~ N(m, p²), in six numbers.
-
-    The same in matrices would spend most of the tests' time on tiny Cholesky factors.
-    """
-
-    a: jax.Array = eqx.field(converter=jnp.asarray, default=0.9)
-    q: jax.Array = eqx.field(converter=jnp.asarray, default=0.6)
-    h: jax.Array = eqx.field(converter=jnp.asarray, default=1.0)
-    r: jax.Array = eqx.field(converter=jnp.asarray, default=0.5)
-    m: jax.Array = eqx.field(converter=jnp.asarray, default=0.5)
-    p: jax.Array = eqx.field(converter=jnp.asarray, default=1.0)
-
-    def sample_initial(self, key, num_particles):
-        return self.m + self.p * jax.random.normal(key, (num_particles,))
-
-    def sample_transition(self, key, states):
-        return self.a * states + self.q * jax.random.normal(key, states.shape)
-
-    def log_likelihood(self, observation, states):
-        return norm.logpdf(observation, self.h * states, self.r)
-
-    def log_transition(self, states, previous_states):
-        return norm.logpdf(states, self.a * previous_states, self.q)
-
-    # What the Gauss-Newton proposal asks for on top:
-
-    def transition_mean(self, states):
-        return self.a * states
-
-    def observation_mean(self, states):
-        return self.h * states
-
-    transition_covariance = property(lambda self: self.q**2)
-    observation_covariance = property(lambda self: self.r**2)
-
-    def in_matrices(self):
-        rows = lambda value: value.reshape(1, 1)  # noqa: E731
-        return mpfjax.LinearGaussianModel(
-            A=rows(self.a), Q=rows(self.q**2), H=rows(self.h), R=rows(self.r**2),
-            m0=self.m.reshape(1), P0=rows(self.p**2),
-        )  # fmt: skip
-
-
-MODEL = Scalar()
+MODEL = ScalarLinear()
 PARAMETERS = tuple("aqhrmp")
 TWO = jnp.array([[1.5, -0.4], [1.0, 0.3], [0.4, 1.2], [0.9, 0.8]])  # of two objects
 ONE = TWO[:, 0]
@@ -92,16 +46,11 @@ def pathwise(model, gradient):
 
 FILTERS = {
     "pf": single(mpfjax.particle_filter, NUM_PARTICLES),
-    "pf adaptive": single(
-        mpfjax.particle_filter, NUM_PARTICLES, scheme="multinomial", ess_threshold=0.5
-    ),
     "mpf": single(mpfjax.mixture_particle_filter, NUM_PARTICLES, 2, ess_threshold=0.7),
     "guided pf": guided,
     "pathwise": pathwise,
     "ps": joint(mpfjax.partitioned_sampling, order=(1, 0)),
-    "dps": joint(
-        mpfjax.distributed_partitioned_sampling, reassembly="evidence", ess_threshold=0.7
-    ),
+    "dps": joint(mpfjax.distributed_partitioned_sampling, reassembly="evidence", ess_threshold=0.7),
 }
 
 
@@ -164,17 +113,46 @@ def test_stop_gradient_scores_are_unbiased(name):
     assert max(map(abs, found.values())) < 4, found
 
 
-@pytest.mark.parametrize("gradient", ["none", "soft", "straight_through"])
-def test_the_other_scores_are_not(gradient):
-    found = deviations("pf", gradient)
-    assert max(map(abs, found.values())) > 20, found
+def test_plain_derivatives_are_biased():
+    found = deviations("pathwise", "none")
+    assert max(map(abs, found.values())) > 10, found
 
 
-@pytest.mark.parametrize("name", ["pf adaptive", "mpf", "guided pf", "ps", "dps"])
-def test_values_are_the_same_to_the_bit(name):
-    key, filters = jax.random.key(5), [FILTERS[name](MODEL, g) for g in ("none", "stop")]
-    runs = [mpfjax.run_filter(key, f, observations_of(f)) for f in filters]
-    for one, two in zip(*map(jax.tree.leaves, runs), strict=True):
+@pytest.mark.parametrize("options", [{}, {"ess_threshold": 0.5}, {"scheme": "residual"}])
+def test_resampling_with_stopped_gradients_is_the_same_to_the_bit(options):
+    for mixture in example_mixtures().values():
+        moved = [
+            eqx.filter_jit(mpfjax.Resample(gradient=gradient, **options))(
+                jax.random.key(5), mixture
+            )
+            for gradient in ("none", "stop", "straight_through")
+        ]
+        for other in moved[1:]:
+            assert_same(moved[0], other)
+
+
+@pytest.mark.parametrize("kind", ["bootstrap", "guided", "halves", "partitioned"])
+def test_propagation_with_stopped_gradients_is_the_same_to_the_bit(kind):
+    joint = mpfjax.MultiObjectModel(MODEL, 2)
+    make = {
+        "bootstrap": lambda gradient: mpfjax.Propagate(MODEL, None, gradient),
+        "guided": lambda gradient: mpfjax.Propagate(
+            MODEL, mpfjax.GaussNewtonProposal(MODEL), gradient
+        ),
+        "halves": lambda gradient: mpfjax.Predict(MODEL, gradient),
+        "partitioned": lambda gradient: mpfjax.Partitioned(joint, gradient=gradient),
+    }[kind]
+    model, observation = (joint, TWO[0]) if kind == "partitioned" else (MODEL, ONE[0])
+    mixture = mpfjax.Filter(model, [make("none")], NUM_PARTICLES).init(jax.random.key(6))
+    moved = [
+        eqx.filter_jit(make(gradient))(jax.random.key(7), mixture, observation)
+        for gradient in ("none", "stop")
+    ]
+    assert_same(*moved)
+
+
+def assert_same(mixture, other):
+    for one, two in zip(jax.tree.leaves(mixture), jax.tree.leaves(other), strict=True):
         np.testing.assert_array_equal(one, two)
 
 
@@ -182,7 +160,8 @@ def test_steps_without_an_observation_keep_the_score_unbiased():
     observations = ONE.at[1].set(jnp.nan)
 
     def log_evidence(model, key):
-        moves = [mpfjax.Resample(gradient="stop"), mpfjax.Predict(model, "stop")]
+        resample = mpfjax.Resample("multinomial", 0.5, gradient="stop")
+        moves = [resample, mpfjax.Predict(model, "stop")]
         filter = mpfjax.Filter(model, [*moves, mpfjax.Weigh(model)], NUM_PARTICLES)
         run = mpfjax.run_filter(key, filter, observations, nothing, missing="skip")
         return run.log_marginal_likelihood
@@ -216,7 +195,7 @@ class Window(mpfjax.QuadraticModel):
         return jnp.where(jnp.abs(observation - states**2) < 0.4, honest, -jnp.inf)
 
 
-@pytest.mark.parametrize("gradient", GRADIENTS)
+@pytest.mark.parametrize("gradient", GRADIENTS[1:])
 def test_gradients_are_finite_where_weights_and_components_vanish(gradient):
     """In float32, with empty slots, dead components, and a step of zero likelihood throughout."""
     observations = jnp.array([1.5, 1.0, BLINDED, 0.4, 0.9])
@@ -230,8 +209,8 @@ def test_gradients_are_finite_where_weights_and_components_vanish(gradient):
         seen = jnp.isfinite(run.log_likelihood_increments)
         return jnp.sum(jnp.where(seen, run.log_likelihood_increments, 0.0)), run
 
-    # The transport solver's own derivative relies on rank promotion.
-    with jax.numpy_rank_promotion("allow"):
+    # The transport solver's own derivative is written for the default promotion.
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         score = eqx.filter_jit(eqx.filter_grad(log_evidence, has_aux=True))
         grads, run = score(Window(0.3, 0.5))
     assert run.degenerate.tolist() == [False, False, True, False, False]

@@ -18,7 +18,11 @@ NUM_DRAWS = 4000
 over_mixtures = pytest.mark.parametrize("mixture", MIXTURES.values(), ids=MIXTURES)
 over_regroupings = pytest.mark.parametrize("name", REGROUPINGS)
 over_rejuvenations = pytest.mark.parametrize("name", REJUVENATIONS)
-RESAMPLINGS = [name for name, move in REJUVENATIONS.items() if isinstance(move, Resample)]
+RESAMPLINGS = [
+    name
+    for name, move in REJUVENATIONS.items()
+    if isinstance(move, Resample) and not move.approximate
+]
 over_resamplings = pytest.mark.parametrize("name", RESAMPLINGS)
 
 
