@@ -45,5 +45,6 @@ from mpfjax.moves import Split as Split
 from mpfjax.moves import Weigh as Weigh
 from mpfjax.proposals import AbstractProposal as AbstractProposal
 from mpfjax.proposals import GaussNewtonProposal as GaussNewtonProposal
+from mpfjax.proposals import NetworkProposal as NetworkProposal
 
 __version__ = "0.1.0"

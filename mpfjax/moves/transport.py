@@ -11,6 +11,7 @@ from mpfjax.operations import take
 
 # In units of the regularisation: e^-APART is nothing in any floating point type.
 _APART = 1e4
+_ITERATIONS = 50
 
 
 def require_ott() -> None:
@@ -104,8 +105,17 @@ def _plan(
     from ott.geometry.geometry import Geometry
     from ott.solvers import linear
 
-    # The solver is written for JAX's default promotion, whatever its caller has set.
+    # The solver is written for JAX's default promotion, whatever its caller has set. A fixed number
+    # of iterations is differentiated as it stands: the implicit derivative solves a linear system
+    # that weights near zero make singular.
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         geometry = Geometry(cost_matrix=cost, epsilon=regularisation, relative_epsilon=None)
-        solution: Any = linear.solve(geometry, sources, slots)
+        solution: Any = linear.solve(
+            geometry,
+            sources,
+            slots,
+            implicit_diff=None,
+            min_iterations=_ITERATIONS,
+            max_iterations=_ITERATIONS,
+        )
         return solution.matrix
