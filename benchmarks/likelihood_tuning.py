@@ -78,6 +78,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--estimators", nargs="+", choices=list(ESTIMATORS), default=list(ESTIMATORS)
     )
+    parser.add_argument("--filters", nargs="+", choices=FILTERS, default=FILTERS)
     parser.add_argument("--starts", type=int, default=20, help="b: random starts")
     parser.add_argument("--steps", type=int, default=CLIMB_STEPS, help="b: of each climb")
     parser.add_argument("--seed", type=int, default=0)
@@ -110,7 +111,7 @@ def run_scores(options: argparse.Namespace, out: Path) -> None:
         (model, filter, n, estimator)
         for model in MODELS
         for n in options.particles
-        for filter in FILTERS
+        for filter in options.filters
         for estimator in options.estimators
         if estimator != "ot" or n <= LARGEST_TRANSPORT
     ]
@@ -126,8 +127,10 @@ def linear_gaussian_task() -> Task:
 
     def build(point: Array) -> mpfjax.LinearGaussianModel:
         a, q, r = point[0], jnp.exp(2 * point[1]), jnp.exp(2 * point[2])
-        rows = [value.reshape(1, 1) for value in (a, q, jnp.ones(()), r)]
-        return mpfjax.LinearGaussianModel(*rows, jnp.zeros(1), jnp.ones((1, 1)))
+        one = jnp.ones((1, 1))
+        return mpfjax.LinearGaussianModel(
+            A=a * one, Q=q * one, H=one, R=r * one, m0=jnp.zeros(1), P0=one
+        )
 
     rng = np.random.default_rng(0)
     state, observations = 0.0, []

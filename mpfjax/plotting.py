@@ -231,6 +231,10 @@ def draw_climbs(
         axis.plot(*path[0], MARKERS[index % len(MARKERS)], color=colour, ms=4)
     axis.plot(*best, "*", color="black", ms=13, label="exact maximum", zorder=3)
     axis.set(xscale="log", yscale="log", xlabel=r"$\sigma_x$", ylabel=r"$\sigma_y$")
+    for one, sigmas in ((axis.xaxis, sigmas_x), (axis.yaxis, sigmas_y)):
+        ticks = [tick for tick in (0.03, 0.05, 0.1, 0.2, 0.5) if sigmas[0] <= tick <= sigmas[-1]]
+        one.set_ticks(ticks, labels=[str(tick) for tick in ticks])
+    axis.minorticks_off()
     axis.set_title("log marginal likelihood below its maximum, and climbs to it", fontsize=10)
     axis.legend(fontsize=8, loc="lower left")
     return figure

@@ -11,7 +11,8 @@ from mpfjax.operations import take
 
 # In units of the regularisation: e^-APART is nothing in any floating point type.
 _APART = 1e4
-_ITERATIONS = 50
+_THRESHOLD = 1e-3
+_MOST_ITERATIONS = 500
 
 
 def require_ott() -> None:
@@ -105,9 +106,9 @@ def _plan(
     from ott.geometry.geometry import Geometry
     from ott.solvers import linear
 
-    # The solver is written for JAX's default promotion, whatever its caller has set. A fixed number
-    # of iterations is differentiated as it stands: the implicit derivative solves a linear system
-    # that weights near zero make singular.
+    # The solver is written for JAX's default promotion, whatever its caller has set. Its iterations
+    # are differentiated as they were: the implicit derivative solves a linear system that weights
+    # near zero make singular, and that of a fixed number of iterations is wrong in ott-jax 0.6.
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         geometry = Geometry(cost_matrix=cost, epsilon=regularisation, relative_epsilon=None)
         solution: Any = linear.solve(
@@ -115,7 +116,7 @@ def _plan(
             sources,
             slots,
             implicit_diff=None,
-            min_iterations=_ITERATIONS,
-            max_iterations=_ITERATIONS,
+            threshold=_THRESHOLD,
+            max_iterations=_MOST_ITERATIONS,
         )
         return solution.matrix

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Mapping
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
@@ -55,7 +56,7 @@ def errors_at(
         )
 
     def score(flat: np.ndarray) -> np.ndarray:
-        at = unravel(flat.astype(point.dtype))
+        at = unravel(jnp.asarray(flat, point.dtype))
         gradients = [ravel_pytree(scores(problem, at, keys)[1])[0] for keys in batches]
         return np.mean([np.asarray(g, float) for g in gradients], axis=0)
 
