@@ -220,9 +220,9 @@ class TestNetworkProposal:
         """It ends above where it began, and below log Z as every bound must."""
         filter = self.filter(NetworkProposal.create(jax.random.key(0), 1, 1, 0.8))
         run = mpfjax.tuning.fit(
-            jax.random.key(4), filter, self.OBSERVATIONS, optax.adam(0.02), 100,
+            jax.random.key(4), filter, self.OBSERVATIONS, optax.adam(0.03), 60,
             parameters={"network": lambda filter: filter.moves[1].proposal.network},
-            num_seeds=16, progress=False,
+            num_seeds=8, progress=False,
         )  # fmt: skip
         bound = run.history["log_marginal_likelihood"]
         exact = grid_filter(self.MODEL, self.OBSERVATIONS, jnp.linspace(-4.0, 4.0, 801))
