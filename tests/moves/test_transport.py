@@ -64,13 +64,13 @@ def test_its_derivative_is_that_of_its_values():
         moved = MOVE(KEY, mixture.replace(log_weights=log_weights))
         return jnp.sum(moved.particles**2 * jnp.arange(80.0).reshape(40, 2))
 
+    direction = np.cos(np.arange(40.0)).astype(np.float32)
     # The transport solver's own derivative is written for the default promotion.
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         both = jax.jit(jax.value_and_grad(moment))
         gradient = np.asarray(both(mixture.log_weights)[1])
-    direction = np.cos(np.arange(40.0)).astype(np.float32)
-    step = 0.01 * direction
-    ends = [float(both(mixture.log_weights + sign * step)[0]) for sign in (1, -1)]
+        steps = [mixture.log_weights + sign * 0.01 * direction for sign in (1, -1)]
+        ends = [float(both(step)[0]) for step in steps]
     assert gradient @ direction == pytest.approx((ends[0] - ends[1]) / 0.02, rel=0.05)
 
 
