@@ -2,6 +2,7 @@
 
 from mpfjax import exact as exact
 from mpfjax import metrics as metrics
+from mpfjax import tuning as tuning
 from mpfjax.filters import Filter as Filter
 from mpfjax.filters import FilterRun as FilterRun
 from mpfjax.filters import StepInfo as StepInfo
@@ -46,5 +47,6 @@ from mpfjax.moves import Split as Split
 from mpfjax.moves import Weigh as Weigh
 from mpfjax.proposals import AbstractProposal as AbstractProposal
 from mpfjax.proposals import GaussNewtonProposal as GaussNewtonProposal
+from mpfjax.proposals import NetworkProposal as NetworkProposal
 
 __version__ = "0.1.0"

@@ -232,7 +232,7 @@ def run_filter(
     Raises `ValueError` for no observations, leaves of different lengths, or an unknown `missing`,
     before anything compiles, and a RuntimeError where the model's densities give NaN.
     """
-    present = _present(observations, missing)
+    present = present_steps(observations, missing)
     run = _run(key, filter, observations, present, collect)
     return _checked(run)
 
@@ -252,7 +252,7 @@ def monte_carlo(
     """
     if jnp.ndim(keys) != 1 or keys.shape[0] < 1:
         raise ValueError(f"keys: shape {jnp.shape(keys)} is not that of one key a run, (seeds,)")
-    present = _present(observations, missing)
+    present = present_steps(observations, missing)
     run = _run_all(keys, filter, observations, present, collect)
     return _checked(run)
 
@@ -265,15 +265,18 @@ def particle_filter(
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
     sort_by: Callable[[PyTree], Array] | None = None,
+    gradient: str = "none",
 ) -> Filter:
     """The standard particle filter: resample, propagate.
 
     Vermaak et al. (2003), section 3, with one component; bootstrap unless a proposal is given.
     The right filter for a filtering distribution of one mode; it loses all but one of several.
+    `gradient` is that of `Resample`, and "stop" that of `Propagate` as well: the one to tune by.
     """
+    resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
     return Filter(
         model,
-        moves=[Resample(scheme, ess_threshold, sort_by=sort_by), Propagate(model, proposal)],
+        moves=[resample, Propagate(model, proposal, _of_draws(gradient))],
         num_particles=num_particles,
     )
 
@@ -288,6 +291,7 @@ def mixture_particle_filter(
     ess_threshold: float = 1.0,
     particles_per_component: int | None = None,
     sort_by: Callable[[PyTree], Array] | None = None,
+    gradient: str = "none",
     merge: Merge | None = None,
     split: Split | None = None,
     kmeans: KMeans | None = None,
@@ -298,12 +302,14 @@ def mixture_particle_filter(
     Vermaak et al. (2003), sections 3 and 4. Components are resampled independently and meet only
     in their mixture weights, so that none can starve another; at every step those that overlap
     merge, diffuse ones split, and K-means refines the rest. All of it is exact. `merge`, `split`
-    and `kmeans` set thresholds, features and scale; see those moves for the defaults. Use it
-    where the filtering distribution has several modes that must all be kept.
+    and `kmeans` set thresholds, features and scale; see those moves for the defaults. `gradient`
+    is that of `particle_filter`. Use it where the filtering distribution has several modes that
+    must all be kept.
     """
-    resample = Resample(scheme, ess_threshold, particles_per_component, sort_by)
+    resample = Resample(scheme, ess_threshold, particles_per_component, sort_by, gradient)
+    propagate = Propagate(model, proposal, _of_draws(gradient))
     return _mixture_filter(
-        model, num_particles, max_components, [resample, Propagate(model, proposal)],
+        model, num_particles, max_components, [resample, propagate],
         merge, split, kmeans, initial_kmeans,
     )  # fmt: skip
 
@@ -388,6 +394,7 @@ def partitioned_sampling(
     *,
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
+    gradient: str = "none",
 ) -> Filter:
     """Partitioned sampling: resample, then move one object after the other.
 
@@ -396,7 +403,8 @@ def partitioned_sampling(
     at every step. Needs far fewer particles than the joint particle filter, which is
     `particle_filter` on the same model; but the early objects of the order keep only a few
     distinct hypotheses, and hardly recover from an occlusion. Unbiased in every order, with an
-    interaction as well. `ess_threshold` is that of the resampling between steps and objects.
+    interaction as well. `ess_threshold` and `gradient` are those of the resampling between steps
+    and objects.
     """
     require_multi_object(model, "partitioned_sampling")
     orders: Any = order
@@ -407,8 +415,10 @@ def partitioned_sampling(
     return Filter(
         model,
         moves=[
-            Resample(scheme, ess_threshold),
-            Partitioned(model, orders, scheme=scheme, ess_threshold=ess_threshold),
+            Resample(scheme, ess_threshold, gradient=gradient),
+            Partitioned(
+                model, orders, scheme=scheme, ess_threshold=ess_threshold, gradient=gradient
+            ),
         ],
         num_particles=num_particles,
     )
@@ -422,6 +432,7 @@ def distributed_partitioned_sampling(
     *,
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
+    gradient: str = "none",
 ) -> Filter:
     """DPS: the particles dealt into C sets, in each of which the objects move in another order.
 
@@ -430,8 +441,9 @@ def distributed_partitioned_sampling(
     first objects falls on all alike. `orders` are C permutations of the objects, the J circular
     shifts for None, or "random" for J new ones at every step. `reassembly` is "prior", the
     paper's, where every set returns to its mass (an approximation: the marginal likelihood is
-    biased), or "evidence", which is exact; see `Partitioned`. Use it where it is not known
-    which object will be hard, and with enough particles for each set of N/C to track.
+    biased), or "evidence", which is exact, and whose gradient can be; see `Partitioned`, for
+    `gradient` as well. Use it where it is not known which object will be hard, and with enough
+    particles for each set of N/C to track.
     """
     require_multi_object(model, "distributed_partitioned_sampling")
     if orders is None:
@@ -440,12 +452,14 @@ def distributed_partitioned_sampling(
     if not isinstance(orders, str):
         orders = check_orders(orders, model.num_objects)
         num_sets = orders.shape[0]
+    resample = Resample(scheme, ess_threshold, gradient=gradient)
     partitioned = Partitioned(
-        model, orders, scheme=scheme, ess_threshold=ess_threshold, reassembly=reassembly
-    )
+        model, orders, scheme=scheme, ess_threshold=ess_threshold, reassembly=reassembly,
+        gradient=gradient,
+    )  # fmt: skip
     return Filter(
         model,
-        moves=[Pool(), Resample(scheme, ess_threshold), RandomPartition(), partitioned],
+        moves=[Pool(), resample, RandomPartition(), partitioned],
         num_particles=num_particles,
         num_components=num_sets,
     )
@@ -490,6 +504,11 @@ def clustered_particle_filter(
     return Filter(model, moves=[move], num_particles=num_particles)
 
 
+def _of_draws(gradient: str) -> str:
+    """What propagation does where resampling has this gradient."""
+    return "stop" if gradient == "stop" else "none"
+
+
 def _mixture_filter(
     model: AbstractStateSpaceModel,
     num_particles: int,
@@ -521,22 +540,23 @@ def _mixture_filter(
 
 @eqx.filter_jit
 def _run(key, filter, observations, present, collect):
-    return _scan(key, filter, observations, present, collect)
+    return scan_filter(key, filter, observations, present, collect)
 
 
 @eqx.filter_jit
 def _run_all(keys, filter, observations, present, collect):
-    run_one = jax.vmap(lambda key: _scan(key, filter, observations, present, collect))
+    run_one = jax.vmap(lambda key: scan_filter(key, filter, observations, present, collect))
     return run_one(keys)
 
 
-def _scan(
+def scan_filter(
     key: Key[Array, ""],
     filter: Filter,
     observations: PyTree,
     present: Bool[Array, " t"] | None,
     collect: Callable[[ParticleMixture], PyTree] | None,
 ) -> FilterRun:
+    """`run_filter` under the caller's jit, unchecked; `present` is what `present_steps` gives."""
     key_initial, key_steps = _split(key, 2)
     length = jax.tree.leaves(observations)[0].shape[0]
 
@@ -621,7 +641,7 @@ def _all_finite(leaf: Array) -> Bool[Array, ""]:
     return jnp.all(jnp.isfinite(leaf))
 
 
-def _present(observations: PyTree, missing: str) -> Bool[Array, " t"] | None:
+def present_steps(observations: PyTree, missing: str) -> Bool[Array, " t"] | None:
     """Which observations are there, or None where all are; raises for what cannot be run."""
     if missing not in ("error", "skip"):
         raise ValueError(f"missing: {missing!r} is neither 'error' nor 'skip'")

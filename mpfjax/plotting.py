@@ -258,3 +258,35 @@ def draw_rates(
     axis.grid(alpha=0.25)
     axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
+
+
+def draw_climbs(
+    sigmas_x: np.ndarray,
+    sigmas_y: np.ndarray,
+    log_likelihood: np.ndarray,
+    paths: Sequence[np.ndarray],
+    best: np.ndarray,
+) -> Figure:
+    """Paths of a tuning, (steps, 2) each, on the log marginal likelihood of σ_x and σ_y.
+
+    `log_likelihood` has a row for each σ_y; `best` is the exact maximum.
+    """
+    figure = Figure(figsize=(6.2, 5.0), layout="constrained")
+    axis = figure.subplots()
+    below = np.max(log_likelihood) - log_likelihood
+    levels = [0.5, 2, 5, 10, 20, 50, 100, 200, 500, 1000]
+    lines = axis.contour(sigmas_x, sigmas_y, below, levels, colors="0.7", linewidths=0.8)
+    axis.clabel(lines, fmt="-%g", fontsize=7)
+    for index, path in enumerate(paths):
+        colour = COLOURS[index % len(COLOURS)]
+        axis.plot(path[:, 0], path[:, 1], color=colour, lw=1.0, alpha=0.8)
+        axis.plot(*path[0], MARKERS[index % len(MARKERS)], color=colour, ms=4)
+    axis.plot(*best, "*", color="black", ms=13, label="exact maximum", zorder=3)
+    axis.set(xscale="log", yscale="log", xlabel=r"$\sigma_x$", ylabel=r"$\sigma_y$")
+    for one, sigmas in ((axis.xaxis, sigmas_x), (axis.yaxis, sigmas_y)):
+        ticks = [tick for tick in (0.03, 0.05, 0.1, 0.2, 0.5) if sigmas[0] <= tick <= sigmas[-1]]
+        one.set_ticks(ticks, labels=[str(tick) for tick in ticks])
+    axis.minorticks_off()
+    axis.set_title("log marginal likelihood below its maximum, and climbs to it", fontsize=10)
+    axis.legend(fontsize=8, loc="lower left")
+    return figure

@@ -1,14 +1,16 @@
 """Proposals q(x_t | x_{t-1}, y_t) with a density of their own."""
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.models.base import require
+from mpfjax.models.base import require, require_positive
 from mpfjax.models.noise import NOISES
 from mpfjax.operations import cholesky, solve_lower
 
@@ -21,6 +23,64 @@ class AbstractProposal(eqx.Module):
         self, key: Key[Array, ""], observation: PyTree, previous_states: PyTree
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """x_t ~ q(. | x_{t-1}, y_t) for every particle, and log q of each, shape (n,)."""
+
+
+class NetworkProposal(AbstractProposal):
+    """A Gaussian whose mean and deviations a network gives, from x_{t-1} and y_t.
+
+    q = N(x_{t-1} + s a, diag(s exp b)²), (a, b) = network(x_{t-1}, y_t), for each particle. It
+    learns by the filter's own bound: E[log Ẑ] <= log Z rises as q comes to fit, and `tuning.fit`
+    climbs it in the network's arrays (Maddison et al. 2017, FIVO), with `gradient="none"`, which
+    differentiates the draws and leaves out the resampling, as they do. The filter stays exact
+    whatever the network is.
+
+    - `network`: one vector, the flattened state before the flattened observation, to one of
+      twice the state's size: a, then b. Such as the `eqx.nn.MLP` that `create` makes.
+    - `scale`: s, (d,) or a scalar, positive, in units of the state: about as long as a step is.
+
+    Raises `ValueError` for a scale that is not positive. Use it where the likelihood is narrow and
+    no `GaussNewtonProposal` fits, and the same model will be run often.
+    """
+
+    network: Callable[[Float[Array, " k"]], Float[Array, " two_d"]]
+    scale: Float[Array, "*d"] = eqx.field(converter=jnp.asarray)
+
+    def __check_init__(self) -> None:
+        require_positive(scale=self.scale)
+
+    @classmethod
+    def create(
+        cls,
+        key: Key[Array, ""],
+        state_size: int,
+        observation_size: int,
+        scale: float | Float[Array, " d"],
+        *,
+        width: int = 16,
+        depth: int = 2,
+    ) -> "NetworkProposal":
+        """An untrained one: a small network, whose draws are about N(x_{t-1}, scale²)."""
+        sizes = (state_size + observation_size, 2 * state_size)
+        network = eqx.nn.MLP(*sizes, width, depth, jax.nn.tanh, key=key)
+        last = lambda net: (net.layers[-1].weight, net.layers[-1].bias)  # noqa: E731
+        network = eqx.tree_at(last, network, [0.1 * leaf for leaf in last(network)])
+        return cls(network, scale)
+
+    def propose(
+        self, key: Key[Array, ""], observation: PyTree, previous_states: Float[Array, "n ..."]
+    ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
+        """x_t from the network's Gaussian of every particle, and its log density."""
+        previous = previous_states.reshape(previous_states.shape[0], -1)
+        seen = ravel_pytree(observation)[0].astype(previous.dtype)
+        rows = jnp.broadcast_to(seen, (previous.shape[0], seen.shape[0]))
+        outputs = jax.vmap(self.network)(jnp.concatenate([previous, rows], axis=1))
+        shifts, log_widths = jnp.split(outputs, 2, axis=1)
+        scale = jnp.broadcast_to(self.scale.astype(previous.dtype), previous.shape)
+        noise = jax.random.normal(key, previous.shape, previous.dtype)
+        states = previous + scale * (shifts + jnp.exp(log_widths) * noise)
+        log_widths = log_widths + jnp.log(scale) + 0.5 * jnp.log(2 * jnp.pi)
+        log_density = -jnp.sum(0.5 * noise**2 + log_widths, axis=1)
+        return states.reshape(previous_states.shape), log_density
 
 
 class GaussNewtonProposal(AbstractProposal):

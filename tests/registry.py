@@ -68,6 +68,8 @@ REJUVENATIONS: dict[str, AbstractRejuvenation] = {
     "systematic, sorted": Resample(sort_by=lambda states: states[:, 0]),
     "systematic, fixed number": Resample(particles_per_component=5),
     "residual, fixed number, adaptive": Resample("residual", 0.5, 5),
+    "soft": Resample(gradient="soft"),
+    "soft, fixed number, adaptive": Resample("residual", 0.5, 5, gradient="soft", softness=0.3),
     "gaussian": GaussianRegeneration(),
     "gaussian, fixed number, stratified": GaussianRegeneration(5, noise="stratified"),
 }

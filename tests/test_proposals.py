@@ -1,15 +1,16 @@
-"""The Gauss-Newton proposal and its noise."""
+"""The Gauss-Newton proposal and its noise, and the proposal that is learned."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 import scipy.stats
 
 import mpfjax
-from mpfjax import GaussNewtonProposal
-from mpfjax.exact import kalman_filter
+from mpfjax import GaussNewtonProposal, NetworkProposal
+from mpfjax.exact import grid_filter, kalman_filter
 from mpfjax.models.noise import independent_normal, stratified_normal, stratified_uniform
 from tests.precision import float64
 
@@ -185,3 +186,51 @@ class TestBadInput:
     def test_options_out_of_range_are_named(self, name, value):
         with pytest.raises(ValueError, match=f"{name}: "):
             GaussNewtonProposal(LINEAR, **{name: value})
+
+
+class TestNetworkProposal:
+    MODEL = mpfjax.QuadraticModel(0.2, 0.2, -1.5, 1.5)
+    OBSERVATIONS = jnp.array([1.0, 0.8, 0.9, 1.3, 1.2, 0.7])
+
+    def filter(self, proposal):
+        return mpfjax.particle_filter(self.MODEL, 24, proposal=proposal)
+
+    def test_the_log_density_is_that_of_the_gaussian_it_draws_from(self):
+        proposal = NetworkProposal.create(jax.random.key(0), 3, 2, jnp.array([0.5, 1.0, 2.0]))
+        previous = LINEAR.sample_initial(jax.random.key(1), 20)
+        states, log_density = propose(proposal, jax.random.key(2), OBSERVATION, previous)
+        for state, before, found in zip(states, previous, log_density, strict=True):
+            outputs = np.asarray(proposal.network(jnp.concatenate([before, OBSERVATION])))
+            mean = np.asarray(before) + np.asarray(proposal.scale) * outputs[:3]
+            deviations = np.asarray(proposal.scale) * np.exp(outputs[3:])
+            expected = scipy.stats.norm(mean, deviations).logpdf(np.asarray(state)).sum()
+            assert float(found) == pytest.approx(expected, abs=1e-3)
+
+    def test_the_evidence_is_unbiased_before_it_has_learned_anything(self):
+        filter = self.filter(NetworkProposal.create(jax.random.key(0), 1, 1, 0.4))
+        keys = jax.random.split(jax.random.key(3), 2000)
+        run = mpfjax.monte_carlo(keys, filter, self.OBSERVATIONS, lambda mixture: None)
+        exact = grid_filter(self.MODEL, self.OBSERVATIONS, jnp.linspace(-4.0, 4.0, 801))
+        ratios = np.exp(run.log_marginal_likelihood - exact.log_marginal_likelihood)
+        standard_error = ratios.std() / np.sqrt(2000)
+        assert standard_error < 0.03
+        assert abs(ratios.mean() - 1) < 4 * standard_error
+
+    def test_it_learns_by_the_filters_own_bound(self):
+        """It ends above where it began, and below log Z as every bound must."""
+        filter = self.filter(NetworkProposal.create(jax.random.key(0), 1, 1, 0.8))
+        run = mpfjax.tuning.fit(
+            jax.random.key(4), filter, self.OBSERVATIONS, optax.adam(0.03), 60,
+            parameters={"network": lambda filter: filter.moves[1].proposal.network},
+            num_seeds=8, progress=False,
+        )  # fmt: skip
+        bound = run.history["log_marginal_likelihood"]
+        exact = grid_filter(self.MODEL, self.OBSERVATIONS, jnp.linspace(-4.0, 4.0, 801))
+        gap = float(exact.log_marginal_likelihood) - np.array(
+            [bound[:10].mean(), bound[-10:].mean()]
+        )
+        assert 0 < gap[1] < 0.8 * gap[0]
+
+    def test_a_scale_that_is_not_positive_is_refused(self):
+        with pytest.raises(ValueError, match=r"scale: .* is not positive"):
+            NetworkProposal.create(jax.random.key(0), 1, 1, 0.0)

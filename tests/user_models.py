@@ -2,8 +2,10 @@
 
 `Drift` is batched, `DriftOfOne` is the same model written for one particle. Both are
 linear-Gaussian, so that the Kalman filter gives the truth (`DRIFT_AS_LINEAR_GAUSSIAN`).
+`ScalarLinear` is another, whose parameters are there to be differentiated.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.stats import norm
@@ -70,6 +72,50 @@ class DriftOfOne:
 
     transition_covariance = property(lambda self: 0.25 * jnp.eye(2))
     observation_covariance = property(lambda self: jnp.array([[0.49]]))
+
+
+class ScalarLinear(mpfjax.AbstractStateSpaceModel):
+    """x_t = a x_{t-1} + N(0, q²), y_t = h x_t + N(0, r²), x_0 ~ N(m, p²), in six numbers.
+
+    The same in matrices would spend most of the tests' time on tiny Cholesky factors.
+    """
+
+    a: jax.Array = eqx.field(converter=jnp.asarray, default=0.9)
+    q: jax.Array = eqx.field(converter=jnp.asarray, default=0.6)
+    h: jax.Array = eqx.field(converter=jnp.asarray, default=1.0)
+    r: jax.Array = eqx.field(converter=jnp.asarray, default=0.5)
+    m: jax.Array = eqx.field(converter=jnp.asarray, default=0.5)
+    p: jax.Array = eqx.field(converter=jnp.asarray, default=1.0)
+
+    def sample_initial(self, key, num_particles):
+        return self.m + self.p * jax.random.normal(key, (num_particles,))
+
+    def sample_transition(self, key, states):
+        return self.a * states + self.q * jax.random.normal(key, states.shape)
+
+    def log_likelihood(self, observation, states):
+        return norm.logpdf(observation, self.h * states, self.r)
+
+    def log_transition(self, states, previous_states):
+        return norm.logpdf(states, self.a * previous_states, self.q)
+
+    # What the Gauss-Newton proposal asks for on top:
+
+    def transition_mean(self, states):
+        return self.a * states
+
+    def observation_mean(self, states):
+        return self.h * states
+
+    transition_covariance = property(lambda self: self.q**2)
+    observation_covariance = property(lambda self: self.r**2)
+
+    def in_matrices(self):
+        rows = lambda value: value.reshape(1, 1)  # noqa: E731
+        return mpfjax.LinearGaussianModel(
+            A=rows(self.a), Q=rows(self.q**2), H=rows(self.h), R=rows(self.r**2),
+            m0=self.m.reshape(1), P0=rows(self.p**2),
+        )  # fmt: skip
 
 
 # Observations at which the model below misbehaves, as a broken model would.

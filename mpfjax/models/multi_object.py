@@ -206,6 +206,20 @@ class MultiObjectModel(AbstractStateSpaceModel):
 
         return jax.vmap(weigh)(states, objects)
 
+    def object_log_transition(
+        self, states: PyTree, previous_states: PyTree, objects: Int[Array, "*n"]
+    ) -> Float[Array, " n"]:
+        """log D(x_t^j | x_{t-1}^j) of one object of each particle."""
+        if not self.per_object or objects.ndim == 0:
+            model: Any = self.object_at(objects) if self.per_object else self.object_model
+            return model.log_transition(states, previous_states)
+
+        def weigh(state: PyTree, previous: PyTree, j: Int[Array, ""]) -> Float[Array, ""]:
+            model: Any = self.object_at(j)
+            return model.log_transition(_many(state), _many(previous))[0]
+
+        return jax.vmap(weigh)(states, previous_states, objects)
+
     def _seen_by(self, observation: PyTree, index: Int[Array, ""]) -> PyTree:
         if self.shared_observation:
             return observation

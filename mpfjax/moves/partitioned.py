@@ -11,10 +11,12 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.propagation import predict
 from mpfjax.moves.resampling import Resample
-from mpfjax.operations import log_sum_exp, take
+from mpfjax.operations import add_gradient, log_sum_exp, take
 
 REASSEMBLIES = ("evidence", "prior")
 
@@ -40,11 +42,15 @@ class Partitioned(AbstractPropagation):
       the total grows as before. The marginal likelihood is then biased (`approximate` is true),
       but no component is lost to a step of bad luck. With one component they are the same.
 
+    - `gradient`: of the resampling after each object, as in `Resample`; with "stop" the draws of
+      the objects are constants as well, and count through their densities, as in `Propagate`.
+
     A component that an object leaves without weight dies, and the others share its slots and,
     with "prior", its mass. Where all weight is lost the particles move by their dynamics alone.
 
     Raises `ValueError` for an order that is no permutation of the objects, a number of orders
-    other than one or the number of components, and an unknown scheme or reassembly.
+    other than one or the number of components, an unknown scheme, reassembly or gradient, and
+    "stop" with an object model that has no `log_transition`.
     """
 
     model: MultiObjectModel
@@ -61,6 +67,7 @@ class Partitioned(AbstractPropagation):
         scheme: str = "systematic",
         ess_threshold: float = 1.0,
         reassembly: str = "evidence",
+        gradient: str = "none",
     ) -> None:
         if reassembly not in REASSEMBLIES:
             raise ValueError(f"reassembly: {reassembly!r} is not one of {REASSEMBLIES}")
@@ -72,13 +79,19 @@ class Partitioned(AbstractPropagation):
         else:
             self.rule, self.orders = None, check_orders(orders, model.num_objects)
         self.model = model
-        self.resample = Resample(scheme, ess_threshold)
+        self.resample = Resample(scheme, ess_threshold, gradient=gradient)
+        if self._stops_draws:
+            require(model.object_model, "log_transition", "gradient='stop'")
         self.reassembly = reassembly
 
     @property
     def approximate(self) -> bool:
         """Whether components return to the mass that they had before."""
         return self.reassembly == "prior"
+
+    @property
+    def _stops_draws(self) -> bool:
+        return self.resample.gradient == "stop"
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -110,7 +123,7 @@ class Partitioned(AbstractPropagation):
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) of all objects and leave the weights."""
-        return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
+        return predict(key, self.model, mixture, "stop" if self._stops_draws else "none")
 
     def _unweighted(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         nothing = jnp.full_like(mixture.log_weights, -jnp.inf)
@@ -127,8 +140,10 @@ class Partitioned(AbstractPropagation):
         """Move each particle's object of this rank; also whether a density was broken."""
         model, particles = self.model, mixture.particles
         objects = _of_particles(orders[:, rank], mixture)
-        states = model.object_states(particles, objects)
-        states = model.sample_object_transition(key, states, objects)
+        previous = model.object_states(particles, objects)
+        states = model.sample_object_transition(key, previous, objects)
+        if self._stops_draws:
+            states = jax.lax.stop_gradient(states)
         log_factors = model.object_log_likelihood(seen, states, objects)
         if log_factors.shape != (mixture.num_particles,):
             raise ValueError(
@@ -137,6 +152,9 @@ class Partitioned(AbstractPropagation):
             )
         log_factors = log_factors.astype(mixture.log_weights.dtype)
         log_factors += self._log_potentials(states, mixture, orders, rank)
+        if self._stops_draws:
+            log_density = model.object_log_transition(states, previous, objects)
+            log_factors = add_gradient(log_factors, log_density.astype(log_factors.dtype))
         empty = mixture.log_weights == -jnp.inf
         log_weights = jnp.where(empty, -jnp.inf, mixture.log_weights + log_factors)
         moved = mixture.replace(

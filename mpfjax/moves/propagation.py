@@ -2,12 +2,15 @@
 
 from typing import cast
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, HasTransitionDensity, require
 from mpfjax.moves.base import AbstractPropagation
+from mpfjax.operations import add_gradient
 from mpfjax.proposals import AbstractProposal
 
 
@@ -19,13 +22,22 @@ class Propagate(AbstractPropagation):
     is the dynamics D, and the factor is L alone; with one it is the guided filter, worth it
     where the likelihood is much narrower than the dynamics.
 
-    Raises `ValueError` for a proposal with a model that has no `log_transition`.
+    - `gradient`: what a derivative sees; the values are the same. "none" differentiates the draw,
+      x_t = f(x_{t-1}, noise; θ), as it is written. "stop" takes what was drawn for a constant and
+      the weight's factor for L D / ⊥q, ⊥ being `stop_gradient`, so that parameters of D count
+      through its density (Ścibior and Wood 2021); parameters of q have no gradient then. Only
+      x_0 is still differentiated through its draw.
+
+    Raises `ValueError` for another gradient, and for a proposal, or "stop", with a model that has
+    no `log_transition`.
     """
 
     model: AbstractStateSpaceModel
     proposal: AbstractProposal | None = None
+    gradient: str = eqx.field(static=True, default="none")
 
     def __check_init__(self) -> None:
+        check_propagated_gradient(self.gradient, self.model)
         if self.proposal is not None:
             require(self.model, "log_transition", f"proposal {type(self.proposal).__name__}")
 
@@ -37,23 +49,30 @@ class Propagate(AbstractPropagation):
             return _weigh(self.model, self.predict(key, mixture), observation)
         previous = mixture.particles
         states, log_density = self.proposal.propose(key, observation, previous)
+        if self.gradient == "stop":
+            states, log_density = jax.lax.stop_gradient((states, log_density))
         dynamics = cast(HasTransitionDensity, self.model)
         log_ratio = dynamics.log_transition(states, previous) - log_density
         return _weigh(self.model, mixture.replace(particles=states), observation, log_ratio)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
-        return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
+        return predict(key, self.model, mixture, self.gradient)
 
 
 class Predict(AbstractPropagation):
     """Draw x_t ~ D(. | x_{t-1}) and leave the weights: the first half of a bootstrap `Propagate`.
 
     With `Weigh` as the second half, for chains that do something between the two, such as
-    redrawing the prediction from its Gaussian (Lin et al. 2012, section 4, step 3).
+    redrawing the prediction from its Gaussian (Lin et al. 2012, section 4, step 3). `gradient` is
+    that of `Propagate`, and so are the errors.
     """
 
     model: AbstractStateSpaceModel
+    gradient: str = eqx.field(static=True, default="none")
+
+    def __check_init__(self) -> None:
+        check_propagated_gradient(self.gradient, self.model)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -64,7 +83,7 @@ class Predict(AbstractPropagation):
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """The same without an observation."""
-        return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
+        return predict(key, self.model, mixture, self.gradient)
 
 
 class Weigh(AbstractPropagation):
@@ -86,6 +105,29 @@ class Weigh(AbstractPropagation):
         """The mixture as it is: there is nothing to weigh by."""
         del key
         return mixture
+
+
+def check_propagated_gradient(gradient: str, model: object) -> None:
+    """Raise a `ValueError` for an unknown gradient, or one whose density the model lacks."""
+    if gradient not in ("none", "stop"):
+        raise ValueError(f"gradient: {gradient!r} is neither 'none' nor 'stop'")
+    if gradient == "stop":
+        require(model, "log_transition", "gradient='stop'")
+
+
+def predict(
+    key: Key[Array, ""], model: AbstractStateSpaceModel, mixture: ParticleMixture, gradient: str
+) -> ParticleMixture:
+    """Draws of x_t, with the weights' derivatives times D / ⊥D where the draws have none."""
+    states = model.sample_transition(key, mixture.particles)
+    if gradient == "none":
+        return mixture.replace(particles=states)
+    states = jax.lax.stop_gradient(states)
+    log_density = cast(HasTransitionDensity, model).log_transition(states, mixture.particles)
+    log_density = jnp.where(mixture.occupied, log_density.astype(mixture.log_weights.dtype), 0.0)
+    return mixture.replace(
+        particles=states, log_weights=add_gradient(mixture.log_weights, log_density)
+    )
 
 
 def _weigh(

@@ -16,7 +16,18 @@ from mpfjax.moves.slots import (
     deal_slots,
     place_slots,
 )
-from mpfjax.operations import count_starts, order_by_segment, prefix_sum, segment_counts, take
+from mpfjax.moves.transport import require_ott, transport
+from mpfjax.operations import (
+    add_gradient,
+    count_starts,
+    order_by_segment,
+    prefix_sum,
+    segment_counts,
+    segment_log_sum_exp,
+    take,
+)
+
+GRADIENTS = ("none", "stop", "soft", "ot", "straight_through")
 
 
 class Resample(AbstractRejuvenation):
@@ -41,14 +52,38 @@ class Resample(AbstractRejuvenation):
       `stratified_normal` spreads their noise, the array form of randomised quasi-Monte Carlo
       (L'Ecuyer, Lécot and Tuffin 2008). Worth its sort where masses or likelihoods must be exact:
       it cut the error of the modes' mass on the quadratic model by four or five.
+    - `gradient`: what a derivative of the filter sees of the resampling, one of
+        - "none": nothing. The indices that were drawn are taken for constants, and the derivative
+          of the log marginal likelihood is NOT an estimate of the score: its bias does not go
+          away with more particles, and may have the wrong sign.
+        - "stop": new weights w_a / ⊥w_a times the old share, ⊥ being `stop_gradient` (Ścibior and
+          Wood 2021, DPF-SGR). Values are the same to the bit; derivatives of Ẑ are unbiased.
+          `Propagate` and `Partitioned` have it as well, for parameters of the dynamics.
+        - "soft": draws from q = (1 - s) w + s / k and weighs by w / q, s the `softness` (Karkus,
+          Hsu and Lee 2018). Noisier weights, and still biased: what is left out grows as s falls.
+        - "ot": no draws: particles move to the barycentres of an entropy-regularised transport
+          plan from the weights to equal ones (Corenflos et al. 2021), by ott-jax, the extra `ot`.
+          Differentiable throughout, O(n²), and biased in value and gradient by the entropy.
+        - "straight_through": resampling in value; the derivative is that of particles moved by
+          Σ_j w_j ⊥x_j, as if every offspring were the component's mean (Bengio et al. 2013).
+      The masses of components carry their derivative in all of them. Component indicators are
+      whole numbers and have none: what a parameter does to the grouping is not seen, which is
+      no error, since regrouping does not change the distribution.
+    - `softness`: s, in (0, 1]. `regularisation`: ε of the transport, positive, in units of the
+      mean squared spread of a component's particles, as Corenflos et al. scale it.
 
-    Raises `ValueError` for an unknown scheme, a threshold outside [0, 1], or k < 1.
+    "soft" and "ot" are approximate: Ẑ is biased. Raises `ValueError` for an unknown scheme or
+    gradient, a threshold outside [0, 1], k < 1, and s or ε out of range; `ImportError` for "ot"
+    without ott-jax.
     """
 
     scheme: str = eqx.field(static=True, default="systematic")
     ess_threshold: float = eqx.field(static=True, default=1.0)
     particles_per_component: int | None = eqx.field(static=True, default=None)
     sort_by: Callable[[PyTree], Float[Array, " n"]] | None = eqx.field(static=True, default=None)
+    gradient: str = eqx.field(static=True, default="none")
+    softness: float = eqx.field(static=True, default=0.5)
+    regularisation: float = eqx.field(static=True, default=0.5)
 
     def __check_init__(self) -> None:
         if self.scheme not in SCHEMES:
@@ -56,6 +91,19 @@ class Resample(AbstractRejuvenation):
         if not 0.0 <= self.ess_threshold <= 1.0:
             raise ValueError(f"ess_threshold: {self.ess_threshold} is not in [0, 1]")
         check_particles_per_component(self.particles_per_component)
+        if self.gradient not in GRADIENTS:
+            raise ValueError(f"gradient: {self.gradient!r} is not one of {GRADIENTS}")
+        if not 0.0 < self.softness <= 1.0:
+            raise ValueError(f"softness: {self.softness} is not in (0, 1]")
+        if not self.regularisation > 0:
+            raise ValueError(f"regularisation: {self.regularisation} is not positive")
+        if self.gradient == "ot":
+            require_ott()
+
+    @property
+    def approximate(self) -> bool:
+        """Whether the weights are normalised after soft draws, or the particles transported."""
+        return self.gradient in ("soft", "ot")
 
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
@@ -73,7 +121,33 @@ class Resample(AbstractRejuvenation):
     ) -> ParticleMixture:
         """Resample every component that is due."""
         due = self.is_due(mixture)
+        drawn_from = self._drawn_from(mixture)
+        # Who is drawn is a whole number, through which no derivative passes.
+        drawn = self._draw(key, jax.lax.stop_gradient(drawn_from), due)
+        slots = drawn.slots
+        copies = _copies(mixture, drawn)
+        num_slots = jnp.maximum(drawn.targets, 1).astype(mixture.log_weights.dtype)
+        log_shares = mixture.log_mixture_weights - jnp.log(num_slots)
+        redrawn = copies.replace(log_weights=take(log_shares, slots.components))
+        if self.gradient == "stop":
+            log_weights = jax.lax.stop_gradient(redrawn.log_weights)
+            redrawn = redrawn.replace(log_weights=add_gradient(log_weights, copies.log_weights))
+        elif self.gradient == "soft":
+            redrawn = _importance_weighted(redrawn, mixture, drawn_from, drawn)
+        elif self.gradient == "straight_through":
+            redrawn = _following_the_mean(redrawn, mixture)
+        elif self.gradient == "ot":
+            redrawn = self._transported(redrawn, mixture, drawn)
+        if self.ess_threshold < 1.0:
+            redrawn = _where(take(due, slots.components), redrawn, copies)
+        return redrawn.replace(log_weights=jnp.where(slots.filled, redrawn.log_weights, -jnp.inf))
+
+    def _draw(
+        self, key: Key[Array, ""], mixture: ParticleMixture, due: Bool[Array, " m"]
+    ) -> "_Drawn":
+        """Each slot's parent: drawn by weight where its component is due, itself elsewhere."""
         as_they_stand = mixture.num_components == 1 and self.sort_by is None
+        as_they_stand &= self.gradient != "ot"  # which needs places without gaps
         if as_they_stand:
             layout = _as_they_stand(mixture)
         else:
@@ -92,8 +166,102 @@ class Resample(AbstractRejuvenation):
             unmoved = take(layout.firsts, slots.components) + slots.ranks
             parents = jnp.where(take(due, slots.components), parents, unmoved)
         parents = jnp.clip(parents, 0, mixture.num_particles - 1)
-        kept_weights = None if self.ess_threshold == 1.0 else ~due
-        return _redrawn(mixture, take(layout.order, parents), slots, targets, kept_weights)
+        return _Drawn(take(layout.order, parents), slots, targets, layout)
+
+    def _drawn_from(self, mixture: ParticleMixture) -> ParticleMixture:
+        """The mixture whose weights the offspring are drawn in proportion to."""
+        if self.gradient != "soft":
+            return mixture
+        counts = jnp.maximum(mixture.component_counts, 1).astype(mixture.log_weights.dtype)
+        uniform = self.softness / take(counts, mixture.component_indicators)
+        softened = (1 - self.softness) * jnp.exp(mixture.log_component_weights) + uniform
+        log_mass = take(mixture.log_mixture_weights, mixture.component_indicators)
+        occupied = mixture.occupied
+        log_weights = jnp.log(softened) + jnp.where(occupied, log_mass, 0.0)
+        return mixture.replace(log_weights=jnp.where(occupied, log_weights, -jnp.inf))
+
+    def _transported(
+        self, redrawn: ParticleMixture, mixture: ParticleMixture, drawn: "_Drawn"
+    ) -> ParticleMixture:
+        """The particles at the barycentres of the plan from the weights to equal ones."""
+        slots, layout = drawn.slots, drawn.layout
+        # Where a component changes its number of slots, its particles repeat or are skipped.
+        counts, shares = layout.counts, jnp.maximum(drawn.targets, 1)
+        stretched = slots.ranks * take(counts, slots.components) // take(shares, slots.components)
+        places = jnp.clip(take(layout.firsts, slots.components) + stretched, 0, len(stretched) - 1)
+        particles, nearest = transport(
+            mixture,
+            take(layout.order, places),
+            slots.components,
+            slots.filled,
+            self.regularisation,
+        )
+        return redrawn.replace(
+            particles=particles, ancestor_indices=take(mixture.ancestor_indices, nearest)
+        )
+
+
+class _Drawn(NamedTuple):
+    """Who stands where after resampling."""
+
+    parents: Int[Array, " n"]
+    slots: Slots
+    targets: Int[Array, " m"]  # how many slots each component has
+    layout: "_Layout"
+
+
+def _copies(mixture: ParticleMixture, drawn: _Drawn) -> ParticleMixture:
+    """Every slot's parent as it was, with its weight."""
+    return mixture.replace(
+        particles=jax.tree.map(lambda leaf: take(leaf, drawn.parents), mixture.particles),
+        log_weights=take(mixture.log_weights, drawn.parents),
+        component_indicators=drawn.slots.components,
+        ancestor_indices=take(mixture.ancestor_indices, drawn.parents),
+    )
+
+
+def _importance_weighted(
+    redrawn: ParticleMixture,
+    mixture: ParticleMixture,
+    drawn_from: ParticleMixture,
+    drawn: _Drawn,
+) -> ParticleMixture:
+    """Weights in proportion to w / q within each component, whose mass stays."""
+    slots = drawn.slots
+    log_ratios = mixture.log_component_weights - drawn_from.log_component_weights
+    log_ratios = jnp.where(mixture.occupied, log_ratios, 0.0)
+    log_ratios = jnp.where(slots.filled, take(log_ratios, drawn.parents), -jnp.inf)
+    log_totals = segment_log_sum_exp(log_ratios, slots.components, mixture.num_components)
+    log_mass = jnp.where(mixture.active, mixture.log_mixture_weights - log_totals, -jnp.inf)
+    return redrawn.replace(log_weights=log_ratios + take(log_mass, slots.components))
+
+
+def _following_the_mean(redrawn: ParticleMixture, mixture: ParticleMixture) -> ParticleMixture:
+    """The same particles, whose derivatives are also those of the component's mean by weight."""
+
+    def follow(leaf: Array, drawn: Array) -> Array:
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            return drawn
+        means = mixture.component_averages(jax.lax.stop_gradient(leaf))
+        return add_gradient(drawn, take(means, redrawn.component_indicators))
+
+    return redrawn.replace(particles=jax.tree.map(follow, mixture.particles, redrawn.particles))
+
+
+def _where(
+    is_redrawn: Bool[Array, " n"], redrawn: ParticleMixture, copies: ParticleMixture
+) -> ParticleMixture:
+    """What was redrawn, and of the components that were not due the particles as they were."""
+
+    def pick(new: Array, old: Array) -> Array:
+        return jnp.where(is_redrawn.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    if redrawn.particles is not copies.particles:
+        redrawn = redrawn.replace(
+            particles=jax.tree.map(pick, redrawn.particles, copies.particles),
+            ancestor_indices=pick(redrawn.ancestor_indices, copies.ancestor_indices),
+        )
+    return redrawn.replace(log_weights=pick(redrawn.log_weights, copies.log_weights))
 
 
 class _Layout(NamedTuple):
@@ -154,28 +322,6 @@ def _within_component(parents: Int[Array, " n"], slots: Slots, layout: _Layout) 
     firsts = take(layout.firsts, slots.components)
     lasts = firsts + take(layout.counts, slots.components) - 1
     return jnp.clip(parents, firsts, lasts)
-
-
-def _redrawn(
-    mixture: ParticleMixture,
-    parents: Int[Array, " n"],
-    slots: Slots,
-    targets: Int[Array, " m"],
-    kept: Bool[Array, " m"] | None,
-) -> ParticleMixture:
-    """The new particles; those of a component that is `kept` bring their own weights along."""
-    shares = jnp.maximum(targets, 1).astype(mixture.log_weights.dtype)
-    equal = mixture.log_mixture_weights - jnp.log(shares)
-    log_weights = take(equal, slots.components)
-    if kept is not None:
-        own = take(mixture.log_weights, parents)
-        log_weights = jnp.where(take(kept, slots.components), own, log_weights)
-    return mixture.replace(
-        particles=jax.tree.map(lambda leaf: take(leaf, parents), mixture.particles),
-        log_weights=jnp.where(slots.filled, log_weights, -jnp.inf),
-        component_indicators=slots.components,
-        ancestor_indices=take(mixture.ancestor_indices, parents),
-    )
 
 
 # A scheme gives the first slot of every particle's offspring, in the layout's order. It sees the

@@ -236,3 +236,21 @@ def test_one_component_that_is_not_due_keeps_its_particles_among_empty_slots(
     moved = draw(move, mixture)
     np.testing.assert_array_equal(moved.log_weights, mixture.log_weights)
     np.testing.assert_array_equal(moved.particles, mixture.particles)
+
+
+def test_soft_resampling_draws_from_the_softened_weights_and_weighs_by_the_ratio():
+    """w / q on offspring drawn from q = 0.7 w + 0.3 / k, within each of two components."""
+    labels = np.repeat([0, 1], [4, 6])
+    mixture = make_mixture(np.zeros((10, 1)), np.linspace(-4.0, 1.0, 10), labels, 2)
+    move = Resample("multinomial", gradient="soft", softness=0.3)
+    keys = jax.random.split(jax.random.key(0), 4000)
+    moved = jax.jit(jax.vmap(lambda key: move(key, mixture)))(keys)
+    weights = np.exp(np.asarray(mixture.log_component_weights))
+    softened = 0.7 * weights + 0.3 / np.repeat([4, 6], [4, 6])
+    drawn = np.bincount(np.asarray(moved.ancestor_indices).ravel(), minlength=10) / 4000
+    np.testing.assert_allclose(drawn, 5 * softened, atol=4 * np.sqrt(5 / 4000))
+    ratios = (weights / softened)[moved.ancestor_indices]
+    ours = np.asarray(moved.component_indicators) == 0
+    mass = float(mixture.mixture_weights[0])
+    expected = mass * ratios / (ratios * ours).sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(np.exp(moved.log_weights)[ours], expected[ours], rtol=1e-4)

@@ -1,0 +1,106 @@
+"""Maps between a parameter's domain and unconstrained numbers, in which optimisers step."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+class AbstractTransform(eqx.Module):
+    """A smooth bijection between the domain of a parameter and all real numbers."""
+
+    @abc.abstractmethod
+    def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The parameter, inside its domain whatever the real numbers are."""
+
+    @abc.abstractmethod
+    def unconstrain(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The real numbers that give this parameter."""
+
+    @abc.abstractmethod
+    def contains(self, value: Float[np.ndarray, "..."]) -> bool:
+        """Whether every entry lies inside the domain."""
+
+
+class Unconstrained(AbstractTransform):
+    """The parameter as it is."""
+
+    def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The same numbers."""
+        return reals
+
+    def unconstrain(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The same numbers."""
+        return value
+
+    def contains(self, value: Float[np.ndarray, "..."]) -> bool:
+        """Whether it is finite."""
+        return bool(np.isfinite(value).all())
+
+
+class Positive(AbstractTransform):
+    """exp: for scales, whose steps are then relative."""
+
+    def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
+        """exp u."""
+        return jnp.exp(reals)
+
+    def unconstrain(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """log x."""
+        return jnp.log(value)
+
+    def contains(self, value: Float[np.ndarray, "..."]) -> bool:
+        """Whether all entries are positive and finite."""
+        return bool((np.isfinite(value) & (value > 0)).all())
+
+
+class Interval(AbstractTransform):
+    """low + (high - low) sigmoid(u): for correlations, rates and single probabilities.
+
+    Raises `ValueError` for an empty interval.
+    """
+
+    low: float = eqx.field(static=True)
+    high: float = eqx.field(static=True)
+
+    def __check_init__(self) -> None:
+        if not self.low < self.high:
+            raise ValueError(f"high: {self.high} is not above low, {self.low}")
+
+    def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Between the ends."""
+        return self.low + (self.high - self.low) * jax.nn.sigmoid(reals)
+
+    def unconstrain(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The logit of where it lies between the ends."""
+        return jnp.log(value - self.low) - jnp.log(self.high - value)
+
+    def contains(self, value: Float[np.ndarray, "..."]) -> bool:
+        """Whether all entries lie strictly between the ends."""
+        return bool(((value > self.low) & (value < self.high)).all())
+
+
+class Simplex(AbstractTransform):
+    """Softmax along the last axis: for probabilities, and histograms, that sum to one.
+
+    The last logit is fixed at zero, so that k probabilities are k - 1 real numbers.
+    """
+
+    def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Positive entries that sum to one."""
+        last = jnp.zeros((*reals.shape[:-1], 1), reals.dtype)
+        return jax.nn.softmax(jnp.concatenate([reals, last], axis=-1), axis=-1)
+
+    def unconstrain(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Logits relative to the last entry's."""
+        logits = jnp.log(value)
+        return logits[..., :-1] - logits[..., -1:]
+
+    def contains(self, value: Float[np.ndarray, "..."]) -> bool:
+        """Whether all entries are positive and sum to one along the last axis."""
+        if np.ndim(value) == 0:
+            return False
+        return bool((value > 0).all() and np.allclose(np.sum(value, axis=-1), 1.0, atol=1e-4))

@@ -1,0 +1,66 @@
+"""The benchmark of gradients and of tuning does what its help says."""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks import likelihood_tuning as benchmark
+
+
+def test_scores_are_written_with_their_bias_and_cost(tmp_path, capsys):
+    arguments = [
+        "--parts",
+        "a",
+        "--runs",
+        "50",
+        "--particles",
+        "20",
+        "--estimators",
+        "none",
+        "stop",
+    ]
+    assert benchmark.main([*arguments, "--filters", "pf", "--out", str(tmp_path)]) == 0
+    written = json.loads((tmp_path / "scores.json").read_text())
+    cells = {(entry["model"], entry["estimator"]) for entry in written["results"]}
+    assert cells == {(m, e) for m in ("linear_gaussian", "quadratic") for e in ("none", "stop")}
+    for entry in written["results"]:
+        numbers = len(benchmark.MODELS[entry["model"]])
+        assert all(len(entry[key]) == numbers for key in ("exact", "bias", "deviation"))
+        assert entry["cost_in_runs"] > 0
+    assert "stop-gradient" in capsys.readouterr().out
+
+
+def test_exact_scores_are_those_of_differences():
+    both = benchmark.exact_quadratic(benchmark.COARSE_GRID)
+    point, step = np.log([0.12, 0.12]), 0.01
+    for axis, expected in enumerate(both(point)[1]):
+        offset = step * np.eye(2)[axis]
+        found = (both(point + offset)[0] - both(point - offset)[0]) / (2 * step)
+        assert found == pytest.approx(expected, rel=0.01, abs=0.2)
+
+
+def test_ends_are_compared_with_the_exact_maximum():
+    maximum = benchmark.Maximum(np.log([0.1, 0.2]), np.array([0.1, 0.2]))
+    entries = [
+        {"start": [0.3, 0.3], "relative_error": error, "end": [0.1, 0.2],
+         "standard_errors_over_exact": ratio}
+        for error, ratio in (([0.01, -0.02], [1.0, 1.1]), ([0.01, 0.05], None))
+    ]  # fmt: skip
+    table = benchmark.as_start_table(entries, maximum)
+    assert "1 of 2 end within 3%" in table
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--runs", "0"], "--runs"),
+        (["--starts", "0"], "--starts"),
+        (["--particles", "1"], "--particles"),
+        (["--estimators", "reinforce"], "--estimators"),
+    ],
+)
+def test_bad_options_are_refused_by_name(arguments, named, capsys):
+    with pytest.raises(SystemExit):
+        benchmark.main(arguments)
+    assert named in capsys.readouterr().err

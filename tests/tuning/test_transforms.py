@@ -1,0 +1,54 @@
+"""Transforms are bijections between a domain and all real numbers."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpfjax.tuning import Interval, Positive, Simplex, Unconstrained
+
+INSIDE = {
+    "positive": (Positive(), [0.01, 1.0, 300.0]),
+    "interval": (Interval(-1.0, 3.0), [-0.9, 0.0, 2.5]),
+    "simplex": (Simplex(), [[0.2, 0.3, 0.5], [0.001, 0.9, 0.099]]),
+    "unconstrained": (Unconstrained(), [-5.0, 0.0, 7.0]),
+}
+
+
+@pytest.mark.parametrize("name", INSIDE)
+def test_there_and_back(name):
+    transform, values = INSIDE[name]
+    assert transform.contains(np.array(values))
+    reals = transform.unconstrain(jnp.array(values))
+    assert np.isfinite(reals).all()
+    np.testing.assert_allclose(transform.constrain(reals), values, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", INSIDE)
+def test_every_real_number_is_a_parameter_inside(name):
+    transform, values = INSIDE[name]
+    reals = transform.unconstrain(jnp.array(values))
+    for shift in (-3.0, 0.0, 3.0):
+        assert transform.contains(np.asarray(transform.constrain(reals + shift)))
+
+
+@pytest.mark.parametrize(
+    ("transform", "value"),
+    [
+        (Positive(), [1.0, 0.0]),
+        (Positive(), [np.inf]),
+        (Positive(), [np.nan]),
+        (Interval(0.0, 1.0), [0.5, 1.0]),
+        (Interval(0.0, 1.0), [np.nan]),
+        (Simplex(), [0.5, 0.4]),
+        (Simplex(), [1.0, 0.0]),
+        (Simplex(), 1.0),
+        (Unconstrained(), [np.inf]),
+    ],
+)
+def test_what_lies_outside_is_known(transform, value):
+    assert not transform.contains(np.array(value))
+
+
+def test_an_empty_interval_is_refused():
+    with pytest.raises(ValueError, match=r"high: 1\.0"):
+        Interval(2.0, 1.0)
