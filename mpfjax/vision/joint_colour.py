@@ -111,6 +111,8 @@ def _sigma(lambda_: float, num_parts: int) -> float:
     """σ of exp(-(mean of d²) / 2σ²) for exp(-λ (sum of d²))."""
     if not 0 < lambda_ < float("inf"):
         raise ValueError(f"lambda_: {lambda_} is not positive")
+    if num_parts < 1:
+        raise ValueError(f"num_parts: {num_parts} is less than 1")
     return float((2 * lambda_ * num_parts) ** -0.5)
 
 
