@@ -48,7 +48,7 @@ class TestMaximum:
     def sequences(self):
         rng = np.random.default_rng(0)
         sequences = []
-        for length in (40, 25):
+        for length in (60, 40):
             state, rows = 0.5, []
             for _ in range(length):
                 state = 0.9 * state + 0.6 * rng.normal()
