@@ -79,6 +79,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--estimators", nargs="+", choices=list(ESTIMATORS), default=list(ESTIMATORS)
     )
+    parser.add_argument("--models", nargs="+", choices=list(MODELS), default=list(MODELS))
     parser.add_argument("--filters", nargs="+", choices=FILTERS, default=FILTERS)
     parser.add_argument("--starts", type=int, default=20, help="b: random starts")
     parser.add_argument("--steps", type=int, default=CLIMB_STEPS, help="b: of each climb")
@@ -110,7 +111,7 @@ def run_scores(options: argparse.Namespace, out: Path) -> None:
     tasks = {"linear_gaussian": linear_gaussian_task(), "quadratic": quadratic_task()}
     cells = [
         (model, filter, n, estimator)
-        for model in MODELS
+        for model in options.models
         for n in options.particles
         for filter in options.filters
         for estimator in options.estimators
@@ -200,6 +201,8 @@ def measure(
     score = compiled(jax.vmap(jax.grad(log_evidence), in_axes=(None, 0)), task.point, keys)
     run_time, _ = timed(run, task.point, keys)
     score_time, scores = timed(score, task.point, keys)
+    scores = scores.astype(float)
+    is_finite = bool(np.isfinite(scores).all())
     return {
         "model": model,
         "filter": filter,
@@ -207,9 +210,10 @@ def measure(
         "estimator": estimator,
         "runs": num_runs,
         "exact": task.exact.tolist(),
-        "bias": (scores.mean(axis=0) - task.exact).tolist(),
-        "standard_error": (scores.std(axis=0) / np.sqrt(num_runs)).tolist(),
-        "deviation": scores.std(axis=0).tolist(),
+        "finite_runs": int(np.isfinite(scores).all(axis=1).sum()),
+        "bias": (scores.mean(axis=0) - task.exact).tolist() if is_finite else None,
+        "standard_error": (scores.std(axis=0) / np.sqrt(num_runs)).tolist() if is_finite else None,
+        "deviation": scores.std(axis=0).tolist() if is_finite else None,
         "milliseconds": 1000 * score_time / num_runs,
         "cost_in_runs": score_time / run_time,
     }
@@ -240,28 +244,31 @@ def as_score_table(results: list[dict[str, Any]]) -> str:
     blocks = []
     for model, names in MODELS.items():
         entries = [entry for entry in results if entry["model"] == model]
-        exact = entries[0]["exact"]
-        header = ["estimator", "filter", "N"]
-        header += [f"{name} ({value:.1f})" for name, value in zip(names, exact, strict=True)]
-        rows = [
-            [
-                ESTIMATORS[entry["estimator"]],
-                entry["filter"],
-                str(entry["particles"]),
-                *(
-                    f"{bias:+.2f} ± {error:.2f} ({deviation:.1f})"
-                    for bias, error, deviation in zip(
-                        entry["bias"], entry["standard_error"], entry["deviation"], strict=True
-                    )
-                ),
-                f"{entry['milliseconds']:.1f}",
-                f"{entry['cost_in_runs']:.1f}",
-            ]
-            for entry in entries
-        ]
-        title = f"{model}: bias ± standard error (deviation of one run) of the score, exact in ()"
-        blocks.append(f"{title}\n{format_table([*header, 'ms', 'runs'], rows)}")
+        if entries:
+            exact = zip(names, entries[0]["exact"], strict=True)
+            header = ["estimator", "filter", "N", *(f"{name} ({x:.1f})" for name, x in exact)]
+            rows = [as_score_row(entry) for entry in entries]
+            title = (
+                f"{model}: bias ± standard error (deviation of one run) of the score, exact in ()"
+            )
+            blocks.append(f"{title}\n{format_table([*header, 'ms', 'runs'], rows)}")
     return "\n\n".join(blocks)
+
+
+def as_score_row(entry: dict[str, Any]) -> list[str]:
+    """One estimator of one filter; words where its derivatives overflowed."""
+    numbers = [f"overflows in {entry['runs'] - entry['finite_runs']} runs"] * len(entry["exact"])
+    if entry["bias"] is not None:
+        parts = zip(entry["bias"], entry["standard_error"], entry["deviation"], strict=True)
+        numbers = [f"{bias:+.2f} ± {error:.2f} ({spread:.1f})" for bias, error, spread in parts]
+    return [
+        ESTIMATORS[entry["estimator"]],
+        entry["filter"],
+        str(entry["particles"]),
+        *numbers,
+        f"{entry['milliseconds']:.1f}",
+        f"{entry['cost_in_runs']:.1f}",
+    ]
 
 
 # Part b.

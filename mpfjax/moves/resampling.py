@@ -66,6 +66,7 @@ class Resample(AbstractRejuvenation):
           Differentiable throughout, O(n²), and biased in value and gradient by the entropy.
         - "straight_through": resampling in value; the derivative is that of particles moved by
           Σ_j w_j ⊥x_j, as if every offspring were the component's mean (Bengio et al. 2013).
+          Biased, and it may grow exponentially with t, as on the quadratic model.
       The masses of components carry their derivative in all of them. Component indicators are
       whole numbers and have none: what a parameter does to the grouping is not seen, which is
       no error, since regrouping does not change the distribution.

@@ -73,29 +73,29 @@ class TestMaximum:
         exact_error = np.sqrt(np.diag(np.linalg.inv(-np.asarray(hessian))))
         run = fit(
             jax.random.key(1),
-            mpfjax.particle_filter(ScalarLinear(a=0.3, r=1.5), 400, gradient="stop"),
+            mpfjax.particle_filter(ScalarLinear(a=0.3, r=1.5), 200, gradient="stop"),
             sequences,
-            optax.adam(optax.cosine_decay_schedule(0.2, 80), b2=0.9),
-            80,
+            optax.adam(optax.cosine_decay_schedule(0.2, 60), b2=0.9),
+            60,
             parameters={n: lambda filter, n=n: getattr(filter.model, n) for n in self.NAMES},
             transforms={"a": Interval(-1.0, 1.0), "r": Positive()},
-            num_seeds=16,
-            curvature_seeds=64,
+            num_seeds=8,
+            curvature_seeds=32,
             progress=False,
         )
         a, r = 2 / (1 + np.exp(-best[0])) - 1, np.exp(best[1])
-        # Within a third of a standard error, which the seeds of the last steps leave.
+        # Within half a standard error, which the seeds of the last steps leave.
         slope = np.array([(1 - a**2) / 2, r])
         found = np.array([run.parameters["a"], run.parameters["r"]])
-        assert (np.abs(found - [a, r]) < 0.3 * slope * exact_error).all()
+        assert (np.abs(found - [a, r]) < 0.5 * slope * exact_error).all()
         assert run.standard_errors is not None
         errors = np.array([run.standard_errors["a"], run.standard_errors["r"]])
-        np.testing.assert_allclose(errors, slope * exact_error, rtol=0.15)
+        np.testing.assert_allclose(errors, slope * exact_error, rtol=0.2)
         expected = float(self.log_evidence(jnp.asarray(best, jnp.float32), sequences))
         assert run.log_marginal_likelihood == pytest.approx(expected, abs=1.0)
         assert run.stopped is None
         assert float(run.filter.model.r) == pytest.approx(float(run.parameters["r"]))
-        assert run.history["r"].shape == (80,)
+        assert run.history["r"].shape == (60,)
         assert run.history["r"][0] == pytest.approx(1.5)
 
     def test_away_from_one_there_are_no_standard_errors(self):
