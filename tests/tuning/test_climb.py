@@ -75,7 +75,7 @@ class TestMaximum:
             jax.random.key(1),
             mpfjax.particle_filter(ScalarLinear(a=0.3, r=1.5), 200, gradient="stop"),
             sequences,
-            optax.adam(optax.cosine_decay_schedule(0.2, 60), b2=0.9),
+            optax.sgd(optax.cosine_decay_schedule(0.03, 60)),
             60,
             parameters={n: lambda filter, n=n: getattr(filter.model, n) for n in self.NAMES},
             transforms={"a": Interval(-1.0, 1.0), "r": Positive()},
@@ -84,10 +84,10 @@ class TestMaximum:
             progress=False,
         )
         a, r = 2 / (1 + np.exp(-best[0])) - 1, np.exp(best[1])
-        # Within half a standard error, which the seeds of the last steps leave.
+        # Within a third of a standard error, which the seeds of the last steps leave.
         slope = np.array([(1 - a**2) / 2, r])
         found = np.array([run.parameters["a"], run.parameters["r"]])
-        assert (np.abs(found - [a, r]) < 0.5 * slope * exact_error).all()
+        assert (np.abs(found - [a, r]) < 0.3 * slope * exact_error).all()
         assert run.standard_errors is not None
         errors = np.array([run.standard_errors["a"], run.standard_errors["r"]])
         np.testing.assert_allclose(errors, slope * exact_error, rtol=0.2)
