@@ -5,6 +5,7 @@ from mpfjax import metrics as metrics
 from mpfjax.filters import Filter as Filter
 from mpfjax.filters import FilterRun as FilterRun
 from mpfjax.filters import StepInfo as StepInfo
+from mpfjax.filters import clustered_particle_filter as clustered_particle_filter
 from mpfjax.filters import distributed_partitioned_sampling as distributed_partitioned_sampling
 from mpfjax.filters import gaussian_mixture_particle_filter as gaussian_mixture_particle_filter
 from mpfjax.filters import gaussian_particle_filter as gaussian_particle_filter
@@ -37,6 +38,7 @@ from mpfjax.moves import Partitioned as Partitioned
 from mpfjax.moves import Pool as Pool
 from mpfjax.moves import Predict as Predict
 from mpfjax.moves import Propagate as Propagate
+from mpfjax.moves import PropagateInClusters as PropagateInClusters
 from mpfjax.moves import PropagateIndependently as PropagateIndependently
 from mpfjax.moves import RandomPartition as RandomPartition
 from mpfjax.moves import Resample as Resample

@@ -14,6 +14,7 @@ from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
+from mpfjax.moves.clusters import PropagateInClusters
 from mpfjax.moves.gaussian import GaussianRegeneration
 from mpfjax.moves.independent import PropagateIndependently
 from mpfjax.moves.partitioned import Partitioned, check_orders
@@ -134,7 +135,7 @@ class Filter(eqx.Module):
                     f" {self.num_particles}"
                 )
         memory = {}
-        for move in self._moves:
+        for move in self.moves:
             if isinstance(move, AbstractMove):
                 memory |= move.initial_memory(self.num_components)
         mixture = single_component(particles, self.num_components).replace(memory=memory)
@@ -461,6 +462,33 @@ def independent_particle_filters(
     """
     require_multi_object(model, "independent_particle_filters")
     return Filter(model, moves=[PropagateIndependently(model, scheme)], num_particles=num_particles)
+
+
+def clustered_particle_filter(
+    model: MultiObjectModel,
+    num_particles: int,
+    *,
+    inside: str = "crossing",
+    start: str = "apart",
+    split_after: int | None = None,
+    scheme: str = "systematic",
+) -> Filter:
+    """A joint filter of clusters of objects, each on its own until it meets another.
+
+    Every object starts with a particle filter of its own. Where the clouds of two meet, that
+    is, where the interaction ψ between any of their points is not 1, they become one joint
+    filter, weighted by ψ, in which objects still cross between rows. It is
+    `independent_particle_filters` where nothing interacts, and unbiased where something does,
+    at the N x J likelihood evaluations a step of partitioned sampling. The derivation and the
+    options are those of `PropagateInClusters`.
+
+    Use it in place of a joint filter, PS or DPS wherever ψ has compact support, as that of
+    `PairwiseRepulsion` has; with a ψ that never ends all objects become one cluster at once.
+    Estimates are after resampling. A cluster's distribution may have several modes, such as
+    look-alikes in either order, and their mean is then nobody's place: take a median.
+    """
+    move = PropagateInClusters(model, inside, start, split_after, scheme)
+    return Filter(model, moves=[move], num_particles=num_particles)
 
 
 def _mixture_filter(
