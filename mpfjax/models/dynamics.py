@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from mpfjax.models.base import require_positive
-from mpfjax.operations import cholesky, solve_lower
+from mpfjax.operations import cholesky, row_sums, solve_lower
 
 
 class AbstractDynamics(eqx.Module):
@@ -97,7 +97,7 @@ class RandomWalk(AbstractDynamics):
         del previous
         deviations = jnp.broadcast_to(self.deviations, current.shape)
         noise = (following - current) / deviations
-        return _log_standard_normal(noise) - jnp.sum(jnp.log(deviations), axis=1)
+        return _log_standard_normal(noise) - row_sums(jnp.log(deviations))
 
     def moments(
         self, current: Float[Array, "n d"], previous: Float[Array, "n d"] | None = None
@@ -200,4 +200,4 @@ def _times(matrices: Float[Array, "*n d d"], vectors: Float[Array, "n d"]) -> Fl
 
 
 def _log_standard_normal(noise: Float[Array, "n d"]) -> Float[Array, " n"]:
-    return jnp.sum(-0.5 * noise**2 - 0.5 * jnp.log(2 * jnp.pi), axis=1)
+    return row_sums(-0.5 * noise**2 - 0.5 * jnp.log(2 * jnp.pi))

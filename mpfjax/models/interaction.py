@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, PyTree
 
 from mpfjax.mixture import flatten_states
 from mpfjax.models.base import require_positive
+from mpfjax.operations import row_sums
 
 
 class PairwiseRepulsion(eqx.Module):
@@ -39,7 +40,7 @@ class PairwiseRepulsion(eqx.Module):
     def __call__(self, states: PyTree, other_states: PyTree) -> Float[Array, " n"]:
         """log ψ of each row of the states with the same row of the other states."""
         gaps = self._positions(states) - self._positions(other_states)
-        squares = jnp.sum((gaps / self.radius.astype(gaps.dtype)) ** 2, axis=1)
+        squares = row_sums((gaps / self.radius.astype(gaps.dtype)) ** 2)
         nearness = jnp.maximum(1 - squares, 0.0) ** 2 if self.compact else jnp.exp(-squares / 2)
         return -self.strength.astype(gaps.dtype) * nearness
 

@@ -14,7 +14,7 @@ from mpfjax.models.base import require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling import Resample
-from mpfjax.operations import default_float, prefix_sum, take
+from mpfjax.operations import default_float, draw_columns, take
 
 INSIDES = ("crossing", "partitioned")
 STARTS = ("apart", "together")
@@ -468,16 +468,11 @@ def _draw_columns(
     Each line's uniform number is uniform on its own; all of them together are spread evenly, so
     that lines that are equal draw evenly.
     """
-    num = log_table.shape[1]
     key_order, key_shift = jax.random.split(key)
     places = jax.random.permutation(key_order, log_table.shape[0]).astype(log_table.dtype)
     uniform = (places + jax.random.uniform(key_shift, places.shape, places.dtype)) / len(places)
-    uniform = jnp.minimum(uniform, 1 - 2 * jnp.finfo(uniform.dtype).eps)
-    shift = _finite_max(log_table)
-    upto = jax.vmap(prefix_sum)(jnp.exp(jax.lax.stop_gradient(log_table) - shift[:, None]))
-    passed = upto <= (uniform * upto[:, -1])[:, None]
-    picked = jnp.minimum(jnp.sum(passed, axis=1, dtype=jnp.int32), num - 1)
-    return picked, _log_sums(log_table)
+    weights = jnp.exp(jax.lax.stop_gradient(log_table) - _finite_max(log_table)[:, None])
+    return draw_columns(uniform, weights), _log_sums(log_table)
 
 
 def _log_sums(log_table: Float[Array, "k n"]) -> Float[Array, " k"]:
