@@ -152,4 +152,15 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "independent filters": _joint(
         lambda joint: mpfjax.independent_particle_filters(joint, NUM_PARTICLES)
     ),
+    "clusters": _joint(
+        lambda joint: mpfjax.clustered_particle_filter(joint, NUM_PARTICLES, scheme="stratified")
+    ),
+    "objects that cross in one cluster": _joint(
+        lambda joint: mpfjax.clustered_particle_filter(joint, NUM_PARTICLES, start="together")
+    ),
+    "partitioned in one cluster": _joint(
+        lambda joint: mpfjax.clustered_particle_filter(
+            joint, NUM_PARTICLES, inside="partitioned", start="together"
+        )
+    ),
 }

@@ -276,12 +276,13 @@ class PropagateInClusters(AbstractPropagation):
     ) -> tuple[PyTree, Float[Array, ""], dict[str, Array]]:
         """The rows of the merged clusters, log of their factor of Ẑ, and the new memory."""
         labels, steps_apart = memory["labels"], memory["steps_apart"]
-        if self.model.interaction is None:
-            return particles, jnp.zeros((), default_float()), memory
         touching = self._touching(particles, labels)
         if self.split_after is not None:
             steps_apart = jnp.where(touching, 0, steps_apart + 1)
             labels = _components(_together(labels) & (steps_apart < self.split_after))
+        if self.model.interaction is None:
+            log_growth = jnp.zeros((), default_float())
+            return particles, log_growth, {"labels": labels, "steps_apart": steps_apart}
         merged = _components(_together(labels) | touching)
         particles, log_growth = jax.lax.cond(
             jnp.any(merged != labels),
@@ -298,6 +299,8 @@ class PropagateInClusters(AbstractPropagation):
         Within a cluster that never splits nobody asks.
         """
         num_objects = self.model.num_objects
+        if self.model.interaction is None:
+            return jnp.zeros((num_objects, num_objects), bool)
         first, second = np.triu_indices(num_objects, 1)
 
         def touch(carry: None, pair: tuple) -> tuple[None, Bool[Array, ""]]:
