@@ -87,8 +87,9 @@ class Blob(mpfjax.AbstractStateSpaceModel):
 
     def log_likelihood(self, observation, states):
         bumps = jax.vmap(
-            lambda place, height: height
-            * jnp.exp(-0.5 * squares(states["now"] - place[None]) / REACH**2)
+            lambda place, height: (
+                height * jnp.exp(-0.5 * squares(states["now"] - place[None]) / REACH**2)
+            )
         )(observation["places"], observation["heights"])
         return -SHARPNESS * (1 - jnp.max(bumps, axis=0))
 

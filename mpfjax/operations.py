@@ -67,9 +67,7 @@ def row_sums(values: Float[Array, "n d"]) -> Float[Array, " n"]:
     return total
 
 
-def draw_columns(
-    uniform: Float[Array, " k"], weights: Float[Array, "k n"]
-) -> Int[Array, " k"]:
+def draw_columns(uniform: Float[Array, " k"], weights: Float[Array, "k n"]) -> Int[Array, " k"]:
     """The column of each row that holds the given quantile, in [0, 1), of the row's weights.
 
     A column of weight zero is not drawn, unless the whole row is zero: its last column then is.

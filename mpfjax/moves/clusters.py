@@ -18,6 +18,7 @@ from mpfjax.operations import default_float, draw_columns, take
 
 INSIDES = ("crossing", "partitioned")
 STARTS = ("apart", "together")
+_GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 class PropagateInClusters(AbstractPropagation):
@@ -46,11 +47,11 @@ class PropagateInClusters(AbstractPropagation):
         b_rjl = L_j(x^{jl}) f_j(x^{jl} | row r) / Σ_r' f_j(x^{jl} | row r').
 
     The update of a row is Σ b_r1l b_r2m ... ψ(x^{1l}, x^{2m}) ... over all combinations of
-    points. N rows are drawn ∝ Π_j Σ_l b_rjl; then for each its objects' points, in an order
-    that is random at every step, ∝ b times ψ with the points already chosen, the row's weight
-    multiplied by Σ b ψ / Σ b; then the rows are resampled. What a row loses by the evidence of
-    one object costs another object no hypotheses. `inside="partitioned"` is partitioned
-    sampling within the cluster, in random order, for a model without a transition density.
+    points. N rows are drawn ∝ Π_j Σ_l b_rjl; then for each its objects' points, round from a
+    random object on, ∝ b times ψ with the points already chosen, the row's weight multiplied by
+    Σ b ψ / Σ b; then the rows are resampled. What a row loses by the evidence of one object
+    costs another object no hypotheses. `inside="partitioned"` is partitioned
+    sampling within the cluster, from a random object on, for a model without a transition density.
 
     - `start`: every object "apart", or all "together" in one cluster from the start; "together"
       with crossing is shared-proposal crossing alone.
@@ -61,7 +62,7 @@ class PropagateInClusters(AbstractPropagation):
 
     Cost: J x N likelihoods a step, J(J-1) N² / 2 potentials to find contact, and N² J
     transition densities inside clusters that cross. Particle i holds row i of every cluster,
-    the clusters in random order of rows, all with equal weight; the particles that the move is
+    turned by a random number of places, all with equal weight; the particles that the move is
     given must be so, as those of x_0 and its own are. A row has no single ancestor, and is its
     own. The clusters are in `memory["clusters"]["labels"]`, (J,): the first object of each
     object's cluster.
@@ -84,7 +85,10 @@ class PropagateInClusters(AbstractPropagation):
     def __check_init__(self) -> None:
         require_multi_object(self.model, "PropagateInClusters")
         Resample(self.scheme)  # raises where there is no such scheme
-        for name, value, choices in (("inside", self.inside, INSIDES), ("start", self.start, STARTS)):
+        for name, value, choices in (
+            ("inside", self.inside, INSIDES),
+            ("start", self.start, STARTS),
+        ):
             if value not in choices:
                 raise ValueError(f"{name}: {value!r} is not one of {choices}")
         if self.split_after is not None and self.split_after < 1:
@@ -123,7 +127,7 @@ class PropagateInClusters(AbstractPropagation):
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = jax.random.split(key, 2 * num_objects + 3)
         keys_objects, keys_rows = keys[:num_objects], keys[num_objects : 2 * num_objects]
-        key_inside, key_merge, key_shuffle = keys[2 * num_objects :]
+        key_inside, key_merge, key_shift = keys[2 * num_objects :]
         seen = self.model.prepare_observation(observation)
         memory = mixture.memory["clusters"]
         labels = memory["labels"]
@@ -134,7 +138,7 @@ class PropagateInClusters(AbstractPropagation):
         if self._may_be_joint:
             particles, log_gain, memory = self._merged(key_merge, particles, memory)
             log_growth += log_gain
-        particles = _shuffled(key_shuffle, particles, memory["labels"])
+        particles = _shifted(key_shift, particles, memory["labels"])
         moved = mixture.replace(
             particles=particles,
             log_weights=mixture.log_weights + log_growth.astype(mixture.log_weights.dtype),
@@ -180,7 +184,7 @@ class PropagateInClusters(AbstractPropagation):
         log_scores = jnp.sum(jnp.where(together[:, :, None], log_sums[None], 0.0), axis=1)
         rows, log_growths = self._resampled(keys_rows, labels, log_scores)
         key_order, key_points, key_rows = jax.random.split(key_inside, 3)
-        order = jax.random.permutation(key_order, objects)
+        order = _rotated(key_order, objects)
 
         def choose(carry: tuple, inputs: tuple) -> tuple[tuple, None]:
             chosen, log_weights, has_moved = carry
@@ -249,7 +253,7 @@ class PropagateInClusters(AbstractPropagation):
         keys_objects, keys_rows, key_inside = keys
         objects = jnp.arange(self.model.num_objects, dtype=jnp.int32)
         together = _together(labels)
-        order = jax.random.permutation(key_inside, objects)
+        order = _rotated(key_inside, objects)
 
         def stage(carry: tuple, j: Int[Array, ""]) -> tuple[tuple, Float[Array, ""]]:
             particles, has_moved = carry
@@ -329,7 +333,7 @@ class PropagateInClusters(AbstractPropagation):
         num_objects = self.model.num_objects
         num_particles = jax.tree.leaves(particles)[0].shape[0]
         keys = jax.random.split(key, 2 * num_objects)
-        order = jnp.argsort(labels).astype(jnp.int32)  # a cluster's objects side by side
+        order = _side_by_side(labels)
         is_last = jnp.concatenate([jnp.diff(take(labels, order)) != 0, jnp.ones(1, bool)])
         table = jnp.zeros((num_particles, num_particles), default_float())
 
@@ -344,9 +348,7 @@ class PropagateInClusters(AbstractPropagation):
                 rows, log_sums = _draw_columns(key, log_psi)
                 own = jnp.arange(num_particles, dtype=jnp.int32)
                 members = labels == labels[j]
-                dealt = _rows_of_each(
-                    particles, jnp.where(members[:, None], rows[None], own[None])
-                )
+                dealt = _rows_of_each(particles, jnp.where(members[:, None], rows[None], own[None]))
                 log_gain = log_sums - jnp.log(jnp.asarray(num_particles, log_sums.dtype))
                 gains = jnp.where((merged == merged[j])[:, None], log_gain[None], 0.0)
                 return dealt, log_weights + gains, table
@@ -468,12 +470,12 @@ def _draw_columns(
 ) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
     """A column of each line, drawn in proportion to its entries, and log of the line's sum.
 
-    Each line's uniform number is uniform on its own; all of them together are spread evenly, so
-    that lines that are equal draw evenly.
+    One shift is drawn for all lines, whose quantiles follow each other in golden strides: each is
+    uniform, and any stretch of lines that are equal draws evenly.
     """
-    key_order, key_shift = jax.random.split(key)
-    places = jax.random.permutation(key_order, log_table.shape[0]).astype(log_table.dtype)
-    uniform = (places + jax.random.uniform(key_shift, places.shape, places.dtype)) / len(places)
+    strides = _GOLDEN * np.arange(log_table.shape[0])
+    shift = jax.random.uniform(key, (), log_table.dtype)
+    uniform = (jnp.asarray(strides % 1, log_table.dtype) + shift) % 1
     weights = jnp.exp(jax.lax.stop_gradient(log_table) - _finite_max(log_table)[:, None])
     return draw_columns(uniform, weights), _log_sums(log_table)
 
@@ -497,12 +499,28 @@ def _rows_of_each(particles: PyTree, rows: Int[Array, "objects n"]) -> PyTree:
     return jax.tree.map(lambda leaf: gather(leaf, rows), particles)
 
 
-def _shuffled(key: Key[Array, ""], particles: PyTree, labels: Int[Array, " objects"]) -> PyTree:
-    """The rows of every cluster in random order, so that a row is a draw of the product."""
-    num_particles = jax.tree.leaves(particles)[0].shape[0]
+def _shifted(key: Key[Array, ""], particles: PyTree, labels: Int[Array, " objects"]) -> PyTree:
+    """The rows of every cluster turned by a random number of places.
+
+    Row i is then a draw of the product of the clouds: any two rows of two clusters meet in it
+    with the same probability.
+    """
+    places = jnp.arange(jax.tree.leaves(particles)[0].shape[0], dtype=jnp.int32)
     keys = take(jax.random.split(key, len(labels)), labels)
-    shuffle = lambda key: jax.random.permutation(key, num_particles).astype(jnp.int32)  # noqa: E731
-    return _rows_of_each(particles, jax.vmap(shuffle)(keys))
+    return _rows_of_each(particles, jax.vmap(_rotated, in_axes=(0, None))(keys, places))
+
+
+def _rotated(key: Key[Array, ""], indices: Int[Array, " k"]) -> Int[Array, " k"]:
+    """The numbers 0, ..., k-1 from a random one on, and round."""
+    return (indices + jax.random.randint(key, (), 0, len(indices), indices.dtype)) % len(indices)
+
+
+def _side_by_side(labels: Int[Array, " objects"]) -> Int[Array, " objects"]:
+    """The objects in ascending order of their labels; counted, since sorts compile slowly."""
+    objects = jnp.arange(len(labels), dtype=jnp.int32)
+    earlier = _together(labels) & (objects[None] < objects[:, None])
+    before = jnp.sum((labels[None] < labels[:, None]) | earlier, axis=1, dtype=jnp.int32)
+    return jnp.zeros_like(objects).at[before].set(objects, unique_indices=True)
 
 
 def _together(labels: Int[Array, " objects"]) -> Bool[Array, "objects objects"]:

@@ -14,7 +14,7 @@ from mpfjax.exact import kalman_filter
 from mpfjax.moves.clusters import _components
 
 KEY = jax.random.key(0)
-NUM_RUNS = 1200
+NUM_RUNS = 600
 
 
 def walker(mean=0.0, noise=0.5):
@@ -28,10 +28,10 @@ def stack(models):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
 
 
-MEANS, NOISES = (0.0, 2.0, -2.5), (0.5, 0.8, 1.0)
+MEANS, NOISES = (-0.5, 4.0, -2.5), (0.5, 0.8, 1.0)
 OBJECTS = [walker(mean, noise) for mean, noise in zip(MEANS, NOISES, strict=True)]
 OBSERVATIONS = jnp.array(
-    [[[0.5], [1.2], [-2.5]], [[1.0], [0.7], [-1.5]], [[1.2], [0.9], [-1.2]]]
+    [[[0.2], [3.0], [-2.5]], [[1.0], [1.5], [-1.5]], [[1.2], [1.2], [-1.2]]]
 )  # fmt: skip
 APART = MultiObjectModel(stack(OBJECTS), 3)
 STRENGTH, RADIUS = 3.0, 0.8
@@ -60,7 +60,7 @@ def assert_unbiased(log_estimates, means, log_evidence, exact_means):
     """E[Ẑ/Z] = 1 and E[Ẑ/Z x̂] = E[x | y] within 4 standard errors."""
     ratios = np.exp(np.asarray(log_estimates, float) - log_evidence)
     error = ratios.std() / np.sqrt(len(ratios))
-    assert error < 0.02
+    assert error < 0.03
     assert abs(ratios.mean() - 1) < 4 * error
     weighted = ratios[:, None] * np.asarray(means)
     z = (weighted.mean(axis=0) - exact_means) / (weighted.std(axis=0) / np.sqrt(len(ratios)))
