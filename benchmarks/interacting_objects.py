@@ -247,8 +247,14 @@ def dps(reassembly: str) -> Callable[..., mpfjax.Filter]:
     return lambda model, n: mpfjax.distributed_partitioned_sampling(model, n, None, reassembly)
 
 
-def clusters(inside: str, start: str) -> Callable[..., mpfjax.Filter]:
-    return lambda model, n: mpfjax.clustered_particle_filter(model, n, inside=inside, start=start)
+def crossing(model: mpfjax.MultiObjectModel, num_particles: int) -> mpfjax.Filter:
+    """Shared-proposal crossing of all objects in one cluster."""
+    return mpfjax.clustered_particle_filter(model, num_particles, start="together")
+
+
+def splitting(model: mpfjax.MultiObjectModel, num_particles: int) -> mpfjax.Filter:
+    """Clusters that part after five steps without contact, an approximation."""
+    return mpfjax.clustered_particle_filter(model, num_particles, split_after=5)
 
 
 METHODS: dict[str, tuple[str, Callable[..., mpfjax.Filter]]] = {
@@ -257,11 +263,11 @@ METHODS: dict[str, tuple[str, Callable[..., mpfjax.Filter]]] = {
     "dps_prior": ("DPS, prior", dps("prior")),
     "dps_evidence": ("DPS, evidence", dps("evidence")),
     "independent": ("independent", mpfjax.independent_particle_filters),
-    "crossing": ("SPX", clusters("crossing", "together")),
-    "clusters_ps": ("clusters, PS inside", clusters("partitioned", "apart")),
-    "clusters": ("clusters, SPX inside", clusters("crossing", "apart")),
+    "crossing": ("one cluster", crossing),
+    "clusters": ("clusters", mpfjax.clustered_particle_filter),
+    "splitting": ("clusters that split", splitting),
 }
-ONE_BY_ONE = ("crossing", "clusters_ps", "clusters")
+ONE_BY_ONE = ("crossing", "clusters", "splitting")
 ESTIMATES = ("median", "mean")
 
 

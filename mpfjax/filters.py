@@ -468,7 +468,6 @@ def clustered_particle_filter(
     model: MultiObjectModel,
     num_particles: int,
     *,
-    inside: str = "crossing",
     start: str = "apart",
     split_after: int | None = None,
     scheme: str = "systematic",
@@ -487,7 +486,7 @@ def clustered_particle_filter(
     Estimates are after resampling. A cluster's distribution may have several modes, such as
     look-alikes in either order, and their mean is then nobody's place: take a median.
     """
-    move = PropagateInClusters(model, inside, start, split_after, scheme)
+    move = PropagateInClusters(model, start, split_after, scheme)
     return Filter(model, moves=[move], num_particles=num_particles)
 
 

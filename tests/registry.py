@@ -158,9 +158,4 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "objects that cross in one cluster": _joint(
         lambda joint: mpfjax.clustered_particle_filter(joint, NUM_PARTICLES, start="together")
     ),
-    "partitioned in one cluster": _joint(
-        lambda joint: mpfjax.clustered_particle_filter(
-            joint, NUM_PARTICLES, inside="partitioned", start="together"
-        )
-    ),
 }
