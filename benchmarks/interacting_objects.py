@@ -134,18 +134,18 @@ def jump(key: Key[Array, ""], path: Float[Array, "t 2"]) -> Float[Array, "t 2"]:
     angle = jax.random.uniform(key, (), maxval=2 * jnp.pi)
     away = JUMP * jnp.array([jnp.cos(angle), jnp.sin(angle)])
     last, back = LOST.start - 1, LOST.stop
-    share = jnp.clip((jnp.arange(NUM_FRAMES) - last) / (back - last), 0.0, 1.0)
+    share = jnp.clip((jnp.arange(float(NUM_FRAMES)) - last) / (back - last), 0.0, 1.0)
     hidden = path[last][None] + share[:, None] * away[None]
     after = path[last] + away - path[back]
-    moved = jnp.where((jnp.arange(NUM_FRAMES) >= back)[:, None], path + after[None], hidden)
-    return jnp.where((jnp.arange(NUM_FRAMES) <= last)[:, None], path, moved)
+    moved = jnp.where((jnp.arange(float(NUM_FRAMES)) >= back)[:, None], path + after[None], hidden)
+    return jnp.where((jnp.arange(float(NUM_FRAMES)) <= last)[:, None], path, moved)
 
 
 def cross(key: Key[Array, ""], centre: Float[Array, "2"]) -> Float[Array, "t 2 2"]:
     """Two objects that come from two sides, linger side by side, and pass each other."""
     key_angle, key_noise = jax.random.split(key)
     angle = jax.random.uniform(key_angle, (), maxval=2 * jnp.pi)
-    u = (jnp.arange(NUM_FRAMES) - (NUM_FRAMES - 1) / 2) / ((NUM_FRAMES - 1) / 2)
+    u = (jnp.arange(float(NUM_FRAMES)) - (NUM_FRAMES - 1) / 2) / ((NUM_FRAMES - 1) / 2)
     along, aside = PASSING[0] * u**3, jnp.full(NUM_FRAMES, PASSING[1])
     turned = jnp.stack(
         [
@@ -166,7 +166,7 @@ def look(
 ) -> Scene:
     """What each object's likelihood sees: the bumps of all that look like it, and how much."""
     num_objects = places.shape[1]
-    heights = jnp.asarray(alike, jnp.float32)[None] * visible[:, None, :]
+    heights = jnp.where(visible[:, None, :], jnp.asarray(alike, jnp.float32)[None], 0.0)
     there = jnp.zeros((NUM_FRAMES, num_objects, 1))
     extra = jnp.zeros((NUM_FRAMES, 1, 2))
     if distracter is not None:
@@ -194,7 +194,7 @@ def everything_visible(num_objects: int) -> Bool[Array, "t objects"]:
 def missed(key: Key[Array, ""], num_objects: int) -> Bool[Array, "t objects"]:
     """Who is seen when, with detections that fail now and then, but for the first frames."""
     visible = jax.random.bernoulli(key, 1 - MISSED, (NUM_FRAMES, num_objects))
-    return visible | (jnp.arange(NUM_FRAMES) < 3)[:, None]
+    return visible | (jnp.arange(float(NUM_FRAMES)) < 3)[:, None]
 
 
 def lost_object(key: Key[Array, ""]) -> Scene:
@@ -208,7 +208,7 @@ def distracted_object(key: Key[Array, ""]) -> Scene:
     key_paths, key_angle = jax.random.split(key)
     places = wander(key_paths, grid(7, 120.0))
     angle = jax.random.uniform(key_angle, (), maxval=2 * jnp.pi)
-    away = LEAD * (jnp.arange(NUM_FRAMES) - DISTRACTED.start)
+    away = LEAD * (jnp.arange(float(NUM_FRAMES)) - DISTRACTED.start)
     direction = jnp.array([jnp.cos(angle), jnp.sin(angle)])
     distracter = places[DISTRACTED.start, 0][None] + away[:, None] * direction[None]
     visible = everything_visible(7).at[DISTRACTED.start, 0].set(False)
@@ -237,6 +237,7 @@ SCENES = {
     "b": Setting("one of seven led away by a distracter", 7, 300, (0,), distracted_object),
     "c": Setting("two pairs of look-alikes cross", 4, 200, (0, 1, 2, 3), crossing_pairs),
     "d": Setting("one pair, one easy, one unseen", 4, 200, (0, 1, 2, 3), pair_and_lost),
+    "e": Setting("as c, with half the particles", 4, 100, (0, 1, 2, 3), crossing_pairs),
 }
 
 

@@ -174,3 +174,36 @@ def test_solve_lower_is_numpys():
     shared = operations.solve_lower(jnp.asarray(factors[:1]), jnp.asarray(vectors))
     expected = np.linalg.solve(factors[0], vectors.T).T
     np.testing.assert_allclose(shared, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("columns", [1, 2, 16, 17, 40])
+def test_row_sums(columns):
+    values = np.random.default_rng(0).normal(size=(9, columns)).astype(np.float32)
+    np.testing.assert_allclose(
+        operations.row_sums(jnp.asarray(values)), values.sum(axis=1), atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("columns", [1, 2, 7, 16, 50])
+def test_draw_columns_finds_the_column_of_each_quantile(columns):
+    rng = np.random.default_rng(columns)
+    weights = rng.exponential(size=(200, columns)) * (rng.random((200, columns)) < 0.6)
+    weights[np.arange(200), rng.integers(0, columns, 200)] += 0.1
+    uniform = rng.random(200)
+    drawn = np.asarray(
+        operations.draw_columns(*(jnp.asarray(a, jnp.float32) for a in (uniform, weights)))
+    )
+    upto = np.cumsum(weights, axis=1)
+    rows = np.arange(200)
+    target = uniform * upto[:, -1]
+    assert (target <= upto[rows, drawn] + 1e-4).all()
+    assert (target >= upto[rows, drawn] - weights[rows, drawn] - 1e-4).all()
+    assert (weights[rows, drawn] > 0).all()
+
+
+def test_draw_columns_at_the_ends():
+    weights = jnp.array([[0.0, 1.0, 0.0, 0.0, 2.0, 0.0]])
+    first, last = (
+        int(operations.draw_columns(jnp.array([u]), weights)[0]) for u in (0.0, 0.99999994)
+    )
+    assert (first, last) == (1, 4)

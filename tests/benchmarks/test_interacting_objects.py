@@ -1,0 +1,83 @@
+"""The benchmark of interacting objects: its scenes, its rates, and a short study."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+import mpfjax
+from benchmarks import interacting_objects as benchmark
+
+KEY = jax.random.key(0)
+
+
+def test_the_lost_object_comes_back_where_the_constants_say():
+    scene = benchmark.lost_object(KEY)
+    last, back = benchmark.LOST.start - 1, benchmark.LOST.stop
+    path = np.asarray(scene.places[:, 3])
+    assert np.linalg.norm(path[back] - path[last]) == pytest.approx(benchmark.JUMP, rel=1e-4)
+    own = np.asarray(scene.seen["heights"])[:, 3, 3]
+    assert (own[benchmark.LOST] == 0).all()
+    assert (own == 1).sum() == benchmark.NUM_FRAMES - (back - benchmark.LOST.start)
+
+
+def test_the_distracter_covers_its_object_and_leads_away():
+    scene = benchmark.distracted_object(KEY)
+    places, heights = scene.seen["places"][:, 0], scene.seen["heights"][:, 0]
+    there = np.flatnonzero(heights[:, -1])
+    assert there.tolist() == list(range(3, 9))
+    gaps = np.linalg.norm(places[:, -1] - scene.places[3, 0][None], axis=1)
+    np.testing.assert_allclose(gaps[there], benchmark.LEAD * np.arange(6), atol=1e-3)
+    assert float(heights[5, 0]) == pytest.approx(benchmark.LIKENESS)
+
+
+def test_a_pair_passes_without_sharing_a_place():
+    places = np.asarray(benchmark.crossing_pairs(KEY).places)
+    gaps = np.linalg.norm(places[:, 0] - places[:, 1], axis=1)
+    assert gaps.min() > 12
+    assert gaps[[0, -1]].min() > 70
+    start, end = places[[0, -1], 0] - places[[0, -1], 1]
+    assert start @ end < 0
+
+
+def test_medians_count_weights():
+    mixture = mpfjax.ParticleMixture(
+        particles={"now": jnp.array([[[3.0, 0.0]], [[1.0, 5.0]], [[2.0, 7.0]]])},
+        log_weights=jnp.log(jnp.array([0.6, 0.3, 0.1])),
+        component_indicators=jnp.zeros(3, jnp.int32),
+        ancestor_indices=jnp.arange(3, dtype=jnp.int32),
+        num_components=1,
+    )
+    found = benchmark.estimates(mixture)
+    assert found["median"].tolist() == [[3.0, 0.0]]
+    np.testing.assert_allclose(found["mean"], [[2.3, 2.2]], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("hits", "runs"), [(0, 20), (13, 20), (200, 200)])
+def test_intervals_are_wilsons(hits, runs):
+    expected = binomtest(hits, runs).proportion_ci(0.95, "wilson")
+    low, high = benchmark.wilson(hits / runs, runs)
+    np.testing.assert_allclose([low, high], [expected.low, expected.high], atol=1e-4)
+
+
+def test_a_short_study(tmp_path, capsys):
+    options = ["--runs", "2", "--scenes", "e", "--methods", "ps", "independent", "--seed", "1"]
+    assert benchmark.main([*options, "--out", str(tmp_path)]) == 0
+    written = json.loads((tmp_path / "interacting_objects.json").read_text())
+    methods = [line["method"] for line in written["results"]]
+    assert methods == ["ps_best", "ps_mean", "independent"]
+    rates = written["results"][0]["recovery"]["median"]
+    assert rates["rate"] == max(rates["by_order"])
+    assert len(rates["by_order"]) == 4
+    assert written["settings"]["seed"] == 1
+    assert (tmp_path / "interacting_objects.png").stat().st_size > 0
+    assert "PS, best order" in capsys.readouterr().out
+
+
+def test_bad_options():
+    for bad in (["--runs", "0"], ["--scenes", "z"], ["--methods", "luck"]):
+        with pytest.raises(SystemExit):
+            benchmark.parse(bad)
