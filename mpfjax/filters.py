@@ -488,12 +488,13 @@ def clustered_particle_filter(
 ) -> Filter:
     """A joint filter of clusters of objects, each on its own until it meets another.
 
-    Every object starts with a particle filter of its own. Where the clouds of two meet, that
-    is, where the interaction ψ between any of their points is not 1, they become one joint
-    filter, weighted by ψ, in which objects still cross between rows. It is
+    Every object starts with a particle filter of its own. Where the predicted clouds of two
+    meet, that is, where the interaction ψ between any of their points is not 1, they become one
+    joint filter, weighted by ψ, in which objects still cross between rows: each of an object's N
+    points serves every row, with the weight L f(point | row) / Σ f(point | any row). It is
     `independent_particle_filters` where nothing interacts, and unbiased where something does,
-    at the N x J likelihood evaluations a step of partitioned sampling. The derivation and the
-    options are those of `PropagateInClusters`.
+    at the N x J likelihood evaluations a step of partitioned sampling. The derivation, the
+    options and what it asks of the object model are in `PropagateInClusters`.
 
     Use it in place of a joint filter, PS or DPS wherever ψ has compact support, as that of
     `PairwiseRepulsion` has; with a ψ that never ends all objects become one cluster at once.

@@ -298,9 +298,10 @@ class PropagateInClusters(AbstractPropagation):
             partners = has_moved & together[objects]
             log_psi = self._log_potentials(chosen, partners, own)
             picked, log_gain = _draw_columns(key, log_b + log_psi)
-            log_gain = jnp.where(
-                jnp.any(partners, axis=1), log_gain - log_sums[objects, parent_rows], 0.0
-            )
+            before = log_sums[objects, parent_rows]
+            # A row without weight is in line only where the whole cluster has none.
+            counts = jnp.any(partners, axis=1) & (before != -jnp.inf)
+            log_gain = jnp.where(counts, log_gain - jnp.where(counts, before, 0.0), 0.0)
             picked = jnp.where(alone[objects], parent_rows, picked)
             states = jax.tree.map(lambda leaf: leaf[picked, objects], points)
             states = jax.vmap(self._with_history)(objects, states, parents)

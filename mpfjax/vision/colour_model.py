@@ -193,6 +193,10 @@ class ColourModel(AbstractStateSpaceModel):
             jnp.where(stays, 1 - self.switch_probability + drawn, drawn).astype(states.box.dtype)
         )
 
+    def with_history(self, states: BoxState, previous_states: BoxState) -> BoxState:
+        """The states as children of the previous ones: they remember those boxes."""
+        return BoxState(states.box, states.reference, self._remembered(previous_states.box))
+
     def log_likelihood(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
     ) -> Float[Array, " n"]:

@@ -144,6 +144,11 @@ class TestAgainstExactAnswers:
             sum(float(run.log_marginal_likelihood) for run in runs),
             np.array([run.means[-1, 0] for run in runs]),
         )
+        before = filter.init(KEY)
+        after, _ = filter.step(KEY, before, OBSERVATIONS[0, :2])
+        pasts, parents = np.asarray(after.particles[:, :, 1]), np.asarray(before.particles[:, :, 0])
+        of_one_row = (pasts[:, None] == parents[None]).all(axis=2)
+        assert of_one_row.any(axis=1).all()
 
 
 class Momentum(mpfjax.AbstractStateSpaceModel):
