@@ -59,6 +59,7 @@ METHODS: dict[str, Callable[[MultiObjectModel, int, Order], mpfjax.Filter]] = {
         model, n, reassembly="evidence"
     ),
     "independent": lambda model, n, _: mpfjax.independent_particle_filters(model, n),
+    "clusters": lambda model, n, _: mpfjax.clustered_particle_filter(model, n),
 }
 ORDERED = ("ps",)
 
@@ -272,6 +273,7 @@ TITLES = {
     "dps": "DPS",
     "dps_evidence": "DPS, evidence",
     "independent": "independent filters",
+    "clusters": "clusters that merge on contact",
 }
 
 
