@@ -27,7 +27,7 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
-from benchmarks.results import format_table, write_json
+from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
 from mpfjax.metrics.coverage import REACH
 from mpfjax.mixture import ParticleMixture
@@ -567,15 +567,7 @@ def _by_size(
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the benchmark; bad input is one line on the error stream and exit status 2."""
-    try:
-        run(parse_arguments(arguments))
-    except (ValueError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted; what was finished is written", file=sys.stderr)
-        return 130
-    return 0
+    return exit_status(lambda: run(parse_arguments(arguments)))
 
 
 if __name__ == "__main__":

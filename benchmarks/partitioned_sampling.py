@@ -34,7 +34,7 @@ from benchmarks.partitioned_tables import (
     print_tables,
     worst_order,
 )
-from benchmarks.results import write_json
+from benchmarks.results import exit_status, write_json
 from mpfjax import plotting
 from mpfjax.metrics.uniqueness import effective_dynamics, uniqueness
 from mpfjax.mixture import ParticleMixture
@@ -511,15 +511,7 @@ def run(options: argparse.Namespace) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the benchmark; bad input is one line on the error stream and exit status 2."""
-    try:
-        run(parse_arguments(arguments))
-    except (ValueError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted; what was finished is written", file=sys.stderr)
-        return 130
-    return 0
+    return exit_status(lambda: run(parse_arguments(arguments)))
 
 
 if __name__ == "__main__":

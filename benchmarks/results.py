@@ -1,7 +1,9 @@
-"""What every benchmark does with its results: write them at once, and whole."""
+"""What every benchmark does with its results and errors: write them at once, and whole."""
 
 import json
 import os
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,3 +29,16 @@ def format_table(header: list[str], rows: list[list[str]]) -> str:
 
     rule = "  ".join("-" * width for width in widths)
     return "\n".join([format_line(header), rule, *map(format_line, rows)])
+
+
+def exit_status(run: Callable[[], None]) -> int:
+    """Run a benchmark: bad input is one line on the error stream and 2, an interruption 130."""
+    try:
+        run()
+    except (ValueError, OSError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted; what was finished is written", file=sys.stderr)
+        return 130
+    return 0

@@ -30,7 +30,7 @@ from tqdm import tqdm
 
 import mpfjax
 from benchmarks.detected_tracking import detect_all, make_trackers, track_detected
-from benchmarks.results import format_table, write_json
+from benchmarks.results import exit_status, format_table, write_json
 from benchmarks.tracking_pictures import (
     NAMES,
     Snapshot,
@@ -461,15 +461,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the benchmark; bad input is one line on the error stream and exit status 2."""
     # Writing a video starts an encoder, whose fork and exec JAX's threads do not touch.
     warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
-    try:
-        run(parse_arguments(arguments))
-    except (ValueError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted; what was finished is written", file=sys.stderr)
-        return 130
-    return 0
+    return exit_status(lambda: run(parse_arguments(arguments)))
 
 
 if __name__ == "__main__":

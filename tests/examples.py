@@ -1,8 +1,10 @@
 """Mixtures made by hand, each with something that goes wrong easily, and weighted sums of them."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+import mpfjax
 from mpfjax import ParticleMixture
 
 NUM_PARTICLES = 40
@@ -61,3 +63,16 @@ def log_masses(mixture: ParticleMixture) -> np.ndarray:
             for m in range(mixture.num_components)
         ]
     )
+
+
+def walker(mean=0.0, noise=0.5):
+    """One linear-Gaussian object on a line."""
+    one = jnp.eye(1)
+    return mpfjax.LinearGaussianModel(
+        0.9 * one, 0.4 * one, one, noise * one, jnp.array([mean]), one
+    )
+
+
+def stack(models):
+    """One model with an axis of objects in front, from a model for each."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)

@@ -2,6 +2,7 @@
 
 import json
 
+import imageio.v3 as imageio
 import jax
 import numpy as np
 import pytest
@@ -19,10 +20,6 @@ from benchmarks.tracking_pictures import Source
 from mpfjax.vision.boxes import read_tracks, write_tracks
 from mpfjax.vision.frames import read_frames, write_image, write_video
 
-imageio = pytest.importorskip(
-    "imageio.v3", reason="reading and writing frames needs the extra 'video'"
-)
-pytest.importorskip("cv2", reason="detection needs the extra 'video'")
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
 
 # Of one size in every test, so that nothing compiles twice.

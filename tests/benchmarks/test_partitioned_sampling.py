@@ -5,6 +5,7 @@ import json
 import jax
 import numpy as np
 import pytest
+from scipy import stats
 
 from benchmarks import partitioned_sampling, partitioned_tables
 from mpfjax.metrics import tracking_quality
@@ -13,8 +14,6 @@ from mpfjax.vision.boxes import boxes_of_frame, read_tracks, write_tracks
 from mpfjax.vision.colours import HSVColours
 from mpfjax.vision.distracter import DistracterScene, distracter_scene
 from mpfjax.vision.frames import parse_range, read_frames, write_image
-
-pytest.importorskip("imageio", reason="reading and writing frames needs the extra 'video'")
 
 NUM_RUNS = 2
 FIELDS = ["lambda", "method", "order", "success", "recovery", "precision", "recall", "runs"]
@@ -218,7 +217,7 @@ class TestRates:
 
     @pytest.mark.parametrize(("successes", "trials"), [(0, 50), (19, 50), (50, 50), (1, 2)])
     def test_wilson_is_scipys(self, successes, trials):
-        stats = pytest.importorskip("scipy.stats")
+
         expected = stats.binomtest(successes, trials).proportion_ci(method="wilson")
         actual = partitioned_tables.wilson(successes / trials, trials)
         np.testing.assert_allclose(actual, [expected.low, expected.high], atol=1e-9)

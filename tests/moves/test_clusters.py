@@ -12,20 +12,10 @@ import mpfjax
 from mpfjax import MultiObjectModel, PairwiseRepulsion, PropagateInClusters
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.clusters import _components
+from tests.examples import stack, walker
 
 KEY = jax.random.key(0)
 NUM_RUNS = 600
-
-
-def walker(mean=0.0, noise=0.5):
-    one = jnp.eye(1)
-    return mpfjax.LinearGaussianModel(
-        0.9 * one, 0.4 * one, one, noise * one, jnp.array([mean]), one
-    )
-
-
-def stack(models):
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
 
 
 MEANS, NOISES = (-0.5, 4.0, -2.5), (0.5, 0.8, 1.0)

@@ -13,20 +13,9 @@ import mpfjax
 from mpfjax import MultiObjectModel, PairwiseRepulsion, Partitioned
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.partitioned import circular_orders
-from tests.examples import make_mixture
+from tests.examples import make_mixture, stack, walker
 
 KEY = jax.random.key(0)
-
-
-def walker(mean=0.0, noise=0.5):
-    one = jnp.eye(1)
-    return mpfjax.LinearGaussianModel(
-        0.9 * one, 0.4 * one, one, noise * one, jnp.array([mean]), one
-    )
-
-
-def stack(models):
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
 
 
 OBJECTS = [walker(0.0, 0.5), walker(1.0, 0.8), walker(-1.0, 1.0)]

@@ -4,11 +4,9 @@ import sys
 
 import numpy as np
 import pytest
+from PIL import Image as pillow
 
 from mpfjax.vision.frames import num_images, read_frames, write_image, write_video
-
-pytest.importorskip("imageio", reason="reading and writing frames needs the extra 'video'")
-pillow = pytest.importorskip("PIL.Image")
 
 
 def shades(num, height=32, width=48):
