@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from mpfjax.generator import fast_key
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
@@ -621,7 +622,7 @@ def _split(key: Key[Array, ""], num: int) -> list[Key[Array, ""]]:
     """One key for each move; the first ones are the same whatever their number, so that a longer
     chain draws alike.
     """
-    return list(jax.random.split(key, num))
+    return list(jax.random.split(fast_key(key), num))
 
 
 def _memory_of(move: AbstractMove) -> list[str]:

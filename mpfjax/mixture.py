@@ -11,7 +11,7 @@ from mpfjax.operations import (
     segment_counts,
     segment_log_sum_exp,
     segment_sum,
-    take,
+    spread,
 )
 
 
@@ -82,7 +82,7 @@ class ParticleMixture(eqx.Module):
     @property
     def log_component_weights(self) -> Float[Array, " n"]:
         """log w_i, the weights within each component; they sum to one in each living one."""
-        log_mass = take(self.log_mixture_weights, self.component_indicators)
+        log_mass = spread(self.log_mixture_weights, self.component_indicators)
         return jnp.where(
             self.occupied, self.log_weights - jnp.where(self.occupied, log_mass, 0.0), -jnp.inf
         )
@@ -117,7 +117,7 @@ class ParticleMixture(eqx.Module):
     def component_covariances(self) -> Float[Array, "m d d"]:
         """The weighted covariance of each component's flattened state, zero for a dead one."""
         states = flatten_states(self.particles)
-        centred = states - take(self.component_averages(states), self.component_indicators)
+        centred = states - spread(self.component_averages(states), self.component_indicators)
         return self.component_averages(centred[:, :, None] * centred[:, None, :])
 
     def mean(self) -> PyTree:

@@ -43,6 +43,29 @@ def test_count_starts_is_a_search_for_the_last_start(n):
     np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.parametrize("n", [1, 8, 31, 40, 96, 1000, 1025])
+def test_sums_before(n):
+    values = RNG.uniform(size=n).astype(np.float32)
+    expected = np.concatenate([[0], np.cumsum(values)[:-1]])
+    np.testing.assert_allclose(operations.sum_before(jnp.asarray(values)), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("n", [1, 7, 8, 31, 32, 1000, 1025])
+def test_whole_blocks_need_no_filling_up(n):
+    length = operations.whole_blocks(n)
+    assert n <= length < n + 32
+    assert operations.whole_blocks(length) == length
+
+
+def test_places_are_counted_alone_and_under_two_vmaps():
+    places = RNG.integers(0, 9, (2, 3, 20))
+    expected = np.stack([[np.bincount(row, minlength=9) for row in rows] for rows in places])
+    places = jnp.asarray(places, jnp.int32)
+    count = lambda row: operations.count_places(row, 9)
+    np.testing.assert_array_equal(jax.vmap(jax.vmap(count))(places), expected)
+    np.testing.assert_array_equal(count(places[1, 2]), expected[1, 2])
+
+
 def labelled(n, m):
     """Values with an empty segment where there is more than one."""
     labels = RNG.integers(0, m, n)
@@ -58,6 +81,12 @@ class TestSegments:
         expected = np.stack([rows[labels == s].sum(axis=0) for s in range(m)])
         found = operations.segment_sum(jnp.asarray(rows), jnp.asarray(labels, jnp.int32), m)
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+    def test_spread_gives_each_entry_its_segments_value(self, m):
+        values, labels = labelled(90, m)
+        of_segments = RNG.normal(size=(m, 2)).astype(np.float32)
+        found = operations.spread(jnp.asarray(of_segments), jnp.asarray(labels, jnp.int32))
+        np.testing.assert_array_equal(found, of_segments[labels])
 
     def test_labels_out_of_range_are_left_out(self, m):
         labels = jnp.array([0, m, m - 1], jnp.int32)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from mpfjax.mixture import ParticleMixture, flatten_states
-from mpfjax.operations import segment_sum, take
+from mpfjax.operations import segment_sum, spread
 
 Scale = ArrayLike | Sequence[float]
 
@@ -69,9 +69,9 @@ def summarise(
     """Weighted mass, mean and covariance of the particles under each label."""
     masses = segment_sum(weights, labels, num_groups)
     safe = jnp.where(masses > 0, masses, 1.0)
-    shares = (weights / take(safe, labels)).astype(features.dtype)
+    shares = (weights / spread(safe, labels)).astype(features.dtype)
     means = segment_sum(shares[:, None] * features, labels, num_groups)
-    centred = features - take(means, labels)
+    centred = features - spread(means, labels)
     squares = shares[:, None, None] * centred[:, :, None] * centred[:, None, :]
     return Groups(masses, means, segment_sum(squares, labels, num_groups))
 

@@ -14,7 +14,7 @@ from mpfjax.moves.base import AbstractRejuvenation
 from mpfjax.moves.features import summarise
 from mpfjax.moves.resampling import Resample
 from mpfjax.moves.slots import check_particles_per_component, deal_slots, place_slots
-from mpfjax.operations import cholesky, segment_argmax, take
+from mpfjax.operations import cholesky, segment_argmax, spread, take
 
 
 class GaussianRegeneration(AbstractRejuvenation):
@@ -79,9 +79,9 @@ class GaussianRegeneration(AbstractRejuvenation):
         )
         slots = place_slots(targets, mixture.num_particles)
         shares = jnp.maximum(targets, 1).astype(mixture.log_weights.dtype)
-        log_weights = take(mixture.log_mixture_weights - jnp.log(shares), slots.components)
+        log_weights = spread(mixture.log_mixture_weights - jnp.log(shares), slots.components)
         heaviest = segment_argmax(mixture.log_weights, mixture.component_indicators, m)
-        parents = take(heaviest, slots.components)
+        parents = spread(heaviest, slots.components)
         return mixture.replace(
             particles=jax.tree.map(lambda leaf: take(leaf, parents), mixture.particles),
             log_weights=jnp.where(slots.filled, log_weights, -jnp.inf),
@@ -100,9 +100,11 @@ class GaussianRegeneration(AbstractRejuvenation):
         states = jnp.where(mixture.occupied[:, None], flatten_states(chosen), 0.0)
         weights = jnp.exp(mixture.log_component_weights).astype(states.dtype)
         moments = summarise(states, weights, mixture.component_indicators, mixture.num_components)
-        factors = take(self.inflation * cholesky(moments.covariances), vacated.component_indicators)
+        factors = spread(
+            self.inflation * cholesky(moments.covariances), vacated.component_indicators
+        )
         noise = NOISES[self.noise](key, states.shape, states.dtype)
-        spread = jnp.einsum("nij,nj->ni", factors, noise)
-        means = take(moments.means, vacated.component_indicators)
+        offsets = jnp.einsum("nij,nj->ni", factors, noise)
+        means = spread(moments.means, vacated.component_indicators)
         unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], chosen))[1]
-        return jax.vmap(unravel)(means + spread)
+        return jax.vmap(unravel)(means + offsets)

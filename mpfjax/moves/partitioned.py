@@ -16,7 +16,7 @@ from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation import predict
 from mpfjax.moves.resampling import Resample
-from mpfjax.operations import add_gradient, log_sum_exp, take
+from mpfjax.operations import add_gradient, log_sum_exp, spread, take
 
 REASSEMBLIES = ("evidence", "prior")
 
@@ -244,5 +244,5 @@ def _with_masses_of(before: ParticleMixture, after: ParticleMixture) -> Particle
     prior = jnp.where(alive, before.log_mixture_weights, 0.0)
     log_total = log_sum_exp(jnp.where(alive, prior, -jnp.inf))
     shift = prior - jnp.where(alive, masses, 0.0) + after.log_mass - log_total
-    log_shift = take(jnp.where(alive, shift, 0.0), after.component_indicators)
+    log_shift = spread(jnp.where(alive, shift, 0.0), after.component_indicators)
     return after.replace(log_weights=after.log_weights + log_shift)

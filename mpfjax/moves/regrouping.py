@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.features import Features, Scale, separation, summarise
-from mpfjax.operations import segment_argmax, segment_counts, segment_sum, take
+from mpfjax.operations import segment_argmax, segment_counts, segment_sum, spread, take
 
 
 class KMeans(AbstractRegrouping):
@@ -126,7 +126,7 @@ class Merge(AbstractRegrouping):
             overlap = durations >= self.patience
             # A merged label is free for another component, which starts a count of its own.
             memory = memory | {"overlap_durations": jnp.where(overlap, 0, durations)}
-        return take(lowest_connected(overlap), mixture.component_indicators), memory
+        return spread(lowest_connected(overlap), mixture.component_indicators), memory
 
     def _overlap(self, mixture: ParticleMixture) -> Bool[Array, "m m"]:
         groups = summarise(
@@ -215,8 +215,8 @@ class Split(AbstractRegrouping):
         )
         lighter = jnp.where(masses[1] <= masses[0], 1, 0)
         labels = free_labels(splits, deviations, mixture.active)
-        moves = (side == take(lighter, parent)) & mixture.occupied
-        return jnp.where(moves, take(labels, parent), parent), mixture.memory
+        moves = (side == spread(lighter, parent)) & mixture.occupied
+        return jnp.where(moves, spread(labels, parent), parent), mixture.memory
 
     def _halve(
         self, features: Float[Array, "n k"], weights: Float[Array, " n"], mixture: ParticleMixture
@@ -360,8 +360,8 @@ def _nearer(
 ) -> Int[Array, " n"]:
     """Which of its own component's two centroids each particle is nearer to."""
     m = centroids.shape[0] // 2
-    first = jnp.sum((features - take(centroids, parent)) ** 2, axis=1)
-    second = jnp.sum((features - take(centroids, parent + m)) ** 2, axis=1)
+    first = jnp.sum((features - spread(centroids[:m], parent)) ** 2, axis=1)
+    second = jnp.sum((features - spread(centroids[m:], parent)) ** 2, axis=1)
     return (second < first).astype(jnp.int32)
 
 
@@ -370,7 +370,7 @@ def _farthest_members(
 ) -> Float[Array, "m k"]:
     """In each component, the particle farthest from the component's point."""
     parent = mixture.component_indicators
-    distance = jnp.sum((features - take(points, parent)) ** 2, axis=1)
+    distance = jnp.sum((features - spread(points, parent)) ** 2, axis=1)
     distance = jnp.where(mixture.occupied, distance, -1.0)
     return take(features, segment_argmax(distance, parent, mixture.num_components))
 

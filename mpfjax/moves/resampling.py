@@ -21,10 +21,13 @@ from mpfjax.operations import (
     add_gradient,
     count_starts,
     order_by_segment,
-    prefix_sum,
     segment_counts,
+    segment_argmax,
     segment_log_sum_exp,
+    spread,
+    sum_before,
     take,
+    whole_blocks,
 )
 
 GRADIENTS = ("none", "stop", "soft", "ot", "straight_through")
@@ -129,7 +132,7 @@ class Resample(AbstractRejuvenation):
         copies = _copies(mixture, drawn)
         num_slots = jnp.maximum(drawn.targets, 1).astype(mixture.log_weights.dtype)
         log_shares = mixture.log_mixture_weights - jnp.log(num_slots)
-        redrawn = copies.replace(log_weights=take(log_shares, slots.components))
+        redrawn = copies.replace(log_weights=spread(log_shares, slots.components))
         if self.gradient == "stop":
             log_weights = jax.lax.stop_gradient(redrawn.log_weights)
             redrawn = redrawn.replace(log_weights=add_gradient(log_weights, copies.log_weights))
@@ -140,7 +143,7 @@ class Resample(AbstractRejuvenation):
         elif self.gradient == "ot":
             redrawn = self._transported(redrawn, mixture, drawn)
         if self.ess_threshold < 1.0:
-            redrawn = _where(take(due, slots.components), redrawn, copies)
+            redrawn = _where(spread(due, slots.components), redrawn, copies)
         return redrawn.replace(log_weights=jnp.where(slots.filled, redrawn.log_weights, -jnp.inf))
 
     def _draw(
@@ -150,33 +153,31 @@ class Resample(AbstractRejuvenation):
         as_they_stand = mixture.num_components == 1 and self.sort_by is None
         as_they_stand &= self.gradient != "ot"  # which needs places without gaps
         if as_they_stand:
-            layout = _as_they_stand(mixture)
+            line = _as_they_stand(mixture)
         else:
-            layout = _contiguous(mixture, due, self.sort_by)
-        targets = deal_slots(
-            layout.counts, due, mixture.num_particles, self.particles_per_component
-        )
+            line = _in_line(mixture, due, self.sort_by)
+        targets = deal_slots(line.counts, due, mixture.num_particles, self.particles_per_component)
         if as_they_stand:
             # What is not redrawn keeps its place, and there may be empty slots before it.
             targets = jnp.where(due, targets, mixture.num_particles)
         slots = place_slots(targets, mixture.num_particles)
-        expected = layout.weights * take(targets, layout.components).astype(layout.weights.dtype)
-        starts = SCHEMES[self.scheme](key, expected, targets, slots, layout)
-        parents = _within_component(count_starts(starts, mixture.num_particles), slots, layout)
+        expected = line.weights * spread(targets, line.components).astype(line.weights.dtype)
+        starts = SCHEMES[self.scheme](key, expected, targets, slots, line)
+        parents = _within_component(count_starts(starts, mixture.num_particles), slots, line)
         if self.ess_threshold < 1.0:
-            unmoved = take(layout.firsts, slots.components) + slots.ranks
-            parents = jnp.where(take(due, slots.components), parents, unmoved)
+            unmoved = spread(line.firsts, slots.components) + slots.ranks
+            parents = jnp.where(spread(due, slots.components), parents, unmoved)
         parents = jnp.clip(parents, 0, mixture.num_particles - 1)
-        return _Drawn(take(layout.order, parents), slots, targets, layout)
+        return _Drawn(take(line.order, parents), slots, targets, line)
 
     def _drawn_from(self, mixture: ParticleMixture) -> ParticleMixture:
         """The mixture whose weights the offspring are drawn in proportion to."""
         if self.gradient != "soft":
             return mixture
         counts = jnp.maximum(mixture.component_counts, 1).astype(mixture.log_weights.dtype)
-        uniform = self.softness / take(counts, mixture.component_indicators)
+        uniform = self.softness / spread(counts, mixture.component_indicators)
         softened = (1 - self.softness) * jnp.exp(mixture.log_component_weights) + uniform
-        log_mass = take(mixture.log_mixture_weights, mixture.component_indicators)
+        log_mass = spread(mixture.log_mixture_weights, mixture.component_indicators)
         occupied = mixture.occupied
         log_weights = jnp.log(softened) + jnp.where(occupied, log_mass, 0.0)
         return mixture.replace(log_weights=jnp.where(occupied, log_weights, -jnp.inf))
@@ -185,14 +186,16 @@ class Resample(AbstractRejuvenation):
         self, redrawn: ParticleMixture, mixture: ParticleMixture, drawn: "_Drawn"
     ) -> ParticleMixture:
         """The particles at the barycentres of the plan from the weights to equal ones."""
-        slots, layout = drawn.slots, drawn.layout
+        slots, line = drawn.slots, drawn.line
         # Where a component changes its number of slots, its particles repeat or are skipped.
-        counts, shares = layout.counts, jnp.maximum(drawn.targets, 1)
-        stretched = slots.ranks * take(counts, slots.components) // take(shares, slots.components)
-        places = jnp.clip(take(layout.firsts, slots.components) + stretched, 0, len(stretched) - 1)
+        counts, shares = line.counts, jnp.maximum(drawn.targets, 1)
+        stretched = (
+            slots.ranks * spread(counts, slots.components) // spread(shares, slots.components)
+        )
+        places = jnp.clip(spread(line.firsts, slots.components) + stretched, 0, len(stretched) - 1)
         particles, nearest = transport(
             mixture,
-            take(layout.order, places),
+            take(line.order, places),
             slots.components,
             slots.filled,
             self.regularisation,
@@ -208,7 +211,7 @@ class _Drawn(NamedTuple):
     parents: Int[Array, " n"]
     slots: Slots
     targets: Int[Array, " m"]  # how many slots each component has
-    layout: "_Layout"
+    line: "_Line"
 
 
 def _copies(mixture: ParticleMixture, drawn: _Drawn) -> ParticleMixture:
@@ -234,7 +237,7 @@ def _importance_weighted(
     log_ratios = jnp.where(slots.filled, take(log_ratios, drawn.parents), -jnp.inf)
     log_totals = segment_log_sum_exp(log_ratios, slots.components, mixture.num_components)
     log_mass = jnp.where(mixture.active, mixture.log_mixture_weights - log_totals, -jnp.inf)
-    return redrawn.replace(log_weights=log_ratios + take(log_mass, slots.components))
+    return redrawn.replace(log_weights=log_ratios + spread(log_mass, slots.components))
 
 
 def _following_the_mean(redrawn: ParticleMixture, mixture: ParticleMixture) -> ParticleMixture:
@@ -244,7 +247,7 @@ def _following_the_mean(redrawn: ParticleMixture, mixture: ParticleMixture) -> P
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
             return drawn
         means = mixture.component_averages(jax.lax.stop_gradient(leaf))
-        return add_gradient(drawn, take(means, redrawn.component_indicators))
+        return add_gradient(drawn, spread(means, redrawn.component_indicators))
 
     return redrawn.replace(particles=jax.tree.map(follow, mixture.particles, redrawn.particles))
 
@@ -265,32 +268,37 @@ def _where(
     return redrawn.replace(log_weights=pick(redrawn.log_weights, copies.log_weights))
 
 
-class _Layout(NamedTuple):
-    """The particles made contiguous by component, the empty slots last."""
+class _Line(NamedTuple):
+    """The particles in line, component by component, and empty places at the end.
 
-    order: Int[Array, " n"]  # which particle stands at each place
-    components: Int[Array, " n"]
-    weights: Float[Array, " n"]  # within the component, zero in an empty slot
+    There are p places, as many as make whole blocks for the prefix sums.
+    """
+
+    order: Int[Array, " p"]  # which particle stands at each place
+    components: Int[Array, " p"]
+    weights: Float[Array, " p"]  # within the component, zero at an empty place
     counts: Int[Array, " m"]
     firsts: Int[Array, " m"]  # the place of each component's first particle
+    length: Int[Array, ""] | int  # how many places come before the empty ones at the end
 
 
-def _as_they_stand(mixture: ParticleMixture) -> _Layout:
-    n = mixture.num_particles
-    return _Layout(
-        order=jnp.arange(n, dtype=jnp.int32),
-        components=jnp.zeros(n, jnp.int32),
-        weights=jnp.exp(mixture.log_component_weights),
+def _as_they_stand(mixture: ParticleMixture) -> _Line:
+    num_places = whole_blocks(mixture.num_particles)
+    return _Line(
+        order=jnp.arange(num_places, dtype=jnp.int32),
+        components=jnp.zeros(num_places, jnp.int32),
+        weights=_padded(jnp.exp(mixture.log_component_weights), 0.0),
         counts=mixture.component_counts,
         firsts=jnp.zeros(1, jnp.int32),
+        length=mixture.num_particles,
     )
 
 
-def _contiguous(
+def _in_line(
     mixture: ParticleMixture,
     due: Bool[Array, " m"],
     sort_by: Callable[[PyTree], Float[Array, " n"]] | None,
-) -> _Layout:
+) -> _Line:
     """Components side by side, without particles that could only be drawn by a rounding error.
 
     A weight may underflow to zero where its logarithm does not. Such a particle is left out of
@@ -298,116 +306,107 @@ def _contiguous(
     """
     m = mixture.num_components
     weights = jnp.exp(mixture.log_component_weights)
-    stays = ~take(due, mixture.component_indicators)
-    in_line = mixture.occupied & ((weights > 0) | stays)
-    labels = jnp.where(in_line, mixture.component_indicators, m)
+    stays = ~spread(due, mixture.component_indicators)
+    stands = mixture.occupied & ((weights > 0) | stays)
+    labels = jnp.where(stands, mixture.component_indicators, m)
     if sort_by is None:
-        order = order_by_segment(labels, m)
+        order = order_by_segment(_padded(labels, m), m)
     else:
         order = jnp.lexsort((sort_by(mixture.particles), labels)).astype(jnp.int32)
-    counts = segment_counts(in_line, mixture.component_indicators, m)
-    return _Layout(
+        order = _padded(order, mixture.num_particles - 1)
+    counts = segment_counts(stands, mixture.component_indicators, m)
+    slots = place_slots(counts, order.shape[0])
+    return _Line(
         order=order,
-        components=take(mixture.component_indicators, order),
-        weights=take(weights, order),
+        components=slots.components,
+        weights=jnp.where(slots.filled, take(_padded(weights, 0.0), order), 0.0),
         counts=counts,
-        firsts=jnp.cumsum(counts) - counts,
+        firsts=slots.firsts,
+        length=jnp.sum(counts, dtype=jnp.int32),
     )
 
 
-def _within_component(parents: Int[Array, " n"], slots: Slots, layout: _Layout) -> Int[Array, " n"]:
+def _padded(values: Array, fill: float) -> Array:
+    n = values.shape[0]
+    return jnp.pad(values, (0, whole_blocks(n) - n), constant_values=fill)
+
+
+def _within_component(parents: Int[Array, " n"], slots: Slots, line: _Line) -> Int[Array, " n"]:
     """Keep rounding of the prefix sums from crossing a border or feeding an empty slot."""
-    if layout.counts.shape[0] == 1:
+    if line.counts.shape[0] == 1:
         parents = jnp.maximum(parents, 0)
-        return jnp.where(take(layout.weights, parents) > 0, parents, jnp.argmax(layout.weights))
-    firsts = take(layout.firsts, slots.components)
-    lasts = firsts + take(layout.counts, slots.components) - 1
+        heaviest = segment_argmax(line.weights, line.components, 1)
+        return jnp.where(take(line.weights, parents) > 0, parents, heaviest)
+    firsts = spread(line.firsts, slots.components)
+    lasts = firsts + spread(line.counts, slots.components) - 1
     return jnp.clip(parents, firsts, lasts)
 
 
-# A scheme gives the first slot of every particle's offspring, in the layout's order. It sees the
-# expected offspring k_m w_i laid end to end on one line, on which component m takes the stretch
-# from slots.firsts[m] to slots.firsts[m] + k_m, and places one point in each slot's share of it.
+# A scheme gives the first slot of every particle's offspring, in the line's order. It sees the
+# expected offspring k_m w_i laid end to end, on which component m takes the stretch from
+# slots.firsts[m] to slots.firsts[m] + k_m, and places one point in each slot's share of it.
 
 
-def _systematic(key, expected, targets, slots, layout):
+def _systematic(key, expected, targets, slots, line):
     shift = jax.random.uniform(key, targets.shape, expected.dtype)
-    return _starts(expected, take(shift, slots.components), targets, slots, layout)
+    before = _expected_before(expected, targets, slots, line)
+    return _points_before(before, spread(shift, line.components))
 
 
-def _stratified(key, expected, targets, slots, layout):
-    shift = jax.random.uniform(key, expected.shape, expected.dtype)
-    return _starts(expected, shift, targets, slots, layout)
+def _stratified(key, expected, targets, slots, line):
+    shift = jax.random.uniform(key, slots.components.shape, expected.dtype)
+    before = _expected_before(expected, targets, slots, line)
+    slot = jnp.clip(before.astype(jnp.int32), 0, shift.shape[0] - 1)
+    return _points_before(before, take(shift, slot))
 
 
-def _starts(
-    expected: Float[Array, " n"],
-    shift: Float[Array, " n"],
-    targets: Int[Array, " m"],
-    slots: Slots,
-    layout: _Layout,
-) -> Int[Array, " n"]:
-    """How many of the points s + shift_s lie before each particle's stretch of the line."""
-    before = _line_before(expected, targets, slots, layout)
+def _points_before(before: Float[Array, " p"], shift: Float[Array, " p"]) -> Int[Array, " p"]:
+    """How many of the points s + shift, one in each slot s, come before a particle's stretch."""
     whole = jnp.floor(before)
-    slot = jnp.clip(whole.astype(jnp.int32), 0, shift.shape[0] - 1)
-    passed = take(shift, slot) < before - whole
-    return whole.astype(jnp.int32) + passed.astype(jnp.int32)
+    return whole.astype(jnp.int32) + (shift < before - whole).astype(jnp.int32)
 
 
-def _multinomial(key, expected, targets, slots, layout):
-    points = _sorted_points(key, slots.components, slots.filled, targets, expected.dtype)
-    before = _line_before(expected, targets, slots, layout)
+def _multinomial(key, expected, targets, slots, line):
+    points = _sorted_points(key, slots, targets, expected.dtype)
+    before = _expected_before(expected, targets, slots, line)
     return jnp.searchsorted(points, before, side="left").astype(jnp.int32)
 
 
-def _residual(key, expected, targets, slots, layout):
+def _residual(key, expected, targets, slots, line):
     # A weight of 1 / k comes out as a hair less in floating point, and is meant to be certain.
     whole = jnp.floor(expected * (1 + 16 * jnp.finfo(expected.dtype).eps))
-    certain = _exclusive(whole)
-    per_component = jax.ops.segment_sum(whole, layout.components, targets.shape[0])
+    certain = sum_before(whole)
+    per_component = jax.ops.segment_sum(whole, line.components, targets.shape[0])
     left = jnp.maximum(targets - per_component.astype(jnp.int32), 0)
-    rest = place_slots(left, expected.shape[0])
-    points = _sorted_points(key, rest.components, rest.filled, left, expected.dtype)
-    before = _line_before(jnp.maximum(expected - whole, 0.0), left, rest, layout)
+    rest = place_slots(left, slots.components.shape[0])
+    points = _sorted_points(key, rest, left, expected.dtype)
+    before = _expected_before(jnp.maximum(expected - whole, 0.0), left, rest, line)
     drawn = jnp.searchsorted(points, before, side="left")
     return certain.astype(jnp.int32) + drawn.astype(jnp.int32)
 
 
-def _line_before(
-    expected: Float[Array, " n"], targets: Int[Array, " m"], slots: Slots, layout: _Layout
-) -> Float[Array, " n"]:
-    """The expected offspring before each particle, held to its component's stretch of the line."""
+def _expected_before(
+    expected: Float[Array, " p"], targets: Int[Array, " m"], slots: Slots, line: _Line
+) -> Float[Array, " p"]:
+    """The expected offspring before each particle, held to its component's stretch of slots."""
     lows = slots.firsts.astype(expected.dtype)
     highs = (slots.firsts + targets).astype(expected.dtype)
     before = jnp.clip(
-        _exclusive(expected), take(lows, layout.components), take(highs, layout.components)
+        sum_before(expected), spread(lows, line.components), spread(highs, line.components)
     )
-    place = jnp.arange(expected.shape[0], dtype=jnp.int32)
-    is_empty = place >= jnp.sum(layout.counts, dtype=jnp.int32)
-    if targets.shape[0] == 1:
-        return before
-    return jnp.where(is_empty, jnp.array(expected.shape[0], expected.dtype), before)
-
-
-def _exclusive(values: Float[Array, " n"]) -> Float[Array, " n"]:
-    inclusive = prefix_sum(values)
-    return jnp.concatenate([jnp.zeros(1, values.dtype), inclusive[:-1]])
+    is_empty = jnp.arange(expected.shape[0], dtype=jnp.int32) >= line.length
+    num_slots = slots.components.shape[0]
+    return jnp.where(is_empty, jnp.array(num_slots, expected.dtype), before)
 
 
 def _sorted_points(
-    key: Key[Array, ""],
-    components: Int[Array, " n"],
-    filled: Bool[Array, " n"],
-    targets: Int[Array, " m"],
-    dtype: jnp.dtype,
+    key: Key[Array, ""], slots: Slots, targets: Int[Array, " m"], dtype: jnp.dtype
 ) -> Float[Array, " n"]:
-    """Independent uniform points on each component's stretch of the line, in ascending order."""
-    firsts = (jnp.cumsum(targets) - targets).astype(dtype)
-    uniform = jax.random.uniform(key, components.shape, dtype)
-    lengths = take(targets, components).astype(dtype)
-    points = take(firsts, components) + lengths * uniform
-    return jnp.sort(jnp.where(filled, points, jnp.inf))
+    """Independent uniform points on each component's stretch of slots, in ascending order."""
+    uniform = jax.random.uniform(key, slots.components.shape, dtype)
+    firsts = spread(slots.firsts, slots.components).astype(dtype)
+    lengths = spread(targets, slots.components).astype(dtype)
+    return jnp.sort(jnp.where(slots.filled, firsts + lengths * uniform, jnp.inf))
 
 
 SCHEMES: dict[str, Callable[..., Int[Array, " n"]]] = {

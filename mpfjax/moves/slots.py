@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from mpfjax.operations import count_starts, take
+from mpfjax.operations import count_starts, spread
 
 
 class Slots(NamedTuple):
@@ -31,6 +31,8 @@ def deal_slots(
     if particles_per_component is not None:
         return jnp.where(counts > 0, min(particles_per_component, num_particles), 0)
     kept = jnp.where(due, 0, counts)
+    if counts.shape[0] == 1:
+        return jnp.where(due, num_particles, kept)
     pool = num_particles - jnp.sum(kept, dtype=jnp.int32)
     sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
     rank = jnp.cumsum(due.astype(jnp.int32)) - 1
@@ -48,7 +50,7 @@ def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:
         components = count_starts(firsts, num_particles)
     return Slots(
         components=components,
-        ranks=slot - take(firsts, components),
+        ranks=slot - spread(firsts, components),
         firsts=firsts,
         filled=slot < jnp.sum(targets, dtype=jnp.int32),
     )

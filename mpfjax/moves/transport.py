@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.operations import take
+from mpfjax.operations import spread, take
 
 # In units of the regularisation: e^-APART is nothing in any floating point type.
 _APART = 1e4
@@ -43,7 +43,7 @@ def transport(
     points = take(states, targets)
     same = components[None] == mixture.component_indicators[:, None]
     squares = jnp.sum((states[:, None] - points[None]) ** 2, axis=2)
-    scale = take(_squared_scales(mixture, states), mixture.component_indicators)
+    scale = spread(_squared_scales(mixture, states), mixture.component_indicators)
     cost = jnp.where(same, squares / scale[:, None], _APART * regularisation)
     plan = _plan(cost, *_marginals(mixture, components, filled, states.dtype), regularisation).T
     rows = jnp.sum(plan, axis=1, keepdims=True)
@@ -77,7 +77,7 @@ def _squared_scales(mixture: ParticleMixture, states: Float[Array, "n d"]) -> Fl
     present = mixture.occupied.astype(states.dtype)[:, None]
     counts = jnp.maximum(mixture.component_sums(present), 1.0)
     means = mixture.component_sums(present * states) / counts
-    centred = states - take(means, mixture.component_indicators)
+    centred = states - spread(means, mixture.component_indicators)
     variances = mixture.component_sums(present * centred**2) / counts
     scales = states.shape[1] * jnp.max(variances, axis=1)
     return jnp.where(scales > 0, scales, 1.0)
@@ -94,7 +94,7 @@ def _marginals(
     present = filled.astype(dtype)
     counts = jax.ops.segment_sum(present, components, mixture.num_components)
     sources = jnp.exp(mixture.log_component_weights).astype(dtype) / num_living
-    return sources, present / (num_living * jnp.maximum(take(counts, components), 1.0))
+    return sources, present / (num_living * jnp.maximum(spread(counts, components), 1.0))
 
 
 def _plan(

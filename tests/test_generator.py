@@ -1,0 +1,75 @@
+"""The fast generator draws what the stock one draws, bit for bit."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax.generator import fast_key, threefry
+
+KEY = jax.random.key(7)
+DRAWS = {
+    "normal": lambda key: jax.random.normal(key, (1000,)),
+    "normal, two axes": lambda key: jax.random.normal(key, (70, 3)),
+    "normal, few": lambda key: jax.random.normal(key, (5,)),
+    "uniform": lambda key: jax.random.uniform(key, (129,)),
+    "bits": lambda key: jax.random.bits(key, (100,), jnp.uint32),
+    "short bits": lambda key: jax.random.bits(key, (100,), jnp.uint8),
+    "gamma": lambda key: jax.random.gamma(key, 2.0, (200,)),
+    "permutation": lambda key: jax.random.permutation(key, 300),
+    "categorical": lambda key: jax.random.categorical(key, jnp.arange(4.0), shape=(100,)),
+    "randint": lambda key: jax.random.randint(key, (100,), 0, 17),
+    "split": lambda key: jax.random.key_data(jax.random.split(key, 5)),
+    "fold_in": lambda key: jax.random.key_data(jax.random.fold_in(key, 5)),
+    "a split key": lambda key: jax.random.normal(jax.random.split(key)[1], (200,)),
+}
+
+
+@pytest.mark.parametrize("draw", DRAWS.values(), ids=DRAWS)
+class TestTheSameBits:
+    def test_alone(self, draw):
+        np.testing.assert_array_equal(draw(fast_key(KEY)), draw(KEY))
+
+    def test_under_jit_and_vmap(self, draw):
+        keys = jax.random.split(KEY, 3)
+        fast = jax.jit(jax.vmap(lambda key: draw(fast_key(key))))
+        np.testing.assert_array_equal(fast(keys), jax.vmap(draw)(keys))
+
+
+def test_64_bit_draws():
+    with jax.enable_x64(True):
+        draw = lambda key: jax.random.normal(key, (100,), jnp.float64)
+        np.testing.assert_array_equal(draw(fast_key(KEY)), draw(KEY))
+
+
+def test_other_settings_and_generators_are_left_alone():
+    other = jax.random.key(0, impl="rbg")
+    assert fast_key(other) is other
+    with jax.threefry_partitionable(False):
+        assert fast_key(KEY) is KEY
+
+
+def test_the_published_answer():
+    # Salmon et al. (2011), known answers of their reference implementation, 20 rounds.
+    ones = jnp.full(2, 0xFFFFFFFF, jnp.uint32)
+    high, low = threefry(ones, ones[:1], ones[:1])
+    assert (int(high[0]), int(low[0])) == (0x1CB996FC, 0xBB002BE7)
+
+
+class KeySpy(mpfjax.QuadraticModel):
+    """A model that notes the generator of the keys that it is given."""
+
+    def sample_transition(self, key, states):
+        seen.append(str(jax.random.key_impl(key)))
+        return super().sample_transition(key, states)
+
+
+seen: list[str] = []
+
+
+def test_the_models_own_draws_use_it():
+    filter = mpfjax.particle_filter(KeySpy(), 64)
+    mpfjax.run_filter(KEY, filter, jnp.ones(2), lambda mixture: mixture.mean())
+    assert seen
+    assert all("utf" in impl or "unrolled" in impl for impl in seen), seen
