@@ -23,7 +23,7 @@ def fast_key(key: Key[Array, "*shape"]) -> Key[Array, "*shape"]:
     where JAX is set not to number its draws (`jax_threefry_partitionable`).
     """
     is_stock = jax.random.key_impl(key) == "threefry2x32"
-    if not is_stock or not jax.config.jax_threefry_partitionable:
+    if not is_stock or not jax.config.read("jax_threefry_partitionable"):
         return key
     return jax.random.wrap_key_data(jax.random.key_data(key), impl=_UNROLLED)
 

@@ -104,7 +104,7 @@ def count_places(places: Int[Array, " n"], num_places: int) -> Int[Array, " num_
         return counts.reshape(num_rows, num_places)
 
     @count_rows.def_vmap
-    def _(axis_size: int, in_batched: list[bool], rows: Int[Array, "b k n"]):  # noqa: ANN202
+    def _(axis_size: int, in_batched: list[bool], rows: Int[Array, "b k n"]):
         del in_batched
         counts = count_rows(rows.reshape(-1, rows.shape[-1]))
         return counts.reshape(axis_size, -1, num_places), True

@@ -61,7 +61,10 @@ def test_places_are_counted_alone_and_under_two_vmaps():
     places = RNG.integers(0, 9, (2, 3, 20))
     expected = np.stack([[np.bincount(row, minlength=9) for row in rows] for rows in places])
     places = jnp.asarray(places, jnp.int32)
-    count = lambda row: operations.count_places(row, 9)
+
+    def count(row):
+        return operations.count_places(row, 9)
+
     np.testing.assert_array_equal(jax.vmap(jax.vmap(count))(places), expected)
     np.testing.assert_array_equal(count(places[1, 2]), expected[1, 2])
 
@@ -83,7 +86,7 @@ class TestSegments:
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
     def test_spread_gives_each_entry_its_segments_value(self, m):
-        values, labels = labelled(90, m)
+        _, labels = labelled(90, m)
         of_segments = RNG.normal(size=(m, 2)).astype(np.float32)
         found = operations.spread(jnp.asarray(of_segments), jnp.asarray(labels, jnp.int32))
         np.testing.assert_array_equal(found, of_segments[labels])

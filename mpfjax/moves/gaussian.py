@@ -100,9 +100,8 @@ class GaussianRegeneration(AbstractRejuvenation):
         states = jnp.where(mixture.occupied[:, None], flatten_states(chosen), 0.0)
         weights = jnp.exp(mixture.log_component_weights).astype(states.dtype)
         moments = summarise(states, weights, mixture.component_indicators, mixture.num_components)
-        factors = spread(
-            self.inflation * cholesky(moments.covariances), vacated.component_indicators
-        )
+        factors = self.inflation * cholesky(moments.covariances)
+        factors = spread(factors, vacated.component_indicators)
         noise = NOISES[self.noise](key, states.shape, states.dtype)
         offsets = jnp.einsum("nij,nj->ni", factors, noise)
         means = spread(moments.means, vacated.component_indicators)

@@ -21,8 +21,8 @@ from mpfjax.operations import (
     add_gradient,
     count_starts,
     order_by_segment,
-    segment_counts,
     segment_argmax,
+    segment_counts,
     segment_log_sum_exp,
     spread,
     sum_before,
@@ -152,10 +152,7 @@ class Resample(AbstractRejuvenation):
         """Each slot's parent: drawn by weight where its component is due, itself elsewhere."""
         as_they_stand = mixture.num_components == 1 and self.sort_by is None
         as_they_stand &= self.gradient != "ot"  # which needs places without gaps
-        if as_they_stand:
-            line = _as_they_stand(mixture)
-        else:
-            line = _in_line(mixture, due, self.sort_by)
+        line = _as_they_stand(mixture) if as_they_stand else _in_line(mixture, due, self.sort_by)
         targets = deal_slots(line.counts, due, mixture.num_particles, self.particles_per_component)
         if as_they_stand:
             # What is not redrawn keeps its place, and there may be empty slots before it.
@@ -189,9 +186,8 @@ class Resample(AbstractRejuvenation):
         slots, line = drawn.slots, drawn.line
         # Where a component changes its number of slots, its particles repeat or are skipped.
         counts, shares = line.counts, jnp.maximum(drawn.targets, 1)
-        stretched = (
-            slots.ranks * spread(counts, slots.components) // spread(shares, slots.components)
-        )
+        stretched = slots.ranks * spread(counts, slots.components)
+        stretched //= spread(shares, slots.components)
         places = jnp.clip(spread(line.firsts, slots.components) + stretched, 0, len(stretched) - 1)
         particles, nearest = transport(
             mixture,
