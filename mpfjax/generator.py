@@ -22,8 +22,8 @@ def fast_key(key: Key[Array, "*shape"]) -> Key[Array, "*shape"]:
     calls of `jax.random`. A key of another generator is returned as it is, and so is every key
     where JAX is set not to number its draws (`jax_threefry_partitionable`).
     """
-    is_stock = jax.random.key_impl(key) == "threefry2x32"
-    if not is_stock or not jax.config.read("jax_threefry_partitionable"):
+    is_numbered = jax.config.jax_threefry_partitionable  # pyright: ignore[reportAttributeAccessIssue]
+    if not is_numbered or jax.random.key_impl(key) != "threefry2x32":
         return key
     return jax.random.wrap_key_data(jax.random.key_data(key), impl=_UNROLLED)
 
