@@ -48,5 +48,10 @@ from mpfjax.moves import Weigh as Weigh
 from mpfjax.proposals import AbstractProposal as AbstractProposal
 from mpfjax.proposals import GaussNewtonProposal as GaussNewtonProposal
 from mpfjax.proposals import NetworkProposal as NetworkProposal
+from mpfjax.storage import load_checkpoint as load_checkpoint
+from mpfjax.storage import save_checkpoint as save_checkpoint
+from mpfjax.studies import Study as Study
+from mpfjax.studies import read_study as read_study
+from mpfjax.studies import run_study as run_study
 
 __version__ = "0.1.0"

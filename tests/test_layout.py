@@ -11,11 +11,13 @@ PACKAGE = Path(__file__).resolve().parents[1] / "mpfjax"
 ORDER = (
     "operations",
     "generator",
+    "storage",
     "mixture",
     "models",
     "proposals",
     "moves",
     "filters",
+    "studies",
     "exact",
     "metrics",
     "vision",

@@ -16,6 +16,7 @@ from jaxtyping import Array, Key, PyTree
 from tqdm import tqdm
 
 from mpfjax.filters import Filter
+from mpfjax.storage import load_arrays, write_arrays
 from mpfjax.tuning.curvature import errors_at
 from mpfjax.tuning.problem import Parameters, Problem, Reals, pose, scores
 from mpfjax.tuning.transforms import AbstractTransform
@@ -233,7 +234,7 @@ class _Climb:
         return state.log_likelihoods[-1], state, stopped
 
     def save(self, path: Path, state: _State) -> None:
-        """Write all of the state, so that an interruption leaves the old file or the new one."""
+        """Write all of the state."""
         arrays = {"fit": np.array(self.described()), "step": np.array(state.step)}
         arrays["log_likelihoods"] = np.array(state.log_likelihoods)
         arrays["deviations"] = np.array(state.deviations)
@@ -242,16 +243,11 @@ class _Climb:
         for name, value in state.reals.items():
             arrays[f"reals {name}"] = np.asarray(value)
             arrays[f"path {name}"] = np.array([point[name] for point in state.path])
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".partial")
-        with open(partial, "wb") as file:
-            np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
-        os.replace(partial, path)
+        write_arrays(path, arrays)
 
     def load(self, path: Path, start: _State) -> _State:
-        """The state that was saved; raises `ValueError` for that of another fit."""
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
+        """The state that was saved; raises `ValueError` for that of another fit, or half of one."""
+        arrays = load_arrays(path)
         if str(arrays.get("fit")) != self.described():
             raise ValueError(
                 f"checkpoint: {path} is of another fit, {arrays.get('fit')},"

@@ -1,0 +1,318 @@
+"""Monte Carlo studies over filters, numbers of particles and settings, which can be broken off."""
+
+import hashlib
+import itertools
+import json
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key, PyTree
+from tqdm import tqdm
+
+from mpfjax.filters import Filter, FilterRun, monte_carlo, present_steps
+from mpfjax.mixture import ParticleMixture
+from mpfjax.storage import (
+    describe,
+    differences,
+    fingerprint,
+    load_arrays,
+    named,
+    write_arrays,
+    write_whole,
+)
+
+_MANIFEST = "study.json"
+_CELL = "cell"
+_TAKEN = ("filter", "num_particles", _CELL)
+
+
+def log_evidence(run: FilterRun) -> dict[str, Array]:
+    """log Ẑ of each seed: what a `Study` measures where it is not told."""
+    return {"log_marginal_likelihood": run.log_marginal_likelihood}
+
+
+def nothing(mixture: ParticleMixture) -> None:
+    """What a `Study` collects where it is not told."""
+    del mixture
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A grid of filters x N x settings, each cell the Monte Carlo runs of one filter.
+
+    Raises `ValueError` for an empty or repeated axis, a setting that is no number or string, a
+    filter's function that returns none, and what `monte_carlo` does.
+    """
+
+    filters: Mapping[str, Callable[..., Filter]]
+    """by name: functions of N, and of the settings by name, that build a filter."""
+    num_particles: Sequence[int]
+    keys: Key[Array, " seeds"]
+    """one for each run of a cell; the same in all cells."""
+    observations: PyTree
+    """y_1..y_t, one data set for all; every leaf has a leading axis t."""
+    settings: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    """by name: the values of each setting, numbers or strings. All combinations are run."""
+    measure: Callable[[FilterRun], Mapping[str, Any]] = log_evidence
+    """arrays by name from a cell's runs, each with the leading axis of seeds."""
+    collect: Callable[[ParticleMixture], PyTree] | None = nothing
+    """as for `run_filter`, for `measure` to use; None keeps all of every mixture."""
+    missing: str = "error"
+    """as for `run_filter`."""
+
+    def __post_init__(self) -> None:
+        taken = [name for name in self.settings if name in _TAKEN]
+        if taken:
+            raise ValueError(f"settings: {taken[0]!r} is what a cell has a name for already")
+        for name, values in _axes(self).items():
+            if not values or len(set(values)) < len(values):
+                raise ValueError(f"{name}: {values} is empty or has the same twice")
+        if jnp.ndim(self.keys) != 1 or self.keys.shape[0] < 1:
+            shape = jnp.shape(self.keys)
+            raise ValueError(f"keys: shape {shape} is not that of one key a run, (seeds,)")
+        present_steps(self.observations, self.missing)
+
+
+def run_study(
+    study: Study,
+    directory: str | os.PathLike[str],
+    *,
+    seeds_at_once: int | None = None,
+    cells_at_once: int = 1,
+) -> list[dict[str, Any]]:
+    """Run every cell of a study, and go on where an earlier call was broken off or killed.
+
+    Each cell is written to a file of its own in `directory` as soon as it is finished, so that at
+    most the cells in flight are lost. Returns one dict a cell: its `filter`, `num_particles`,
+    settings and measured arrays. On a terminal a bar shows the time left.
+
+        circle = lambda num_particles, noise: mpfjax.mixture_particle_filter(
+            Circle(noise), num_particles, max_components=4)
+        study = mpfjax.Study({"mpf": circle}, [50, 200, 800], jax.random.split(key, 100),
+                             observations, settings={"noise": [0.1, 0.3]})
+        results = mpfjax.run_study(study, "results/circle")
+
+    - `seeds_at_once`: how many seeds share one `vmap`, where memory is short; None is all.
+    - `cells_at_once`: with 2, one cell compiles while another runs; a kill may lose both.
+
+    Raises `ValueError`, before anything runs, for a `directory` of another study, naming what
+    differs, and for files in it that are cut off: delete those, and only their cells are run
+    again. Raises `OSError` where a cell cannot be written, a full disk say; finished cells stay.
+    Filters are compared by their structure and numbers, `measure` and `collect` only by their
+    names: take a new directory after changing code. Several processes share one directory, which
+    the first writes. Use it where a loop over `monte_carlo` would take long.
+    """
+    for name, number in (("seeds_at_once", seeds_at_once), ("cells_at_once", cells_at_once)):
+        if number is not None and number < 1:
+            raise ValueError(f"{name}: {number} is less than 1")
+    directory = Path(directory)
+    cells = _cells(study)
+    manifest = _claim(directory, study, cells)
+    results = _finished(directory, manifest)
+    pending = [cell for cell in cells if cell.file not in results]
+
+    def finish(cell: _Cell) -> str:
+        try:
+            measured = _measure(study, cell, seeds_at_once)
+        except Exception as error:
+            error.add_note(f"in the cell {cell.description}")
+            raise
+        if jax.process_index() == 0:
+            write_arrays(directory / cell.file, measured | {_CELL: _mark(manifest, cell.file)})
+        results[cell.file] = measured
+        return cell.file
+
+    with tqdm(total=len(cells), initial=len(results), unit="cell", disable=None) as bar:
+        for _ in _in_turn(finish, pending, cells_at_once):
+            bar.update()
+    return [cell.description | results[cell.file] for cell in cells]
+
+
+def read_study(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
+    """The finished cells of a study, as `run_study` returns them, without what it was made from.
+
+    Also while it runs. Raises `FileNotFoundError` for a directory without a study, and
+    `ValueError` for files in it that are cut off or from another study.
+    """
+    directory = Path(directory)
+    manifest = _read_manifest(directory / _MANIFEST)
+    results = _finished(directory, manifest)
+    cells = manifest["cells"]
+    return [cells[file]["is"] | results[file] for file in cells if file in results]
+
+
+@dataclass(frozen=True)
+class _Cell:
+    """One filter at one size under one combination of settings."""
+
+    file: str
+    description: dict[str, Any]
+    filter: Filter
+
+
+def _cells(study: Study) -> list[_Cell]:
+    """All cells, with their filters built: what cannot be built is an error before any runs."""
+    axes = _axes(study)
+    # Settings are outermost: neighbours, which may compile at once, are different programs.
+    outermost_first = [*study.settings, "num_particles", "filter"]
+    cells = []
+    for index, values in enumerate(itertools.product(*(axes[k] for k in outermost_first))):
+        value_of = dict(zip(outermost_first, values, strict=True))
+        description = {name: value_of[name] for name in axes}
+        name, num_particles = description["filter"], description["num_particles"]
+        settings = {name: description[name] for name in study.settings}
+        filter = study.filters[name](num_particles, **settings)
+        if not isinstance(filter, Filter):
+            raise ValueError(f"filters: {name} made {filter!r}, no Filter")
+        words = [name, f"N{num_particles}", *(f"{k}_{v}" for k, v in settings.items())]
+        stem = re.sub(r"[^\w.+-]+", "_", "-".join([f"{index:04d}", *words]))[:100]
+        cells.append(_Cell(f"{stem}.npz", description, filter))
+    return cells
+
+
+def _axes(study: Study) -> dict[str, list[Any]]:
+    """The values along each axis of the grid, the filters' names first."""
+    axes = {"filter": study.filters, "num_particles": study.num_particles, **study.settings}
+    return {name: [_plain(name, value) for value in values] for name, values in axes.items()}
+
+
+def _plain(name: str, value: Any) -> Any:
+    """A value of an axis as JSON can hold it."""
+    if isinstance(value, np.generic | np.ndarray | jax.Array) and value.ndim == 0:
+        value = value.item()
+    if value is not None and not isinstance(value, str | int | float | bool):
+        raise ValueError(
+            f"{name}: {value!r} is no number or string; name it, and let the filter's function"
+            " look it up"
+        )
+    return value
+
+
+def _manifest(study: Study, cells: list[_Cell]) -> dict[str, Any]:
+    """What has to be the same for a directory to be of this study, as JSON holds it."""
+    manifest = {
+        "axes": _axes(study),
+        "keys": _summary(study.keys),
+        "observations": _summary(study.observations),
+        "measure": named(study.measure),
+        "collect": named(study.collect),
+        "missing": study.missing,
+        "cells": {
+            cell.file: {"is": cell.description, "filter": fingerprint(cell.filter)}
+            for cell in cells
+        },
+    }
+    return json.loads(json.dumps(manifest))
+
+
+def _summary(tree: PyTree) -> str:
+    shapes = ", ".join(f"{place} {kind}".strip() for place, kind in describe(tree).items())
+    return f"{shapes} ({fingerprint(tree)[:16]})"
+
+
+def _claim(directory: Path, study: Study, cells: list[_Cell]) -> dict[str, Any]:
+    """The manifest of this study, written into its directory unless it is there already."""
+    manifest, path = _manifest(study, cells), directory / _MANIFEST
+    if path.exists():
+        there = _read_manifest(path)
+        # As text, in which a NaN is equal to itself.
+        if json.dumps(there, sort_keys=True) != json.dumps(manifest, sort_keys=True):
+            raise ValueError(
+                f"directory: {directory} holds another study ({_difference(there, manifest)});"
+                " take another directory, or delete that one"
+            )
+    elif jax.process_index() == 0:
+        content = json.dumps(manifest, indent=1) + "\n"
+        write_whole(path, lambda file: file.write(content.encode()))
+    return manifest
+
+
+def _difference(there: dict[str, Any], here: dict[str, Any]) -> str:
+    """What differs, by name; the filters' inside where nothing else does."""
+    there, here = there.copy(), here.copy()
+    cells, own = there.pop("cells"), here.pop("cells")
+    there |= there.pop("axes")
+    here |= here.pop("axes")
+    if there != here:
+        return differences(there, here)
+    other = [file for file in own if cells.get(file) != own[file]]
+    return f"the filters of {len(other)} cells have other moves or numbers, first {other[0]}"
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: cut off, damaged or no study ({error})") from error
+    if not isinstance(manifest, dict) or "cells" not in manifest:
+        raise ValueError(f"{path}: no study")
+    return manifest
+
+
+def _mark(manifest: dict[str, Any], file: str) -> np.ndarray:
+    """What says which cell of which study a file holds."""
+    digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
+    return np.array(json.dumps({"study": digest} | manifest["cells"][file]["is"]))
+
+
+def _finished(directory: Path, manifest: dict[str, Any]) -> dict[str, dict[str, np.ndarray]]:
+    """The measured arrays of the cells that are there, by file."""
+    # No warning and a second run: who has a damaged file should know, for others may be as well.
+    results, faults = {}, []
+    for file in manifest["cells"]:
+        path = directory / file
+        if not path.exists():
+            continue
+        try:
+            arrays = load_arrays(path)
+        except ValueError as error:
+            faults.append(str(error))
+            continue
+        if str(arrays.pop(_CELL, None)) != str(_mark(manifest, file)):
+            faults.append(f"{path}: results of another study or cell")
+        results[file] = arrays
+    if faults:
+        raise ValueError("; ".join([*faults, "delete these, and only their cells are run again"]))
+    return results
+
+
+def _measure(study: Study, cell: _Cell, seeds_at_once: int | None) -> dict[str, np.ndarray]:
+    """All seeds of one cell, a bounded number of them at once."""
+    num_seeds = study.keys.shape[0]
+    size = num_seeds if seeds_at_once is None else min(seeds_at_once, num_seeds)
+    parts = []
+    for start in range(0, num_seeds, size):
+        # The last batch is filled up, so that it does not compile anew.
+        batch = study.keys[np.clip(np.arange(start, start + size), 0, num_seeds - 1)]
+        run = monte_carlo(
+            batch, cell.filter, study.observations, study.collect, missing=study.missing
+        )
+        measured = {name: np.asarray(array) for name, array in study.measure(run).items()}
+        for name, array in measured.items():
+            if name in cell.description or name in _TAKEN:
+                raise ValueError(f"measure: {name!r} is what a cell is described by")
+            if array.shape[:1] != (size,):
+                raise ValueError(f"measure: {name}'s shape, {array.shape}, has no axis of seeds")
+        parts.append(measured)
+    return {name: np.concatenate([part[name] for part in parts])[:num_seeds] for name in parts[0]}
+
+
+def _in_turn(finish: Callable[[_Cell], str], cells: list[_Cell], at_once: int) -> Iterator[str]:
+    """Finish the cells, so many at once; an error ends it once those in flight are finished."""
+    if at_once == 1:
+        yield from map(finish, cells)
+        return
+    pool = ThreadPoolExecutor(at_once)
+    try:
+        for future in as_completed([pool.submit(finish, cell) for cell in cells]):
+            yield future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
