@@ -29,6 +29,8 @@ from mpfjax.storage import (
     write_whole,
 )
 
+Values = Sequence[Any] | np.ndarray | Array
+
 _MANIFEST = "study.json"
 _CELL = "cell"
 _TAKEN = ("filter", "num_particles", _CELL)
@@ -54,12 +56,12 @@ class Study:
 
     filters: Mapping[str, Callable[..., Filter]]
     """by name: functions of N, and of the settings by name, that build a filter."""
-    num_particles: Sequence[int]
+    num_particles: Values
     keys: Key[Array, " seeds"]
     """one for each run of a cell; the same in all cells."""
     observations: PyTree
     """y_1..y_t, one data set for all; every leaf has a leading axis t."""
-    settings: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    settings: Mapping[str, Values] = field(default_factory=dict)
     """by name: the values of each setting, numbers or strings. All combinations are run."""
     measure: Callable[[FilterRun], Mapping[str, Any]] = log_evidence
     """arrays by name from a cell's runs, each with the leading axis of seeds."""
