@@ -3,9 +3,9 @@ particles. Run with `python -m benchmarks.score_vs_particles`; `--help` lists th
 """
 
 import argparse
+import functools
+import shutil
 import sys
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from tqdm import tqdm
 
 import mpfjax
-from benchmarks.results import format_table, write_json
+from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
 from mpfjax.exact import grid_filter
 from mpfjax.metrics import mass_above, modes_represented
@@ -44,26 +43,39 @@ OF_THE_PAPER = ["pf", "mpf", "guided_mpf"]
 def main(arguments: list[str] | None = None) -> int:
     """Run the study, print its table, and write its results and figures."""
     options = parse(arguments)
+    return exit_status(lambda: run(options))
+
+
+def run(options: argparse.Namespace) -> None:
+    """All of it; a run that was broken off goes on where it was."""
     out = Path(options.out)
     model = mpfjax.QuadraticModel(SIGMA, SIGMA, LOW, HIGH)
     truth, observations = simulate(options.data_seed)
     exact_mass = np.asarray(grid_filter(model, observations, jnp.linspace(*GRID)).mass_above(0.0))
 
-    settings = settings_of(options)
-    results: list[dict[str, Any]] = []
-    typical: dict[str, plotting.Trace] = {}
-    cells = [(name, n) for n in options.particles for name in options.filters]
+    def write(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        results = [
+            summarise(cell["filter"], cell["num_particles"], cell, exact_mass) for cell in cells
+        ]
+        content = {"settings": settings_of(options), "results": results}
+        write_json(out / "score_vs_particles.json", content)
+        return results
+
+    unfinished = out / "unfinished"
+    study = study_of(options, model, truth, observations)
     try:
-        finished = run_cells(cells, model, truth, observations, options)
-        for (name, num_particles), runs in zip(cells, finished, strict=True):
-            results.append(summarise(name, num_particles, runs, exact_mass))
-            write_json(out / "score_vs_particles.json", {"settings": settings, "results": results})
-            if num_particles == typical_size(options.particles):
-                typical[name] = typical_run(runs)
+        # One cell compiles while the one before it runs.
+        cells = mpfjax.run_study(study, unfinished, seeds_at_once=SEEDS_AT_ONCE, cells_at_once=2)
     except KeyboardInterrupt:
-        print(f"interrupted: {len(results)} of {len(cells)} cells are in {out}", file=sys.stderr)
-        return 130
+        write(mpfjax.read_study(unfinished))
+        raise
+    results = write(cells)
     print(as_table(results))
+    typical = {
+        cell["filter"]: typical_run(cell)
+        for cell in cells
+        if cell["num_particles"] == typical_size(options.particles)
+    }
     figures = {
         "typical_run": plotting.draw_typical_run(
             typical, np.asarray(truth), np.asarray(observations), LABELS
@@ -72,8 +84,9 @@ def main(arguments: list[str] | None = None) -> int:
     }
     for stem, figure in figures.items():
         figure.savefig(out / f"{stem}.png", dpi=150)
+    # The next run is to show what the code does then, not what it did now.
+    shutil.rmtree(unfinished)
     print(f"results and figures: {out}/")
-    return 0
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
@@ -148,47 +161,29 @@ def collect(mixture: mpfjax.ParticleMixture) -> dict[str, Array]:
     }
 
 
-def run_cells(
-    cells: list[tuple[str, int]],
+def study_of(
+    options: argparse.Namespace,
     model: mpfjax.QuadraticModel,
     truth: Float[Array, " t"],
     observations: Float[Array, " t"],
-    options: argparse.Namespace,
-) -> Iterator[dict[str, np.ndarray]]:
-    """The runs of every cell in turn, one cell compiling while the one before it runs."""
-    with ThreadPoolExecutor(max_workers=2) as pool:
-        futures = [
-            pool.submit(run_cell, name, n, model, truth, observations, options) for name, n in cells
-        ]
-        try:
-            for future in tqdm(futures, disable=not sys.stderr.isatty(), unit="cell"):
-                yield future.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+) -> mpfjax.Study:
+    """All seeds of every filter at every size; particles are kept at the size of figure 1 only."""
 
-
-def run_cell(
-    name: str,
-    num_particles: int,
-    model: mpfjax.QuadraticModel,
-    truth: Float[Array, " t"],
-    observations: Float[Array, " t"],
-    options: argparse.Namespace,
-) -> dict[str, np.ndarray]:
-    """All seeds of one filter at one size, a bounded number of them at once."""
-    filter = build(name, model, num_particles)
-    keys = jax.random.split(jax.random.fold_in(jax.random.key(options.seed), 1), options.seeds)
-    size = min(SEEDS_AT_ONCE, options.seeds)
-    parts = []
-    for start in range(0, options.seeds, size):
-        # The last batch is filled up, so that it does not compile anew.
-        batch = keys[np.clip(np.arange(start, start + size), 0, options.seeds - 1)]
-        kept = mpfjax.monte_carlo(batch, filter, observations, collect).collected
+    def measure(run: mpfjax.FilterRun) -> dict[str, Array]:
+        kept = dict(run.collected)
         kept["both"] = both_represented(kept["positions"], kept["occupied"], truth)
-        if num_particles != typical_size(options.particles):
+        if kept["positions"].shape[-1] != typical_size(options.particles):
             kept = {k: kept[k] for k in ("both", "weight", "components", "mass_above")}
-        parts.append(jax.tree.map(np.asarray, kept))
-    return {k: np.concatenate([part[k] for part in parts])[: options.seeds] for k in parts[0]}
+        return kept
+
+    return mpfjax.Study(
+        filters={name: functools.partial(build, name, model) for name in options.filters},
+        num_particles=list(dict.fromkeys(options.particles)),
+        keys=jax.random.split(jax.random.fold_in(jax.random.key(options.seed), 1), options.seeds),
+        observations=observations,
+        measure=measure,
+        collect=collect,
+    )
 
 
 @jax.jit

@@ -53,19 +53,39 @@ def test_draws_both_figures(finished):
         assert (out / name).stat().st_size > 10_000
 
 
-def test_an_interruption_leaves_what_was_finished(tmp_path, monkeypatch):
-    real = benchmark.run_cell
+def test_an_interruption_leaves_what_was_finished_and_the_next_run_goes_on(
+    finished, tmp_path, monkeypatch, capsys
+):
+    real, built = mpfjax.studies.monte_carlo, []
 
-    def interrupted(name, *rest):
-        if name == "mpf":
+    def interrupted(keys, filter, *rest, **options):
+        built.append(filter.num_particles)
+        if filter.num_particles == 40:
             raise KeyboardInterrupt
-        return real(name, *rest)
+        return real(keys, filter, *rest, **options)
 
-    monkeypatch.setattr(benchmark, "run_cell", interrupted)
-    arguments = ["--seeds", "2", "--particles", "20", "--filters", "pf", "mpf"]
-    assert benchmark.main([*arguments, "--out", str(tmp_path)]) == 130
+    arguments = ["--seeds", "3", "--particles", "20", "40", "--out", str(tmp_path)]
+    monkeypatch.setattr(mpfjax.studies, "monte_carlo", interrupted)
+    assert benchmark.main(arguments) == 130
     written = json.loads((tmp_path / "score_vs_particles.json").read_text())
-    assert [entry["filter"] for entry in written["results"]] == ["pf"]
+    names = [(entry["filter"], entry["particles"]) for entry in written["results"]]
+    assert names == [("pf", 20), ("mpf", 20), ("guided_mpf", 20)]
+    assert "interrupted" in capsys.readouterr().err
+    assert benchmark.main([*arguments, "--seed", "1"]) == 2
+    assert "holds another study (keys is" in capsys.readouterr().err
+
+    def noted(keys, filter, *rest, **options):
+        built.append(filter.num_particles)
+        return real(keys, filter, *rest, **options)
+
+    built.clear()
+    monkeypatch.setattr(mpfjax.studies, "monte_carlo", noted)
+    assert benchmark.main(arguments) == 0
+    assert built == [40, 40, 40]
+    assert json.loads((tmp_path / "score_vs_particles.json").read_text()) == finished[1]
+    assert {path.name for path in tmp_path.iterdir()} == {
+        path.name for path in finished[0].iterdir()
+    }
 
 
 @pytest.mark.parametrize(
