@@ -1,19 +1,18 @@
 """What every benchmark does with its results and errors: write them at once, and whole."""
 
 import json
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from mpfjax.storage import write_whole
+
 
 def write_json(path: Path, content: Any) -> None:
     """Write `content` so that an interruption leaves the old file or the new one, never half."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
-    os.replace(partial, path)
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    write_whole(path, lambda file: file.write(text.encode()))
 
 
 def format_table(header: list[str], rows: list[list[str]]) -> str:

@@ -103,7 +103,8 @@ def run_study(
         results = mpfjax.run_study(study, "results/circle")
 
     - `seeds_at_once`: how many seeds share one `vmap`, where memory is short; None is all.
-    - `cells_at_once`: with 2, one cell compiles while another runs; a kill may lose both.
+    - `cells_at_once`: with 2, one cell compiles while another runs; a kill may lose both. Several
+      processes, which must meet in the same cell, run one at a time.
 
     Raises `ValueError`, before anything runs, for a `directory` of another study, naming what
     differs, and for files in it that are cut off: delete those, and only their cells are run
@@ -120,6 +121,8 @@ def run_study(
     manifest = _claim(directory, study, cells)
     results = _finished(directory, manifest)
     pending = [cell for cell in cells if cell.file not in results]
+    if jax.process_count() > 1:
+        cells_at_once = 1
 
     def finish(cell: _Cell) -> str:
         try:

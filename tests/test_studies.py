@@ -180,6 +180,21 @@ class TestBrokenOff:
         assert len(studies.read_study(killed)) == num_cells
 
 
+class TestSeveralProcesses:
+    def test_only_the_first_writes_and_all_have_the_results(self, alone, tmp_path, monkeypatch):
+        monkeypatch.setattr(jax, "process_index", lambda: 1)
+        results = mpfjax.run_study(small_study(NUM_CELLS), tmp_path)
+        assert_same_results(results, alone[1])
+        assert not list(tmp_path.iterdir())
+
+    def test_run_the_cells_in_one_order(self, copy, monkeypatch):
+        for path in files_of(copy):
+            path.unlink()
+        monkeypatch.setattr(jax, "process_count", lambda: 2)
+        monkeypatch.setattr(studies, "ThreadPoolExecutor", None)
+        mpfjax.run_study(small_study(NUM_CELLS), copy, cells_at_once=2)
+
+
 class TestOtherFiles:
     @pytest.mark.parametrize(
         ("changes", "named"),

@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.tuning import Interval, Positive, fit, standard_errors
+from tests.full_disk import no_room_beyond
 from tests.user_models import ScalarLinear
 
 OBSERVATIONS = jnp.array([1.5, 0.2, -0.4, 0.8, 1.9, 1.1, 0.3, -0.9])
@@ -141,6 +142,22 @@ class TestResuming:
         short_fit(1, checkpoint=tmp_path / "fit.npz")
         with pytest.raises(ValueError, match=r"checkpoint: .* is of another fit"):
             short_fit(checkpoint=tmp_path / "fit.npz", **other)
+
+    def test_a_checkpoint_that_is_cut_off_is_named_and_left_alone(self, tmp_path):
+        path = tmp_path / "fit.npz"
+        short_fit(1, checkpoint=path)
+        path.write_bytes(path.read_bytes()[:500])
+        with pytest.raises(ValueError, match=r"fit\.npz: cut off"):
+            short_fit(checkpoint=path)
+        assert path.stat().st_size == 500
+
+    def test_a_full_disk_leaves_the_last_checkpoint(self, tmp_path):
+        path = tmp_path / "fit.npz"
+        short_fit(2, checkpoint=path)
+        before = path.read_bytes()
+        with pytest.raises(OSError, match=r"fit\.npz"), no_room_beyond(500):
+            short_fit(checkpoint=path)
+        assert path.read_bytes() == before
 
 
 class TestStopping:
