@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import mpfjax
+from mpfjax.generator import fast_key
 from mpfjax.storage import load_arrays, write_arrays
 from tests.examples import make_mixture
 from tests.full_disk import no_room_beyond
@@ -67,11 +68,15 @@ class TestOnlineFilter:
 
 
 class TestRoundTrip:
-    @pytest.mark.parametrize("implementation", ["threefry2x32", "rbg"])
-    def test_every_kind_of_leaf_comes_back(self, path, implementation):
+    @pytest.mark.parametrize(
+        "key",
+        [jax.random.key(3), jax.random.key(3, impl="rbg"), fast_key(jax.random.key(3))],
+        ids=lambda key: str(key.dtype),
+    )
+    def test_every_kind_of_leaf_comes_back(self, path, key):
         state = {
             "mixture": MIXTURE,
-            "keys": jax.random.split(jax.random.key(3, impl=implementation), 2),
+            "keys": jax.random.split(key, 2),
             "half": jnp.array([1.5, -2.0], jnp.bfloat16),
             "nothing": jnp.zeros((0, 2)),
             "awkward": jnp.array([jnp.nan, -jnp.inf, -0.0]),

@@ -70,15 +70,15 @@ class TestResults:
     def test_are_those_of_monte_carlo_for_each_cell(self, tmp_path):
         keys = jax.random.split(jax.random.key(0), 4)
 
-        def mpf(num_particles, noise):
+        def adaptive(num_particles, noise):
             model = mpfjax.QuadraticModel(0.3, noise, -2.0, 2.0)
-            return mpfjax.mixture_particle_filter(model, num_particles, 2)
+            return mpfjax.particle_filter(model, num_particles, ess_threshold=0.5)
 
-        study = small_study(2, filters={"pf": build, "mpf": mpf})
+        study = small_study(2, filters={"pf": build, "adaptive": adaptive})
         results = mpfjax.run_study(study, tmp_path)
         cells = [(entry["filter"], entry["num_particles"], entry["noise"]) for entry in results]
-        assert cells == [("pf", 8, 0.1), ("mpf", 8, 0.1), ("pf", 8, 1.0), ("mpf", 8, 1.0)]
-        for entry, function in zip(results, [build, mpf, build, mpf], strict=True):
+        assert cells == [("pf", 8, 0.1), ("adaptive", 8, 0.1), ("pf", 8, 1.0), ("adaptive", 8, 1.0)]
+        for entry, function in zip(results, [build, adaptive, build, adaptive], strict=True):
             filter = function(entry["num_particles"], entry["noise"])
             run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean)
             np.testing.assert_array_equal(entry["evidence"], run.log_marginal_likelihood)
