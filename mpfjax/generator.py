@@ -1,6 +1,7 @@
 """JAX's own random numbers, drawn faster on a CPU: the same bits from an unrolled Threefry."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,6 @@ from jaxtyping import Array, Key, UInt32
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
-_FEW = 64
 
 
 def fast_key(key: Key[Array, "*shape"]) -> Key[Array, "*shape"]:
@@ -29,21 +29,37 @@ def fast_key(key: Key[Array, "*shape"]) -> Key[Array, "*shape"]:
 
 
 def _random_bits(key: UInt32[Array, " 2"], bit_width: int, shape: tuple[int, ...]) -> Array:
-    size = math.prod(shape)
-    if bit_width != 32 or not _FEW <= size < 2**32:
-        return threefry_prng_impl.random_bits(key, bit_width, shape)
-    return jax.lax.platform_dependent(
-        key,
-        cpu=lambda key: _unrolled_bits(key, shape),
-        default=lambda key: threefry_prng_impl.random_bits(key, bit_width, shape),
-    )
+    stock = partial(threefry_prng_impl.random_bits, bit_width=bit_width, shape=shape)
+    if bit_width != 32 or not 0 < math.prod(shape) < 2**32:
+        return stock(key)
+    return jax.lax.platform_dependent(key, cpu=partial(_words, shape=shape), default=stock)
 
 
-def _unrolled_bits(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, "..."]:
+def _split(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, "*shape 2"]:
+    stock = partial(threefry_prng_impl.split, shape=shape)
+    if not 0 < math.prod(shape) < 2**32:
+        return stock(key)
+    return jax.lax.platform_dependent(key, cpu=partial(_keys, shape=shape), default=stock)
+
+
+@partial(jax.jit, static_argnames="shape")
+def _words(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, "..."]:
     """The word of each position: both halves of its hash, xored."""
-    index = jax.lax.iota(jnp.uint32, math.prod(shape)).reshape(shape)
-    high, low = threefry(key, jnp.zeros_like(index), index)
+    high, low = _hashes(key, shape)
     return high ^ low
+
+
+@partial(jax.jit, static_argnames="shape")
+def _keys(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, "..."]:
+    """The key of each position: both halves of its hash, side by side."""
+    return jnp.stack(_hashes(key, shape), axis=-1)
+
+
+def _hashes(
+    key: UInt32[Array, " 2"], shape: tuple[int, ...]
+) -> tuple[UInt32[Array, "..."], UInt32[Array, "..."]]:
+    index = jax.lax.iota(jnp.uint32, math.prod(shape)).reshape(shape)
+    return threefry(key, jnp.zeros_like(index), index)
 
 
 def threefry(
@@ -68,7 +84,7 @@ def _rotate_left(word: UInt32[Array, " *shape"], by: int) -> UInt32[Array, " *sh
 _UNROLLED = define_prng_impl(
     key_shape=(2,),
     seed=threefry_prng_impl.seed,
-    split=threefry_prng_impl.split,
+    split=_split,
     random_bits=_random_bits,
     fold_in=threefry_prng_impl.fold_in,
     name="unrolled_threefry2x32",

@@ -25,6 +25,7 @@ from mpfjax.operations import (
     segment_counts,
     segment_log_sum_exp,
     spread,
+    stored,
     sum_before,
     take,
     whole_blocks,
@@ -164,7 +165,7 @@ class Resample(AbstractRejuvenation):
         if self.ess_threshold < 1.0:
             unmoved = spread(line.firsts, slots.components) + slots.ranks
             parents = jnp.where(spread(due, slots.components), parents, unmoved)
-        parents = jnp.clip(parents, 0, mixture.num_particles - 1)
+        parents = stored(jnp.clip(parents, 0, mixture.num_particles - 1))
         return _Drawn(take(line.order, parents), slots, targets, line)
 
     def _drawn_from(self, mixture: ParticleMixture) -> ParticleMixture:
@@ -275,7 +276,6 @@ class _Line(NamedTuple):
     weights: Float[Array, " p"]  # within the component, zero at an empty place
     counts: Int[Array, " m"]
     firsts: Int[Array, " m"]  # the place of each component's first particle
-    length: Int[Array, ""] | int  # how many places come before the empty ones at the end
 
 
 def _as_they_stand(mixture: ParticleMixture) -> _Line:
@@ -286,7 +286,6 @@ def _as_they_stand(mixture: ParticleMixture) -> _Line:
         weights=_padded(jnp.exp(mixture.log_component_weights), 0.0),
         counts=mixture.component_counts,
         firsts=jnp.zeros(1, jnp.int32),
-        length=mixture.num_particles,
     )
 
 
@@ -318,7 +317,6 @@ def _in_line(
         weights=jnp.where(slots.filled, take(_padded(weights, 0.0), order), 0.0),
         counts=counts,
         firsts=slots.firsts,
-        length=jnp.sum(counts, dtype=jnp.int32),
     )
 
 
@@ -344,14 +342,13 @@ def _within_component(parents: Int[Array, " n"], slots: Slots, line: _Line) -> I
 
 
 def _systematic(key, expected, targets, slots, line):
-    shift = jax.random.uniform(key, targets.shape, expected.dtype)
-    before = _expected_before(expected, targets, slots, line)
-    return _points_before(before, spread(shift, line.components))
+    shift = stored(jax.random.uniform(key, targets.shape, expected.dtype))
+    return _points_before(sum_before(expected), spread(shift, line.components))
 
 
 def _stratified(key, expected, targets, slots, line):
     shift = jax.random.uniform(key, slots.components.shape, expected.dtype)
-    before = _expected_before(expected, targets, slots, line)
+    before = sum_before(expected)
     slot = jnp.clip(before.astype(jnp.int32), 0, shift.shape[0] - 1)
     return _points_before(before, take(shift, slot))
 
@@ -364,8 +361,7 @@ def _points_before(before: Float[Array, " p"], shift: Float[Array, " p"]) -> Int
 
 def _multinomial(key, expected, targets, slots, line):
     points = _sorted_points(key, slots, targets, expected.dtype)
-    before = _expected_before(expected, targets, slots, line)
-    return jnp.searchsorted(points, before, side="left").astype(jnp.int32)
+    return jnp.searchsorted(points, sum_before(expected), side="left").astype(jnp.int32)
 
 
 def _residual(key, expected, targets, slots, line):
@@ -376,23 +372,9 @@ def _residual(key, expected, targets, slots, line):
     left = jnp.maximum(targets - per_component.astype(jnp.int32), 0)
     rest = place_slots(left, slots.components.shape[0])
     points = _sorted_points(key, rest, left, expected.dtype)
-    before = _expected_before(jnp.maximum(expected - whole, 0.0), left, rest, line)
+    before = sum_before(jnp.maximum(expected - whole, 0.0))
     drawn = jnp.searchsorted(points, before, side="left")
     return certain.astype(jnp.int32) + drawn.astype(jnp.int32)
-
-
-def _expected_before(
-    expected: Float[Array, " p"], targets: Int[Array, " m"], slots: Slots, line: _Line
-) -> Float[Array, " p"]:
-    """The expected offspring before each particle, held to its component's stretch of slots."""
-    lows = slots.firsts.astype(expected.dtype)
-    highs = (slots.firsts + targets).astype(expected.dtype)
-    before = jnp.clip(
-        sum_before(expected), spread(lows, line.components), spread(highs, line.components)
-    )
-    is_empty = jnp.arange(expected.shape[0], dtype=jnp.int32) >= line.length
-    num_slots = slots.components.shape[0]
-    return jnp.where(is_empty, jnp.array(num_slots, expected.dtype), before)
 
 
 def _sorted_points(

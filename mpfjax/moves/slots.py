@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from mpfjax.operations import count_starts, spread
+from mpfjax.operations import segments_in_order, spread, stored
 
 
 class Slots(NamedTuple):
@@ -37,17 +37,14 @@ def deal_slots(
     sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
     rank = jnp.cumsum(due.astype(jnp.int32)) - 1
     share = pool // sharers + (rank < pool % sharers).astype(jnp.int32)
-    return jnp.where(due, share, kept)
+    return stored(jnp.where(due, share, kept))
 
 
 def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:
     """The slots of each component, given how many it gets."""
     firsts = jnp.cumsum(targets) - targets
     slot = jnp.arange(num_particles, dtype=jnp.int32)
-    if targets.shape[0] == 1:
-        components = jnp.zeros(num_particles, jnp.int32)
-    else:
-        components = count_starts(firsts, num_particles)
+    components = segments_in_order(firsts, num_particles)
     return Slots(
         components=components,
         ranks=slot - spread(firsts, components),
