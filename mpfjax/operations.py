@@ -150,45 +150,6 @@ def _in_rows(
     return lambda row: scatter_rows(row[None])[0]
 
 
-def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, " num_places"]:
-    """Each place's segment, where segments lie side by side from ascending first places.
-
-    An empty segment has no place, and places past the last segment's are the last one's.
-    """
-    if firsts.shape[0] > _FEW_SEGMENTS:
-        return count_starts(firsts, num_places)
-    place = jnp.arange(num_places, dtype=jnp.int32)
-    segments = jnp.zeros(num_places, jnp.int32)
-    for m in range(1, firsts.shape[0]):
-        segments = segments + (place >= firsts[m]).astype(jnp.int32)
-    return segments
-
-
-def count_places(places: Int[Array, " n"], num_places: int) -> Int[Array, " num_places"]:
-    """How many of the entries name each place, all of which must be in [0, num_places).
-
-    Under `vmap` all rows are counted in one scatter over one line of places, about twice as fast
-    on a CPU as a scatter with pairs of indices.
-    """
-
-    @jax.custom_batching.custom_vmap
-    def count_rows(rows: Int[Array, "k n"]) -> Int[Array, "k num_places"]:
-        num_rows = rows.shape[0]
-        firsts = num_places * jnp.arange(num_rows, dtype=jnp.int32)
-        on_line = (stored(rows) + firsts[:, None]).reshape(-1)
-        counts = jnp.zeros(num_rows * num_places, jnp.int32)
-        counts = counts.at[_from_the_start(on_line)].add(1, mode="promise_in_bounds")
-        return counts.reshape(num_rows, num_places)
-
-    @count_rows.def_vmap
-    def _(axis_size: int, in_batched: list[bool], rows: Int[Array, "b k n"]):
-        del in_batched
-        counts = count_rows(rows.reshape(-1, rows.shape[-1]))
-        return counts.reshape(axis_size, -1, num_places), True
-
-    return count_rows(places[None])[0]
-
-
 def stored(values: Array) -> Array:
     """The same finite numbers, computed once and kept, where XLA for a CPU would not keep them.
 
