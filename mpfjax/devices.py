@@ -4,7 +4,7 @@ import math
 import os
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -48,9 +48,8 @@ def join_processes(
     """
     if not timeout_seconds > 0:
         raise ValueError(f"timeout_seconds: {timeout_seconds} is not positive")
-    if process_id is not None and num_processes is not None:
-        if not 0 <= process_id < num_processes:
-            raise ValueError(f"process_id: {process_id} is not in [0, {num_processes})")
+    if None not in (process_id, num_processes) and process_id not in range(num_processes or 0):
+        raise ValueError(f"process_id: {process_id} is not in [0, {num_processes})")
     if jax.config.jax_cpu_collectives_implementation in (None, "none"):
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
     joined = threading.Event()
@@ -101,9 +100,8 @@ def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
             raise ValueError(f"devices: {devices} asked for, and there are {len(available)}")
         chosen = available[: int(devices)]
     else:
-        chosen = list(devices)
-        unknown = [device for device in chosen if not isinstance(device, jax.Device)]
-        if unknown or not chosen:
+        chosen = list(devices) if isinstance(devices, Iterable) else []
+        if not chosen or not all(isinstance(device, jax.Device) for device in chosen):
             raise ValueError(f"devices: {devices} is not a number or some of jax.devices()")
         if len(set(chosen)) < len(chosen):
             raise ValueError(f"devices: {devices} names one twice")

@@ -60,7 +60,7 @@ def run_islands(
     leave_to_caller = devices is None and is_traced((key, arguments))
     chosen = None if leave_to_caller else _dividing(num_islands, devices)
     run = spread(_run_block, _run_on_one, keys, arguments, chosen)
-    return checked(_joined(run, filter, collect is None))
+    return checked(_joined(run, collect is None))
 
 
 def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any]:
@@ -88,34 +88,33 @@ def _run_on_one(keys, filter, observations, present, collect):
     return jax.tree.map(lambda leaf: leaf[0], run)
 
 
-def _joined(run: FilterRun, filter: Filter, whole: bool) -> FilterRun:
+def _joined(run: FilterRun, whole: bool) -> FilterRun:
     """The run of the whole mixture, from one whose every leaf has a leading axis of islands."""
-    collected = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), run.collected)
-    num_islands, num_steps = run.degenerate.shape
-    resampled = jnp.moveaxis(run.resampled, 0, 1).reshape(num_steps, -1)
+    collected = run.collected
+    if whole:
+        collected = jax.vmap(_whole_mixture, in_axes=1)(collected)
+    else:
+        collected = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), collected)
+    resampled = jnp.moveaxis(run.resampled, 0, 1)
     return FilterRun(
         log_marginal_likelihood=run.log_marginal_likelihood[0],
         log_likelihood_increments=run.log_likelihood_increments[0],
-        collected=_whole_mixture(collected, 1) if whole else collected,
-        final=_whole_mixture(run.final, 0),
-        resampled=resampled,
+        collected=collected,
+        final=_whole_mixture(run.final),
+        resampled=resampled.reshape(resampled.shape[0], -1),
         degenerate=run.degenerate[0],
     )
 
 
-def _whole_mixture(islands: ParticleMixture, axis: int) -> ParticleMixture:
-    """One mixture of the islands' particles, from fields with their axis at the given place."""
-    num_islands, num_components = islands.log_weights.shape[axis], islands.num_components
+def _whole_mixture(islands: ParticleMixture) -> ParticleMixture:
+    """One mixture of the islands' particles, from fields with a leading axis of islands."""
+    num_islands, num_components = islands.log_weights.shape[0], islands.num_components
     firsts = num_components * jnp.arange(num_islands, dtype=jnp.int32)
-    components = islands.component_indicators + firsts.reshape(*[1] * axis, -1, 1)
-
-    def side_by_side(leaf: Array) -> Array:
-        return leaf.reshape(*leaf.shape[:axis], -1, *leaf.shape[axis + 2 :])
-
+    side_by_side = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
     return ParticleMixture(
         particles=jax.tree.map(side_by_side, islands.particles),
         log_weights=side_by_side(islands.log_weights),
-        component_indicators=side_by_side(components),
+        component_indicators=side_by_side(islands.component_indicators + firsts[:, None]),
         ancestor_indices=side_by_side(islands.ancestor_indices),
         num_components=num_islands * num_components,
         memory=islands.memory,
