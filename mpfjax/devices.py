@@ -1,5 +1,6 @@
 """Work spread over devices and processes, and what islands of particles tell each other."""
 
+import hashlib
 import math
 import os
 import sys
@@ -50,7 +51,7 @@ def join_processes(
         raise ValueError(f"timeout_seconds: {timeout_seconds} is not positive")
     if None not in (process_id, num_processes) and process_id not in range(num_processes or 0):
         raise ValueError(f"process_id: {process_id} is not in [0, {num_processes})")
-    if jax.config.jax_cpu_collectives_implementation in (None, "none"):
+    if getattr(jax.config, "jax_cpu_collectives_implementation", None) in (None, "none"):
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
     joined = threading.Event()
     who = "this process" if process_id is None else f"process {process_id} of {num_processes}"
@@ -215,7 +216,7 @@ def log_sum_over_islands(log_value: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def _default_devices(available: list[Any]) -> list[Any]:
-    default = jax.config.jax_default_device
+    default = getattr(jax.config, "jax_default_device", None)
     if default is None:
         return available
     return jax.devices(default) if isinstance(default, str) else [default]
@@ -227,19 +228,39 @@ def _placed(tree: PyTree, where: Any) -> PyTree:
     arrays, rest = eqx.partition(tree, is_array)
     if jax.process_count() == 1:
         return eqx.combine(jax.device_put(arrays, where), rest)
+    _require_same_everywhere(arrays)
     return eqx.combine(jax.tree.map(lambda leaf: _global(leaf, where), arrays), rest)
+
+
+def _require_same_everywhere(arrays: PyTree) -> None:
+    """Raise where the processes do not hold the same numbers; a digest is all that they send."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(arrays):
+        if not _is_global(leaf):
+            values = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+            digest.update(f"{values.dtype} {values.shape}".encode() + values.tobytes())
+    own = np.frombuffer(digest.digest(), np.uint8)
+    if (multihost_utils.process_allgather(own) != own[None]).any():
+        raise ValueError("keys, filter, observations: not the same in every process")
 
 
 def _global(leaf: Any, sharding: NamedSharding) -> Array:
     """An array over all processes, of which each holds a copy of the whole."""
-    if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable:
+    if _is_global(leaf):
         return leaf
-    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+    if _is_key(leaf):
         data = _global(jax.random.key_data(leaf), sharding)
         return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
     values = np.asarray(jnp.asarray(leaf))
-    multihost_utils.assert_equal(values, "keys, filter, observations: processes passed others")
     return jax.make_array_from_callback(values.shape, sharding, lambda index: values[index])
+
+
+def _is_global(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array) and not leaf.is_fully_addressable
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _gathered(tree: PyTree, mesh: Mesh) -> PyTree:

@@ -36,10 +36,10 @@ def of_components(mixture):
     return mixture.component_means(), mixture.mixture_weights
 
 
-def replicates(devices=None):
+def replicates(devices=None, seed=0):
     """Runs that share nothing."""
     filter = mpfjax.particle_filter(quadratic(), 40, ess_threshold=0.5)
-    keys = jax.random.split(jax.random.key(0), NUM_KEYS)
+    keys = jax.random.split(jax.random.key(seed), NUM_KEYS)
     return mpfjax.monte_carlo(keys, filter, observations(), devices=devices)
 
 
@@ -68,7 +68,7 @@ def compiled_islands(num_particles):
     keys = jax.random.split(jax.random.key(1), NUM_ISLANDS)
     arguments = (islands_filter(num_particles), observations(), None, of_components)
     run = jax.jit(lambda keys: spread(_run_block, _run_on_one, keys, arguments, jax.devices()))
-    return run.lower(keys).compile().as_text().splitlines()
+    return str(run.lower(keys).compile().as_text()).splitlines()
 
 
 def collectives(lines):
@@ -114,13 +114,16 @@ def leaves(**runs):
     }
 
 
-def main(file, port=None, process=-1):
+def main(file, port=None, process="0"):
     jax.config.update("jax_enable_x64", True)
     if port is not None:
         mpfjax.join_processes(f"localhost:{port}", 2, int(process), timeout_seconds=60)
     runs = leaves(replicates=replicates(), islands=islands())
     told: dict = {"devices": len(jax.devices())}
-    if port is None:
+    if port is not None:
+        told["other keys"] = error_of(lambda: replicates(seed=int(process)))
+        told["left out"] = error_of(lambda: replicates(1))
+    else:
         told["collectives"] = [collectives(compiled_islands(n)) for n in (32, 256)]
         last, keys = jax.devices()[-1:], jax.random.split(jax.random.key(0), 3)
         told["only device"] = spread(draw, jax.jit(draw), keys, (), last).devices() == {*last}

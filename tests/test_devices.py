@@ -293,6 +293,14 @@ class TestExchange:
             mpfjax.run_islands(jax.random.key(0), filter, OBSERVATIONS, num_islands=2)
 
 
+class TestProcesses:
+    @pytest.mark.parametrize("which", ["first", "second"])
+    def test_must_all_pass_the_same_and_take_part(self, started, which):
+        told = started[which][1]
+        assert "keys, filter, observations: not the same in every process" in told["other keys"]
+        assert "leaves 1 of the processes without any" in told["left out"]
+
+
 @pytest.mark.parametrize("which", ["eight", "first", "second"])
 class TestManyDevices:
     def test_they_take_part(self, started, which):
