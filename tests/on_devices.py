@@ -124,7 +124,7 @@ def main(file, port=None, process="0"):
         told["other keys"] = error_of(lambda: replicates(seed=int(process)))
         told["left out"] = error_of(lambda: replicates(1))
     else:
-        told["collectives"] = [collectives(compiled_islands(n)) for n in (32, 256)]
+        told["collectives"] = collectives(compiled_islands(256))
         last, keys = jax.devices()[-1:], jax.random.split(jax.random.key(0), 3)
         told["only device"] = spread(draw, jax.jit(draw), keys, (), last).devices() == {*last}
         told["too many"] = error_of(lambda: replicates(9))

@@ -142,7 +142,7 @@ def island_chains():
 
 
 class TestIslands:
-    @pytest.mark.parametrize("chain", island_chains())
+    @pytest.mark.parametrize("chain", ["pf, exchange", "mixture, exchange"])
     def test_evidence_and_means_are_unbiased(self, chain):
         runs, keys = 1500, jax.random.split(jax.random.key(3), 1500)
         filter = island_chains()[chain]
@@ -160,7 +160,7 @@ class TestIslands:
             assert (np.abs(estimates.mean(axis=0) - truth) < 4 * standard_error).all()
 
     def test_one_island_is_a_run_of_the_filter(self):
-        filter, key = island_chains()["mixture, exchange"], jax.random.key(4)
+        filter, key = island_chains()["pf, exchange"], jax.random.key(4)
         islands = mpfjax.run_islands(key, filter, OBSERVATIONS, num_islands=1)
         run = mpfjax.run_filter(jax.random.fold_in(key, 0), filter, OBSERVATIONS)
         assert jax.tree.structure(islands) == jax.tree.structure(run)
@@ -317,17 +317,17 @@ class TestManyDevices:
 
 
 class TestTheCompiledProgram:
+    """Of islands of 256 particles in two components each, on eight devices."""
+
     def test_sends_a_number_an_island_twice_a_step_and_no_more(self, started):
-        """For the total mass, and for whether an exchange is due; whatever N is."""
-        for collectives in started["eight"][1]["collectives"]:
-            everywhere = [c[:2] for c in collectives if not c[2]]
-            assert everywhere == [["all-gather", NUM_ISLANDS]] * 2
+        """For the total mass, and for whether an exchange is due."""
+        everywhere = [c[:2] for c in started["eight"][1]["collectives"] if not c[2]]
+        assert everywhere == [["all-gather", NUM_ISLANDS]] * 2
 
     def test_sends_particles_in_the_branch_that_exchanges_them(self, started):
         """Every slot's state, weight, label and ancestor."""
-        for n, collectives in zip((32, 256), started["eight"][1]["collectives"], strict=True):
-            in_branch = [c[:2] for c in collectives if c[2]]
-            assert in_branch == [["all-to-all", n]] * 4
+        in_branch = [c[:2] for c in started["eight"][1]["collectives"] if c[2]]
+        assert in_branch == [["all-to-all", 256]] * 4
 
 
 class TestChoosingDevices:
