@@ -3,6 +3,7 @@
 from mpfjax import exact as exact
 from mpfjax import metrics as metrics
 from mpfjax import tuning as tuning
+from mpfjax.devices import join_processes as join_processes
 from mpfjax.filters import Filter as Filter
 from mpfjax.filters import FilterRun as FilterRun
 from mpfjax.filters import StepInfo as StepInfo
@@ -16,6 +17,7 @@ from mpfjax.filters import monte_carlo as monte_carlo
 from mpfjax.filters import particle_filter as particle_filter
 from mpfjax.filters import partitioned_sampling as partitioned_sampling
 from mpfjax.filters import run_filter as run_filter
+from mpfjax.islands import run_islands as run_islands
 from mpfjax.mixture import ParticleMixture as ParticleMixture
 from mpfjax.models import AbstractDynamics as AbstractDynamics
 from mpfjax.models import AbstractStateSpaceModel as AbstractStateSpaceModel
@@ -31,6 +33,7 @@ from mpfjax.moves import AbstractMove as AbstractMove
 from mpfjax.moves import AbstractPropagation as AbstractPropagation
 from mpfjax.moves import AbstractRegrouping as AbstractRegrouping
 from mpfjax.moves import AbstractRejuvenation as AbstractRejuvenation
+from mpfjax.moves import Exchange as Exchange
 from mpfjax.moves import Exclusion as Exclusion
 from mpfjax.moves import GaussianRegeneration as GaussianRegeneration
 from mpfjax.moves import KMeans as KMeans

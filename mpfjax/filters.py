@@ -1,5 +1,6 @@
 """A filter as a chain of moves, its runners, and the filters of the literature."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -10,12 +11,21 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from mpfjax.devices import (
+    choose_devices,
+    is_traced,
+    island_index,
+    log_sum_over_islands,
+    num_islands,
+    spread,
+)
 from mpfjax.generator import fast_key
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
 from mpfjax.moves.clusters import PropagateInClusters
+from mpfjax.moves.exchange import Exchange
 from mpfjax.moves.gaussian import GaussianRegeneration
 from mpfjax.moves.independent import PropagateIndependently
 from mpfjax.moves.partitioned import Partitioned, check_orders
@@ -55,6 +65,8 @@ class FilterRun(eqx.Module):
     """the steps at which every particle had zero likelihood."""
 
 
+# Moves that leave the total mass as it is, so that there is nothing to normalise.
+_KEEP_MASS = (AbstractRegrouping, AbstractRejuvenation, Exchange)
 _BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
 
@@ -194,7 +206,7 @@ class Filter(eqx.Module):
             if isinstance(move, Resample):
                 resampled |= move.is_due(mixture)
             moved = move(move_key, mixture, observation)
-            if not isinstance(move, AbstractRegrouping | AbstractRejuvenation):
+            if not isinstance(move, _KEEP_MASS):
                 moved, log_growth = _normalise(moved, mixture.log_weights)
                 increment += log_growth
             mixture = moved
@@ -235,7 +247,7 @@ def run_filter(
     """
     present = present_steps(observations, missing)
     run = _run(key, filter, observations, present, collect)
-    return _checked(run)
+    return checked(run)
 
 
 def monte_carlo(
@@ -245,17 +257,28 @@ def monte_carlo(
     collect: Callable[[ParticleMixture], PyTree] | None = None,
     *,
     missing: str = "error",
+    devices: int | Sequence[Any] | None = None,
 ) -> FilterRun:
-    """Run a filter once for each key, all on the same observations, under one `vmap`.
+    """Run a filter once for each key, all on the same observations, under one `vmap` a device.
 
     Every field of the result has a leading axis of seeds. Arguments and errors are those of
     `run_filter`; run k equals `run_filter(keys[k], ...)`.
+
+    - `devices`: what the runs are spread over. None is every device there is, of all processes
+      after `join_processes`; a number means the first few, a sequence those of `jax.devices()`.
+      Any number of keys will do. Devices tell each other nothing; the result is gathered on the
+      first one, and each process has all of it. Under the caller's own jit, grad or vmap None is
+      one device.
+
+    Raises `ValueError` for more devices than there are.
     """
     if jnp.ndim(keys) != 1 or keys.shape[0] < 1:
         raise ValueError(f"keys: shape {jnp.shape(keys)} is not that of one key a run, (seeds,)")
     present = present_steps(observations, missing)
-    run = _run_all(keys, filter, observations, present, collect)
-    return _checked(run)
+    arguments = (filter, observations, present, collect)
+    leave_to_caller = devices is None and is_traced((keys, arguments))
+    chosen = None if leave_to_caller else choose_devices(devices)
+    return checked(spread(_run_each, _run_all, keys, arguments, chosen))
 
 
 def particle_filter(
@@ -545,10 +568,12 @@ def _run(key, filter, observations, present, collect):
     return scan_filter(key, filter, observations, present, collect)
 
 
-@eqx.filter_jit
-def _run_all(keys, filter, observations, present, collect):
+def _run_each(keys, filter, observations, present, collect):
     run_one = jax.vmap(lambda key: scan_filter(key, filter, observations, present, collect))
     return run_one(keys)
+
+
+_run_all = eqx.filter_jit(_run_each)
 
 
 def scan_filter(
@@ -576,7 +601,7 @@ def scan_filter(
         return mixture, (kept, info.log_likelihood_increment, info.resampled, info.degenerate)
 
     inputs = (jax.random.split(key_steps, length), observations, present)
-    final, outputs = jax.lax.scan(advance, filter.init(key_initial), inputs)
+    final, outputs = jax.lax.scan(advance, _share_of_islands(filter.init(key_initial)), inputs)
     collected, increments, resampled, degenerate = outputs
     return FilterRun(
         log_marginal_likelihood=jnp.sum(increments),
@@ -592,7 +617,7 @@ def _normalise(
     mixture: ParticleMixture, previous_log_weights: Float[Array, " n"]
 ) -> tuple[ParticleMixture, Float[Array, ""]]:
     """Remove the mass's growth; where no mass is left, go on with the weights of before."""
-    log_growth = mixture.log_mass
+    log_growth = log_sum_over_islands(mixture.log_mass)
     has_mass = log_growth > -jnp.inf
     normalised = mixture.log_weights - jnp.where(has_mass, log_growth, 0.0)
     # NaN compares false, and must not be taken for a step of zero likelihood.
@@ -615,7 +640,17 @@ def _report(
 
 
 def _own_ancestors(mixture: ParticleMixture) -> ParticleMixture:
-    return mixture.replace(ancestor_indices=jnp.arange(mixture.num_particles, dtype=jnp.int32))
+    own = jnp.arange(mixture.num_particles, dtype=jnp.int32)
+    if num_islands() > 1:
+        own += mixture.num_particles * island_index()
+    return mixture.replace(ancestor_indices=own)
+
+
+def _share_of_islands(mixture: ParticleMixture) -> ParticleMixture:
+    """The mixture's share of a whole that is made of as many as there are islands."""
+    if num_islands() == 1:
+        return mixture
+    return mixture.replace(log_weights=mixture.log_weights - math.log(num_islands()))
 
 
 def _split(key: Key[Array, ""], num: int) -> list[Key[Array, ""]]:
@@ -682,7 +717,7 @@ def _present_traced(leaves: list[Array], missing: str) -> Bool[Array, " t"] | No
     return eqx.error_if(present, ~present, "observations: NaN or infinite")
 
 
-def _checked(run: FilterRun) -> FilterRun:
+def checked(run: FilterRun) -> FilterRun:
     """The run, or an error where a density of the model was NaN or infinite."""
     increments = run.log_likelihood_increments
     if isinstance(increments, Tracer):

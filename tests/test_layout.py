@@ -10,6 +10,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "mpfjax"
 # From the ground up: each part may import from those above it here, and from itself.
 ORDER = (
     "operations",
+    "devices",
     "generator",
     "storage",
     "mixture",
@@ -17,6 +18,7 @@ ORDER = (
     "proposals",
     "moves",
     "filters",
+    "islands",
     "studies",
     "exact",
     "metrics",

@@ -1,0 +1,121 @@
+"""One filter over many devices: islands of particles that share nothing but their total mass."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key, PyTree
+
+from mpfjax.devices import DEVICE_AXIS, ISLAND_AXIS, choose_devices, is_traced, spread
+from mpfjax.filters import Filter, FilterRun, checked, present_steps, scan_filter
+from mpfjax.mixture import ParticleMixture
+
+
+def run_islands(
+    key: Key[Array, ""],
+    filter: Filter,
+    observations: PyTree,
+    collect: Callable[[ParticleMixture], PyTree] | None = None,
+    *,
+    num_islands: int,
+    missing: str = "error",
+    devices: int | Sequence[Any] | None = None,
+) -> FilterRun:
+    """Run one filter of G islands, each a copy of `filter`, over many devices.
+
+    The islands are the parts of ONE mixture of G N particles in G M components: every island
+    draws its own x_0 and moves its own components, and since the weights are joint that is
+    exact. Only the normalisation needs the others: a step's total mass is the sum of G masses,
+    O(1) numbers from each island, whatever N is (Vermaak et al. 2003, section 2: components
+    "interact only through the mixture weights"; Vergé et al. 2015 for islands). The estimate of
+    the marginal likelihood is as unbiased as the filter's.
+
+    - `filter`: that of one island, so N and M are an island's. A plain particle filter makes
+      islands of particles; with an `Exchange` among the moves their masses stay even.
+    - `num_islands`: G. The numbers depend on the key and on G alone; devices only share the work.
+      Results on other numbers of devices differ by rounding, and where that decides a draw,
+      like another run.
+    - `devices`: None for as many as divide G, a number, or a sequence of `jax.devices()`, which
+      must divide G.
+    - `collect(mixture)` sees one island, whose weights sum to its mass, and is stacked over t and
+      islands, (t, G, ...). What is a sum over weighted particles, such as `mixture.mean()`, is
+      then the whole mixture's once it is summed over islands.
+
+    The result is that of `run_filter` on the whole mixture: slots and component labels of island
+    g come after those of island g - 1, ancestors may lie on other islands, and only `memory`
+    keeps a leading axis of islands. `observations`, `missing` and errors are those of
+    `run_filter`; also `ValueError` for G < 1, and devices that are not there or do not divide G.
+
+    Use it where one filter is too large or too slow for one device. For many runs of a filter
+    that fits use `monte_carlo`, whose runs share nothing at all.
+    """
+    if not isinstance(num_islands, int | np.integer) or num_islands < 1:
+        raise ValueError(f"num_islands: {num_islands} is not a whole number of at least 1")
+    present = present_steps(observations, missing)
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_islands, dtype=jnp.uint32))
+    arguments = (filter, observations, present, collect)
+    leave_to_caller = devices is None and is_traced((key, arguments))
+    chosen = None if leave_to_caller else _dividing(num_islands, devices)
+    run = spread(_run_block, _run_on_one, keys, arguments, chosen)
+    return checked(_joined(run, collect is None))
+
+
+def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any]:
+    """The devices chosen; without a choice the most that deal the islands evenly."""
+    chosen = choose_devices(devices)
+    if num_islands % len(chosen) == 0:
+        return chosen
+    if devices is not None or jax.process_count() > 1:
+        raise ValueError(
+            f"num_islands: {num_islands} islands cannot be dealt evenly to {len(chosen)} devices"
+        )
+    return chosen[: max(d for d in range(1, len(chosen)) if num_islands % d == 0)]
+
+
+def _run_block(keys, filter, observations, present, collect):
+    """The islands of one device."""
+    run_one = lambda key: scan_filter(key, filter, observations, present, collect)  # noqa: E731
+    return jax.vmap(run_one, axis_name=ISLAND_AXIS)(keys)
+
+
+@eqx.filter_jit
+def _run_on_one(keys, filter, observations, present, collect):
+    run_block = lambda keys: _run_block(keys, filter, observations, present, collect)  # noqa: E731
+    run = jax.vmap(run_block, axis_name=DEVICE_AXIS)(keys[None])
+    return jax.tree.map(lambda leaf: leaf[0], run)
+
+
+def _joined(run: FilterRun, whole: bool) -> FilterRun:
+    """The run of the whole mixture, from one whose every leaf has a leading axis of islands."""
+    collected = run.collected
+    if whole:
+        collected = jax.vmap(_whole_mixture, in_axes=1)(collected)
+    else:
+        collected = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), collected)
+    resampled = jnp.moveaxis(run.resampled, 0, 1)
+    return FilterRun(
+        log_marginal_likelihood=run.log_marginal_likelihood[0],
+        log_likelihood_increments=run.log_likelihood_increments[0],
+        collected=collected,
+        final=_whole_mixture(run.final),
+        resampled=resampled.reshape(resampled.shape[0], -1),
+        degenerate=run.degenerate[0],
+    )
+
+
+def _whole_mixture(islands: ParticleMixture) -> ParticleMixture:
+    """One mixture of the islands' particles, from fields with a leading axis of islands."""
+    num_islands, num_components = islands.log_weights.shape[0], islands.num_components
+    firsts = num_components * jnp.arange(num_islands, dtype=jnp.int32)
+    side_by_side = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
+    return ParticleMixture(
+        particles=jax.tree.map(side_by_side, islands.particles),
+        log_weights=side_by_side(islands.log_weights),
+        component_indicators=side_by_side(islands.component_indicators + firsts[:, None]),
+        ancestor_indices=side_by_side(islands.ancestor_indices),
+        num_components=num_islands * num_components,
+        memory=islands.memory,
+    )

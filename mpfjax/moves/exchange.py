@@ -1,0 +1,75 @@
+"""Exchange of particles between islands whose masses have drifted apart."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Key, PyTree
+
+from mpfjax.devices import deal_to_islands, num_islands, over_islands
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractMove
+from mpfjax.operations import log_sum_exp
+
+
+class Exchange(AbstractMove):
+    """Deal every island's particles to all islands, where their masses have drifted apart.
+
+    For `run_islands`; outside it there is one island, and nothing happens. An island resamples
+    within itself and keeps its mass, so that in time few islands hold it all and the others work
+    for nothing. Where the effective number of islands, (Σ π_g)² / Σ π_g² with π_g the mass of
+    island g, falls below `threshold` times their number G, particle i of every island goes to
+    island i mod G, with its joint weight, its component's label and its ancestor. All islands
+    then hold nearly the same mass. Exact: the particles of the whole mixture are the same ones,
+    in other places (compare Whiteley, Lee and Heine 2016, on when islands should interact).
+
+    - `threshold`: in [0, 1]; 0 never exchanges.
+
+    It is the only move that sends particles between devices, all of them at once, and it does
+    so only in the steps that need it. Put it before `Resample`, which then spreads the heavy
+    particles over all islands' slots; in a mixture before the step's regrouping, since
+    components of the same label become one. Raises `ValueError` for a threshold out of range,
+    and where G does not divide an island's number of slots.
+    """
+
+    threshold: float = eqx.field(static=True, default=0.5)
+
+    def __check_init__(self) -> None:
+        if not 0.0 <= self.threshold <= 1.0:
+            raise ValueError(f"threshold: {self.threshold} is not in [0, 1]")
+
+    def is_due(self, mixture: ParticleMixture) -> Bool[Array, ""]:
+        """Whether the masses of the islands are uneven enough, the same for each."""
+        log_masses = over_islands(mixture.log_mass)
+        log_size = 2 * log_sum_exp(log_masses) - log_sum_exp(2 * log_masses)
+        return jnp.exp(log_size) < self.threshold * num_islands()
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+    ) -> ParticleMixture:
+        """Deal the particles where that is due."""
+        del key, observation
+        if num_islands() == 1:
+            return mixture
+        if mixture.num_particles % num_islands():
+            raise ValueError(
+                f"num_particles: {mixture.num_particles} of an island cannot be dealt evenly to"
+                f" {num_islands()} islands, as Exchange does"
+            )
+        slots = (
+            mixture.particles,
+            mixture.log_weights,
+            mixture.component_indicators,
+            mixture.ancestor_indices,
+        )
+        particles, log_weights, components, ancestors = jax.lax.cond(
+            self.is_due(mixture),
+            lambda slots: jax.tree.map(deal_to_islands, slots),
+            lambda slots: slots,
+            slots,
+        )
+        return mixture.replace(
+            particles=particles,
+            log_weights=log_weights,
+            component_indicators=components,
+            ancestor_indices=ancestors,
+        )

@@ -1,0 +1,356 @@
+"""Many devices and processes give the numbers of one; islands, and what they exchange."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax.devices import (
+    DEVICE_AXIS,
+    ISLAND_AXIS,
+    choose_devices,
+    deal_to_islands,
+    island_index,
+    num_islands,
+    over_islands,
+)
+from mpfjax.exact import grid_filter
+from tests import on_devices
+from tests.examples import make_mixture
+from tests.precision import float64
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+NUM_ISLANDS = on_devices.NUM_ISLANDS
+
+
+def start(*arguments, devices=1, program=("-m", "tests.on_devices")):
+    environment = os.environ | {
+        "PYTHONPATH": str(REPOSITORY),
+        "JAX_PLATFORMS": "cpu",
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+    }
+    return subprocess.Popen(
+        [sys.executable, *program, *map(str, arguments)],
+        cwd=REPOSITORY,
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def free_port():
+    with socket.socket() as server:
+        server.bind(("localhost", 0))
+        return server.getsockname()[1]
+
+
+def results_of(process, file):
+    _, error = process.communicate(timeout=120)
+    assert process.returncode == 0, error[-3000:]
+    with np.load(file) as saved:
+        runs = {name: saved[name] for name in saved.files if name != "told"}
+        return runs, json.loads(str(saved["told"]))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def processes(tmp_path_factory):
+    """Eight devices in one process, and two processes of one device.
+
+    They run while the tests that come first do.
+    """
+    folder, port = tmp_path_factory.mktemp("devices"), free_port()
+    files = [folder / f"{name}.npz" for name in ("eight", "first", "second")]
+    processes = [
+        start(files[0], devices=8),
+        start(files[1], port, 0),
+        start(files[2], port, 1),
+    ]
+    yield dict(zip(files, processes, strict=True))
+    for process in processes:
+        process.kill()
+
+
+@pytest.fixture(scope="module")
+def started(processes):
+    return {file.stem: results_of(process, file) for file, process in processes.items()}
+
+
+@pytest.fixture(scope="module")
+def on_one_device():
+    with float64(), jax.numpy_dtype_promotion("standard"):
+        return on_devices.leaves(replicates=on_devices.replicates(), islands=on_devices.islands())
+
+
+class TestJoiningProcesses:
+    def test_without_a_cluster_or_the_others_it_ends_with_a_clear_error(self):
+        script = (
+            "import mpfjax, sys\n"
+            "try: mpfjax.join_processes()\n"
+            "except ValueError as error: print(error, file=sys.stderr)\n"
+            f"mpfjax.join_processes('localhost:{free_port()}', 2, 0, timeout_seconds=0.5)\n"
+            "print('joined', file=sys.stderr)"
+        )
+        process = start(program=("-c", script))
+        _, error = process.communicate(timeout=60)
+        assert process.returncode == 1
+        assert "coordinator_address, num_processes, process_id: " in error
+        assert "process 0 of 2 has waited 0.5 s for all processes to join at localhost" in error
+        assert "joined" not in error
+
+    def test_bad_arguments(self):
+        with pytest.raises(ValueError, match="timeout_seconds: 0 is not positive"):
+            mpfjax.join_processes(timeout_seconds=0)
+        with pytest.raises(ValueError, match=r"process_id: 2 is not in \[0, 2\)"):
+            mpfjax.join_processes("localhost:1", 2, 2)
+
+
+MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
+OBSERVATIONS = jnp.array(on_devices.OBSERVATIONS)
+
+
+class Cliff(mpfjax.QuadraticModel):
+    """Particles far from explaining the observation have no likelihood at all."""
+
+    def log_likelihood(self, observation, states):
+        near = jnp.abs(states**2 - observation) < 0.3
+        return jnp.where(near, 0.0, -jnp.inf)
+
+
+def mean(mixture):
+    return mixture.mean()
+
+
+def island_chains():
+    resample, propagate = mpfjax.Resample(), mpfjax.Propagate(MODEL)
+    adaptive = mpfjax.Resample("stratified", 0.5)
+    seeded, regroup = [mpfjax.KMeans(2, reseed=True)], mpfjax.KMeans(2)
+    return {
+        "pf": mpfjax.Filter(MODEL, [resample, propagate], 12),
+        "pf, exchange": mpfjax.Filter(MODEL, [mpfjax.Exchange(), adaptive, propagate], 12),
+        "mixture, exchange": mpfjax.Filter(
+            MODEL, [resample, propagate, mpfjax.Exchange(0.9), regroup], 12, 2, seeded
+        ),
+    }
+
+
+class TestIslands:
+    @pytest.mark.parametrize("chain", ["pf, exchange", "mixture, exchange"])
+    def test_evidence_and_means_are_unbiased(self, chain):
+        runs, keys = 1500, jax.random.split(jax.random.key(3), 1500)
+        filter = island_chains()[chain]
+        run = jax.vmap(
+            lambda key: mpfjax.run_islands(key, filter, OBSERVATIONS, mean, num_islands=4)
+        )(keys)
+        exact = grid_filter(MODEL, OBSERVATIONS, jnp.linspace(-5.0, 5.0, 1001))
+        log_ratios = np.cumsum(
+            run.log_likelihood_increments - exact.log_likelihood_increments[None], axis=1
+        )
+        ratios = np.exp(log_ratios)
+        means = ratios * np.asarray(run.collected.sum(axis=2))
+        for estimates, truth in ((ratios, 1.0), (means, np.asarray(exact.means))):
+            standard_error = estimates.std(axis=0) / np.sqrt(runs)
+            assert (np.abs(estimates.mean(axis=0) - truth) < 4 * standard_error).all()
+
+    def test_one_island_is_a_run_of_the_filter(self):
+        filter, key = island_chains()["pf, exchange"], jax.random.key(4)
+        islands = mpfjax.run_islands(key, filter, OBSERVATIONS, num_islands=1)
+        run = mpfjax.run_filter(jax.random.fold_in(key, 0), filter, OBSERVATIONS)
+        assert jax.tree.structure(islands) == jax.tree.structure(run)
+        for one, other in zip(jax.tree.leaves(islands), jax.tree.leaves(run), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+
+    def test_the_whole_is_one_normalised_mixture(self):
+        filter = island_chains()["mixture, exchange"]
+        run = mpfjax.run_islands(jax.random.key(5), filter, OBSERVATIONS, num_islands=4)
+        assert run.resampled.shape == (4, 8)
+        assert run.final.num_components == 8
+        whole = run.collected
+        assert whole.particles.shape == (4, 48)
+        np.testing.assert_allclose(jnp.exp(whole.log_weights).sum(axis=1), 1.0, rtol=1e-5)
+        home = np.asarray(whole.component_indicators) // 2
+        np.testing.assert_array_equal(home, np.tile(np.repeat(np.arange(4), 12), (4, 1)))
+        assert len(np.unique(whole.particles[0])) == 48
+        # A child is no farther from its parent than the dynamics take it.
+        ancestors = np.asarray(whole.ancestor_indices)
+        parents = np.take_along_axis(np.asarray(whole.particles)[:-1], ancestors[1:], axis=1)
+        assert np.abs(np.asarray(whole.particles)[1:] - parents).max() < 5 * 0.3
+        assert (ancestors // 12 != home).any()
+
+    def test_islands_without_any_likelihood_die_and_an_exchange_revives_them(self):
+        model = Cliff(0.3, 0.5, -2.0, 2.0)
+        propagate = mpfjax.Propagate(model)
+        mass = lambda mixture: mixture.log_mass  # noqa: E731
+        for before in ([], [mpfjax.Exchange(1.0)]):
+            filter = mpfjax.Filter(model, [*before, mpfjax.Resample(), propagate], 8)
+            run = mpfjax.run_islands(jax.random.key(6), filter, OBSERVATIONS, mass, num_islands=8)
+            assert np.isfinite(run.log_marginal_likelihood)
+            dead = np.asarray(run.collected) == -np.inf
+            assert dead[0].any()
+            if not before:
+                assert (dead[1:] >= dead[:-1]).all()
+        assert not dead[-1].all()
+        assert (dead[:-1] & ~dead[1:]).any()
+        assert not any(np.isnan(leaf).any() for leaf in jax.tree.leaves(run))
+
+    def test_missing_observations_and_broken_steps(self):
+        filter = island_chains()["pf"]
+        holed = OBSERVATIONS.at[1].set(jnp.nan)
+        with pytest.raises(ValueError, match="index 1"):
+            mpfjax.run_islands(jax.random.key(7), filter, holed, num_islands=2)
+        run = mpfjax.run_islands(
+            jax.random.key(7), filter, holed.at[2].set(1e30), mean, num_islands=2, missing="skip"
+        )
+        assert run.log_likelihood_increments[1] == 0
+        np.testing.assert_array_equal(run.degenerate, [False, False, True, False])
+        assert np.isfinite(run.collected).all()
+
+    @pytest.mark.parametrize("islands", [0, -2, 1.5])
+    @pytest.mark.usefixtures("as_installed")
+    def test_bad_numbers_of_islands(self, islands):
+        with pytest.raises(ValueError, match="num_islands: "):
+            mpfjax.run_islands(
+                jax.random.key(0), island_chains()["pf"], OBSERVATIONS, num_islands=islands
+            )
+
+
+def on_islands(function, values):
+    """`function` on each of the islands that lie along the leading axis, two on a device."""
+    inner = jax.vmap(function, axis_name=ISLAND_AXIS)
+    outer = jax.vmap(inner, axis_name=DEVICE_AXIS)
+    pairs = jax.tree.map(lambda leaf: leaf.reshape(-1, 2, *leaf.shape[1:]), values)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), outer(pairs))
+
+
+class TestTellingOtherIslands:
+    def test_each_knows_its_place_and_hears_all_in_order(self):
+        heard = on_islands(
+            lambda value: (over_islands(value), island_index(), jnp.full((), num_islands())),
+            jnp.arange(6.0),
+        )
+        np.testing.assert_array_equal(heard[0], np.tile(np.arange(6.0), (6, 1)))
+        np.testing.assert_array_equal(heard[1], np.arange(6))
+        np.testing.assert_array_equal(heard[2], 6)
+        assert num_islands() == 1
+
+    def test_row_i_is_dealt_to_island_i(self):
+        rows = np.arange(4 * 12 * 2).reshape(4, 12, 2)
+        dealt = np.asarray(on_islands(deal_to_islands, jnp.asarray(rows)))
+        for island in range(4):
+            expected = rows[:, np.arange(12) % 4 == island].reshape(-1, 2)
+            np.testing.assert_array_equal(np.sort(dealt[island], axis=0), expected)
+
+
+class TestExchange:
+    def exchanged(self, threshold, log_masses, n=24):
+        rng = np.random.default_rng(0)
+        g = len(log_masses)
+        log_weights = rng.normal(size=(g, n)) + np.asarray(log_masses)[:, None]
+        states, labels = rng.normal(size=g * n), rng.integers(0, 3, g * n)
+        whole = make_mixture(states, log_weights.ravel(), labels, 3)
+        islands = jax.tree.map(lambda leaf: leaf.reshape(g, n, *leaf.shape[1:]), whole)
+        move = mpfjax.Exchange(threshold)
+        return islands, on_islands(lambda part: move(jax.random.key(0), part), islands)
+
+    def test_evens_the_masses_and_keeps_every_particle(self):
+        before, after = self.exchanged(0.5, [0.0, -5.0, -20.0, -300.0])
+        masses = np.exp(np.asarray(after.log_weights, float)).sum(axis=1)
+        np.testing.assert_allclose(masses, 0.25, atol=0.15)
+        fields = ("particles", "log_weights", "component_indicators", "ancestor_indices")
+        one, other = (
+            np.stack([np.asarray(getattr(m, name)).ravel() for name in fields], axis=1)
+            for m in (before, after)
+        )
+        np.testing.assert_array_equal(other[np.argsort(other[:, 3])], one)
+
+    @pytest.mark.parametrize(
+        ("threshold", "log_masses"), [(0.5, [0.0, 0.5, 0.0, 0.5]), (0.0, [0.0, -9.0, -9.0, -9.0])]
+    )
+    def test_does_nothing_while_masses_are_even_enough(self, threshold, log_masses):
+        before, after = self.exchanged(threshold, log_masses)
+        for one, other in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+    def test_outside_islands_does_nothing(self):
+        mixture = make_mixture(np.zeros(5), np.zeros(5), np.zeros(5), 1)
+        assert mpfjax.Exchange()(jax.random.key(0), mixture) is mixture
+
+    @pytest.mark.parametrize("threshold", [-0.1, 1.1])
+    def test_bad_thresholds(self, threshold):
+        with pytest.raises(ValueError, match="threshold: "):
+            mpfjax.Exchange(threshold)
+
+    def test_slots_that_cannot_be_dealt_evenly(self):
+        filter = mpfjax.Filter(MODEL, [mpfjax.Exchange(), mpfjax.Propagate(MODEL)], 13)
+        with pytest.raises(ValueError, match=r"num_particles: 13 of an island .* 2 islands"):
+            mpfjax.run_islands(jax.random.key(0), filter, OBSERVATIONS, num_islands=2)
+
+
+class TestProcesses:
+    @pytest.mark.parametrize("which", ["first", "second"])
+    def test_must_all_pass_the_same_and_take_part(self, started, which):
+        told = started[which][1]
+        assert "keys, filter, observations: not the same in every process" in told["other keys"]
+        assert "leaves 1 of the processes without any" in told["left out"]
+
+
+@pytest.mark.parametrize("which", ["eight", "first", "second"])
+class TestManyDevices:
+    def test_they_take_part(self, started, which):
+        assert started[which][1]["devices"] == (8 if which == "eight" else 2)
+
+    @pytest.mark.parametrize("kind", ["replicates", "islands"])
+    def test_give_the_numbers_of_one(self, started, on_one_device, which, kind):
+        runs = started[which][0]
+        assert runs.keys() == on_one_device.keys()
+        names = [name for name in runs if name.startswith(kind)]
+        assert len(names) > 8
+        for name in names:
+            np.testing.assert_allclose(runs[name], on_one_device[name], rtol=1e-9, atol=1e-9)
+
+
+class TestTheCompiledProgram:
+    """Of islands of 256 particles in two components each, on eight devices."""
+
+    def test_sends_a_number_an_island_twice_a_step_and_no_more(self, started):
+        """For the total mass, and for whether an exchange is due."""
+        everywhere = [c[:2] for c in started["eight"][1]["collectives"] if not c[2]]
+        assert everywhere == [["all-gather", NUM_ISLANDS]] * 2
+
+    def test_sends_particles_in_the_branch_that_exchanges_them(self, started):
+        """Every slot's state, weight, label and ancestor."""
+        in_branch = [c[:2] for c in started["eight"][1]["collectives"] if c[2]]
+        assert in_branch == [["all-to-all", 256]] * 4
+
+
+class TestChoosingDevices:
+    def test_more_than_there_are(self, started):
+        assert started["eight"][1]["too many"] == "devices: 9 asked for, and there are 8"
+        with pytest.raises(ValueError, match="devices: 2 asked for, and there are 1"):
+            on_devices.islands(2)
+
+    def test_one_twice(self, started):
+        assert "names one twice" in started["eight"][1]["twice"]
+
+    def test_islands_that_cannot_be_dealt_evenly(self, started):
+        assert "cannot be dealt evenly to 3 devices" in started["eight"][1]["uneven"]
+
+    def test_a_given_one_is_the_one_that_runs(self, started):
+        assert started["eight"][1]["only device"]
+
+    @pytest.mark.parametrize("devices", [0, -1, [], ["cpu"], 2.0])
+    @pytest.mark.usefixtures("as_installed")
+    def test_what_is_no_device(self, devices):
+        with pytest.raises(ValueError, match="devices: "):
+            choose_devices(devices)
+
+    def test_the_default_device_is_the_only_one(self):
+        with jax.default_device(jax.devices()[0]):
+            assert choose_devices(None) == jax.devices()[:1]
