@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.features import Features, Scale, separation, summarise
-from mpfjax.operations import segment_argmax, segment_counts, segment_sum, spread, take
+from mpfjax.operations import row_sums, segment_argmax, segment_counts, segment_sum, spread, take
 
 
 class KMeans(AbstractRegrouping):
@@ -294,13 +294,14 @@ def nearest(
 
     A running minimum over the centroids: no (m, n) array is made.
     """
+    centroids = jnp.where(alive[:, None], centroids, jnp.inf)
     best = jnp.full(features.shape[0], jnp.inf, features.dtype)
     labels = jnp.zeros(features.shape[0], jnp.int32)
     for m in range(centroids.shape[0]):
-        distance = jnp.sum((features - centroids[m][None]) ** 2, axis=1)
-        closer = alive[m] & (distance < best)
-        best = jnp.where(closer, distance, best)
+        distance = row_sums((features - centroids[m][None]) ** 2)
+        closer = distance < best
         labels = jnp.where(closer, m, labels)
+        best = jnp.where(closer, distance, best)
     return labels
 
 
