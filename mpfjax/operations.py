@@ -157,6 +157,9 @@ def stored(values: Array) -> Array:
     are one a component, and without vectors within a scatter or gather over flattened rows. A
     product with the identity is what it computes on its own. Whole numbers must be below 2^24.
     """
+    is_float = jnp.issubdtype(values.dtype, jnp.floating)
+    if not is_float and values.shape[-1] >= _EXACT_IN_FLOAT32:
+        return values
     return jax.lax.platform_dependent(values, cpu=_times_identity, default=lambda values: values)
 
 
@@ -177,6 +180,13 @@ def count(values: Int[Array, " n"]) -> Int[Array, " n"]:
     if values.shape[0] >= _EXACT_IN_FLOAT32:
         return jnp.cumsum(values)
     return prefix_sum(values.astype(jnp.float32)).astype(jnp.int32)
+
+
+def count_before(members: Bool[Array, " n"]) -> Int[Array, " n"]:
+    """How many members come before each entry, exact."""
+    if members.shape[0] >= _EXACT_IN_FLOAT32:
+        return _shifted(jnp.cumsum(members, dtype=jnp.int32))
+    return sum_before(members.astype(jnp.float32)).astype(jnp.int32)
 
 
 def row_sums(values: Float[Array, "n d"]) -> Float[Array, " n"]:
@@ -297,21 +307,26 @@ def order_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array
     several times faster than sorting pairs.
     """
     n = segments.shape[0]
-    index = jnp.arange(n, dtype=jnp.int32)
     if num_segments <= _FEW_SEGMENTS:
-        counts = segment_counts(jnp.ones(n, bool), segments, num_segments)
-        firsts = stored(jnp.cumsum(counts) - counts)
-        place, others = jnp.zeros(n, jnp.int32), index + jnp.sum(counts, dtype=jnp.int32)
-        for m in range(num_segments):
-            member = segments == m
-            before = sum_before(member.astype(jnp.float32)).astype(jnp.int32)
-            place = jnp.where(member, firsts[m] + before, place)
-            others = others - before
-        place = jnp.where(segments == num_segments, others, place)
-        return inverse_permutation(place)
+        return inverse_permutation(_places_by_segment(segments, num_segments))
     if (num_segments + 1) * n >= 2**31:
         return jnp.argsort(segments, stable=True).astype(jnp.int32)
+    index = jnp.arange(n, dtype=jnp.int32)
     return jax.lax.sort(segments.astype(jnp.int32) * n + index) % n
+
+
+def _places_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " n"]:
+    """Each entry's place in the order, by one prefix sum a segment."""
+    n = segments.shape[0]
+    counts = segment_counts(jnp.ones(n, bool), segments, num_segments)
+    firsts = stored(jnp.cumsum(counts) - counts)
+    place = jnp.zeros(n, jnp.int32)
+    unlabelled = jnp.arange(n, dtype=jnp.int32) + jnp.sum(counts, dtype=jnp.int32)
+    for m in range(num_segments):
+        before = count_before(segments == m)
+        place = jnp.where(segments == m, firsts[m] + before, place)
+        unlabelled = unlabelled - before
+    return jnp.where(segments == num_segments, unlabelled, place)
 
 
 def cholesky(matrices: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
