@@ -34,7 +34,78 @@ class BoxState(eqx.Module):
     previous: Float[Array, "n 4"] | None = None
 
 
-class ColourModel(AbstractStateSpaceModel):
+class AbstractBoxModel(AbstractStateSpaceModel):
+    """Boxes that move at random, without what is seen of them.
+
+    x_0 is spread equally over the reference boxes and scatters about them; (x, y, s_x, s_y) follow
+    the dynamics, and r never changes, or is drawn anew with the switch probability in a frame.
+    """
+
+    reference_boxes: eqx.AbstractVar[Float[Array, "k 4"]]
+    dynamics: eqx.AbstractVar[AbstractDynamics]
+    initial_deviations: eqx.AbstractVar[Float[Array, "k 4"]]
+    switch_probability: eqx.AbstractVar[float]
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> BoxState:
+        """x_0 about the reference boxes, equally many for each, at scale one."""
+        k = self.reference_boxes.shape[0]
+        key_offset, key_noise = jax.random.split(key)
+        offset = jax.random.randint(key_offset, (), 0, num_particles)
+        reference = (jnp.arange(num_particles) * k + offset) // num_particles % k
+        centre = jnp.concatenate(
+            [self.reference_boxes[:, :2], jnp.ones_like(self.reference_boxes[:, :2])], axis=1
+        )
+        noise = jax.random.normal(key_noise, (num_particles, 4), centre.dtype)
+        box = centre[reference] + self.initial_deviations[reference] * noise
+        return BoxState(box, reference, self._remembered(box))
+
+    def sample_transition(self, key: Key[Array, ""], states: BoxState) -> BoxState:
+        """x_t from the dynamics, and r drawn anew with the switch probability."""
+        key_noise, key_switch, key_reference = jax.random.split(key, 3)
+        reference = states.reference
+        if self.switch_probability > 0:
+            k = self.reference_boxes.shape[0]
+            switches = jax.random.bernoulli(key_switch, self.switch_probability, reference.shape)
+            drawn = jax.random.randint(key_reference, reference.shape, 0, k, reference.dtype)
+            reference = jnp.where(switches, drawn, reference)
+        dynamics = self.dynamics_of(states)
+        box = dynamics.sample(key_noise, states.box, states.previous)
+        return BoxState(box, reference, self._remembered(states.box))
+
+    def log_transition(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
+        """log D(x_t | x_{t-1}) + log P(r_t | r_{t-1}), -inf where r cannot have changed."""
+        dynamics = self.dynamics_of(previous_states)
+        log_density = dynamics.log_density(
+            states.box, previous_states.box, previous_states.previous
+        )
+        return log_density + self.log_switch(states, previous_states)
+
+    def log_switch(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
+        """log P(r_t | r_{t-1}), the part of `log_transition` that is not of the box."""
+        drawn = self.switch_probability / self.reference_boxes.shape[0]
+        stays = states.reference == previous_states.reference
+        return jnp.log(
+            jnp.where(stays, 1 - self.switch_probability + drawn, drawn).astype(states.box.dtype)
+        )
+
+    def with_history(self, states: BoxState, previous_states: BoxState) -> BoxState:
+        """The states as children of the previous ones: they remember those boxes."""
+        return BoxState(states.box, states.reference, self._remembered(previous_states.box))
+
+    def dynamics_of(self, states: BoxState) -> AbstractDynamics:
+        """The dynamics of each particle's own reference."""
+        return jax.tree.map(lambda leaf: leaf[states.reference], self.dynamics)
+
+    def _remembered(self, box: Float[Array, "n 4"]) -> Float[Array, "n 4"] | None:
+        return box if self.dynamics.order == 2 else None
+
+    def boxes(self, states: BoxState) -> Float[Array, "n 4"]:
+        """(x, y, s_x l_x, s_y l_y): the hypothesised boxes, centre and size in pixels."""
+        size = self.reference_boxes[states.reference, 2:]
+        return jnp.concatenate([states.box[:, :2], states.box[:, 2:] * size], axis=1)
+
+
+class ColourModel(AbstractBoxModel):
     """Boxes that move at random and are known by the colours that they hold.
 
     Vermaak et al. (2003), section 5.2: (x, y, s_x, s_y) follow independent Gaussian random walks,
@@ -151,52 +222,6 @@ class ColourModel(AbstractStateSpaceModel):
             wide_counts=wide_counts,
         )
 
-    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> BoxState:
-        """x_0 about the reference boxes, equally many for each, at scale one."""
-        k = self.reference_boxes.shape[0]
-        key_offset, key_noise = jax.random.split(key)
-        offset = jax.random.randint(key_offset, (), 0, num_particles)
-        reference = (jnp.arange(num_particles) * k + offset) // num_particles % k
-        centre = jnp.concatenate(
-            [self.reference_boxes[:, :2], jnp.ones_like(self.reference_boxes[:, :2])], axis=1
-        )
-        noise = jax.random.normal(key_noise, (num_particles, 4), centre.dtype)
-        box = centre[reference] + self.initial_deviations[reference] * noise
-        return BoxState(box, reference, self._remembered(box))
-
-    def sample_transition(self, key: Key[Array, ""], states: BoxState) -> BoxState:
-        """x_t from the dynamics, and r drawn anew with the switch probability."""
-        key_noise, key_switch, key_reference = jax.random.split(key, 3)
-        reference = states.reference
-        if self.switch_probability > 0:
-            k = self.reference_boxes.shape[0]
-            switches = jax.random.bernoulli(key_switch, self.switch_probability, reference.shape)
-            drawn = jax.random.randint(key_reference, reference.shape, 0, k, reference.dtype)
-            reference = jnp.where(switches, drawn, reference)
-        dynamics = self.dynamics_of(states)
-        box = dynamics.sample(key_noise, states.box, states.previous)
-        return BoxState(box, reference, self._remembered(states.box))
-
-    def log_transition(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
-        """log D(x_t | x_{t-1}) + log P(r_t | r_{t-1}), -inf where r cannot have changed."""
-        dynamics = self.dynamics_of(previous_states)
-        log_density = dynamics.log_density(
-            states.box, previous_states.box, previous_states.previous
-        )
-        return log_density + self.log_switch(states, previous_states)
-
-    def log_switch(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
-        """log P(r_t | r_{t-1}), the part of `log_transition` that is not of the box."""
-        drawn = self.switch_probability / self.reference_boxes.shape[0]
-        stays = states.reference == previous_states.reference
-        return jnp.log(
-            jnp.where(stays, 1 - self.switch_probability + drawn, drawn).astype(states.box.dtype)
-        )
-
-    def with_history(self, states: BoxState, previous_states: BoxState) -> BoxState:
-        """The states as children of the previous ones: they remember those boxes."""
-        return BoxState(states.box, states.reference, self._remembered(previous_states.box))
-
     def log_likelihood(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
     ) -> Float[Array, " n"]:
@@ -242,18 +267,6 @@ class ColourModel(AbstractStateSpaceModel):
         histograms = normalise(counts, weights)
         distances = bhattacharyya(histograms, jnp.broadcast_to(references, histograms.shape))
         return jnp.mean(jnp.sum(distances, axis=2), axis=1)
-
-    def dynamics_of(self, states: BoxState) -> AbstractDynamics:
-        """The dynamics of each particle's own reference."""
-        return jax.tree.map(lambda leaf: leaf[states.reference], self.dynamics)
-
-    def _remembered(self, box: Float[Array, "n 4"]) -> Float[Array, "n 4"] | None:
-        return box if self.dynamics.order == 2 else None
-
-    def boxes(self, states: BoxState) -> Float[Array, "n 4"]:
-        """(x, y, s_x l_x, s_y l_y): the hypothesised boxes, centre and size in pixels."""
-        size = self.reference_boxes[states.reference, 2:]
-        return jnp.concatenate([states.box[:, :2], states.box[:, 2:] * size], axis=1)
 
 
 def _for_each(dynamics: AbstractDynamics, num_boxes: int) -> AbstractDynamics:
