@@ -1,8 +1,13 @@
-"""Tuning of a filter's parameters by the gradient of its log marginal likelihood."""
+"""Tuning of a filter's parameters by gradients, and their posterior."""
 
+from mpfjax.tuning.climb import Maximisation as Maximisation
 from mpfjax.tuning.climb import TuningRun as TuningRun
 from mpfjax.tuning.climb import fit as fit
+from mpfjax.tuning.climb import maximise as maximise
 from mpfjax.tuning.curvature import standard_errors as standard_errors
+from mpfjax.tuning.labels import LabelLikelihood as LabelLikelihood
+from mpfjax.tuning.labels import label_log_posteriors as label_log_posteriors
+from mpfjax.tuning.labels import transition_candidates as transition_candidates
 from mpfjax.tuning.transforms import AbstractTransform as AbstractTransform
 from mpfjax.tuning.transforms import Interval as Interval
 from mpfjax.tuning.transforms import Positive as Positive

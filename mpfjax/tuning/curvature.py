@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.filters import Filter
-from mpfjax.tuning.problem import Parameters, Problem, Reals, pose, scores
+from mpfjax.tuning.problem import Parameters, Problem, Reals, pose_evidence, scores
 from mpfjax.tuning.transforms import AbstractTransform
 
 _MOST_NUMBERS = 50
@@ -40,7 +40,7 @@ def standard_errors(
     """
     if num_seeds < 1:
         raise ValueError(f"num_seeds: {num_seeds} is less than 1")
-    problem = pose(filter, observations, parameters, transforms, missing)
+    problem = pose_evidence(filter, observations, parameters, transforms, missing)
     return errors_at(problem, problem.start(), [jax.random.split(key, num_seeds)])
 
 

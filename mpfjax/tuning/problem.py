@@ -1,4 +1,4 @@
-"""What is tuned: some leaves of a filter, on sequences of observations."""
+"""What is tuned: some leaves of a filter or model, and the objective that they are to maximise."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,15 +15,16 @@ from mpfjax.tuning.transforms import AbstractTransform, Unconstrained
 
 Parameters = Mapping[str, Callable[[Any], PyTree]] | PyTree
 Reals = dict[str, Array]
+Objective = Callable[[Key[Array, ""], Any], Float[Array, ""]]
 
 
 class Problem(eqx.Module):
-    """A filter as a function of its tuned leaves in unconstrained numbers, by name."""
+    """An objective as a function of tuned leaves in unconstrained numbers, by name."""
 
     leaves: list[Any]
     transforms: dict[str, AbstractTransform]
-    groups: list[tuple[PyTree, Array | None]]
-    """sequences of one shape, stacked: observations, and which steps have one."""
+    objective: Objective
+    """of a seed and the tree that the leaves are of; its arrays are the data."""
     tuned: tuple[tuple[str, int], ...] = eqx.field(static=True)
     """the parameters' names, and where they are among the leaves."""
     structure: Any = eqx.field(static=True)
@@ -46,16 +47,27 @@ class Problem(eqx.Module):
         """The parameters on their own scale."""
         return {name: np.asarray(self.transforms[name].constrain(u)) for name, u in reals.items()}
 
-    def filter_at(self, reals: Reals) -> Filter:
-        """The filter with these parameters."""
+    def at(self, reals: Reals) -> Any:
+        """The filter or model with these parameters."""
         leaves = list(self.leaves)
         for name, index in self.tuned:
             leaves[index] = self.transforms[name].constrain(reals[name])
         return jax.tree.unflatten(self.structure, leaves)
 
-    def log_evidence(self, reals: Reals, key: Key[Array, ""]) -> Float[Array, ""]:
-        """log Ẑ of one seed, summed over sequences."""
-        filter, total = self.filter_at(reals), 0.0
+    def value(self, reals: Reals, key: Key[Array, ""]) -> Float[Array, ""]:
+        """The objective of one seed."""
+        return self.objective(key, self.at(reals))
+
+
+class LogEvidence(eqx.Module):
+    """log Ẑ of a filter with one seed, summed over sequences of observations."""
+
+    groups: list[tuple[PyTree, Array | None]]
+    """sequences of one shape, stacked: observations, and which steps have one."""
+
+    def __call__(self, key: Key[Array, ""], filter: Filter) -> Float[Array, ""]:
+        """One run for each sequence."""
+        total = 0.0
         for g, (observations, present) in enumerate(self.groups):
             num_sequences = jax.tree.leaves(observations)[0].shape[0]
             keys = jax.random.split(jax.random.fold_in(key, g), num_sequences)
@@ -70,10 +82,10 @@ class Problem(eqx.Module):
 def scores(
     problem: Problem, reals: Reals, keys: Key[Array, " seeds"]
 ) -> tuple[Float[Array, " seeds"], Reals]:
-    """log Ẑ of each seed, and the gradient of their mean."""
+    """The objective of each seed, and the gradient of their mean."""
 
     def mean(reals: Reals) -> tuple[Float[Array, ""], Float[Array, " seeds"]]:
-        values = jax.vmap(lambda key: problem.log_evidence(reals, key))(keys)
+        values = jax.vmap(lambda key: problem.value(reals, key))(keys)
         return jnp.mean(values), values
 
     gradient, values = jax.grad(mean, has_aux=True)(reals)
@@ -81,15 +93,14 @@ def scores(
 
 
 def pose(
-    filter: Filter,
-    observations: PyTree,
+    tree: PyTree,
+    objective: Objective,
     parameters: Parameters,
     transforms: Mapping[str, AbstractTransform] | None,
-    missing: str,
 ) -> Problem:
     """The problem, with a `ValueError` for arguments that make none."""
-    leaves, structure = jax.tree.flatten(filter)
-    tuned = _named_leaves(filter, parameters)
+    leaves, structure = jax.tree.flatten(tree)
+    tuned = _named_leaves(tree, parameters)
     if not tuned:
         raise ValueError("parameters: there is nothing to tune")
     transforms = dict(transforms or {})
@@ -99,53 +110,67 @@ def pose(
     return Problem(
         leaves=leaves,
         transforms={name: transforms.get(name, Unconstrained()) for name in tuned},
-        groups=_groups(observations, missing),
+        objective=objective,
         tuned=tuple(tuned.items()),
         structure=structure,
     )
 
 
+def pose_evidence(
+    filter: Filter,
+    observations: PyTree,
+    parameters: Parameters,
+    transforms: Mapping[str, AbstractTransform] | None,
+    missing: str,
+) -> Problem:
+    """The problem of the log marginal likelihood; without `parameters`, in those of the model."""
+    if parameters is None:
+        fixed = jax.tree.map(lambda _: False, filter)
+        of_model = jax.tree.map(eqx.is_inexact_array, filter.model)
+        parameters = eqx.tree_at(lambda f: f.model, fixed, of_model)
+    return pose(filter, LogEvidence(_groups(observations, missing)), parameters, transforms)
+
+
 @dataclass(frozen=True)
 class _Place:
-    """Stands for a leaf of the filter, by its place among all of them."""
+    """Stands for a leaf, by its place among all of them."""
 
     index: int
 
 
-def _named_leaves(filter: Filter, parameters: Parameters) -> dict[str, int]:
-    """Each parameter's name, and where it is among the filter's leaves."""
-    leaves, structure = jax.tree.flatten(filter)
+def _named_leaves(tree: PyTree, parameters: Parameters) -> dict[str, int]:
+    """Each parameter's name, and where it is among the tree's leaves."""
+    leaves, structure = jax.tree.flatten(tree)
     places = jax.tree.unflatten(structure, map(_Place, range(len(leaves))))
     if isinstance(parameters, Mapping):
         chosen = [_chosen(name, where, places, leaves) for name, where in parameters.items()]
         return {name: index for named in chosen for name, index in named.items()}
-    names = [
-        jax.tree_util.keystr(path).removeprefix(".model.")
-        for path, _ in jax.tree_util.tree_leaves_with_path(places)
-    ]
     if parameters is None:
-        of_model = [place.index for place in jax.tree.leaves(places.model)]
-        return {names[i]: i for i in of_model if eqx.is_inexact_array(leaves[i])}
-    spec = jax.tree.leaves(jax.tree.broadcast(parameters, filter))
+        parameters = jax.tree.map(eqx.is_inexact_array, tree)
+    spec = jax.tree.leaves(jax.tree.broadcast(parameters, tree))
     if len(spec) != len(leaves) or not all(isinstance(is_tuned, bool) for is_tuned in spec):
         raise ValueError("parameters: the filter spec is no pytree of booleans like the filter")
+    names = [
+        jax.tree_util.keystr(path).removeprefix(".model.").removeprefix(".")
+        for path, _ in jax.tree_util.tree_leaves_with_path(places)
+    ]
     return {names[i]: i for i, is_tuned in enumerate(spec) if is_tuned}
 
 
-def _chosen(name: str, where: Any, places: Filter, leaves: list[Any]) -> dict[str, int]:
+def _chosen(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[str, int]:
     """What one entry of the mapping stands for: a leaf, or the arrays of a node."""
     if not callable(where):
-        raise ValueError(f"parameters: {name} is {where!r}, no function that picks from a filter")
+        raise ValueError(f"parameters: {name} is {where!r}, no function that picks from it")
     found = jax.tree_util.tree_leaves_with_path(where(places))
     for _, place in found:
         if not isinstance(place, _Place):
-            raise ValueError(f"parameters: {name} picks {place!r}, which is no leaf of the filter")
+            raise ValueError(f"parameters: {name} picks {place!r}, which is no leaf")
     if len(found) > 1:  # a network has functions among its leaves
         found = [
             (path, place) for path, place in found if eqx.is_inexact_array(leaves[place.index])
         ]
     if not found:
-        raise ValueError(f"parameters: {name} picks no array of the filter")
+        raise ValueError(f"parameters: {name} picks no array")
     return {name + jax.tree_util.keystr(path): place.index for path, place in found}
 
 

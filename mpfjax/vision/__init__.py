@@ -24,10 +24,14 @@ from mpfjax.vision.histograms import integral_histogram as integral_histogram
 from mpfjax.vision.joint_colour import joint_colour_model as joint_colour_model
 from mpfjax.vision.joint_colour import object_boxes as object_boxes
 from mpfjax.vision.joint_colour import with_lambda as with_lambda
+from mpfjax.vision.labels import boxes_around as boxes_around
+from mpfjax.vision.labels import labelled_states as labelled_states
 from mpfjax.vision.object_moves import ObjectExclusion as ObjectExclusion
 from mpfjax.vision.object_moves import PruneHypotheses as PruneHypotheses
 from mpfjax.vision.scenes import Scene as Scene
 from mpfjax.vision.scenes import football_scene as football_scene
+from mpfjax.vision.soft_histograms import SoftColourModel as SoftColourModel
+from mpfjax.vision.soft_histograms import soft_histograms as soft_histograms
 from mpfjax.vision.tracker import ObjectTracker as ObjectTracker
 from mpfjax.vision.tracker import TrackerState as TrackerState
 from mpfjax.vision.tracker import Tracks as Tracks

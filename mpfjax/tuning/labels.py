@@ -1,0 +1,118 @@
+"""What labels say of a likelihood: the posterior of the label among candidate states."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import logsumexp
+from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.models.base import AbstractStateSpaceModel
+
+
+class LabelLikelihood(eqx.Module):
+    """The conditional log likelihood of labels given their observations, for `maximise`.
+
+    The mean over labels of `label_log_posteriors`, at each step over `num_frames` frames that its
+    seed draws, or over all of them. exp(-λ B²) and other likelihoods without their normaliser over
+    y have no maximum in λ by the marginal likelihood of a filter, which rises as λ falls; this has
+    one. Use it for such likelihoods, on frames whose true states are known.
+
+    - `observations`: leading axis t.
+    - `labels`: the true states: leaves (t, k, ...), k of them in each frame.
+    - `candidates`: rival states of each: leaves (t, k, n, ...), such as `transition_candidates`.
+    - `num_frames`: drawn for a step, without replacement; None takes all. Static.
+
+    Raises `ValueError` for leaves whose leading axes do not agree, no frames, labels or candidates,
+    and a `num_frames` that is not between 1 and t.
+    """
+
+    observations: PyTree
+    labels: PyTree
+    candidates: PyTree
+    num_frames: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        t = _check(self.observations, self.labels, self.candidates)
+        if self.num_frames is not None and not 1 <= self.num_frames <= t:
+            raise ValueError(f"num_frames: {self.num_frames} is not between 1 and the {t} frames")
+
+    def __call__(self, key: Key[Array, ""], model: AbstractStateSpaceModel) -> Float[Array, ""]:
+        """The mean over labels, in nats; at most log(n + 1)."""
+        data = (self.observations, self.labels, self.candidates)
+        if self.num_frames is not None:
+            t = jax.tree.leaves(self.labels)[0].shape[0]
+            chosen = jax.random.choice(key, t, (self.num_frames,), replace=False)
+            data = jax.tree.map(lambda leaf: leaf[chosen], data)
+        return jnp.mean(label_log_posteriors(model, *data))
+
+
+def label_log_posteriors(
+    model: AbstractStateSpaceModel, observations: PyTree, labels: PyTree, candidates: PyTree
+) -> Float[Array, "t k"]:
+    """log p(x* | y) / q(x*) of every label, by Monte Carlo over its candidates.
+
+    With candidates x_1..x_n ~ q, the prior that they are drawn from, and x_0 = x* the label,
+
+        log L(y | x*) - log (1 / (n + 1)) Σ_{i=0..n} L(y | x_i),
+
+    the log posterior density of the label relative to q, normalised over the state, so that a
+    factor of L that does not depend on the state cancels: conditional maximum likelihood (for
+    tracking, Taycher, Demirdjian, Darrell and Shakhnarovich 2006). With the label in the sum it is
+    at most log(n + 1), and its mean over labels a lower bound of the information that y has on x*
+    (van den Oord, Li and Vinyals 2018). Labels that are right to a pixel only ask for a likelihood
+    as wide as that: λ has a finite best value.
+
+    Shapes as in `LabelLikelihood`; one frame after the other, whose terms are computed again for
+    the derivative, so that memory does not grow with t but for the data.
+    """
+    _check(observations, labels, candidates)
+
+    @jax.checkpoint
+    def of_frame(data: tuple[PyTree, PyTree, PyTree]) -> Float[Array, " k"]:
+        observation, label, rivals = data
+        states = jax.tree.map(lambda a, b: jnp.concatenate([a[:, None], b], axis=1), label, rivals)
+        k, n = jax.tree.leaves(states)[0].shape[:2]
+        flat = jax.tree.map(lambda leaf: leaf.reshape(k * n, *leaf.shape[2:]), states)
+        logs = model.log_likelihood(observation, flat).reshape(k, n)
+        return logs[:, 0] - logsumexp(logs, axis=1) + jnp.log(jnp.asarray(n, logs.dtype))
+
+    return jax.lax.map(of_frame, (observations, labels, candidates))
+
+
+def transition_candidates(
+    key: Key[Array, ""], model: AbstractStateSpaceModel, labels: PyTree, num_candidates: int
+) -> PyTree:
+    """Draws from D(. | the label one frame before), for every frame but the first.
+
+    `labels` has leaves (t, k, ...), the result (t - 1, k, n, ...): rivals as a filter would meet
+    them. Raises `ValueError` for fewer than one candidate, and for fewer than two frames.
+    """
+    if num_candidates < 1:
+        raise ValueError(f"num_candidates: {num_candidates} is less than 1")
+    t, k = jax.tree.leaves(labels)[0].shape[:2]
+    if t < 2:
+        raise ValueError(f"labels: {t} frames leave none with a label one frame before")
+    lead = (t - 1, k, num_candidates)
+    before = jax.tree.map(
+        lambda leaf: jnp.repeat(leaf[:-1].reshape((t - 1) * k, *leaf.shape[2:]), lead[2], axis=0),
+        labels,
+    )
+    drawn = model.sample_transition(key, before)
+    return jax.tree.map(lambda leaf: leaf.reshape(*lead, *leaf.shape[1:]), drawn)
+
+
+def _check(observations: PyTree, labels: PyTree, candidates: PyTree) -> int:
+    """The number of frames, or a `ValueError` for leading axes that do not agree."""
+    lead = jax.tree.leaves(candidates)[0].shape[:3]
+    if len(lead) < 3 or 0 in lead:
+        raise ValueError(f"candidates: leading axes {lead} are not frames, labels and candidates")
+    for name, tree, axes in (
+        ("observations", observations, 1), ("labels", labels, 2), ("candidates", candidates, 3),
+    ):  # fmt: skip
+        for leaf in jax.tree.leaves(tree):
+            if jnp.shape(leaf)[:axes] != lead[:axes]:
+                raise ValueError(
+                    f"{name}: leading axes {jnp.shape(leaf)[:axes]} are not {lead[:axes]},"
+                    " as of the candidates"
+                )
+    return lead[0]

@@ -1,0 +1,60 @@
+"""Labelled boxes as states of a model, and boxes around them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from mpfjax.models.base import require_positive
+from mpfjax.vision.boxes import centred
+from mpfjax.vision.colour_model import AbstractBoxModel, BoxState
+
+
+def labelled_states(model: AbstractBoxModel, boxes: Float[np.ndarray, "t k 4"]) -> BoxState:
+    """The states of k labelled objects in t consecutive frames: leaves (t, k, ...).
+
+    Boxes are (x, y, w, h), top-left corner first; object j is the model's reference j. Where the
+    dynamics are of second order the first frame's states have stood still. Raises `ValueError`
+    for another number of boxes than of references, and for a box that is not finite or has no area.
+    """
+    boxes = np.asarray(boxes, float)
+    k = model.reference_boxes.shape[0]
+    if boxes.ndim != 3 or boxes.shape[1:] != (k, 4):
+        raise ValueError(f"boxes: shape {boxes.shape} is not (t, {k}, 4), for {k} references")
+    if not (np.isfinite(boxes).all() and (boxes[..., 2:] > 0).all()):
+        raise ValueError("boxes: one is not finite, or has no area")
+    places = jnp.asarray(centred(boxes.reshape(-1, 4)).reshape(boxes.shape), float)
+    scales = places[..., 2:] / model.reference_boxes[None, :, 2:]
+    box = jnp.concatenate([places[..., :2], scales], axis=-1)
+    reference = jnp.broadcast_to(jnp.arange(k, dtype=jnp.int32)[None], box.shape[:2])
+    second = model.dynamics.order == 2
+    return BoxState(box, reference, jnp.concatenate([box[:1], box[:-1]]) if second else None)
+
+
+def boxes_around(
+    key: Key[Array, ""],
+    model: AbstractBoxModel,
+    states: BoxState,
+    num_boxes: int,
+    reach: float = 2.0,
+) -> BoxState:
+    """Boxes spread evenly over the neighbourhood of each: leaves (..., n, ...).
+
+    Centres are uniform within `reach` widths and heights to each side; sizes stay. For the
+    candidates of a `LabelLikelihood`, which a filter's own dynamics would seldom draw. Raises
+    `ValueError` for fewer than one box, and a reach that is not positive.
+    """
+    if num_boxes < 1:
+        raise ValueError(f"num_boxes: {num_boxes} is less than 1")
+    require_positive(reach=reach)
+
+    def each(leaf: Array) -> Array:
+        lead = states.reference.shape
+        shape = (*lead, num_boxes, *leaf.shape[len(lead) :])
+        return jnp.broadcast_to(jnp.expand_dims(leaf, len(lead)), shape)
+
+    spread = jax.tree.map(each, states)
+    size = model.reference_boxes[spread.reference, 2:] * spread.box[..., 2:]
+    shift = jax.random.uniform(key, size.shape, size.dtype, -reach, reach) * size
+    box = jnp.concatenate([spread.box[..., :2] + shift, spread.box[..., 2:]], axis=-1)
+    return BoxState(box, spread.reference, spread.previous)
