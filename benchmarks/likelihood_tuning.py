@@ -1,7 +1,8 @@
 """Which gradients of a filter's likelihood can be trusted, and tuning by those that can.
 
 Part a: bias, spread and time of every gradient estimator against exact scores. Part b: σ_x and
-σ_y of the quadratic model tuned from random starts, against the exact maximum. Run with
+σ_y of the quadratic model tuned from random starts, against the exact maximum. Part c: a colour
+likelihood tuned on labelled frames, and trackers with and without it on held-out ones. Run with
 `python -m benchmarks.likelihood_tuning`; `--help` lists the options.
 """
 
@@ -21,6 +22,8 @@ from scipy.optimize import minimize
 from tqdm import tqdm
 
 import mpfjax
+from benchmarks.label_tuning import CLIMB_STEPS as LABEL_STEPS
+from benchmarks.label_tuning import SEQUENCES, run_labels
 from benchmarks.results import format_table, write_json
 from benchmarks.score_vs_particles import HIGH, LOW, position, simulate
 from mpfjax import plotting
@@ -63,6 +66,11 @@ def main(arguments: list[str] | None = None) -> int:
             run_scores(options, out)
         if "b" in options.parts:
             run_starts(options, out)
+        if "c" in options.parts:
+            run_labels(options, out)
+    except FileNotFoundError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print(f"interrupted: what was finished is in {out}", file=sys.stderr)
         return 130
@@ -73,7 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     """The options, or a message that names the one that cannot be run."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.likelihood_tuning")
-    parser.add_argument("--parts", nargs="+", choices=("a", "b"), default=["a", "b"])
+    parser.add_argument("--parts", nargs="+", choices=("a", "b", "c"), default=["a", "b", "c"])
     parser.add_argument("--runs", type=int, default=200, help="a: seeds for each estimator")
     parser.add_argument("--particles", type=int, nargs="+", default=[100, 1000], metavar="N")
     parser.add_argument(
@@ -83,12 +91,17 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--filters", nargs="+", choices=FILTERS, default=FILTERS)
     parser.add_argument("--starts", type=int, default=20, help="b: random starts")
     parser.add_argument("--steps", type=int, default=CLIMB_STEPS, help="b: of each climb")
+    parser.add_argument("--sequences", nargs="+", choices=SEQUENCES, default=SEQUENCES, help="c")
+    parser.add_argument("--label-runs", type=int, default=6, help="c: seeds of each filter")
+    parser.add_argument("--label-steps", type=int, default=LABEL_STEPS, help="c: of each climb")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", default="results/likelihood_tuning", metavar="DIR")
     options = parser.parse_args(arguments)
-    for name in ("runs", "starts", "steps"):
-        if getattr(options, name) < 1:
-            parser.error(f"--{name}: {getattr(options, name)} is less than 1")
+    least = {"runs": 1, "starts": 1, "steps": 1, "label_runs": 2, "label_steps": 1}
+    for name, number in least.items():
+        if getattr(options, name) < number:
+            option = name.replace("_", "-")
+            parser.error(f"--{option}: {getattr(options, name)} is less than {number}")
     if min(options.particles) < 2:
         parser.error(f"--particles: {min(options.particles)} is less than 2")
     return options

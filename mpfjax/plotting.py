@@ -290,3 +290,25 @@ def draw_climbs(
     axis.set_title("log marginal likelihood below its maximum, and climbs to it", fontsize=10)
     axis.legend(fontsize=8, loc="lower left")
     return figure
+
+
+def draw_overlaps(panels: Sequence[tuple[str, Mapping[str, np.ndarray], int]]) -> Figure:
+    """A panel for each sequence: its name, overlaps by kind, (runs, t), and their first frame.
+
+    Lines are means over runs, bands one standard error of them.
+    """
+    figure = Figure(figsize=(7.0, 2.2 * len(panels)), layout="constrained")
+    axes = figure.subplots(len(panels), squeeze=False)[:, 0]
+    for axis, (title, curves, first) in zip(axes, panels, strict=True):
+        for index, (name, values) in enumerate(curves.items()):
+            frames = first + np.arange(values.shape[1])
+            mean = values.mean(axis=0)
+            error = values.std(axis=0) / np.sqrt(len(values))
+            axis.plot(frames, mean, label=name, lw=1.4, color=COLOURS[index])
+            axis.fill_between(frames, mean - error, mean + error, color=COLOURS[index], alpha=0.2)
+        axis.set(ylabel="overlap", ylim=(0, 1))
+        axis.set_title(title, fontsize=10)
+        axis.grid(alpha=0.25)
+    axes[0].legend(fontsize=8, loc="lower left")
+    axes[-1].set_xlabel("frame")
+    return figure

@@ -8,6 +8,8 @@ from mpfjax.tuning.curvature import standard_errors as standard_errors
 from mpfjax.tuning.labels import LabelLikelihood as LabelLikelihood
 from mpfjax.tuning.labels import label_log_posteriors as label_log_posteriors
 from mpfjax.tuning.labels import transition_candidates as transition_candidates
+from mpfjax.tuning.metropolis import Posterior as Posterior
+from mpfjax.tuning.metropolis import metropolis_hastings as metropolis_hastings
 from mpfjax.tuning.transforms import AbstractTransform as AbstractTransform
 from mpfjax.tuning.transforms import Interval as Interval
 from mpfjax.tuning.transforms import Positive as Positive

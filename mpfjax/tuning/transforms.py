@@ -24,6 +24,10 @@ class AbstractTransform(eqx.Module):
     def contains(self, value: Float[np.ndarray, "..."]) -> bool:
         """Whether every entry lies inside the domain."""
 
+    @abc.abstractmethod
+    def log_jacobian(self, reals: Float[Array, "..."]) -> Float[Array, ""]:
+        """log |det ∂x/∂u|, by which a density of x becomes one of u."""
+
 
 class Unconstrained(AbstractTransform):
     """The parameter as it is."""
@@ -40,6 +44,10 @@ class Unconstrained(AbstractTransform):
         """Whether it is finite."""
         return bool(np.isfinite(value).all())
 
+    def log_jacobian(self, reals: Float[Array, "..."]) -> Float[Array, ""]:
+        """0."""
+        return jnp.zeros((), reals.dtype)
+
 
 class Positive(AbstractTransform):
     """exp: for scales, whose steps are then relative."""
@@ -55,6 +63,10 @@ class Positive(AbstractTransform):
     def contains(self, value: Float[np.ndarray, "..."]) -> bool:
         """Whether all entries are positive and finite."""
         return bool((np.isfinite(value) & (value > 0)).all())
+
+    def log_jacobian(self, reals: Float[Array, "..."]) -> Float[Array, ""]:
+        """The sum of u."""
+        return jnp.sum(reals)
 
 
 class Interval(AbstractTransform):
@@ -82,6 +94,11 @@ class Interval(AbstractTransform):
         """Whether all entries lie strictly between the ends."""
         return bool(((value > self.low) & (value < self.high)).all())
 
+    def log_jacobian(self, reals: Float[Array, "..."]) -> Float[Array, ""]:
+        """The sum of log((high - low) sigmoid(u) sigmoid(-u))."""
+        slopes = jax.nn.log_sigmoid(reals) + jax.nn.log_sigmoid(-reals)
+        return jnp.sum(slopes + jnp.log(jnp.asarray(self.high - self.low, reals.dtype)))
+
 
 class Simplex(AbstractTransform):
     """Softmax along the last axis: for probabilities, and histograms, that sum to one.
@@ -104,3 +121,7 @@ class Simplex(AbstractTransform):
         if np.ndim(value) == 0:
             return False
         return bool((value > 0).all() and np.allclose(np.sum(value, axis=-1), 1.0, atol=1e-4))
+
+    def log_jacobian(self, reals: Float[Array, "..."]) -> Float[Array, ""]:
+        """The sum of all log probabilities: of the first k - 1 entries in the logits."""
+        return jnp.sum(jnp.log(self.constrain(reals)))

@@ -1,5 +1,6 @@
 """Transforms are bijections between a domain and all real numbers."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -29,6 +30,17 @@ def test_every_real_number_is_a_parameter_inside(name):
     reals = transform.unconstrain(jnp.array(values))
     for shift in (-3.0, 0.0, 3.0):
         assert transform.contains(np.asarray(transform.constrain(reals + shift)))
+
+
+@pytest.mark.parametrize("name", INSIDE)
+def test_the_jacobian_is_that_of_automatic_differentiation(name):
+    transform, values = INSIDE[name]
+    reals = transform.unconstrain(jnp.array(values)) + 0.3
+    jacobian = np.asarray(jax.jacfwd(transform.constrain)(reals), float)
+    # Of probabilities, those that are free: the last is one minus the rest.
+    free = jacobian[..., : reals.shape[-1], :, :] if reals.ndim == 2 else jacobian
+    expected = np.linalg.slogdet(free.reshape(reals.size, reals.size))[1]
+    assert float(transform.log_jacobian(reals)) == pytest.approx(expected, rel=1e-3, abs=1e-4)
 
 
 @pytest.mark.parametrize(
