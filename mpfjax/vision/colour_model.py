@@ -29,9 +29,9 @@ class BoxState(eqx.Module):
     - `previous`: the box one frame before, where the dynamics are of second order.
     """
 
-    box: Float[Array, "n 4"]
-    reference: Int[Array, " n"]
-    previous: Float[Array, "n 4"] | None = None
+    box: Float[Array, "*n 4"]
+    reference: Int[Array, "*n"]
+    previous: Float[Array, "*n 4"] | None = None
 
 
 class AbstractBoxModel(AbstractStateSpaceModel):

@@ -37,16 +37,21 @@ def boxes_around(
     states: BoxState,
     num_boxes: int,
     reach: float = 2.0,
+    stretch: float = 1.5,
 ) -> BoxState:
     """Boxes spread evenly over the neighbourhood of each: leaves (..., n, ...).
 
-    Centres are uniform within `reach` widths and heights to each side; sizes stay. For the
-    candidates of a `LabelLikelihood`, which a filter's own dynamics would seldom draw. Raises
-    `ValueError` for fewer than one box, and a reach that is not positive.
+    Centres are uniform within `reach` widths and heights to each side; width and height are
+    multiplied by up to `stretch`, or divided by it, uniformly in the logarithm. For the candidates
+    of a `LabelLikelihood` that a filter's dynamics reach in many steps, not in one: without boxes
+    of wrong sizes it says nothing of size. Raises `ValueError` for fewer than one box, a reach that
+    is not positive, and a stretch below one.
     """
     if num_boxes < 1:
         raise ValueError(f"num_boxes: {num_boxes} is less than 1")
     require_positive(reach=reach)
+    if not stretch >= 1:
+        raise ValueError(f"stretch: {stretch} is less than 1")
 
     def each(leaf: Array) -> Array:
         lead = states.reference.shape
@@ -55,6 +60,7 @@ def boxes_around(
 
     spread = jax.tree.map(each, states)
     size = model.reference_boxes[spread.reference, 2:] * spread.box[..., 2:]
-    shift = jax.random.uniform(key, size.shape, size.dtype, -reach, reach) * size
-    box = jnp.concatenate([spread.box[..., :2] + shift, spread.box[..., 2:]], axis=-1)
-    return BoxState(box, spread.reference, spread.previous)
+    shift, power = jax.random.uniform(key, (2, *size.shape), size.dtype, -1.0, 1.0)
+    centre = spread.box[..., :2] + reach * size * shift
+    scale = spread.box[..., 2:] * stretch**power
+    return BoxState(jnp.concatenate([centre, scale], axis=-1), spread.reference, spread.previous)

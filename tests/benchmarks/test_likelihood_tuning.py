@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from benchmarks import label_tuning
 from benchmarks import likelihood_tuning as benchmark
 
 
@@ -50,12 +51,54 @@ def test_ends_are_compared_with_the_exact_maximum():
     assert "1 of 2 end within 3%" in table
 
 
+def test_tuned_labels_are_judged_on_other_frames(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(label_tuning.LAST_FRAME, "rendered", 8)
+    monkeypatch.setattr(label_tuning, "NUM_PARTICLES", 10)
+    monkeypatch.setattr(label_tuning, "FILTERS", ("pf",))
+    arguments = ["--parts", "c", "--sequences", "rendered", "--label-runs", "2"]
+    assert benchmark.main([*arguments, "--label-steps", "2", "--out", str(tmp_path)]) == 0
+    written = json.loads((tmp_path / "labels.json").read_text())
+    assert [entry["filter"] for entry in written["results"]] == ["pf"]
+    for entry in written["results"]:
+        assert entry["first_frame"] == 5
+        assert entry["lambda"][0] != entry["lambda"][1]
+        for kind in label_tuning.KINDS:
+            assert 0 < entry["overlap"][kind][0] < 1
+            assert len(entry["overlap_by_frame"][kind]) == 4
+            assert np.sum(entry["references"][kind]) == pytest.approx(4 * 2 * 3, rel=0.01)
+    assert (tmp_path / "overlaps.png").stat().st_size > 0
+    assert "last frame's" in capsys.readouterr().out
+
+
+def test_a_sequence_that_is_not_there_is_left_out(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("MPFJAX_DATA", str(tmp_path))
+    arguments = ["--parts", "c", "--sequences", "otb_jogging", "--out", str(tmp_path)]
+    assert benchmark.main(arguments) == 2
+    assert "otb_jogging left out" in capsys.readouterr().err
+
+
+def test_overlaps_are_those_of_boxes():
+    truth = np.array([[[0.0, 0, 10, 10]]])
+    found = label_tuning.overlaps(np.array([[[[5.0, 0, 10, 10]]], [[[20.0, 0, 10, 10]]]]), truth)
+    np.testing.assert_allclose(found[:, 0, 0], [1 / 3, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("gain", "said"),
+    [((0.1, 0.01), "better"), ((-0.1, 0.01), "worse"), ((0.1, 0.06), "no difference")],
+)
+def test_the_verdict_asks_for_two_standard_errors(gain, said):
+    assert label_tuning.verdict(*gain) == said
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         (["--runs", "0"], "--runs"),
         (["--starts", "0"], "--starts"),
         (["--particles", "1"], "--particles"),
+        (["--label-runs", "1"], "--label-runs"),
+        (["--sequences", "football"], "--sequences"),
         (["--estimators", "reinforce"], "--estimators"),
     ],
 )

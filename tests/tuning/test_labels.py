@@ -1,0 +1,155 @@
+"""Label likelihoods: exact on a model whose posterior is known, and with a best scale."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from jax.scipy.stats import norm
+
+from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.tuning import (
+    LabelLikelihood,
+    Positive,
+    label_log_posteriors,
+    maximise,
+    transition_candidates,
+)
+
+
+class Unnormalised(AbstractStateSpaceModel):
+    """x_t = x_{t-1} + N(0, 1), and exp(-lambda (y - x)^2 + c y^2), which is no density of y."""
+
+    lambda_: jax.Array = eqx.field(converter=jnp.asarray, default=1.0)
+    c: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)
+
+    def sample_initial(self, key, num_particles):
+        return jax.random.normal(key, (num_particles,))
+
+    def sample_transition(self, key, states):
+        return states + jax.random.normal(key, states.shape)
+
+    def log_likelihood(self, observation, states):
+        return -self.lambda_ * (observation - states) ** 2 + self.c * observation**2
+
+
+SIGMA = 0.5  # of the noise in y: the right lambda is 1 / (2 sigma^2) = 2
+
+
+def data(num_frames, num_candidates, num_labels=1):
+    key = jax.random.key(0)
+    key_states, key_noise, key_candidates = jax.random.split(key, 3)
+    steps = jax.random.normal(key_states, (num_frames + 1, num_labels))
+    labels = jnp.cumsum(steps, axis=0)
+    noise = SIGMA * jax.random.normal(key_noise, (num_frames, 1))
+    observations = (labels[1:, :1] + noise)[:, 0]
+    rivals = transition_candidates(key_candidates, Unnormalised(), labels, num_candidates)
+    return observations, labels, rivals
+
+
+def test_they_are_log_posterior_over_prior():
+    """With the dynamics as prior: of two Gaussians, in closed form."""
+    observations, labels, rivals = data(6, 40_000)
+    found = label_log_posteriors(Unnormalised(lambda_=2.0), observations, labels[1:], rivals)
+    before, here = labels[:-1, 0], labels[1:, 0]
+    variance = 1 / (1 + 1 / SIGMA**2)
+    mean = variance * (before + observations / SIGMA**2)
+    expected = norm.logpdf(here, mean, jnp.sqrt(variance)) - norm.logpdf(here, before, 1.0)
+    np.testing.assert_allclose(found[:, 0], expected, atol=0.05)
+
+
+def test_each_label_has_its_own_candidates():
+    observations, labels, rivals = data(3, 5, num_labels=2)
+    model = Unnormalised(lambda_=0.7)
+    found = np.asarray(label_log_posteriors(model, observations, labels[1:], rivals))
+    for t in range(3):
+        for k in range(2):
+            states = np.concatenate([labels[1 + t, k][None], rivals[t, k]])
+            likelihoods = np.exp(-0.7 * (float(observations[t]) - states) ** 2)
+            expected = np.log(likelihoods[0] / likelihoods.mean())
+            assert found[t, k] == pytest.approx(expected, abs=1e-4)
+            assert found[t, k] <= np.log(6) + 1e-5
+
+
+def test_the_scale_has_a_best_value_and_a_factor_of_y_none():
+    observations, labels, rivals = data(400, 60)
+    objective = LabelLikelihood(observations, labels[1:], rivals)
+    run = maximise(
+        jax.random.key(1), objective, Unnormalised(lambda_=0.2), optax.adam(0.1), 80,
+        parameters={"lambda": lambda model: model.lambda_}, transforms={"lambda": Positive()},
+        progress=False,
+    )  # fmt: skip
+    # Of 400 labels, its standard error is about 0.15.
+    assert run.parameters["lambda"] == pytest.approx(0.5 / SIGMA**2, abs=0.6)
+    assert run.value > run.history["value"][0] + 0.1
+    assert float(run.model.lambda_) == run.parameters["lambda"]
+    slope = jax.grad(lambda model: objective(jax.random.key(0), model))(run.model)
+    assert abs(float(slope.c)) < 1e-4
+    assert abs(float(slope.lambda_)) < 0.02
+
+
+def test_frames_are_drawn_anew_at_every_step():
+    observations, labels, rivals = data(20, 4)
+    objective = LabelLikelihood(observations, labels[1:], rivals, num_frames=3)
+    everything = label_log_posteriors(Unnormalised(), observations, labels[1:], rivals)
+    keys = jax.random.split(jax.random.key(0), 400)
+    values = np.asarray(jax.jit(jax.vmap(objective, (0, None)))(keys, Unnormalised()))
+    error = values.std() / np.sqrt(400)
+    assert error > 0
+    assert abs(values.mean() - float(everything.mean())) < 4 * error
+
+
+class TestMaximise:
+    """What `fit` has not shown already."""
+
+    def parabola(self, key, model):
+        return -((model.lambda_ - 3.0) ** 2)
+
+    def climb(self, num_steps=60, **options):
+        options = {"parameters": {"lambda": lambda m: m.lambda_}, "progress": False} | options
+        return maximise(
+            jax.random.key(0), self.parabola, Unnormalised(), optax.sgd(0.1), num_steps, **options
+        )
+
+    def test_a_function_is_an_objective(self):
+        run = self.climb()
+        assert run.parameters["lambda"] == pytest.approx(3.0, abs=1e-3)
+        np.testing.assert_allclose(run.history["lambda"][:2], [1.0, 1.4], rtol=1e-5)
+        assert run.value == pytest.approx(0.0, abs=1e-4)
+
+    def test_it_goes_on_from_a_checkpoint(self, tmp_path):
+        whole = self.climb(6)
+        self.climb(3, checkpoint=tmp_path / "climb.npz")
+        resumed = self.climb(6, checkpoint=tmp_path / "climb.npz")
+        assert resumed.parameters["lambda"] == whole.parameters["lambda"]
+
+    def test_a_parameter_without_effect_is_named(self):
+        with pytest.raises(ValueError, match="value does not depend on c"):
+            self.climb(parameters=None)
+
+    def test_a_break_is_said_to_be_its_own(self):
+        with pytest.raises(RuntimeError, match="maximise: the value was nan at the start"):
+            maximise(
+                jax.random.key(0), lambda key, model: model.lambda_ * jnp.nan, Unnormalised(),
+                optax.sgd(0.1), 2, parameters={"lambda": lambda m: m.lambda_}, progress=False,
+            )  # fmt: skip
+
+
+def test_bad_input_is_refused_by_name():
+    observations, labels, rivals = data(4, 3)
+    present = labels[1:]
+    for arguments, named in (
+        ((observations[:3], present, rivals), "observations: "),
+        ((observations, labels, rivals), "labels: "),
+        ((observations, present, rivals[:, 0]), "candidates: "),
+        ((observations, present, rivals[:, :, :0]), "candidates: "),
+        ((observations, present, rivals, 5), "num_frames: 5"),
+        ((observations, present, rivals, 0), "num_frames: 0"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            LabelLikelihood(*arguments)
+    with pytest.raises(ValueError, match="num_candidates: 0"):
+        transition_candidates(jax.random.key(0), Unnormalised(), labels, 0)
+    with pytest.raises(ValueError, match="labels: 1 frames"):
+        transition_candidates(jax.random.key(0), Unnormalised(), labels[:1], 2)
