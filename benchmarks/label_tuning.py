@@ -49,6 +49,7 @@ FRAMES_A_STEP = 8
 CLIMB_STEPS = 60
 RATE = 0.03
 KINDS = ("first", "last", "tuned")
+LEGENDS = ("reference of the first frame", "of the last labelled frame", "tuned")
 
 
 class Labelled(NamedTuple):
@@ -200,7 +201,8 @@ def run_labels(options: Any, out: Path) -> None:
             continue
         entries, curves, first = judge(name, labelled, options)
         results += entries
-        panels.append((name, curves, first))
+        named = dict(zip(LEGENDS, (curves[kind] for kind in KINDS), strict=True))
+        panels.append((f"{name}, {FILTERS[-1].upper()}", named, first))
         write_json(out / "labels.json", {"settings": settings_of(options), "results": results})
     if not results:
         raise FileNotFoundError("--sequences: none of them is there")
