@@ -201,7 +201,9 @@ def run_labels(options: Any, out: Path) -> None:
             continue
         entries, curves, first = judge(name, labelled, options)
         results += entries
-        named = dict(zip(LEGENDS, (curves[kind] for kind in KINDS), strict=True))
+        named: dict[str, np.ndarray] = dict(
+            zip(LEGENDS, (curves[kind] for kind in KINDS), strict=True)
+        )
         panels.append((f"{name}, {FILTERS[-1].upper()}", named, first))
         write_json(out / "labels.json", {"settings": settings_of(options), "results": results})
     if not results:
