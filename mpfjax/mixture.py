@@ -96,9 +96,11 @@ class ParticleMixture(eqx.Module):
     @property
     def effective_sample_size(self) -> Float[Array, ""]:
         """(Σ exp ℓ)² / Σ exp 2ℓ over all particles, zero where there is none."""
-        log_mass = self.log_mass
-        log_size = 2 * log_mass - log_sum_exp(2 * self.log_weights)
-        return jnp.where(log_mass > -jnp.inf, jnp.exp(log_size), 0.0)
+        largest = jnp.max(jax.lax.stop_gradient(self.log_weights))
+        weights = jnp.exp(self.log_weights - jnp.where(jnp.isfinite(largest), largest, 0.0))
+        squares = jnp.sum(weights**2)
+        size = jnp.sum(weights) ** 2 / jnp.where(squares > 0, squares, 1.0)
+        return jnp.where(squares > 0, size, 0.0)
 
     def component_sums(self, values: Float[Array, "n *rest"]) -> Float[Array, "m *rest"]:
         """Σ_{c_i = m} v_i over each component's slots."""
