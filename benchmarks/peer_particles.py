@@ -2,8 +2,10 @@
 
 A Feynman-Kac model of its own for each job, the fast way that its documentation shows beside
 state-space models of distribution objects, and `multiSMC` over the seeds. A module without JAX:
-particles' own processes import it.
+particles' own processes import it. Draws come from numpy's global generator, which is the one that
+particles seeds.
 """
+# ruff: noqa: NPY002
 
 from collections.abc import Callable
 from typing import Any

@@ -5,12 +5,14 @@ leaves the others alone. `Worker` is the parent's end; run as a module, this is 
 """
 
 import argparse
+import contextlib
 import json
 import os
 import select
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
@@ -18,6 +20,7 @@ from typing import IO, Any
 from benchmarks.peer_jobs import JOBS
 
 ROOT = Path(__file__).resolve().parents[1]
+PATIENCE = 10.0
 
 
 class Worker:
@@ -72,17 +75,34 @@ class Worker:
         self.ask(**request)
         return self.answer(time_limit)
 
-    def stop(self) -> None:
-        """End the process, whatever it is at."""
-        self._process.kill()
-        self._process.wait()
-        for name in ("stdin", "stdout"):
-            self._pipe(name).close()
+    def dismiss(self) -> None:
+        """Tell it that there is no more to do; it may wait for others to be told as well."""
+        with contextlib.suppress(BrokenPipeError):
+            self._pipe("stdin").close()
+
+    def stop(self, patience: float = 0.0) -> None:
+        """End the process, whatever it is at, if it has not ended on its own by then."""
+        self.dismiss()
+        try:
+            self._process.wait(patience)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._pipe("stdout").close()
 
     def _pipe(self, name: str) -> IO[str]:
         pipe = getattr(self._process, name)
         assert pipe is not None
         return pipe
+
+
+def stop_all(workers: Iterable[Worker]) -> None:
+    """End processes that may work together: all are dismissed before any is waited for."""
+    workers = list(workers)
+    for worker in workers:
+        worker.dismiss()
+    for worker in workers:
+        worker.stop(PATIENCE)
 
 
 def main() -> None:
@@ -93,9 +113,9 @@ def main() -> None:
     parser.add_argument("--devices", type=int)
     parser.add_argument("--processes", nargs=3, metavar=("ADDRESS", "NUMBER", "INDEX"))
     options = parser.parse_args()
-    # Answers go out on a descriptor of their own: libraries may print.
+    # Answers go out on a descriptor of their own: what libraries print is no answer.
     channel = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
     def reply(content: dict[str, Any]) -> None:
         channel.write(json.dumps(content) + "\n")
@@ -119,9 +139,7 @@ def introduce(options: argparse.Namespace) -> dict[str, Any]:
 
     name = options.library.removesuffix("_2")
     found: dict[str, Any] = {"version": metadata.version(name)}
-    if name == "particles":
-        from benchmarks import peer_particles as _
-    else:
+    if name != "particles":
         import jax
 
         if options.devices is not None:

@@ -26,7 +26,7 @@ from scipy import stats
 
 from benchmarks.peer_jobs import JOBS, Job, Quadratic
 from benchmarks.peer_libraries import LIBRARIES, model_of
-from benchmarks.peer_worker import Worker
+from benchmarks.peer_worker import Worker, stop_all
 from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
 from mpfjax.exact import grid_filter, kalman_filter
@@ -97,8 +97,7 @@ def run(options: argparse.Namespace, refused: list[str]) -> None:
                         refused.append(entry["library"])
                 write_json(out / "peers.json", content)
         finally:
-            for worker in workers.values():
-                worker.stop()
+            stop_all(workers.values())
     labels = labels_of(options.devices)
     for job_name in options.jobs:
         print(as_tables(job_name, content["results"], labels), end="\n\n")

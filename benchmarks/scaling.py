@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
-from benchmarks.peer_worker import Worker
+from benchmarks.peer_worker import Worker, stop_all
 from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
 
@@ -208,11 +208,11 @@ def measure(programs: Mapping[Cell, Any], repeats: int) -> dict[Cell, tuple[list
 
 
 def compile_cell(cell: Cell) -> Any:
-    """The program that runs a cell, from keys to the log marginal likelihoods."""
+    """The program that runs a cell, from keys to results."""
     filter, observations = build(cell)
 
-    def run_all(keys: jax.Array) -> jax.Array:
-        return mpfjax.monte_carlo(keys, filter, observations, nothing).log_marginal_likelihood
+    def run_all(keys: jax.Array) -> mpfjax.FilterRun:
+        return mpfjax.monte_carlo(keys, filter, observations, nothing)
 
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), cell.seeds))
     return jax.jit(run_all).lower(keys).compile()
@@ -276,8 +276,7 @@ def spread_over(
                     elapsed[number].append(max(seconds))
     finally:
         for workers in groups.values():
-            for worker in workers:
-                worker.stop()
+            stop_all(workers)
     return [
         {"kind": kind, "number": n, "seconds": times, "median": float(np.median(times))}
         for n, times in elapsed.items()
@@ -305,9 +304,7 @@ def _answers(workers: list[Worker]) -> list[dict[str, Any]]:
 # --- tables and the picture -------------------------------------------------------------------
 
 
-def as_tables(
-    axis: str, entries: list[dict[str, Any]], slopes: list[dict[str, Any]]
-) -> str:
+def as_tables(axis: str, entries: list[dict[str, Any]], slopes: list[dict[str, Any]]) -> str:
     """Times with their ratios to the PF's of the same size, memory, and the slopes of both."""
     values = sorted({entry[axis] for entry in entries})
     cells = {(entry["filter"], entry[axis]): entry for entry in entries}
