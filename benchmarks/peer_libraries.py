@@ -138,17 +138,18 @@ def through_blackjax(job: Job, num_particles: int) -> Callable[[Any], tuple[Any,
         initial_key, steps_key = jax.random.split(key)
         states = functions.initial(initial_key, (num_particles, *job.state_shape))
 
-        def advance(state: base.SMCState, inputs: tuple[Any, Any]) -> tuple[base.SMCState, Any]:
+        def advance(state: Any, inputs: tuple[Any, Any]) -> tuple[Any, Any]:
             step_key, observation = inputs
-            state, info = base.step(
+            new: Any
+            new, info = base.step(
                 step_key,
                 state,
                 update_fn=lambda keys, x, _: (functions.transition(keys[0], x), None),
                 weight_fn=lambda x: functions.log_likelihood(observation, x),
                 resample_fn=resampling.systematic,
             )
-            size = 1 / jnp.sum(state.weights**2)
-            return state, (state.weights @ state.particles, size, info.log_likelihood_increment)
+            size = 1 / jnp.sum(new.weights**2)
+            return new, (new.weights @ new.particles, size, info.log_likelihood_increment)
 
         keys = jax.random.split(steps_key, job.num_steps)
         _, (means, sizes, increments) = jax.lax.scan(
@@ -173,8 +174,10 @@ def through_cuthbert(job: Job, num_particles: int) -> Callable[[Any], tuple[Any,
     observations = jnp.asarray(job.observations)
     filter = particle_filter.build_filter(
         init_sample=lambda key: functions.initial(key, job.state_shape),
-        propagate_sample=lambda key, x, _: functions.transition(key, x),
-        log_potential=lambda _, x, y: functions.log_likelihood(y, x),
+        propagate_sample=lambda key, state, model_inputs: functions.transition(key, state),
+        log_potential=lambda state_prev, state, model_inputs: functions.log_likelihood(
+            model_inputs, state
+        ),
         n_filter_particles=num_particles,
         resampling_fn=systematic.resampling,
     )

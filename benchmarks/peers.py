@@ -207,7 +207,8 @@ def disagreement(
         gap = abs(ours.mean() - others.mean())
         if gap <= ROUNDING * max(1.0, abs(others.mean())):
             continue
-        if stats.ttest_ind(ours, others, equal_var=False).pvalue < LEVEL:
+        test: Any = stats.ttest_ind(ours, others, equal_var=False)
+        if test.pvalue < LEVEL:
             return f"mean {what.replace('_', ' ')} {ours.mean():.6g}, not {others.mean():.6g}"
     estimates = np.array(found["log_likelihoods"])
     number, variance = len(estimates), estimates.var(ddof=1)
