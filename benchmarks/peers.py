@@ -1,6 +1,6 @@
 """How fast mpfjax is beside particles, blackjax and cuthbert, on the same jobs.
 
-    python -m benchmarks.peers                        # needs the extra `bench`
+    python -m benchmarks.peers                        # whichever rivals are installed
     python -m benchmarks.peers --devices 2            # and mpfjax on two host devices
 
 A bootstrap filter with systematic resampling at every step, for all seeds; mean, effective sample
@@ -31,7 +31,12 @@ from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
 from mpfjax.exact import grid_filter, kalman_filter
 
-RIVALS = ("particles", "blackjax", "cuthbert")
+RIVALS = {  # and how each is installed
+    # particles 0.4 asks for numpy below 2, works with 2, and would take JAX back to 0.7.
+    "particles": "pip install joblib numba scikit-learn; pip install --no-deps particles",
+    "blackjax": "pip install blackjax",
+    "cuthbert": "pip install cuthbert",
+}
 ON_DEVICES = "mpfjax_devices"
 MOST_PARTICLES = {"quadratic": 1_000_000, "constant_velocity": 10_000}
 GRID = (-4.0, 4.0, 1601)
@@ -58,7 +63,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--jobs", nargs="+", choices=list(JOBS), default=list(JOBS))
     parser.add_argument("--seeds", type=int, default=20, help="runs of each filter, at once")
     parser.add_argument("--repeats", type=int, default=9, help="times that each cell is timed")
-    parser.add_argument("--skip", nargs="+", choices=RIVALS, default=[], help="libraries")
+    parser.add_argument("--skip", nargs="+", choices=list(RIVALS), default=[], help="libraries")
     parser.add_argument("--devices", type=int, default=1, help="mpfjax on so many, beside on one")
     parser.add_argument("--time-limit", type=float, default=600.0, help="seconds, of one run")
     parser.add_argument("--out", default="results/peers", metavar="DIR")
@@ -108,11 +113,11 @@ def run(options: argparse.Namespace, refused: list[str]) -> None:
 def chosen_libraries(options: argparse.Namespace) -> list[str]:
     """The names of what runs, mpfjax first; says which rival is not installed."""
     chosen = ["mpfjax"] + ([ON_DEVICES] if options.devices > 1 else [])
-    for name in RIVALS:
+    for name, command in RIVALS.items():
         if name in options.skip:
             continue
         if importlib.util.find_spec(name) is None:
-            print(f"{name} is not installed and left out: pip install {name}", file=sys.stderr)
+            print(f"{name} is not installed and left out: {command}", file=sys.stderr)
             continue
         chosen += ["particles", "particles_2"] if name == "particles" else [name]
     return chosen
