@@ -312,3 +312,66 @@ def draw_overlaps(panels: Sequence[tuple[str, Mapping[str, np.ndarray], int]]) -
     axes[0].legend(fontsize=8, loc="lower left")
     axes[-1].set_xlabel("frame")
     return figure
+
+
+@dataclass(frozen=True)
+class CostPanel:
+    """Named lines of what something costs, each of points (size, cost), on logarithmic axes."""
+
+    title: str
+    xlabel: str
+    ylabel: str
+    lines: Mapping[str, Sequence[tuple[float, float]]]
+
+
+def draw_costs(rows: Sequence[Sequence[CostPanel]]) -> Figure:
+    """Panels of costs in rows that share their axis of costs.
+
+    A name has the same colour and marker in all of them.
+    """
+    num_columns = max(len(row) for row in rows)
+    figure = Figure(figsize=(3.9 * num_columns, 3.3 * len(rows) + 0.5), layout="constrained")
+    axes = figure.subplots(len(rows), num_columns, squeeze=False, sharey="row")
+    names = list(dict.fromkeys(name for row in rows for panel in row for name in panel.lines))
+    for row_axes, row in zip(axes, rows, strict=True):
+        for axis in row_axes[len(row) :]:
+            axis.set_axis_off()
+        for axis, panel in zip(row_axes, row, strict=False):
+            _draw_cost_panel(axis, panel, names)
+        _set_cost_ticks(row_axes[0])
+    handles = {
+        label: handle
+        for axis in axes.ravel()
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        [handles[name] for name in names], names, loc="outside upper center", fontsize=8,
+        ncols=min(len(names), 2 * num_columns),
+    )  # fmt: skip
+    return figure
+
+
+def _draw_cost_panel(axis: Axes, panel: CostPanel, names: Sequence[str]) -> None:
+    sizes = set()
+    for name, points in panel.lines.items():
+        index = names.index(name)
+        x, y = np.array(sorted(points)).T
+        axis.plot(
+            x, y, label=name, lw=1.4, ms=5, color=COLOURS[index % len(COLOURS)],
+            marker=MARKERS[index % len(MARKERS)],
+        )  # fmt: skip
+        sizes |= set(x.tolist())
+    axis.set(xscale="log", yscale="log", xlabel=panel.xlabel, ylabel=panel.ylabel)
+    axis.set_title(panel.title, fontsize=10)
+    ticks = sorted(sizes)
+    axis.set_xticks(ticks, [f"{tick:,.0f}".replace(",", "\u2009") for tick in ticks], fontsize=8)
+    axis.xaxis.set_minor_locator(NullLocator())
+    axis.grid(alpha=0.25)
+
+
+def _set_cost_ticks(axis: Axes) -> None:
+    """Ticks at every decade, and between where there are few of them."""
+    low, high = axis.get_ylim()
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 1000 * low else (1.0, 2.0, 5.0)))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_locator(NullLocator())
