@@ -10,6 +10,8 @@ from jaxtyping import Array, Key, UInt32
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
+_SHORT_ROW = 8
+_FEW = 256
 
 
 def fast_key(key: Key[Array, "*shape"]) -> Key[Array, "*shape"]:
@@ -30,7 +32,10 @@ def fast_key(key: Key[Array, "*shape"]) -> Key[Array, "*shape"]:
 
 def _random_bits(key: UInt32[Array, " 2"], bit_width: int, shape: tuple[int, ...]) -> Array:
     stock = partial(threefry_prng_impl.random_bits, bit_width=bit_width, shape=shape)
-    if bit_width != 32 or not 0 < math.prod(shape) < 2**32:
+    size = math.prod(shape)
+    # Fused with draws in short rows, the rounds would not run on vectors.
+    in_short_rows = len(shape) > 1 and shape[-1] < _SHORT_ROW and size > _FEW
+    if bit_width != 32 or in_short_rows or not 0 < size < 2**32:
         return stock(key)
     return jax.lax.platform_dependent(key, cpu=partial(_words, shape=shape), default=stock)
 
