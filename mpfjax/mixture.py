@@ -10,7 +10,9 @@ from mpfjax.operations import (
     log_sum_exp,
     segment_counts,
     segment_log_sum_exp,
+    segment_softmax,
     segment_sum,
+    softmax,
     spread,
 )
 
@@ -62,6 +64,8 @@ class ParticleMixture(eqx.Module):
     @property
     def log_mixture_weights(self) -> Float[Array, " m"]:
         """log π_m, -inf for a dead component."""
+        if self.num_components == 1:
+            return self.log_mass[None]
         return segment_log_sum_exp(self.log_weights, self.component_indicators, self.num_components)
 
     @property
@@ -88,9 +92,16 @@ class ParticleMixture(eqx.Module):
         )
 
     @property
+    def component_weights(self) -> Float[Array, " n"]:
+        """w_i, the weights within each component; they sum to one in each living one."""
+        if self.num_components == 1:
+            return softmax(self.log_weights)
+        return segment_softmax(self.log_weights, self.component_indicators, self.num_components)
+
+    @property
     def component_effective_sample_sizes(self) -> Float[Array, " m"]:
         """1 / Σ w_i² of each component, zero for a dead one."""
-        squares = self.component_sums(jnp.exp(2 * self.log_component_weights))
+        squares = self.component_sums(self.component_weights**2)
         return jnp.where(squares > 0, 1 / jnp.where(squares > 0, squares, 1.0), 0.0)
 
     @property
@@ -108,7 +119,7 @@ class ParticleMixture(eqx.Module):
 
     def component_averages(self, values: Float[Array, "n *rest"]) -> Float[Array, "m *rest"]:
         """Σ_{c_i = m} w_i v_i, the weighted average of `values` in each component, zero if dead."""
-        weights = jnp.exp(self.log_component_weights).astype(values.dtype)
+        weights = self.component_weights.astype(values.dtype)
         filled = jnp.where(_rows(self.occupied, values), values, jnp.zeros((), values.dtype))
         return self.component_sums(_rows(weights, values) * filled)
 

@@ -286,6 +286,25 @@ def segment_log_sum_exp(
     return _log(total) + shift
 
 
+def softmax(log_values: Float[Array, " n"]) -> Float[Array, " n"]:
+    """exp of the values as shares of their sum, all zero where every entry is -inf."""
+    largest = jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf)
+    values = jnp.exp(log_values - jnp.where(jnp.isfinite(largest), largest, 0.0))
+    total = jnp.sum(values)
+    return values / jnp.where(total == 0, 1.0, total)
+
+
+def segment_softmax(
+    log_values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Float[Array, " n"]:
+    """exp of the values as shares of their segment's sum, zero where that sum is zero."""
+    largest = segment_max(jax.lax.stop_gradient(log_values), segments, num_segments)
+    shift = jnp.where(jnp.isfinite(largest), largest, 0.0)
+    values = jnp.exp(log_values - spread(shift, segments))
+    totals = segment_sum(values, segments, num_segments)
+    return values / spread(jnp.where(totals == 0, 1.0, totals), segments)
+
+
 def segment_argmax(
     values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Int[Array, " num_segments"]:

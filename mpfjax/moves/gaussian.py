@@ -98,7 +98,7 @@ class GaussianRegeneration(AbstractRejuvenation):
     ) -> PyTree:
         """Draws for the new slots, with the moments of `mixture`'s components."""
         states = jnp.where(mixture.occupied[:, None], flatten_states(chosen), 0.0)
-        weights = jnp.exp(mixture.log_component_weights).astype(states.dtype)
+        weights = mixture.component_weights.astype(states.dtype)
         moments = summarise(states, weights, mixture.component_indicators, mixture.num_components)
         factors = self.inflation * cholesky(moments.covariances)
         factors = spread(factors, vacated.component_indicators)

@@ -131,7 +131,7 @@ class Merge(AbstractRegrouping):
     def _overlap(self, mixture: ParticleMixture) -> Bool[Array, "m m"]:
         groups = summarise(
             self.features(mixture),
-            jnp.exp(mixture.log_component_weights),
+            mixture.component_weights,
             mixture.component_indicators,
             mixture.num_components,
         )
@@ -199,7 +199,7 @@ class Split(AbstractRegrouping):
         """The lighter half of every component that is too diffuse, to a free label."""
         del key
         features, m = self.features(mixture), mixture.num_components
-        weights = jnp.exp(mixture.log_component_weights)
+        weights = mixture.component_weights
         parent = mixture.component_indicators
         side = self._halve(features, weights, mixture)
         halves = summarise(features, weights, parent + m * side, 2 * m)

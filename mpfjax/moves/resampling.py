@@ -174,7 +174,7 @@ class Resample(AbstractRejuvenation):
             return mixture
         counts = jnp.maximum(mixture.component_counts, 1).astype(mixture.log_weights.dtype)
         uniform = self.softness / spread(counts, mixture.component_indicators)
-        softened = (1 - self.softness) * jnp.exp(mixture.log_component_weights) + uniform
+        softened = (1 - self.softness) * mixture.component_weights + uniform
         log_mass = spread(mixture.log_mixture_weights, mixture.component_indicators)
         occupied = mixture.occupied
         log_weights = jnp.log(softened) + jnp.where(occupied, log_mass, 0.0)
@@ -283,7 +283,7 @@ def _as_they_stand(mixture: ParticleMixture) -> _Line:
     return _Line(
         order=jnp.arange(num_places, dtype=jnp.int32),
         components=jnp.zeros(num_places, jnp.int32),
-        weights=_padded(jnp.exp(mixture.log_component_weights), 0.0),
+        weights=_padded(mixture.component_weights, 0.0),
         counts=mixture.component_counts,
         firsts=jnp.zeros(1, jnp.int32),
     )
@@ -300,7 +300,7 @@ def _in_line(
     the line of a component that is resampled, and kept with one that is not.
     """
     m = mixture.num_components
-    weights = jnp.exp(mixture.log_component_weights)
+    weights = mixture.component_weights
     stays = ~spread(due, mixture.component_indicators)
     stands = mixture.occupied & ((weights > 0) | stays)
     labels = jnp.where(stands, mixture.component_indicators, m)

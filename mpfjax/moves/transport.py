@@ -93,7 +93,7 @@ def _marginals(
     num_living = jnp.maximum(jnp.sum(mixture.active.astype(dtype)), 1.0)
     present = filled.astype(dtype)
     counts = jax.ops.segment_sum(present, components, mixture.num_components)
-    sources = jnp.exp(mixture.log_component_weights).astype(dtype) / num_living
+    sources = mixture.component_weights.astype(dtype) / num_living
     return sources, present / (num_living * jnp.maximum(spread(counts, components), 1.0))
 
 
