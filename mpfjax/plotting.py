@@ -1,5 +1,6 @@
 """Figures of the papers; the only file that imports matplotlib."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -217,7 +218,9 @@ def draw_object_bars(rows: Mapping[str, Sequence[np.ndarray]], titles: Sequence[
     figure = Figure(figsize=(3.1 * len(titles), 0.4 + 1.5 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), len(titles), squeeze=False, sharex=True, sharey="col")
     for row, (name, panels) in zip(axes, rows.items(), strict=True):
-        row[0].set_ylabel(name.replace(" {", "\n{"), fontsize=8)
+        row[0].set_ylabel(
+            textwrap.fill(name.replace(" {", "\n{"), 20, replace_whitespace=False), fontsize=8
+        )
         for index, (axis, values) in enumerate(zip(row, panels, strict=True)):
             objects = np.arange(1, len(values) + 1)
             bars = axis.bar(objects, values, color=COLOURS[index], width=0.7)
