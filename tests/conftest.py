@@ -39,6 +39,10 @@ jax.config.update("jax_disable_most_optimizations", quick)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
+# Compiling makes many small objects, few of them garbage: modules are swept as they end, below.
+gc.freeze()
+gc.set_threshold(50_000, 20, 50)
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
