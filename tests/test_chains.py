@@ -25,7 +25,7 @@ from tests.user_models import (
     TrickyQuadraticModel,
 )
 
-NUM_RUNS = 4000
+NUM_RUNS = 2000
 OBSERVATIONS = jnp.array([1.5, 1.0, 0.4, 0.9])
 GRID = jnp.linspace(-5.0, 5.0, 1001)
 MODELS = {"quadratic": TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0), "drift": Drift()}

@@ -32,10 +32,11 @@ NUM_ISLANDS = on_devices.NUM_ISLANDS
 
 
 def start(*arguments, devices=1, program=("-m", "tests.on_devices")):
+    count = f"--xla_force_host_platform_device_count={devices}"
     environment = os.environ | {
         "PYTHONPATH": str(REPOSITORY),
         "JAX_PLATFORMS": "cpu",
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {count}",
     }
     return subprocess.Popen(
         [sys.executable, *program, *map(str, arguments)],
