@@ -10,7 +10,15 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.features import Features, Scale, separation, summarise
-from mpfjax.operations import row_sums, segment_argmax, segment_counts, segment_sum, spread, take
+from mpfjax.operations import (
+    count_before,
+    row_sums,
+    segment_argmax,
+    segment_counts,
+    segment_sum,
+    spread,
+    take,
+)
 
 
 class KMeans(AbstractRegrouping):
@@ -281,10 +289,18 @@ class RandomPartition(AbstractRegrouping):
             raise ValueError(
                 f"num_sets: {num_sets} is more than num_components, {mixture.num_components}"
             )
-        draw = jax.random.uniform(key, (n,), mixture.log_weights.dtype)
-        place = jnp.argsort(jnp.where(mixture.occupied, draw, 1.0))
-        ranks = jnp.zeros(n, jnp.int32).at[place].set(jnp.arange(n, dtype=jnp.int32))
-        return ranks % num_sets, mixture.memory
+        # Sets dealt in turn, in an order drawn by sorting: the set stands in a word's lowest bits,
+        # random bits above it, and the sets for the empty slots come after all others.
+        width = (num_sets - 1).bit_length()
+        occupied, index = mixture.occupied, jnp.arange(n, dtype=jnp.int32)
+        num_filled = jnp.sum(occupied, dtype=jnp.int32)
+        noise = jax.random.bits(key, (n,), jnp.uint32) >> (width + 1) << width
+        is_last = (index >= num_filled).astype(jnp.uint32) << 31
+        words = jax.lax.sort(is_last | noise | (index % num_sets).astype(jnp.uint32))
+        dealt = (words & jnp.uint32((1 << width) - 1)).astype(jnp.int32)
+        filled_before = count_before(occupied)
+        turn = jnp.where(occupied, filled_before, num_filled + index - filled_before)
+        return take(dealt, turn), mixture.memory
 
 
 def nearest(
