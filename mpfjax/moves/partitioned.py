@@ -119,15 +119,34 @@ class Partitioned(AbstractPropagation):
         # Resampling may have lost a NaN, or left nothing of the particles but empty slots.
         moved = moved.replace(log_weights=jnp.where(broken, jnp.nan, moved.log_weights))
         lost = ~broken & ~jnp.any(moved.log_weights > -jnp.inf)
-        return jax.lax.cond(lost, lambda: self._unweighted(key, mixture), lambda: moved)
+        return self._unweighted_where(lost, key, mixture, moved)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) of all objects and leave the weights."""
         return predict(key, self.model, mixture, "stop" if self._stops_draws else "none")
 
-    def _unweighted(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        nothing = jnp.full_like(mixture.log_weights, -jnp.inf)
-        return self.predict(key, mixture).replace(log_weights=nothing)
+    def _unweighted_where(
+        self,
+        lost: Bool[Array, ""],
+        key: Key[Array, ""],
+        mixture: ParticleMixture,
+        moved: ParticleMixture,
+    ) -> ParticleMixture:
+        """The prediction without weights where every particle is lost, `moved` elsewhere.
+
+        A loop of one turn at most: under `vmap` a `cond` would draw the prediction at every step.
+        """
+        move, before, after = _without_gradient((self, mixture, moved))
+
+        def predict(carry: tuple[Array, ParticleMixture]) -> tuple[Array, ParticleMixture]:
+            nothing = jnp.full_like(before.log_weights, -jnp.inf)
+            predicted = move.predict(key, before).replace(log_weights=nothing)
+            return jnp.zeros_like(carry[0]), predicted
+
+        _, predicted = jax.lax.while_loop(lambda carry: carry[0], predict, (lost, after))
+        return jax.tree.map(
+            lambda otherwise, usually: jnp.where(lost, otherwise, usually), predicted, moved
+        )
 
     def _advance(
         self,
@@ -201,6 +220,12 @@ class Partitioned(AbstractPropagation):
                 f"orders: {self.orders.shape[0]} of them, for {num_components} components"
             )
         return jnp.broadcast_to(self.orders, (num_components, num_objects))
+
+
+def _without_gradient(tree: PyTree) -> PyTree:
+    return jax.tree.map(
+        lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, tree
+    )
 
 
 def circular_orders(num_orders: int, num_objects: int) -> Int[np.ndarray, "orders objects"]:
