@@ -190,7 +190,13 @@ class TestSeveralProcesses:
     def test_run_the_cells_in_one_order(self, copy, monkeypatch):
         for path in files_of(copy):
             path.unlink()
+        def in_one_process(*arguments, **options):
+            with monkeypatch.context() as patch:
+                patch.setattr(jax, "process_count", lambda: 1)
+                return mpfjax.monte_carlo(*arguments, **options)
+
         monkeypatch.setattr(jax, "process_count", lambda: 2)
+        monkeypatch.setattr(studies, "monte_carlo", in_one_process)
         monkeypatch.setattr(studies, "ThreadPoolExecutor", None)
         mpfjax.run_study(small_study(NUM_CELLS), copy, cells_at_once=2)
 
