@@ -190,6 +190,7 @@ class TestSeveralProcesses:
     def test_run_the_cells_in_one_order(self, copy, monkeypatch):
         for path in files_of(copy):
             path.unlink()
+
         def in_one_process(*arguments, **options):
             with monkeypatch.context() as patch:
                 patch.setattr(jax, "process_count", lambda: 1)
