@@ -291,7 +291,8 @@ def softmax(log_values: Float[Array, " n"]) -> Float[Array, " n"]:
     largest = jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf)
     values = jnp.exp(log_values - jnp.where(jnp.isfinite(largest), largest, 0.0))
     total = jnp.sum(values)
-    return values / jnp.where(total == 0, 1.0, total)
+    shares = values / jnp.where(total == 0, 1.0, total)
+    return _masked(log_values, shares)
 
 
 def segment_softmax(
@@ -302,7 +303,8 @@ def segment_softmax(
     shift = jnp.where(jnp.isfinite(largest), largest, 0.0)
     values = jnp.exp(log_values - spread(shift, segments))
     totals = segment_sum(values, segments, num_segments)
-    return values / spread(jnp.where(totals == 0, 1.0, totals), segments)
+    shares = values / spread(jnp.where(totals == 0, 1.0, totals), segments)
+    return _masked(log_values, shares)
 
 
 def segment_argmax(
@@ -412,6 +414,11 @@ def _add_gradient_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 def default_float() -> jnp.dtype:
     """The floating point type of new arrays: float32, or float64 where JAX is set to it."""
     return jnp.result_type(float)
+
+
+def _masked(log_values: Float[Array, " n"], shares: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The shares, with no gradient at -inf, where what uses them may have none that is finite."""
+    return jnp.where(log_values == -jnp.inf, 0.0, shares)
 
 
 def _log(total: Float[Array, " *shape"]) -> Float[Array, " *shape"]:

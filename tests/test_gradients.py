@@ -205,7 +205,7 @@ def test_gradients_are_finite_where_weights_and_components_vanish(gradient):
         propagate = mpfjax.Propagate(model, None, "stop" if gradient == "stop" else "none")
         partition = [mpfjax.RandomPartition()]
         filter = mpfjax.Filter(model, [resample, propagate], 24, 6, initial_moves=partition)
-        run = mpfjax.run_filter(jax.random.key(3), filter, observations)
+        run = mpfjax.run_filter(jax.random.key(6), filter, observations)
         seen = jnp.isfinite(run.log_likelihood_increments)
         return jnp.sum(jnp.where(seen, run.log_likelihood_increments, 0.0)), run
 

@@ -139,6 +139,38 @@ class TestSegments:
         np.testing.assert_array_equal(order, np.argsort(labels, kind="stable"))
 
 
+class TestSoftmax:
+    VALUES = np.array([0.3, -np.inf, -20.0, 1.2, -np.inf, 0.0], np.float32)
+
+    @pytest.mark.parametrize("m", FEW_AND_MANY)
+    def test_shares_sum_to_one_in_every_segment_that_has_any(self, m):
+        labels = np.array([0, 0, m - 1, 0, m - 1, m - 1])
+        found = operations.segment_softmax(
+            jnp.asarray(self.VALUES), jnp.asarray(labels, jnp.int32), m
+        )
+        for s in np.unique(labels):
+            weights = np.exp(self.VALUES[labels == s].astype(float))
+            np.testing.assert_allclose(found[labels == s], weights / weights.sum(), rtol=1e-5)
+
+    def test_one_segment_is_softmax(self):
+        alone = operations.softmax(jnp.asarray(self.VALUES))
+        segments = jnp.zeros(6, jnp.int32)
+        np.testing.assert_array_equal(
+            alone, operations.segment_softmax(jnp.asarray(self.VALUES), segments, 1)
+        )
+        assert (operations.softmax(jnp.full(3, -jnp.inf)) == 0).all()
+
+    @pytest.mark.parametrize("m", FEW_AND_MANY)
+    def test_gradient_is_finite_where_that_of_what_uses_the_shares_is_not(self, m):
+        segments = jnp.zeros(6, jnp.int32)
+
+        def entropy(values):
+            shares = operations.segment_softmax(values, segments, m)
+            return jnp.sum(jnp.where(jnp.asarray(self.VALUES) > -100, jnp.log(shares), 0.0))
+
+        assert np.isfinite(jax.grad(entropy)(jnp.asarray(self.VALUES))).all()
+
+
 class TestLogSumExp:
     def test_of_nothing_but_minus_infinity_is_minus_infinity_with_a_finite_gradient(self):
         values = jnp.full(5, -jnp.inf)
