@@ -6,6 +6,9 @@ log marginal likelihood. The three in JAX are given keys, are vmapped over them 
 keep no particles of earlier steps.
 """
 
+# The rivals are installed for this benchmark only.
+# pyright: reportMissingImports=false
+
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

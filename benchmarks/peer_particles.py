@@ -5,6 +5,8 @@ state-space models of distribution objects, and `multiSMC` over the seeds. A mod
 particles' own processes import it. Draws come from numpy's global generator, which is the one that
 particles seeds.
 """
+# The rivals are installed for this benchmark only.
+# pyright: reportMissingImports=false
 # ruff: noqa: NPY002
 
 from collections.abc import Callable
