@@ -214,7 +214,7 @@ def _draw_players(
         (where,), (scale,) = camera.project(foot[None])
         speed = 0.0 if t == 1 else float(np.linalg.norm(paths[-1, i] - paths[-2, i]))
         heading = 1.0 if t == 1 or paths[-1, i, 0] >= paths[-2, i, 0] else -1.0
-        phase = 2 * np.pi * (walked[i] / 1.7 + strides[i])
+        phase = 2 * np.pi * float(walked[i] / 1.7 + strides[i])
         gait = min(speed / 0.22, 1.0)
         _draw_player(frame, where, scale, kits[i], int(i), phase, gait, heading)
         tall, wide = _PLAYER_HEIGHT * scale, 0.82 * scale
