@@ -117,7 +117,7 @@ def is_traced(tree: PyTree) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def spread(
+def over_devices(
     run: Callable[..., PyTree],
     run_on_one: Callable[..., PyTree],
     keys: Key[Array, " k"],

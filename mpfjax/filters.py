@@ -17,7 +17,7 @@ from mpfjax.devices import (
     island_index,
     log_sum_over_islands,
     num_islands,
-    spread,
+    over_devices,
 )
 from mpfjax.generator import fast_key
 from mpfjax.mixture import ParticleMixture, single_component
@@ -278,7 +278,7 @@ def monte_carlo(
     arguments = (filter, observations, present, collect)
     leave_to_caller = devices is None and is_traced((keys, arguments))
     chosen = None if leave_to_caller else choose_devices(devices)
-    return checked(spread(_run_each, _run_all, keys, arguments, chosen))
+    return checked(over_devices(_run_each, _run_all, keys, arguments, chosen))
 
 
 def particle_filter(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.devices import DEVICE_AXIS, ISLAND_AXIS, choose_devices, is_traced, spread
+from mpfjax.devices import DEVICE_AXIS, ISLAND_AXIS, choose_devices, is_traced, over_devices
 from mpfjax.filters import Filter, FilterRun, checked, present_steps, scan_filter
 from mpfjax.mixture import ParticleMixture
 
@@ -59,7 +59,7 @@ def run_islands(
     arguments = (filter, observations, present, collect)
     leave_to_caller = devices is None and is_traced((key, arguments))
     chosen = None if leave_to_caller else _dividing(num_islands, devices)
-    run = spread(_run_block, _run_on_one, keys, arguments, chosen)
+    run = over_devices(_run_block, _run_on_one, keys, arguments, chosen)
     return checked(_joined(run, collect is None))
 
 

@@ -101,17 +101,12 @@ class ParticleMixture(eqx.Module):
     @property
     def component_effective_sample_sizes(self) -> Float[Array, " m"]:
         """1 / Σ w_i² of each component, zero for a dead one."""
-        squares = self.component_sums(self.component_weights**2)
-        return jnp.where(squares > 0, 1 / jnp.where(squares > 0, squares, 1.0), 0.0)
+        return _inverse(self.component_sums(self.component_weights**2))
 
     @property
     def effective_sample_size(self) -> Float[Array, ""]:
         """(Σ exp ℓ)² / Σ exp 2ℓ over all particles, zero where there is none."""
-        largest = jnp.max(jax.lax.stop_gradient(self.log_weights))
-        weights = jnp.exp(self.log_weights - jnp.where(jnp.isfinite(largest), largest, 0.0))
-        squares = jnp.sum(weights**2)
-        size = jnp.sum(weights) ** 2 / jnp.where(squares > 0, squares, 1.0)
-        return jnp.where(squares > 0, size, 0.0)
+        return _inverse(jnp.sum(softmax(self.log_weights) ** 2))
 
     def component_sums(self, values: Float[Array, "n *rest"]) -> Float[Array, "m *rest"]:
         """Σ_{c_i = m} v_i over each component's slots."""
@@ -172,6 +167,11 @@ def flatten_states(particles: PyTree) -> Float[Array, "n d"]:
         ],
         axis=1,
     )
+
+
+def _inverse(squares: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
+    """1 / Σ w², zero where there is no weight."""
+    return jnp.where(squares > 0, 1 / jnp.where(squares > 0, squares, 1.0), 0.0)
 
 
 def _rows(per_particle: Array, values: Array) -> Array:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
 _FEW_SEGMENTS = 4
 _FEW_COLUMNS = 16
@@ -24,43 +24,28 @@ def _block_size(n: int) -> int:
     return next((size for size in _BLOCKS if n % size == 0), _BLOCKS[0])
 
 
-def prefix_sum(values: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The inclusive prefix sum, c_i = v_0 + ... + v_i, shape (n,).
-
-    On a CPU it runs as products of blocks of 32 with a triangle of ones, several times faster
-    than XLA's own cumulative sum, which other platforms keep. Rounding may leave neighbours out
-    of order by one unit in the last place: a caller that compares neighbours must allow for it.
-    """
-    return jax.lax.platform_dependent(values, cpu=_blocked_prefix_sum, default=jnp.cumsum)
-
-
 def sum_before(values: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The exclusive prefix sum, c_i = v_0 + ... + v_{i-1}, shape (n,); otherwise `prefix_sum`."""
+    """The exclusive prefix sum, c_i = v_0 + ... + v_{i-1}, shape (n,).
+
+    On a CPU it runs as products of blocks with a triangle of ones, several times faster than
+    XLA's own cumulative sum, which other platforms keep. Rounding may leave neighbours out of
+    order by one unit in the last place: a caller that compares neighbours must allow for it.
+    """
     return jax.lax.platform_dependent(
         values, cpu=_blocked_sum_before, default=lambda values: _shifted(jnp.cumsum(values))
     )
 
 
-def _shifted(values: Float[Array, " n"]) -> Float[Array, " n"]:
+def _shifted(values: Shaped[Array, " n"]) -> Shaped[Array, " n"]:
     return jnp.concatenate([jnp.zeros(1, values.dtype), values[:-1]])
-
-
-def _blocked_prefix_sum(values: Float[Array, " n"]) -> Float[Array, " n"]:
-    n = values.shape[0]
-    if n <= _BLOCKS[0]:
-        return _triangle(n, 0, values.dtype) @ values
-    blocks = _in_blocks(values)
-    within = blocks @ _triangle(blocks.shape[1], 0, values.dtype).T
-    before = _blocked_sum_before(within[:, -1])
-    return (within + before[:, None]).reshape(-1)[:n]
 
 
 def _blocked_sum_before(values: Float[Array, " n"]) -> Float[Array, " n"]:
     n = values.shape[0]
     if n <= _BLOCKS[0]:
-        return _triangle(n, -1, values.dtype) @ values
+        return _ones_before(n, values.dtype) @ values
     blocks = _in_blocks(values)
-    within = blocks @ _triangle(blocks.shape[1], -1, values.dtype).T
+    within = blocks @ _ones_before(blocks.shape[1], values.dtype).T
     before = _blocked_sum_before(within[:, -1] + blocks[:, -1])
     return (within + before[:, None]).reshape(-1)[:n]
 
@@ -70,8 +55,9 @@ def _in_blocks(values: Float[Array, " n"]) -> Float[Array, "blocks size"]:
     return jnp.pad(values, (0, whole_blocks(n) - n)).reshape(-1, _block_size(n))
 
 
-def _triangle(size: int, diagonal: int, dtype: jnp.dtype) -> Float[Array, "size size"]:
-    return jnp.tril(jnp.ones((size, size), dtype), diagonal)
+def _ones_before(size: int, dtype: jnp.dtype) -> Float[Array, "size size"]:
+    """The triangle with ones below its diagonal."""
+    return jnp.tril(jnp.ones((size, size), dtype), -1)
 
 
 def count_starts(starts: Int[Array, " n"], num_slots: int) -> Int[Array, " num_slots"]:
@@ -85,7 +71,7 @@ def count_starts(starts: Int[Array, " n"], num_slots: int) -> Int[Array, " num_s
     # Those that are dropped get a place of their own.
     num_places = -(-(num_slots + 1) // _BLOCKS[0]) * _BLOCKS[0]
     at_start = count_places(jnp.minimum(starts, num_slots), num_places)
-    return (count(at_start) - 1)[:num_slots]
+    return (count_before(at_start) + at_start - 1)[:num_slots]
 
 
 def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, " num_places"]:
@@ -127,7 +113,7 @@ def inverse_permutation(places: Int[Array, " n"]) -> Int[Array, " n"]:
 
 def _on_one_line(rows: Int[Array, "k n"], num_places: int) -> UInt32[Array, " k*n"]:
     firsts = num_places * jnp.arange(rows.shape[0], dtype=jnp.int32)
-    return _from_the_start((stored(rows) + firsts[:, None]).reshape(-1))
+    return _from_the_start((stored(rows, num_places) + firsts[:, None]).reshape(-1))
 
 
 def _in_rows(
@@ -150,15 +136,16 @@ def _in_rows(
     return lambda row: scatter_rows(row[None])[0]
 
 
-def stored(values: Array) -> Array:
+def stored(values: Shaped[Array, "*rest n"], bound: int | None = None) -> Shaped[Array, "*rest n"]:
     """The same finite numbers, computed once and kept, where XLA for a CPU would not keep them.
 
     It would compute them again within whatever uses them, once for every particle even where they
     are one a component, and without vectors within a scatter or gather over flattened rows. A
-    product with the identity is what it computes on its own. Whole numbers must be below 2^24.
+    product with the identity is what it computes on its own. `bound` is above all whole numbers
+    there may be; where it is above 2^24, which float32 cannot tell from its neighbours, nothing
+    is done.
     """
-    is_float = jnp.issubdtype(values.dtype, jnp.floating)
-    if not is_float and values.shape[-1] >= _EXACT_IN_FLOAT32:
+    if bound is not None and bound > _EXACT_IN_FLOAT32:
         return values
     return jax.lax.platform_dependent(values, cpu=_times_identity, default=lambda values: values)
 
@@ -175,18 +162,11 @@ def _times_identity(values: Array) -> Array:
     return product[..., :n].astype(values.dtype)
 
 
-def count(values: Int[Array, " n"]) -> Int[Array, " n"]:
-    """The inclusive prefix sum of small whole numbers, exact."""
+def count_before(values: Int[Array, " n"] | Bool[Array, " n"]) -> Int[Array, " n"]:
+    """The exclusive prefix sum of whole numbers, or of members, exact."""
     if values.shape[0] >= _EXACT_IN_FLOAT32:
-        return jnp.cumsum(values)
-    return prefix_sum(values.astype(jnp.float32)).astype(jnp.int32)
-
-
-def count_before(members: Bool[Array, " n"]) -> Int[Array, " n"]:
-    """How many members come before each entry, exact."""
-    if members.shape[0] >= _EXACT_IN_FLOAT32:
-        return _shifted(jnp.cumsum(members, dtype=jnp.int32))
-    return sum_before(members.astype(jnp.float32)).astype(jnp.int32)
+        return _shifted(jnp.cumsum(values, dtype=jnp.int32))
+    return sum_before(values.astype(jnp.float32)).astype(jnp.int32)
 
 
 def row_sums(values: Float[Array, "n d"]) -> Float[Array, " n"]:
@@ -226,7 +206,9 @@ def draw_columns(uniform: Float[Array, " k"], weights: Float[Array, "k n"]) -> I
     return jnp.minimum(block * size + jnp.minimum(column, size - 1), num_columns - 1)
 
 
-def spread(values: Array, segments: Int[Array, " n"]) -> Array:
+def spread(
+    values: Shaped[Array, "m *rest"], segments: Int[Array, " n"]
+) -> Shaped[Array, "n *rest"]:
     """values[segments], each entry its segment's value; a label out of range gets some value.
 
     Few segments are chosen between, many are gathered: on a CPU a gather keeps all that is
@@ -266,13 +248,14 @@ def segment_counts(
     mask: Bool[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Int[Array, " num_segments"]:
     """How many of the masked entries lie in each segment."""
+    if mask.shape[0] >= _EXACT_IN_FLOAT32:
+        return jax.ops.segment_sum(mask.astype(jnp.int32), segments, num_segments)
     return segment_sum(mask.astype(default_float()), segments, num_segments).astype(jnp.int32)
 
 
 def log_sum_exp(log_values: Float[Array, " n"]) -> Float[Array, ""]:
     """log Σ exp, -inf where every entry is -inf, with a gradient that is finite there too."""
-    largest = jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf)
-    shift = jnp.where(jnp.isfinite(largest), largest, 0.0)
+    shift = _finite(jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf))
     return _log(jnp.sum(jnp.exp(log_values - shift))) + shift
 
 
@@ -280,16 +263,15 @@ def segment_log_sum_exp(
     log_values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " num_segments"]:
     """log Σ exp in each segment, -inf in one that is empty or holds nothing but -inf."""
-    largest = segment_max(jax.lax.stop_gradient(log_values), segments, num_segments)
-    shift = jnp.where(jnp.isfinite(largest), largest, 0.0)
+    shift = _finite(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
     total = segment_sum(jnp.exp(log_values - spread(shift, segments)), segments, num_segments)
     return _log(total) + shift
 
 
 def softmax(log_values: Float[Array, " n"]) -> Float[Array, " n"]:
     """exp of the values as shares of their sum, all zero where every entry is -inf."""
-    largest = jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf)
-    values = jnp.exp(log_values - jnp.where(jnp.isfinite(largest), largest, 0.0))
+    shift = _finite(jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf))
+    values = jnp.exp(log_values - shift)
     total = jnp.sum(values)
     shares = values / jnp.where(total == 0, 1.0, total)
     return _masked(log_values, shares)
@@ -299,8 +281,7 @@ def segment_softmax(
     log_values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " n"]:
     """exp of the values as shares of their segment's sum, zero where that sum is zero."""
-    largest = segment_max(jax.lax.stop_gradient(log_values), segments, num_segments)
-    shift = jnp.where(jnp.isfinite(largest), largest, 0.0)
+    shift = _finite(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
     values = jnp.exp(log_values - spread(shift, segments))
     totals = segment_sum(values, segments, num_segments)
     shares = values / spread(jnp.where(totals == 0, 1.0, totals), segments)
@@ -340,7 +321,7 @@ def _places_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Arr
     """Each entry's place in the order, by one prefix sum a segment."""
     n = segments.shape[0]
     counts = segment_counts(jnp.ones(n, bool), segments, num_segments)
-    firsts = stored(jnp.cumsum(counts) - counts)
+    firsts = stored(jnp.cumsum(counts) - counts, n)
     place = jnp.zeros(n, jnp.int32)
     unlabelled = jnp.arange(n, dtype=jnp.int32) + jnp.sum(counts, dtype=jnp.int32)
     for m in range(num_segments):
@@ -414,6 +395,11 @@ def _add_gradient_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 def default_float() -> jnp.dtype:
     """The floating point type of new arrays: float32, or float64 where JAX is set to it."""
     return jnp.result_type(float)
+
+
+def _finite(largest: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
+    """What may be taken off a logarithm: the largest, or nothing where that is infinite or NaN."""
+    return jnp.where(jnp.isfinite(largest), largest, 0.0)
 
 
 def _masked(log_values: Float[Array, " n"], shares: Float[Array, " n"]) -> Float[Array, " n"]:

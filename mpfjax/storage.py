@@ -158,6 +158,7 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
                     with archive.open(name) as member:
                         array = np.lib.format.read_array(member, allow_pickle=False)
                     arrays[name.removesuffix(".npy")] = array
+        # A flipped bit may also name a compression that zipfile does not have.
         except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError) as error:
             raise ValueError(f"{path}: cut off, damaged or no .npz file ({error})") from error
     return arrays

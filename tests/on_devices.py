@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
-from mpfjax.devices import spread
+from mpfjax.devices import over_devices
 from mpfjax.islands import _run_block, _run_on_one
 
 OBSERVATIONS = (1.5, 1.0, 0.4, 0.9)
@@ -67,7 +67,9 @@ def compiled_islands(num_particles):
     """The program of islands on all devices, a line an instruction."""
     keys = jax.random.split(jax.random.key(1), NUM_ISLANDS)
     arguments = (islands_filter(num_particles), observations(), None, of_components)
-    run = jax.jit(lambda keys: spread(_run_block, _run_on_one, keys, arguments, jax.devices()))
+    run = jax.jit(
+        lambda keys: over_devices(_run_block, _run_on_one, keys, arguments, jax.devices())
+    )
     return str(run.lower(keys).compile().as_text()).splitlines()
 
 
@@ -126,7 +128,7 @@ def main(file, port=None, process="0"):
     else:
         told["collectives"] = collectives(compiled_islands(256))
         last, keys = jax.devices()[-1:], jax.random.split(jax.random.key(0), 3)
-        told["only device"] = spread(draw, jax.jit(draw), keys, (), last).devices() == {*last}
+        told["only device"] = over_devices(draw, jax.jit(draw), keys, (), last).devices() == {*last}
         told["too many"] = error_of(lambda: replicates(9))
         told["twice"] = error_of(lambda: replicates([*last, *last]))
         told["uneven"] = error_of(lambda: islands(3))

@@ -188,7 +188,10 @@ class TestIslands:
     def test_islands_without_any_likelihood_die_and_an_exchange_revives_them(self):
         model = Cliff(0.3, 0.5, -2.0, 2.0)
         propagate = mpfjax.Propagate(model)
-        mass = lambda mixture: mixture.log_mass  # noqa: E731
+
+        def mass(mixture):
+            return mixture.log_mass
+
         for before in ([], [mpfjax.Exchange(1.0)]):
             filter = mpfjax.Filter(model, [*before, mpfjax.Resample(), propagate], 8)
             run = mpfjax.run_islands(jax.random.key(6), filter, OBSERVATIONS, mass, num_islands=8)

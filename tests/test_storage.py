@@ -95,7 +95,9 @@ class TestRoundTrip:
         assert_same_bits(mpfjax.load_checkpoint(path, jax.eval_shape(lambda: state)), state)
 
     def test_a_filter_with_a_network_comes_back(self, path):
-        network = lambda seed: eqx.nn.MLP(1, 2, 4, 1, key=jax.random.key(seed))  # noqa: E731
+        def network(seed):
+            return eqx.nn.MLP(1, 2, 4, 1, key=jax.random.key(seed))
+
         mpfjax.save_checkpoint(path, network(0))
         assert_same_bits(
             eqx.filter(mpfjax.load_checkpoint(path, like=network(1)), eqx.is_array),

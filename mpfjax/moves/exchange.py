@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Key, PyTree
 from mpfjax.devices import deal_to_islands, num_islands, over_islands
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
-from mpfjax.operations import log_sum_exp
+from mpfjax.operations import softmax
 
 
 class Exchange(AbstractMove):
@@ -40,8 +40,7 @@ class Exchange(AbstractMove):
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, ""]:
         """Whether the masses of the islands are uneven enough, the same for each."""
         log_masses = over_islands(mixture.log_mass)
-        log_size = 2 * log_sum_exp(log_masses) - log_sum_exp(2 * log_masses)
-        return jnp.exp(log_size) < self.threshold * num_islands()
+        return 1 / jnp.sum(softmax(log_masses) ** 2) < self.threshold * num_islands()
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None

@@ -165,7 +165,7 @@ class Resample(AbstractRejuvenation):
         if self.ess_threshold < 1.0:
             unmoved = spread(line.firsts, slots.components) + slots.ranks
             parents = jnp.where(spread(due, slots.components), parents, unmoved)
-        parents = stored(jnp.clip(parents, 0, mixture.num_particles - 1))
+        parents = stored(jnp.clip(parents, 0, mixture.num_particles - 1), mixture.num_particles)
         return _Drawn(take(line.order, parents), slots, targets, line)
 
     def _drawn_from(self, mixture: ParticleMixture) -> ParticleMixture:

@@ -37,7 +37,7 @@ def deal_slots(
     sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
     rank = jnp.cumsum(due.astype(jnp.int32)) - 1
     share = pool // sharers + (rank < pool % sharers).astype(jnp.int32)
-    return stored(jnp.where(due, share, kept))
+    return stored(jnp.where(due, share, kept), num_particles + 1)
 
 
 def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:

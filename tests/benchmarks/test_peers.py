@@ -14,6 +14,8 @@ from benchmarks.peer_libraries import jax_functions, model_of, prepare
 from benchmarks.peer_worker import Worker
 from mpfjax.exact import kalman_filter
 
+# They are no part of the tests' own extra: particles 0.4 would take numpy and JAX back.
+NO_RIVAL = "a library to compare with comes with the extra 'bench'"
 PARTICLES = importlib.util.find_spec("particles") is not None
 
 
@@ -60,7 +62,7 @@ def test_plain_functions_are_those_of_the_model(job):
 
 @pytest.mark.parametrize("job", JOBS.values(), ids=list(JOBS))
 def test_particles_weighs_like_the_model(job):
-    pytest.importorskip("particles")
+    pytest.importorskip("particles", reason=NO_RIVAL)
     from benchmarks import peer_particles
 
     kinds = {
@@ -76,7 +78,7 @@ def test_particles_weighs_like_the_model(job):
 
 @pytest.mark.parametrize("library", ["blackjax", "cuthbert"])
 def test_rivals_in_jax_estimate_the_likelihood(library):
-    pytest.importorskip(library)
+    pytest.importorskip(library, reason=NO_RIVAL)
     job = dataclasses.replace(JOBS["constant_velocity"], num_steps=5)
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         prepared = prepare(library, job, num_particles=2000, num_seeds=4)
