@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mpfjax.operations import (
     default_float,
+    exp,
     log_sum_exp,
     segment_counts,
     segment_log_sum_exp,
@@ -54,7 +55,7 @@ class ParticleMixture(eqx.Module):
     @property
     def weights(self) -> Float[Array, " n"]:
         """exp ℓ, the joint weights; they sum to one over all particles."""
-        return jnp.exp(self.log_weights)
+        return exp(self.log_weights)
 
     @property
     def log_mass(self) -> Float[Array, ""]:
@@ -134,8 +135,12 @@ class ParticleMixture(eqx.Module):
 
     def average(self, values: Float[Array, "n *rest"]) -> Float[Array, " *rest"]:
         """Σ_i exp(ℓ_i) v_i, the estimate of an expectation under the filtering distribution."""
-        filled = jnp.where(_rows(self.occupied, values), values, jnp.zeros((), values.dtype))
-        return jnp.sum(_rows(self.weights.astype(values.dtype), values) * filled, axis=0)
+        is_filled, zero = _rows(self.occupied, values), jnp.zeros((), values.dtype)
+        products = _rows(self.weights.astype(values.dtype), values) * jnp.where(
+            is_filled, values, zero
+        )
+        # XLA for a CPU may take thirty times as long for a sum that does the multiplying.
+        return jnp.sum(jnp.where(is_filled, products, zero), axis=0)
 
     def replace(self, **fields: PyTree) -> "ParticleMixture":
         """A copy with some fields changed."""

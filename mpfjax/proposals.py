@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
+from mpfjax.generator import normal
 from mpfjax.models.base import require, require_positive
 from mpfjax.models.noise import NOISES
 from mpfjax.operations import cholesky, solve_lower
@@ -76,7 +77,7 @@ class NetworkProposal(AbstractProposal):
         outputs = jax.vmap(self.network)(jnp.concatenate([previous, rows], axis=1))
         shifts, log_widths = jnp.split(outputs, 2, axis=1)
         scale = jnp.broadcast_to(self.scale.astype(previous.dtype), previous.shape)
-        noise = jax.random.normal(key, previous.shape, previous.dtype)
+        noise = normal(key, previous.shape, previous.dtype)
         states = previous + scale * (shifts + jnp.exp(log_widths) * noise)
         log_widths = log_widths + jnp.log(scale) + 0.5 * jnp.log(2 * jnp.pi)
         log_density = -jnp.sum(0.5 * noise**2 + log_widths, axis=1)

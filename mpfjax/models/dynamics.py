@@ -3,10 +3,10 @@
 import abc
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from mpfjax.generator import normal
 from mpfjax.models.base import require_positive
 from mpfjax.operations import cholesky, row_sums, solve_lower
 
@@ -84,7 +84,7 @@ class RandomWalk(AbstractDynamics):
     ) -> Float[Array, "n d"]:
         """x_{t-1} plus noise."""
         del previous
-        noise = jax.random.normal(key, current.shape, current.dtype)
+        noise = normal(key, current.shape, current.dtype)
         return current + jnp.broadcast_to(self.deviations, current.shape) * noise
 
     def log_density(
@@ -164,7 +164,7 @@ class Autoregression(AbstractDynamics):
         previous: Float[Array, "n d"] | None = None,
     ) -> Float[Array, "n d"]:
         """The expected x_t plus B ω_t."""
-        noise = jax.random.normal(key, current.shape, current.dtype)
+        noise = normal(key, current.shape, current.dtype)
         return self.moments(current, previous)[0] + _times(self.B, noise)
 
     def log_density(

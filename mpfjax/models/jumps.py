@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from mpfjax.generator import normal
 from mpfjax.models.base import require_positive
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
 
@@ -64,7 +65,7 @@ class RandomWalkWithJumps(AbstractDynamics):
             jnp.broadcast_to(self.jump_deviations, current.shape),
             jnp.broadcast_to(self.deviations, current.shape),
         )
-        return current + steps * jax.random.normal(key_noise, current.shape, current.dtype)
+        return current + steps * normal(key_noise, current.shape, current.dtype)
 
     def log_density(
         self,

@@ -1,10 +1,10 @@
 """The linear-Gaussian model, whose filtering distribution the Kalman filter gives exactly."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from mpfjax.generator import normal
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.operations import row_sums, solve_lower
 
@@ -38,14 +38,14 @@ class LinearGaussianModel(AbstractStateSpaceModel):
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n d"]:
         """x_0 ~ N(m0, P0)."""
-        noise = jax.random.normal(key, (num_particles, self.m0.shape[0]), self.m0.dtype)
+        noise = normal(key, (num_particles, self.m0.shape[0]), self.m0.dtype)
         return self.m0[None] + noise @ jnp.linalg.cholesky(self.P0).T
 
     def sample_transition(
         self, key: Key[Array, ""], states: Float[Array, "n d"]
     ) -> Float[Array, "n d"]:
         """x_t ~ N(A x_{t-1}, Q)."""
-        noise = jax.random.normal(key, states.shape, states.dtype)
+        noise = normal(key, states.shape, states.dtype)
         return self.transition_mean(states) + noise @ jnp.linalg.cholesky(self.Q).T
 
     def log_likelihood(

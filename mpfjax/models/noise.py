@@ -4,12 +4,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from mpfjax.generator import normal, normal_quantile
+
 
 def independent_normal(
     key: Key[Array, ""], shape: tuple[int, ...], dtype: jnp.dtype
 ) -> Float[Array, "n d"]:
     """Independent standard normal draws."""
-    return jax.random.normal(key, shape, dtype)
+    return normal(key, shape, dtype)
 
 
 def stratified_normal(
@@ -28,9 +30,9 @@ def stratified_normal(
     multipliers = jnp.array([int(2**32 * alpha) | 1 for alpha in _lattice(d)], jnp.uint32)
     shift = jax.random.bits(key, (d,), jnp.uint32)
     points = jnp.arange(n, dtype=jnp.uint32)[:, None] * multipliers[None] + shift[None]
-    # The top 23 bits, at the middle of their cells, keep clear of 0 and 1 in float32 as well.
-    uniform = ((points >> 9).astype(dtype) + 0.5) * jnp.array(2.0**-23, dtype)
-    return jax.scipy.special.ndtri(uniform)
+    # The top 23 bits, at the middle of their cells, keep clear of -1 and 1 in float32 as well.
+    centred = ((points >> 9).astype(dtype) + 0.5) * jnp.array(2.0**-22, dtype) - 1
+    return normal_quantile(centred)
 
 
 def stratified_uniform(key: Key[Array, ""], num_points: int) -> Float[Array, " n"]:

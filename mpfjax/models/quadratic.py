@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from mpfjax.generator import normal
 from mpfjax.models.base import AbstractStateSpaceModel, require_positive
 from mpfjax.models.noise import stratified_uniform
 
@@ -52,7 +53,7 @@ class QuadraticModel(AbstractStateSpaceModel):
         self, key: Key[Array, ""], states: Float[Array, " n"]
     ) -> Float[Array, " n"]:
         """x_t ~ N(x_{t-1}, σ_x²)."""
-        return states + self.sigma_x * jax.random.normal(key, states.shape, states.dtype)
+        return states + self.sigma_x * normal(key, states.shape, states.dtype)
 
     def log_likelihood(
         self, observation: Float[Array, ""], states: Float[Array, " n"]

@@ -21,7 +21,6 @@ from mpfjax.operations import (
     add_gradient,
     count_starts,
     order_by_segment,
-    segment_argmax,
     segment_counts,
     segment_log_sum_exp,
     spread,
@@ -160,7 +159,10 @@ class Resample(AbstractRejuvenation):
             targets = jnp.where(due, targets, mixture.num_particles)
         slots = place_slots(targets, mixture.num_particles)
         expected = line.weights * spread(targets, line.components).astype(line.weights.dtype)
-        starts = SCHEMES[self.scheme](key, expected, targets, slots, line)
+        before, total = sum_before(expected)
+        starts = SCHEMES[self.scheme](key, expected, before, targets, slots, line)
+        # Rounding must not leave a slot to those that stand past all weight.
+        starts = jnp.where(before < total, starts, mixture.num_particles)
         parents = _within_component(count_starts(starts, mixture.num_particles), slots, line)
         if self.ess_threshold < 1.0:
             unmoved = spread(line.firsts, slots.components) + slots.ranks
@@ -326,11 +328,9 @@ def _padded(values: Array, fill: float) -> Array:
 
 
 def _within_component(parents: Int[Array, " n"], slots: Slots, line: _Line) -> Int[Array, " n"]:
-    """Keep rounding of the prefix sums from crossing a border or feeding an empty slot."""
+    """Keep rounding of the prefix sums from crossing a border between components."""
     if line.counts.shape[0] == 1:
-        parents = jnp.maximum(parents, 0)
-        heaviest = segment_argmax(line.weights, line.components, 1)
-        return jnp.where(take(line.weights, parents) > 0, parents, heaviest)
+        return parents
     firsts = spread(line.firsts, slots.components)
     lasts = firsts + spread(line.counts, slots.components) - 1
     return jnp.clip(parents, firsts, lasts)
@@ -338,17 +338,17 @@ def _within_component(parents: Int[Array, " n"], slots: Slots, line: _Line) -> I
 
 # A scheme gives the first slot of every particle's offspring, in the line's order. It sees the
 # expected offspring k_m w_i laid end to end, on which component m takes the stretch from
-# slots.firsts[m] to slots.firsts[m] + k_m, and places one point in each slot's share of it.
+# slots.firsts[m] to slots.firsts[m] + k_m, and places one point in each slot's share of it;
+# `before` is where each particle's stretch begins.
 
 
-def _systematic(key, expected, targets, slots, line):
+def _systematic(key, expected, before, targets, slots, line):
     shift = stored(jax.random.uniform(key, targets.shape, expected.dtype))
-    return _points_before(sum_before(expected), spread(shift, line.components))
+    return _points_before(before, spread(shift, line.components))
 
 
-def _stratified(key, expected, targets, slots, line):
+def _stratified(key, expected, before, targets, slots, line):
     shift = jax.random.uniform(key, slots.components.shape, expected.dtype)
-    before = sum_before(expected)
     slot = jnp.clip(before.astype(jnp.int32), 0, shift.shape[0] - 1)
     return _points_before(before, take(shift, slot))
 
@@ -359,21 +359,21 @@ def _points_before(before: Float[Array, " p"], shift: Float[Array, " p"]) -> Int
     return whole.astype(jnp.int32) + (shift < before - whole).astype(jnp.int32)
 
 
-def _multinomial(key, expected, targets, slots, line):
+def _multinomial(key, expected, before, targets, slots, line):
     points = _sorted_points(key, slots, targets, expected.dtype)
-    return jnp.searchsorted(points, sum_before(expected), side="left").astype(jnp.int32)
+    return jnp.searchsorted(points, before, side="left").astype(jnp.int32)
 
 
-def _residual(key, expected, targets, slots, line):
+def _residual(key, expected, before, targets, slots, line):
     # A weight of 1 / k comes out as a hair less in floating point, and is meant to be certain.
     whole = jnp.floor(expected * (1 + 16 * jnp.finfo(expected.dtype).eps))
-    certain = sum_before(whole)
+    certain, _ = sum_before(whole)
     per_component = jax.ops.segment_sum(whole, line.components, targets.shape[0])
     left = jnp.maximum(targets - per_component.astype(jnp.int32), 0)
     rest = place_slots(left, slots.components.shape[0])
     points = _sorted_points(key, rest, left, expected.dtype)
-    before = sum_before(jnp.maximum(expected - whole, 0.0))
-    drawn = jnp.searchsorted(points, before, side="left")
+    rests_before, _ = sum_before(jnp.maximum(expected - whole, 0.0))
+    drawn = jnp.searchsorted(points, rests_before, side="left")
     return certain.astype(jnp.int32) + drawn.astype(jnp.int32)
 
 
