@@ -28,6 +28,7 @@ import mpfjax
 from benchmarks.peer_worker import Worker, stop_all
 from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
+from mpfjax.devices import wide_vectors
 
 FILTERS = {
     "pf": "PF",
@@ -215,7 +216,7 @@ def compile_cell(cell: Cell) -> Any:
         return mpfjax.monte_carlo(keys, filter, observations, nothing)
 
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), cell.seeds))
-    return jax.jit(run_all).lower(keys).compile()
+    return jax.jit(run_all, compiler_options=wide_vectors()).lower(keys).compile()
 
 
 def bytes_of(program: Any) -> int:

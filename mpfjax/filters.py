@@ -15,6 +15,7 @@ from mpfjax.devices import (
     choose_devices,
     is_traced,
     island_index,
+    jit_on_wide_vectors,
     log_sum_over_islands,
     num_islands,
     over_devices,
@@ -156,7 +157,7 @@ class Filter(eqx.Module):
             mixture = move(move_key, mixture)
         return mixture
 
-    @eqx.filter_jit
+    @jit_on_wide_vectors
     def step(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> tuple[ParticleMixture, StepInfo]:
@@ -180,7 +181,7 @@ class Filter(eqx.Module):
         broken = ~(info.log_likelihood_increment < jnp.inf)
         return eqx.error_if((moved, info), broken, _BROKEN_DENSITY)
 
-    @eqx.filter_jit
+    @jit_on_wide_vectors
     def predict(
         self, key: Key[Array, ""], mixture: ParticleMixture
     ) -> tuple[ParticleMixture, StepInfo]:
@@ -563,7 +564,7 @@ def _mixture_filter(
     )
 
 
-@eqx.filter_jit
+@jit_on_wide_vectors
 def _run(key, filter, observations, present, collect):
     return scan_filter(key, filter, observations, present, collect)
 
@@ -573,7 +574,7 @@ def _run_each(keys, filter, observations, present, collect):
     return run_one(keys)
 
 
-_run_all = eqx.filter_jit(_run_each)
+_run_all = jit_on_wide_vectors(_run_each)
 
 
 def scan_filter(

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.random import define_prng_impl, threefry_prng_impl
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Key, UInt32
 
 from mpfjax.operations import default_float, stored
@@ -47,7 +48,7 @@ def fast_key(key: Key[Array, "*shape"]) -> Key[Array, "*shape"]:
 
 
 def normal(
-    key: Key[Array, ""], shape: tuple[int, ...], dtype: jnp.dtype | None = None
+    key: Key[Array, ""], shape: tuple[int, ...], dtype: DTypeLike | None = None
 ) -> Float[Array, "..."]:
     """Standard normal draws: those of `jax.random.normal`, up to rounding, in a third of its time.
 

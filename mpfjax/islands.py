@@ -3,13 +3,19 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.devices import DEVICE_AXIS, ISLAND_AXIS, choose_devices, is_traced, over_devices
+from mpfjax.devices import (
+    DEVICE_AXIS,
+    ISLAND_AXIS,
+    choose_devices,
+    is_traced,
+    jit_on_wide_vectors,
+    over_devices,
+)
 from mpfjax.filters import Filter, FilterRun, checked, present_steps, scan_filter
 from mpfjax.mixture import ParticleMixture
 
@@ -81,7 +87,7 @@ def _run_block(keys, filter, observations, present, collect):
     return jax.vmap(run_one, axis_name=ISLAND_AXIS)(keys)
 
 
-@eqx.filter_jit
+@jit_on_wide_vectors
 def _run_on_one(keys, filter, observations, present, collect):
     run_block = lambda keys: _run_block(keys, filter, observations, present, collect)  # noqa: E731
     run = jax.vmap(run_block, axis_name=DEVICE_AXIS)(keys[None])

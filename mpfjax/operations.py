@@ -5,11 +5,13 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
 _FEW_SEGMENTS = 4
 _FEW_COLUMNS = 16
 _BLOCKS = (32, 16, 8)
+_ONE_BLOCK = 128
 _EXACT_IN_FLOAT32 = 2**24
 
 
@@ -50,15 +52,18 @@ def _shifted(values: Shaped[Array, " n"]) -> Shaped[Array, " n"]:
 
 def _blocked_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     n = values.shape[0]
+    if n <= _ONE_BLOCK:
+        sums = (values[None] @ _ones_before(n, whole_blocks(n + 1), values.dtype))[0]
+        return sums[:n], sums[n]
     blocks = _in_blocks(values)
+    size = blocks.shape[1]
     # Columns are summed in the same order, so that a zero adds nothing to the next one.
-    within = blocks @ _ones_before(blocks.shape[1], values.dtype).T
+    within = blocks @ _ones_before(size, size, values.dtype)
     totals = within[:, -1] + blocks[:, -1]
-    if blocks.shape[0] == 1:
-        return within[0, :n], totals[0]
     # A zero after the last block has the sum of all before it.
     before, _ = _blocked_sum_before(jnp.pad(totals, (0, 1)))
-    before = stored(before)
+    if before.shape[0] > _ONE_BLOCK:
+        before = stored(before)
     upto = before[1:, None]
     # Between blocks the order of summing changes: zeros at a block's end go with the next block.
     sums = jnp.where(within == totals[:, None], upto, jnp.minimum(before[:-1, None] + within, upto))
@@ -70,9 +75,9 @@ def _in_blocks(values: Float[Array, " n"]) -> Float[Array, "blocks size"]:
     return jnp.pad(values, (0, whole_blocks(n) - n)).reshape(-1, _block_size(n))
 
 
-def _ones_before(size: int, dtype: jnp.dtype) -> Float[Array, "size size"]:
-    """The triangle with ones below its diagonal."""
-    return jnp.tril(jnp.ones((size, size), dtype), -1)
+def _ones_before(num_rows: int, num_columns: int, dtype: jnp.dtype) -> Float[Array, "rows columns"]:
+    """The matrix with ones above its diagonal."""
+    return jnp.triu(jnp.ones((num_rows, num_columns), dtype), 1)
 
 
 def count_starts(starts: Int[Array, " n"], num_slots: int) -> Int[Array, " num_slots"]:
@@ -84,7 +89,7 @@ def count_starts(starts: Int[Array, " n"], num_slots: int) -> Int[Array, " num_s
     are dropped; a slot before the first start gets -1.
     """
     # Those that are dropped get a place of their own.
-    num_places = -(-(num_slots + 1) // _BLOCKS[0]) * _BLOCKS[0]
+    num_places = whole_blocks(num_slots + 1)
     dtype = jnp.float32 if len(starts) < _EXACT_IN_FLOAT32 else jnp.int32
     at_start = count_places(jnp.minimum(starts, num_slots), num_places, dtype)
     return (count_before(at_start) + at_start.astype(jnp.int32) - 1)[:num_slots]
@@ -105,7 +110,7 @@ def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, "
 
 
 def count_places(
-    places: Int[Array, " n"], num_places: int, dtype: jnp.dtype = jnp.int32
+    places: Int[Array, " n"], num_places: int, dtype: DTypeLike = jnp.int32
 ) -> Shaped[Array, " num_places"]:
     """How many of the entries name each place, all of which must be in [0, num_places)."""
 
@@ -146,7 +151,7 @@ def _in_rows(
     @scatter_rows.def_vmap
     def _(
         axis_size: int, in_batched: list[bool], rows: Int[Array, "b k n"]
-    ) -> tuple[Int[Array, "b k p"], bool]:
+    ) -> tuple[Shaped[Array, "b k p"], bool]:
         del in_batched
         scattered = scatter_rows(rows.reshape(-1, rows.shape[-1]))
         return scattered.reshape(axis_size, -1, scattered.shape[-1]), True

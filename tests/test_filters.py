@@ -327,6 +327,17 @@ class TestGradients:
         np.testing.assert_allclose(gradient.m0, exact.m0, rtol=0.05, atol=0.01)
         np.testing.assert_allclose(gradient.A, exact.A, rtol=0.05, atol=0.01)
 
+    def test_is_passed_on_by_what_is_collected(self):
+        key = jax.random.key(19)
+        filter = mpfjax.particle_filter(mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0), 16)
+
+        def collected(scale):
+            collect = lambda mixture: scale * mixture.mean()  # noqa: E731
+            return jnp.sum(mpfjax.run_filter(key, filter, OBSERVATIONS, collect).collected)
+
+        np.testing.assert_allclose(jax.grad(collected)(1.0), collected(1.0), rtol=1e-5)
+        np.testing.assert_allclose(jax.jit(collected)(1.0), collected(1.0), rtol=1e-5)
+
     def test_there_is_one_copy_of_the_models_parameters(self):
         for chain, build in CHAINS.items():
             model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)

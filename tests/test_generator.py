@@ -4,9 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import erfinv, log_ndtr
 
 import mpfjax
-from mpfjax.generator import fast_key, threefry
+from mpfjax.generator import fast_key, normal, normal_quantile, threefry
+from tests.precision import float64
 
 KEY = jax.random.key(7)
 DRAWS = {
@@ -55,6 +57,48 @@ def test_the_published_answer():
     ones = jnp.full(2, 0xFFFFFFFF, jnp.uint32)
     high, low = threefry(ones, ones[:1], ones[:1])
     assert (int(high[0]), int(low[0])) == (0x1CB996FC, 0xBB002BE7)
+
+
+class TestNormal:
+    @pytest.mark.parametrize("shape", [(), (1,), (1000,), (70, 3), (40, 20)])
+    def test_draws_what_jax_draws(self, shape):
+        np.testing.assert_allclose(
+            normal(KEY, shape), jax.random.normal(KEY, shape), rtol=2e-6, atol=1e-7
+        )
+
+    def test_under_vmap_and_with_a_fast_key(self):
+        keys = jax.random.split(KEY, 3)
+        drawn = jax.jit(jax.vmap(lambda key: normal(fast_key(key), (200,))))(keys)
+        expected = jax.vmap(lambda key: jax.random.normal(key, (200,)))(keys)
+        np.testing.assert_allclose(drawn, expected, rtol=2e-6, atol=1e-7)
+
+    def test_other_precisions_and_generators_are_those_of_jax(self):
+        other = jax.random.key(0, impl="rbg")
+        np.testing.assert_allclose(
+            normal(other, (100,)), jax.random.normal(other, (100,)), rtol=2e-6, atol=1e-7
+        )
+        np.testing.assert_array_equal(
+            normal(KEY, (5,), jnp.bfloat16), jax.random.normal(KEY, (5,), jnp.bfloat16)
+        )
+        with float64():
+            drawn, stock = normal(KEY, (100,)), jax.random.normal(KEY, (100,))
+            assert drawn.dtype == np.float64
+            np.testing.assert_array_equal(drawn, stock)
+
+    def test_quantiles_over_the_whole_range_of_a_uniform(self):
+        # Every 2^9th of the uniforms that there are, and the last 2^9 at either end.
+        index = np.concatenate(
+            [np.arange(2**9), np.arange(0, 2**23, 2**9), np.arange(2**23 - 2**9, 2**23)]
+        )
+        low = np.nextafter(np.float32(-1), np.float32(0))
+        uniform = (index / 2**23 * 2).astype(np.float32) + low
+        found = np.asarray(normal_quantile(jnp.asarray(uniform)), float)
+        exact = np.sqrt(2) * erfinv(uniform.astype(float))
+        np.testing.assert_allclose(found, exact, rtol=1e-6, atol=1e-7)
+        tail = -np.abs(found[:20])
+        np.testing.assert_allclose(
+            np.exp(log_ndtr(tail)), (1 - np.abs(uniform[:20].astype(float))) / 2, rtol=2e-5
+        )
 
 
 class KeySpy(mpfjax.QuadraticModel):

@@ -17,17 +17,48 @@ FEW_AND_MANY = (1, 3, 4, 5, 17)
 @pytest.mark.parametrize("n", SIZES)
 def test_sums_before(n):
     values = RNG.random(n).astype(np.float32)
-    expected = np.concatenate([[0], np.cumsum(values.astype(float))[:-1]])
-    np.testing.assert_allclose(operations.sum_before(jnp.asarray(values)), expected, rtol=1e-5)
+    upto = np.cumsum(values.astype(float))
+    before, total = operations.sum_before(jnp.asarray(values))
+    np.testing.assert_allclose(before, np.concatenate([[0], upto[:-1]]), rtol=1e-5)
+    np.testing.assert_allclose(total, upto[-1], rtol=1e-5)
 
 
 def test_sums_before_in_float64_and_under_vmap():
-    values = RNG.random((3, 70))
+    values = RNG.random((3, 200))
     with float64():
-        sums = jax.vmap(operations.sum_before)(jnp.asarray(values))
-        assert sums.dtype == np.float64
-        expected = np.cumsum(values, axis=1) - values
-        np.testing.assert_allclose(sums, expected, rtol=1e-13, atol=1e-14)
+        before, total = jax.vmap(operations.sum_before)(jnp.asarray(values))
+        assert before.dtype == np.float64
+        upto = np.cumsum(values, axis=1)
+        np.testing.assert_allclose(before, upto - values, rtol=1e-13, atol=1e-14)
+        np.testing.assert_allclose(total, upto[:, -1], rtol=1e-13)
+
+
+@pytest.mark.parametrize("how", ["blocked", "scanned"])
+@pytest.mark.parametrize("n", [*SIZES, 10_000])
+def test_sums_never_fall_and_zeros_add_nothing(n, how):
+    # Zeros in runs, some over whole blocks, at the front and at the end; sizes far apart.
+    rows = np.exp(RNG.normal(scale=5, size=(20, n)))
+    runs = np.repeat(RNG.random((20, -(-n // 40))) < 0.5, 40, axis=1)[:, :n]
+    rows[runs | (RNG.random((20, n)) < 0.3)] = 0
+    rows[:3] = 0
+    rows[1, n // 2] = rows[2, -1] = 1
+    sums = {"blocked": operations._blocked_sum_before, "scanned": operations._scanned_sum_before}
+    values = jnp.asarray(rows, jnp.float32)
+    before, total = map(np.asarray, jax.vmap(sums[how])(values))
+    line = np.concatenate([before, total[:, None]], axis=1)
+    assert (np.diff(line) >= 0).all()
+    assert (np.diff(line)[np.asarray(values) == 0] == 0).all()
+    np.testing.assert_allclose(total, np.asarray(values).sum(axis=1, dtype=float), rtol=1e-5)
+
+
+def test_exponentials_are_never_subnormal():
+    powers = jnp.asarray([0.0, -70.0, -80.0, -95.0, -200.0, -jnp.inf, jnp.nan])
+    values = np.asarray(operations.exp(powers))
+    np.testing.assert_allclose(values[:2], np.exp([0.0, -70.0]), rtol=1e-5)
+    assert (values[2:6] == 0).all()
+    assert np.isnan(values[6])
+    smallest = values[1]
+    assert smallest * np.finfo(np.float32).eps >= np.finfo(np.float32).tiny
 
 
 @pytest.mark.parametrize("n", SIZES)
