@@ -1,12 +1,13 @@
 """What time and memory grow with: N, M, seeds and T, and what devices and processes gain.
 
     python -m benchmarks.scaling
+    python -m benchmarks.scaling --axes --islands 10000000    # one filter, as islands
 
 The quadratic model, whose likelihood costs next to nothing, so that what is seen is the filter;
 DPS tracks J such objects. One axis is varied at a time, from a common middle. The cells of an
 axis take turns. Slopes are fitted to log-log points: 1 is proportional, 0 no growth. Memory is
 what the compiled program asks for, its temporaries and results, with nothing collected. Into
---out DIR go scaling.json and scaling.png.
+--out DIR go scaling.json and, where an axis was varied, scaling.png.
 """
 
 import argparse
@@ -43,6 +44,7 @@ AXES = {
     "seeds": "number of seeds",
     "steps": "number of steps $T$",
 }
+NUM_ISLANDS, ISLAND_STEPS = 8, 20
 SLOW_SECONDS, FEWEST_REPEATS = 6.0, 3
 TIME_LIMIT = 300.0
 
@@ -96,7 +98,10 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     """The options, or a message that names the one that cannot be run."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scaling")
     parser.add_argument("--filters", nargs="+", choices=list(FILTERS), default=list(FILTERS))
-    parser.add_argument("--axes", nargs="+", choices=list(AXES), default=list(AXES))
+    parser.add_argument("--axes", nargs="*", choices=list(AXES), default=list(AXES))
+    parser.add_argument(
+        "--islands", type=int, nargs="*", default=[], metavar="N", help="particles of one filter"
+    )
     parser.add_argument("--repeats", type=int, default=5, help="times that each cell is timed")
     parser.add_argument("--devices", type=int, nargs="*", default=[1, 2], help="none: leave out")
     parser.add_argument("--processes", type=int, nargs="*", default=[1, 2], help="none: leave out")
@@ -109,6 +114,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         too_few = [number for number in getattr(options, name) if number < 1]
         if too_few:
             parser.error(f"--{name}: {too_few[0]} is less than 1")
+    uneven = [number for number in options.islands if number < 1 or number % NUM_ISLANDS**2]
+    if uneven:
+        parser.error(f"--islands: {uneven[0]} is not a positive multiple of {NUM_ISLANDS**2}")
     return options
 
 
@@ -117,7 +125,8 @@ def run(options: argparse.Namespace) -> None:
     out = Path(options.out)
     sizes = QUICK if options.quick else FULL
     content: dict[str, Any] = {
-        "settings": settings_of(options, sizes), "results": [], "slopes": [], "spread": []
+        "settings": settings_of(options, sizes), "results": [], "slopes": [], "spread": [],
+        "islands": [],
     }  # fmt: skip
     programs: dict[Cell, Any] = {}
     for axis in options.axes:
@@ -134,9 +143,13 @@ def run(options: argparse.Namespace) -> None:
         content["spread"] += found
         if found:
             print(spread_table(kind, found, sizes.spread), end="\n\n")
+    content["islands"] = [run_as_islands(number, options.repeats) for number in options.islands]
+    if options.islands:
+        print(island_table(content["islands"]), end="\n\n")
     write_json(out / "scaling.json", content)
-    draw(content["results"]).savefig(out / "scaling.png", dpi=150)
-    print(f"results and figure: {out}/")
+    if content["results"]:
+        draw(content["results"]).savefig(out / "scaling.png", dpi=150)
+    print(f"results: {out}/")
 
 
 # --- the filters ------------------------------------------------------------------------------
@@ -302,6 +315,31 @@ def _answers(workers: list[Worker]) -> list[dict[str, Any]]:
     return found
 
 
+def run_as_islands(num_particles: int, repeats: int) -> dict[str, Any]:
+    """One particle filter on so many particles, its islands exchanging when they have to."""
+    model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
+    moves = [mpfjax.Exchange(), mpfjax.Resample(), mpfjax.Propagate(model)]
+    filter = mpfjax.Filter(model, moves, num_particles // NUM_ISLANDS)
+    observations = (2 * jnp.sin(2 * jnp.pi * jnp.arange(1.0, ISLAND_STEPS + 1) / 100)) ** 2
+
+    def run_islands(key: jax.Array) -> jax.Array:
+        run = mpfjax.run_islands(key, filter, observations, nothing, num_islands=NUM_ISLANDS)
+        return run.log_marginal_likelihood
+
+    program = jax.jit(run_islands, compiler_options=wide_vectors())
+    program = program.lower(jax.random.key(0)).compile()
+    seconds = []
+    for repeat in range(1 + repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(program(jax.random.key(repeat)))
+        seconds.append(time.perf_counter() - start)
+        if sum(seconds[1:]) > SLOW_SECONDS and len(seconds) > FEWEST_REPEATS:
+            break
+    found = {"particles": num_particles, "islands": NUM_ISLANDS, "steps": ISLAND_STEPS}
+    timed = {"seconds": seconds[1:], "median": float(np.median(seconds[1:]))}
+    return {**found, **timed, "bytes": bytes_of(program)}
+
+
 # --- tables and the picture -------------------------------------------------------------------
 
 
@@ -356,6 +394,21 @@ def spread_table(kind: str, found: list[dict[str, Any]], size: Mapping[str, int]
     ]
     title = f"{kind} (PF, N = {size['particles']}, {size['seeds']} seeds)"
     return format_table([title, "median [ms]", "gain"], rows)
+
+
+def island_table(found: list[dict[str, Any]]) -> str:
+    """Time of a whole run, of a step and particle, and memory."""
+    rows = [
+        [
+            str(entry["particles"]),
+            f"{entry['median']:.3g}",
+            f"{1e9 * entry['median'] / entry['steps'] / entry['particles']:.3g}",
+            f"{entry['bytes'] / 1e6:.3g}",
+        ]
+        for entry in found
+    ]
+    title = f"particles on {NUM_ISLANDS} islands, {ISLAND_STEPS} steps"
+    return format_table([title, "median [s]", "[ns] a particle and step", "memory [MB]"], rows)
 
 
 def draw(results: list[dict[str, Any]]) -> Any:

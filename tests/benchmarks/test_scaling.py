@@ -67,8 +67,11 @@ def test_every_cell_is_there(finished):
 def test_memory_does_not_depend_on_the_steps_where_nothing_is_collected(finished):
     for slope in finished[1]["slopes"]:
         assert abs(slope["memory"]) < 0.05
-    for entry in finished[1]["results"]:
-        assert entry["bytes"] < 50 * entry["seeds"] * entry["particles"] * 4
+    short, long = sorted(finished[1]["results"], key=lambda entry: entry["steps"])
+    a_mixture = 12 * short["seeds"] * short["particles"]
+    assert long["bytes"] - short["bytes"] < a_mixture / 2 * (long["steps"] - short["steps"])
+    triangles = 2**17  # of the prefix sums, whatever N is
+    assert long["bytes"] < 12 * a_mixture + triangles
 
 
 def test_memory_grows_with_the_steps_where_all_is_collected(monkeypatch):
@@ -107,3 +110,15 @@ def test_bad_options_are_refused_by_name(arguments, named, capsys):
     with pytest.raises(SystemExit):
         scaling.main(arguments)
     assert named in capsys.readouterr().err
+
+
+def test_islands_alone(tmp_path, capsys):
+    arguments = ["--axes", *ONLY_AXES, "--repeats", "1", "--out", str(tmp_path)]
+    assert scaling.main([*arguments, "--islands", "192"]) == 0
+    (found,) = json.loads((tmp_path / "scaling.json").read_text())["islands"]
+    assert (found["particles"], len(found["seconds"])) == (192, 1)
+    assert found["bytes"] > 0
+    assert "memory" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        scaling.main([*arguments, "--islands", "81"])
+    assert "--islands: 81" in capsys.readouterr().err
