@@ -80,8 +80,10 @@ def _ones_before(num_rows: int, num_columns: int, dtype: jnp.dtype) -> Float[Arr
     return jnp.triu(jnp.ones((num_rows, num_columns), dtype), 1)
 
 
-def count_starts(starts: Int[Array, " n"], num_slots: int) -> Int[Array, " num_slots"]:
+def count_starts(starts: Int[Array, "*rows n"], num_slots: int) -> Int[Array, " num_slots"]:
     """For each slot s, the last i with starts_i <= s, given starts in ascending order.
+
+    Rows are one line, the first row first.
 
     With starts_i the first slot of parent i this is every slot's parent, in O(n) and without a
     search: a one is scattered at each start, and the prefix sum counts them. Parents without
@@ -90,8 +92,9 @@ def count_starts(starts: Int[Array, " n"], num_slots: int) -> Int[Array, " num_s
     """
     # Those that are dropped get a place of their own.
     num_places = whole_blocks(num_slots + 1)
-    dtype = jnp.float32 if len(starts) < _EXACT_IN_FLOAT32 else jnp.int32
-    at_start = count_places(jnp.minimum(starts, num_slots), num_places, dtype)
+    dtype = jnp.float32 if starts.size < _EXACT_IN_FLOAT32 else jnp.int32
+    starts = stored(jnp.minimum(starts, num_slots), num_slots + 1)
+    at_start = count_places(starts.reshape(-1), num_places, dtype)
     return (count_before(at_start) + at_start.astype(jnp.int32) - 1)[:num_slots]
 
 
@@ -131,12 +134,12 @@ def inverse_permutation(places: Int[Array, " n"]) -> Int[Array, " n"]:
         line = jnp.zeros(index.shape, jnp.int32).at[_on_one_line(rows, n)]
         return line.set(index, mode="promise_in_bounds", unique_indices=True).reshape(-1, n)
 
-    return _in_rows(scatter)(places)
+    return _in_rows(scatter)(stored(places, n))
 
 
 def _on_one_line(rows: Int[Array, "k n"], num_places: int) -> UInt32[Array, " k*n"]:
     firsts = num_places * jnp.arange(rows.shape[0], dtype=jnp.int32)
-    return _from_the_start((stored(rows, num_places) + firsts[:, None]).reshape(-1))
+    return _from_the_start((rows + firsts[:, None]).reshape(-1))
 
 
 def _in_rows(

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRejuvenation
@@ -23,6 +23,7 @@ from mpfjax.operations import (
     order_by_segment,
     segment_counts,
     segment_log_sum_exp,
+    segment_sum,
     spread,
     stored,
     sum_before,
@@ -30,6 +31,8 @@ from mpfjax.operations import (
     whole_blocks,
 )
 
+# Up to so many components are resampled as they stand, each in a pass of its own.
+_FEW_ROWS = 4
 GRADIENTS = ("none", "stop", "soft", "ot", "straight_through")
 
 
@@ -150,25 +153,53 @@ class Resample(AbstractRejuvenation):
         self, key: Key[Array, ""], mixture: ParticleMixture, due: Bool[Array, " m"]
     ) -> "_Drawn":
         """Each slot's parent: drawn by weight where its component is due, itself elsewhere."""
-        as_they_stand = mixture.num_components == 1 and self.sort_by is None
+        num_particles, num_components = mixture.num_particles, mixture.num_components
+        # A component that keeps its particles needs them side by side, unless it has all slots.
+        all_are_due = self.ess_threshold == 1.0
+        as_they_stand = num_components == 1 or (num_components <= _FEW_ROWS and all_are_due)
+        as_they_stand &= self.sort_by is None
         as_they_stand &= self.gradient != "ot"  # which needs places without gaps
-        line = _as_they_stand(mixture) if as_they_stand else _in_line(mixture, due, self.sort_by)
-        targets = deal_slots(line.counts, due, mixture.num_particles, self.particles_per_component)
-        if as_they_stand:
+        line = _as_they_stand(mixture) if as_they_stand else self._side_by_side(mixture, due)
+        targets = deal_slots(line.counts, due, num_particles, self.particles_per_component)
+        if as_they_stand and num_components == 1:
             # What is not redrawn keeps its place, and there may be empty slots before it.
-            targets = jnp.where(due, targets, mixture.num_particles)
-        slots = place_slots(targets, mixture.num_particles)
-        expected = line.weights * spread(targets, line.components).astype(line.weights.dtype)
-        before, total = sum_before(expected)
+            targets = jnp.where(due, targets, num_particles)
+        slots = place_slots(targets, num_particles)
+        expected = line.weights * line.of_places(targets).astype(line.weights.dtype)
+        before, total = jax.vmap(sum_before)(expected)
         starts = SCHEMES[self.scheme](key, expected, before, targets, slots, line)
         # Rounding must not leave a slot to those that stand past all weight.
-        starts = jnp.where(before < total, starts, mixture.num_particles)
-        parents = _within_component(count_starts(starts, mixture.num_particles), slots, line)
-        if self.ess_threshold < 1.0:
+        num_slots = line.num_slots(targets, num_particles)
+        starts = jnp.minimum(starts, num_slots)
+        starts = jnp.where(before < total[:, None], starts, num_slots) + line.first_slots(slots)
+        parents = line.places_of(count_starts(starts, num_particles), slots)
+        if not all_are_due:
             unmoved = spread(line.firsts, slots.components) + slots.ranks
             parents = jnp.where(spread(due, slots.components), parents, unmoved)
-        parents = stored(jnp.clip(parents, 0, mixture.num_particles - 1), mixture.num_particles)
-        return _Drawn(take(line.order, parents), slots, targets, line)
+        parents = stored(jnp.clip(parents, 0, num_particles - 1), num_particles)
+        return _Drawn(line.particles_at(parents), slots, targets, line)
+
+    def _side_by_side(self, mixture: ParticleMixture, due: Bool[Array, " m"]) -> "_Line":
+        """One row of components, without particles that only a rounding error could draw.
+
+        A weight may underflow to zero where its logarithm does not. Such a particle is left out of
+        the row of a component that is resampled, and kept with one that is not.
+        """
+        m = mixture.num_components
+        weights = mixture.component_weights
+        stands = weights > 0
+        if self.ess_threshold < 1.0:
+            stands |= mixture.occupied & ~spread(due, mixture.component_indicators)
+        labels = jnp.where(stands, mixture.component_indicators, m)
+        if self.sort_by is None:
+            order = order_by_segment(_padded(labels, m), m)
+        else:
+            order = jnp.lexsort((self.sort_by(mixture.particles), labels)).astype(jnp.int32)
+            order = _padded(order, mixture.num_particles - 1)
+        counts = segment_counts(stands, mixture.component_indicators, m)
+        slots = place_slots(counts, order.shape[0])
+        weights = jnp.where(slots.filled, take(_padded(weights, 0.0), order), 0.0)
+        return _Line(weights[None], counts, slots.firsts, order, slots.components)
 
     def _drawn_from(self, mixture: ParticleMixture) -> ParticleMixture:
         """The mixture whose weights the offspring are drawn in proportion to."""
@@ -268,57 +299,66 @@ def _where(
 
 
 class _Line(NamedTuple):
-    """The particles in line, component by component, and empty places at the end.
+    """The particles in line for their offspring, in rows of places.
 
-    There are p places, as many as make whole blocks for the prefix sums.
+    Either as they stand, in a row for each component, in which only its own have a weight; or in
+    one row, component by component, and empty places at the end. A row has p places, as many as
+    make whole blocks for the prefix sums.
     """
 
-    order: Int[Array, " p"]  # which particle stands at each place
-    components: Int[Array, " p"]
-    weights: Float[Array, " p"]  # within the component, zero at an empty place
+    weights: Float[Array, "rows p"]  # within the component, zero at an empty place
     counts: Int[Array, " m"]
-    firsts: Int[Array, " m"]  # the place of each component's first particle
+    firsts: Int[Array, " m"]  # the place of each component's first particle in its row
+    order: Int[Array, " p"] | None = None  # which particle stands at each place of the one row
+    components: Int[Array, " p"] | None = None
+
+    def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, "rows places"]:
+        """At each place, or for each row, the value of the component."""
+        if self.components is None:
+            return values[:, None]
+        return spread(values, self.components)[None]
+
+    def sums(self, values: Float[Array, "rows p"]) -> Float[Array, " m"]:
+        """The sum over each component's places."""
+        if self.components is None:
+            return jnp.sum(values, axis=1)
+        return segment_sum(values[0], self.components, self.counts.shape[0])
+
+    def first_slots(self, slots: Slots) -> Int[Array, "rows 1"]:
+        """Where the slots of each row begin."""
+        if self.components is None:
+            return slots.firsts[:, None]
+        return jnp.zeros((1, 1), jnp.int32)
+
+    def num_slots(self, targets: Int[Array, " m"], num_particles: int) -> Int[Array, "rows 1"]:
+        """How many slots each row has."""
+        if self.components is None:
+            return targets[:, None]
+        return jnp.full((1, 1), num_particles, jnp.int32)
+
+    def places_of(self, parents: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
+        """The place in its row of each slot's parent, counted over all rows."""
+        if self.components is None:
+            return parents - self.weights.shape[1] * slots.components
+        # Rounding of the prefix sums must not cross a border between components.
+        firsts = spread(self.firsts, slots.components)
+        return jnp.clip(parents, firsts, firsts + spread(self.counts, slots.components) - 1)
+
+    def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
+        """Which particles stand at these places."""
+        return places if self.order is None else take(self.order, places)
 
 
 def _as_they_stand(mixture: ParticleMixture) -> _Line:
-    num_places = whole_blocks(mixture.num_particles)
-    return _Line(
-        order=jnp.arange(num_places, dtype=jnp.int32),
-        components=jnp.zeros(num_places, jnp.int32),
-        weights=_padded(mixture.component_weights, 0.0),
-        counts=mixture.component_counts,
-        firsts=jnp.zeros(1, jnp.int32),
-    )
-
-
-def _in_line(
-    mixture: ParticleMixture,
-    due: Bool[Array, " m"],
-    sort_by: Callable[[PyTree], Float[Array, " n"]] | None,
-) -> _Line:
-    """Components side by side, without particles that could only be drawn by a rounding error.
-
-    A weight may underflow to zero where its logarithm does not. Such a particle is left out of
-    the line of a component that is resampled, and kept with one that is not.
-    """
     m = mixture.num_components
-    weights = mixture.component_weights
-    stays = ~spread(due, mixture.component_indicators)
-    stands = mixture.occupied & ((weights > 0) | stays)
-    labels = jnp.where(stands, mixture.component_indicators, m)
-    if sort_by is None:
-        order = order_by_segment(_padded(labels, m), m)
-    else:
-        order = jnp.lexsort((sort_by(mixture.particles), labels)).astype(jnp.int32)
-        order = _padded(order, mixture.num_particles - 1)
-    counts = segment_counts(stands, mixture.component_indicators, m)
-    slots = place_slots(counts, order.shape[0])
+    is_member = mixture.component_indicators[None] == jnp.arange(m, dtype=jnp.int32)[:, None]
+    weights = mixture.component_weights[None]
+    if m > 1:
+        weights = jnp.where(is_member, weights, 0.0)
     return _Line(
-        order=order,
-        components=slots.components,
-        weights=jnp.where(slots.filled, take(_padded(weights, 0.0), order), 0.0),
-        counts=counts,
-        firsts=slots.firsts,
+        weights=jax.vmap(lambda row: _padded(row, 0.0))(weights),
+        counts=mixture.component_counts,
+        firsts=jnp.zeros(m, jnp.int32),
     )
 
 
@@ -327,33 +367,26 @@ def _padded(values: Array, fill: float) -> Array:
     return jnp.pad(values, (0, whole_blocks(n) - n), constant_values=fill)
 
 
-def _within_component(parents: Int[Array, " n"], slots: Slots, line: _Line) -> Int[Array, " n"]:
-    """Keep rounding of the prefix sums from crossing a border between components."""
-    if line.counts.shape[0] == 1:
-        return parents
-    firsts = spread(line.firsts, slots.components)
-    lasts = firsts + spread(line.counts, slots.components) - 1
-    return jnp.clip(parents, firsts, lasts)
-
-
-# A scheme gives the first slot of every particle's offspring, in the line's order. It sees the
-# expected offspring k_m w_i laid end to end, on which component m takes the stretch from
-# slots.firsts[m] to slots.firsts[m] + k_m, and places one point in each slot's share of it;
-# `before` is where each particle's stretch begins.
+# A scheme gives the first slot of every particle's offspring, counted from the first slot of its
+# row. It sees the expected offspring k_m w_i laid end to end in each row, and where each particle's
+# stretch begins there, and places one point in each slot's share.
 
 
 def _systematic(key, expected, before, targets, slots, line):
     shift = stored(jax.random.uniform(key, targets.shape, expected.dtype))
-    return _points_before(before, spread(shift, line.components))
+    return _points_before(before, line.of_places(shift))
 
 
 def _stratified(key, expected, before, targets, slots, line):
     shift = jax.random.uniform(key, slots.components.shape, expected.dtype)
-    slot = jnp.clip(before.astype(jnp.int32), 0, shift.shape[0] - 1)
-    return _points_before(before, take(shift, slot))
+    slot = line.first_slots(slots) + before.astype(jnp.int32)
+    slot = jnp.clip(slot, 0, shift.shape[0] - 1)
+    return _points_before(before, take(shift, slot.reshape(-1)).reshape(slot.shape))
 
 
-def _points_before(before: Float[Array, " p"], shift: Float[Array, " p"]) -> Int[Array, " p"]:
+def _points_before(
+    before: Float[Array, "rows p"], shift: Float[Array, "rows #p"]
+) -> Int[Array, "rows p"]:
     """How many of the points s + shift, one in each slot s, come before a particle's stretch."""
     whole = jnp.floor(before)
     return whole.astype(jnp.int32) + (shift < before - whole).astype(jnp.int32)
@@ -361,20 +394,27 @@ def _points_before(before: Float[Array, " p"], shift: Float[Array, " p"]) -> Int
 
 def _multinomial(key, expected, before, targets, slots, line):
     points = _sorted_points(key, slots, targets, expected.dtype)
-    return jnp.searchsorted(points, before, side="left").astype(jnp.int32)
+    return _sorted_points_before(before, points, line.first_slots(slots))
 
 
 def _residual(key, expected, before, targets, slots, line):
     # A weight of 1 / k comes out as a hair less in floating point, and is meant to be certain.
     whole = jnp.floor(expected * (1 + 16 * jnp.finfo(expected.dtype).eps))
-    certain, _ = sum_before(whole)
-    per_component = jax.ops.segment_sum(whole, line.components, targets.shape[0])
-    left = jnp.maximum(targets - per_component.astype(jnp.int32), 0)
+    certain, _ = jax.vmap(sum_before)(whole)
+    left = jnp.maximum(targets - line.sums(whole).astype(jnp.int32), 0)
     rest = place_slots(left, slots.components.shape[0])
     points = _sorted_points(key, rest, left, expected.dtype)
-    rests_before, _ = sum_before(jnp.maximum(expected - whole, 0.0))
-    drawn = jnp.searchsorted(points, rests_before, side="left")
-    return certain.astype(jnp.int32) + drawn.astype(jnp.int32)
+    rests_before, _ = jax.vmap(sum_before)(jnp.maximum(expected - whole, 0.0))
+    drawn = _sorted_points_before(rests_before, points, line.first_slots(rest))
+    return certain.astype(jnp.int32) + drawn
+
+
+def _sorted_points_before(
+    before: Float[Array, "rows p"], points: Float[Array, " n"], first_slots: Int[Array, "rows 1"]
+) -> Int[Array, "rows p"]:
+    """How many of the points of its row come before a particle's stretch."""
+    found = jnp.searchsorted(points, before + first_slots.astype(before.dtype), side="left")
+    return found.astype(jnp.int32) - first_slots
 
 
 def _sorted_points(
