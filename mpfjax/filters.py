@@ -68,6 +68,8 @@ class FilterRun(eqx.Module):
 
 # Moves that leave the total mass as it is, so that there is nothing to normalise.
 _KEEP_MASS = (AbstractRegrouping, AbstractRejuvenation, Exchange)
+# Particles, of a megabyte and four for every number that one has: what a CPU's caches hold.
+_IN_NEAR_CACHE, _IN_CACHE = 2**18, 2**20
 _BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
 
@@ -570,8 +572,21 @@ def _run(key, filter, observations, present, collect):
 
 
 def _run_each(keys, filter, observations, present, collect):
-    run_one = jax.vmap(lambda key: scan_filter(key, filter, observations, present, collect))
-    return run_one(keys)
+    run_together = jax.vmap(lambda key: scan_filter(key, filter, observations, present, collect))
+    num_keys = keys.shape[0]
+    size = _group_size(num_keys, filter.num_particles)
+    if size == num_keys:
+        return run_together(keys)
+    runs = jax.lax.map(run_together, keys.reshape(-1, size))
+    return jax.tree.map(lambda leaf: leaf.reshape(num_keys, *leaf.shape[2:]), runs)
+
+
+def _group_size(num_runs: int, num_particles: int) -> int:
+    """How many runs go on together: on a CPU no more than leaves their particles in its cache."""
+    if jax.default_backend() != "cpu" or num_runs * num_particles <= _IN_CACHE:
+        return num_runs
+    sizes = [size for size in range(1, num_runs + 1) if num_runs % size == 0]
+    return max(size for size in sizes if size == 1 or size * num_particles <= _IN_NEAR_CACHE)
 
 
 _run_all = jit_on_wide_vectors(_run_each)

@@ -295,6 +295,25 @@ class TestUsersModel:
             custom.predict(key, custom.init(key))
 
 
+class TestGroupsOfRuns:
+    def test_each_run_is_that_of_its_key(self, monkeypatch):
+        keys = jax.random.split(jax.random.key(20), 6)
+        filter = mpfjax.particle_filter(mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0), 32)
+        together = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean)
+        monkeypatch.setattr(mpfjax.filters, "_IN_CACHE", 100)
+        monkeypatch.setattr(mpfjax.filters, "_IN_NEAR_CACHE", 80)
+        assert mpfjax.filters._group_size(6, 32) == 2
+        in_groups = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, lambda mixture: mean(mixture))
+        assert_same(in_groups, together, rtol=1e-5)
+
+    @pytest.mark.parametrize(
+        ("num_runs", "num_particles", "size"),
+        [(20, 10_000, 20), (20, 100_000, 2), (11, 100_000, 1), (3, 10**7, 1), (1, 10**7, 1)],
+    )
+    def test_sizes_divide_and_fit(self, num_runs, num_particles, size):
+        assert mpfjax.filters._group_size(num_runs, num_particles) == size
+
+
 class TestGradients:
     def test_of_the_log_evidence_is_finite(self):
         filter = CHAINS["guided pf"](mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0))

@@ -225,7 +225,7 @@ class Resample(AbstractRejuvenation):
         places = jnp.clip(spread(line.firsts, slots.components) + stretched, 0, len(stretched) - 1)
         particles, nearest = transport(
             mixture,
-            take(line.order, places),
+            line.particles_at(places),
             slots.components,
             slots.filled,
             self.regularisation,
