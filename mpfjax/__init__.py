@@ -17,6 +17,7 @@ from mpfjax.filters import monte_carlo as monte_carlo
 from mpfjax.filters import particle_filter as particle_filter
 from mpfjax.filters import partitioned_sampling as partitioned_sampling
 from mpfjax.filters import run_filter as run_filter
+from mpfjax.generator import normal as normal
 from mpfjax.islands import run_islands as run_islands
 from mpfjax.mixture import ParticleMixture as ParticleMixture
 from mpfjax.models import AbstractDynamics as AbstractDynamics

@@ -140,11 +140,12 @@ def jit_on_wide_vectors(function: Callable[..., PyTree]) -> Callable[..., PyTree
 
     @functools.wraps(function)
     def run(*arguments: Any, **named: Any) -> PyTree:
-        if not is_traced((arguments, named, jnp.zeros(()))):
+        if not is_traced((arguments, named)):
             try:
                 return wide()(*arguments, **named)
             except ValueError as error:
-                # A tracer may also hide in what a function among the arguments closes over.
+                # Where all arguments are constants of the caller's program, or a function among
+                # them closes over a tracer.
                 if "compiler_options" not in str(error):
                     raise
         return plain(*arguments, **named)

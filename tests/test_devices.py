@@ -21,6 +21,7 @@ from mpfjax.devices import (
     island_index,
     num_islands,
     over_islands,
+    wide_vectors,
 )
 from mpfjax.exact import grid_filter
 from tests import on_devices
@@ -332,6 +333,13 @@ class TestTheCompiledProgram:
         """Every slot's state, weight, label and ancestor."""
         in_branch = [c[:2] for c in started["eight"][1]["collectives"] if c[2]]
         assert in_branch == [["all-to-all", 256]] * 4
+
+
+def test_the_width_of_vectors_is_left_to_a_flag_that_sets_it(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    assert wide_vectors() == {"xla_cpu_prefer_vector_width": 512}
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=128")
+    assert wide_vectors() == {}
 
 
 class TestChoosingDevices:
