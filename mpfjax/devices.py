@@ -7,10 +7,13 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -192,6 +195,60 @@ def over_devices(
     if padding:
         result = jax.tree.map(lambda leaf: leaf[:num_keys], result)
     return result
+
+
+def over_threads(
+    run: Callable[..., PyTree],
+    keys: Key[Array, " k"],
+    arguments: tuple[PyTree, ...],
+    num_threads: int,
+) -> PyTree:
+    """`run(keys, *arguments)` with the keys dealt to threads of this process in equal blocks.
+
+    For programs of many short operations, which a CPU device does mostly one after the other.
+    `run` is compiled, or compiles once, whichever thread comes first. Without threads where they
+    would not see what this thread does: under a transformation of the caller's, or a setting of
+    JAX that holds for this thread alone.
+    """
+    num_keys = keys.shape[0]
+    size = -(-num_keys // num_threads)
+    if size == num_keys or not _is_like_any_thread():
+        return run(keys, *arguments)
+    count = -(-num_keys // size)
+    padded = keys[np.minimum(np.arange(count * size), num_keys - 1)]
+    threads = _threads()
+    blocks = [padded[i * size : (i + 1) * size] for i in range(count)]
+    runs = list(threads.map(lambda block: jax.block_until_ready(run(block, *arguments)), blocks))
+    return _end_to_end(runs, num_keys)
+
+
+def num_processors() -> int:
+    """How many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@functools.cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max(2, num_processors()), thread_name_prefix="mpfjax")
+
+
+def _is_like_any_thread() -> bool:
+    return _seen_by_thread() == _threads().submit(_seen_by_thread).result()
+
+
+def _seen_by_thread() -> tuple[Any, ...]:
+    """JAX's settings, and which transformations go on. Of an old JAX it cannot be told."""
+    trace_state = getattr(jax.extend.core, "get_opaque_trace_state", None)
+    if trace_state is None:
+        return (threading.get_ident(),)
+    return dict(jax.config.values), trace_state(convention="nnx")
+
+
+@partial(jax.jit, static_argnums=1)
+def _end_to_end(runs: list[PyTree], length: int) -> PyTree:
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:length], *runs)
 
 
 @jit_on_wide_vectors

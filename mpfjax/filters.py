@@ -18,7 +18,9 @@ from mpfjax.devices import (
     jit_on_wide_vectors,
     log_sum_over_islands,
     num_islands,
+    num_processors,
     over_devices,
+    over_threads,
 )
 from mpfjax.generator import fast_key
 from mpfjax.mixture import ParticleMixture, single_component
@@ -68,8 +70,9 @@ class FilterRun(eqx.Module):
 
 # Moves that leave the total mass as it is, so that there is nothing to normalise.
 _KEEP_MASS = (AbstractRegrouping, AbstractRejuvenation, Exchange)
-# Particles, of a megabyte and four for every number that one has: what a CPU's caches hold.
-_IN_NEAR_CACHE, _IN_CACHE = 2**18, 2**20
+# Particles, of a megabyte and two for every number that one has: what a CPU's caches hold.
+_IN_NEAR_CACHE, _IN_CACHE = 2**18, 2**19
+_WORTH_A_THREAD = 2**12  # particles, of all its runs
 _BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
 
@@ -262,7 +265,7 @@ def monte_carlo(
     missing: str = "error",
     devices: int | Sequence[Any] | None = None,
 ) -> FilterRun:
-    """Run a filter once for each key, all on the same observations, under one `vmap` a device.
+    """Run a filter once for each key, all on the same observations, under `vmap`.
 
     Every field of the result has a leading axis of seeds. Arguments and errors are those of
     `run_filter`; run k equals `run_filter(keys[k], ...)`.
@@ -271,7 +274,8 @@ def monte_carlo(
       after `join_processes`; a number means the first few, a sequence those of `jax.devices()`.
       Any number of keys will do. Devices tell each other nothing; the result is gathered on the
       first one, and each process has all of it. Under the caller's own jit, grad or vmap None is
-      one device.
+      one device. One device that is a CPU is kept busy by a thread for each processor, if there
+      is enough to do.
 
     Raises `ValueError` for more devices than there are.
     """
@@ -281,7 +285,7 @@ def monte_carlo(
     arguments = (filter, observations, present, collect)
     leave_to_caller = devices is None and is_traced((keys, arguments))
     chosen = None if leave_to_caller else choose_devices(devices)
-    return checked(over_devices(_run_each, _run_all, keys, arguments, chosen))
+    return checked(over_devices(_run_each, _run_on_threads, keys, arguments, chosen))
 
 
 def particle_filter(
@@ -590,6 +594,15 @@ def _group_size(num_runs: int, num_particles: int) -> int:
 
 
 _run_all = jit_on_wide_vectors(_run_each)
+
+
+def _run_on_threads(keys, filter, observations, present, collect):
+    """All runs on one device, which on a CPU is kept busy by several threads."""
+    num_threads = min(num_processors(), keys.shape[0] * filter.num_particles // _WORTH_A_THREAD)
+    keeps_all = collect is None  # of which there had better not be two copies for a while
+    if num_threads < 2 or keeps_all or jax.default_backend() != "cpu":
+        return _run_all(keys, filter, observations, present, collect)
+    return over_threads(_run_all, keys, (filter, observations, present, collect), num_threads)
 
 
 def scan_filter(

@@ -1,7 +1,9 @@
 """JAX's own random numbers, drawn faster on a CPU: an unrolled Threefry and normals from it."""
 
 import math
-from functools import partial
+from collections.abc import Sequence
+from functools import partial, reduce
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -82,10 +84,11 @@ def normal_quantile(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     exponent = -_log((1 - values) * (1 + values))
     is_central = exponent < 5
     powers = jnp.where(is_central, exponent - 2.5, jnp.sqrt(exponent) - 3.0)
-    ratio = jnp.zeros_like(powers)
-    for central, tail in zip(_CENTRE, _TAIL, strict=True):
-        ratio = ratio * powers + jnp.where(is_central, np.float32(central), np.float32(tail))
-    return np.float32(math.sqrt(2)) * ratio * values
+    coefficients = [
+        jnp.where(is_central, np.float32(central), np.float32(tail))
+        for central, tail in zip(_CENTRE, _TAIL, strict=True)
+    ]
+    return np.float32(math.sqrt(2)) * _polynomial(coefficients, powers) * values
 
 
 def _log(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -95,10 +98,13 @@ def _log(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     exponent = (bits >> 23).astype(jnp.float32)
     mantissa = jax.lax.bitcast_convert_type((bits & _FRACTION) + _ROOT_OF_HALF, jnp.float32)
     f = mantissa - 1
-    series = jnp.zeros_like(f)
-    for coefficient in _LOGARITHM:
-        series = series * f + np.float32(coefficient)
+    series = _polynomial([np.float32(coefficient) for coefficient in _LOGARITHM], f)
     return exponent * np.float32(math.log(2)) + (f + f * f * (f * series - 0.5))
+
+
+def _polynomial(coefficients: Sequence[Any], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """The coefficient of the highest power comes first."""
+    return reduce(lambda value, coefficient: value * x + coefficient, coefficients)
 
 
 def _random_bits(key: UInt32[Array, " 2"], bit_width: int, shape: tuple[int, ...]) -> Array:

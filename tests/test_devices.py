@@ -5,6 +5,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import jax
@@ -21,6 +22,7 @@ from mpfjax.devices import (
     island_index,
     num_islands,
     over_islands,
+    over_threads,
     wide_vectors,
 )
 from mpfjax.exact import grid_filter
@@ -333,6 +335,65 @@ class TestTheCompiledProgram:
         """Every slot's state, weight, label and ancestor."""
         in_branch = [c[:2] for c in started["eight"][1]["collectives"] if c[2]]
         assert in_branch == [["all-to-all", 256]] * 4
+
+
+class TestThreads:
+    @pytest.mark.parametrize("num_threads", [2, 3, 7, 20])
+    def test_the_numbers_are_those_of_one_block(self, num_threads):
+        keys = jax.random.split(jax.random.key(3), 7)
+        drawn = over_threads(jax.jit(draw_with), keys, (2.0,), num_threads)
+        np.testing.assert_array_equal(drawn, draw_with(keys, 2.0))
+
+    def test_each_block_runs_in_a_thread_of_its_own_and_compiles_once(self):
+        traced, ran = [], set()
+
+        def run(keys):
+            traced.append(keys.shape)
+            return draw_with(keys, 1.0)
+
+        compiled = jax.jit(run)
+
+        def noted(keys):
+            ran.add(threading.get_ident())
+            barrier.wait(60)  # which the blocks pass together or not at all
+            return compiled(keys)
+
+        barrier = threading.Barrier(2)
+        over_threads(noted, jax.random.split(jax.random.key(4), 6), (), 2)
+        assert traced == [(3,)]
+        assert len(ran) == 2
+        assert threading.get_ident() not in ran
+
+    def test_settings_and_transformations_of_this_thread_hold(self):
+        keys = jax.random.split(jax.random.key(5), 4)
+        with float64():
+            assert over_threads(jax.jit(draw_with), keys, (2.0,), 2).dtype == np.float64
+        total = lambda scale: jnp.sum(over_threads(draw_with, keys, (scale,), 2))  # noqa: E731
+        np.testing.assert_allclose(jax.grad(total)(2.0), total(1.0), rtol=1e-5)
+        np.testing.assert_allclose(jax.jit(total)(2.0), total(2.0), rtol=1e-5)
+
+    def test_an_error_is_raised_here(self):
+        def fail(keys):
+            raise ValueError(f"{keys.shape[0]} of them")
+
+        with pytest.raises(ValueError, match="2 of them"):
+            over_threads(fail, jax.random.split(jax.random.key(6), 4), (), 2)
+
+    def test_a_study_on_threads_is_that_of_each_key(self, monkeypatch):
+        monkeypatch.setattr(mpfjax.filters, "_WORTH_A_THREAD", 1)
+        monkeypatch.setattr(mpfjax.filters, "num_processors", lambda: 3)
+        keys = jax.random.split(jax.random.key(7), 5)
+        filter = mpfjax.particle_filter(mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0), 32)
+        mean = lambda mixture: mixture.mean()  # noqa: E731
+        runs = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean)
+        for k in range(5):
+            run = mpfjax.run_filter(keys[k], filter, OBSERVATIONS, mean)
+            np.testing.assert_allclose(runs.collected[k], run.collected, rtol=1e-5)
+            np.testing.assert_allclose(runs.final.particles[k], run.final.particles, rtol=1e-5)
+
+
+def draw_with(keys, scale):
+    return scale * jax.vmap(lambda key: jax.random.normal(key, (4,)))(keys)
 
 
 def test_the_width_of_vectors_is_left_to_a_flag_that_sets_it(monkeypatch):
