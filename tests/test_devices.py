@@ -368,7 +368,10 @@ class TestThreads:
         keys = jax.random.split(jax.random.key(5), 4)
         with float64():
             assert over_threads(jax.jit(draw_with), keys, (2.0,), 2).dtype == np.float64
-        total = lambda scale: jnp.sum(over_threads(draw_with, keys, (scale,), 2))  # noqa: E731
+
+        def total(scale):
+            return jnp.sum(over_threads(draw_with, keys, (scale,), 2))
+
         np.testing.assert_allclose(jax.grad(total)(2.0), total(1.0), rtol=1e-5)
         np.testing.assert_allclose(jax.jit(total)(2.0), total(2.0), rtol=1e-5)
 
@@ -384,7 +387,7 @@ class TestThreads:
         monkeypatch.setattr(mpfjax.filters, "num_processors", lambda: 3)
         keys = jax.random.split(jax.random.key(7), 5)
         filter = mpfjax.particle_filter(mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0), 32)
-        mean = lambda mixture: mixture.mean()  # noqa: E731
+        mean = mpfjax.ParticleMixture.mean
         runs = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean)
         for k in range(5):
             run = mpfjax.run_filter(keys[k], filter, OBSERVATIONS, mean)

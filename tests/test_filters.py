@@ -351,7 +351,9 @@ class TestGradients:
         filter = mpfjax.particle_filter(mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0), 16)
 
         def collected(scale):
-            collect = lambda mixture: scale * mixture.mean()  # noqa: E731
+            def collect(mixture):
+                return scale * mixture.mean()
+
             return jnp.sum(mpfjax.run_filter(key, filter, OBSERVATIONS, collect).collected)
 
         np.testing.assert_allclose(jax.grad(collected)(1.0), collected(1.0), rtol=1e-5)

@@ -23,7 +23,10 @@ class TestBesideOpenCV:
 
     def test_a_pixel_too_many_is_refused(self, tmp_path, capsys, monkeypatch):
         by_opencv = histograms.by_opencv
-        one_more = lambda *arguments: lambda: by_opencv(*arguments)() + 1  # noqa: E731
+
+        def one_more(*arguments):
+            return lambda: by_opencv(*arguments)() + 1
+
         monkeypatch.setattr(histograms, "by_opencv", one_more)
         assert histograms.main([*SMALL, "--boxes", "3", "--out", str(tmp_path)]) == 2
         assert "differ" in capsys.readouterr().err
