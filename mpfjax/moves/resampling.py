@@ -174,12 +174,12 @@ class Resample(AbstractRejuvenation):
         starts = jnp.where(before < total[:, None], starts, num_slots) + line.first_slots(slots)
         parents = line.places_of(count_starts(starts, num_particles), slots)
         if not all_are_due:
-            unmoved = spread(line.firsts, slots.components) + slots.ranks
+            unmoved = line.places_by_rank(slots.ranks, slots)
             parents = jnp.where(spread(due, slots.components), parents, unmoved)
         parents = stored(jnp.clip(parents, 0, num_particles - 1), num_particles)
         return _Drawn(line.particles_at(parents), slots, targets, line)
 
-    def _side_by_side(self, mixture: ParticleMixture, due: Bool[Array, " m"]) -> "_Line":
+    def _side_by_side(self, mixture: ParticleMixture, due: Bool[Array, " m"]) -> "_SideBySide":
         """One row of components, without particles that only a rounding error could draw.
 
         A weight may underflow to zero where its logarithm does not. Such a particle is left out of
@@ -199,7 +199,7 @@ class Resample(AbstractRejuvenation):
         counts = segment_counts(stands, mixture.component_indicators, m)
         slots = place_slots(counts, order.shape[0])
         weights = jnp.where(slots.filled, take(_padded(weights, 0.0), order), 0.0)
-        return _Line(weights[None], counts, slots.firsts, order, slots.components)
+        return _SideBySide(weights[None], counts, slots.firsts, order, slots.components)
 
     def _drawn_from(self, mixture: ParticleMixture) -> ParticleMixture:
         """The mixture whose weights the offspring are drawn in proportion to."""
@@ -222,7 +222,7 @@ class Resample(AbstractRejuvenation):
         counts, shares = line.counts, jnp.maximum(drawn.targets, 1)
         stretched = slots.ranks * spread(counts, slots.components)
         stretched //= spread(shares, slots.components)
-        places = jnp.clip(spread(line.firsts, slots.components) + stretched, 0, len(stretched) - 1)
+        places = jnp.clip(line.places_by_rank(stretched, slots), 0, len(stretched) - 1)
         particles, nearest = transport(
             mixture,
             line.particles_at(places),
@@ -241,7 +241,7 @@ class _Drawn(NamedTuple):
     parents: Int[Array, " n"]
     slots: Slots
     targets: Int[Array, " m"]  # how many slots each component has
-    line: "_Line"
+    line: "_AsTheyStand | _SideBySide"
 
 
 def _copies(mixture: ParticleMixture, drawn: _Drawn) -> ParticleMixture:
@@ -298,68 +298,95 @@ def _where(
     return redrawn.replace(log_weights=pick(redrawn.log_weights, copies.log_weights))
 
 
-class _Line(NamedTuple):
-    """The particles in line for their offspring, in rows of places.
+class _AsTheyStand(NamedTuple):
+    """The particles as they stand, in a row for each component, where only its own have a weight.
 
-    Either as they stand, in a row for each component, in which only its own have a weight; or in
-    one row, component by component, and empty places at the end. A row has p places, as many as
-    make whole blocks for the prefix sums.
+    A row has p places, as many as make whole blocks for the prefix sums.
     """
 
-    weights: Float[Array, "rows p"]  # within the component, zero at an empty place
+    weights: Float[Array, "m p"]  # within the component, zero at another's place and an empty one
     counts: Int[Array, " m"]
-    firsts: Int[Array, " m"]  # the place of each component's first particle in its row
-    order: Int[Array, " p"] | None = None  # which particle stands at each place of the one row
-    components: Int[Array, " p"] | None = None
 
-    def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, "rows places"]:
-        """At each place, or for each row, the value of the component."""
-        if self.components is None:
-            return values[:, None]
-        return spread(values, self.components)[None]
+    def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, "m 1"]:
+        """For each row the value of its component."""
+        return values[:, None]
 
-    def sums(self, values: Float[Array, "rows p"]) -> Float[Array, " m"]:
+    def sums(self, values: Float[Array, "m p"]) -> Float[Array, " m"]:
         """The sum over each component's places."""
-        if self.components is None:
-            return jnp.sum(values, axis=1)
-        return segment_sum(values[0], self.components, self.counts.shape[0])
+        return jnp.sum(values, axis=1)
 
-    def first_slots(self, slots: Slots) -> Int[Array, "rows 1"]:
+    def first_slots(self, slots: Slots) -> Int[Array, "m 1"]:
         """Where the slots of each row begin."""
-        if self.components is None:
-            return slots.firsts[:, None]
-        return jnp.zeros((1, 1), jnp.int32)
+        return slots.firsts[:, None]
 
-    def num_slots(self, targets: Int[Array, " m"], num_particles: int) -> Int[Array, "rows 1"]:
+    def num_slots(self, targets: Int[Array, " m"], num_particles: int) -> Int[Array, "m 1"]:
         """How many slots each row has."""
-        if self.components is None:
-            return targets[:, None]
-        return jnp.full((1, 1), num_particles, jnp.int32)
+        del num_particles
+        return targets[:, None]
 
     def places_of(self, parents: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
         """The place in its row of each slot's parent, counted over all rows."""
-        if self.components is None:
-            return parents - self.weights.shape[1] * slots.components
-        # Rounding of the prefix sums must not cross a border between components.
-        firsts = spread(self.firsts, slots.components)
-        return jnp.clip(parents, firsts, firsts + spread(self.counts, slots.components) - 1)
+        return parents - self.weights.shape[1] * slots.components
+
+    def places_by_rank(self, ranks: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
+        """The place of a rank in each slot's component, which is the only one."""
+        del slots
+        return ranks
 
     def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
         """Which particles stand at these places."""
-        return places if self.order is None else take(self.order, places)
+        return places
 
 
-def _as_they_stand(mixture: ParticleMixture) -> _Line:
+class _SideBySide(NamedTuple):
+    """The particles in one row of p places, component by component, and empty places at the end."""
+
+    weights: Float[Array, "1 p"]  # within the component, zero at an empty place
+    counts: Int[Array, " m"]
+    firsts: Int[Array, " m"]  # the place of each component's first particle
+    order: Int[Array, " p"]  # which particle stands at each place
+    components: Int[Array, " p"]
+
+    def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, "1 p"]:
+        """At each place the value of its component."""
+        return spread(values, self.components)[None]
+
+    def sums(self, values: Float[Array, "1 p"]) -> Float[Array, " m"]:
+        """The sum over each component's places."""
+        return segment_sum(values[0], self.components, self.counts.shape[0])
+
+    def first_slots(self, slots: Slots) -> Int[Array, "1 1"]:
+        """Where the slots of the row begin."""
+        del slots
+        return jnp.zeros((1, 1), jnp.int32)
+
+    def num_slots(self, targets: Int[Array, " m"], num_particles: int) -> Int[Array, "1 1"]:
+        """How many slots the row has."""
+        del targets
+        return jnp.full((1, 1), num_particles, jnp.int32)
+
+    def places_of(self, parents: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
+        """The place of each slot's parent; rounding must not cross a border of components."""
+        firsts = spread(self.firsts, slots.components)
+        return jnp.clip(parents, firsts, firsts + spread(self.counts, slots.components) - 1)
+
+    def places_by_rank(self, ranks: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
+        """The place of a rank in each slot's component."""
+        return spread(self.firsts, slots.components) + ranks
+
+    def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
+        """Which particles stand at these places."""
+        return take(self.order, places)
+
+
+def _as_they_stand(mixture: ParticleMixture) -> _AsTheyStand:
     m = mixture.num_components
     is_member = mixture.component_indicators[None] == jnp.arange(m, dtype=jnp.int32)[:, None]
     weights = mixture.component_weights[None]
     if m > 1:
         weights = jnp.where(is_member, weights, 0.0)
-    return _Line(
-        weights=jax.vmap(lambda row: _padded(row, 0.0))(weights),
-        counts=mixture.component_counts,
-        firsts=jnp.zeros(m, jnp.int32),
-    )
+    padded = jax.vmap(lambda row: _padded(row, 0.0))(weights)
+    return _AsTheyStand(padded, mixture.component_counts)
 
 
 def _padded(values: Array, fill: float) -> Array:
