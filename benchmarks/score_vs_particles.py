@@ -29,6 +29,7 @@ LOW, HIGH = -2.5, 2.5
 GRID = (-4.0, 4.0, 1601)
 TYPICAL_NUM_PARTICLES = 100
 SEEDS_AT_ONCE = 100
+MOST_SHARED_SLOTS = 1000
 
 LABELS = {
     "pf": "particle filter",
@@ -38,6 +39,7 @@ LABELS = {
     "gm_mpf": "Gaussian mixture particle filter",
 }
 OF_THE_PAPER = ["pf", "mpf", "guided_mpf"]
+OF_PARTICLES = ("positions", "occupied", "component_indicators")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -65,7 +67,13 @@ def run(options: argparse.Namespace) -> None:
     study = study_of(options, model, truth, observations)
     try:
         # One cell compiles while the one before it runs.
-        cells = mpfjax.run_study(study, unfinished, seeds_at_once=SEEDS_AT_ONCE, cells_at_once=2)
+        cells = mpfjax.run_study(
+            study,
+            unfinished,
+            seeds_at_once=SEEDS_AT_ONCE,
+            cells_at_once=2,
+            slots=shared_slots(options.particles),
+        )
     except KeyboardInterrupt:
         write(mpfjax.read_study(unfinished))
         raise
@@ -170,10 +178,12 @@ def study_of(
     """All seeds of every filter at every size; particles are kept at the size of figure 1 only."""
 
     def measure(run: mpfjax.FilterRun) -> dict[str, Array]:
-        kept = dict(run.collected)
-        kept["both"] = both_represented(kept["positions"], kept["occupied"], truth)
-        if kept["positions"].shape[-1] != typical_size(options.particles):
-            kept = {k: kept[k] for k in ("both", "weight", "components", "mass_above")}
+        particles = {k: run.collected[k] for k in OF_PARTICLES}
+        kept = {k: values for k, values in run.collected.items() if k not in OF_PARTICLES}
+        kept["both"] = both_represented(particles["positions"], particles["occupied"], truth)
+        size = num_particles(run.final)
+        if size == typical_size(options.particles):
+            kept |= {k: values[..., :size] for k, values in particles.items()}
         return kept
 
     return mpfjax.Study(
@@ -214,6 +224,17 @@ def summarise(
         "weight_std": float(weights.std()),
         "mode_mass_error": float(np.sqrt((error**2).mean())),
     }
+
+
+def num_particles(runs: mpfjax.ParticleMixture) -> int:
+    """N of these runs, which may have more slots."""
+    return runs.log_weights.shape[-1] if runs.limit is None else int(runs.limit[0])
+
+
+def shared_slots(sizes: list[int]) -> int | None:
+    """In how many slots all small filters run, so that their sizes need not compile one by one."""
+    small = [n for n in sizes if n <= MOST_SHARED_SLOTS]
+    return max(small) if len(small) > 1 else None
 
 
 def typical_size(sizes: list[int]) -> int:

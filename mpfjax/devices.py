@@ -20,7 +20,7 @@ from jax.core import Tracer
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from mpfjax.operations import log_sum_exp
 
@@ -164,27 +164,25 @@ def is_traced(tree: PyTree) -> bool:
 def over_devices(
     run: Callable[..., PyTree],
     run_on_one: Callable[..., PyTree],
-    keys: Key[Array, " k"],
+    inputs: PyTree,
     arguments: tuple[PyTree, ...],
     devices: list[Any] | None,
 ) -> PyTree:
-    """`run(keys, *arguments)` with the keys dealt to the devices in blocks of equal size.
+    """`run(inputs, *arguments)` with the inputs dealt to the devices in blocks of equal size.
 
-    Every leaf of the result has a leading axis k, like the keys, and lies on the first device, or
-    on the first one of each process. The last key is repeated where the number of devices does
-    not divide k, and its results are dropped. Devices tell each other only what `run` has them
-    tell. `run_on_one`, compiled already, does all on one device; None leaves which to JAX.
+    Every leaf of the result has a leading axis k, like the inputs, and lies on the first device,
+    or on the first one of each process. The last input is repeated where the number of devices
+    does not divide k, and its results are dropped. Devices tell each other only what `run` has
+    them tell. `run_on_one`, compiled already, does all on one device; None leaves which to JAX.
     """
-    traced = is_traced((keys, arguments))
+    traced = is_traced((inputs, arguments))
     if devices is None or len(devices) == 1:
         if not traced and devices not in (None, jax.devices()[:1]):
-            keys, arguments = _placed((keys, arguments), devices[0])
-        return run_on_one(keys, *arguments)
-    num_keys = keys.shape[0]
-    padding = -num_keys % len(devices)
-    padded = keys
-    if padding:
-        padded = keys[np.minimum(np.arange(num_keys + padding), num_keys - 1)]
+            inputs, arguments = _placed((inputs, arguments), devices[0])
+        return run_on_one(inputs, *arguments)
+    num_inputs = _length(inputs)
+    padding = -num_inputs % len(devices)
+    padded = _filled_up(inputs, num_inputs + padding)
     mesh = Mesh(np.array(devices), (DEVICE_AXIS,))
     if not traced:
         padded = _placed(padded, NamedSharding(mesh, P(DEVICE_AXIS)))
@@ -193,33 +191,48 @@ def over_devices(
     if not traced:
         result = _gathered(result, mesh)
     if padding:
-        result = jax.tree.map(lambda leaf: leaf[:num_keys], result)
+        result = jax.tree.map(lambda leaf: leaf[:num_inputs], result)
     return result
 
 
 def over_threads(
     run: Callable[..., PyTree],
-    keys: Key[Array, " k"],
+    inputs: PyTree,
     arguments: tuple[PyTree, ...],
     num_threads: int,
 ) -> PyTree:
-    """`run(keys, *arguments)` with the keys dealt to threads of this process in equal blocks.
+    """`run(inputs, *arguments)` with the inputs dealt to threads of this process in equal blocks.
 
     For programs of many short operations, which a CPU device does mostly one after the other.
     `run` is compiled, or compiles once, whichever thread comes first. Without threads where they
     would not see what this thread does: under a transformation of the caller's, or a setting of
     JAX that holds for this thread alone.
     """
-    num_keys = keys.shape[0]
-    size = -(-num_keys // num_threads)
-    if size == num_keys or not _is_like_any_thread():
-        return run(keys, *arguments)
-    count = -(-num_keys // size)
-    padded = keys[np.minimum(np.arange(count * size), num_keys - 1)]
+    num_inputs = _length(inputs)
+    size = -(-num_inputs // num_threads)
+    if size == num_inputs or not _is_like_any_thread():
+        return run(inputs, *arguments)
+    count = -(-num_inputs // size)
+    padded = _filled_up(inputs, count * size)
     threads = _threads()
-    blocks = [padded[i * size : (i + 1) * size] for i in range(count)]
+    blocks = [
+        jax.tree.map(lambda leaf, i=i: leaf[i * size : (i + 1) * size], padded)
+        for i in range(count)
+    ]
     runs = list(threads.map(lambda block: jax.block_until_ready(run(block, *arguments)), blocks))
-    return _end_to_end(runs, num_keys)
+    return _end_to_end(runs, num_inputs)
+
+
+def _length(inputs: PyTree) -> int:
+    return jax.tree.leaves(inputs)[0].shape[0]
+
+
+def _filled_up(inputs: PyTree, length: int) -> PyTree:
+    """As many inputs, of which the last is repeated."""
+    last = _length(inputs) - 1
+    if length == last + 1:
+        return inputs
+    return jax.tree.map(lambda leaf: leaf[np.minimum(np.arange(length), last)], inputs)
 
 
 def num_processors() -> int:
@@ -252,11 +265,11 @@ def _end_to_end(runs: list[PyTree], length: int) -> PyTree:
 
 
 @jit_on_wide_vectors
-def _spread(run, keys, arguments, mesh):
+def _spread(run, inputs, arguments, mesh):
     arrays, rest = eqx.partition(arguments, eqx.is_array)
 
-    def on_each(keys: Key[Array, " k"], arrays: PyTree) -> PyTree:
-        return run(keys, *eqx.combine(arrays, rest))
+    def on_each(inputs: PyTree, arrays: PyTree) -> PyTree:
+        return run(inputs, *eqx.combine(arrays, rest))
 
     # The check of what varies over devices would ask every loop in a user's model to declare it.
     mapped = jax.shard_map(
@@ -266,7 +279,7 @@ def _spread(run, keys, arguments, mesh):
         out_specs=P(DEVICE_AXIS),
         check_vma=False,
     )
-    return mapped(keys, arrays)
+    return mapped(inputs, arrays)
 
 
 def num_islands() -> int:

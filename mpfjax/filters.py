@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.devices import (
     choose_devices,
@@ -74,6 +74,15 @@ _KEEP_MASS = (AbstractRegrouping, AbstractRejuvenation, Exchange)
 _IN_NEAR_CACHE, _IN_CACHE = 2**18, 2**19
 _WORTH_A_THREAD = 2**12  # particles, of all its runs
 _BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
+
+
+class _Start(NamedTuple):
+    """Where a run starts: its key, and x_0 where that was drawn before."""
+
+    key: Key[Array, "*seeds"]
+    particles: PyTree = None
+    """as many as there are slots, of which those after the first `num_particles` are empty."""
+    num_particles: Int[Array, "*seeds"] | None = None
 
 
 class _Tied(eqx.Module):
@@ -144,20 +153,19 @@ class Filter(eqx.Module):
 
     def init(self, key: Key[Array, ""]) -> ParticleMixture:
         """The mixture at time 0: draws of x_0 with equal weights, grouped by the initial moves."""
-        keys = _split(key, 1 + len(self._initial_moves))
-        particles = self.model.sample_initial(keys[0], self.num_particles)
-        for leaf in jax.tree.leaves(particles):
-            if jnp.shape(leaf)[:1] != (self.num_particles,):
-                raise ValueError(
-                    f"model: {type(self.model).__name__}.sample_initial returned a leaf of shape"
-                    f" {jnp.shape(leaf)}; its leading axis is not num_particles,"
-                    f" {self.num_particles}"
-                )
+        return self._init(_Start(key))
+
+    def _init(self, start: _Start) -> ParticleMixture:
+        keys = _split(start.key, 1 + len(self._initial_moves))
+        particles = start.particles
+        if particles is None:
+            particles = _sample_initial(keys[0], self.model, self.num_particles)
         memory = {}
         for move in self.moves:
             if isinstance(move, AbstractMove):
                 memory |= move.initial_memory(self.num_components)
-        mixture = single_component(particles, self.num_components).replace(memory=memory)
+        mixture = single_component(particles, self.num_components, start.num_particles)
+        mixture = mixture.replace(memory=memory)
         for move_key, move in zip(keys[1:], _untie(self._initial_moves, self.model), strict=True):
             mixture = move(move_key, mixture)
         return mixture
@@ -264,6 +272,7 @@ def monte_carlo(
     *,
     missing: str = "error",
     devices: int | Sequence[Any] | None = None,
+    slots: int | None = None,
 ) -> FilterRun:
     """Run a filter once for each key, all on the same observations, under `vmap`.
 
@@ -276,16 +285,24 @@ def monte_carlo(
       first one, and each process has all of it. Under the caller's own jit, grad or vmap None is
       one device. One device that is a CPU is kept busy by a thread for each processor, if there
       is enough to do.
+    - `slots`: keep the particles in so many slots, of which all but N stay empty. Filters that
+      differ in N alone then share one compiled program, at the cost of as many particles as there
+      are slots. The particles are those of a run without, up to rounding, and `collect` sees the
+      empty slots as well.
 
-    Raises `ValueError` for more devices than there are.
+    Raises `ValueError` for more devices than there are, fewer slots than particles, and moves
+    that fill every slot, `PropagateIndependently` and `PropagateInClusters`.
     """
     if jnp.ndim(keys) != 1 or keys.shape[0] < 1:
         raise ValueError(f"keys: shape {jnp.shape(keys)} is not that of one key a run, (seeds,)")
     present = present_steps(observations, missing)
+    starts = _Start(keys)
+    if slots is not None:
+        starts, filter = _in_slots(keys, filter, slots)
     arguments = (filter, observations, present, collect)
-    leave_to_caller = devices is None and is_traced((keys, arguments))
+    leave_to_caller = devices is None and is_traced((starts, arguments))
     chosen = None if leave_to_caller else choose_devices(devices)
-    return checked(over_devices(_run_each, _run_on_threads, keys, arguments, chosen))
+    return checked(over_devices(_run_each, _run_on_threads, starts, arguments, chosen))
 
 
 def particle_filter(
@@ -575,14 +592,41 @@ def _run(key, filter, observations, present, collect):
     return scan_filter(key, filter, observations, present, collect)
 
 
-def _run_each(keys, filter, observations, present, collect):
-    run_together = jax.vmap(lambda key: scan_filter(key, filter, observations, present, collect))
-    num_keys = keys.shape[0]
-    size = _group_size(num_keys, filter.num_particles)
-    if size == num_keys:
-        return run_together(keys)
-    runs = jax.lax.map(run_together, keys.reshape(-1, size))
-    return jax.tree.map(lambda leaf: leaf.reshape(num_keys, *leaf.shape[2:]), runs)
+def _in_slots(keys: Key[Array, " seeds"], filter: Filter, slots: int) -> tuple[_Start, Filter]:
+    """Where the runs start, and the filter, both of so many slots whatever N is."""
+    num_particles = filter.num_particles
+    if not isinstance(slots, int | np.integer) or slots < num_particles:
+        raise ValueError(f"slots: {slots} is no whole number of at least N, {num_particles}")
+    # How a model draws may depend on N: stratified draws do. So this is a program of its own.
+    particles = _sample_each(keys, filter.model, num_particles, int(slots))
+    limits = jnp.full(keys.shape, num_particles, jnp.int32)
+    initial_moves = _untie(filter._initial_moves, filter.model)
+    filter = Filter(filter.model, filter.moves, int(slots), filter.num_components, initial_moves)
+    return _Start(keys, particles, limits), filter
+
+
+@jit_on_wide_vectors
+def _sample_each(keys, model, num_particles, slots):
+    """x_0 of each run; the slots that stay empty hold one of its states as well."""
+
+    def sample(key: Key[Array, ""]) -> PyTree:
+        key_initial = _split(_split(key, 2)[0], 1)[0]
+        particles = _sample_initial(key_initial, model, num_particles)
+        index = np.minimum(np.arange(slots), num_particles - 1)
+        return jax.tree.map(lambda leaf: leaf[index], particles)
+
+    return jax.vmap(sample)(keys)
+
+
+def _run_each(starts, filter, observations, present, collect):
+    run_together = jax.vmap(lambda start: _scan(start, filter, observations, present, collect))
+    num_runs = starts.key.shape[0]
+    size = _group_size(num_runs, filter.num_particles)
+    if size == num_runs:
+        return run_together(starts)
+    in_groups = jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), starts)
+    runs = jax.lax.map(run_together, in_groups)
+    return jax.tree.map(lambda leaf: leaf.reshape(num_runs, *leaf.shape[2:]), runs)
 
 
 def _group_size(num_runs: int, num_particles: int) -> int:
@@ -596,13 +640,14 @@ def _group_size(num_runs: int, num_particles: int) -> int:
 _run_all = jit_on_wide_vectors(_run_each)
 
 
-def _run_on_threads(keys, filter, observations, present, collect):
+def _run_on_threads(starts, filter, observations, present, collect):
     """All runs on one device, which on a CPU is kept busy by several threads."""
-    num_threads = min(num_processors(), keys.shape[0] * filter.num_particles // _WORTH_A_THREAD)
+    num_particles = starts.key.shape[0] * filter.num_particles
+    num_threads = min(num_processors(), num_particles // _WORTH_A_THREAD)
     keeps_all = collect is None  # of which there had better not be two copies for a while
     if num_threads < 2 or keeps_all or jax.default_backend() != "cpu":
-        return _run_all(keys, filter, observations, present, collect)
-    return over_threads(_run_all, keys, (filter, observations, present, collect), num_threads)
+        return _run_all(starts, filter, observations, present, collect)
+    return over_threads(_run_all, starts, (filter, observations, present, collect), num_threads)
 
 
 def scan_filter(
@@ -613,7 +658,17 @@ def scan_filter(
     collect: Callable[[ParticleMixture], PyTree] | None,
 ) -> FilterRun:
     """`run_filter` under the caller's jit, unchecked; `present` is what `present_steps` gives."""
-    key_initial, key_steps = _split(key, 2)
+    return _scan(_Start(key), filter, observations, present, collect)
+
+
+def _scan(
+    start: _Start,
+    filter: Filter,
+    observations: PyTree,
+    present: Bool[Array, " t"] | None,
+    collect: Callable[[ParticleMixture], PyTree] | None,
+) -> FilterRun:
+    key_initial, key_steps = _split(start.key, 2)
     length = jax.tree.leaves(observations)[0].shape[0]
 
     def advance(mixture: ParticleMixture, inputs: PyTree) -> tuple[ParticleMixture, PyTree]:
@@ -630,7 +685,8 @@ def scan_filter(
         return mixture, (kept, info.log_likelihood_increment, info.resampled, info.degenerate)
 
     inputs = (jax.random.split(key_steps, length), observations, present)
-    final, outputs = jax.lax.scan(advance, _share_of_islands(filter.init(key_initial)), inputs)
+    initial = filter._init(start._replace(key=key_initial))
+    final, outputs = jax.lax.scan(advance, _share_of_islands(initial), inputs)
     collected, increments, resampled, degenerate = outputs
     return FilterRun(
         log_marginal_likelihood=jnp.sum(increments),
@@ -640,6 +696,20 @@ def scan_filter(
         resampled=resampled,
         degenerate=degenerate,
     )
+
+
+def _sample_initial(
+    key: Key[Array, ""], model: AbstractStateSpaceModel, num_particles: int
+) -> PyTree:
+    """The model's x_0; raises for leaves of another length."""
+    particles = model.sample_initial(key, num_particles)
+    for leaf in jax.tree.leaves(particles):
+        if jnp.shape(leaf)[:1] != (num_particles,):
+            raise ValueError(
+                f"model: {type(model).__name__}.sample_initial returned a leaf of shape"
+                f" {jnp.shape(leaf)}; its leading axis is not num_particles, {num_particles}"
+            )
+    return particles
 
 
 def _normalise(

@@ -33,6 +33,7 @@ class ParticleMixture(eqx.Module):
     - `ancestor_indices`: shape (n,), which slot of the previous step's mixture each came from.
     - `num_components`: M, the most components there can be; static.
     - `memory`: what moves with a memory carry from step to step, by the move's name.
+    - `limit`: how many slots may be filled, where that is fewer than there are; None is all.
     """
 
     particles: PyTree
@@ -41,11 +42,17 @@ class ParticleMixture(eqx.Module):
     ancestor_indices: Int[Array, " n"]
     num_components: int = eqx.field(static=True)
     memory: dict[str, PyTree] = eqx.field(default_factory=dict)
+    limit: Int[Array, ""] | None = None
 
     @property
     def num_particles(self) -> int:
         """N, the number of slots, filled or not."""
         return self.log_weights.shape[0]
+
+    @property
+    def room(self) -> int | Int[Array, ""]:
+        """How many slots may be filled."""
+        return self.num_particles if self.limit is None else self.limit
 
     @property
     def occupied(self) -> Bool[Array, " n"]:
@@ -149,15 +156,27 @@ class ParticleMixture(eqx.Module):
         )
 
 
-def single_component(particles: PyTree, num_components: int = 1) -> ParticleMixture:
-    """Equally weighted particles, all in component 0, each its own ancestor."""
-    num_particles = jax.tree.leaves(particles)[0].shape[0]
+def single_component(
+    particles: PyTree, num_components: int = 1, limit: Int[Array, ""] | None = None
+) -> ParticleMixture:
+    """Equally weighted particles, all in component 0, each its own ancestor.
+
+    With a `limit` only the first so many are particles, and the slots of the rest are empty.
+    """
+    num_slots = jax.tree.leaves(particles)[0].shape[0]
+    slot = jnp.arange(num_slots, dtype=jnp.int32)
+    if limit is None:
+        log_weights = jnp.full(num_slots, -jnp.log(num_slots), default_float())
+    else:
+        log_share = -jnp.log(limit.astype(default_float()))
+        log_weights = jnp.where(slot < limit, log_share, -jnp.inf)
     return ParticleMixture(
         particles=particles,
-        log_weights=jnp.full(num_particles, -jnp.log(num_particles), default_float()),
-        component_indicators=jnp.zeros(num_particles, jnp.int32),
-        ancestor_indices=jnp.arange(num_particles, dtype=jnp.int32),
+        log_weights=log_weights,
+        component_indicators=jnp.zeros(num_slots, jnp.int32),
+        ancestor_indices=slot,
         num_components=num_components,
+        limit=limit,
     )
 
 

@@ -89,6 +89,7 @@ def run_study(
     *,
     seeds_at_once: int | None = None,
     cells_at_once: int = 1,
+    slots: int | None = None,
 ) -> list[dict[str, Any]]:
     """Run every cell of a study, and go on where an earlier call was broken off or killed.
 
@@ -105,6 +106,9 @@ def run_study(
     - `seeds_at_once`: how many seeds share one `vmap`, where memory is short; None is all.
     - `cells_at_once`: with 2, one cell compiles while another runs; a kill may lose both. Several
       processes, which must meet in the same cell, run one at a time.
+    - `slots`: filters of at most so many particles run within so many slots, as `monte_carlo` has
+      it, so that a filter compiles once for all these N. For small filters, of which the study
+      compiles for longer than it runs; with a filter that fills every slot it is an error.
 
     Raises `ValueError`, before anything runs, for a `directory` of another study, naming what
     differs, and for files in it that are cut off: delete those, and only their cells are run
@@ -113,7 +117,10 @@ def run_study(
     names: take a new directory after changing code. Several processes share one directory, which
     the first writes. Use it where a loop over `monte_carlo` would take long.
     """
-    for name, number in (("seeds_at_once", seeds_at_once), ("cells_at_once", cells_at_once)):
+    at_least_one = {
+        "seeds_at_once": seeds_at_once, "cells_at_once": cells_at_once, "slots": slots
+    }  # fmt: skip
+    for name, number in at_least_one.items():
         if number is not None and number < 1:
             raise ValueError(f"{name}: {number} is less than 1")
     directory = Path(directory)
@@ -126,7 +133,7 @@ def run_study(
 
     def finish(cell: _Cell) -> str:
         try:
-            measured = _measure(study, cell, seeds_at_once)
+            measured = _measure(study, cell, seeds_at_once, slots)
         except Exception as error:
             error.add_note(f"in the cell {cell.description}")
             raise
@@ -289,8 +296,12 @@ def _finished(directory: Path, manifest: dict[str, Any]) -> dict[str, dict[str, 
     return results
 
 
-def _measure(study: Study, cell: _Cell, seeds_at_once: int | None) -> dict[str, np.ndarray]:
+def _measure(
+    study: Study, cell: _Cell, seeds_at_once: int | None, slots: int | None
+) -> dict[str, np.ndarray]:
     """All seeds of one cell, a bounded number of them at once."""
+    if slots is not None and cell.filter.num_particles > slots:
+        slots = None
     num_seeds = study.keys.shape[0]
     size = num_seeds if seeds_at_once is None else min(seeds_at_once, num_seeds)
     parts = []
@@ -298,7 +309,12 @@ def _measure(study: Study, cell: _Cell, seeds_at_once: int | None) -> dict[str, 
         # The last batch is filled up, so that it does not compile anew.
         batch = study.keys[np.clip(np.arange(start, start + size), 0, num_seeds - 1)]
         run = monte_carlo(
-            batch, cell.filter, study.observations, study.collect, missing=study.missing
+            batch,
+            cell.filter,
+            study.observations,
+            study.collect,
+            missing=study.missing,
+            slots=slots,
         )
         measured = {name: np.asarray(array) for name, array in study.measure(run).items()}
         for name, array in measured.items():

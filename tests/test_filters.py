@@ -14,6 +14,7 @@ from tests.user_models import (
     BLINDED,
     BROKEN,
     DRIFT_AS_LINEAR_GAUSSIAN,
+    TRACES,
     DriftOfOne,
     TrickyQuadraticModel,
 )
@@ -35,6 +36,10 @@ LINEAR_2D = mpfjax.LinearGaussianModel(
 
 def mean(mixture):
     return mixture.mean()
+
+
+def occupied_particles(mixture):
+    return mixture.particles, mixture.occupied
 
 
 def assert_same(run, other, **tolerance):
@@ -219,6 +224,68 @@ class TestMissing:
         )
         ratios = np.exp(run.log_marginal_likelihood - exact)
         assert abs(ratios.mean() - 1) < 4 * ratios.std() / np.sqrt(200)
+
+
+class TestSlots:
+    """A filter of N particles among more slots draws what it draws in N slots."""
+
+    @pytest.mark.parametrize(
+        "chain",
+        [
+            "pf adaptive",
+            "mpf",
+            "mpf fixed number",
+            "random labels, residual",
+            "gaussian mixture",
+            "exclusion",
+            "ps adaptive, random order",
+            "dps",
+        ],
+    )
+    def test_that_stay_empty_change_nothing(self, chain):
+        keys = jax.random.split(jax.random.key(20), 6)
+        with float64():
+            filter = CHAINS[chain](mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0))
+            observations = jnp.asarray(np.asarray(OBSERVATIONS), jnp.float64)
+            own = mpfjax.monte_carlo(keys, filter, observations, occupied_particles)
+            shared = mpfjax.monte_carlo(keys, filter, observations, occupied_particles, slots=70)
+        np.testing.assert_allclose(
+            shared.log_likelihood_increments, own.log_likelihood_increments, rtol=1e-9, atol=1e-9
+        )
+        n = filter.num_particles
+        particles, occupied = shared.collected
+        assert occupied.shape[-1] == 70
+        assert not occupied[..., n:].any()
+        np.testing.assert_array_equal(occupied[..., :n], own.collected[1])
+        np.testing.assert_allclose(
+            particles[occupied], own.collected[0][own.collected[1]], rtol=1e-9, atol=1e-9
+        )
+
+    def test_are_one_program_whatever_the_number_of_particles(self):
+        keys = jax.random.split(jax.random.key(21), 3)
+
+        def evidence(num_particles):
+            model = TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0)
+            filter = mpfjax.mixture_particle_filter(model, num_particles, 2)
+            run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean, slots=61)
+            return run.log_marginal_likelihood
+
+        evidence(20)
+        traced = len(TRACES)
+        others = [evidence(n) for n in (33, 61)]
+        assert len(TRACES) == traced
+        assert np.isfinite(others).all()
+
+    def test_fewer_than_particles_are_an_error(self):
+        keys = jax.random.split(jax.random.key(22), 2)
+        with pytest.raises(ValueError, match=r"slots: 47 is .* N, 48"):
+            mpfjax.monte_carlo(keys, CHAINS["pf"](QUADRATIC), OBSERVATIONS, slots=47)
+
+    @pytest.mark.parametrize("chain", ["independent filters", "clusters"])
+    def test_are_an_error_for_moves_that_fill_them_all(self, chain):
+        keys = jax.random.split(jax.random.key(23), 2)
+        with pytest.raises(ValueError, match=r"slots: Propagate\w+ fills every slot"):
+            mpfjax.monte_carlo(keys, CHAINS[chain](QUADRATIC), OBSERVATIONS, slots=60)
 
 
 class TestBrokenLikelihoods:

@@ -114,6 +114,29 @@ class TestResults:
         mpfjax.run_study(small_study(4, filters={"pf": tricky}), tmp_path / "two", seeds_at_once=3)
         assert len(TRACES) == before
 
+    def test_of_many_sizes_compile_once_within_shared_slots(self, tmp_path):
+        def tricky(num_particles, noise):
+            model = TrickyQuadraticModel(0.3, noise, -2.0, 2.0)
+            return mpfjax.particle_filter(model, num_particles)
+
+        def one(sizes):
+            return small_study(1, filters={"pf": tricky}, num_particles=sizes)
+
+        mpfjax.run_study(one([5]), tmp_path / "one", slots=9)
+        before = len(TRACES)
+        mpfjax.run_study(one([4, 7, 9]), tmp_path / "two", slots=9)
+        assert len(TRACES) == before
+        mpfjax.run_study(one([4, 11]), tmp_path / "three", slots=9)
+        assert len(TRACES) > before  # eleven do not fit
+        results = studies.read_study(tmp_path / "three")
+        alone = mpfjax.run_study(one([4, 11]), tmp_path / "four")
+        for cell, same in zip(results, alone, strict=True):
+            np.testing.assert_allclose(cell["evidence"], same["evidence"], rtol=1e-4)
+
+    def test_slots_below_one_are_an_error(self, tmp_path):
+        with pytest.raises(ValueError, match="slots: 0 is less than 1"):
+            mpfjax.run_study(small_study(1), tmp_path, slots=0)
+
 
 class TestBrokenOff:
     @pytest.mark.parametrize("cells_at_once", [1, 2])

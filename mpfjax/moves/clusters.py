@@ -14,6 +14,7 @@ from mpfjax.models.base import require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling import Resample
+from mpfjax.moves.slots import require_all_slots
 from mpfjax.operations import default_float, draw_columns, take
 
 STARTS = ("apart", "together")
@@ -123,6 +124,7 @@ class PropagateInClusters(AbstractPropagation):
         """One step of every cluster's filter, those that meet merged before."""
         if mixture.num_components != 1:
             raise ValueError(f"mixture: {mixture.num_components} components, not one")
+        require_all_slots(mixture, "PropagateInClusters")
         num_objects = self.model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = jax.random.split(key, 2 * num_objects + 2)

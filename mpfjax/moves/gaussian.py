@@ -74,9 +74,7 @@ class GaussianRegeneration(AbstractRejuvenation):
     def _vacated(self, mixture: ParticleMixture) -> ParticleMixture:
         """The slots dealt anew, each holding its component's heaviest particle."""
         m, counts = mixture.num_components, mixture.component_counts
-        targets = deal_slots(
-            counts, counts > 0, mixture.num_particles, self.particles_per_component
-        )
+        targets = deal_slots(counts, counts > 0, mixture, self.particles_per_component)
         slots = place_slots(targets, mixture.num_particles)
         shares = jnp.maximum(targets, 1).astype(mixture.log_weights.dtype)
         log_weights = spread(mixture.log_mixture_weights - jnp.log(shares), slots.components)

@@ -9,6 +9,7 @@ from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling import Resample
+from mpfjax.moves.slots import require_all_slots
 
 
 class PropagateIndependently(AbstractPropagation):
@@ -44,6 +45,7 @@ class PropagateIndependently(AbstractPropagation):
         """One step of every object's filter."""
         if mixture.num_components != 1:
             raise ValueError(f"mixture: {mixture.num_components} components, not one")
+        require_all_slots(mixture, "PropagateIndependently")
         num_objects = self.model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = jax.random.split(key, 2 * num_objects)

@@ -160,7 +160,7 @@ class Resample(AbstractRejuvenation):
         as_they_stand &= self.sort_by is None
         as_they_stand &= self.gradient != "ot"  # which needs places without gaps
         line = _as_they_stand(mixture) if as_they_stand else self._side_by_side(mixture, due)
-        targets = deal_slots(line.counts, due, num_particles, self.particles_per_component)
+        targets = deal_slots(line.counts, due, mixture, self.particles_per_component)
         if as_they_stand and num_components == 1:
             # What is not redrawn keeps its place, and there may be empty slots before it.
             targets = jnp.where(due, targets, num_particles)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from mpfjax.mixture import ParticleMixture
 from mpfjax.operations import segments_in_order, spread, stored
 
 
@@ -20,24 +21,26 @@ class Slots(NamedTuple):
 def deal_slots(
     counts: Int[Array, " m"],
     due: Bool[Array, " m"],
-    num_particles: int,
+    mixture: ParticleMixture,
     particles_per_component: int | None,
 ) -> Int[Array, " m"]:
     """How many slots each component gets.
 
-    Those that are not due keep what they have; the others share the rest of the slots equally, or
-    get `particles_per_component` each where that is a number.
+    Those that are not due keep what they have, `counts`; the others share the rest of the slots
+    that may be filled equally, or get `particles_per_component` each where that is a number.
     """
+    room, num_slots = mixture.room, mixture.num_particles
     if particles_per_component is not None:
-        return jnp.where(counts > 0, min(particles_per_component, num_particles), 0)
+        share = jnp.asarray(min(particles_per_component, num_slots), jnp.int32)
+        return jnp.where(counts > 0, share, 0)
     kept = jnp.where(due, 0, counts)
     if counts.shape[0] == 1:
-        return jnp.where(due, num_particles, kept)
-    pool = num_particles - jnp.sum(kept, dtype=jnp.int32)
+        return jnp.where(due, room, kept)
+    pool = room - jnp.sum(kept, dtype=jnp.int32)
     sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
     rank = jnp.cumsum(due.astype(jnp.int32)) - 1
     share = pool // sharers + (rank < pool % sharers).astype(jnp.int32)
-    return stored(jnp.where(due, share, kept), num_particles + 1)
+    return stored(jnp.where(due, share, kept), num_slots + 1)
 
 
 def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:
@@ -51,6 +54,12 @@ def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:
         firsts=firsts,
         filled=slot < jnp.sum(targets, dtype=jnp.int32),
     )
+
+
+def require_all_slots(mixture: ParticleMixture, who: str) -> None:
+    """Raise a `ValueError` where some slots must stay empty."""
+    if mixture.limit is not None:
+        raise ValueError(f"slots: {who} fills every slot, and cannot leave some of them empty")
 
 
 def check_particles_per_component(value: int | None) -> None:
