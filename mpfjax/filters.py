@@ -70,8 +70,10 @@ class FilterRun(eqx.Module):
 
 # Moves that leave the total mass as it is, so that there is nothing to normalise.
 _KEEP_MASS = (AbstractRegrouping, AbstractRejuvenation, Exchange)
-# Particles, of a megabyte and two for every number that one has: what a CPU's caches hold.
-_IN_NEAR_CACHE, _IN_CACHE = 2**18, 2**19
+# Particles, times the components that have a row of them each: what a CPU's caches hold of all that
+# a step makes of them.
+_IN_NEAR_CACHE, _IN_CACHE = 2**15, 2**17
+_MOST_ROWS = 4
 _WORTH_A_THREAD = 2**12  # particles, of all its runs
 _BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
@@ -621,7 +623,7 @@ def _sample_each(keys, model, num_particles, slots):
 def _run_each(starts, filter, observations, present, collect):
     run_together = jax.vmap(lambda start: _scan(start, filter, observations, present, collect))
     num_runs = starts.key.shape[0]
-    size = _group_size(num_runs, filter.num_particles)
+    size = _group_size(num_runs, filter)
     if size == num_runs:
         return run_together(starts)
     in_groups = jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), starts)
@@ -629,12 +631,13 @@ def _run_each(starts, filter, observations, present, collect):
     return jax.tree.map(lambda leaf: leaf.reshape(num_runs, *leaf.shape[2:]), runs)
 
 
-def _group_size(num_runs: int, num_particles: int) -> int:
+def _group_size(num_runs: int, filter: Filter) -> int:
     """How many runs go on together: on a CPU no more than leaves their particles in its cache."""
-    if jax.default_backend() != "cpu" or num_runs * num_particles <= _IN_CACHE:
+    one_run = filter.num_particles * min(filter.num_components, _MOST_ROWS)
+    if jax.default_backend() != "cpu" or num_runs * one_run <= _IN_CACHE:
         return num_runs
     sizes = [size for size in range(1, num_runs + 1) if num_runs % size == 0]
-    return max(size for size in sizes if size == 1 or size * num_particles <= _IN_NEAR_CACHE)
+    return max(size for size in sizes if size == 1 or size * one_run <= _IN_NEAR_CACHE)
 
 
 _run_all = jit_on_wide_vectors(_run_each)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +11,12 @@ from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
 _FEW_SEGMENTS = 4
 _FEW_COLUMNS = 16
+_LANES = 8
 _BLOCKS = (32, 16, 8)
 _ONE_BLOCK = 128
 _EXACT_IN_FLOAT32 = 2**24
+_COUNTED_BLOCK = 32
+_MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # of which a block's counts are eight a particle
 
 
 def whole_blocks(n: int) -> int:
@@ -118,9 +122,8 @@ def count_places(
     """How many of the entries name each place, all of which must be in [0, num_places)."""
 
     def scatter(rows: Int[Array, "k n"]) -> Shaped[Array, "k num_places"]:
-        counts = jnp.zeros(rows.shape[0] * num_places, dtype)
-        counts = counts.at[_on_one_line(rows, num_places)].add(1, mode="promise_in_bounds")
-        return counts.reshape(-1, num_places)
+        line = jnp.zeros(rows.shape[0] * num_places, dtype).at[_on_one_line(rows, num_places)]
+        return line.add(1, mode="promise_in_bounds").reshape(-1, num_places)
 
     return _in_rows(scatter)(places)
 
@@ -142,9 +145,7 @@ def _on_one_line(rows: Int[Array, "k n"], num_places: int) -> UInt32[Array, " k*
     return _from_the_start((rows + firsts[:, None]).reshape(-1))
 
 
-def _in_rows(
-    scatter: Callable[[Array], Array],
-) -> Callable[[Array], Array]:
+def _in_rows(scatter: Callable[..., Array]) -> Callable[..., Array]:
     """A scatter over one row that under `vmap` scatters all rows at once, over one line of places.
 
     On a CPU that takes about half the time of a scatter with pairs of indices.
@@ -153,13 +154,16 @@ def _in_rows(
 
     @scatter_rows.def_vmap
     def _(
-        axis_size: int, in_batched: list[bool], rows: Int[Array, "b k n"]
+        axis_size: int, in_batched: list[bool], *arguments: Shaped[Array, "..."]
     ) -> tuple[Shaped[Array, "b k p"], bool]:
-        del in_batched
-        scattered = scatter_rows(rows.reshape(-1, rows.shape[-1]))
+        every = [
+            rows if is_batched else jnp.broadcast_to(rows, (axis_size, *rows.shape))
+            for rows, is_batched in zip(arguments, in_batched, strict=True)
+        ]
+        scattered = scatter_rows(*(rows.reshape(-1, rows.shape[-1]) for rows in every))
         return scattered.reshape(axis_size, -1, scattered.shape[-1]), True
 
-    return lambda row: scatter_rows(row[None])[0]
+    return lambda *arguments: scatter_rows(*(row[None] for row in arguments))[0]
 
 
 def stored(values: Shaped[Array, "*rest n"], bound: int | None = None) -> Shaped[Array, "*rest n"]:
@@ -255,7 +259,9 @@ def segment_sum(
 ) -> Float[Array, "num_segments *rest"]:
     """The sum of the values in each segment; a label outside [0, num_segments) is left out."""
     if num_segments > _FEW_SEGMENTS:
-        return jax.ops.segment_sum(values, segments, num_segments)
+        columns = values.reshape(values.shape[0], -1).T
+        sums = jax.vmap(lambda column: _scattered_sum(column, segments, num_segments))(columns)
+        return sums.T.reshape(num_segments, *values.shape[1:])
     member = _members(segments, num_segments, values.ndim - 1)
     return jnp.sum(jnp.where(member, values[None], jnp.zeros((), values.dtype)), axis=1)
 
@@ -265,7 +271,7 @@ def segment_max(
 ) -> Float[Array, " num_segments"]:
     """The largest value in each segment, -inf in an empty one."""
     if num_segments > _FEW_SEGMENTS:
-        return jax.ops.segment_max(values, segments, num_segments)
+        return _scattered("max", values, segments, num_segments, -jnp.inf)
     member = _members(segments, num_segments)
     return jnp.max(jnp.where(member, values[None], jnp.array(-jnp.inf, values.dtype)), axis=1)
 
@@ -275,8 +281,57 @@ def segment_counts(
 ) -> Int[Array, " num_segments"]:
     """How many of the masked entries lie in each segment."""
     if mask.shape[0] >= _EXACT_IN_FLOAT32:
-        return jax.ops.segment_sum(mask.astype(jnp.int32), segments, num_segments)
+        return _scattered("add", mask.astype(jnp.int32), segments, num_segments, 0)
     return segment_sum(mask.astype(default_float()), segments, num_segments).astype(jnp.int32)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _scattered_sum(
+    values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Float[Array, " num_segments"]:
+    return _scattered("add", values, segments, num_segments, 0)
+
+
+@_scattered_sum.defjvp
+def _scattered_sum_jvp(num_segments: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    values, segments = primals
+    # In JAX's own form, which can be transposed.
+    tangent = jax.ops.segment_sum(tangents[0], segments, num_segments)
+    return _scattered_sum(values, segments, num_segments), tangent
+
+
+def _scattered(
+    how: str,
+    values: Shaped[Array, " n"],
+    segments: Int[Array, " n"],
+    num_segments: int,
+    initial: float,
+) -> Shaped[Array, " num_segments"]:
+    """The values of each segment added up, or their "max" or "min", beginning at `initial`.
+
+    Neighbours go to different lanes, each with a place for every segment: where many in a row are
+    of one segment, a CPU would wait at every one of them for the last to be done.
+    """
+    n = values.shape[0]
+    num_lanes = _LANES if n >= _LANES * num_segments else 1
+    num_places = num_lanes * (num_segments + 1)  # one more a lane, for what is in no segment
+
+    def scatter(
+        rows: Shaped[Array, "k n"], labels: Int[Array, "k n"]
+    ) -> Shaped[Array, "k num_segments"]:
+        labels = jnp.where((labels >= 0) & (labels < num_segments), labels, num_segments)
+        lanes = (num_segments + 1) * (jnp.arange(n, dtype=jnp.int32) % num_lanes)
+        places = labels + lanes[None]
+        line = jnp.full(rows.shape[0] * num_places, initial, rows.dtype)
+        combine = getattr(line.at[_on_one_line(places, num_places)], how)
+        lines = combine(rows.reshape(-1), mode="promise_in_bounds")
+        lines = lines.reshape(-1, num_lanes, num_segments + 1)[:, :, :num_segments]
+        return _OVER_LANES[how](lines, axis=1).astype(rows.dtype)
+
+    return _in_rows(scatter)(values, segments)
+
+
+_OVER_LANES: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": jnp.max, "min": jnp.min}
 
 
 def exp(log_values: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
@@ -333,7 +388,7 @@ def segment_argmax(
     is_largest = values >= spread(segment_max(values, segments, num_segments), segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
     if num_segments > _FEW_SEGMENTS:
-        return jnp.clip(jax.ops.segment_min(index, segments, num_segments), 0, n - 1)
+        return _scattered("min", index, segments, num_segments, n - 1)
     member = _members(segments, num_segments)
     return jnp.min(jnp.where(member, index[None], n - 1), axis=1)
 
@@ -341,12 +396,12 @@ def segment_argmax(
 def order_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " n"]:
     """The indices that make segments contiguous and ascending, original order kept within each.
 
-    A label equal to `num_segments` comes last. Few segments are counted, one prefix sum each; for
-    more, label and index are packed into one integer where they fit, since sorting one array is
-    several times faster than sorting pairs.
+    A label equal to `num_segments` comes last. Up to a few hundred segments it is counted which
+    place an entry comes to, in O(n); for more, label and index are packed into one integer where
+    they fit, since sorting one array is several times faster than sorting pairs.
     """
     n = segments.shape[0]
-    if num_segments <= _FEW_SEGMENTS:
+    if num_segments <= _MOST_COUNTED_SEGMENTS and n < _EXACT_IN_FLOAT32:
         return inverse_permutation(_places_by_segment(segments, num_segments))
     if (num_segments + 1) * n >= 2**31:
         return jnp.argsort(segments, stable=True).astype(jnp.int32)
@@ -355,17 +410,25 @@ def order_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array
 
 
 def _places_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " n"]:
-    """Each entry's place in the order, by one prefix sum a segment."""
+    """Each entry's place in the order: how many come before it.
+
+    A table holds how many of each segment every block of entries has, a row for each segment. In
+    one prefix sum over all of it, row after row, a cell's share of the order begins; an entry's
+    rank within its cell is how many of those before it in the block are of its segment.
+    """
     n = segments.shape[0]
-    counts = segment_counts(jnp.ones(n, bool), segments, num_segments)
-    firsts = stored(jnp.cumsum(counts) - counts, n)
-    place = jnp.zeros(n, jnp.int32)
-    unlabelled = jnp.arange(n, dtype=jnp.int32) + jnp.sum(counts, dtype=jnp.int32)
-    for m in range(num_segments):
-        before = count_before(segments == m)
-        place = jnp.where(segments == m, firsts[m] + before, place)
-        unlabelled = unlabelled - before
-    return jnp.where(segments == num_segments, unlabelled, place)
+    # Odd, since rows a power of two apart would share a few places of a cache.
+    num_blocks = -(-n // _COUNTED_BLOCK) | 1
+    cells = segments * num_blocks + jnp.arange(n, dtype=jnp.int32) // _COUNTED_BLOCK
+    num_cells = whole_blocks((num_segments + 1) * num_blocks)
+    before, _ = sum_before(count_places(cells, num_cells, jnp.float32))
+    # The start of the first block is filled up with what names no cell.
+    line = jnp.pad(cells, (_COUNTED_BLOCK, 0), constant_values=-1)
+    ranks = jnp.zeros(n, jnp.int32)
+    for back in range(1, _COUNTED_BLOCK):
+        earlier = jax.lax.slice_in_dim(line, _COUNTED_BLOCK - back, _COUNTED_BLOCK - back + n)
+        ranks = ranks + (earlier == cells).astype(jnp.int32)
+    return take(before, cells).astype(jnp.int32) + ranks
 
 
 def cholesky(matrices: Float[Array, "n d d"]) -> Float[Array, "n d d"]:

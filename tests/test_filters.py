@@ -369,16 +369,26 @@ class TestGroupsOfRuns:
         together = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean)
         monkeypatch.setattr(mpfjax.filters, "_IN_CACHE", 100)
         monkeypatch.setattr(mpfjax.filters, "_IN_NEAR_CACHE", 80)
-        assert mpfjax.filters._group_size(6, 32) == 2
+        assert mpfjax.filters._group_size(6, filter) == 2
         in_groups = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, lambda mixture: mean(mixture))
         assert_same(in_groups, together, rtol=1e-5)
 
     @pytest.mark.parametrize(
-        ("num_runs", "num_particles", "size"),
-        [(20, 10_000, 20), (20, 100_000, 2), (11, 100_000, 1), (3, 10**7, 1), (1, 10**7, 1)],
+        ("num_runs", "num_particles", "num_components", "size"),
+        [
+            (10, 10_000, 1, 10),
+            (20, 10_000, 1, 2),
+            (20, 10_000, 2, 1),
+            (50, 2_000, 2, 5),
+            (50, 2_000, 99, 2),
+            (11, 100_000, 1, 1),
+            (1, 10**7, 1, 1),
+        ],
     )
-    def test_sizes_divide_and_fit(self, num_runs, num_particles, size):
-        assert mpfjax.filters._group_size(num_runs, num_particles) == size
+    def test_sizes_divide_and_fit(self, num_runs, num_particles, num_components, size):
+        model = mpfjax.QuadraticModel()
+        filter = mpfjax.mixture_particle_filter(model, num_particles, num_components)
+        assert mpfjax.filters._group_size(num_runs, filter) == size
 
 
 class TestGradients:

@@ -338,12 +338,22 @@ def farthest_first(
 
 
 def lowest_connected(adjacent: Bool[Array, "m m"]) -> Int[Array, " m"]:
-    """The lowest label in the connected component of each node of a symmetric graph."""
+    """The lowest label in the connected component of each node of a symmetric graph.
+
+    Each node takes the lowest label of its neighbours, then that label's own, until none changes.
+    """
     m = adjacent.shape[0]
+    own = jnp.arange(m, dtype=jnp.int32)
     reach = adjacent | jnp.eye(m, dtype=bool)
-    for _ in range(max(m - 1, 1).bit_length()):
-        reach = (reach.astype(jnp.float32) @ reach.astype(jnp.float32)) > 0
-    return jnp.argmax(reach, axis=1).astype(jnp.int32)
+
+    def lower(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        labels, _ = state
+        lowest = jnp.min(jnp.where(reach, labels[None], m), axis=1)
+        lowest = take(lowest, lowest)
+        return lowest, jnp.any(lowest != labels)
+
+    labels, _ = jax.lax.while_loop(lambda state: state[1], lower, (own, jnp.ones((), bool)))
+    return labels
 
 
 def free_labels(
