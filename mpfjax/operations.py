@@ -107,11 +107,12 @@ def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, "
 
     An empty segment has no place, and places past the last segment's are the last one's.
     """
-    if firsts.shape[0] > _FEW_SEGMENTS:
-        return count_starts(firsts, num_places)
+    num_segments = firsts.shape[0]
+    if num_segments > _FEW_SEGMENTS:
+        return stored(count_starts(firsts, num_places), num_segments)
     place = jnp.arange(num_places, dtype=jnp.int32)
     segments = jnp.zeros(num_places, jnp.int32)
-    for m in range(1, firsts.shape[0]):
+    for m in range(1, num_segments):
         segments = segments + (place >= firsts[m]).astype(jnp.int32)
     return segments
 

@@ -172,42 +172,40 @@ class TestSegments:
         order = operations.order_by_segment(jnp.asarray(labels, jnp.int32), m)
         np.testing.assert_array_equal(order, np.argsort(labels, kind="stable"))
 
-    @pytest.mark.parametrize(
-        ("n", "m"), [(1, 5), (31, 2), (32, 64), (33, 256), (64, 257), (1000, 64), (1024, 31)]
-    )
-    def test_order_by_segment_counts_and_sorts_alike(self, n, m):
-        rng = np.random.default_rng(n + m)
-        for labels in (
-            rng.integers(0, m + 1, n),
-            np.full(n, m),
-            np.zeros(n),
-            np.arange(n)[::-1] % m,
-        ):
-            order = operations.order_by_segment(jnp.asarray(labels, jnp.int32), m)
-            np.testing.assert_array_equal(order, np.argsort(labels, kind="stable"))
 
-    def test_runs_of_one_segment_are_added_up_in_lanes(self):
-        """Enough entries a segment for the lanes, and both ways through `vmap` and its gradient."""
-        rng = np.random.default_rng(5)
-        labels = np.sort(rng.integers(-1, 8, (3, 200)), axis=1)
-        values = rng.normal(size=(3, 200)).astype(np.float32)
-        own = jax.vmap(lambda v, s: operations.segment_sum(v, s, 7))
-        shared = jax.vmap(lambda v, s: operations.segment_sum(v, s, 7), (0, None))
-        largest = jax.vmap(lambda v, s: operations.segment_max(v, s, 7))
-        expected = [
-            [v[s == m].sum() for m in range(7)] for v, s in zip(values, labels, strict=True)
-        ]
-        every = jnp.asarray(values), jnp.asarray(labels, jnp.int32)
-        np.testing.assert_allclose(own(*every), expected, rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(shared(every[0], every[1][1])[1], expected[1], rtol=1e-4)
-        expected = [
-            [v[s == m].max() for m in range(7)] for v, s in zip(values, labels, strict=True)
-        ]
-        np.testing.assert_array_equal(largest(*every), np.float32(expected))
-        weights = jnp.arange(1.0, 8.0)
-        gradient = jax.grad(lambda v: jnp.sum(own(v, every[1]) * weights[None]))(every[0])
-        inside = (labels >= 0) & (labels < 7)
-        np.testing.assert_array_equal(gradient, np.where(inside, labels + 1, 0))
+@pytest.mark.parametrize(
+    ("n", "m"), [(1, 5), (31, 2), (32, 64), (33, 256), (64, 257), (1000, 64), (1024, 31)]
+)
+def test_order_by_segment_counts_and_sorts_alike(n, m):
+    rng = np.random.default_rng(n + m)
+    for labels in (
+        rng.integers(0, m + 1, n),
+        np.full(n, m),
+        np.zeros(n),
+        np.arange(n)[::-1] % m,
+    ):
+        order = operations.order_by_segment(jnp.asarray(labels, jnp.int32), m)
+        np.testing.assert_array_equal(order, np.argsort(labels, kind="stable"))
+
+
+def test_runs_of_one_segment_are_added_up_in_lanes():
+    """Enough entries a segment for the lanes, and both ways through `vmap` and its gradient."""
+    rng = np.random.default_rng(5)
+    labels = np.sort(rng.integers(-1, 8, (3, 200)), axis=1)
+    values = rng.normal(size=(3, 200)).astype(np.float32)
+    own = jax.vmap(lambda v, s: operations.segment_sum(v, s, 7))
+    shared = jax.vmap(lambda v, s: operations.segment_sum(v, s, 7), (0, None))
+    largest = jax.vmap(lambda v, s: operations.segment_max(v, s, 7))
+    expected = [[v[s == m].sum() for m in range(7)] for v, s in zip(values, labels, strict=True)]
+    every = jnp.asarray(values), jnp.asarray(labels, jnp.int32)
+    np.testing.assert_allclose(own(*every), expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(shared(every[0], every[1][1])[1], expected[1], rtol=1e-4)
+    expected = [[v[s == m].max() for m in range(7)] for v, s in zip(values, labels, strict=True)]
+    np.testing.assert_array_equal(largest(*every), np.float32(expected))
+    weights = jnp.arange(1.0, 8.0)
+    gradient = jax.grad(lambda v: jnp.sum(own(v, every[1]) * weights[None]))(every[0])
+    inside = (labels >= 0) & (labels < 7)
+    np.testing.assert_array_equal(gradient, np.where(inside, labels + 1, 0))
 
 
 class TestSoftmax:

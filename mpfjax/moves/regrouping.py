@@ -367,8 +367,8 @@ def free_labels(
     rank = jnp.sum(goes_first, axis=0, dtype=jnp.int32)
     free_rank = jnp.cumsum((~active).astype(jnp.int32)) - 1
     matches = ~active[None] & (rank[:, None] == free_rank[None])
-    granted = wanted & jnp.any(matches, axis=1)
-    return jnp.where(granted, jnp.argmax(matches, axis=1).astype(jnp.int32), own)
+    label = jnp.max(jnp.where(matches, own[None], -1), axis=1)
+    return jnp.where(wanted & (label >= 0), label, own)
 
 
 def _centroids(
