@@ -84,7 +84,11 @@ class ParticleMixture(eqx.Module):
     @property
     def component_counts(self) -> Int[Array, " m"]:
         """How many filled slots each component has."""
-        return segment_counts(self.occupied, self.component_indicators, self.num_components)
+        labels = self.component_indicators
+        if self.num_components == 1:
+            # Labels that nothing reads need not be copied from step to step.
+            labels = jnp.zeros_like(labels)
+        return segment_counts(self.occupied, labels, self.num_components)
 
     @property
     def active(self) -> Bool[Array, " m"]:

@@ -246,10 +246,11 @@ class _Drawn(NamedTuple):
 
 def _copies(mixture: ParticleMixture, drawn: _Drawn) -> ParticleMixture:
     """Every slot's parent as it was, with its weight."""
+    is_one = mixture.num_components == 1
     return mixture.replace(
         particles=jax.tree.map(lambda leaf: take(leaf, drawn.parents), mixture.particles),
         log_weights=take(mixture.log_weights, drawn.parents),
-        component_indicators=drawn.slots.components,
+        component_indicators=mixture.component_indicators if is_one else drawn.slots.components,
         ancestor_indices=take(mixture.ancestor_indices, drawn.parents),
     )
 
