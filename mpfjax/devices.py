@@ -214,12 +214,12 @@ def over_threads(
         return run(inputs, *arguments)
     count = -(-num_inputs // size)
     padded = _filled_up(inputs, count * size)
-    threads = _threads()
-    blocks = [
-        jax.tree.map(lambda leaf, i=i: leaf[i * size : (i + 1) * size], padded)
-        for i in range(count)
-    ]
-    runs = list(threads.map(lambda block: jax.block_until_ready(run(block, *arguments)), blocks))
+
+    def run_block(i: int) -> PyTree:
+        block = jax.tree.map(lambda leaf: leaf[i * size : (i + 1) * size], padded)
+        return jax.block_until_ready(run(block, *arguments))
+
+    runs = list(_threads().map(run_block, range(count)))
     return _end_to_end(runs, num_inputs)
 
 

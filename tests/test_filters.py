@@ -376,7 +376,7 @@ class TestGroupsOfRuns:
     @pytest.mark.parametrize(
         ("num_runs", "num_particles", "num_components", "size"),
         [
-            (10, 10_000, 1, 10),
+            (10, 5_000, 1, 10),
             (20, 10_000, 1, 2),
             (20, 10_000, 2, 1),
             (50, 2_000, 2, 5),
