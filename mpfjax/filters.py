@@ -70,8 +70,8 @@ class FilterRun(eqx.Module):
 
 # Moves that leave the total mass as it is, so that there is nothing to normalise.
 _KEEP_MASS = (AbstractRegrouping, AbstractRejuvenation, Exchange)
-# Particles, times the components that have a row of them each: what a CPU's caches hold of all that
-# a step makes of them.
+# Particles, times the components where these are few and have a row of them each: what a CPU's
+# caches hold of all that a step makes of them.
 _IN_NEAR_CACHE, _IN_CACHE = 2**15, 2**16
 _MOST_ROWS = 4
 _WORTH_A_THREAD = 2**12  # particles, of all its runs
@@ -633,7 +633,8 @@ def _run_each(starts, filter, observations, present, collect):
 
 def _group_size(num_runs: int, filter: Filter) -> int:
     """How many runs go on together: on a CPU no more than leaves their particles in its cache."""
-    one_run = filter.num_particles * min(filter.num_components, _MOST_ROWS)
+    num_rows = filter.num_components if filter.num_components <= _MOST_ROWS else 1
+    one_run = filter.num_particles * num_rows
     if jax.default_backend() != "cpu" or num_runs * one_run <= _IN_CACHE:
         return num_runs
     sizes = [size for size in range(1, num_runs + 1) if num_runs % size == 0]
