@@ -15,9 +15,8 @@ def uniqueness(mixture: ParticleMixture) -> Float[Array, " objects"]:
     Pass it as `collect` to see it after every step: a weighted resampling within the step lowers
     it for the objects that have moved, as in the paper's figure 4.
     """
-    return jax.vmap(
-        lambda states: _distinct_rows(states, mixture), in_axes=1
-    )(mixture.particles) / mixture.num_particles  # fmt: skip
+    distinct = jax.vmap(lambda states: _distinct_rows(states, mixture), in_axes=1)
+    return distinct(mixture.particles) / jnp.asarray(mixture.room, mixture.log_weights.dtype)
 
 
 def effective_dynamics(mixture: ParticleMixture) -> PyTree:
