@@ -34,7 +34,7 @@ from mpfjax.moves.independent import PropagateIndependently
 from mpfjax.moves.partitioned import Partitioned, check_orders
 from mpfjax.moves.propagation import Predict, Propagate, Weigh
 from mpfjax.moves.regrouping import KMeans, Merge, Pool, RandomPartition, Split
-from mpfjax.moves.resampling import Resample
+from mpfjax.moves.resampling import FEW_ROWS, Resample
 from mpfjax.proposals import AbstractProposal
 
 
@@ -73,7 +73,6 @@ _KEEP_MASS = (AbstractRegrouping, AbstractRejuvenation, Exchange)
 # Particles, times the components where these are few and have a row of them each: what a CPU's
 # caches hold of all that a step makes of them.
 _IN_NEAR_CACHE, _IN_CACHE = 2**15, 2**16
-_MOST_ROWS = 4
 _WORTH_A_THREAD = 2**12  # particles, of all its runs
 _BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
@@ -633,7 +632,7 @@ def _run_each(starts, filter, observations, present, collect):
 
 def _group_size(num_runs: int, filter: Filter) -> int:
     """How many runs go on together: on a CPU no more than leaves their particles in its cache."""
-    num_rows = filter.num_components if filter.num_components <= _MOST_ROWS else 1
+    num_rows = filter.num_components if filter.num_components <= FEW_ROWS else 1
     one_run = filter.num_particles * num_rows
     if jax.default_backend() != "cpu" or num_runs * one_run <= _IN_CACHE:
         return num_runs

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -148,6 +149,10 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
     write_whole(path, write)
 
 
+# What a flipped bit may lead to; where it names an unknown compression or an encryption, the last.
+_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, RuntimeError)
+
+
 def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """The arrays of a .npz file; `ValueError` for one that is cut off, damaged or no such file."""
     arrays = {}
@@ -158,8 +163,7 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
                     with archive.open(name) as member:
                         array = np.lib.format.read_array(member, allow_pickle=False)
                     arrays[name.removesuffix(".npy")] = array
-        # A flipped bit may also name a compression that zipfile does not have.
-        except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError) as error:
+        except _DAMAGE as error:
             raise ValueError(f"{path}: cut off, damaged or no .npz file ({error})") from error
     return arrays
 

@@ -117,10 +117,8 @@ def run_study(
     names: take a new directory after changing code. Several processes share one directory, which
     the first writes. Use it where a loop over `monte_carlo` would take long.
     """
-    at_least_one = {
-        "seeds_at_once": seeds_at_once, "cells_at_once": cells_at_once, "slots": slots
-    }  # fmt: skip
-    for name, number in at_least_one.items():
+    sizes = {"seeds_at_once": seeds_at_once, "cells_at_once": cells_at_once, "slots": slots}
+    for name, number in sizes.items():
         if number is not None and number < 1:
             raise ValueError(f"{name}: {number} is less than 1")
     directory = Path(directory)

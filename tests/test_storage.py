@@ -152,6 +152,23 @@ class TestFiles:
         with pytest.raises(ValueError, match="cut off, damaged"):
             load_arrays(path)
 
+    @pytest.mark.parametrize("is_compressed", [False, True])
+    def test_whichever_bit_flips_there_is_no_other_error(self, path, is_compressed):
+        write_arrays(path, {"x": np.arange(3.0)})
+        if is_compressed:
+            np.savez_compressed(path, x=np.arange(3.0))
+        whole, faults = path.read_bytes(), []
+        for bit in range(8 * len(whole)):
+            content = bytearray(whole)
+            content[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(content)
+            try:
+                load_arrays(path)
+            except ValueError as error:
+                faults.append(str(error))
+        assert faults
+        assert all("cut off, damaged" in fault for fault in faults)
+
     def test_a_missing_file_is_named(self, path):
         with pytest.raises(FileNotFoundError, match=r"checkpoint.npz"):
             mpfjax.load_checkpoint(path, like=MIXTURE)

@@ -32,7 +32,7 @@ from mpfjax.operations import (
 )
 
 # Up to so many components are resampled as they stand, each in a pass of its own.
-_FEW_ROWS = 4
+FEW_ROWS = 4
 GRADIENTS = ("none", "stop", "soft", "ot", "straight_through")
 
 
@@ -156,7 +156,7 @@ class Resample(AbstractRejuvenation):
         num_particles, num_components = mixture.num_particles, mixture.num_components
         # A component that keeps its particles needs them side by side, unless it has all slots.
         all_are_due = self.ess_threshold == 1.0
-        as_they_stand = num_components == 1 or (num_components <= _FEW_ROWS and all_are_due)
+        as_they_stand = num_components == 1 or (num_components <= FEW_ROWS and all_are_due)
         as_they_stand &= self.sort_by is None
         as_they_stand &= self.gradient != "ot"  # which needs places without gaps
         line = _as_they_stand(mixture) if as_they_stand else self._side_by_side(mixture, due)
