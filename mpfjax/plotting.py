@@ -82,7 +82,7 @@ def _draw_trace(axis: Axes, trace: Trace, truth: np.ndarray) -> None:
 
 def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str]) -> Figure:
     """Figure 2 of Vermaak et al. (2003), and the error of the modes' mass beside it."""
-    figure = Figure(figsize=(10.5, 3.4), layout="constrained")
+    figure = Figure(figsize=(10.5, 3.7), layout="constrained")
     score, weight, mass = figure.subplots(1, 3)
     names = [name for name in labels if any(entry["filter"] == name for entry in results)]
     for index, name in enumerate(names):
@@ -122,7 +122,9 @@ def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str])
     mass.set_ylabel(r"error of $P(x_t > 0 \mid y_1 \ldots y_t)$")
     mass.set_title("RMS error of the upper mode's mass", fontsize=10)
     mass.set_ylim(bottom=0)
-    score.legend(loc="lower right", fontsize=8)
+    # Above the axes: every corner of the first holds bars, at some N.
+    handles, texts = mass.get_legend_handles_labels()
+    figure.legend(handles, texts, loc="outside upper center", ncols=len(names), fontsize=8)
     return figure
 
 
