@@ -9,6 +9,7 @@ from mpfjax.operations import (
     default_float,
     exp,
     log_sum_exp,
+    scaled_exp,
     segment_counts,
     segment_log_sum_exp,
     segment_softmax,
@@ -62,7 +63,8 @@ class ParticleMixture(eqx.Module):
     @property
     def weights(self) -> Float[Array, " n"]:
         """exp ℓ, the joint weights; they sum to one over all particles."""
-        return exp(self.log_weights)
+        values, log_scale = scaled_exp(self.log_weights)
+        return values * exp(log_scale)
 
     @property
     def log_mass(self) -> Float[Array, ""]:
@@ -93,7 +95,7 @@ class ParticleMixture(eqx.Module):
     @property
     def active(self) -> Bool[Array, " m"]:
         """Which components are alive."""
-        return self.component_counts > 0
+        return self.log_mixture_weights > -jnp.inf
 
     @property
     def log_component_weights(self) -> Float[Array, " n"]:
@@ -118,7 +120,8 @@ class ParticleMixture(eqx.Module):
     @property
     def effective_sample_size(self) -> Float[Array, ""]:
         """(Σ exp ℓ)² / Σ exp 2ℓ over all particles, zero where there is none."""
-        return _inverse(jnp.sum(softmax(self.log_weights) ** 2))
+        values, _ = scaled_exp(self.log_weights)
+        return jnp.sum(values) ** 2 * _inverse(jnp.sum(values**2))
 
     def component_sums(self, values: Float[Array, "n *rest"]) -> Float[Array, "m *rest"]:
         """Σ_{c_i = m} v_i over each component's slots."""

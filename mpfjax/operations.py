@@ -6,6 +6,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
@@ -14,7 +15,7 @@ _FEW_COLUMNS = 16
 _LANES = 8
 _BLOCKS = (32, 16, 8)
 _ONE_BLOCK = 128
-_EXACT_IN_FLOAT32 = 2**24
+_EXACT_IN_FLOAT32 = 2**23  # as exact as up to 2^24, and readable from the lowest bits
 _COUNTED_BLOCK = 32
 _MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # of which a block's counts are eight a particle
 
@@ -99,7 +100,7 @@ def count_starts(starts: Int[Array, "*rows n"], num_slots: int) -> Int[Array, " 
     dtype = jnp.float32 if starts.size < _EXACT_IN_FLOAT32 else jnp.int32
     starts = stored(jnp.minimum(starts, num_slots), num_slots + 1)
     at_start = count_places(starts.reshape(-1), num_places, dtype)
-    return (count_before(at_start) + at_start.astype(jnp.int32) - 1)[:num_slots]
+    return count_upto(at_start, starts.size)[:num_slots] - 1
 
 
 def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, " num_places"]:
@@ -109,7 +110,7 @@ def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, "
     """
     num_segments = firsts.shape[0]
     if num_segments > _FEW_SEGMENTS:
-        return stored(count_starts(firsts, num_places), num_segments)
+        return count_starts(firsts, num_places)
     place = jnp.arange(num_places, dtype=jnp.int32)
     segments = jnp.zeros(num_places, jnp.int32)
     for m in range(1, num_segments):
@@ -173,8 +174,7 @@ def stored(values: Shaped[Array, "*rest n"], bound: int | None = None) -> Shaped
     It would compute them again within whatever uses them, once for every particle even where they
     are one a component, and without vectors within a scatter or gather over flattened rows. A
     product with the identity is what it computes on its own. `bound` is above all whole numbers
-    there may be; where it is above 2^24, which float32 cannot tell from its neighbours, nothing
-    is done.
+    there may be; where it is above 2^23, more than is certain to come out exactly, nothing is done.
     """
     if bound is not None and bound > _EXACT_IN_FLOAT32:
         return values
@@ -190,14 +190,44 @@ def _times_identity(values: Array) -> Array:
     lines = jnp.pad(lines, [(0, 0)] * len(rest) + [(0, whole_blocks(n) - n)])
     blocks = lines.reshape(*rest, -1, size)
     product = (blocks @ jnp.eye(size, dtype=lines.dtype)).reshape(lines.shape)
-    return product[..., :n].astype(values.dtype)
+    return (product if is_float else to_int(product))[..., :n].astype(values.dtype)
 
 
-def count_before(values: Shaped[Array, " n"]) -> Int[Array, " n"]:
-    """The exclusive prefix sum of whole numbers, of whatever type, or of members, exact."""
-    if values.shape[0] >= _EXACT_IN_FLOAT32:
-        return _shifted(jnp.cumsum(values, dtype=jnp.int32))
-    return sum_before(values.astype(jnp.float32))[0].astype(jnp.int32)
+def to_int(
+    values: Float[Array, "*shape"], bound: int = _EXACT_IN_FLOAT32 - 1
+) -> Int[Array, "*shape"]:
+    """Whole numbers from 0 to `bound` as integers.
+
+    Added to 2^23 they stand in the lowest bits, as long as they are smaller. XLA's own conversion
+    costs a CPU several times as much, since it looks for NaN and for what is out of range.
+    """
+    if values.dtype != jnp.float32 or bound >= _EXACT_IN_FLOAT32:
+        return values.astype(jnp.int32)
+    shift = np.float32(2**23)
+    return jax.lax.bitcast_convert_type(values + shift, jnp.int32) - shift.view(np.int32)
+
+
+def count_upto(values: Shaped[Array, " n"], bound: int) -> Int[Array, " n"]:
+    """The inclusive prefix sums of whole numbers of whatever type, or of members, exact.
+
+    `bound` is what their sum cannot exceed.
+    """
+    scanned = partial(jnp.cumsum, dtype=jnp.int32)
+    if bound >= _EXACT_IN_FLOAT32:
+        return scanned(values)
+    return jax.lax.platform_dependent(values, cpu=_blocked_count_upto, default=scanned)
+
+
+def _blocked_count_upto(values: Shaped[Array, " n"]) -> Int[Array, " n"]:
+    n = values.shape[0]
+    blocks = _in_blocks(values.astype(jnp.float32))
+    before, _ = _blocked_sum_before(jnp.sum(blocks, axis=1))
+    size = blocks.shape[1]
+    # No order of summing rounds: what is before a block may be summed along with its first entry.
+    is_first = jnp.arange(size) == 0
+    blocks = blocks + jnp.where(is_first[None], before[:, None], 0.0)
+    upto = blocks @ jnp.triu(jnp.ones((size, size), blocks.dtype))
+    return to_int(upto).reshape(-1)[:n]
 
 
 def row_sums(values: Float[Array, "n d"]) -> Float[Array, " n"]:
@@ -315,19 +345,25 @@ def _scattered(
     """
     n = values.shape[0]
     num_lanes = _LANES if n >= _LANES * num_segments else 1
-    num_places = num_lanes * (num_segments + 1)  # one more a lane, for what is in no segment
+    padding = ((0, 0), (0, -n % num_lanes))
 
     def scatter(
         rows: Shaped[Array, "k n"], labels: Int[Array, "k n"]
     ) -> Shaped[Array, "k num_segments"]:
+        num_rows = rows.shape[0]
+        # One more, for what is in no segment.
         labels = jnp.where((labels >= 0) & (labels < num_segments), labels, num_segments)
-        lanes = (num_segments + 1) * (jnp.arange(n, dtype=jnp.int32) % num_lanes)
-        places = labels + lanes[None]
-        line = jnp.full(rows.shape[0] * num_places, initial, rows.dtype)
-        combine = getattr(line.at[_on_one_line(places, num_places)], how)
-        lines = combine(rows.reshape(-1), mode="promise_in_bounds")
-        lines = lines.reshape(-1, num_lanes, num_segments + 1)[:, :, :num_segments]
-        return _OVER_LANES[how](lines, axis=1).astype(rows.dtype)
+        labels = jnp.pad(labels, padding, constant_values=num_segments)
+        labels = labels.reshape(num_rows, -1, num_lanes)
+        # Row and lane are added as they are: XLA would take arithmetic on them out of a filter's
+        # loop, and then no longer see that two sums by the same labels have the same places.
+        row, lane = (jax.lax.broadcasted_iota(jnp.int32, labels.shape, axis) for axis in (0, 2))
+        places = (labels * num_lanes + lane) * num_rows + row
+        line = jnp.full((num_segments + 1) * num_lanes * num_rows, initial, rows.dtype)
+        combine = getattr(line.at[_from_the_start(places.reshape(-1))], how)
+        lines = combine(jnp.pad(rows, padding).reshape(-1), mode="promise_in_bounds")
+        lines = lines.reshape(-1, num_lanes, num_rows)[:num_segments]
+        return _OVER_LANES[how](lines, axis=1).T.astype(rows.dtype)
 
     return _in_rows(scatter)(values, segments)
 
@@ -346,10 +382,19 @@ def exp(log_values: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
     return jnp.where(log_values < smallest, 0.0, jnp.exp(log_values))  # NaN stays
 
 
+def scaled_exp(log_values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+    """e to these powers over the largest of them, and its logarithm.
+
+    All that is derived from weights starts from these, which XLA then computes once.
+    """
+    log_scale = _finite(jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf))
+    return exp(log_values - log_scale), log_scale
+
+
 def log_sum_exp(log_values: Float[Array, " n"]) -> Float[Array, ""]:
     """log Σ exp, -inf where every entry is -inf, with a gradient that is finite there too."""
-    shift = _finite(jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf))
-    return _log(jnp.sum(exp(log_values - shift))) + shift
+    values, log_scale = scaled_exp(log_values)
+    return _log(jnp.sum(values)) + log_scale
 
 
 def segment_log_sum_exp(
@@ -363,8 +408,7 @@ def segment_log_sum_exp(
 
 def softmax(log_values: Float[Array, " n"]) -> Float[Array, " n"]:
     """exp of the values as shares of their sum, all zero where every entry is -inf."""
-    shift = _finite(jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf))
-    values = exp(log_values - shift)
+    values, _ = scaled_exp(log_values)
     total = jnp.sum(values)
     shares = values / jnp.where(total == 0, 1.0, total)
     return _masked(log_values, shares)
@@ -394,24 +438,30 @@ def segment_argmax(
     return jnp.min(jnp.where(member, index[None], n - 1), axis=1)
 
 
-def order_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " n"]:
-    """The indices that make segments contiguous and ascending, original order kept within each.
+def order_by_segment(
+    segments: Int[Array, " n"], num_segments: int
+) -> tuple[Int[Array, " n"], Int[Array, " num_segments"]]:
+    """The indices that make segments contiguous and ascending, and how many each segment has.
 
-    A label equal to `num_segments` comes last. Up to a few hundred segments it is counted which
+    The original order is kept within each; a label equal to `num_segments` comes last. Up to a few hundred segments it is counted which
     place an entry comes to, in O(n); for more, label and index are packed into one integer where
     they fit, since sorting one array is several times faster than sorting pairs.
     """
     n = segments.shape[0]
     if num_segments <= _MOST_COUNTED_SEGMENTS and n < _EXACT_IN_FLOAT32:
-        return inverse_permutation(_places_by_segment(segments, num_segments))
+        places, counts = _places_by_segment(segments, num_segments)
+        return inverse_permutation(places), counts
+    counts = segment_counts(jnp.ones(n, bool), segments, num_segments)
     if (num_segments + 1) * n >= 2**31:
-        return jnp.argsort(segments, stable=True).astype(jnp.int32)
+        return jnp.argsort(segments, stable=True).astype(jnp.int32), counts
     index = jnp.arange(n, dtype=jnp.int32)
-    return jax.lax.sort(segments.astype(jnp.int32) * n + index) % n
+    return jax.lax.sort(segments.astype(jnp.int32) * n + index) % n, counts
 
 
-def _places_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " n"]:
-    """Each entry's place in the order: how many come before it.
+def _places_by_segment(
+    segments: Int[Array, " n"], num_segments: int
+) -> tuple[Int[Array, " n"], Int[Array, " num_segments"]]:
+    """Each entry's place in the order, which is how many come before it, and segments' counts.
 
     A table holds how many of each segment every block of entries has, a row for each segment. In
     one prefix sum over all of it, row after row, a cell's share of the order begins; an entry's
@@ -421,15 +471,17 @@ def _places_by_segment(segments: Int[Array, " n"], num_segments: int) -> Int[Arr
     # Odd, since rows a power of two apart would share a few places of a cache.
     num_blocks = -(-n // _COUNTED_BLOCK) | 1
     cells = segments * num_blocks + jnp.arange(n, dtype=jnp.int32) // _COUNTED_BLOCK
-    num_cells = whole_blocks((num_segments + 1) * num_blocks)
-    before, _ = sum_before(count_places(cells, num_cells, jnp.float32))
+    num_cells = whole_blocks((num_segments + 1) * num_blocks + 1)
+    # One place further on, so that what is summed up to a cell is what is before it.
+    before = count_upto(count_places(cells + 1, num_cells, jnp.float32), n)
     # The start of the first block is filled up with what names no cell.
     line = jnp.pad(cells, (_COUNTED_BLOCK, 0), constant_values=-1)
     ranks = jnp.zeros(n, jnp.int32)
     for back in range(1, _COUNTED_BLOCK):
         earlier = jax.lax.slice_in_dim(line, _COUNTED_BLOCK - back, _COUNTED_BLOCK - back + n)
         ranks = ranks + (earlier == cells).astype(jnp.int32)
-    return take(before, cells).astype(jnp.int32) + ranks
+    firsts = before[: (num_segments + 1) * num_blocks : num_blocks]
+    return take(before, cells) + ranks, jnp.diff(firsts)
 
 
 def cholesky(matrices: Float[Array, "n d d"]) -> Float[Array, "n d d"]:

@@ -62,11 +62,23 @@ def test_exponentials_are_never_subnormal():
 
 
 @pytest.mark.parametrize("n", SIZES)
-def test_count_before_is_exact(n):
+def test_count_upto_is_exact(n):
     ones = RNG.integers(0, 2, n)
-    expected = np.cumsum(ones) - ones
     for values in (jnp.asarray(ones, jnp.int32), jnp.asarray(ones, bool)):
-        np.testing.assert_array_equal(operations.count_before(values), expected)
+        np.testing.assert_array_equal(operations.count_upto(values, n), np.cumsum(ones))
+
+
+def test_count_upto_is_exact_where_float32_is_not():
+    counts = np.array([2**23 - 1, 1, 2**24, 1, 0, 3])
+    found = operations.count_upto(jnp.asarray(counts, jnp.int32), int(counts.sum()))
+    np.testing.assert_array_equal(found, np.cumsum(counts))
+
+
+def test_whole_numbers_become_integers():
+    whole = np.array([0, 1, 2, 3, 2**22, 2**23 - 1])
+    found = operations.to_int(jnp.asarray(whole, jnp.float32))
+    assert found.dtype == jnp.int32
+    np.testing.assert_array_equal(found, whole)
 
 
 def test_more_places_than_float32_can_number():
@@ -169,8 +181,9 @@ class TestSegments:
     def test_order_by_segment_is_a_stable_argsort(self, m):
         _, labels = labelled(90, m)
         labels[::5] = m  # the empty slots, which come last
-        order = operations.order_by_segment(jnp.asarray(labels, jnp.int32), m)
+        order, counts = operations.order_by_segment(jnp.asarray(labels, jnp.int32), m)
         np.testing.assert_array_equal(order, np.argsort(labels, kind="stable"))
+        np.testing.assert_array_equal(counts, np.bincount(labels.astype(int), minlength=m + 1)[:m])
 
 
 @pytest.mark.parametrize(
@@ -184,8 +197,9 @@ def test_order_by_segment_counts_and_sorts_alike(n, m):
         np.zeros(n),
         np.arange(n)[::-1] % m,
     ):
-        order = operations.order_by_segment(jnp.asarray(labels, jnp.int32), m)
+        order, counts = operations.order_by_segment(jnp.asarray(labels, jnp.int32), m)
         np.testing.assert_array_equal(order, np.argsort(labels, kind="stable"))
+        np.testing.assert_array_equal(counts, np.bincount(labels.astype(int), minlength=m + 1)[:m])
 
 
 def test_runs_of_one_segment_are_added_up_in_lanes():

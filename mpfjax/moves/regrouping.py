@@ -11,7 +11,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.features import Features, Scale, separation, summarise
 from mpfjax.operations import (
-    count_before,
+    count_upto,
     row_sums,
     segment_argmax,
     segment_counts,
@@ -298,7 +298,7 @@ class RandomPartition(AbstractRegrouping):
         is_last = (index >= num_filled).astype(jnp.uint32) << 31
         words = jax.lax.sort(is_last | noise | (index % num_sets).astype(jnp.uint32))
         dealt = (words & jnp.uint32((1 << width) - 1)).astype(jnp.int32)
-        filled_before = count_before(occupied)
+        filled_before = count_upto(occupied, n) - occupied.astype(jnp.int32)
         turn = jnp.where(occupied, filled_before, num_filled + index - filled_before)
         return take(dealt, turn), mixture.memory
 

@@ -28,6 +28,7 @@ from mpfjax.operations import (
     stored,
     sum_before,
     take,
+    to_int,
     whole_blocks,
 )
 
@@ -114,9 +115,9 @@ class Resample(AbstractRejuvenation):
 
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
-        counts = mixture.component_counts
         if self.ess_threshold == 1.0:
-            return counts > 0
+            return mixture.active
+        counts = mixture.component_counts
         limit = self.ess_threshold * counts.astype(mixture.log_weights.dtype)
         due = mixture.component_effective_sample_sizes < limit
         if self.particles_per_component is not None:
@@ -160,7 +161,9 @@ class Resample(AbstractRejuvenation):
         as_they_stand &= self.sort_by is None
         as_they_stand &= self.gradient != "ot"  # which needs places without gaps
         line = _as_they_stand(mixture) if as_they_stand else self._side_by_side(mixture, due)
-        targets = deal_slots(line.counts, due, mixture, self.particles_per_component)
+        # Where all that live are due, none keeps what it has.
+        counts = due.astype(jnp.int32) if all_are_due else line.counts
+        targets = deal_slots(counts, due, mixture, self.particles_per_component)
         if as_they_stand and num_components == 1:
             # What is not redrawn keeps its place, and there may be empty slots before it.
             targets = jnp.where(due, targets, num_particles)
@@ -176,8 +179,8 @@ class Resample(AbstractRejuvenation):
         if not all_are_due:
             unmoved = line.places_by_rank(slots.ranks, slots)
             parents = jnp.where(spread(due, slots.components), parents, unmoved)
-        parents = stored(jnp.clip(parents, 0, num_particles - 1), num_particles)
-        return _Drawn(line.particles_at(parents), slots, targets, line)
+        parents = line.particles_at(jnp.clip(parents, 0, num_particles - 1))
+        return _Drawn(parents, slots, targets, line)
 
     def _side_by_side(self, mixture: ParticleMixture, due: Bool[Array, " m"]) -> "_SideBySide":
         """One row of components, without particles that only a rounding error could draw.
@@ -192,14 +195,16 @@ class Resample(AbstractRejuvenation):
             stands |= mixture.occupied & ~spread(due, mixture.component_indicators)
         labels = jnp.where(stands, mixture.component_indicators, m)
         if self.sort_by is None:
-            order = order_by_segment(_padded(labels, m), m)
+            order, counts = order_by_segment(_padded(labels, m), m)
         else:
             order = jnp.lexsort((self.sort_by(mixture.particles), labels)).astype(jnp.int32)
             order = _padded(order, mixture.num_particles - 1)
-        counts = segment_counts(stands, mixture.component_indicators, m)
-        slots = place_slots(counts, order.shape[0])
-        weights = jnp.where(slots.filled, take(_padded(weights, 0.0), order), 0.0)
-        return _SideBySide(weights[None], counts, slots.firsts, order, slots.components)
+            counts = segment_counts(stands, mixture.component_indicators, m)
+        num_standing = jnp.sum(counts, dtype=jnp.int32)
+        is_filled = jnp.arange(order.shape[0], dtype=jnp.int32) < num_standing
+        weights = jnp.where(is_filled, take(_padded(weights, 0.0), order), 0.0)
+        components = take(_padded(mixture.component_indicators, 0), order)
+        return _SideBySide(weights[None], counts, jnp.cumsum(counts) - counts, order, components)
 
     def _drawn_from(self, mixture: ParticleMixture) -> ParticleMixture:
         """The mixture whose weights the offspring are drawn in proportion to."""
@@ -377,7 +382,7 @@ class _SideBySide(NamedTuple):
 
     def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
         """Which particles stand at these places."""
-        return take(self.order, places)
+        return take(self.order, stored(places, self.order.shape[0]))
 
 
 def _as_they_stand(mixture: ParticleMixture) -> _AsTheyStand:
@@ -417,7 +422,7 @@ def _points_before(
 ) -> Int[Array, "rows p"]:
     """How many of the points s + shift, one in each slot s, come before a particle's stretch."""
     whole = jnp.floor(before)
-    return whole.astype(jnp.int32) + (shift < before - whole).astype(jnp.int32)
+    return to_int(whole, before.shape[-1]) + (shift < before - whole).astype(jnp.int32)
 
 
 def _multinomial(key, expected, before, targets, slots, line):
