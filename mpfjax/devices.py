@@ -201,26 +201,35 @@ def over_threads(
     arguments: tuple[PyTree, ...],
     num_threads: int,
 ) -> PyTree:
-    """`run(inputs, *arguments)` with the inputs dealt to threads of this process in equal blocks.
+    """`run(inputs, *arguments)`, compiled, with the inputs dealt to threads of this process.
 
-    For programs of many short operations, which a CPU device does mostly one after the other.
-    `run` is compiled, or compiles once, whichever thread comes first. Without threads where they
-    would not see what this thread does: under a transformation of the caller's, or a setting of
-    JAX that holds for this thread alone.
+    For programs of many short operations, which a CPU device does mostly one after the other. The
+    blocks are of equal size; the last input fills up the last of them, and what comes of that is
+    dropped. This thread takes the first block, and all that are left by threads which would not
+    see what it sees: a setting of JAX that holds for it alone, or a transformation of the caller's.
     """
     num_inputs = _length(inputs)
     size = -(-num_inputs // num_threads)
-    if size == num_inputs or not _is_like_any_thread():
-        return run(inputs, *arguments)
-    count = -(-num_inputs // size)
-    padded = _filled_up(inputs, count * size)
+    seen = _seen_by_thread()
 
-    def run_block(i: int) -> PyTree:
-        block = jax.tree.map(lambda leaf: leaf[i * size : (i + 1) * size], padded)
-        return jax.block_until_ready(run(block, *arguments))
+    def run_block(first: int) -> PyTree:
+        if _seen_by_thread() == seen:
+            block = _run_block(run, np.asarray(first), size, inputs, arguments)
+            return jax.block_until_ready(block)
 
-    runs = list(_threads().map(run_block, range(count)))
-    return _end_to_end(runs, num_inputs)
+    first, *others = range(0, num_inputs, size)
+    started = [_threads().submit(run_block, other) for other in others]
+    blocks = [run_block(first)]
+    for other, thread in zip(others, started, strict=True):
+        block = thread.result()
+        blocks.append(run_block(other) if block is None else block)
+    return _end_to_end(blocks, num_inputs)
+
+
+@jit_on_wide_vectors
+def _run_block(run, first, size, inputs, arguments):
+    index = jnp.minimum(first + np.arange(size), _length(inputs) - 1)
+    return run(jax.tree.map(lambda leaf: leaf[index], inputs), *arguments)
 
 
 def _length(inputs: PyTree) -> int:
@@ -245,10 +254,6 @@ def num_processors() -> int:
 @functools.cache
 def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(2, num_processors()), thread_name_prefix="mpfjax")
-
-
-def _is_like_any_thread() -> bool:
-    return _seen_by_thread() == _threads().submit(_seen_by_thread).result()
 
 
 def _seen_by_thread() -> tuple[Any, ...]:

@@ -648,9 +648,11 @@ def _run_on_threads(starts, filter, observations, present, collect):
     num_particles = starts.key.shape[0] * filter.num_particles
     num_threads = min(num_processors(), num_particles // _WORTH_A_THREAD)
     keeps_all = collect is None  # of which there had better not be two copies for a while
-    if num_threads < 2 or keeps_all or jax.default_backend() != "cpu":
-        return _run_all(starts, filter, observations, present, collect)
-    return over_threads(_run_all, starts, (filter, observations, present, collect), num_threads)
+    arguments = (filter, observations, present, collect)
+    leave_to_caller = is_traced((starts, arguments)) or jax.default_backend() != "cpu"
+    if num_threads < 2 or keeps_all or leave_to_caller:
+        return _run_all(starts, *arguments)
+    return over_threads(_run_each, starts, arguments, num_threads)
 
 
 def scan_filter(
