@@ -443,9 +443,10 @@ def order_by_segment(
 ) -> tuple[Int[Array, " n"], Int[Array, " num_segments"]]:
     """The indices that make segments contiguous and ascending, and how many each segment has.
 
-    The original order is kept within each; a label equal to `num_segments` comes last. Up to a few hundred segments it is counted which
-    place an entry comes to, in O(n); for more, label and index are packed into one integer where
-    they fit, since sorting one array is several times faster than sorting pairs.
+    The original order is kept within each; a label equal to `num_segments` comes last. Up to a few
+    hundred segments it is counted which place an entry comes to, in O(n); for more, label and
+    index are packed into one integer where they fit, since sorting one array is several times
+    faster than sorting pairs.
     """
     n = segments.shape[0]
     if num_segments <= _MOST_COUNTED_SEGMENTS and n < _EXACT_IN_FLOAT32:
