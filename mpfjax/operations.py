@@ -12,7 +12,9 @@ from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
 _FEW_SEGMENTS = 4
 _FEW_COLUMNS = 16
-_LANES = 8
+# Neighbours that are added to the same place go to different lanes, each with a place of its own: a
+# CPU would wait at every one of them for the last to be done.
+_LANES, _LANES_OF_ROWS = 8, 4
 _BLOCKS = (32, 16, 8)
 _ONE_BLOCK = 128
 _EXACT_IN_FLOAT32 = 2**23  # as exact as up to 2^24, and readable from the lowest bits
@@ -99,7 +101,13 @@ def count_starts(starts: Int[Array, "*rows n"], num_slots: int) -> Int[Array, " 
     num_places = whole_blocks(num_slots + 1)
     dtype = jnp.float32 if starts.size < _EXACT_IN_FLOAT32 else jnp.int32
     starts = stored(jnp.minimum(starts, num_slots), num_slots + 1)
-    at_start = count_places(starts.reshape(-1), num_places, dtype)
+    if starts.ndim == 1 or starts.shape[0] == 1:
+        at_start = count_places(starts.reshape(-1), num_places, dtype)
+    else:  # a row has long runs without offspring, which are another row's
+        lane = jnp.arange(starts.shape[1], dtype=jnp.int32) % _LANES_OF_ROWS
+        places = (starts + num_places * lane[None]).reshape(-1)
+        lanes = count_places(places, _LANES_OF_ROWS * num_places, dtype)
+        at_start = jnp.sum(lanes.reshape(_LANES_OF_ROWS, -1), axis=0)
     return count_upto(at_start, starts.size)[:num_slots] - 1
 
 
@@ -340,8 +348,7 @@ def _scattered(
 ) -> Shaped[Array, " num_segments"]:
     """The values of each segment added up, or their "max" or "min", beginning at `initial`.
 
-    Neighbours go to different lanes, each with a place for every segment: where many in a row are
-    of one segment, a CPU would wait at every one of them for the last to be done.
+    Where there are many in a segment they are dealt to lanes.
     """
     n = values.shape[0]
     num_lanes = _LANES if n >= _LANES * num_segments else 1
