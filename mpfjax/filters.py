@@ -73,7 +73,7 @@ _KEEP_MASS = (AbstractRegrouping, AbstractRejuvenation, Exchange)
 # Particles, times the components where these are few and have a row of them each: what a CPU's
 # caches hold of all that a step makes of them.
 _IN_NEAR_CACHE, _IN_CACHE = 2**15, 2**16
-_WORTH_A_THREAD = 2**12  # particles, of all its runs
+_WORTH_A_THREAD = 2**9  # particles, of all its runs
 _BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
 
