@@ -645,8 +645,9 @@ _run_all = jit_on_wide_vectors(_run_each)
 
 def _run_on_threads(starts, filter, observations, present, collect):
     """All runs on one device, which on a CPU is kept busy by several threads."""
-    num_particles = starts.key.shape[0] * filter.num_particles
-    num_threads = min(num_processors(), num_particles // _WORTH_A_THREAD)
+    num_runs = starts.key.shape[0]
+    num_worth_it = num_runs * filter.num_particles // _WORTH_A_THREAD
+    num_threads = min(num_processors(), num_runs, num_worth_it)
     keeps_all = collect is None  # of which there had better not be two copies for a while
     arguments = (filter, observations, present, collect)
     leave_to_caller = is_traced((starts, arguments)) or jax.default_backend() != "cpu"

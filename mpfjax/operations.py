@@ -391,7 +391,7 @@ def exp(log_values: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
 
 
 def scaled_exp(log_values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-    """e to these powers over the largest of them, and its logarithm.
+    """exp of the values over the largest exp of them, and the logarithm of that one.
 
     All that is derived from weights starts from these, which XLA then computes once.
     """
