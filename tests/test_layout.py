@@ -9,6 +9,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "mpfjax"
 
 # From the ground up: each part may import from those above it here, and from itself.
 ORDER = (
+    "checks",
     "operations",
     "devices",
     "generator",

@@ -1,0 +1,162 @@
+"""Checks of arguments, each raising a `ValueError` with the argument, its value and what would do.
+
+Arguments are given by name: `check_whole(1, num_particles=num_particles)`. What may be None is
+checked through `given`, which leaves it out: `check_positive(**given(max_distance=None))`.
+"""
+
+import math
+from collections.abc import Callable, Collection
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array
+
+_LONGEST = 200
+
+
+def given(**arguments: Any) -> dict[str, Any]:
+    """The arguments that are not None."""
+    return {name: value for name, value in arguments.items() if value is not None}
+
+
+def check_whole(least: int = 1, /, **arguments: Any) -> None:
+    """Each argument is a whole number (a Python or numpy integer, no boolean) from `least` on."""
+    for name, value in arguments.items():
+        is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        if not is_whole or value < least:
+            raise ValueError(f"{name}: {shown(value)} is not a whole number of at least {least}")
+
+
+def check_positive(**arguments: Any) -> None:
+    """Each argument is a finite number above zero."""
+    for name, value in arguments.items():
+        if not (_is_number(value) and 0 < value < math.inf):
+            raise ValueError(f"{name}: {shown(value)} is not a positive, finite number")
+
+
+def check_not_negative(**arguments: Any) -> None:
+    """Each argument is a finite number of at least zero."""
+    for name, value in arguments.items():
+        if not (_is_number(value) and 0 <= value < math.inf):
+            raise ValueError(f"{name}: {shown(value)} is not a finite number of at least 0")
+
+
+def check_finite(**arguments: Any) -> None:
+    """Each argument is a finite number."""
+    for name, value in arguments.items():
+        if not (_is_number(value) and math.isfinite(value)):
+            raise ValueError(f"{name}: {shown(value)} is not a finite number")
+
+
+def check_share(most: float = 1.0, /, **arguments: Any) -> None:
+    """Each argument is a number in [0, most]."""
+    for name, value in arguments.items():
+        if not (_is_number(value) and 0 <= value <= most):
+            raise ValueError(f"{name}: {shown(value)} is not a number in [0, {most:g}]")
+
+
+def check_one_of(choices: Collection[str], /, **arguments: Any) -> None:
+    """Each argument is one of some strings."""
+    for name, value in arguments.items():
+        if not isinstance(value, str) or value not in choices:
+            raise ValueError(f"{name}: {shown(value)} is not one of {sorted(choices)}")
+
+
+def check_flag(**arguments: Any) -> None:
+    """Each argument is True or False."""
+    for name, value in arguments.items():
+        if not isinstance(value, bool | np.bool_):
+            raise ValueError(f"{name}: {shown(value)} is neither True nor False")
+
+
+def check_callable(what: str, /, **arguments: Any) -> None:
+    """Each argument can be called; `what` says in words what it should be."""
+    for name, value in arguments.items():
+        if isinstance(value, type) or not callable(value):
+            raise ValueError(f"{name}: {shown(value)} is not {what}")
+
+
+def check_type(kind: type | tuple[type, ...], what: str, /, **arguments: Any) -> None:
+    """Each argument is an instance of a class; `what` says in words what it should be."""
+    for name, value in arguments.items():
+        if not isinstance(value, kind):
+            hint = f"; write {value.__name__}(...)" if isinstance(value, type) else ""
+            raise ValueError(f"{name}: {shown(value)} is not {what}{hint}")
+
+
+def check_key(key: Any, name: str = "key", *, batch: bool = False) -> None:
+    """It is one typed key, or with `batch` a vector of at least one."""
+    is_array = isinstance(key, jax.Array | np.ndarray)
+    if not is_array or not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        raw = is_array and key.dtype == np.uint32
+        why = "is of JAX's old kind of key" if raw else "is no typed key"
+        use = "jax.random.split(jax.random.key(0), seeds)" if batch else "jax.random.key(0)"
+        raise ValueError(f"{name}: {shown(key)} {why}; use {use}")
+    if batch and (key.ndim != 1 or key.shape[0] < 1):
+        raise ValueError(
+            f"{name}: shape {key.shape} is not that of one key a run, (seeds,);"
+            " use jax.random.split(key, seeds)"
+        )
+    if not batch and key.ndim != 0:
+        raise ValueError(
+            f"{name}: shape {key.shape} is not that of one key, (); monte_carlo takes many"
+        )
+
+
+def to_array(name: str, *, floating: bool = True) -> Callable[[Any], Array]:
+    """A converter of the argument of this name to an array, for `eqx.field(converter=...)`.
+
+    With `floating`, whole numbers and booleans become floating point numbers.
+    """
+
+    def convert(value: Any) -> Array:
+        if isinstance(value, jax.ShapeDtypeStruct):
+            return value  # pyright: ignore[reportReturnType]
+        try:
+            # JAX takes a string for the name of a type.
+            array = jnp.asarray(None if isinstance(value, str | bytes) else value)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"{name}: {shown(value)} is no array of numbers") from error
+        if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
+            raise ValueError(f"{name}: {shown(value)} is a key, no array of numbers")
+        if jnp.issubdtype(array.dtype, jnp.complexfloating):
+            raise ValueError(f"{name}: {shown(value)} is complex, and must be real")
+        if floating and not jnp.issubdtype(array.dtype, jnp.floating):
+            return array.astype(jnp.result_type(float))
+        return array
+
+    return convert
+
+
+def check_positive_array(**arguments: Any) -> None:
+    """Each array has numbers, all of them positive and finite, as far as they are known."""
+    _check_entries(lambda array: (array > 0) & np.isfinite(array), "positive and finite", arguments)
+
+
+def check_finite_array(**arguments: Any) -> None:
+    """Each array has numbers, all of them finite, as far as they are known."""
+    _check_entries(np.isfinite, "finite", arguments)
+
+
+def _check_entries(holds: Callable[..., Any], what: str, arguments: dict[str, Any]) -> None:
+    for name, array in arguments.items():
+        if isinstance(array, Tracer | jax.ShapeDtypeStruct):
+            continue
+        if np.size(array) == 0:
+            raise ValueError(f"{name}: shape {np.shape(array)} holds no number")
+        if not np.all(holds(np.asarray(array))):
+            raise ValueError(f"{name}: {shown(array)} is not {what} throughout")
+
+
+def shown(value: Any) -> str:
+    """The value as it is printed, cut where it is long."""
+    text = str(value) if isinstance(value, jax.Array | np.ndarray) else repr(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
+
+
+def _is_number(value: Any) -> bool:
+    numbers = (int, float, np.integer, np.floating)
+    return isinstance(value, numbers) and not isinstance(value, bool)
