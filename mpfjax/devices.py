@@ -20,9 +20,9 @@ from jax.core import Tracer
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from mpfjax.operations import log_sum_exp
+from mpfjax.operations import finite_max, log_sum_exp
 
 DEVICE_AXIS = "mpfjax_devices"
 ISLAND_AXIS = "mpfjax_islands"
@@ -329,6 +329,13 @@ def deal_to_islands(values: Array) -> Array:
 def log_sum_over_islands(log_value: Float[Array, ""]) -> Float[Array, ""]:
     """log Σ exp over the islands: O(1) numbers from each. Itself outside `run_islands`."""
     return log_value if num_islands() == 1 else log_sum_exp(over_islands(log_value))
+
+
+def largest_of_islands(value: Float[Array, ""], counts: Bool[Array, ""]) -> Float[Array, ""]:
+    """The largest value of the islands that count, 0 if none does. Itself outside `run_islands`."""
+    if num_islands() == 1:
+        return value
+    return finite_max(over_islands(jnp.where(counts, value, -jnp.inf)))
 
 
 def _default_devices(available: list[Any]) -> list[Any]:

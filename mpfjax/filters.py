@@ -16,13 +16,14 @@ from mpfjax.devices import (
     is_traced,
     island_index,
     jit_on_wide_vectors,
+    largest_of_islands,
     log_sum_over_islands,
     num_islands,
     num_processors,
     over_devices,
     over_threads,
 )
-from mpfjax.generator import fast_key
+from mpfjax.generator import split
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
@@ -35,6 +36,7 @@ from mpfjax.moves.partitioned import Partitioned, check_orders
 from mpfjax.moves.propagation import Predict, Propagate, Weigh
 from mpfjax.moves.regrouping import KMeans, Merge, Pool, RandomPartition, Split
 from mpfjax.moves.resampling import FEW_ROWS, Resample
+from mpfjax.operations import scaled_log_sum_exp
 from mpfjax.proposals import AbstractProposal
 
 
@@ -224,8 +226,18 @@ class Filter(eqx.Module):
             if not isinstance(move, _KEEP_MASS):
                 moved, log_growth = _normalise(moved, mixture.log_weights)
                 increment += log_growth
-            mixture = moved
+            mixture = self._forgetting(moved)
         return mixture, _report(mixture, increment, resampled)
+
+    def _forgetting(self, mixture: ParticleMixture) -> ParticleMixture:
+        """The mixture, in whose memory there is nothing of components that have died."""
+        if not mixture.memory:
+            return mixture
+        memory, dead = mixture.memory, ~mixture.active
+        for move in self.moves:
+            if isinstance(move, AbstractMove):
+                memory = move.forget(memory, dead)
+        return mixture.replace(memory=memory)
 
     def _predict(
         self, key: Key[Array, ""], mixture: ParticleMixture
@@ -234,7 +246,7 @@ class Filter(eqx.Module):
         for move_key, move in zip(_split(key, len(self._moves)), self.moves, strict=True):
             if not isinstance(move, AbstractMove):
                 raise ValueError(f"moves: {move!r} does not define predict, for a missing y_t")
-            mixture = move.predict(move_key, mixture)
+            mixture = self._forgetting(move.predict(move_key, mixture))
         increment = jnp.zeros((), mixture.log_weights.dtype)
         return mixture, _report(mixture, increment, jnp.zeros(self.num_components, bool))
 
@@ -721,15 +733,21 @@ def _sample_initial(
 def _normalise(
     mixture: ParticleMixture, previous_log_weights: Float[Array, " n"]
 ) -> tuple[ParticleMixture, Float[Array, ""]]:
-    """Remove the mass's growth; where no mass is left, go on with the weights of before."""
-    log_growth = log_sum_over_islands(mixture.log_mass)
-    has_mass = log_growth > -jnp.inf
-    normalised = mixture.log_weights - jnp.where(has_mass, log_growth, 0.0)
+    """Remove the mass's growth; where no mass is left, go on with the weights of before.
+
+    The scale goes first, and exactly: with it the sum of the weights would be rounded away.
+    """
+    log_total, log_largest = scaled_log_sum_exp(mixture.log_weights)
+    own_scale = log_largest if mixture.log_scale is None else log_largest + mixture.log_scale
+    log_scale = largest_of_islands(own_scale, log_total > -jnp.inf)
+    log_total = log_sum_over_islands(log_total + (own_scale - log_scale))
+    has_mass = log_total > -jnp.inf
+    log_share = (own_scale - log_scale) - jnp.where(has_mass, log_total, 0.0)
+    normalised = (mixture.log_weights - log_largest) + log_share
     # NaN compares false, and must not be taken for a step of zero likelihood.
-    keep = has_mass | jnp.isnan(log_growth)
-    return mixture.replace(log_weights=jnp.where(keep, normalised, previous_log_weights)), (
-        log_growth
-    )
+    keep = has_mass | jnp.isnan(log_total)
+    log_weights = jnp.where(keep, normalised, previous_log_weights)
+    return mixture.replace(log_weights=log_weights, log_scale=None), log_scale + log_total
 
 
 def _report(
@@ -762,7 +780,7 @@ def _split(key: Key[Array, ""], num: int) -> list[Key[Array, ""]]:
     """One key for each move; the first ones are the same whatever their number, so that a longer
     chain draws alike.
     """
-    return list(jax.random.split(fast_key(key), num))
+    return list(split(key, num))
 
 
 def _memory_of(move: AbstractMove) -> list[str]:
@@ -796,11 +814,14 @@ def present_steps(observations: PyTree, missing: str) -> Bool[Array, " t"] | Non
         raise ValueError(f"observations: shapes {shapes} do not share a leading axis t")
     if lengths == {0}:
         raise ValueError("observations: the leading axis t is empty")
+    _require_real(leaves, "observations")
     inexact = [leaf for leaf in leaves if jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)]
     if not inexact:
         return None
     if any(isinstance(leaf, Tracer) for leaf in inexact):
         return _present_traced(inexact, missing)
+    for leaf in inexact:
+        _require_fitting(np.asarray(leaf), "observations")
     finite = [np.isfinite(leaf).reshape(len(leaf), -1).all(axis=1) for leaf in inexact]
     present = np.logical_and.reduce(finite)
     if present.all():
@@ -811,6 +832,31 @@ def present_steps(observations: PyTree, missing: str) -> Bool[Array, " t"] | Non
             " of the leading axis; missing='skip' takes such steps as missing"
         )
     return jnp.asarray(present)
+
+
+def _require_real(leaves: list[Any], name: str) -> None:
+    """Raise a `ValueError` for complex numbers, whose imaginary part a density would drop."""
+    for leaf in leaves:
+        dtype = jnp.result_type(leaf)
+        if jnp.issubdtype(dtype, jnp.complexfloating):
+            raise ValueError(
+                f"{name}: {dtype} is complex; give the real and the imaginary part as two numbers"
+            )
+
+
+def _require_fitting(leaf: np.ndarray, name: str) -> None:
+    """Raise a `ValueError` for finite numbers that JAX's own type would make infinite."""
+    dtype = jax.dtypes.canonicalize_dtype(leaf.dtype)
+    if dtype == leaf.dtype:
+        return
+    with np.errstate(over="ignore"):
+        lost = np.isfinite(leaf) & ~np.isfinite(leaf.astype(dtype))
+    if lost.any():
+        first = tuple(map(int, np.argwhere(lost)[0]))
+        raise ValueError(
+            f"{name}: {leaf[first]:g} at index {first if len(first) != 1 else first[0]} is more"
+            f" than {dtype} holds; set jax_enable_x64, or choose other units"
+        )
 
 
 def _present_traced(leaves: list[Array], missing: str) -> Bool[Array, " t"] | None:

@@ -39,14 +39,35 @@ def fast_key(key: Key[Array, "*shape"]) -> Key[Array, "*shape"]:
     XLA compiles JAX's Threefry for a CPU as a loop over its rounds, which it cannot fuse with
     what uses the bits. Here the 20 rounds of Threefry-2x32 (Salmon et al. 2011, "Parallel random
     numbers: as easy as 1, 2, 3") are written out, so that one pass turns counters into, say,
-    normal draws. A filter wraps the keys that it hands to its moves, and so to the model's own
-    calls of `jax.random`. A key of another generator is returned as it is, and so is every key
+    normal draws. The library wraps a key where it draws; moves and models are handed ordinary
+    keys, since not all of `jax.random` takes this one (`poisson` does not, nor does `jnp.where`
+    beside an ordinary key). A key of another generator is returned as it is, and so is every key
     where JAX is set not to number its draws (`jax_threefry_partitionable`).
     """
     is_numbered = jax.config.jax_threefry_partitionable  # pyright: ignore[reportAttributeAccessIssue]
     if not is_numbered or jax.random.key_impl(key) != "threefry2x32":
         return key
     return jax.random.wrap_key_data(jax.random.key_data(key), impl=_UNROLLED)
+
+
+def split(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
+    """`jax.random.split`, the same ordinary keys in less time on a CPU."""
+    keys = jax.random.split(fast_key(key), num)
+    return jax.random.wrap_key_data(jax.random.key_data(keys), impl=jax.random.key_impl(key))
+
+
+def uniform(
+    key: Key[Array, ""], shape: tuple[int, ...], dtype: DTypeLike | None = None
+) -> Float[Array, "..."]:
+    """`jax.random.uniform` on [0, 1), the same numbers in less time on a CPU."""
+    return jax.random.uniform(
+        fast_key(key), shape, default_float() if dtype is None else jnp.dtype(dtype)
+    )
+
+
+def bits(key: Key[Array, ""], shape: tuple[int, ...]) -> UInt32[Array, "..."]:
+    """`jax.random.bits` of 32 bits, the same in less time on a CPU."""
+    return jax.random.bits(fast_key(key), shape, jnp.uint32)
 
 
 def normal(

@@ -3,11 +3,13 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree, Shaped
 
 from mpfjax.operations import (
+    as_inexact,
     default_float,
     exp,
+    finite_max,
     log_sum_exp,
     scaled_exp,
     segment_counts,
@@ -35,6 +37,11 @@ class ParticleMixture(eqx.Module):
     - `num_components`: M, the most components there can be; static.
     - `memory`: what moves with a memory carry from step to step, by the move's name.
     - `limit`: how many slots may be filled, where that is fewer than there are; None is all.
+    - `log_scale`: within a step, log of a factor of all weights that ℓ leaves out, since beside a
+      log-likelihood of a million ℓ would be rounded away; None, which is zero, once normalised.
+
+    Properties are those of one mixture: for a stack of them, as `monte_carlo` and `collect=None`
+    give, they raise a `ValueError` that says to `jax.vmap` over the leading axes.
     """
 
     particles: PyTree
@@ -44,10 +51,12 @@ class ParticleMixture(eqx.Module):
     num_components: int = eqx.field(static=True)
     memory: dict[str, PyTree] = eqx.field(default_factory=dict)
     limit: Int[Array, ""] | None = None
+    log_scale: Float[Array, ""] | None = None
 
     @property
     def num_particles(self) -> int:
         """N, the number of slots, filled or not."""
+        self._require_one()
         return self.log_weights.shape[0]
 
     @property
@@ -63,19 +72,23 @@ class ParticleMixture(eqx.Module):
     @property
     def weights(self) -> Float[Array, " n"]:
         """exp ℓ, the joint weights; they sum to one over all particles."""
+        self._require_one()
         values, log_scale = scaled_exp(self.log_weights)
         return values * exp(log_scale)
 
     @property
     def log_mass(self) -> Float[Array, ""]:
         """log Σ exp ℓ: zero once normalised, and the step's growth of mass before."""
-        return log_sum_exp(self.log_weights)
+        self._require_one()
+        log_mass = log_sum_exp(self.log_weights)
+        return log_mass if self.log_scale is None else log_mass + self.log_scale
 
     @property
     def log_mixture_weights(self) -> Float[Array, " m"]:
         """log π_m, -inf for a dead component."""
+        self._require_one()
         if self.num_components == 1:
-            return self.log_mass[None]
+            return log_sum_exp(self.log_weights)[None]
         return segment_log_sum_exp(self.log_weights, self.component_indicators, self.num_components)
 
     @property
@@ -86,6 +99,7 @@ class ParticleMixture(eqx.Module):
     @property
     def component_counts(self) -> Int[Array, " m"]:
         """How many filled slots each component has."""
+        self._require_one()
         labels = self.component_indicators
         if self.num_components == 1:
             # Labels that nothing reads need not be copied from step to step.
@@ -108,6 +122,7 @@ class ParticleMixture(eqx.Module):
     @property
     def component_weights(self) -> Float[Array, " n"]:
         """w_i, the weights within each component; they sum to one in each living one."""
+        self._require_one()
         if self.num_components == 1:
             return softmax(self.log_weights)
         return segment_softmax(self.log_weights, self.component_indicators, self.num_components)
@@ -120,21 +135,30 @@ class ParticleMixture(eqx.Module):
     @property
     def effective_sample_size(self) -> Float[Array, ""]:
         """(Σ exp ℓ)² / Σ exp 2ℓ over all particles, zero where there is none."""
+        self._require_one()
         values, _ = scaled_exp(self.log_weights)
         return jnp.sum(values) ** 2 * _inverse(jnp.sum(values**2))
 
     def component_sums(self, values: Float[Array, "n *rest"]) -> Float[Array, "m *rest"]:
         """Σ_{c_i = m} v_i over each component's slots."""
+        self._require_one()
         return segment_sum(values, self.component_indicators, self.num_components)
 
-    def component_averages(self, values: Float[Array, "n *rest"]) -> Float[Array, "m *rest"]:
-        """Σ_{c_i = m} w_i v_i, the weighted average of `values` in each component, zero if dead."""
+    def component_averages(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, "m *rest"]:
+        """Σ_{c_i = m} w_i v_i, the weighted average of `values` in each component, zero if dead.
+
+        Whole numbers and booleans are averaged as floating point numbers.
+        """
+        values = as_inexact(values)
         weights = self.component_weights.astype(values.dtype)
         filled = jnp.where(_rows(self.occupied, values), values, jnp.zeros((), values.dtype))
         return self.component_sums(_rows(weights, values) * filled)
 
     def component_means(self) -> PyTree:
-        """The weighted mean of each component: every leaf (m, ...), zero for a dead one."""
+        """The weighted mean of each component: every leaf (m, ...), zero for a dead one.
+
+        Leaves that are not floating point are averaged as `component_averages` does.
+        """
         return jax.tree.map(self.component_averages, self.particles)
 
     def component_covariances(self) -> Float[Array, "m d d"]:
@@ -144,11 +168,16 @@ class ParticleMixture(eqx.Module):
         return self.component_averages(centred[:, :, None] * centred[:, None, :])
 
     def mean(self) -> PyTree:
-        """E[x_t | y_1..y_t], leaf by leaf, over the whole mixture."""
+        """E[x_t | y_1..y_t], leaf by leaf, over the whole mixture; see `average`."""
         return jax.tree.map(self.average, self.particles)
 
-    def average(self, values: Float[Array, "n *rest"]) -> Float[Array, " *rest"]:
-        """Σ_i exp(ℓ_i) v_i, the estimate of an expectation under the filtering distribution."""
+    def average(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, " *rest"]:
+        """Σ_i exp(ℓ_i) v_i, the estimate of an expectation under the filtering distribution.
+
+        Of an event it is the probability: `m.average(m.particles["mode"] == 2)`. Whole numbers and
+        booleans are averaged as floating point numbers.
+        """
+        values = as_inexact(values)
         is_filled, zero = _rows(self.occupied, values), jnp.zeros((), values.dtype)
         products = _rows(self.weights.astype(values.dtype), values) * jnp.where(
             is_filled, values, zero
@@ -156,11 +185,35 @@ class ParticleMixture(eqx.Module):
         # XLA for a CPU may take thirty times as long for a sum that does the multiplying.
         return jnp.sum(jnp.where(is_filled, products, zero), axis=0)
 
+    def weighed(self, *log_factors: Float[Array, "#n"]) -> "ParticleMixture":
+        """The mixture with its weights multiplied by exp of the factors, one array or several.
+
+        What the filled slots have in common of each array goes to `log_scale`, so that a constant
+        of any size changes nothing but the mass. An empty slot stays empty whatever its factor is.
+        """
+        log_weights, log_scale = self.log_weights, self.log_scale
+        for factors in log_factors:
+            factors = factors.astype(log_weights.dtype)
+            common = finite_max(jnp.where(self.occupied, factors, -jnp.inf))
+            log_weights = log_weights + (factors - common)
+            log_scale = common if log_scale is None else log_scale + common
+        log_weights = jnp.where(self.occupied, log_weights, -jnp.inf)
+        return self.replace(log_weights=log_weights, log_scale=log_scale)
+
     def replace(self, **fields: PyTree) -> "ParticleMixture":
         """A copy with some fields changed."""
         return type(self)(
             **{name: fields.get(name, getattr(self, name)) for name in self.__dataclass_fields__}
         )
+
+    def _require_one(self) -> None:
+        shape = self.log_weights.shape
+        if len(shape) != 1:
+            raise ValueError(
+                f"mixture: a stack of {' x '.join(map(str, shape[:-1]))} mixtures has no such"
+                " property of its own; jax.vmap over the leading axes, as in"
+                " jax.vmap(lambda mixture: mixture.mean())(mixtures)"
+            )
 
 
 def single_component(
@@ -189,15 +242,9 @@ def single_component(
 
 def flatten_states(particles: PyTree) -> Float[Array, "n d"]:
     """All leaves of the particles side by side, one row a particle."""
-    leaves = [leaf.reshape(leaf.shape[0], -1) for leaf in jax.tree.leaves(particles)]
-    is_float = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
-    return jnp.concatenate(
-        [
-            leaf if keep else leaf.astype(default_float())
-            for leaf, keep in zip(leaves, is_float, strict=True)
-        ],
-        axis=1,
-    )
+    leaves = [as_inexact(leaf.reshape(leaf.shape[0], -1)) for leaf in jax.tree.leaves(particles)]
+    widest = max((leaf.dtype for leaf in leaves), key=lambda dtype: jnp.finfo(dtype).bits)
+    return jnp.concatenate([leaf.astype(widest) for leaf in leaves], axis=1)
 
 
 def _inverse(squares: Float[Array, " *shape"]) -> Float[Array, " *shape"]:

@@ -3,18 +3,21 @@
 import math
 from collections.abc import Callable
 from functools import partial, reduce
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
+from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree, Shaped, UInt32
 
 _FEW_SEGMENTS = 4
 _FEW_COLUMNS = 16
 # Neighbours that are added to the same place go to different lanes, each with a place of its own: a
 # CPU would wait at every one of them for the last to be done.
 _LANES, _LANES_OF_ROWS = 8, 4
+# One after the other, a million equal numbers add up to a thousandth too much in float32.
+_LONGEST_SUM = 2**10
 _BLOCKS = (32, 16, 8)
 _ONE_BLOCK = 128
 _EXACT_IN_FLOAT32 = 2**23  # as exact as up to 2^24, and readable from the lowest bits
@@ -159,7 +162,8 @@ def _on_one_line(rows: Int[Array, "k n"], num_places: int) -> UInt32[Array, " k*
 def _in_rows(scatter: Callable[..., Array]) -> Callable[..., Array]:
     """A scatter over one row that under `vmap` scatters all rows at once, over one line of places.
 
-    On a CPU that takes about half the time of a scatter with pairs of indices.
+    On a CPU that takes about half the time of a scatter with pairs of indices. To a derivative it
+    is a constant: JAX would apply the rule below to itself without end.
     """
     scatter_rows = jax.custom_batching.custom_vmap(scatter)
 
@@ -174,7 +178,7 @@ def _in_rows(scatter: Callable[..., Array]) -> Callable[..., Array]:
         scattered = scatter_rows(*(rows.reshape(-1, rows.shape[-1]) for rows in every))
         return scattered.reshape(axis_size, -1, scattered.shape[-1]), True
 
-    return lambda *arguments: scatter_rows(*(row[None] for row in arguments))[0]
+    return lambda *arguments: scatter_rows(*(row[None] for row in without_gradient(arguments)))[0]
 
 
 def stored(values: Shaped[Array, "*rest n"], bound: int | None = None) -> Shaped[Array, "*rest n"]:
@@ -255,6 +259,7 @@ def draw_columns(uniform: Float[Array, " k"], weights: Float[Array, "k n"]) -> I
     A column of weight zero is not drawn, unless the whole row is zero: its last column then is.
     Two levels, blocks of columns and columns in a block, take one pass over the table.
     """
+    # In both, rounding may leave the target on either side of a border, or past the end.
     num_rows, num_columns = weights.shape
     size = max(math.isqrt(num_columns), 1)
     num_blocks = -(-num_columns // size)
@@ -262,18 +267,29 @@ def draw_columns(uniform: Float[Array, " k"], weights: Float[Array, "k n"]) -> I
     blocks = padded.reshape(num_rows, num_blocks, size)
     sums = jnp.sum(blocks, axis=2)
     upto = jnp.cumsum(sums, axis=1)
-    # The largest quantile must not be rounded to the whole.
-    uniform = jnp.minimum(uniform, 1 - 4 * jnp.finfo(weights.dtype).eps)
     target = uniform * upto[:, -1]
-    block = jnp.sum(upto <= target[:, None], axis=1, dtype=jnp.int32)
-    block = jnp.minimum(block, num_blocks - 1)
+    block = _first_above(target, upto, sums)
     rows = jnp.arange(num_rows, dtype=jnp.int32)
-    inside = jnp.cumsum(blocks[rows, block], axis=1)
-    # Rounding may leave the target past the block's end, by its own sum.
+    chosen = blocks[rows, block]
     rest = target - (upto[rows, block] - sums[rows, block])
-    rest = jnp.minimum(rest, inside[:, -1] * (1 - 4 * jnp.finfo(weights.dtype).eps))
-    column = jnp.sum(inside <= rest[:, None], axis=1, dtype=jnp.int32)
-    return jnp.minimum(block * size + jnp.minimum(column, size - 1), num_columns - 1)
+    column = _first_above(rest, jnp.cumsum(chosen, axis=1), chosen)
+    return jnp.minimum(block * size + column, num_columns - 1)
+
+
+def _first_above(
+    target: Float[Array, " k"], upto: Float[Array, "k n"], weights: Float[Array, "k n"]
+) -> Int[Array, " k"]:
+    """In each row the first place of positive weight whose cumulative sum is above the target.
+
+    The last place of positive weight where none is, and the last of all where none has weight.
+    """
+    last = weights.shape[1] - 1
+    place = jnp.arange(last + 1, dtype=jnp.int32)[None]
+    is_positive = weights > 0
+    first = jnp.min(jnp.where(is_positive & (upto > target[:, None]), place, last + 1), axis=1)
+    last_positive = jnp.max(jnp.where(is_positive, place, -1), axis=1)
+    last_positive = jnp.where(last_positive < 0, last, last_positive)
+    return jnp.minimum(first, last_positive)
 
 
 def spread(
@@ -352,7 +368,7 @@ def _scattered(
     Where there are many in a segment they are dealt to lanes.
     """
     n = values.shape[0]
-    num_lanes = _LANES if n >= _LANES * num_segments else 1
+    num_lanes = _num_lanes(n) if n >= _LANES * num_segments else 1
     padding = ((0, 0), (0, -n % num_lanes))
 
     def scatter(
@@ -376,6 +392,11 @@ def _scattered(
     return _in_rows(scatter)(values, segments)
 
 
+def _num_lanes(n: int) -> int:
+    """A power of two, of which no lane gets more than so many: a long sum would drift."""
+    return max(_LANES, 1 << max(-(-n // _LONGEST_SUM) - 1, 0).bit_length())
+
+
 _OVER_LANES: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": jnp.max, "min": jnp.min}
 
 
@@ -395,14 +416,33 @@ def scaled_exp(log_values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Floa
 
     All that is derived from weights starts from these, which XLA then computes once.
     """
-    log_scale = _finite(jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf))
+    log_scale = finite_max(log_values)
     return exp(log_values - log_scale), log_scale
+
+
+def finite_max(log_values: Float[Array, " n"]) -> Float[Array, ""]:
+    """What logarithms may be reduced by: the largest, or 0 where that is infinite or NaN.
+
+    It is a constant to a derivative.
+    """
+    return _finite(jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf))
 
 
 def log_sum_exp(log_values: Float[Array, " n"]) -> Float[Array, ""]:
     """log Σ exp, -inf where every entry is -inf, with a gradient that is finite there too."""
+    log_total, log_scale = scaled_log_sum_exp(log_values)
+    return log_total + log_scale
+
+
+def scaled_log_sum_exp(
+    log_values: Float[Array, " n"],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """log Σ exp in two parts: that of the values over the largest, and the largest.
+
+    Of logarithms beyond a million or so the sum of both would keep little of the first.
+    """
     values, log_scale = scaled_exp(log_values)
-    return _log(jnp.sum(values)) + log_scale
+    return _log(jnp.sum(values)), log_scale
 
 
 def segment_log_sum_exp(
@@ -438,6 +478,7 @@ def segment_argmax(
 ) -> Int[Array, " num_segments"]:
     """The index of the largest value in each segment, some index where it is empty."""
     n = values.shape[0]
+    values = jax.lax.stop_gradient(values)  # an index has no derivative
     is_largest = values >= spread(segment_max(values, segments, num_segments), segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
     if num_segments > _FEW_SEGMENTS:
@@ -554,9 +595,26 @@ def _add_gradient_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return add_gradient(*primals), tangents[0] + tangents[1]
 
 
+def without_gradient(tree: PyTree) -> PyTree:
+    """The same values, all of them constants to a derivative."""
+    return jax.tree.map(
+        lambda leaf: jax.lax.stop_gradient(leaf) if _is_inexact_array(leaf) else leaf, tree
+    )
+
+
+def as_inexact(values: Shaped[Array, "*shape"]) -> Inexact[Array, "*shape"]:
+    """The same numbers in floating point: whole ones and booleans have no averages of their own."""
+    is_inexact = jnp.issubdtype(values.dtype, jnp.inexact)
+    return values if is_inexact else values.astype(default_float())
+
+
 def default_float() -> jnp.dtype:
     """The floating point type of new arrays: float32, or float64 where JAX is set to it."""
     return jnp.result_type(float)
+
+
+def _is_inexact_array(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jnp.inexact)
 
 
 def _finite(largest: Float[Array, " *shape"]) -> Float[Array, " *shape"]:

@@ -170,6 +170,35 @@ class TestOnline:
         assert not bool(info.degenerate)
         assert np.isfinite(after.mean()).all()
 
+    @pytest.mark.parametrize("constant", [1e3, -1e3, 1e6, -1e6, 1e9, -1e9, 1e30, -1e30])
+    def test_a_constant_moves_the_evidence_and_nothing_else(self, chain, constant):
+        """Added to every log-likelihood, of any size that the type holds.
+
+        What it leaves of the likelihoods' own digits is the same in both filters.
+        """
+        constant = np.float32(constant)
+        with_it, without = (
+            CHAINS[chain](TrickyQuadraticModel(0.3, 0.5, constant=constant, taken_off=taken_off))
+            for taken_off in (np.float32(0), constant)
+        )
+        mixture = expected = started(chain_filter(chain, "quadratic"))
+        copies = getattr(with_it.model, "num_objects", 1)
+        for t, observation in enumerate(OBSERVATIONS[1:3]):
+            mixture, info = with_it.step(jax.random.key(t), mixture, observation)
+            expected, plain = without.step(jax.random.key(t), expected, observation)
+            assert float(mixture.weights.sum()) == pytest.approx(1, rel=1e-5)
+            increment = copies * constant + plain.log_likelihood_increment
+            np.testing.assert_allclose(
+                info.log_likelihood_increment, increment, rtol=1e-6, atol=1e-5
+            )
+            np.testing.assert_array_equal(info.resampled, plain.resampled)
+            np.testing.assert_allclose(info.mixture_weights, plain.mixture_weights, atol=1e-5)
+            np.testing.assert_allclose(mixture.weights, expected.weights, rtol=1e-4, atol=1e-6)
+            np.testing.assert_allclose(mixture.particles, expected.particles, atol=1e-5)
+            np.testing.assert_array_equal(mixture.ancestor_indices, expected.ancestor_indices)
+            labels = mixture.component_indicators, expected.component_indicators
+            np.testing.assert_array_equal(*labels)
+
     def test_a_nan_observation_is_an_error(self, chain):
         filter = chain_filter(chain, "quadratic")
         with pytest.raises(RuntimeError, match="observation"):

@@ -1,11 +1,13 @@
 """What is derived from a mixture, against its definition by numpy."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mpfjax.mixture import flatten_states, single_component
-from tests.examples import example_mixtures, log_masses
+from mpfjax.moves.features import Features
+from tests.examples import example_mixtures, log_masses, make_mixture
 
 MIXTURES = example_mixtures()
 over_mixtures = pytest.mark.parametrize("mixture", MIXTURES.values(), ids=MIXTURES)
@@ -98,3 +100,102 @@ def test_replace_changes_what_it_names_and_nothing_else():
     np.testing.assert_array_equal(changed.component_indicators, 0)
     assert changed.particles is mixture.particles
     assert changed.num_components == mixture.num_components
+
+
+class TestStatesThatAreNotFloats:
+    """A switching model: a mode, and a flag, beside a position."""
+
+    def mixture(self):
+        rng = np.random.default_rng(1)
+        states = {
+            "position": rng.normal(size=(40, 2)).astype(np.float32),
+            "mode": rng.integers(1, 4, 40).astype(np.int32),
+            "seen": rng.random(40) < 0.3,
+        }
+        mixture = MIXTURES["dead components"]
+        return mixture.replace(particles=jax.tree.map(jnp.asarray, states)), states
+
+    def test_means_are_weighted_averages_of_the_values(self):
+        mixture, states = self.mixture()
+        weights = np.exp(np.asarray(mixture.log_weights, float))
+        within = np.exp(np.asarray(mixture.log_component_weights, float))
+        mean, by_component = mixture.mean(), mixture.component_means()
+        for name, values in states.items():
+            assert jnp.issubdtype(mean[name].dtype, jnp.floating)
+            expected = np.einsum("i,i...->...", weights, values)
+            np.testing.assert_allclose(mean[name], expected, rtol=1e-5, atol=1e-6)
+            for m, slots in enumerate(members(mixture)):
+                expected = np.einsum("i,i...->...", within[slots], values[slots])
+                np.testing.assert_allclose(by_component[name][m], expected, rtol=1e-5, atol=1e-6)
+
+    def test_the_average_of_an_event_is_its_probability(self):
+        mixture, states = self.mixture()
+        weights = np.exp(np.asarray(mixture.log_weights, float))
+        found = mixture.average(mixture.particles["mode"] == 2)
+        assert float(found) == pytest.approx(weights[states["mode"] == 2].sum(), rel=1e-5)
+
+    def test_covariances_take_them_as_numbers(self):
+        mixture, states = self.mixture()
+        flat = np.column_stack([states["mode"], states["position"], states["seen"]]).astype(float)
+        within = np.exp(np.asarray(mixture.log_component_weights, float))
+        slots = members(mixture)[0]
+        centred = flat[slots] - within[slots] @ flat[slots]
+        expected = (within[slots, None] * centred).T @ centred
+        np.testing.assert_allclose(mixture.component_covariances()[0], expected, atol=1e-5)
+
+    def test_leaves_of_several_floating_point_types_stand_side_by_side(self):
+        leaves = {"a": jnp.ones((4, 1), jnp.bfloat16), "b": jnp.ones(4, jnp.float32)}
+        assert flatten_states(leaves).dtype == jnp.float32
+
+    def test_regrouping_measures_whole_numbers_in_any_unit(self):
+        mixture, states = self.mixture()
+        features = Features(lambda state: state["mode"], 0.5)(mixture)
+        filled = np.asarray(mixture.occupied)
+        modes = 2.0 * states["mode"][filled]
+        np.testing.assert_allclose(np.asarray(features)[filled, 0], modes - modes.mean(), atol=1e-5)
+
+
+STACKED = (
+    "num_particles",
+    "weights",
+    "log_mass",
+    "log_mixture_weights",
+    "mixture_weights",
+    "component_counts",
+    "active",
+    "log_component_weights",
+    "component_weights",
+    "component_effective_sample_sizes",
+    "effective_sample_size",
+)
+
+
+@pytest.mark.parametrize("name", STACKED)
+@pytest.mark.parametrize("num_components", [1, 6])
+def test_a_stack_of_mixtures_has_no_property_of_one(name, num_components, as_installed):
+    labels = np.zeros(40) if num_components == 1 else np.arange(40) % 6
+    one = make_mixture(np.arange(40.0), np.zeros(40), labels, num_components)
+    # As many as there are particles: shapes would fit.
+    stack = jax.tree.map(lambda leaf: jnp.stack([leaf] * 40), one)
+    with pytest.raises(ValueError, match=r"mixture: a stack of 40 mixtures .* jax\.vmap"):
+        getattr(stack, name)
+    each = jax.vmap(lambda mixture: getattr(mixture, name))(stack) if name != STACKED[0] else None
+    if each is not None:
+        np.testing.assert_allclose(each[3], getattr(one, name), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "summary",
+    [
+        lambda mixture: mixture.mean(),
+        lambda mixture: mixture.component_means(),
+        lambda mixture: mixture.component_covariances(),
+        lambda mixture: mixture.average(mixture.particles),
+        lambda mixture: mixture.component_sums(mixture.particles),
+        lambda mixture: mixture.component_averages(mixture.particles),
+    ],
+)
+def test_a_stack_of_mixtures_has_no_summary_of_one(summary, as_installed):
+    stack = jax.tree.map(lambda leaf: jnp.stack([leaf] * 40), MIXTURES["ordinary"])
+    with pytest.raises(ValueError, match="mixture: a stack of 40 mixtures"):
+        summary(stack)

@@ -354,3 +354,50 @@ def test_draw_columns_at_the_ends():
         int(operations.draw_columns(jnp.array([u]), weights)[0]) for u in (0.0, 0.99999994)
     )
     assert (first, last) == (1, 4)
+
+
+@pytest.mark.parametrize("num_segments", FEW_AND_MANY)
+class TestSumsOfAMillion:
+    """In float32, to the precision of a pairwise sum: none drifts as it grows."""
+
+    n = 10**6
+
+    def test_of_equal_values(self, num_segments):
+        segments = np.arange(self.n) % num_segments
+        found = operations.segment_sum(
+            jnp.full(self.n, 0.3, jnp.float32), jnp.asarray(segments, jnp.int32), num_segments
+        )
+        expected = np.float64(np.float32(0.3)) * np.bincount(segments)
+        np.testing.assert_allclose(found, expected, rtol=2e-5)
+
+    def test_of_values_far_from_zero(self, num_segments):
+        segments = RNG.integers(0, num_segments, self.n)
+        values = (1000 + RNG.normal(size=self.n)).astype(np.float32)
+        found = operations.segment_sum(
+            jnp.asarray(values), jnp.asarray(segments, jnp.int32), num_segments
+        )
+        expected = np.bincount(segments, weights=values.astype(float))
+        np.testing.assert_allclose(found, expected, rtol=2e-5)
+
+
+def test_columns_of_no_weight_are_not_drawn_at_the_borders_of_blocks():
+    """Quantiles exactly where a block, or a run of zeros, begins and ends."""
+    for num_columns in (4, 9, 37, 100):
+        weights = RNG.random((400, num_columns)).astype(np.float32)
+        weights[RNG.random(weights.shape) < 0.6] = 0
+        weights[:, 1] += weights.sum(axis=1) == 0
+        upto = np.cumsum(weights, axis=1)
+        border = np.argmax(RNG.random(weights.shape), axis=1)
+        quantiles = np.concatenate([upto[np.arange(400), border] / upto[:, -1], np.zeros(400)])
+        quantiles = np.concatenate([quantiles, np.full(400, np.nextafter(np.float32(1), 0))])
+        table = np.tile(weights, (3, 1))
+        found = operations.draw_columns(
+            jnp.asarray(np.minimum(quantiles, np.nextafter(np.float32(1), 0)), jnp.float32),
+            jnp.asarray(table),
+        )
+        assert (table[np.arange(len(table)), np.asarray(found)] > 0).all()
+
+
+def test_the_last_column_is_drawn_of_a_row_without_weight():
+    found = operations.draw_columns(jnp.array([0.0, 0.7]), jnp.zeros((2, 11)))
+    np.testing.assert_array_equal(found, [10, 10])

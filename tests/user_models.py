@@ -125,12 +125,19 @@ BLINDED, BROKEN, EXPLODING = -99.0, -98.0, -97.0
 class TrickyQuadraticModel(mpfjax.QuadraticModel):
     """The quadratic model, with a zero, a NaN and an infinite likelihood on demand.
 
-    It also counts how often it is traced, in `TRACES`.
+    A `constant` is added to all log-likelihoods; what is left of them beside it is what they are,
+    with the constant or, where it is `taken_off`, without. It also counts how often it is traced,
+    in `TRACES`.
     """
+
+    constant: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)
+    taken_off: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)
 
     def log_likelihood(self, observation, states):
         TRACES.append(states.shape)
         honest = super().log_likelihood(observation, states)
+        # Two numbers, so that no compiler may see that their difference is what was there.
+        honest = (honest + self.constant) - self.taken_off
         first = jnp.arange(states.shape[0]) == 0
         honest = jnp.where(observation == BLINDED, -jnp.inf, honest)
         honest = jnp.where((observation == BROKEN) & first, jnp.nan, honest)

@@ -5,9 +5,13 @@ from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.checks import shown
+from mpfjax.generator import split
 
 
 class AbstractStateSpaceModel(eqx.Module):
@@ -53,11 +57,35 @@ def require(model: Any, method: str, needed_by: str) -> None:
         )
 
 
+def check_log_density(
+    values: Any, model: Any, method: str, num_particles: int
+) -> Float[Array, " n"]:
+    """What a density of the model returned; a `ValueError` unless it is one real number each."""
+    who = f"model: {type(model).__name__}.{method} returned"
+    if not isinstance(values, jax.Array | np.ndarray):
+        raise ValueError(
+            f"{who} {shown(values)}, not one value a particle, an array of shape ({num_particles},)"
+        )
+    if values.shape != (num_particles,):
+        raise ValueError(
+            f"{who} shape {values.shape}, not one value a particle, ({num_particles},)"
+        )
+    if jnp.issubdtype(values.dtype, jnp.complexfloating):
+        raise ValueError(f"{who} complex values ({values.dtype}); a log-density is real")
+    return jnp.asarray(values)
+
+
 def require_positive(**parameters: Any) -> None:
     """Raise a `ValueError` for a parameter that is known not to be positive."""
     for name, value in parameters.items():
         if not isinstance(value, Tracer) and not np.all(np.asarray(value) > 0):
             raise ValueError(f"{name}: {value} is not positive")
+
+
+# What the library looks for in a model beside the three methods: functions of one particle, and
+# what all particles share.
+_BATCHED = ("log_transition", "log_initial", "with_history", "transition_mean", "observation_mean")
+_SHARED = ("transition_covariance", "observation_covariance", "prepare_observation")
 
 
 class _PerParticleModel(AbstractStateSpaceModel):
@@ -66,11 +94,11 @@ class _PerParticleModel(AbstractStateSpaceModel):
     model: Any
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
-        return jax.vmap(self.model.sample_initial)(jax.random.split(key, num_particles))
+        return jax.vmap(self.model.sample_initial)(split(key, num_particles))
 
     def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         num_particles = jax.tree.leaves(states)[0].shape[0]
-        return jax.vmap(self.model.sample_transition)(jax.random.split(key, num_particles), states)
+        return jax.vmap(self.model.sample_transition)(split(key, num_particles), states)
 
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
         return jax.vmap(self.model.log_likelihood, in_axes=(None, 0))(observation, states)
@@ -78,21 +106,25 @@ class _PerParticleModel(AbstractStateSpaceModel):
     def __getattr__(self, name: str) -> Any:
         # Only reached for names that the class lacks: the densities and means that a proposal
         # looks for are there exactly when the wrapped model has them.
-        batched_over = {"log_transition": 2, "transition_mean": 1, "observation_mean": 1}
-        if name in batched_over:
-            return jax.vmap(getattr(self.model, name))
-        if name in ("transition_covariance", "observation_covariance"):
-            return getattr(self.model, name)
-        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        model = self.__dict__.get("model")
+        if name in _BATCHED and hasattr(model, name):
+            return jax.vmap(getattr(model, name))
+        if name in _SHARED and hasattr(model, name):
+            return getattr(model, name)
+        raise AttributeError(f"{type(model).__name__} (per_particle) has no attribute {name!r}")
 
 
 def per_particle(model: Any) -> AbstractStateSpaceModel:
     """Make a batched model of one that is written for a single particle.
 
     `model` has `sample_initial(key)`, `sample_transition(key, state)` and
-    `log_likelihood(observation, state)`, and where a proposal needs it
-    `log_transition(state, previous_state)`, each for one particle. Use it for a first version of
-    a model: a key for each particle makes the draws four to five times slower than a batched one.
+    `log_likelihood(observation, state)`, each for one particle. What else the library looks for
+    in a model is passed on where it is there: `log_transition(state, previous_state)`,
+    `log_initial(state)`, `with_history(state, previous_state)`, `transition_mean(state)` and
+    `observation_mean(state)`, of one particle as well; `transition_covariance`,
+    `observation_covariance` and `prepare_observation(observation)`, as they are. Use it for a first
+    version of a model: a key for each particle makes the draws four to five times slower than a
+    batched one.
 
     Raises `ValueError` where one of the three methods is missing.
     """

@@ -58,7 +58,7 @@ class RandomWalkWithJumps(AbstractDynamics):
     ) -> Float[Array, "n d"]:
         """x_{t-1} plus a step, long for the particles that jump."""
         del previous
-        key_noise, key_jump = jax.random.split(key)
+        key_noise, key_jump = split(key, 2)
         jumps = jax.random.bernoulli(key_jump, self.jump_probability, (current.shape[0], 1))
         steps = jnp.where(
             jumps,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
+from mpfjax.generator import split
 from mpfjax.models.base import AbstractStateSpaceModel, require
 
 # A number of particles that no parameter has by chance as the length of an axis.
@@ -78,7 +79,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         """x_0 of every object, independent: every leaf (n, J, ...)."""
-        keys = jax.random.split(key, 2 * self.num_objects).reshape(2, self.num_objects)
+        keys = split(key, 2 * self.num_objects).reshape(2, self.num_objects)
 
         def draw(key: Key[Array, ""], key_order: Key[Array, ""], j: Int[Array, ""]) -> PyTree:
             states = self.object_at(j).sample_initial(key, num_particles)
@@ -93,7 +94,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
 
     def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """x_t of every object, independent of each other given x_{t-1}."""
-        keys = jax.random.split(key, self.num_objects)
+        keys = split(key, self.num_objects)
         draw = lambda key, states, j: self.object_at(j).sample_transition(key, states)  # noqa: E731
         return jax.vmap(draw, in_axes=(0, 1, 0), out_axes=1)(keys, states, self._indices)
 
@@ -175,7 +176,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
         def draw(key: Key[Array, ""], state: PyTree, j: Int[Array, ""]) -> PyTree:
             return _one(self.object_at(j).sample_transition(key, _many(state)))
 
-        return jax.vmap(draw)(jax.random.split(key, objects.shape[0]), states, objects)
+        return jax.vmap(draw)(split(key, objects.shape[0]), states, objects)
 
     def prepare_observation(self, observation: PyTree) -> PyTree:
         """What the objects' likelihoods look at: y_t, or what the object model makes of it."""

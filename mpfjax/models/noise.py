@@ -1,10 +1,9 @@
 """Standard normal and uniform draws: independent, or spread evenly over all particles."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from mpfjax.generator import normal, normal_quantile
+from mpfjax.generator import bits, normal, normal_quantile, uniform
 
 
 def independent_normal(
@@ -28,7 +27,7 @@ def stratified_normal(
     n, d = shape
     # Fractions of 2^32 in integers: floating point would lose the fraction of i α for large i.
     multipliers = jnp.array([int(2**32 * alpha) | 1 for alpha in _lattice(d)], jnp.uint32)
-    shift = jax.random.bits(key, (d,), jnp.uint32)
+    shift = bits(key, (d,))
     points = jnp.arange(n, dtype=jnp.uint32)[:, None] * multipliers[None] + shift[None]
     # The top 23 bits, at the middle of their cells, keep clear of -1 and 1 in float32 as well.
     centred = ((points >> 9).astype(dtype) + 0.5) * jnp.array(2.0**-22, dtype) - 1
@@ -42,7 +41,7 @@ def stratified_uniform(key: Key[Array, ""], num_points: int) -> Float[Array, " n
     those of x_0 do, they leave no gap wider than two cells.
     """
     cells = jnp.arange(num_points).astype(jnp.result_type(float))
-    return (cells + jax.random.uniform(key, (num_points,))) / num_points
+    return (cells + uniform(key, (num_points,))) / num_points
 
 
 def _lattice(dimension: int) -> list[float]:

@@ -1,11 +1,10 @@
 """The scalar model with two symmetric modes, Vermaak et al. (2003), section 5.1."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from mpfjax.generator import normal
+from mpfjax.generator import normal, uniform
 from mpfjax.models.base import AbstractStateSpaceModel, require_positive
 from mpfjax.models.noise import stratified_uniform
 
@@ -44,10 +43,10 @@ class QuadraticModel(AbstractStateSpaceModel):
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, " n"]:
         """x_0, uniform on [low, high]."""
         if self.initial_draw == "stratified":
-            uniform = stratified_uniform(key, num_particles)
+            shares = stratified_uniform(key, num_particles)
         else:
-            uniform = jax.random.uniform(key, (num_particles,))
-        return self.low + (self.high - self.low) * uniform
+            shares = uniform(key, (num_particles,))
+        return self.low + (self.high - self.low) * shares
 
     def sample_transition(
         self, key: Key[Array, ""], states: Float[Array, " n"]

@@ -3,9 +3,10 @@
 import abc
 
 import equinox as eqx
-from jaxtyping import Array, Int, Key, PyTree
+from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
+from mpfjax.operations import without_gradient
 
 
 class AbstractMove(eqx.Module):
@@ -39,6 +40,14 @@ class AbstractMove(eqx.Module):
         del num_components
         return {}
 
+    def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
+        """The mixture's memory without what the move knows of dead components.
+
+        A filter asks for it after each move, so that a label which is taken again has no past.
+        """
+        del dead
+        return memory
+
 
 class AbstractRegrouping(AbstractMove):
     """A move that rewrites the component indicators and nothing else, so that it is exact.
@@ -59,7 +68,8 @@ class AbstractRegrouping(AbstractMove):
         """Regroup the particles; the observation plays no part."""
         if mixture.num_components == 1:
             return mixture
-        indicators, memory = self.regroup(key, mixture)
+        # Indicators are whole numbers, through which no derivative passes.
+        indicators, memory = self.regroup(key, without_gradient(mixture))
         return mixture.replace(component_indicators=indicators, memory=memory)
 
 

@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from mpfjax.generator import split, uniform
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import require
+from mpfjax.models.base import check_log_density, require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling import Resample
 from mpfjax.moves.slots import require_all_slots
-from mpfjax.operations import default_float, draw_columns, take
+from mpfjax.operations import default_float, draw_columns, finite_max, take
 
 STARTS = ("apart", "together")
 _GOLDEN = (np.sqrt(5) - 1) / 2
@@ -127,7 +128,7 @@ class PropagateInClusters(AbstractPropagation):
         require_all_slots(mixture, "PropagateInClusters")
         num_objects = self.model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
-        keys = jax.random.split(key, 2 * num_objects + 2)
+        keys = split(key, 2 * num_objects + 2)
         keys_objects, keys_rows = keys[:num_objects], keys[num_objects : 2 * num_objects]
         key_inside, key_shift = keys[2 * num_objects :]
         seen = self.model.prepare_observation(observation)
@@ -136,11 +137,16 @@ class PropagateInClusters(AbstractPropagation):
         def move(key: Key[Array, ""], states: PyTree, j: Int[Array, ""]) -> tuple:
             points = self.model.sample_object_transition(key, states, j)
             log_likelihood = self.model.object_log_likelihood(seen, points, j)
+            log_likelihood = check_log_density(
+                log_likelihood, self.model.object_model, "log_likelihood", mixture.num_particles
+            )
             return points, log_likelihood.astype(default_float())
 
         points, log_likelihoods = jax.vmap(move, in_axes=(0, 1, 0), out_axes=(1, 0))(
             keys_objects, particles, jnp.arange(num_objects, dtype=jnp.int32)
         )
+        common = jax.vmap(finite_max)(log_likelihoods)
+        log_likelihoods = log_likelihoods - common[:, None]
         if self._may_be_joint:
             memory = self._regrouped(points, memory)
             particles, log_growth = self._updated(
@@ -151,10 +157,8 @@ class PropagateInClusters(AbstractPropagation):
             particles = _rows_of_each(points, rows)
         particles = _shifted(key_shift, particles, memory["labels"])
         moved = mixture.replace(
-            particles=particles,
-            log_weights=mixture.log_weights + log_growth.astype(mixture.log_weights.dtype),
-            memory=mixture.memory | {"clusters": memory},
-        )
+            particles=particles, memory=mixture.memory | {"clusters": memory}
+        ).weighed(log_growth[None], jnp.sum(common)[None])
         return jax.lax.cond(
             log_growth == -jnp.inf, lambda: self._unweighted(key, mixture), lambda: moved
         )
@@ -164,8 +168,8 @@ class PropagateInClusters(AbstractPropagation):
         return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
 
     def _unweighted(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        nothing = jnp.full_like(mixture.log_weights, -jnp.inf)
-        return self.predict(key, mixture).replace(log_weights=nothing)
+        nothing = jnp.full((1,), -jnp.inf, mixture.log_weights.dtype)
+        return self.predict(key, mixture).weighed(nothing)
 
     def _updated(
         self,
@@ -177,7 +181,7 @@ class PropagateInClusters(AbstractPropagation):
     ) -> tuple[PyTree, Float[Array, ""]]:
         """The clusters' new rows, of equal weight, and log of their factors of Ẑ."""
         keys_rows, key_inside = keys
-        key_cross, key_last = jax.random.split(key_inside)
+        key_cross, key_last = split(key_inside)
         together = _together(labels)
         alone = jnp.sum(together, axis=1) == 1
         log_totals, log_sums = self._scores(particles, points, log_likelihoods, alone)
@@ -188,7 +192,7 @@ class PropagateInClusters(AbstractPropagation):
             chosen, log_weights = self._crossed(
                 key_cross, particles, points, rows, log_likelihoods - log_totals, log_sums, together
             )
-            keys_last = jax.random.split(key_last, len(labels))
+            keys_last = split(key_last, len(labels))
             last, log_gain = self._resampled(keys_last, labels, log_weights)
             # Rounding could still redraw equal weights.
             unmoved = jnp.arange(last.shape[1], dtype=last.dtype)
@@ -282,7 +286,7 @@ class PropagateInClusters(AbstractPropagation):
     ) -> tuple[PyTree, Float[Array, "objects n"]]:
         """The points that each row takes, and what its cluster's weight is multiplied by."""
         num_objects, num_particles = log_sums.shape
-        key_start, key_points = jax.random.split(key)
+        key_start, key_points = split(key)
         ks = jnp.arange(num_particles, dtype=jnp.int32)
         starts = _rotated(key_start, jnp.arange(num_objects, dtype=jnp.int32))[ks % num_objects]
         alone = jnp.sum(together, axis=1) == 1
@@ -315,7 +319,7 @@ class PropagateInClusters(AbstractPropagation):
         has_moved = jnp.zeros((num_particles, num_objects), bool)
         carry = (particles, jnp.zeros_like(log_sums), has_moved)
         inputs = (
-            jax.random.split(key_points, num_objects),
+            split(key_points, num_objects),
             jnp.arange(num_objects, dtype=jnp.int32),
         )
         (chosen, log_weights, _), _ = jax.lax.scan(choose, carry, inputs)
@@ -333,8 +337,7 @@ class PropagateInClusters(AbstractPropagation):
         resample = Resample(self.scheme)
 
         def draw(key: Key[Array, ""], log_weights: Float[Array, " n"]) -> tuple:
-            cloud = single_component(log_weights)
-            cloud = cloud.replace(log_weights=cloud.log_weights + log_weights)
+            cloud = single_component(log_weights).weighed(log_weights)
             return resample(key, cloud).ancestor_indices, cloud.log_mass
 
         rows, log_growths = jax.vmap(draw)(take(keys, labels), log_weights)
@@ -398,10 +401,10 @@ def _draw_columns(
     uniform, and any stretch of lines that are equal draws evenly.
     """
     strides = _GOLDEN * np.arange(log_table.shape[0])
-    shift = jax.random.uniform(key, (), log_table.dtype)
-    uniform = (jnp.asarray(strides % 1, log_table.dtype) + shift) % 1
+    shift = uniform(key, (), log_table.dtype)
+    quantiles = (jnp.asarray(strides % 1, log_table.dtype) + shift) % 1
     weights = jnp.exp(jax.lax.stop_gradient(log_table) - _finite_max(log_table)[:, None])
-    return draw_columns(uniform, weights), _log_sums(log_table)
+    return draw_columns(quantiles, weights), _log_sums(log_table)
 
 
 def _log_sums(log_table: Float[Array, "k n"]) -> Float[Array, " k"]:
@@ -430,7 +433,7 @@ def _shifted(key: Key[Array, ""], particles: PyTree, labels: Int[Array, " object
     with the same probability.
     """
     places = jnp.arange(jax.tree.leaves(particles)[0].shape[0], dtype=jnp.int32)
-    keys = take(jax.random.split(key, len(labels)), labels)
+    keys = take(split(key, len(labels)), labels)
     return _rows_of_each(particles, jax.vmap(_rotated, in_axes=(0, None))(keys, places))
 
 

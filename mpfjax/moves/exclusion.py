@@ -59,8 +59,7 @@ class Exclusion(AbstractPropagation):
         del key, observation
         if mixture.num_components == 1:
             return mixture
-        nearness = self._nearness(mixture).astype(mixture.log_weights.dtype)
-        return mixture.replace(log_weights=mixture.log_weights - self.strength * nearness)
+        return mixture.weighed(-self.strength * self._nearness(mixture))
 
     def _nearness(self, mixture: ParticleMixture) -> Float[Array, " n"]:
         features = self.features(mixture)

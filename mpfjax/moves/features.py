@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from mpfjax.mixture import ParticleMixture, flatten_states
-from mpfjax.operations import segment_sum, spread
+from mpfjax.operations import as_inexact, segment_sum, spread
 
 Scale = ArrayLike | Sequence[float]
 
@@ -37,14 +37,24 @@ class Features(eqx.Module):
             raise ValueError(f"scale: {self.scale} is not positive")
 
     def __call__(self, mixture: ParticleMixture) -> Float[Array, "n k"]:
-        """The features of every particle, zero in an empty slot."""
+        """The features of every particle, counted from their average, zero in an empty slot.
+
+        Regrouping asks for differences alone, and far from zero these would drown in rounding.
+        """
         particles = mixture.particles
         values = flatten_states(particles) if self.function is None else self.function(particles)
-        values = values.reshape(mixture.num_particles, -1)
+        values = as_inexact(values.reshape(mixture.num_particles, -1))
         if len(self.scale) not in (1, values.shape[1]):
             raise ValueError(f"scale: {len(self.scale)} units for {values.shape[1]} features")
         values = values / jnp.array(self.scale, values.dtype)[None]
-        return jnp.where(mixture.occupied[:, None], values, 0.0)
+        return jnp.where(mixture.occupied[:, None], values - origin(values, mixture)[None], 0.0)
+
+
+def origin(values: Float[Array, "n k"], mixture: ParticleMixture) -> Float[Array, " k"]:
+    """The average of the filled slots' values, each counting the same."""
+    filled = mixture.occupied[:, None]
+    total = jnp.sum(jnp.where(filled, values, 0.0), axis=0)
+    return total / jnp.maximum(jnp.sum(filled), 1).astype(values.dtype)
 
 
 class Groups(eqx.Module):

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Key, PyTree
 
+from mpfjax.generator import split
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import AbstractRejuvenation
-from mpfjax.moves.features import summarise
+from mpfjax.moves.features import origin, summarise
 from mpfjax.moves.resampling import Resample
 from mpfjax.moves.slots import check_particles_per_component, deal_slots, place_slots
 from mpfjax.operations import cholesky, segment_argmax, spread, take
@@ -61,7 +62,7 @@ class GaussianRegeneration(AbstractRejuvenation):
     ) -> ParticleMixture:
         """Redraw every living component."""
         del observation
-        key_noise, key_rest = jax.random.split(key)
+        key_noise, key_rest = split(key, 2)
         if self.where is None:
             vacated = self._vacated(mixture)
             drawn = self._draw(key_noise, mixture.particles, mixture, vacated)
@@ -95,7 +96,15 @@ class GaussianRegeneration(AbstractRejuvenation):
         vacated: ParticleMixture,
     ) -> PyTree:
         """Draws for the new slots, with the moments of `mixture`'s components."""
+        for place, leaf in jax.tree_util.tree_leaves_with_path(chosen):
+            if not jnp.issubdtype(leaf.dtype, jnp.floating):
+                raise ValueError(
+                    f"where: the state{jax.tree_util.keystr(place)} is {leaf.dtype}, and no draw of"
+                    " a Gaussian is; choose the leaves that are floating point"
+                )
         states = jnp.where(mixture.occupied[:, None], flatten_states(chosen), 0.0)
+        centre = origin(states, mixture)  # far from it, moments would drown in rounding
+        states = jnp.where(mixture.occupied[:, None], states - centre[None], 0.0)
         weights = mixture.component_weights.astype(states.dtype)
         moments = summarise(states, weights, mixture.component_indicators, mixture.num_components)
         factors = self.inflation * cholesky(moments.covariances)
@@ -104,4 +113,4 @@ class GaussianRegeneration(AbstractRejuvenation):
         offsets = jnp.einsum("nij,nj->ni", factors, noise)
         means = spread(moments.means, vacated.component_indicators)
         unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], chosen))[1]
-        return jax.vmap(unravel)(means + offsets)
+        return jax.vmap(unravel)(centre[None] + means + offsets)

@@ -5,7 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
+from mpfjax.generator import split
 from mpfjax.mixture import ParticleMixture, single_component
+from mpfjax.models.base import check_log_density
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling import Resample
@@ -48,17 +50,18 @@ class PropagateIndependently(AbstractPropagation):
         require_all_slots(mixture, "PropagateIndependently")
         num_objects = self.model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
-        keys = jax.random.split(key, 2 * num_objects)
+        keys = split(key, 2 * num_objects)
         seen = self.model.prepare_observation(observation)
 
         def step(
             key: Key[Array, ""], key_resample: Key[Array, ""], states: PyTree, j: Int[Array, ""]
         ) -> tuple[PyTree, Float[Array, ""]]:
             states = self.model.sample_object_transition(key, states, j)
-            cloud = single_component(states)
             log_likelihood = self.model.object_log_likelihood(seen, states, j)
-            log_weights = cloud.log_weights + log_likelihood.astype(cloud.log_weights.dtype)
-            cloud = cloud.replace(log_weights=log_weights)
+            log_likelihood = check_log_density(
+                log_likelihood, self.model.object_model, "log_likelihood", mixture.num_particles
+            )
+            cloud = single_component(states).weighed(log_likelihood)
             drawn = Resample(self.scheme)(key_resample, cloud).particles
             # An object whose particles all have zero likelihood moves by its dynamics alone.
             has_mass = cloud.log_mass > -jnp.inf
@@ -71,8 +74,7 @@ class PropagateIndependently(AbstractPropagation):
             mixture.particles,
             jnp.arange(num_objects, dtype=jnp.int32),
         )
-        log_weights = mixture.log_weights + jnp.sum(log_growths)
-        return mixture.replace(particles=particles, log_weights=log_weights)
+        return mixture.replace(particles=particles).weighed(jnp.sum(log_growths)[None])
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) of all objects."""

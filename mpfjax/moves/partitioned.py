@@ -10,13 +10,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from mpfjax.generator import split
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import require
+from mpfjax.models.base import check_log_density, require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation import predict
 from mpfjax.moves.resampling import Resample
-from mpfjax.operations import add_gradient, log_sum_exp, spread, take
+from mpfjax.operations import add_gradient, log_sum_exp, spread, take, without_gradient
 
 REASSEMBLIES = ("evidence", "prior")
 
@@ -98,8 +99,9 @@ class Partitioned(AbstractPropagation):
     ) -> ParticleMixture:
         """Propagate and weigh the objects of every particle in its component's order."""
         num_objects = self.model.num_objects
+        mixture = mixture.replace(log_scale=jnp.zeros((), mixture.log_weights.dtype))
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
-        keys = jax.random.split(key, 2 * num_objects + 1)
+        keys = split(key, 2 * num_objects + 1)
         orders = self._orders(keys[-1], mixture.num_components)
         seen = self.model.prepare_observation(observation)
 
@@ -136,7 +138,7 @@ class Partitioned(AbstractPropagation):
 
         A loop of one turn at most: under `vmap` a `cond` would draw the prediction at every step.
         """
-        move, before, after = _without_gradient((self, mixture, moved))
+        move, before, after = without_gradient((self, mixture, moved))
 
         def predict(carry: tuple[Array, ParticleMixture]) -> tuple[Array, ParticleMixture]:
             nothing = jnp.full_like(before.log_weights, -jnp.inf)
@@ -164,22 +166,16 @@ class Partitioned(AbstractPropagation):
         if self._stops_draws:
             states = jax.lax.stop_gradient(states)
         log_factors = model.object_log_likelihood(seen, states, objects)
-        if log_factors.shape != (mixture.num_particles,):
-            raise ValueError(
-                f"model: {type(model.object_model).__name__}.log_likelihood returned shape"
-                f" {log_factors.shape}, not one value a particle, ({mixture.num_particles},)"
-            )
-        log_factors = log_factors.astype(mixture.log_weights.dtype)
-        log_factors += self._log_potentials(states, mixture, orders, rank)
+        log_factors = check_log_density(
+            log_factors, model.object_model, "log_likelihood", mixture.num_particles
+        )
+        log_potentials = self._log_potentials(states, mixture, orders, rank)
         if self._stops_draws:
             log_density = model.object_log_transition(states, previous, objects)
-            log_factors = add_gradient(log_factors, log_density.astype(log_factors.dtype))
-        empty = mixture.log_weights == -jnp.inf
-        log_weights = jnp.where(empty, -jnp.inf, mixture.log_weights + log_factors)
-        moved = mixture.replace(
-            particles=model.replace_object(particles, objects, states), log_weights=log_weights
-        )
-        return moved, jnp.any(~(log_weights < jnp.inf))
+            log_potentials = add_gradient(log_potentials, log_density.astype(log_potentials.dtype))
+        moved = mixture.weighed(log_factors, log_potentials)
+        moved = moved.replace(particles=model.replace_object(particles, objects, states))
+        return moved, jnp.any(~(moved.log_weights < jnp.inf))
 
     def _log_potentials(
         self,
@@ -209,7 +205,7 @@ class Partitioned(AbstractPropagation):
         """The order of each component."""
         num_objects = self.model.num_objects
         if self.rule == "random":
-            keys = jax.random.split(key, num_components)
+            keys = split(key, num_components)
             shuffle = lambda key: jax.random.permutation(key, num_objects)  # noqa: E731
             return jax.vmap(shuffle)(keys).astype(jnp.int32)
         if self.rule == "circular":
@@ -220,12 +216,6 @@ class Partitioned(AbstractPropagation):
                 f"orders: {self.orders.shape[0]} of them, for {num_components} components"
             )
         return jnp.broadcast_to(self.orders, (num_components, num_objects))
-
-
-def _without_gradient(tree: PyTree) -> PyTree:
-    return jax.tree.map(
-        lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, tree
-    )
 
 
 def circular_orders(num_orders: int, num_objects: int) -> Int[np.ndarray, "orders objects"]:
@@ -268,6 +258,6 @@ def _with_masses_of(before: ParticleMixture, after: ParticleMixture) -> Particle
     alive = masses > -jnp.inf
     prior = jnp.where(alive, before.log_mixture_weights, 0.0)
     log_total = log_sum_exp(jnp.where(alive, prior, -jnp.inf))
-    shift = prior - jnp.where(alive, masses, 0.0) + after.log_mass - log_total
+    shift = prior - jnp.where(alive, masses, 0.0) + log_sum_exp(after.log_weights) - log_total
     log_shift = spread(jnp.where(alive, shift, 0.0), after.component_indicators)
     return after.replace(log_weights=after.log_weights + log_shift)

@@ -8,7 +8,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, HasTransitionDensity, require
+from mpfjax.models.base import (
+    AbstractStateSpaceModel,
+    HasTransitionDensity,
+    check_log_density,
+    require,
+)
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.operations import add_gradient
 from mpfjax.proposals import AbstractProposal
@@ -51,8 +56,7 @@ class Propagate(AbstractPropagation):
         states, log_density = self.proposal.propose(key, observation, previous)
         if self.gradient == "stop":
             states, log_density = jax.lax.stop_gradient((states, log_density))
-        dynamics = cast(HasTransitionDensity, self.model)
-        log_ratio = dynamics.log_transition(states, previous) - log_density
+        log_ratio = log_transition(self.model, states, previous) - log_density
         return _weigh(self.model, mixture.replace(particles=states), observation, log_ratio)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
@@ -123,11 +127,20 @@ def predict(
     if gradient == "none":
         return mixture.replace(particles=states)
     states = jax.lax.stop_gradient(states)
-    log_density = cast(HasTransitionDensity, model).log_transition(states, mixture.particles)
+    log_density = log_transition(model, states, mixture.particles)
     log_density = jnp.where(mixture.occupied, log_density.astype(mixture.log_weights.dtype), 0.0)
     return mixture.replace(
         particles=states, log_weights=add_gradient(mixture.log_weights, log_density)
     )
+
+
+def log_transition(
+    model: AbstractStateSpaceModel, states: PyTree, previous_states: PyTree
+) -> Float[Array, " n"]:
+    """log D of each particle, checked."""
+    values = cast(HasTransitionDensity, model).log_transition(states, previous_states)
+    num_particles = jax.tree.leaves(states)[0].shape[0]
+    return check_log_density(values, model, "log_transition", num_particles)
 
 
 def _weigh(
@@ -138,14 +151,5 @@ def _weigh(
 ) -> ParticleMixture:
     """The weights times L, and times D / q where the draw was not from D."""
     log_factors = model.log_likelihood(observation, mixture.particles)
-    if log_factors.shape != (mixture.num_particles,):
-        raise ValueError(
-            f"model: {type(model).__name__}.log_likelihood returned shape {log_factors.shape},"
-            f" not one value a particle, ({mixture.num_particles},)"
-        )
-    if log_ratio is not None:
-        log_factors += log_ratio
-    log_factors = log_factors.astype(mixture.log_weights.dtype)
-    # An empty slot stays empty whatever the model makes of its stale state.
-    log_weights = jnp.where(mixture.occupied, mixture.log_weights + log_factors, -jnp.inf)
-    return mixture.replace(log_weights=log_weights)
+    log_factors = check_log_density(log_factors, model, "log_likelihood", mixture.num_particles)
+    return mixture.weighed(*[log_factors] if log_ratio is None else [log_factors, log_ratio])

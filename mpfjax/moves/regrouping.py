@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from mpfjax.generator import bits
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.features import Features, Scale, separation, summarise
@@ -132,9 +133,16 @@ class Merge(AbstractRegrouping):
         if self.patience > 1:
             durations = jnp.where(overlap, memory["overlap_durations"] + 1, 0)
             overlap = durations >= self.patience
-            # A merged label is free for another component, which starts a count of its own.
-            memory = memory | {"overlap_durations": jnp.where(overlap, 0, durations)}
+            memory = memory | {"overlap_durations": durations}
         return spread(lowest_connected(overlap), mixture.component_indicators), memory
+
+    def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
+        """No pair with a dead component has overlapped yet."""
+        if self.patience == 1:
+            return memory
+        is_dead = dead[:, None] | dead[None]
+        durations = jnp.where(is_dead, 0, memory["overlap_durations"])
+        return memory | {"overlap_durations": durations}
 
     def _overlap(self, mixture: ParticleMixture) -> Bool[Array, "m m"]:
         groups = summarise(
@@ -294,7 +302,7 @@ class RandomPartition(AbstractRegrouping):
         width = (num_sets - 1).bit_length()
         occupied, index = mixture.occupied, jnp.arange(n, dtype=jnp.int32)
         num_filled = jnp.sum(occupied, dtype=jnp.int32)
-        noise = jax.random.bits(key, (n,), jnp.uint32) >> (width + 1) << width
+        noise = bits(key, (n,)) >> (width + 1) << width
         is_last = (index >= num_filled).astype(jnp.uint32) << 31
         words = jax.lax.sort(is_last | noise | (index % num_sets).astype(jnp.uint32))
         dealt = (words & jnp.uint32((1 << width) - 1)).astype(jnp.int32)

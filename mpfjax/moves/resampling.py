@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
+from mpfjax.generator import uniform
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRejuvenation
 from mpfjax.moves.slots import (
@@ -406,12 +407,12 @@ def _padded(values: Array, fill: float) -> Array:
 
 
 def _systematic(key, expected, before, targets, slots, line):
-    shift = stored(jax.random.uniform(key, targets.shape, expected.dtype))
+    shift = stored(uniform(key, targets.shape, expected.dtype))
     return _points_before(before, line.of_places(shift))
 
 
 def _stratified(key, expected, before, targets, slots, line):
-    shift = jax.random.uniform(key, slots.components.shape, expected.dtype)
+    shift = uniform(key, slots.components.shape, expected.dtype)
     slot = line.first_slots(slots) + before.astype(jnp.int32)
     slot = jnp.clip(slot, 0, shift.shape[0] - 1)
     return _points_before(before, take(shift, slot.reshape(-1)).reshape(slot.shape))
@@ -454,10 +455,13 @@ def _sorted_points(
     key: Key[Array, ""], slots: Slots, targets: Int[Array, " m"], dtype: jnp.dtype
 ) -> Float[Array, " n"]:
     """Independent uniform points on each component's stretch of slots, in ascending order."""
-    uniform = jax.random.uniform(key, slots.components.shape, dtype)
+    shares = uniform(key, slots.components.shape, dtype)
     firsts = spread(slots.firsts, slots.components).astype(dtype)
     lengths = spread(targets, slots.components).astype(dtype)
-    return jnp.sort(jnp.where(slots.filled, firsts + lengths * uniform, jnp.inf))
+    # Rounding must not take the last of them for the first of the next component.
+    before_end = jnp.nextafter(firsts + lengths, jnp.zeros_like(firsts))
+    points = jnp.minimum(firsts + lengths * shares, before_end)
+    return jnp.sort(jnp.where(slots.filled, points, jnp.inf))
 
 
 SCHEMES: dict[str, Callable[..., Int[Array, " n"]]] = {

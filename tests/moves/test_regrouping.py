@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax import KMeans, Merge, Pool, RandomPartition, Split
+from mpfjax import Filter, KMeans, Merge, Pool, QuadraticModel, RandomPartition, Split
 from mpfjax.moves.regrouping import farthest_first, free_labels, lowest_connected
 from tests.examples import make_mixture
 
@@ -140,10 +140,27 @@ class TestMerge:
         merged = []
         for mixture in (near, near, far, near, near, near, near):
             moved = eqx.filter_jit(merge)(KEY, mixture.replace(memory=memory))
-            memory = moved.memory
+            memory = merge.forget(moved.memory, ~moved.active)
             merged.append(int(moved.component_indicators[-1]) == 0)
         # After a merge both labels start a count of their own.
         assert merged == [False, False, False, False, False, True, False]
+
+    def test_a_label_that_is_taken_again_has_no_past(self):
+        """A label that Merge frees and Split takes in the same step starts its counts anew."""
+        merge = Merge(None, 0.7, patience=3)
+        states = np.concatenate([np.zeros(20), np.full(20, 0.5), np.full(10, -10), np.full(10, 12)])
+        mixture = make_mixture(states[:, None], np.zeros(60), np.repeat([0, 1, 2], 20), 3)
+        # 0 and 1 overlap for the third time, 1 and 2, whose mean lies at 1, for the second.
+        durations = jnp.array([[0, 2, 0], [2, 0, 1], [0, 1, 0]], jnp.int32)
+        mixture = mixture.replace(memory={"overlap_durations": durations})
+        filter = Filter(QuadraticModel(), [merge, Split()], 60, 3)
+        moved, _ = eqx.filter_jit(filter._step)(KEY, mixture, jnp.zeros(()))
+        labels = np.asarray(moved.component_indicators)
+        assert set(labels[:40]) == {0}
+        assert set(labels[40:]) == {1, 2}
+        durations = np.asarray(moved.memory["overlap_durations"])
+        assert (durations[1] == 0).all()
+        assert (durations[:, 1] == 0).all()
 
     def test_connected_components_of_a_graph(self):
         adjacent = np.zeros((7, 7), bool)

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from mpfjax import Resample
+from mpfjax.moves.resampling import _sorted_points
+from mpfjax.moves.slots import place_slots
 from tests.examples import make_mixture
 
 SCHEMES = ("systematic", "stratified", "multinomial", "residual")
@@ -254,3 +256,17 @@ def test_soft_resampling_draws_from_the_softened_weights_and_weighs_by_the_ratio
     mass = float(mixture.mixture_weights[0])
     expected = mass * ratios / (ratios * ours).sum(axis=1, keepdims=True)
     np.testing.assert_allclose(np.exp(moved.log_weights)[ours], expected[ours], rtol=1e-4)
+
+
+def test_points_stay_within_their_components_stretch_of_slots():
+    """The largest uniform numbers round up onto the border, which is the next component's.
+
+    One resampling in 320 then gave a slot to another component's particle, multinomial or residual.
+    """
+    targets = jnp.full(4, 25_000, jnp.int32)
+    slots = place_slots(targets, 100_000)
+    draw = jax.jit(lambda key: _sorted_points(key, slots, targets, jnp.dtype("float32")))
+    borders = np.asarray(slots.firsts) + 25_000
+    for seed in range(300):
+        points = np.asarray(draw(jax.random.key(seed))).reshape(4, -1)
+        assert (points < borders[:, None]).all(), seed
