@@ -105,7 +105,8 @@ def fit(
     errors = None
     if curvature_seeds:
         key_curvature = jax.random.fold_in(key, num_steps + 1)
-        errors = errors_at(problem, end.state.reals, climb.batches(key_curvature, curvature_seeds))
+        batches = climb.batches(key_curvature, curvature_seeds)
+        errors = errors_at(problem, end.state.reals, batches, "curvature_seeds")
     return TuningRun(
         filter=problem.at(end.state.reals),
         parameters=problem.constrained(end.state.reals),

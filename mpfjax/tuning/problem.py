@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.filters import Filter, present_steps, scan_filter
@@ -90,6 +91,15 @@ def scores(
 
     gradient, values = jax.grad(mean, has_aux=True)(reals)
     return values, gradient
+
+
+@eqx.filter_jit
+def score_of_each(
+    problem: Problem, reals: Reals, keys: Key[Array, " seeds"]
+) -> Float[Array, "seeds d"]:
+    """The gradient of each seed's objective, as `ravel_pytree` lays the parameters out."""
+    gradient = jax.grad(problem.value)
+    return jax.vmap(lambda key: ravel_pytree(gradient(reals, key))[0])(keys)
 
 
 def pose(
