@@ -206,10 +206,12 @@ def _apart(informations: Float[np.ndarray, "seeds d d"]) -> float:
     for _ in range(_NUM_HALVINGS):
         order = generator.permutation(num_seeds)
         halves = order[: num_seeds // 2], order[num_seeds // 2 :]
-        covariances = [_inverse(informations[half].mean(axis=0)) for half in halves]
-        if any(covariance is None for covariance in covariances):
-            return np.inf
-        variances = [np.diagonal(covariance) for covariance in covariances]
+        variances = []
+        for half in halves:
+            covariance = _inverse(informations[half].mean(axis=0))
+            if covariance is None:
+                return np.inf
+            variances.append(np.diagonal(covariance))
         logs.append(np.log(variances[0] / variances[1]) / 2)
     return float(np.expm1(np.sqrt(np.mean(np.square(logs), axis=0)).max()))
 

@@ -1,5 +1,7 @@
 """Standard errors are the exact ones in any units, and say how well the seeds settle them."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,11 +9,9 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
-from mpfjax.tuning import Interval, Positive, standard_errors
-from mpfjax.tuning.curvature import _apart, _inverse
+from mpfjax.tuning import standard_errors
 from tests.user_models import ScalarLinear
 
-STATES, OBSERVED = 0.5, 0.7
 TRUTH = {"a": 0.8, "q": 0.6, "h": 1.0, "r": 0.5, "m": 0.5, "p": 0.3}
 # Powers of each unit in the model's numbers: of the states, and of the observations.
 POWERS = {"q": (1, 0), "h": (-1, 1), "r": (0, 1), "m": (1, 0), "p": (1, 0)}
@@ -63,10 +63,12 @@ def exact_errors(names):
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 100.0, 1e4])
 def test_a_location_has_its_error_in_any_unit(unit):
-    found = standard_errors(
-        jax.random.key(0), filter_in(unit, unit), jnp.asarray(unit * OBSERVATIONS),
-        parameters=picked("m"), num_seeds=64,
-    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of seeds that would be too few
+        found = standard_errors(
+            jax.random.key(0), filter_in(unit, unit), jnp.asarray(unit * OBSERVATIONS),
+            parameters=picked("m"), num_seeds=64,
+        )  # fmt: skip
     assert found["m"] / unit == pytest.approx(exact_errors("m")["m"], rel=0.05)
 
 
@@ -99,3 +101,23 @@ def test_a_step_is_no_shorter_than_what_rounding_leaves():
 
     exact = float(-jax.hessian(log_evidence)(jnp.zeros(()))) ** -0.5
     assert found["m"] == pytest.approx(exact, rel=0.1)
+
+
+def test_too_few_seeds_are_said_to_be_too_few():
+    """Eight particles and six seeds, which differ by half and more from key to key."""
+    run = lambda key: standard_errors(  # noqa: E731
+        key, filter_in(1.0, 1.0, 8), jnp.asarray(OBSERVATIONS), parameters=picked("r"), num_seeds=6
+    )
+    with pytest.warns(UserWarning, match=r"6 seeds leave them uncertain.*raise num_seeds") as said:
+        found = run(jax.random.key(1))
+    assert np.isfinite(found["r"])
+    assert said[0].filename == __file__
+
+
+def test_one_seed_cannot_be_halved():
+    with pytest.warns(UserWarning, match="num_seeds is 1"):
+        found = standard_errors(
+            jax.random.key(0), filter_in(1.0, 1.0), jnp.asarray(OBSERVATIONS),
+            parameters=picked("m"), num_seeds=1,
+        )  # fmt: skip
+    assert found["m"] == pytest.approx(exact_errors("m")["m"], rel=0.3)
