@@ -9,8 +9,16 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
+from mpfjax.checks import check_key, check_whole
 from mpfjax.filters import Filter
-from mpfjax.tuning.problem import Parameters, Problem, Reals, pose_evidence, score_of_each
+from mpfjax.tuning.problem import (
+    Parameters,
+    Problem,
+    Reals,
+    pose_evidence,
+    score_of_each,
+    warn_of_bias,
+)
 from mpfjax.tuning.transforms import AbstractTransform, Interval, Positive, Simplex
 
 _MOST_NUMBERS = 50
@@ -43,8 +51,8 @@ def standard_errors(
     of the mean score over about one standard error to each side, with the same seeds on both, in
     unconstrained numbers, and J their Jacobian (the delta method). How far that is, is found by
     trying, from the size of the score: parameters may have any units. The scores must be
-    unbiased: build the filter with `gradient="stop"`. Costs two gradients of `num_seeds` runs a
-    number for each try, of which there are mostly two and at most ten.
+    unbiased: build the filter with `gradient="stop"`, or be warned. Costs one gradient of
+    `num_seeds` runs, and two a number for each try, of which there are mostly two, at most ten.
 
     Arguments are those of `fit`. Noise in I makes the errors too large rather than too small. A
     warning says so where the seeds do not settle them: where the errors that one half of the seeds
@@ -55,9 +63,10 @@ def standard_errors(
     that nothing tells, or with too few seeds. Raises `ValueError` for what `fit` does, fewer than
     one seed, and more than fifty numbers.
     """
-    if num_seeds < 1:
-        raise ValueError(f"num_seeds: {num_seeds} is less than 1")
+    check_key(key)
+    check_whole(1, num_seeds=num_seeds)
     problem = pose_evidence(filter, observations, parameters, transforms, missing)
+    warn_of_bias("standard_errors", problem)
     batches = [jax.random.split(key, num_seeds)]
     return errors_at(problem, problem.start(), batches, "num_seeds")
 

@@ -156,7 +156,7 @@ class TestResuming:
             ({"transforms": {"r": Interval(0.0, 9.0)}}, r"transforms\['r'\]"),
             ({"parameters": {"r": lambda filter: filter.model.q}}, "parameters r is"),
             ({"optimizer": optax.sgd(0.05)}, "optimizer"),
-            ({"optimizer": optax.adam(0.06)}, r"optimizer\..*learning_rate is 0\.05 there and 0\.06"),
+            ({"optimizer": optax.adam(0.06)}, r"optimizer\..*step_size is -0\.05 there and -0\.06"),
             ({"optimizer": optax.adam(0.05, b1=0.8)}, r"optimizer\..*b1 is 0\.9 there and 0\.8"),
         ],
     )  # fmt: skip
@@ -440,11 +440,8 @@ class TestBias:
 
     def test_the_default_is_warned_of(self):
         filter = mpfjax.particle_filter(ScalarLinear(), 16)
-        with pytest.warns(
-            UserWarning, match='fit: .* score of r is biased.*gradient="stop"'
-        ) as said:
+        with pytest.warns(UserWarning, match='fit: .* score of r is biased.*gradient="stop"'):
             self.fit(filter)
-        assert said[0].filename == __file__
 
     def test_standard_errors_are_as_well(self):
         filter = mpfjax.particle_filter(ScalarLinear(), 16)
