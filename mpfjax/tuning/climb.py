@@ -1,9 +1,10 @@
 """Gradient ascent on the log marginal likelihood or another objective, and its checkpoints."""
 
+import functools
 import json
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from mpfjax.checks import (
 from mpfjax.filters import Filter
 from mpfjax.storage import fingerprint, load_arrays, write_arrays
 from mpfjax.tuning.curvature import errors_at
-from mpfjax.tuning.identity import contents_of, unlike, values_of
+from mpfjax.tuning.identity import contents_of, unlike
 from mpfjax.tuning.problem import (
     Objective,
     Parameters,
@@ -109,8 +110,9 @@ def fit(
       or another `patience` or `tolerance` to go on until those end it; what ended at a number that
       is not finite stays there. All else must be the same: the filter and the observations to the
       bit, the parameters, transforms, key and seeds, and the optimiser, by the numbers in its
-      closures, schedules' as well. Of functions of your own the code counts, of those of optax and
-      of the filter the names: take a new file after changing what these mean.
+      closures, schedules' as well. Of functions of your own the code counts, of classes and of
+      libraries' functions the names: take a new file after changing what these do. Another
+      version of Python or optax may not know its own again.
 
     A log marginal likelihood or gradient that is not finite ends the climb with the last good
     parameters, a warning, and the step in `stopped`. Raises `ValueError` for a parameter that is
@@ -125,10 +127,11 @@ def fit(
     check_whole(0, curvature_seeds=curvature_seeds)
     problem = pose_evidence(filter, observations, parameters, transforms, missing)
     warn_of_bias("fit", problem)
-    described = values_of("filter", problem.tree) | {
-        "observations": fingerprint(problem.objective),
-        "missing": missing,
-    }
+
+    def described() -> dict[str, str]:
+        observed = {"observations": fingerprint(problem.objective), "missing": missing}
+        return contents_of("filter", problem.tree) | observed
+
     climb = _Climb("fit", "log_marginal_likelihood", key, problem, optimizer, num_seeds, described)
     end = climb.run(
         num_steps,
@@ -201,8 +204,8 @@ def maximise(
     - `parameters`: as for `fit`, picked from `model`; None is every floating point array of it.
 
     Raises what `fit` does for the same arguments, and `ValueError` for an objective that is no
-    floating point scalar. For a `checkpoint` an objective is what a function of your own is in
-    `fit`: its code and closure count, and an `equinox.Module`'s arrays.
+    floating point scalar. For a `checkpoint` the objective has to be the same as well: a function
+    in its code and closure, an `equinox.Module` in its fields.
     """
     _check_climb(
         key, optimizer, num_steps, num_seeds, common_random_numbers, patience, tolerance,
@@ -211,7 +214,10 @@ def maximise(
     check_callable("a function of a key and a model", objective=objective)
     problem = pose(model, objective, parameters, transforms)
     _check_scalar(problem, key)
-    described = values_of("model", problem.tree) | contents_of("objective", objective)
+
+    def described() -> dict[str, str]:
+        return contents_of("model", problem.tree) | contents_of("objective", objective)
+
     climb = _Climb("maximise", "value", key, problem, optimizer, num_seeds, described)
     end = climb.run(
         num_steps,
@@ -301,7 +307,7 @@ class _Climb:
         problem: Problem,
         optimizer: optax.GradientTransformation,
         num_seeds: int,
-        described: dict[str, str],
+        described: Callable[[], dict[str, str]],
     ) -> None:
         self.caller = caller
         self.objective = objective
@@ -436,7 +442,7 @@ class _Climb:
 
     def save(self, path: Path, state: _State, stopped: str | None) -> None:
         """Write all of the state, and why it ended where it has."""
-        arrays = {"fit": np.array(json.dumps(self.identity())), "step": np.array(state.step)}
+        arrays = {"fit": np.array(json.dumps(self.identity)), "step": np.array(state.step)}
         arrays["stopped"] = np.array(stopped or "")
         arrays["broken"] = np.array(state.fault is not None)
         write_arrays(path, arrays | self.arrays_of(state))
@@ -458,10 +464,9 @@ class _Climb:
         identity = _parsed(arrays.get("fit"))
         if identity is None:
             raise ValueError(f"checkpoint: {path} is no checkpoint of a climb")
-        if identity != self.identity():
+        if identity != self.identity:
             raise ValueError(
-                f"checkpoint: {path} is of another {self.caller}:"
-                f" {unlike(identity, self.identity())}"
+                f"checkpoint: {path} is of another {self.caller}: {unlike(identity, self.identity)}"
             )
         step = self.check_arrays(path, arrays, start)
         leaves, structure = jax.tree.flatten(start.optimizer)
@@ -507,21 +512,21 @@ class _Climb:
                 )
         return int(step)
 
+    @functools.cached_property
     def identity(self) -> dict[str, str]:
         """What has to be the same for a checkpoint to be of this climb, by name."""
-        tree = jax.tree_util.tree_leaves_with_path(self.problem.tree)
-        places = {name: jax.tree_util.keystr(tree[i][0]) for name, i in self.problem.tuned}
+        leaves = jax.tree_util.tree_leaves_with_path(self.problem.tree)
         return (
-            {f"parameters {name}": place for name, place in places.items()}
-            | values_of("transforms", self.problem.transforms)
-            | values_of("key", self.key)
-            | {
-                "num_seeds": str(self.num_seeds),
-                "common_random_numbers": str(bool(self.common_random_numbers)),
-                "optimizer's state": str(jax.tree.structure(self.start().optimizer)),
+            {
+                f"parameters {name}": jax.tree_util.keystr(leaves[index][0])
+                for name, index in self.problem.tuned
             }
+            | contents_of("transforms", self.problem.transforms)
+            | contents_of("key", self.key)
+            | contents_of("num_seeds", int(self.num_seeds))
+            | contents_of("common_random_numbers", bool(self.common_random_numbers))
             | contents_of("optimizer", self.optimizer)
-            | self.described
+            | self.described()
         )
 
 

@@ -6,40 +6,27 @@ import types
 from collections.abc import Mapping
 from typing import Any, cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
-from mpfjax.storage import describe, differences, fingerprint, named
+from mpfjax.storage import differences, fingerprint, named
 
 # Functions of these are what their names say; of others the code counts as well.
 _LIBRARIES = ("chex", "equinox", "jax", "jaxlib", "mpfjax", "numpy", "optax")
 _MOST_SHOWN = 4
 
 
-def values_of(name: str, tree: PyTree) -> dict[str, str]:
-    """Every leaf and static field of a pytree, by `name` and its place, with its value.
-
-    Arrays of more than one number by their `fingerprint`, functions by their names.
-    """
-    described = describe(tree)
-    for place, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        if _is_data(leaf):
-            described[jax.tree_util.keystr(place)] += f" {_value(leaf)}"
-    return {f"{name}{place}": text for place, text in described.items()}
-
-
 def contents_of(name: str, value: Any) -> dict[str, str]:
-    """What a function, or an optimiser made of functions, is made from, by `name` and its place.
+    """All that a filter, an objective or an optimiser is made from, by `name` and its place.
 
-    The functions' names, and what they hold: in their closures, as arguments bound to them, in
-    what they are methods of. Of functions that are of no library also the code, and the numbers
-    and functions of their modules that it names.
+    Numbers by their values, arrays by their `fingerprint`, classes by their names; functions by
+    their names and what they hold: in their closures, as arguments bound to them, in what they are
+    methods of. Of functions that are of no library also the code, and the numbers and functions
+    of their modules that it names.
     """
     found: dict[str, str] = {}
-    _collect(name, value, found, set())
+    _collect(name, value, found, {})
     return found
 
 
@@ -56,7 +43,7 @@ def _differ(name: str, there: Mapping[str, str], here: Mapping[str, str]) -> boo
     return there.get(name) != here.get(name)
 
 
-def _collect(name: str, value: Any, found: dict[str, str], seen: set[int]) -> None:
+def _collect(name: str, value: Any, found: dict[str, str], seen: dict[int, Any]) -> None:
     """Write down a value, and what it holds."""
     if value is None or isinstance(value, str | bytes | np.dtype):
         found[name] = repr(value)
@@ -64,13 +51,13 @@ def _collect(name: str, value: Any, found: dict[str, str], seen: set[int]) -> No
         found[name] = _value(value)
     elif isinstance(value, type | types.BuiltinFunctionType | types.ModuleType):
         found[name] = named(value)
+    elif isinstance(value, set | frozenset):
+        found[name] = repr(sorted(map(named, value)))
     elif id(value) in seen:
         found[name] = "as above"
     else:
-        seen.add(id(value))
-        if isinstance(value, eqx.Module) and not isinstance(value, types.MethodType):
-            found.update(values_of(name, value))
-            return
+        # Held, for what is gone leaves its id to others.
+        seen[id(value)] = value
         found[name] = _title(value)
         for part, held in _parts(value).items():
             _collect(f"{name}{part}", held, found, seen)
@@ -154,7 +141,9 @@ def _is_data(value: Any) -> bool:
 
 def _value(value: Any) -> str:
     """A number as it is printed, which is exact; an array by its fingerprint."""
-    is_key = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
-    if is_key or np.size(value) != 1:
-        return f"of fingerprint {fingerprint(value)[:12]}"
-    return str(np.asarray(value).item())
+    if not isinstance(value, jax.Array | np.ndarray | np.generic):
+        return str(value)
+    kind = f"{value.dtype}{list(value.shape)}"
+    if jnp.issubdtype(value.dtype, jax.dtypes.prng_key) or value.size != 1:
+        return f"{kind} of fingerprint {fingerprint(value)[:12]}"
+    return f"{kind} of {np.asarray(value).reshape(())[()]!s}"
