@@ -1,7 +1,7 @@
 """Standard errors from the curvature of the log marginal likelihood."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +9,30 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
+from mpfjax.checks import check_key, check_whole
 from mpfjax.filters import Filter
-from mpfjax.tuning.problem import Parameters, Problem, Reals, pose_evidence, scores
-from mpfjax.tuning.transforms import AbstractTransform
+from mpfjax.tuning.problem import (
+    Parameters,
+    Problem,
+    Reals,
+    pose_evidence,
+    score_of_each,
+    warn_of_bias,
+)
+from mpfjax.tuning.transforms import AbstractTransform, Interval, Positive, Simplex
 
 _MOST_NUMBERS = 50
-_FIRST_STEP = 0.05
+# Of 1 / I, the square of the step: what is near enough to one standard error.
+_NEAR = (0.4, 2.5)
+_MOST_ROUNDS = 10
+_FURTHEST_ROUND = 16.0
+# Units in the last place of a parameter, of which a shorter step is mostly rounding.
+_FEWEST_PLACES = 256
+# Logarithms and logits have no unit, and half of one is as far as a parabola goes.
+_WITHOUT_UNIT = (Positive, Interval, Simplex)
+_LONGEST_WITHOUT_UNIT = 0.5
+_NUM_HALVINGS = 32
+_MOST_APART = 0.25
 
 
 def standard_errors(
@@ -31,23 +49,35 @@ def standard_errors(
 
     The roots of the diagonal of J I⁻¹ Jᵀ: I is the observed information, by central differences
     of the mean score over about one standard error to each side, with the same seeds on both, in
-    unconstrained numbers, and J their Jacobian (the delta method). The scores must be unbiased:
-    build the filter with `gradient="stop"`. Costs four gradients of `num_seeds` runs a number.
+    unconstrained numbers, and J their Jacobian (the delta method). How far that is, is found by
+    trying, from the size of the score: parameters may have any units. The scores must be
+    unbiased: build the filter with `gradient="stop"`, or be warned. Costs one gradient of
+    `num_seeds` runs, and two a number for each try, of which there are mostly two, at most ten.
 
-    Arguments are those of `fit`. None, with a warning, where I is not positive definite: away
-    from a maximum, along a direction that nothing tells, or with too few seeds. Raises
-    `ValueError` for what `fit` does, fewer than one seed, and more than fifty numbers.
+    Arguments are those of `fit`. Noise in I makes the errors too large rather than too small. A
+    warning says so where the seeds do not settle them: where the errors that one half of the seeds
+    gives and those of the other half differ by more than 25% (the root mean square of the
+    logarithm, over many ways to halve them), so that those of all are uncertain by half of that.
+
+    None, with a warning, where I is not positive definite: away from a maximum, along a direction
+    that nothing tells, or with too few seeds. Raises `ValueError` for what `fit` does, fewer than
+    one seed, and more than fifty numbers.
     """
-    if num_seeds < 1:
-        raise ValueError(f"num_seeds: {num_seeds} is less than 1")
+    check_key(key)
+    check_whole(1, num_seeds=num_seeds)
     problem = pose_evidence(filter, observations, parameters, transforms, missing)
-    return errors_at(problem, problem.start(), [jax.random.split(key, num_seeds)])
+    warn_of_bias("standard_errors", problem)
+    batches = [jax.random.split(key, num_seeds)]
+    return errors_at(problem, problem.start(), batches, "num_seeds")
 
 
 def errors_at(
-    problem: Problem, reals: Reals, batches: list[Key[Array, " seeds"]]
+    problem: Problem, reals: Reals, batches: list[Key[Array, " seeds"]], of_seeds: str
 ) -> dict[str, np.ndarray] | None:
-    """The standard errors at a point, from scores with all batches of seeds."""
+    """The standard errors at a point, from scores with all batches of seeds.
+
+    `of_seeds` is the argument that says how many there are.
+    """
     point, unravel = ravel_pytree(reals)
     if point.size > _MOST_NUMBERS:
         raise ValueError(
@@ -55,38 +85,144 @@ def errors_at(
             f" which is for at most {_MOST_NUMBERS}"
         )
 
-    def score(flat: np.ndarray) -> np.ndarray:
-        at = unravel(jnp.asarray(flat, point.dtype))
-        gradients = [ravel_pytree(scores(problem, at, keys)[1])[0] for keys in batches]
-        return np.mean([np.asarray(g, float) for g in gradients], axis=0)
+    def score(flat: np.ndarray) -> Float[np.ndarray, "seeds d"]:
+        at = unravel(jnp.asarray(flat))
+        each = [np.asarray(score_of_each(problem, at, keys), float) for keys in batches]
+        return np.concatenate(each)
 
-    centre = np.asarray(point)
-    steps = np.full(centre.shape, _FIRST_STEP)
-    for _ in range(2):
-        information = _differences(score, centre, steps)
-        steep = np.maximum(np.diagonal(information), 0.0)
-        # As far as the likelihood tells the points apart: where the noise matters least.
-        steps = np.where(steep > 0, 1 / np.sqrt(np.where(steep > 0, steep, 1.0)), steps)
-        steps = np.clip(steps, 1e-3, 0.5)
-    if not np.isfinite(information).all() or np.linalg.eigvalsh(information)[0] <= 0:
+    informations = _informations(score, np.asarray(point), _longest_steps(problem, reals))
+    covariance = _inverse(informations.mean(axis=0))
+    if covariance is None:
         warnings.warn(
             "standard_errors: the log marginal likelihood has no maximum here, or too few seeds"
             " to see it",
-            stacklevel=2,
+            stacklevel=3,
         )
         return None
-    covariance = np.linalg.inv(information)
+    _warn_of_noise(informations, of_seeds)
     return _on_their_own_scale(problem, reals, covariance)
 
 
-def _differences(score, centre: np.ndarray, steps: np.ndarray) -> Float[np.ndarray, "d d"]:
+def _informations(
+    score: Callable[[np.ndarray], np.ndarray], centre: np.ndarray, longest: np.ndarray
+) -> Float[np.ndarray, "seeds d d"]:
+    """The observed information, as each seed has it; NaN where there is none."""
+    # A score is about as large as one over a standard error, in whatever units it is: by the
+    # noise of its seeds where nothing else.
+    sizes = np.sqrt(np.mean(score(centre) ** 2, axis=0))
+    shortest = _FEWEST_PLACES * np.asarray(np.spacing(np.abs(centre)), float)
     columns = []
-    for axis, step in enumerate(steps):
-        offset = np.zeros_like(centre)
-        offset[axis] = step
-        columns.append((score(centre - offset) - score(centre + offset)) / (2 * step))
-    matrix = np.stack(columns, axis=1)
-    return (matrix + matrix.T) / 2
+    for axis, size in enumerate(sizes):
+        first = 1 / size if 0 < size < np.inf else 1.0
+        columns.append(_column(score, centre, axis, first, shortest[axis], longest[axis]))
+    matrices = np.stack(columns, axis=2)
+    return (matrices + matrices.transpose(0, 2, 1)) / 2
+
+
+def _column(
+    score: Callable[[np.ndarray], np.ndarray],
+    centre: np.ndarray,
+    axis: int,
+    first: float,
+    shortest: float,
+    longest: float,
+) -> Float[np.ndarray, "seeds d"]:
+    """One column of every seed's information, by differences over about one standard error.
+
+    So far the likelihood tells the points apart, and the noise matters least.
+    """
+    step = float(np.clip(first, shortest, longest))
+    for _ in range(_MOST_ROUNDS):
+        column = _difference(score, centre, axis, step)
+        # Twice the nats that are lost by a step, if it is a parabola.
+        told = abs(column[:, axis].mean()) * step**2
+        if not np.isfinite(column).all():
+            # Past where the model is defined.
+            longest, following = step / 2, step / 8
+        elif _NEAR[0] <= told <= _NEAR[1]:
+            break
+        else:
+            factor = _FURTHEST_ROUND if told == 0 else 1 / np.sqrt(told)
+            following = step * np.clip(factor, 1 / _FURTHEST_ROUND, _FURTHEST_ROUND)
+        following = float(np.clip(following, shortest, max(shortest, longest)))
+        if following == step:
+            break
+        step = following
+    return column
+
+
+def _difference(
+    score: Callable[[np.ndarray], np.ndarray], centre: np.ndarray, axis: int, step: float
+) -> Float[np.ndarray, "seeds d"]:
+    """-∂score/∂θ along one axis, for every seed."""
+    below, above = centre.copy(), centre.copy()
+    below[axis] -= step
+    above[axis] += step
+    # The distance that the numbers really have, which are rounded.
+    distance = float(above[axis]) - float(below[axis])
+    return (score(below) - score(above)) / distance
+
+
+def _longest_steps(problem: Problem, reals: Reals) -> np.ndarray:
+    """By number, in the order of `ravel_pytree`, how far a step may go."""
+    limit = {
+        name: _LONGEST_WITHOUT_UNIT if isinstance(transform, _WITHOUT_UNIT) else np.inf
+        for name, transform in problem.transforms.items()
+    }
+    return np.concatenate([np.full(reals[name].size, limit[name]) for name in sorted(reals)])
+
+
+def _inverse(information: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"] | None:
+    """The inverse, or None for a matrix that is not positive definite, in whatever units."""
+    steep = np.diagonal(information)
+    if not np.isfinite(information).all() or (steep <= 0).any():
+        return None
+    scale = 1 / np.sqrt(steep)
+    scales = np.outer(scale, scale)
+    relative = information * scales
+    # No smaller than what rounding leaves of a zero.
+    if np.linalg.eigvalsh(relative)[0] <= 1e-12:
+        return None
+    return np.linalg.inv(relative) * scales
+
+
+def _warn_of_noise(informations: Float[np.ndarray, "seeds d d"], of_seeds: str) -> None:
+    """Warn where halves of the seeds disagree on the errors."""
+    num_seeds = len(informations)
+    if num_seeds == 1:
+        warnings.warn(
+            f"standard_errors: {of_seeds} is 1, which leaves no halves that could differ: how"
+            " uncertain the standard errors are is not known",
+            stacklevel=4,
+        )
+        return
+    apart = _apart(informations)
+    if apart > _MOST_APART:
+        found = f"differ by {apart:.0%}" if np.isfinite(apart) else "may be no errors at all"
+        warnings.warn(
+            f"standard_errors: {num_seeds} seeds leave them uncertain, and rather too large: those"
+            f" of one half of the seeds and of the other half {found}; raise {of_seeds}",
+            stacklevel=4,
+        )
+
+
+def _apart(informations: Float[np.ndarray, "seeds d d"]) -> float:
+    """By how much errors from halves of the seeds differ, the worst of them; inf for no errors."""
+    num_seeds = len(informations)
+    # Halves of one split differ a lot or a little by chance.
+    generator = np.random.default_rng(0)
+    logs = []
+    for _ in range(_NUM_HALVINGS):
+        order = generator.permutation(num_seeds)
+        halves = order[: num_seeds // 2], order[num_seeds // 2 :]
+        variances = []
+        for half in halves:
+            covariance = _inverse(informations[half].mean(axis=0))
+            if covariance is None:
+                return np.inf
+            variances.append(np.diagonal(covariance))
+        logs.append(np.log(variances[0] / variances[1]) / 2)
+    return float(np.expm1(np.sqrt(np.mean(np.square(logs), axis=0)).max()))
 
 
 def _on_their_own_scale(

@@ -1,12 +1,15 @@
 """What labels say of a likelihood: the posterior of the label among candidate states."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.checks import check_key, check_whole, given, shown
+from mpfjax.models.base import AbstractStateSpaceModel, require
 
 
 class LabelLikelihood(eqx.Module):
@@ -33,7 +36,8 @@ class LabelLikelihood(eqx.Module):
 
     def __check_init__(self) -> None:
         t = _check(self.observations, self.labels, self.candidates)
-        if self.num_frames is not None and not 1 <= self.num_frames <= t:
+        check_whole(1, **given(num_frames=self.num_frames))
+        if self.num_frames is not None and self.num_frames > t:
             raise ValueError(f"num_frames: {self.num_frames} is not between 1 and the {t} frames")
 
     def __call__(self, key: Key[Array, ""], model: AbstractStateSpaceModel) -> Float[Array, ""]:
@@ -65,6 +69,7 @@ def label_log_posteriors(
     Shapes as in `LabelLikelihood`; one frame after the other, whose terms are computed again for
     the derivative, so that memory does not grow with t but for the data.
     """
+    require(model, "log_likelihood", "label_log_posteriors")
     _check(observations, labels, candidates)
 
     @jax.checkpoint
@@ -85,11 +90,13 @@ def transition_candidates(
     """Draws from D(. | the label one frame before), for every frame but the first.
 
     `labels` has leaves (t, k, ...), the result (t - 1, k, n, ...): rivals as a filter would meet
-    them. Raises `ValueError` for fewer than one candidate, and for fewer than two frames.
+    them. Raises `ValueError` for fewer than one candidate, fewer than two frames, and labels that
+    are no arrays.
     """
-    if num_candidates < 1:
-        raise ValueError(f"num_candidates: {num_candidates} is less than 1")
-    t, k = jax.tree.leaves(labels)[0].shape[:2]
+    check_key(key)
+    require(model, "sample_transition", "transition_candidates")
+    check_whole(1, num_candidates=num_candidates)
+    t, k = _leading_axes("labels", labels, 2, "frames and labels")
     if t < 2:
         raise ValueError(f"labels: {t} frames leave none with a label one frame before")
     lead = (t - 1, k, num_candidates)
@@ -103,16 +110,33 @@ def transition_candidates(
 
 def _check(observations: PyTree, labels: PyTree, candidates: PyTree) -> int:
     """The number of frames, or a `ValueError` for leading axes that do not agree."""
-    lead = jax.tree.leaves(candidates)[0].shape[:3]
-    if len(lead) < 3 or 0 in lead:
-        raise ValueError(f"candidates: leading axes {lead} are not frames, labels and candidates")
+    lead = _leading_axes("candidates", candidates, 3, "frames, labels and candidates")
     for name, tree, axes in (
         ("observations", observations, 1), ("labels", labels, 2), ("candidates", candidates, 3),
     ):  # fmt: skip
-        for leaf in jax.tree.leaves(tree):
+        for leaf in _arrays(name, tree):
             if jnp.shape(leaf)[:axes] != lead[:axes]:
                 raise ValueError(
                     f"{name}: leading axes {jnp.shape(leaf)[:axes]} are not {lead[:axes]},"
                     " as of the candidates"
                 )
     return lead[0]
+
+
+def _leading_axes(name: str, tree: PyTree, count: int, what: str) -> tuple[int, ...]:
+    """The first axes of the first leaf, none of them empty."""
+    lead = jnp.shape(_arrays(name, tree)[0])[:count]
+    if len(lead) < count or 0 in lead:
+        raise ValueError(f"{name}: leading axes {lead} are not {what}")
+    return lead
+
+
+def _arrays(name: str, tree: PyTree) -> list[Any]:
+    """The leaves, of which there is one and each an array of numbers."""
+    leaves = jax.tree.leaves(tree)
+    for leaf in leaves:
+        if not eqx.is_array_like(leaf):
+            raise ValueError(f"{name}: {shown(leaf)} is no array of numbers")
+    if not leaves:
+        raise ValueError(f"{name}: {shown(tree)} holds no array")
+    return leaves

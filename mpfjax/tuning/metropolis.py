@@ -14,6 +14,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 from tqdm import tqdm
 
+from mpfjax.checks import (
+    check_callable,
+    check_flag,
+    check_key,
+    check_type,
+    check_whole,
+    shown,
+)
 from mpfjax.filters import Filter
 from mpfjax.tuning.problem import Parameters, Problem, pose_evidence
 from mpfjax.tuning.transforms import AbstractTransform
@@ -79,12 +87,15 @@ def metropolis_hastings(
 
     A NaN or +inf ends the chains with a warning, what they have, and the step in `stopped`. Raises
     `ImportError` where blackjax is missing, `ValueError` for numbers below one, deviations that are
-    not positive or of unknown parameters, a filter that is `approximate`, a start without a
-    prior, and what `fit` does; `RuntimeError` where the start has no likelihood.
+    not positive or of unknown parameters, a filter that is `approximate`, a prior that is no
+    number, a start without one, and what `fit` does; `RuntimeError` where the start has no
+    likelihood.
     """
-    for name, number in (("num_steps", num_steps), ("num_chains", num_chains)):
-        if number < 1:
-            raise ValueError(f"{name}: {number} is less than 1")
+    check_key(key)
+    check_type(Filter, "a filter", filter=filter)
+    check_whole(1, num_steps=num_steps, num_chains=num_chains)
+    check_callable("a function of the parameters by name", log_prior=log_prior)
+    check_flag(progress=progress)
     if filter.approximate:
         raise ValueError(
             "filter: an approximate one has no unbiased likelihood, and no exact chain"
@@ -93,7 +104,7 @@ def metropolis_hastings(
     problem = pose_evidence(filter, observations, parameters, transforms, missing)
     start = problem.start()
     chain = _Chain(problem, log_prior, _deviations(proposal_deviations, start))
-    prior = float(chain.log_prior_density(start))
+    prior = _checked_prior(chain, start)
     if not np.isfinite(prior):
         raise ValueError(f"log_prior: {prior} at the start")
     key_start, key_steps = jax.random.split(key)
@@ -168,6 +179,16 @@ class _Chain(eqx.Module):
         return {"reals": reals, "key": jax.random.key_data(key_fresh)}
 
 
+def _checked_prior(chain: _Chain, start: dict[str, Array]) -> float:
+    """The log density at the start, of a prior that is a number."""
+    values = {name: chain.problem.transforms[name].constrain(u) for name, u in start.items()}
+    density = chain.prior(values)
+    is_number = eqx.is_array_like(density) and jnp.ndim(density) == 0
+    if not is_number or not jnp.issubdtype(jnp.result_type(density), jnp.floating):
+        raise ValueError(f"log_prior: {shown(density)} at the start is no floating point number")
+    return float(chain.log_prior_density(start))
+
+
 def _kernels(blackjax: ModuleType, chain: _Chain) -> tuple[Callable, Callable]:
     """The first states, and one step, of all chains."""
 
@@ -192,7 +213,12 @@ def _deviations(given: float | Mapping[str, Any], start: dict[str, Array]) -> di
         raise ValueError(f"proposal_deviations: those of {sorted(by_name)}, not of {sorted(start)}")
     deviations = {}
     for name, u in start.items():
-        value = np.asarray(by_name[name], float)
+        try:
+            value = np.asarray(by_name[name], float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"proposal_deviations: {shown(by_name[name])} of {name} is no number"
+            ) from error
         if not (np.isfinite(value).all() and (value > 0).all()):
             raise ValueError(f"proposal_deviations: {value} of {name} is not positive")
         if value.shape not in ((), u.shape):

@@ -1,5 +1,6 @@
 """What is tuned: some leaves of a filter or model, and the objective that they are to maximise."""
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -8,10 +9,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
+from mpfjax.checks import check_type, shown
 from mpfjax.filters import Filter, present_steps, scan_filter
+from mpfjax.moves.clusters import PropagateInClusters
+from mpfjax.moves.independent import PropagateIndependently
+from mpfjax.moves.resampling import Resample
+from mpfjax.proposals import AbstractProposal
 from mpfjax.tuning.transforms import AbstractTransform, Unconstrained
+
+_DECLARED = "eqx.field(converter=jnp.asarray)"
 
 Parameters = Mapping[str, Callable[[Any], PyTree]] | PyTree
 Reals = dict[str, Array]
@@ -29,16 +38,21 @@ class Problem(eqx.Module):
     """the parameters' names, and where they are among the leaves."""
     structure: Any = eqx.field(static=True)
 
+    @property
+    def tree(self) -> Any:
+        """The filter or model as it is."""
+        return jax.tree.unflatten(self.structure, self.leaves)
+
     def start(self) -> Reals:
         """The parameters as they are; raises `ValueError` for one that cannot be tuned."""
         reals = {}
         for name, index in self.tuned:
             value, transform = self.leaves[index], self.transforms[name]
-            if not eqx.is_inexact_array(value):
-                raise ValueError(f"parameters: {name} is {value!r}, no floating point array")
             if not transform.contains(np.asarray(value)):
                 kind = type(transform).__name__
-                raise ValueError(f"parameters: {name} starts at {value}, outside {kind}'s domain")
+                raise ValueError(
+                    f"parameters: {name} starts at {shown(value)}, outside {kind}'s domain"
+                )
             # A strong type: a weak one would compile anew once an optimiser has made it strong.
             reals[name] = jax.lax.convert_element_type(transform.unconstrain(value), value.dtype)
         return reals
@@ -92,6 +106,15 @@ def scores(
     return values, gradient
 
 
+@eqx.filter_jit
+def score_of_each(
+    problem: Problem, reals: Reals, keys: Key[Array, " seeds"]
+) -> Float[Array, "seeds d"]:
+    """The gradient of each seed's objective, as `ravel_pytree` lays the parameters out."""
+    gradient = jax.grad(problem.value)
+    return jax.vmap(lambda key: ravel_pytree(gradient(reals, key))[0])(keys)
+
+
 def pose(
     tree: PyTree,
     objective: Objective,
@@ -102,8 +125,10 @@ def pose(
     leaves, structure = jax.tree.flatten(tree)
     tuned = _named_leaves(tree, parameters)
     if not tuned:
-        raise ValueError("parameters: there is nothing to tune")
-    transforms = dict(transforms or {})
+        raise ValueError(f"parameters: there is nothing to tune{_what_there_is(tree)}")
+    for name, index in tuned.items():
+        leaves[index] = _as_array(name, leaves[index])
+    transforms = _checked_transforms(transforms)
     unknown = sorted(set(transforms) - set(tuned))
     if unknown:
         raise ValueError(f"transforms: {unknown} are not among the parameters, {sorted(tuned)}")
@@ -124,11 +149,55 @@ def pose_evidence(
     missing: str,
 ) -> Problem:
     """The problem of the log marginal likelihood; without `parameters`, in those of the model."""
+    check_type(Filter, "a filter", filter=filter)
     if parameters is None:
         fixed = jax.tree.map(lambda _: False, filter)
         of_model = jax.tree.map(eqx.is_inexact_array, filter.model)
         parameters = eqx.tree_at(lambda f: f.model, fixed, of_model)
     return pose(filter, LogEvidence(_groups(observations, missing)), parameters, transforms)
+
+
+def warn_of_bias(caller: str, problem: Problem) -> None:
+    """Warn where the derivatives of a filter are not the score of what is tuned.
+
+    Not for parameters of proposals, whose bound is to be climbed without the resampling, and not
+    for filters that never resample.
+    """
+    filter = jax.tree.unflatten(problem.structure, map(_Place, range(len(problem.leaves))))
+    of_proposals = {
+        place.index
+        for node in _nodes(filter, AbstractProposal)
+        for place in jax.tree.leaves(node)
+        if isinstance(place, _Place)
+    }
+    names = [name for name, index in problem.tuned if index not in of_proposals]
+    if not names:
+        return
+    silent = [
+        type(move).__name__
+        for move in _nodes(filter, (PropagateInClusters, PropagateIndependently))
+    ]
+    plain = [
+        move for move in _nodes(filter, Resample)
+        if move.gradient == "none" and move.ess_threshold > 0
+    ]  # fmt: skip
+    if not silent and not plain:
+        return
+    use = (
+        'build it with gradient="stop"' if plain
+        else f"{silent[0]} has no other: take a filter that has, such as partitioned_sampling"
+    )  # fmt: skip
+    warnings.warn(
+        f"{caller}: the filter's resampling has no gradient, so that the score of"
+        f" {', '.join(names)} is biased, however many particles there are; {use}",
+        stacklevel=3,
+    )
+
+
+def _nodes(tree: PyTree, kinds: type | tuple[type, ...]) -> list[Any]:
+    """What is of some kinds, anywhere in a pytree."""
+    is_one = lambda node: isinstance(node, kinds)  # noqa: E731
+    return [node for node in jax.tree.leaves(tree, is_leaf=is_one) if is_one(node)]
 
 
 @dataclass(frozen=True)
@@ -138,33 +207,100 @@ class _Place:
     index: int
 
 
+def _as_array(name: str, value: Any) -> Array:
+    """A parameter as an array; raises `ValueError` for what has no derivative."""
+    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating):
+        return value
+    if isinstance(value, np.ndarray | np.generic) and np.issubdtype(value.dtype, np.floating):
+        return jnp.asarray(value)
+    if isinstance(value, float):
+        return jnp.asarray(value, float)
+    use = ""
+    if isinstance(value, int) and not isinstance(value, bool):
+        use = f"; give the model {float(value)}, or declare it {_DECLARED}"
+    raise ValueError(f"parameters: {name} is {shown(value)}, no floating point number{use}")
+
+
+def _what_there_is(tree: PyTree) -> str:
+    """A hint at the numbers that are no arrays, which are tuned by name alone."""
+    names = _names(tree)
+    numbers = [
+        name for name, leaf in zip(names, jax.tree.leaves(tree), strict=True)
+        if isinstance(leaf, float) and not name.startswith("_")
+    ]  # fmt: skip
+    if not numbers:
+        return ""
+    return (
+        f"; {', '.join(numbers)} are Python floats, which are tuned where `parameters` names"
+        f" them, or where their fields are declared {_DECLARED}"
+    )
+
+
+def _checked_transforms(
+    transforms: Mapping[str, AbstractTransform] | None,
+) -> dict[str, AbstractTransform]:
+    if transforms is None:
+        return {}
+    check_type(Mapping, "a mapping from names to transforms", transforms=transforms)
+    for name, transform in transforms.items():
+        check_type(AbstractTransform, "a transform", **{f"transforms[{name!r}]": transform})
+    return dict(transforms)
+
+
+def _names(tree: PyTree) -> list[str]:
+    """What each leaf is called where it is not named."""
+    return [
+        jax.tree_util.keystr(path).removeprefix(".model.").removeprefix(".")
+        for path, _ in jax.tree_util.tree_leaves_with_path(tree)
+    ]
+
+
 def _named_leaves(tree: PyTree, parameters: Parameters) -> dict[str, int]:
     """Each parameter's name, and where it is among the tree's leaves."""
     leaves, structure = jax.tree.flatten(tree)
     places = jax.tree.unflatten(structure, map(_Place, range(len(leaves))))
     if isinstance(parameters, Mapping):
-        chosen = [_chosen(name, where, places, leaves) for name, where in parameters.items()]
-        return {name: index for named in chosen for name, index in named.items()}
+        chosen: dict[str, int] = {}
+        for name, where in parameters.items():
+            check_type(str, "a name", parameters=name)
+            for inner, index in _chosen(name, where, places, leaves).items():
+                if index in chosen.values():
+                    twice = next(other for other in chosen if chosen[other] == index)
+                    raise ValueError(f"parameters: {twice} and {inner} pick the same number")
+                chosen[inner] = index
+        return chosen
     if parameters is None:
         parameters = jax.tree.map(eqx.is_inexact_array, tree)
-    spec = jax.tree.leaves(jax.tree.broadcast(parameters, tree))
+    try:
+        spec = jax.tree.leaves(jax.tree.broadcast(parameters, tree))
+    except (ValueError, TypeError):
+        spec = []
     if len(spec) != len(leaves) or not all(isinstance(is_tuned, bool) for is_tuned in spec):
-        raise ValueError("parameters: the filter spec is no pytree of booleans like the filter")
-    names = [
-        jax.tree_util.keystr(path).removeprefix(".model.").removeprefix(".")
-        for path, _ in jax.tree_util.tree_leaves_with_path(places)
-    ]
+        raise ValueError(
+            f"parameters: {shown(parameters)} is neither a mapping from names to functions, such"
+            ' as {"r": lambda filter: filter.model.r}, nor a filter spec, a pytree of booleans like'
+            " the filter"
+        )
+    names = _names(tree)
     return {names[i]: i for i, is_tuned in enumerate(spec) if is_tuned}
 
 
 def _chosen(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[str, int]:
     """What one entry of the mapping stands for: a leaf, or the arrays of a node."""
     if not callable(where):
-        raise ValueError(f"parameters: {name} is {where!r}, no function that picks from it")
-    found = jax.tree_util.tree_leaves_with_path(where(places))
+        raise ValueError(f"parameters: {name} is {shown(where)}, no function that picks from it")
+    try:
+        picked = where(places)
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        raise ValueError(f"parameters: {name} cannot be picked: {error}") from error
+    found = jax.tree_util.tree_leaves_with_path(picked)
     for _, place in found:
         if not isinstance(place, _Place):
-            raise ValueError(f"parameters: {name} picks {place!r}, which is no leaf")
+            raise ValueError(
+                f"parameters: {name} picks {shown(place)}, which is no leaf but a static field, or"
+                f" made from others; a field can be tuned where it is declared {_DECLARED}, without"
+                " static=True"
+            )
     if len(found) > 1:  # a network has functions among its leaves
         found = [
             (path, place) for path, place in found if eqx.is_inexact_array(leaves[place.index])
@@ -180,6 +316,9 @@ def _groups(observations: PyTree, missing: str) -> list[tuple[PyTree, Array | No
         raise ValueError("observations: there are no sequences")
     by_shape: dict[Any, list[tuple[PyTree, Any]]] = {}
     for sequence in sequences:
+        for leaf in jax.tree.leaves(sequence):
+            if not eqx.is_array_like(leaf):
+                raise ValueError(f"observations: {shown(leaf)} is no array of numbers")
         present = present_steps(sequence, missing)
         shapes = jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf).name), sequence)
         by_shape.setdefault(str(shapes), []).append((sequence, present))

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mpfjax.checks import check_finite
+
 
 class AbstractTransform(eqx.Module):
     """A smooth bijection between the domain of a parameter and all real numbers."""
@@ -72,13 +74,14 @@ class Positive(AbstractTransform):
 class Interval(AbstractTransform):
     """low + (high - low) sigmoid(u): for correlations, rates and single probabilities.
 
-    Raises `ValueError` for an empty interval.
+    Raises `ValueError` for an empty interval, and for ends that are not finite numbers.
     """
 
     low: float = eqx.field(static=True)
     high: float = eqx.field(static=True)
 
     def __check_init__(self) -> None:
+        check_finite(low=self.low, high=self.high)
         if not self.low < self.high:
             raise ValueError(f"high: {self.high} is not above low, {self.low}")
 

@@ -1,5 +1,12 @@
 """`fit` finds the maximum, says what is wrong, and goes on where it was interrupted."""
 
+import functools
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,12 +18,14 @@ from scipy.optimize import minimize
 import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.tuning import Interval, Positive, fit, standard_errors
+from mpfjax.tuning.identity import contents_of
 from tests.full_disk import no_room_beyond
 from tests.user_models import ScalarLinear
 
 OBSERVATIONS = jnp.array([1.5, 0.2, -0.4, 0.8, 1.9, 1.1, 0.3, -0.9])
 NOISE = {"r": lambda filter: filter.model.r}
 ADAM = optax.adam(0.05)
+RATE = 0.1
 
 
 class Fragile(ScalarLinear):
@@ -29,15 +38,15 @@ class Fragile(ScalarLinear):
         return jnp.where(self.r < 0.3, jnp.nan, honest)
 
 
-def small(**parameters):
-    return mpfjax.particle_filter(Fragile(**parameters), 16, gradient="stop")
+def small(num_particles=16, gradient="stop", **parameters):
+    return mpfjax.particle_filter(Fragile(**parameters), num_particles, gradient=gradient)
 
 
 def short_fit(num_steps=6, *, parameters=NOISE, optimizer=ADAM, start=None, **options):
     options = {"num_seeds": 4, "progress": False, "transforms": {"r": Positive()}} | options
-    filter = small(**(start or {}))
-    key = jax.random.key(0)
-    return fit(key, filter, OBSERVATIONS, optimizer, num_steps, parameters=parameters, **options)
+    arguments = {"key": jax.random.key(0), "observations": OBSERVATIONS}
+    arguments |= {"filter": small(**(start or {})), "optimizer": optimizer, "num_steps": num_steps}
+    return fit(**arguments | {"parameters": parameters} | options)
 
 
 class TestMaximum:
@@ -136,12 +145,99 @@ class TestResuming:
         assert short_fit(checkpoint=path).parameters["r"] == short_fit().parameters["r"]
 
     @pytest.mark.parametrize(
-        "other", [{"num_seeds": 2}, {"start": {"r": 0.7}}, {"optimizer": optax.sgd(0.1)}]
-    )
-    def test_a_checkpoint_of_another_fit_is_refused(self, tmp_path, other):
+        ("other", "named"),
+        [
+            ({"num_seeds": 2}, "num_seeds is 4 there and 2 here"),
+            ({"common_random_numbers": True}, "common_random_numbers is False there"),
+            ({"start": {"r": 0.7}}, r"filter\.model\.r is .* 0\.5 there and .* 0\.7 here"),
+            ({"start": {"q": 0.7}}, r"filter\.model\.q is"),
+            ({"start": {"num_particles": 8}}, r"filter\.num_particles is 16 there and 8 here"),
+            ({"start": {"gradient": "straight_through"}}, r"filter\._moves\[0\]\.gradient is"),
+            ({"observations": OBSERVATIONS.at[3].add(1e-6)}, "observations is"),
+            ({"missing": "skip"}, "missing is error there and skip here"),
+            ({"key": jax.random.key(1)}, "key is"),
+            ({"transforms": {"r": Interval(0.0, 9.0)}}, r"transforms\['r'\]"),
+            ({"parameters": {"r": lambda filter: filter.model.q}}, "parameters r is"),
+            ({"optimizer": optax.sgd(0.05)}, "optimizer"),
+            ({"optimizer": optax.adam(0.06)}, r"optimizer\..*step_size is -0\.05 there and -0\.06"),
+            ({"optimizer": optax.adam(0.05, b1=0.8)}, r"optimizer\..*b1 is 0\.9 there and 0\.8"),
+        ],
+    )  # fmt: skip
+    def test_a_checkpoint_of_another_fit_is_refused_with_what_differs(self, tmp_path, other, named):
         short_fit(1, checkpoint=tmp_path / "fit.npz")
-        with pytest.raises(ValueError, match=r"checkpoint: .* is of another fit"):
+        with pytest.raises(
+            ValueError, match=r"checkpoint: .*fit\.npz is of another fit: .*" + named
+        ):
             short_fit(checkpoint=tmp_path / "fit.npz", **other)
+
+    def test_what_may_differ_is_how_long_it_goes_on(self, tmp_path):
+        short_fit(2, checkpoint=tmp_path / "fit.npz", patience=9)
+        options = {"patience": 2, "tolerance": -1e9, "checkpoint_every": 1}
+        resumed = short_fit(checkpoint=tmp_path / "fit.npz", **options)
+        np.testing.assert_array_equal(resumed.history["r"], short_fit().history["r"])
+
+    def test_a_fit_that_converged_does_not_go_on(self, tmp_path):
+        options = {"optimizer": optax.sgd(1e-4), "patience": 3, "common_random_numbers": True}
+        options |= {"tolerance": 1.0, "checkpoint": tmp_path / "fit.npz"}
+        first = short_fit(40, **options)
+        assert "3 steps gained" in first.stopped
+        with np.load(options["checkpoint"], allow_pickle=False) as file:
+            assert str(file["stopped"]) == first.stopped
+        assert_same(short_fit(40, **options), first)
+        assert_same(short_fit(80, **options), first)
+        further = short_fit(10, **options | {"patience": None})
+        assert further.stopped is None
+        assert len(further.history["r"]) == 10
+        np.testing.assert_array_equal(further.history["r"][:6], first.history["r"])
+
+    @pytest.mark.parametrize(("num_steps", "step"), [(6, 0.2), (1, 1.0)])
+    def test_a_fit_that_broke_does_not_go_on(self, tmp_path, num_steps, step):
+        """In the middle, or where its end was evaluated."""
+        options = {"optimizer": falling(step), "checkpoint": tmp_path / "fit.npz"}
+        with pytest.warns(UserWarning, match="was nan at step"):
+            first = short_fit(num_steps, **options)
+        before = options["checkpoint"].read_bytes()
+        for more in (0, 5):
+            with pytest.warns(UserWarning, match="was nan at step"):
+                assert_same(short_fit(num_steps + more, **options), first)
+        assert options["checkpoint"].read_bytes() == before
+
+    @pytest.mark.parametrize(
+        ("name", "array"),
+        [
+            ("reals r", np.zeros(2, np.float32)),
+            ("reals r", np.zeros((), np.float64)),
+            ("optimizer 0", None),
+            ("optimizer 1", np.zeros((), np.int32)),
+            ("path r", np.zeros(1, np.float32)),
+            ("values", None),
+            ("step", np.array(1.5)),
+            ("step", np.array(9)),
+        ],
+    )
+    def test_a_file_with_other_arrays_is_damaged(self, tmp_path, name, array):
+        path = tmp_path / "fit.npz"
+        short_fit(2, checkpoint=path)
+        arrays = mpfjax.storage.load_arrays(path)
+        del arrays[name]
+        mpfjax.storage.write_arrays(path, arrays | ({} if array is None else {name: array}))
+        with pytest.raises(ValueError, match=r"checkpoint: .*fit\.npz is damaged"):
+            short_fit(checkpoint=path)
+
+    def test_a_file_of_something_else_is_refused(self, tmp_path):
+        path = tmp_path / "fit.npz"
+        mpfjax.storage.write_arrays(path, {"step": np.array(3)})
+        with pytest.raises(ValueError, match=r"fit\.npz is no checkpoint of a climb"):
+            short_fit(checkpoint=path)
+
+    def test_an_optimiser_with_a_key_and_short_floats_goes_on(self, tmp_path):
+        noisy = optax.chain(
+            optax.add_noise(0.01, 0.5, jax.random.key(3)), optax.adam(0.05, mu_dtype=jnp.bfloat16)
+        )
+        whole = short_fit(4, optimizer=noisy)
+        short_fit(2, optimizer=noisy, checkpoint=tmp_path / "fit.npz")
+        resumed = short_fit(4, optimizer=noisy, checkpoint=tmp_path / "fit.npz")
+        np.testing.assert_array_equal(resumed.history["r"], whole.history["r"])
 
     def test_a_checkpoint_that_is_cut_off_is_named_and_left_alone(self, tmp_path):
         path = tmp_path / "fit.npz"
@@ -158,6 +254,99 @@ class TestResuming:
         with pytest.raises(OSError, match=r"fit\.npz"), no_room_beyond(500):
             short_fit(checkpoint=path)
         assert path.read_bytes() == before
+
+
+def assert_same(run, other):
+    """To the bit, and neither has taken a step more."""
+    assert run.parameters["r"] == other.parameters["r"]
+    assert run.log_marginal_likelihood == other.log_marginal_likelihood
+    assert run.stopped == other.stopped
+    for name, values in other.history.items():
+        np.testing.assert_array_equal(run.history[name], values)
+
+
+class TestOptimisers:
+    """Which are closures: two are the same where all that these hold is."""
+
+    def same(self, one, other):
+        return contents_of("optimizer", one) == contents_of("optimizer", other)
+
+    @pytest.mark.parametrize(
+        "make",
+        [
+            lambda: optax.adam(0.05),
+            lambda: optax.adam(optax.cosine_decay_schedule(0.05, 100)),
+            lambda: optax.chain(optax.clip(1.0), optax.inject_hyperparams(optax.sgd)(0.1)),
+            lambda: optax.MultiSteps(optax.sgd(0.1), 3),
+            lambda: optax.lbfgs(),
+            lambda: falling(0.2),
+            lambda: optax.sgd(lambda step: 0.1 / (1 + step)),
+            lambda: optax.multi_transform({"a": optax.sgd(0.1), "b": optax.adam(0.2)}, {"r": "a"}),
+        ],
+    )
+    def test_made_twice_they_are_the_same(self, make):
+        assert self.same(make(), make())
+
+    @pytest.mark.parametrize(
+        ("one", "other"),
+        [
+            (optax.adam(0.05), optax.adam(0.06)),
+            (optax.adam(0.05), optax.adamw(0.05)),
+            (optax.adam(0.05, eps=1e-8), optax.adam(0.05, eps=1e-7)),
+            (
+                optax.adam(optax.cosine_decay_schedule(0.05, 100)),
+                optax.adam(optax.cosine_decay_schedule(0.05, 200)),
+            ),
+            (
+                optax.sgd(optax.piecewise_constant_schedule(0.1, {5000: 0.5})),
+                optax.sgd(optax.piecewise_constant_schedule(0.1, {6000: 0.5})),
+            ),
+            (
+                optax.inject_hyperparams(optax.sgd)(0.1),
+                optax.inject_hyperparams(optax.sgd)(0.2),
+            ),
+            (optax.inject_hyperparams(optax.sgd)(0.1), optax.inject_hyperparams(optax.adam)(0.1)),
+            (optax.MultiSteps(optax.sgd(0.1), 3), optax.MultiSteps(optax.sgd(0.1), 4)),
+            (optax.sgd(lambda step: 0.1 / (1 + step)), optax.sgd(lambda step: 0.2 / (1 + step))),
+            (optax.sgd(lambda step: 0.1 / (1 + step)), optax.sgd(lambda step: 0.1 / (2 + step))),
+            (
+                optax.sgd(jax.jit(lambda step: 0.1 / (1 + step))),
+                optax.sgd(jax.jit(lambda step: 0.1 / (2 + step))),
+            ),
+            (
+                optax.sgd(functools.partial(jnp.multiply, 0.1)),
+                optax.sgd(functools.partial(jnp.multiply, 0.2)),
+            ),
+        ],
+    )
+    def test_of_other_numbers_or_code_they_are_others(self, one, other):
+        assert not self.same(one, other)
+
+    def test_numbers_of_the_module_that_a_schedule_names_count(self, monkeypatch):
+        schedule = lambda step: RATE / (1 + step)  # noqa: E731
+        before = contents_of("optimizer", optax.sgd(schedule))
+        monkeypatch.setitem(globals(), "RATE", 0.7)
+        assert contents_of("optimizer", optax.sgd(schedule)) != before
+
+    def test_they_are_the_same_in_another_process(self):
+        """Where addresses and the order of sets are others."""
+        code = """
+import hashlib, jax, mpfjax, optax
+from mpfjax.tuning.identity import contents_of
+filter = mpfjax.mixture_particle_filter(mpfjax.QuadraticModel(0.3, 0.3, -2.5, 2.5), 20, 2)
+rate = optax.cosine_decay_schedule(0.05, 100)
+optimizer = optax.chain(optax.clip(1.0), optax.adam(lambda t: rate(t) if t in {1, 2} else 0.1))
+found = contents_of("", [optimizer, optax.lbfgs(), filter, {"a", "b", "c"}, jax.nn.tanh])
+print(hashlib.sha256(repr(found).encode()).hexdigest())
+"""
+        digests = {
+            subprocess.run(
+                [sys.executable, "-c", code], env=os.environ | {"PYTHONHASHSEED": seed},
+                capture_output=True, text=True, check=True, cwd=Path(__file__).parents[2],
+            ).stdout
+            for seed in ("1", "2")
+        }  # fmt: skip
+        assert len(digests) == 1
 
 
 class TestStopping:
@@ -214,6 +403,159 @@ def test_parameters_can_be_all_of_the_model_or_a_filter_spec():
 def test_the_bar_shows_the_steps(capsys):
     short_fit(2, progress=True)
     assert "2/2" in capsys.readouterr().err
+
+
+class Plain(ScalarLinear):
+    """Fields as a user writes them who knows nothing of arrays: floats, a count, a constant."""
+
+    r: float = 0.5
+    h: float = 1.0
+    order: int = 3
+    q: float = eqx.field(static=True, default=0.6)
+
+
+class TestFloats:
+    """Fields that are Python floats."""
+
+    def fit(self, parameters, **numbers):
+        filter = mpfjax.particle_filter(Plain(**numbers), 16, gradient="stop")
+        return fit(
+            jax.random.key(0), filter, OBSERVATIONS, ADAM, 3, parameters=parameters, num_seeds=4,
+            progress=False,
+        )  # fmt: skip
+
+    def test_are_tuned_like_arrays_where_they_are_named(self):
+        found = self.fit(NOISE)
+        filter = mpfjax.particle_filter(ScalarLinear(), 16, gradient="stop")
+        expected = fit(
+            jax.random.key(0), filter, OBSERVATIONS, ADAM, 3, parameters=NOISE, num_seeds=4,
+            progress=False,
+        )  # fmt: skip
+        np.testing.assert_allclose(found.history["r"], expected.history["r"], rtol=1e-5)
+        assert len(set(found.history["r"])) == 3
+
+    def test_that_are_static_are_said_to_be(self):
+        with pytest.raises(ValueError, match=r"q picks 0\.6, which is .* static field.*asarray"):
+            self.fit({"q": lambda filter: filter.model.q})
+
+    def test_whole_numbers_are_no_parameters(self):
+        with pytest.raises(ValueError, match=r"parameters: order is 3, no floating.*3\.0"):
+            self.fit({"order": lambda filter: filter.model.order})
+
+    def test_that_nobody_named_are_said_to_be_there(self):
+        class Bare(eqx.Module):
+            a: float = 0.5
+
+        with pytest.raises(ValueError, match="nothing to tune; a are Python floats"):
+            mpfjax.tuning.maximise(jax.random.key(0), lambda key, m: m.a, Bare(), ADAM, 1)
+
+
+class TestBias:
+    """A filter whose resampling has no gradient is tuned with a warning."""
+
+    PROPOSAL = mpfjax.NetworkProposal.create(jax.random.key(0), 1, 1, 0.8)
+
+    def fit(self, filter, parameters=NOISE):
+        return fit(
+            jax.random.key(0), filter, OBSERVATIONS, ADAM, 1, parameters=parameters, num_seeds=2,
+            progress=False,
+        )  # fmt: skip
+
+    def test_the_default_is_warned_of(self):
+        filter = mpfjax.particle_filter(ScalarLinear(), 16)
+        with pytest.warns(UserWarning, match='fit: .* score of r is biased.*gradient="stop"'):
+            self.fit(filter)
+
+    @pytest.mark.filterwarnings("ignore:standard_errors. 2 seeds")
+    def test_standard_errors_are_as_well(self):
+        filter = mpfjax.particle_filter(ScalarLinear(), 16)
+        with pytest.warns(UserWarning, match="standard_errors: .* score of r is biased"):
+            standard_errors(
+                jax.random.key(0), filter, OBSERVATIONS, parameters=NOISE, num_seeds=2
+            )  # fmt: skip
+
+    def test_what_is_right_is_not(self):
+        weights = {"w": lambda filter: filter.moves[1].proposal.network}
+        learning = mpfjax.particle_filter(ScalarLinear(), 16, proposal=self.PROPOSAL)
+        never = mpfjax.particle_filter(ScalarLinear(), 16, ess_threshold=0.0)
+        propagation = mpfjax.Propagate(ScalarLinear())
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            self.fit(mpfjax.particle_filter(ScalarLinear(), 16, gradient="stop"))
+            self.fit(learning, weights)
+            self.fit(never)
+            self.fit(mpfjax.Filter(propagation.model, [propagation], 16))
+
+    def test_a_model_beside_its_proposal_is(self):
+        learning = mpfjax.particle_filter(ScalarLinear(), 16, proposal=self.PROPOSAL)
+        weights = {"w": lambda filter: filter.moves[1].proposal.network}
+        with pytest.warns(UserWarning, match="score of r is biased"):
+            self.fit(learning, weights | NOISE)
+
+
+@pytest.mark.usefixtures("as_installed")
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"key": 0}, "key: 0 is no typed key"),
+        ({"key": None}, "key: None is no typed key"),
+        ({"key": [0, 1]}, "key: "),
+        ({"key": jax.random.PRNGKey(0)}, "key: .*old kind"),
+        ({"key": jax.random.split(jax.random.key(0), 2)}, "key: shape"),
+        ({"filter": None}, "filter: None is not a filter"),
+        ({"filter": ScalarLinear()}, "filter: "),
+        ({"observations": None}, "observations: "),
+        ({"observations": "12345678"}, "observations: '12345678' is no array"),
+        ({"observations": 3.0}, "observations: "),
+        ({"optimizer": 0.1}, "optimizer: 0.1 has no init"),
+        ({"optimizer": optax.adam}, "optimizer: "),
+        ({"num_steps": 2.0}, "num_steps: 2.0 is not a whole number of at least 1"),
+        ({"num_steps": None}, "num_steps: None"),
+        ({"num_steps": True}, "num_steps: True"),
+        ({"num_seeds": "8"}, "num_seeds: '8'"),
+        ({"patience": 1.5}, "patience: 1.5"),
+        ({"tolerance": float("nan")}, "tolerance: nan"),
+        ({"tolerance": float("inf")}, "tolerance: inf"),
+        ({"tolerance": None}, "tolerance: None"),
+        ({"curvature_seeds": 2.5}, "curvature_seeds: 2.5"),
+        ({"checkpoint": 3}, "checkpoint: 3"),
+        ({"checkpoint": os.curdir}, "checkpoint: . is a directory"),
+        ({"checkpoint_every": 0}, "checkpoint_every: 0"),
+        ({"checkpoint_every": 2.0}, "checkpoint_every: 2.0"),
+        ({"progress": None}, "progress: None"),
+        ({"common_random_numbers": 1}, "common_random_numbers: 1"),
+        ({"missing": None}, "missing: None"),
+        ({"parameters": "r"}, "parameters: 'r' is neither"),
+        ({"parameters": lambda f: f.model.r}, "parameters: .* is neither"),
+        ({"parameters": {0: lambda f: f.model.r}}, "parameters: 0 is not a name"),
+        ({"parameters": {"r": lambda f: f.model.rho}}, "parameters: r cannot be picked"),
+        ({"parameters": {"r": lambda f: f.model.r * 2}}, "parameters: r cannot be picked"),
+        ({"parameters": NOISE | {"s": NOISE["r"]}}, "parameters: r and s pick the same"),
+        ({"transforms": {"r": Positive}}, r"transforms\['r'\]: .*write Positive\(\.\.\.\)"),
+        ({"transforms": [Positive()]}, "transforms: "),
+    ],
+)
+def test_wrong_types_are_refused_by_name(options, named):
+    with pytest.raises(ValueError, match=named):
+        short_fit(**options)
+
+
+@pytest.mark.usefixtures("as_installed")
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"key": 0}, "key: 0"),
+        ({"filter": 1}, "filter: 1"),
+        ({"num_seeds": 0}, "num_seeds: 0 is not a whole number of at least 1"),
+        ({"num_seeds": 2.0}, "num_seeds: 2.0"),
+        ({"parameters": 3}, "parameters: 3"),
+        ({"transforms": 3}, "transforms: 3"),
+    ],
+)
+def test_standard_errors_refuse_the_same(options, named):
+    arguments = {"key": jax.random.key(0), "filter": small(), "observations": OBSERVATIONS}
+    with pytest.raises(ValueError, match=named):
+        standard_errors(**arguments | options)
 
 
 @pytest.mark.parametrize(

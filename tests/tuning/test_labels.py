@@ -124,6 +124,46 @@ class TestMaximise:
         resumed = self.climb(6, checkpoint=tmp_path / "climb.npz")
         assert resumed.parameters["lambda"] == whole.parameters["lambda"]
 
+    @pytest.mark.parametrize("wrap", [lambda function: function, eqx.filter_jit])
+    def test_a_checkpoint_of_another_objective_is_refused(self, tmp_path, wrap):
+        def climb(num_steps, aim, **options):
+            data = jnp.array([aim, 0.0])
+            return maximise(
+                jax.random.key(0), wrap(lambda key, model: -((model.lambda_ - data[0]) ** 2)),
+                Unnormalised(), optax.sgd(0.1), num_steps,
+                parameters={"lambda": lambda m: m.lambda_}, progress=False,
+                checkpoint=tmp_path / "climb.npz", **options,
+            )  # fmt: skip
+
+        climb(2, 3.0)
+        assert climb(3, 3.0).history["lambda"].shape == (3,)
+        with pytest.raises(ValueError, match=r"is of another maximise: objective.*\.data is float"):
+            climb(3, 4.0)
+
+    def test_one_that_ended_is_returned_as_it_ended(self, tmp_path):
+        first = self.climb(60, checkpoint=tmp_path / "climb.npz", patience=2, tolerance=1e-3)
+        again = self.climb(90, checkpoint=tmp_path / "climb.npz", patience=2, tolerance=1e-3)
+        assert "2 steps gained" in first.stopped
+        assert again.stopped == first.stopped
+        np.testing.assert_array_equal(again.history["lambda"], first.history["lambda"])
+
+    @pytest.mark.parametrize(
+        ("objective", "named"),
+        [
+            (None, "objective: None is not a function"),
+            (lambda key, model: model.lambda_ * jnp.ones(2), "objective: it returns"),
+            (lambda key, model: None, "objective: it returns None"),
+            (lambda key, model: jnp.zeros((), int), "objective: it returns"),
+        ],
+    )
+    @pytest.mark.usefixtures("as_installed")
+    def test_what_is_no_objective_is_refused(self, objective, named):
+        with pytest.raises(ValueError, match=named):
+            maximise(
+                jax.random.key(0), objective, Unnormalised(), optax.sgd(0.1), 2,
+                parameters={"lambda": lambda m: m.lambda_}, progress=False,
+            )  # fmt: skip
+
     def test_a_parameter_without_effect_is_named(self):
         with pytest.raises(ValueError, match="value does not depend on c"):
             self.climb(parameters=None)
@@ -153,3 +193,29 @@ def test_bad_input_is_refused_by_name():
         transition_candidates(jax.random.key(0), Unnormalised(), labels, 0)
     with pytest.raises(ValueError, match="labels: 1 frames"):
         transition_candidates(jax.random.key(0), Unnormalised(), labels[:1], 2)
+
+
+@pytest.mark.usefixtures("as_installed")
+def test_wrong_types_are_refused_by_name():
+    observations, labels, rivals = data(4, 3)
+    key, present = jax.random.key(0), labels[1:]
+    for arguments, named in (
+        ((None, present, rivals), "observations: None"),
+        ((observations, "labels", rivals), "labels: 'labels'"),
+        ((observations, present, None), "candidates: None"),
+        ((observations, present, rivals, 2.0), "num_frames: 2.0 is not a whole number"),
+        ((observations, present, rivals, True), "num_frames: True"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            LabelLikelihood(*arguments)
+    with pytest.raises(ValueError, match="model: NoneType defines no log_likelihood"):
+        label_log_posteriors(None, observations, present, rivals)
+    for arguments, named in (
+        ((0, Unnormalised(), labels, 2), "key: 0"),
+        ((key, None, labels, 2), "model: NoneType"),
+        ((key, Unnormalised(), None, 2), "labels: None"),
+        ((key, Unnormalised(), labels[:, 0], 2), "labels: leading axes"),
+        ((key, Unnormalised(), labels, 2.5), "num_candidates: 2.5"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            transition_candidates(*arguments)

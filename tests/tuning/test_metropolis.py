@@ -23,13 +23,14 @@ def log_prior(parameters):
     return norm.logpdf(parameters["a"], 0.3, 0.5)
 
 
-def sample(num_steps=5, *, filter=None, **options):
+def sample(num_steps=5, *, filter=None, key=None, **options):
     options = {
         "log_prior": log_prior, "parameters": A, "transforms": {"a": INSIDE},
         "proposal_deviations": 1.5, "progress": False,
     } | options  # fmt: skip
     filter = mpfjax.particle_filter(ScalarLinear(), 12) if filter is None else filter
-    return metropolis_hastings(jax.random.key(0), filter, OBSERVATIONS, num_steps, **options)
+    key = jax.random.key(0) if key is None else key
+    return metropolis_hastings(key, filter, OBSERVATIONS, num_steps, **options)
 
 
 def test_the_posterior_is_the_exact_one():
@@ -121,6 +122,31 @@ def test_a_start_that_breaks_is_an_error():
     ],
 )
 def test_bad_arguments_are_refused_by_name(options, named):
+    with pytest.raises(ValueError, match=named):
+        sample(**options)
+
+
+@pytest.mark.usefixtures("as_installed")
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"key": 0}, "key: 0 is no typed key"),
+        ({"key": jax.random.PRNGKey(0)}, "key: .*old kind"),
+        ({"filter": 3}, "filter: 3 is not a filter"),
+        ({"num_steps": 2.0}, "num_steps: 2.0"),
+        ({"num_chains": None}, "num_chains: None"),
+        ({"progress": "no"}, "progress: 'no'"),
+        ({"log_prior": None}, "log_prior: None"),
+        ({"log_prior": lambda p: None}, "log_prior: None at the start"),
+        ({"log_prior": lambda p: jnp.ones(2) * p["a"]}, "log_prior: .* is no floating"),
+        ({"proposal_deviations": "wide"}, "proposal_deviations: 'wide' of a"),
+        ({"proposal_deviations": None}, "proposal_deviations: "),
+        ({"parameters": "a"}, "parameters: 'a'"),
+        ({"transforms": "a"}, "transforms: 'a'"),
+        ({"missing": 0}, "missing: 0"),
+    ],
+)
+def test_wrong_types_are_refused_by_name(options, named):
     with pytest.raises(ValueError, match=named):
         sample(**options)
 

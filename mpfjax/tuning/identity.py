@@ -1,0 +1,149 @@
+"""What makes two climbs the same one: every number and function of them, by name, as text."""
+
+import functools
+import hashlib
+import types
+from collections.abc import Mapping
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpfjax.storage import differences, fingerprint, named
+
+# Functions of these are what their names say; of others the code counts as well.
+_LIBRARIES = ("chex", "equinox", "jax", "jaxlib", "mpfjax", "numpy", "optax")
+_MOST_SHOWN = 4
+
+
+def contents_of(name: str, value: Any) -> dict[str, str]:
+    """All that a filter, an objective or an optimiser is made from, by `name` and its place.
+
+    Numbers by their values, arrays by their `fingerprint`, classes by their names; functions by
+    their names and what they hold: in their closures, as arguments bound to them, in what they are
+    methods of. Of functions that are of no library also the code, and the numbers and functions
+    of their modules that it names.
+    """
+    found: dict[str, str] = {}
+    _collect(name, value, found, {})
+    return found
+
+
+def unlike(there: Mapping[str, str], here: Mapping[str, str]) -> str:
+    """In words, the first few things in which two descriptions differ."""
+    names = [name for name in sorted(there.keys() | here.keys()) if _differ(name, there, here)]
+    first = names[:_MOST_SHOWN]
+    only = lambda of: {name: of[name] for name in first if name in of}  # noqa: E731
+    more = len(names) - len(first)
+    return differences(only(there), only(here)) + (f"; and {more} more" if more else "")
+
+
+def _differ(name: str, there: Mapping[str, str], here: Mapping[str, str]) -> bool:
+    return there.get(name) != here.get(name)
+
+
+def _collect(name: str, value: Any, found: dict[str, str], seen: dict[int, Any]) -> None:
+    """Write down a value, and what it holds."""
+    if value is None or isinstance(value, str | bytes | np.dtype):
+        found[name] = repr(value)
+    elif _is_data(value):
+        found[name] = _value(value)
+    elif isinstance(value, type | types.BuiltinFunctionType | types.ModuleType):
+        found[name] = named(value)
+    elif isinstance(value, set | frozenset):
+        found[name] = repr(sorted(map(named, value)))
+    elif id(value) in seen:
+        found[name] = "as above"
+    else:
+        # Held, for what is gone leaves its id to others.
+        seen[id(value)] = value
+        found[name] = _title(value)
+        for part, held in _parts(value).items():
+            _collect(f"{name}{part}", held, found, seen)
+
+
+def _title(value: Any) -> str:
+    """What kind of thing it is."""
+    if isinstance(value, types.FunctionType):
+        title = f"{value.__module__}.{value.__qualname__}"
+        return title if _of_library(value) else f"{title}, code {_digest(value.__code__)}"
+    return type(value).__name__
+
+
+def _parts(value: Any) -> dict[str, Any]:
+    """What a thing holds, by what to write after its own name."""
+    if isinstance(value, types.FunctionType):
+        return _parts_of_function(value)
+    if isinstance(value, types.MethodType):
+        return {".__func__": value.__func__, ".__self__": value.__self__}
+    if isinstance(value, functools.partial):
+        return {".func": value.func, ".args": value.args, ".keywords": value.keywords}
+    if isinstance(value, Mapping):
+        return {f"[{key!r}]": value[key] for key in value}
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return {f".{field}": held for field, held in cast(Any, value)._asdict().items()}
+    if isinstance(value, list | tuple):
+        return {f"[{i}]": held for i, held in enumerate(value)}
+    if hasattr(value, "__wrapped__"):
+        return {".__wrapped__": value.__wrapped__}
+    return {f".{field}": held for field, held in getattr(value, "__dict__", {}).items()}
+
+
+def _parts_of_function(function: types.FunctionType) -> dict[str, Any]:
+    parts: dict[str, Any] = {}
+    cells = function.__closure__ or ()
+    for variable, cell in zip(function.__code__.co_freevars, cells, strict=True):
+        try:
+            parts[f".{variable}"] = cell.cell_contents
+        except ValueError:
+            # Not assigned yet.
+            continue
+    parts |= {f".default {i}": value for i, value in enumerate(function.__defaults__ or ())}
+    parts |= {f".{name}": value for name, value in (function.__kwdefaults__ or {}).items()}
+    if _of_library(function):
+        return parts
+    for variable in sorted(_names(function.__code__)):
+        value = function.__globals__.get(variable)
+        own_function = isinstance(value, types.FunctionType) and not _of_library(value)
+        if own_function or _is_data(value) or isinstance(value, str):
+            parts[f".{variable}"] = value
+    return parts
+
+
+def _of_library(function: types.FunctionType) -> bool:
+    return (function.__module__ or "").split(".")[0] in _LIBRARIES
+
+
+def _names(code: types.CodeType) -> set[str]:
+    """The names from outside that code uses, functions in it included."""
+    inner = (_names(const) for const in code.co_consts if isinstance(const, types.CodeType))
+    return set(code.co_names).union(*inner)
+
+
+def _digest(code: types.CodeType) -> str:
+    """Of what a function does, wherever it is written."""
+    digest = hashlib.sha256(code.co_code + repr((code.co_names, code.co_varnames)).encode())
+    for const in code.co_consts:
+        if isinstance(const, types.CodeType):
+            text = _digest(const)
+        elif isinstance(const, frozenset):
+            text = repr(sorted(map(repr, const)))
+        else:
+            text = repr(const)
+        digest.update(text.encode())
+    return digest.hexdigest()[:12]
+
+
+def _is_data(value: Any) -> bool:
+    return isinstance(value, jax.Array | np.ndarray | np.generic | bool | int | float | complex)
+
+
+def _value(value: Any) -> str:
+    """A number as it is printed, which is exact; an array by its fingerprint."""
+    if not isinstance(value, jax.Array | np.ndarray | np.generic):
+        return str(value)
+    kind = f"{value.dtype}{list(value.shape)}"
+    if jnp.issubdtype(value.dtype, jax.dtypes.prng_key) or value.size != 1:
+        return f"{kind} of fingerprint {fingerprint(value)[:12]}"
+    return f"{kind} of {np.asarray(value).reshape(())[()]!s}"

@@ -1,0 +1,122 @@
+"""Standard errors are the exact ones in any units, and say how well the seeds settle them."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax.exact import kalman_filter
+from mpfjax.tuning import standard_errors
+from tests.user_models import ScalarLinear
+
+TRUTH = {"a": 0.8, "q": 0.6, "h": 1.0, "r": 0.5, "m": 0.5, "p": 0.3}
+# Powers of each unit in the model's numbers: of the states, and of the observations.
+POWERS = {"q": (1, 0), "h": (-1, 1), "r": (0, 1), "m": (1, 0), "p": (1, 0)}
+
+
+def observations(length=40):
+    rng = np.random.default_rng(3)
+    state, rows = TRUTH["m"] + TRUTH["p"] * rng.normal(), []
+    for _ in range(length):
+        state = TRUTH["a"] * state + TRUTH["q"] * rng.normal()
+        rows.append(state + TRUTH["r"] * rng.normal())
+    return np.array(rows, np.float32)
+
+
+OBSERVATIONS = observations()
+
+
+def unit_of(name, of_states, of_observations):
+    power = POWERS.get(name, (0, 0))
+    return of_states ** power[0] * of_observations ** power[1]
+
+
+def filter_in(of_states, of_observations, num_particles=200, **parameters):
+    numbers = TRUTH | parameters
+    model = ScalarLinear(
+        **{name: value * unit_of(name, of_states, of_observations)
+           for name, value in numbers.items()}
+    )  # fmt: skip
+    return mpfjax.particle_filter(model, num_particles, gradient="stop")
+
+
+def picked(names):
+    return {name: lambda filter, name=name: getattr(filter.model, name) for name in names}
+
+
+def exact_errors(names):
+    """Of the Kalman filter's likelihood, in units of one."""
+
+    def log_evidence(values):
+        numbers = TRUTH | dict(zip(names, values, strict=True))
+        model = ScalarLinear(**numbers).in_matrices()
+        return kalman_filter(model, jnp.asarray(OBSERVATIONS)[:, None]).log_marginal_likelihood
+
+    hessian = jax.hessian(log_evidence)(jnp.array([TRUTH[name] for name in names]))
+    information = -np.asarray(hessian, float)
+    assert np.linalg.eigvalsh(information)[0] > 0
+    return dict(zip(names, np.sqrt(np.diag(np.linalg.inv(information))), strict=True))
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 100.0, 1e4])
+def test_a_location_has_its_error_in_any_unit(unit):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of seeds that would be too few
+        found = standard_errors(
+            jax.random.key(0), filter_in(unit, unit), jnp.asarray(unit * OBSERVATIONS),
+            parameters=picked("m"), num_seeds=64,
+        )  # fmt: skip
+    assert found["m"] / unit == pytest.approx(exact_errors("m")["m"], rel=0.05)
+
+
+def test_numbers_of_very_different_units_are_told_together():
+    """Standard errors from 1e-6 to 1e3, none of them by a transform."""
+    units, names = (1e3, 1e-3), ("a", "h", "m", "r")
+    found = standard_errors(
+        jax.random.key(0), filter_in(*units), jnp.asarray(units[1] * OBSERVATIONS),
+        parameters=picked(names), num_seeds=256,
+    )  # fmt: skip
+    exact = exact_errors(names)
+    ratios = [found[name] / unit_of(name, *units) / exact[name] for name in names]
+    np.testing.assert_allclose(ratios, 1.0, atol=0.2)
+
+
+def test_a_step_is_no_shorter_than_what_rounding_leaves():
+    """A level of 1e4 standard deviations, in which a float has three digits left."""
+    level = 1e4
+    model = ScalarLinear(a=1.0, q=0.01, h=1.0, r=0.5, m=level, p=0.01)
+    rows = jnp.asarray(level + 0.5 * np.random.default_rng(0).normal(size=40), jnp.float32)
+    found = standard_errors(
+        jax.random.key(0), mpfjax.particle_filter(model, 100, gradient="stop"), rows,
+        parameters=picked("m"), num_seeds=32,
+    )  # fmt: skip
+
+    def log_evidence(m):
+        # Of what lies above the level, for the sake of single precision.
+        model = ScalarLinear(a=1.0, q=0.01, h=1.0, r=0.5, m=m, p=0.01).in_matrices()
+        return kalman_filter(model, rows[:, None] - level).log_marginal_likelihood
+
+    exact = float(-jax.hessian(log_evidence)(jnp.zeros(()))) ** -0.5
+    assert found["m"] == pytest.approx(exact, rel=0.1)
+
+
+def test_too_few_seeds_are_said_to_be_too_few():
+    """Eight particles and six seeds, which differ by half and more from key to key."""
+    run = lambda key: standard_errors(  # noqa: E731
+        key, filter_in(1.0, 1.0, 8), jnp.asarray(OBSERVATIONS), parameters=picked("r"), num_seeds=6
+    )
+    with pytest.warns(UserWarning, match=r"6 seeds leave them uncertain.*raise num_seeds"):
+        found = run(jax.random.key(1))
+    assert np.isfinite(found["r"])
+
+
+def test_one_seed_cannot_be_halved():
+    with pytest.warns(UserWarning, match="num_seeds is 1"):
+        found = standard_errors(
+            jax.random.key(0), filter_in(1.0, 1.0), jnp.asarray(OBSERVATIONS),
+            parameters=picked("m"), num_seeds=1,
+        )  # fmt: skip
+    assert found["m"] == pytest.approx(exact_errors("m")["m"], rel=0.3)
