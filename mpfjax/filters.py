@@ -183,6 +183,7 @@ class Filter(eqx.Module):
         every particle has zero likelihood the increment is -inf, the particles move on with the
         weights that they had before, and `degenerate` is true.
         """
+        _require_real(jax.tree.leaves(observation), "observation")
         observation = jax.tree.map(
             lambda leaf: (
                 eqx.error_if(

@@ -25,10 +25,10 @@ def make_mixture(states, log_weights, labels, num_components, memory=None) -> Pa
     )
 
 
-def example_mixtures() -> dict[str, ParticleMixture]:
-    """Forty particles in the plane with up to six components."""
+def example_mixtures(m: int = NUM_COMPONENTS) -> dict[str, ParticleMixture]:
+    """Forty particles in the plane with up to m components."""
     rng = np.random.default_rng(0)
-    n, m = NUM_PARTICLES, NUM_COMPONENTS
+    n = NUM_PARTICLES
     labels = rng.integers(0, m, n)
     centres = 4 * rng.normal(size=(m, 2))
     states = centres[labels] + rng.normal(size=(n, 2))
@@ -41,7 +41,7 @@ def example_mixtures() -> dict[str, ParticleMixture]:
     return {
         "ordinary": make_mixture(states, ordinary, labels, m),
         "equal weights": make_mixture(states, np.zeros(n), labels, m),
-        "one component": make_mixture(states, ordinary, np.full(n, 3), m),
+        "one component": make_mixture(states, ordinary, np.full(n, min(3, m - 1)), m),
         "dead components": make_mixture(states, two_dead, labels, m),
         "empty slots with stale states": make_mixture(
             stale, np.where(empty, -np.inf, ordinary), labels, m

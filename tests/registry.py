@@ -32,7 +32,8 @@ from mpfjax import (
 )
 
 NUM_PARTICLES = 48
-NUM_COMPONENTS = 3
+# On either side of the number of components up to which they are worked on as rows.
+NUM_COMPONENTS, MANY_COMPONENTS = 3, 6
 
 
 class RandomLabels(AbstractRegrouping):
@@ -79,18 +80,18 @@ def _pf(**options) -> Callable[..., Filter]:
     return lambda model: mpfjax.particle_filter(model, NUM_PARTICLES, **options)
 
 
-def _mpf(**options) -> Callable[..., Filter]:
-    return lambda model: mpfjax.mixture_particle_filter(
-        model, NUM_PARTICLES, NUM_COMPONENTS, **options
-    )
+def _mpf(m: int = NUM_COMPONENTS, **options) -> Callable[..., Filter]:
+    return lambda model: mpfjax.mixture_particle_filter(model, NUM_PARTICLES, m, **options)
 
 
-def _chain(*before, then=(), proposal=lambda model: None) -> Callable[..., Filter]:
+def _chain(
+    *before, m: int = NUM_COMPONENTS, then=(), proposal=lambda model: None
+) -> Callable[..., Filter]:
     return lambda model: Filter(
         model,
         [*before, Propagate(model, proposal(model)), *then],
         NUM_PARTICLES,
-        NUM_COMPONENTS,
+        m,
         initial_moves=[KMeans(3, reseed=True)],
     )
 
@@ -100,33 +101,56 @@ def _joint(make: Callable[[MultiObjectModel], Filter]) -> Callable[..., Filter]:
     return lambda model: make(MultiObjectModel(model, 2, shared_observation=True))
 
 
+def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
+    """The chains that regroup, with M components."""
+    return {
+        "mpf": _mpf(m),
+        "mpf fixed number": _mpf(m, particles_per_component=36 // m),
+        "guided mpf": lambda model: _mpf(m, proposal=GaussNewtonProposal(model))(model),
+        "guided, sorted, stratified noise": _chain(
+            Resample(sort_by=lambda states: states.reshape(NUM_PARTICLES, -1)[:, 0]),
+            m=m,
+            proposal=lambda model: GaussNewtonProposal(model, noise="stratified"),
+            then=[KMeans(2)],
+        ),
+        "patient merge": _chain(Resample(), m=m, then=[Merge(2.0, 1.0, patience=2)]),
+        "kmeans only": _chain(Resample("stratified"), m=m, then=[KMeans()]),
+        "split only, adaptive": _chain(Resample(ess_threshold=0.5), m=m, then=[Split(2.0)]),
+        "random labels, multinomial": _chain(Resample("multinomial"), m=m, then=[RandomLabels()]),
+        "random labels, residual": _chain(RandomLabels(), Resample("residual"), m=m),
+        "never resampled": _chain(m=m),
+        "gaussian mixture": _chain(GaussianRegeneration(), m=m, then=[KMeans()]),
+        "predictive Gaussian": lambda model: mpfjax.gaussian_mixture_particle_filter(
+            model, NUM_PARTICLES, m, importance="predictive_gaussian"
+        ),
+        "exclusion": _chain(
+            Resample("stratified"), m=m, then=[Exclusion(2.0, 0.5), KMeans(3, reseed=True)]
+        ),
+        "partitioned in clusters": _joint(
+            lambda joint: Filter(
+                joint,
+                [Resample(), KMeans(), Partitioned(joint, "circular")],
+                NUM_PARTICLES,
+                m,
+                initial_moves=[KMeans(3, reseed=True)],
+            )
+        ),
+    }
+
+
 CHAINS: dict[str, Callable[..., Filter]] = {
     "pf": _pf(),
     "pf multinomial": _pf(scheme="multinomial"),
     "pf adaptive": _pf(ess_threshold=0.5),
     "guided pf": lambda model: _pf(proposal=GaussNewtonProposal(model))(model),
-    "mpf": _mpf(),
-    "mpf fixed number": _mpf(particles_per_component=12),
-    "guided mpf": lambda model: _mpf(proposal=GaussNewtonProposal(model))(model),
-    "guided, sorted, stratified noise": _chain(
-        Resample(sort_by=lambda states: states.reshape(NUM_PARTICLES, -1)[:, 0]),
-        proposal=lambda model: GaussNewtonProposal(model, noise="stratified"),
-        then=[KMeans(2)],
-    ),
-    "patient merge": _chain(Resample(), then=[Merge(2.0, 1.0, patience=2)]),
-    "kmeans only": _chain(Resample("stratified"), then=[KMeans()]),
-    "split only, adaptive": _chain(Resample(ess_threshold=0.5), then=[Split(2.0)]),
-    "random labels, multinomial": _chain(Resample("multinomial"), then=[RandomLabels()]),
-    "random labels, residual": _chain(RandomLabels(), Resample("residual")),
-    "never resampled": _chain(),
+    **_of_components(NUM_COMPONENTS),
+    **{
+        f"{name}, M = {MANY_COMPONENTS}": chain
+        for name, chain in _of_components(MANY_COMPONENTS).items()
+    },
     "predict and weigh": lambda model: Filter(
         model, [Resample(), Predict(model), Weigh(model)], NUM_PARTICLES
     ),
-    "gaussian mixture": _chain(GaussianRegeneration(), then=[KMeans()]),
-    "predictive Gaussian": lambda model: mpfjax.gaussian_mixture_particle_filter(
-        model, NUM_PARTICLES, NUM_COMPONENTS, importance="predictive_gaussian"
-    ),
-    "exclusion": _chain(Resample("stratified"), then=[Exclusion(2.0, 0.5), KMeans(3, reseed=True)]),
     "joint pf": _joint(_pf()),
     "ps": _joint(lambda joint: mpfjax.partitioned_sampling(joint, NUM_PARTICLES, (1, 0))),
     "ps adaptive, random order": _joint(
@@ -141,15 +165,6 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     ),
     "dps prior": _joint(
         lambda joint: mpfjax.distributed_partitioned_sampling(joint, NUM_PARTICLES)
-    ),
-    "partitioned in clusters": _joint(
-        lambda joint: Filter(
-            joint,
-            [Resample(), KMeans(), Partitioned(joint, "circular")],
-            NUM_PARTICLES,
-            NUM_COMPONENTS,
-            initial_moves=[KMeans(3, reseed=True)],
-        )
     ),
     "independent filters": _joint(
         lambda joint: mpfjax.independent_particle_filters(joint, NUM_PARTICLES)

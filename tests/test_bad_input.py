@@ -91,6 +91,9 @@ def test_as_many_units_as_features():
         ({}, "observations: there are none"),
         (np.array([0.0, np.nan, 1.0]), "observations: NaN or infinite at index 1"),
         (np.array([0.0, 1.0, -np.inf]), "observations: NaN or infinite at index 2"),
+        (np.array([0.0, 1j]), "observations: complex64 is complex"),
+        (np.array([0.0, 1e300, 1.0]), r"observations: 1e\+300 at index 1 is more than float32"),
+        ({"a": np.array([[0.0, 1.0], [-1e39, 0.0]])}, r"observations: -1e\+39 at index \(1, 0\)"),
     ],
 )
 def test_observations_that_cannot_be_run(observations, message):
@@ -136,6 +139,41 @@ class TestAModelThatIsNotOne:
 
         with pytest.raises(ValueError, match=r"model: Wrong.log_likelihood returned shape \(10, 1"):
             mpfjax.run_filter(KEY, mpfjax.particle_filter(Wrong(), 10), jnp.zeros(3))
+
+
+@pytest.mark.parametrize("make", [mpfjax.particle_filter, mpfjax.independent_particle_filters])
+def test_a_complex_likelihood(make):
+    class Wrong(mpfjax.QuadraticModel):
+        def log_likelihood(self, observation, states):
+            return -((observation - states).astype(jnp.complex64) ** 2)
+
+    model, observations = Wrong(), jnp.zeros(3)
+    if make is mpfjax.independent_particle_filters:
+        model, observations = mpfjax.MultiObjectModel(model, 2), jnp.zeros((3, 2))
+    with pytest.raises(ValueError, match=r"model: Wrong.log_likelihood returned complex values"):
+        mpfjax.run_filter(KEY, make(model, 10), observations)
+
+
+def test_a_complex_observation_of_one_step():
+    mixture = FILTER.init(KEY)
+    with pytest.raises(ValueError, match="observation: complex64 is complex"):
+        FILTER.step(KEY, mixture, jnp.array(1j))
+
+
+def test_a_gaussian_of_whole_numbers():
+    class Switching(mpfjax.AbstractStateSpaceModel):
+        def sample_initial(self, key, num_particles):
+            return {"x": jnp.zeros(num_particles), "mode": jnp.ones(num_particles, jnp.int32)}
+
+        def sample_transition(self, key, states):
+            return states
+
+        def log_likelihood(self, observation, states):
+            return states["x"]
+
+    filter = mpfjax.gaussian_particle_filter(Switching(), 10)
+    with pytest.raises(ValueError, match=r"where: the state\['mode'\] is int32"):
+        mpfjax.run_filter(KEY, filter, jnp.zeros(3))
 
 
 def test_observations_of_the_wrong_shape():

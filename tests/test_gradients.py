@@ -272,3 +272,41 @@ def test_transport_without_its_library_is_an_error_that_names_the_extra(monkeypa
     monkeypatch.setitem(sys.modules, "ott", None)
     with pytest.raises(ImportError, match=r"mpfjax\[ot\]"):
         mpfjax.particle_filter(MODEL, 10, gradient="ot")
+
+
+REGROUPED = {
+    "mpf": lambda model, m, gradient: mpfjax.mixture_particle_filter(
+        model, NUM_PARTICLES, m, gradient=gradient
+    ),
+    "gm-mpf": lambda model, m, gradient: mpfjax.gaussian_mixture_particle_filter(
+        model, NUM_PARTICLES, m
+    ),
+}
+
+
+@pytest.mark.parametrize("m", [3, 6])
+@pytest.mark.parametrize(
+    ("make", "gradient"),
+    [("mpf", "none"), ("mpf", "stop"), ("mpf", "soft"), ("mpf", "straight_through"),
+     ("gm-mpf", "none")],
+)  # fmt: skip
+def test_derivatives_in_both_modes_and_of_second_order(make, gradient, m):
+    """On either side of the number of components up to which sums are unrolled.
+
+    What is an index, a label or a shift is a constant in every order of differentiating.
+    """
+
+    def log_evidence(sigma):
+        filter = REGROUPED[make](mpfjax.QuadraticModel(sigma, 0.5, -2.0, 2.0), m, gradient)
+        run = mpfjax.run_filter(jax.random.key(0), filter, ONE[:2] ** 2, nothing)
+        return run.log_marginal_likelihood
+
+    @jax.jit
+    def derivatives(sigma):
+        reverse, forward = jax.grad(log_evidence), jax.jacfwd(log_evidence)
+        first = reverse(sigma), forward(sigma)
+        return first, (jax.jacfwd(reverse)(sigma), jax.jacfwd(forward)(sigma))
+
+    for reverse, forward in derivatives(0.3):
+        assert np.isfinite(reverse)
+        assert float(reverse) == pytest.approx(float(forward), rel=1e-3)

@@ -122,6 +122,25 @@ class TestPerParticle:
         moved = wrapped.sample_transition(jax.random.key(7), jnp.zeros((5, 2)))
         assert len(np.unique(np.asarray(moved))) == 10
 
+    def test_passes_on_all_that_the_library_looks_for(self):
+        class Full(DriftOfOne):
+            def log_initial(self, state):
+                return -0.5 * (state**2).sum()
+
+            def with_history(self, state, previous_state):
+                return jnp.concatenate([state[:1], previous_state[1:]])
+
+            def prepare_observation(self, observation):
+                return 2 * observation
+
+        wrapped = mpfjax.per_particle(Full())
+        states, previous = np.asarray(jax.random.normal(jax.random.key(5), (2, 6, 2)))
+        expected = -0.5 * (states**2).sum(axis=1)
+        np.testing.assert_allclose(wrapped.log_initial(states), expected, rtol=1e-5)
+        expected = np.column_stack([states[:, 0], previous[:, 1]])
+        np.testing.assert_array_equal(wrapped.with_history(states, previous), expected)
+        assert wrapped.prepare_observation(jnp.ones(())) == 2
+
     def test_a_density_that_the_model_lacks_stays_lacking(self):
         class Bare:
             def sample_initial(self, key):
@@ -150,3 +169,36 @@ def test_models_follow_the_precision():
         moved = model.sample_transition(jax.random.key(9), states)
         assert moved.dtype == np.float64
         assert model.log_likelihood(jnp.array(1.0), moved).dtype == np.float64
+
+
+class TestModelsThatDrawWithAllOfJaxRandom:
+    """Whatever takes a key takes those that a filter hands to its model."""
+
+    class Counting(mpfjax.AbstractStateSpaceModel):
+        """Counts that come and go; also mixes its key with one of its own."""
+
+        def sample_initial(self, key, num_particles):
+            return jax.random.poisson(key, 4.0, (num_particles,)).astype(jnp.float32)
+
+        def sample_transition(self, key, states):
+            own = jax.random.key(7)
+            either = jnp.where(states.sum() > 0, key, own)
+            both = jnp.concatenate([key[None], own[None]])
+            arrivals = jax.random.poisson(either, 1.0, states.shape).astype(states.dtype)
+            stay = jax.random.binomial(both[0], states, 0.8)
+            return stay.astype(states.dtype) + arrivals
+
+        def log_likelihood(self, observation, states):
+            return -0.5 * (observation - states) ** 2
+
+    def test_in_every_kind_of_move(self):
+        model = self.Counting()
+        joint = mpfjax.MultiObjectModel(model, 2, shared_observation=True)
+        for filter in (
+            mpfjax.particle_filter(model, 20),
+            mpfjax.mixture_particle_filter(model, 20, 2),
+            mpfjax.partitioned_sampling(joint, 20),
+            mpfjax.independent_particle_filters(joint, 20),
+        ):
+            run = mpfjax.run_filter(jax.random.key(1), filter, jnp.array([3.0, 5.0]))
+            assert np.isfinite(run.log_marginal_likelihood)

@@ -12,7 +12,9 @@ from mpfjax import Resample
 from tests.examples import example_mixtures, log_masses
 from tests.registry import REGROUPINGS, REJUVENATIONS
 
-MIXTURES = example_mixtures()
+# On either side of the number of components up to which they are worked on as rows.
+FEW = ("ordinary", "dead components", "masses 200 nats apart")
+MIXTURES = example_mixtures() | {f"{name}, M = 3": example_mixtures(3)[name] for name in FEW}
 NUM_DRAWS = 4000
 
 over_mixtures = pytest.mark.parametrize("mixture", MIXTURES.values(), ids=MIXTURES)
