@@ -15,10 +15,13 @@ from mpfjax.vision.histograms import (
     bhattacharyya,
     integral_histogram,
     normalise,
+    num_pixels,
 )
 
 PAPER_VARIANCES = (2.5, 1.5, 0.05, 0.05)
 _SURROUND = 2.0
+# A box of more pixels cannot be counted in 16 bits.
+_LARGEST_NARROW = 2**16 - 1
 
 
 class BoxState(eqx.Module):
@@ -122,8 +125,8 @@ class ColourModel(AbstractBoxModel):
       surround does, so that grass within a box counts for little.
 
     An observation is an RGB frame, uint8 of shape (h, w, 3), or its `IntegralHistogram`. A box
-    outside the frame holds no colour and lies at the largest distance, B = 1. Make one with
-    `from_frame`. Use it for objects that keep their colours, among other colours.
+    outside the frame holds no colour and lies at the largest distance, B = 1; so does a box of more
+    pixels than can be counted, see `wide_counts`. Make one with `from_frame`. Use it for objects that keep their colours, among other colours.
 
     - `reference_boxes`: (k, 4), centre and size in pixels; x_0 scatters about them.
     - `references`, `colour_weights`: h_ref and the weights of its colours, (k, parts, channels,
@@ -135,8 +138,10 @@ class ColourModel(AbstractBoxModel):
     - `colours`: the bins of the histograms.
     - `switch_probability`: with which r is drawn anew, from all references, in a frame.
     - `contrast`: how much it speaks for a box that what lies to its sides, half a width each, does
-      not have the reference's colours; 0, as in the paper, looks at the box alone.
-    - `wide_counts`: count pixels in 32 bits; see `integral_histogram`.
+      not have the reference's colours; 0, as in the paper, looks at the box alone. Sides that
+      cannot be counted, of a box that is too large with them, do not speak for it.
+    - `wide_counts`: count pixels in 32 bits; see `integral_histogram`. Without it a box, or with
+      `contrast` a box and its sides, has at most 65 535 pixels.
     """
 
     reference_boxes: Float[Array, "k 4"]
@@ -199,16 +204,15 @@ class ColourModel(AbstractBoxModel):
             raise ValueError(f"contrast: {contrast} is negative")
         if deviations.shape not in ((4,), (len(boxes), 4)) or not np.all(deviations > 0):
             raise ValueError(f"deviations: {deviations} are not four positive numbers a box")
-        # Room for boxes to grow to twice the area of the largest reference.
-        wide_counts = bool(2 * np.prod(boxes[:, 2:], axis=1).max() >= 2**16)
-        table = integral_histogram(jnp.asarray(frame), colours, wide_counts)
         places = jnp.asarray(centred(boxes), float)
-        references, weights = _references(table, places, num_parts, weigh_colours)
+        references, weights = _references(frame, colours, places, num_parts, weigh_colours)
         if share_reference:
             references = jnp.broadcast_to(references.mean(0, keepdims=True), references.shape)
             size = places[:, 2:].mean(0, keepdims=True)
             places = places.at[:, 2:].set(jnp.broadcast_to(size, (len(boxes), 2)))
         steps = jnp.broadcast_to(jnp.asarray(deviations, float), (len(boxes), 4))
+        # Room for boxes to grow to twice the area of the largest reference.
+        room = 2 * np.prod(boxes[:, 2:], axis=1).max() * (_SURROUND if contrast > 0 else 1)
         return cls(
             reference_boxes=places,
             references=references,
@@ -219,7 +223,7 @@ class ColourModel(AbstractBoxModel):
             colours=colours,
             switch_probability=switch_probability,
             contrast=contrast,
-            wide_counts=wide_counts,
+            wide_counts=bool(room > _LARGEST_NARROW),
         )
 
     def log_likelihood(
@@ -233,7 +237,9 @@ class ColourModel(AbstractBoxModel):
             boxes = self.boxes(states)
             wide = boxes * jnp.array([[1.0, 1.0, _SURROUND, 1.0]], boxes.dtype)
             sides = observation.counts(wide, num_parts) - observation.counts(boxes, num_parts)
-            distances -= self.contrast * self._to_reference(sides, states)
+            uncounted = jnp.isnan(sides[:, 0, 0, 0])
+            around = jnp.where(uncounted, 0.0, self._to_reference(sides, states))
+            distances -= self.contrast * around
         return -0.5 * distances / self.sigma**2
 
     def prepare_observation(
@@ -280,13 +286,19 @@ def _for_each(dynamics: AbstractDynamics, num_boxes: int) -> AbstractDynamics:
 
 
 def _references(
-    table: IntegralHistogram, places: Float[Array, "k 4"], num_parts: int, weigh_colours: bool
+    frame: UInt8[np.ndarray, "h w 3"],
+    colours: AbstractColours,
+    places: Float[Array, "k 4"],
+    num_parts: int,
+    weigh_colours: bool,
 ) -> tuple[Float[Array, "k parts channels bins"], Float[Array, "k parts channels bins"]]:
     """The normalised histograms of the reference boxes, and the weights of their colours."""
+    around = places * jnp.array([[1.0, 1.0, _SURROUND, _SURROUND]], places.dtype)
+    largest = jnp.max(num_pixels(around if weigh_colours else places, *frame.shape[:2]))
+    table = integral_histogram(jnp.asarray(frame), colours, bool(largest > _LARGEST_NARROW))
     counts = table.counts(places, num_parts)
     if not weigh_colours:
         return normalise(counts), jnp.ones_like(counts)
-    around = places * jnp.array([[1.0, 1.0, _SURROUND, _SURROUND]], places.dtype)
     ring = table.counts(around)[:, 0, None] - jnp.sum(counts, axis=1, keepdims=True)
     inside, outside = normalise(counts), normalise(ring)
     share = inside + outside

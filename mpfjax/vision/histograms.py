@@ -47,27 +47,22 @@ class IntegralHistogram(eqx.Module):
 
         Boxes are (x, y, w, h) about their centre, in pixels, the frame spanning [0, width] x
         [0, height]; a pixel belongs to a box that covers its centre. Boxes that leave the frame
-        are clipped to it, and one that lies wholly outside, has no area, is not finite or holds
-        more than `largest_box` pixels counts nothing.
+        are clipped to it, and one that lies wholly outside, has no area or is not finite counts
+        nothing. The counts of one that holds more than `largest_box` pixels are NaN, for a zero
+        would say that it has none of a colour.
         """
-        rows, columns = self._edges(boxes, num_parts)
+        rows, columns = _edges(boxes, num_parts, self.height, self.width)
         corners = self.table.at[rows[:, :, None], columns[:, None, :]].get(mode="clip")
         bands = jnp.diff(corners[:, :, 1] - corners[:, :, 0], axis=1)
         pixels = (rows[:, -1] - rows[:, 0]) * (columns[:, 1] - columns[:, 0])
         # An unsigned count is never negative, so an inverted box must be silenced by its edges.
         valid = (columns[:, 1] > columns[:, 0]) & (rows[:, -1] > rows[:, 0])
-        valid &= pixels <= self.largest_box
-        counts = jnp.where(valid[:, None, None], bands, jnp.zeros((), bands.dtype))
-        counts = counts.reshape(boxes.shape[0], num_parts, self.num_channels, -1)
-        return counts[..., : self.num_bins].astype(boxes.dtype)
-
-    def _edges(
-        self, boxes: Float[Array, "n 4"], num_parts: int
-    ) -> tuple[Int[Array, "n rows"], Int[Array, "n 2"]]:
-        x, y, w, h = (boxes[:, i, None] for i in range(4))
-        across = jnp.array([[-0.5, 0.5]], boxes.dtype)
-        down = jnp.linspace(-0.5, 0.5, num_parts + 1, dtype=boxes.dtype)[None]
-        return _pixel(y + h * down, self.height), _pixel(x + w * across, self.width)
+        too_large = valid & (pixels > self.largest_box)
+        instead = jnp.where(too_large, jnp.nan, 0.0).astype(boxes.dtype)
+        counts = bands.reshape(boxes.shape[0], num_parts, self.num_channels, -1)
+        counts = counts[..., : self.num_bins].astype(boxes.dtype)
+        counted = (valid & ~too_large)[:, None, None, None]
+        return jnp.where(counted, counts, instead[:, None, None, None])
 
 
 def integral_histogram(
@@ -87,10 +82,21 @@ def integral_histogram(
     return IntegralHistogram(table, colours.num_channels, colours.num_bins, height, width)
 
 
+def num_pixels(boxes: Float[Array, "n 4"], height: int, width: int) -> Int[Array, " n"]:
+    """How many pixels of a frame of this size each box (x, y, w, h) about its centre holds."""
+    sides = [jnp.maximum(edges[:, 1] - edges[:, 0], 0) for edges in _edges(boxes, 1, height, width)]
+    return sides[0] * sides[1]
+
+
 def normalise(
     counts: Float[Array, "... bins"], bin_weights: Float[Array, "... bins"] | None = None
 ) -> Float[Array, "... bins"]:
-    """Counts as shares that sum to one over the bins; all zero where nothing was counted."""
+    """Counts as shares that sum to one over the bins.
+
+    All zero where nothing was counted, or nothing could be: counts of NaN leave none behind, nor in
+    a derivative.
+    """
+    counts = jnp.where(counts >= 0, counts, 0.0)
     if bin_weights is not None:
         counts = counts * jnp.broadcast_to(bin_weights, counts.shape)
     total = jnp.sum(counts, axis=-1, keepdims=True)
@@ -148,6 +154,16 @@ def _running_sums(terms: list[Array]) -> list[Array]:
     for term in terms[1:]:
         sums.append(sums[-1] + term)
     return sums
+
+
+def _edges(
+    boxes: Float[Array, "n 4"], num_parts: int, height: int, width: int
+) -> tuple[Int[Array, "n rows"], Int[Array, "n 2"]]:
+    """The rows at which the bands of each box begin and end, and its first column and its end."""
+    x, y, w, h = (boxes[:, i, None] for i in range(4))
+    across = jnp.array([[-0.5, 0.5]], boxes.dtype)
+    down = jnp.linspace(-0.5, 0.5, num_parts + 1, dtype=boxes.dtype)[None]
+    return _pixel(y + h * down, height), _pixel(x + w * across, width)
 
 
 def _pixel(edges: Float[Array, "n e"], size: int) -> Int[Array, "n e"]:

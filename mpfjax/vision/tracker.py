@@ -88,7 +88,7 @@ class ObjectTracker(eqx.Module):
     - `rejuvenation`: `Resample(particles_per_component=P)` for an MPF, or
       `GaussianRegeneration(P, where=lambda states: (states.box, states.previous))`, the default.
     - `colours`, `sigma`, `num_parts`, `wide_counts`: of the `ColourModel`. Objects of 65 536 pixels
-      or more need the last.
+      or more need the last; without it they have no colours, and nothing of them is learned.
     - `momentum`: the share of a box centre's last step that it repeats in the next, in [0, 1]: 1 is
       constant velocity, 0 a random walk. Sizes have none.
     - `step_deviations`: of the noise of a step, (x, y) in units of the box and (s_x, s_y).
@@ -315,8 +315,10 @@ class ObjectTracker(eqx.Module):
         others = ~jnp.eye(self.max_objects, dtype=bool) & alive[None]
         alone = ~jnp.any((_overlap(boxes, boxes) > 0.05) & others, axis=1)
         rate = jnp.where(own.valid & alone, self.adaptation, 0.0)
-        rate = rate[:, None, None, None]
         histograms = normalise(table.counts(boxes, self.num_parts))
+        # What has no pixel, or too many to count, teaches nothing.
+        counted = jnp.sum(histograms, axis=3, keepdims=True) > 0
+        rate = jnp.where(counted, rate[:, None, None, None], 0.0)
         references = (1 - rate) * state.colour.references + rate * histograms
         return _replace(state, colour=_replace(state.colour, references=references))
 
