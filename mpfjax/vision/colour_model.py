@@ -126,7 +126,8 @@ class ColourModel(AbstractBoxModel):
 
     An observation is an RGB frame, uint8 of shape (h, w, 3), or its `IntegralHistogram`. A box
     outside the frame holds no colour and lies at the largest distance, B = 1; so does a box of more
-    pixels than can be counted, see `wide_counts`. Make one with `from_frame`. Use it for objects that keep their colours, among other colours.
+    pixels than can be counted, see `wide_counts`. Make one with `from_frame`. Use it for objects
+    that keep their colours, among other colours.
 
     - `reference_boxes`: (k, 4), centre and size in pixels; x_0 scatters about them.
     - `references`, `colour_weights`: h_ref and the weights of its colours, (k, parts, channels,
