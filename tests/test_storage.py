@@ -277,14 +277,10 @@ class TestHeadersThatLie:
         loaded["x"][0, 0] = 7
 
 
-class TestCheckpointsThatLie:
-    STATE = {
-        "x": jnp.arange(3.0),
-        "key": jax.random.key(0),
-        "t": 2,
-        "half": jnp.ones(2, "bfloat16"),
-    }
+STATE = {"x": jnp.arange(3.0), "key": jax.random.key(0), "t": 2, "half": jnp.ones(2, "bfloat16")}
 
+
+class TestCheckpointsThatLie:
     def spoil(self, path, **changes):
         """A checkpoint of the state with some of its arrays changed or, by None, left out."""
         mpfjax.save_checkpoint(path, STATE)
