@@ -404,7 +404,7 @@ class TestBadInput:
             ({"settings": {3: [0.1]}}, "settings: 3"),
             ({"keys": None}, "keys: None"),
             ({"keys": 4}, "keys: 4"),
-            ({"keys": np.zeros((4, 2), np.uint32)}, "keys: .*old kind"),
+            ({"keys": np.zeros((4, 2), np.uint32)}, "(?s)keys: .*old kind"),
             ({"measure": None}, "measure: None"),
             ({"measure": "evidence"}, "measure: 'evidence'"),
             ({"collect": 3}, "collect: 3"),
