@@ -1,15 +1,29 @@
 """The colour tracking model of Vermaak et al. (2003), section 5.2, and Lin et al. (2012), 2."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt8
 
+from mpfjax.checks import (
+    check_flag,
+    check_not_negative,
+    check_positive,
+    check_share,
+    check_type,
+    check_whole,
+    given,
+    shown,
+    to_rows,
+)
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
 from mpfjax.vision.boxes import centred, check_boxes
 from mpfjax.vision.colours import AbstractColours, RGBColours
+from mpfjax.vision.frames import check_frame
 from mpfjax.vision.histograms import (
     IntegralHistogram,
     bhattacharyya,
@@ -186,25 +200,27 @@ class ColourModel(AbstractBoxModel):
         - `switch_probability`: with which a particle's reference is drawn anew in a frame.
         - `contrast`: the weight of the unlikeness of a box's two sides.
 
-        Raises `ValueError` naming the argument for a box of no area or outside the frame, for a
-        number that is not positive, and for a probability outside [0, 1].
+        Raises `ValueError` naming the argument for one of another kind, for a frame that is not
+        (h, w, 3) of type uint8, for a box of no area or outside the frame, for a number that is not
+        positive, and for a probability outside [0, 1].
         """
-        boxes = np.asarray(boxes, float).reshape(-1, 4)
+        check_frame(frame)
+        boxes = to_rows(4, "boxes", boxes)
         if len(boxes) == 0:
             raise ValueError("boxes: there are none")
         check_boxes(boxes, *frame.shape[:2])
         colours = RGBColours() if colours is None else colours
-        deviations = np.sqrt(PAPER_VARIANCES) if deviations is None else np.asarray(deviations)
-        if not sigma > 0:
-            raise ValueError(f"sigma: {sigma} is not positive")
-        if num_parts < 1:
-            raise ValueError(f"num_parts: {num_parts} is less than 1")
-        if not 0 <= switch_probability <= 1:
-            raise ValueError(f"switch_probability: {switch_probability} is not in [0, 1]")
-        if contrast < 0:
-            raise ValueError(f"contrast: {contrast} is negative")
-        if deviations.shape not in ((4,), (len(boxes), 4)) or not np.all(deviations > 0):
-            raise ValueError(f"deviations: {deviations} are not four positive numbers a box")
+        check_type(AbstractColours, "AbstractColours such as RGBColours()", colours=colours)
+        kind = "AbstractDynamics such as RandomWalk(deviations)"
+        check_type(AbstractDynamics, kind, **given(dynamics=dynamics))
+        deviations = positive_deviations(
+            np.sqrt(PAPER_VARIANCES) if deviations is None else deviations, len(boxes)
+        )
+        check_positive(sigma=sigma)
+        check_whole(num_parts=num_parts)
+        check_flag(weigh_colours=weigh_colours, share_reference=share_reference)
+        check_share(switch_probability=switch_probability)
+        check_not_negative(contrast=contrast)
         places = jnp.asarray(centred(boxes), float)
         references, weights = _references(frame, colours, places, num_parts, weigh_colours)
         if share_reference:
@@ -274,6 +290,18 @@ class ColourModel(AbstractBoxModel):
         histograms = normalise(counts, weights)
         distances = bhattacharyya(histograms, jnp.broadcast_to(references, histograms.shape))
         return jnp.mean(jnp.sum(distances, axis=2), axis=1)
+
+
+def positive_deviations(deviations: Any, num_boxes: int) -> np.ndarray:
+    """Four positive numbers, for all boxes or a row for each, or a `ValueError`."""
+    try:
+        numbers = np.asarray(deviations, float)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    fits = numbers.shape in ((4,), (num_boxes, 4))
+    if not fits or not np.all((numbers > 0) & np.isfinite(numbers)):
+        raise ValueError(f"deviations: {shown(deviations)} are not four positive numbers a box")
+    return numbers
 
 
 def _for_each(dynamics: AbstractDynamics, num_boxes: int) -> AbstractDynamics:

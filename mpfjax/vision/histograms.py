@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped, UInt8
 
+from mpfjax.checks import check_flag, check_shape, check_type, check_whole
 from mpfjax.vision.colours import AbstractColours
+from mpfjax.vision.frames import check_frame
 
 _BLOCK = 32
 # XLA for a CPU builds the table up to four times faster if its rows are so wide, in such steps.
@@ -49,8 +51,11 @@ class IntegralHistogram(eqx.Module):
         [0, height]; a pixel belongs to a box that covers its centre. Boxes that leave the frame
         are clipped to it, and one that lies wholly outside, has no area or is not finite counts
         nothing. The counts of one that holds more than `largest_box` pixels are NaN, for a zero
-        would say that it has none of a colour.
+        would say that it has none of a colour. Raises `ValueError` for boxes that are no array of
+        four numbers each and a number of parts that is no whole number from 1 on.
         """
+        check_shape("n 4", boxes=boxes)
+        check_whole(num_parts=num_parts)
         rows, columns = _edges(boxes, num_parts, self.height, self.width)
         corners = self.table.at[rows[:, :, None], columns[:, None, :]].get(mode="clip")
         bands = jnp.diff(corners[:, :, 1] - corners[:, :, 0], axis=1)
@@ -73,10 +78,9 @@ def integral_histogram(
     `wide_counts` counts in 32 bits, two to four times slower, for boxes of 65 536 pixels or more.
     Raises `ValueError` for a frame of one channel or not of eight bits.
     """
-    if frame.ndim != 3 or frame.shape[2] != 3:
-        raise ValueError(f"frame: {frame.shape} is not the shape (h, w, 3) of a colour image")
-    if frame.dtype != jnp.uint8:
-        raise ValueError(f"frame: {frame.dtype} is not uint8")
+    check_frame(frame)
+    check_type(AbstractColours, "AbstractColours such as RGBColours()", colours=colours)
+    check_flag(wide_counts=wide_counts)
     height, width, _ = frame.shape
     table = _table(frame, colours, wide_counts)
     return IntegralHistogram(table, colours.num_channels, colours.num_bins, height, width)
@@ -110,7 +114,12 @@ def bhattacharyya(
 
     Vermaak et al. (2003), section 5.2. Between 0, for equal histograms, and 1, for histograms
     that share no colour; an empty histogram shares none. The square is what the likelihood needs.
+    Raises `ValueError` for what is no array, and for another number of bins in one than in the
+    other.
     """
+    check_shape("... bins", histograms=histograms, references=references)
+    if histograms.shape[-1] != references.shape[-1]:
+        raise ValueError(f"references: {references.shape} has not the bins of {histograms.shape}")
     return jnp.clip(1 - jnp.sum(jnp.sqrt(histograms * references), axis=-1), 0.0, 1.0)
 
 
