@@ -27,6 +27,7 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
+from benchmarks.arguments import seed, whole
 from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
 from mpfjax.metrics.coverage import REACH
@@ -430,19 +431,16 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         description="PF, GPF, MPF and GM-MPF on two targets (Lin et al. 2012, figures and table).",
     )
     parser.add_argument("--sequence", type=Path, metavar="DIR", help="img/ and gt.txt")
-    parser.add_argument("--ids", type=int, nargs=2, metavar="ID", help="two objects of gt.txt")
+    parser.add_argument("--ids", type=whole(0), nargs=2, metavar="ID", help="two objects of gt.txt")
     parser.add_argument("--frames", metavar="A:B", help="frames A to B, counted from 1, both in")
     parser.add_argument("--filters", nargs="+", choices=list(NAMES), default=list(NAMES))
-    parser.add_argument("--particles", type=int, nargs="+", default=[100, 200, 300], metavar="N")
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--particles", type=whole(2), nargs="+", default=[100, 200, 300], metavar="N"
+    )
+    parser.add_argument("--seeds", type=whole(), default=20)
+    parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--out", type=Path, default=Path("results/gm_mpf"))
-    options = parser.parse_args(arguments)
-    if options.seeds < 1:
-        parser.error(f"--seeds: {options.seeds} is less than 1")
-    if min(options.particles) < 2:
-        parser.error(f"--particles: {min(options.particles)} is less than one for each target")
-    return options
+    return parser.parse_args(arguments)
 
 
 def open_targets(options: argparse.Namespace) -> Targets:

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
+from benchmarks.arguments import whole
 from benchmarks.results import exit_status, format_table, write_json
 from mpfjax.devices import wide_vectors
 from mpfjax.vision import RGBColours
@@ -39,19 +40,11 @@ def main(arguments: list[str] | None = None) -> int:
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     """The options, or a message that names the one that cannot be run."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.histograms")
-    parser.add_argument("--boxes", type=int, nargs="+", default=[300, 2100, 100_000])
-    parser.add_argument("--size", type=int, nargs=2, default=[360, 288], metavar=("W", "H"))
-    parser.add_argument("--repeats", type=int, default=15, help="times that each is timed")
+    parser.add_argument("--boxes", type=whole(), nargs="+", default=[300, 2100, 100_000])
+    parser.add_argument("--size", type=whole(), nargs=2, default=[360, 288], metavar=("W", "H"))
+    parser.add_argument("--repeats", type=whole(), default=15, help="times that each is timed")
     parser.add_argument("--out", default="results/histograms", metavar="DIR")
-    options = parser.parse_args(arguments)
-    for name, values, least in (
-        ("boxes", options.boxes, 1),
-        ("size", options.size, 1),
-        ("repeats", [options.repeats], 1),
-    ):
-        if min(values) < least:
-            parser.error(f"--{name}: {min(values)} is less than {least}")
-    return options
+    return parser.parse_args(arguments)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 import mpfjax
+from benchmarks.arguments import seed, whole
 from benchmarks.results import format_table, write_json
 from mpfjax.metrics.tracking_quality import recovery_rate, track_state
 
@@ -466,15 +467,12 @@ def main(arguments: list[str] | None = None) -> int:
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     """The options, or a message that names the one that cannot be run."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.interacting_objects")
-    parser.add_argument("--runs", type=int, default=200, help="random scenes, one run in each")
-    parser.add_argument("--seed", type=int, default=0, help="of the scenes and the runs")
+    parser.add_argument("--runs", type=whole(), default=200, help="random scenes, one run in each")
+    parser.add_argument("--seed", type=seed, default=0, help="of the scenes and the runs")
     parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--out", default="results/interacting_objects", metavar="DIR")
-    options = parser.parse_args(arguments)
-    if options.runs < 1:
-        parser.error(f"--runs: {options.runs} is less than 1")
-    return options
+    return parser.parse_args(arguments)
 
 
 def settings_of(options: argparse.Namespace) -> dict[str, Any]:

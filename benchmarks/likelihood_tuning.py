@@ -22,6 +22,7 @@ from scipy.optimize import minimize
 from tqdm import tqdm
 
 import mpfjax
+from benchmarks.arguments import fill_in, seed, whole
 from benchmarks.label_tuning import CLIMB_STEPS as LABEL_STEPS
 from benchmarks.label_tuning import SEQUENCES, run_labels
 from benchmarks.results import format_table, write_json
@@ -82,28 +83,36 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     """The options, or a message that names the one that cannot be run."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.likelihood_tuning")
     parser.add_argument("--parts", nargs="+", choices=("a", "b", "c"), default=["a", "b", "c"])
-    parser.add_argument("--runs", type=int, default=200, help="a: seeds for each estimator")
-    parser.add_argument("--particles", type=int, nargs="+", default=[100, 1000], metavar="N")
+    parser.add_argument("--runs", type=whole(), help="a: seeds for each estimator; default: 200")
     parser.add_argument(
-        "--estimators", nargs="+", choices=list(ESTIMATORS), default=list(ESTIMATORS)
+        "--particles", type=whole(2), nargs="+", metavar="N", help="a; default: 100 1000"
     )
-    parser.add_argument("--models", nargs="+", choices=list(MODELS), default=list(MODELS))
-    parser.add_argument("--filters", nargs="+", choices=FILTERS, default=FILTERS)
-    parser.add_argument("--starts", type=int, default=20, help="b: random starts")
-    parser.add_argument("--steps", type=int, default=CLIMB_STEPS, help="b: of each climb")
-    parser.add_argument("--sequences", nargs="+", choices=SEQUENCES, default=SEQUENCES, help="c")
-    parser.add_argument("--label-runs", type=int, default=6, help="c: seeds of each filter")
-    parser.add_argument("--label-steps", type=int, default=LABEL_STEPS, help="c: of each climb")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--estimators", nargs="+", choices=list(ESTIMATORS), help="a; default: all")
+    parser.add_argument("--models", nargs="+", choices=list(MODELS), help="a; default: all")
+    parser.add_argument("--filters", nargs="+", choices=FILTERS, help="a; default: all")
+    parser.add_argument("--starts", type=whole(), help="b: random starts; default: 20")
+    parser.add_argument("--steps", type=whole(), help=f"b: of each climb; default: {CLIMB_STEPS}")
+    parser.add_argument("--sequences", nargs="+", choices=SEQUENCES, help="c; default: all")
+    parser.add_argument("--label-runs", type=whole(2), help="c: seeds of each filter; default: 6")
+    parser.add_argument(
+        "--label-steps", type=whole(), help=f"c: of each climb; default: {LABEL_STEPS}"
+    )
+    parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--out", default="results/likelihood_tuning", metavar="DIR")
     options = parser.parse_args(arguments)
-    least = {"runs": 1, "starts": 1, "steps": 1, "label_runs": 2, "label_steps": 1}
-    for name, number in least.items():
-        if getattr(options, name) < number:
-            option = name.replace("_", "-")
-            parser.error(f"--{option}: {getattr(options, name)} is less than {number}")
-    if min(options.particles) < 2:
-        parser.error(f"--particles: {min(options.particles)} is less than 2")
+    defaults: dict[str, dict[str, Any]] = {
+        "a": {
+            "runs": 200,
+            "particles": [100, 1000],
+            "estimators": list(ESTIMATORS),
+            "models": list(MODELS),
+            "filters": FILTERS,
+        },
+        "b": {"starts": 20, "steps": CLIMB_STEPS},
+        "c": {"sequences": SEQUENCES, "label_runs": 6, "label_steps": LABEL_STEPS},
+    }
+    for part, own in defaults.items():
+        fill_in(parser, options, part in options.parts, f"without part {part}", **own)
     return options
 
 

@@ -26,6 +26,7 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
+from benchmarks.arguments import fill_in, positive, seed, whole
 from benchmarks.partitioned_tables import (
     Rates,
     checks_of,
@@ -392,42 +393,50 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--sequence", type=Path, metavar="DIR", help="img/ and gt.txt")
     parser.add_argument(
-        "--ids", type=int, nargs="+", metavar="ID", help="objects of gt.txt, the occluded one first"
+        "--ids",
+        type=whole(0),
+        nargs="+",
+        metavar="ID",
+        help="objects of gt.txt, the occluded one first",
     )
     parser.add_argument("--frames", metavar="A:B", help="frames A to B, counted from 1, both in")
     parser.add_argument(
         "--stretch",
-        type=int,
-        default=1,
+        type=whole(),
         metavar="K",
-        help="which of the sequence's own in STRETCHES",
+        help="which of the sequence's own in STRETCHES; default: 1",
     )
-    parser.add_argument("--runs", type=int, default=50)
+    parser.add_argument("--runs", type=whole(), default=50)
     parser.add_argument(
-        "--particles", type=int, metavar="N", help="default: 300 on the synthetic sequence, or 200"
+        "--particles",
+        type=whole(),
+        metavar="N",
+        help="default: 300 on the synthetic sequence, or 200",
     )
     parser.add_argument(
-        "--lambdas", type=float, nargs="+", metavar="λ", help="default: 20 30 40 50, or 20"
+        "--lambdas", type=positive, nargs="+", metavar="λ", help="default: 20 30 40 50, or 20"
     )
     parser.add_argument(
         "--methods", nargs="+", choices=list(METHODS), metavar="NAME", default=list(METHODS),
         help=f"of {', '.join(METHODS)}; default: all",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="of the filters")
-    parser.add_argument("--scene", type=int, default=SCENE, help="key of the synthetic sequence")
+    parser.add_argument("--seed", type=seed, default=0, help="of the filters")
+    parser.add_argument(
+        "--scene", type=seed, help=f"key of the synthetic sequence; default: {SCENE}"
+    )
     parser.add_argument("--out", type=Path, default=Path("results/partitioned_sampling"))
     options = parser.parse_args(arguments)
     real = options.sequence is not None
     options.lambdas = options.lambdas or (REAL_LAMBDAS if real else LAMBDAS)
     if options.particles is None:
         options.particles = REAL_NUM_PARTICLES if real else NUM_PARTICLES
-    for name in ("runs", "particles", "stretch"):
-        if getattr(options, name) < 1:
-            parser.error(f"--{name}: {getattr(options, name)} is less than 1")
-    if not min(options.lambdas) > 0:
-        parser.error(f"--lambdas: {min(options.lambdas)} is not positive")
-    if not real and (options.ids or options.frames):
+    chosen = bool(options.ids or options.frames)
+    if not real and chosen:
         parser.error("--ids, --frames: without --sequence there is nothing to choose")
+    has_stretches = real and options.sequence.name in STRETCHES and not chosen
+    why = "but with a --sequence in STRETCHES and without --ids and --frames"
+    fill_in(parser, options, has_stretches, why, stretch=1)
+    fill_in(parser, options, not real, "with --sequence", scene=SCENE)
     return options
 
 

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
+from benchmarks.arguments import positive, whole
 from benchmarks.peer_jobs import JOBS, Job, Quadratic
 from benchmarks.peer_libraries import LIBRARIES, model_of
 from benchmarks.peer_worker import Worker, stop_all
@@ -58,24 +59,18 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     """The options, or a message that names the one that cannot be run."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.peers")
     parser.add_argument(
-        "--particles", type=int, nargs="+", default=[100, 1000, 10_000, 100_000], metavar="N"
+        "--particles", type=whole(2), nargs="+", default=[100, 1000, 10_000, 100_000], metavar="N"
     )
     parser.add_argument("--jobs", nargs="+", choices=list(JOBS), default=list(JOBS))
-    parser.add_argument("--seeds", type=int, default=20, help="runs of each filter, at once")
-    parser.add_argument("--repeats", type=int, default=9, help="times that each cell is timed")
+    parser.add_argument("--seeds", type=whole(3), default=20, help="runs of each filter, at once")
+    parser.add_argument("--repeats", type=whole(), default=9, help="times that each cell is timed")
     parser.add_argument("--skip", nargs="+", choices=list(RIVALS), default=[], help="libraries")
-    parser.add_argument("--devices", type=int, default=1, help="mpfjax on so many, beside on one")
-    parser.add_argument("--time-limit", type=float, default=600.0, help="seconds, of one run")
+    parser.add_argument(
+        "--devices", type=whole(), default=1, help="mpfjax on so many, beside on one"
+    )
+    parser.add_argument("--time-limit", type=positive, default=600.0, help="seconds, of one run")
     parser.add_argument("--out", default="results/peers", metavar="DIR")
-    options = parser.parse_args(arguments)
-    least = {"particles": 2, "seeds": 3, "repeats": 1, "devices": 1}
-    for name, smallest in least.items():
-        value = min(np.atleast_1d(getattr(options, name)))
-        if value < smallest:
-            parser.error(f"--{name}: {value} is less than {smallest}")
-    if not options.time_limit > 0:
-        parser.error(f"--time-limit: {options.time_limit} is not positive")
-    return options
+    return parser.parse_args(arguments)
 
 
 def run(options: argparse.Namespace, refused: list[str]) -> None:

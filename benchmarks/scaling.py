@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
+from benchmarks.arguments import whole
 from benchmarks.peer_worker import Worker, stop_all
 from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
@@ -100,21 +101,24 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--filters", nargs="+", choices=list(FILTERS), default=list(FILTERS))
     parser.add_argument("--axes", nargs="*", choices=list(AXES), default=list(AXES))
     parser.add_argument(
-        "--islands", type=int, nargs="*", default=[], metavar="N", help="particles of one filter"
+        "--islands",
+        type=whole(),
+        nargs="*",
+        default=[],
+        metavar="N",
+        help="particles of one filter",
     )
-    parser.add_argument("--repeats", type=int, default=5, help="times that each cell is timed")
-    parser.add_argument("--devices", type=int, nargs="*", default=[1, 2], help="none: leave out")
-    parser.add_argument("--processes", type=int, nargs="*", default=[1, 2], help="none: leave out")
+    parser.add_argument("--repeats", type=whole(), default=5, help="times that each cell is timed")
+    parser.add_argument(
+        "--devices", type=whole(), nargs="*", default=[1, 2], help="none: leave out"
+    )
+    parser.add_argument(
+        "--processes", type=whole(), nargs="*", default=[1, 2], help="none: leave out"
+    )
     parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
     parser.add_argument("--out", default="results/scaling", metavar="DIR")
     options = parser.parse_args(arguments)
-    if options.repeats < 1:
-        parser.error(f"--repeats: {options.repeats} is less than 1")
-    for name in ("devices", "processes"):
-        too_few = [number for number in getattr(options, name) if number < 1]
-        if too_few:
-            parser.error(f"--{name}: {too_few[0]} is less than 1")
-    uneven = [number for number in options.islands if number < 1 or number % NUM_ISLANDS**2]
+    uneven = [number for number in options.islands if number % NUM_ISLANDS**2]
     if uneven:
         parser.error(f"--islands: {uneven[0]} is not a positive multiple of {NUM_ISLANDS**2}")
     return options

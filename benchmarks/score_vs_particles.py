@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 import mpfjax
+from benchmarks.arguments import seed, whole
 from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
 from mpfjax.exact import grid_filter
@@ -100,26 +101,22 @@ def run(options: argparse.Namespace) -> None:
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     """The options, or a message that names the one that cannot be run."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.score_vs_particles")
-    parser.add_argument("--seeds", type=int, default=20, help="runs of each filter at each size")
     parser.add_argument(
-        "--particles", type=int, nargs="+", default=[20, 50, 100, 200, 500, 1000], metavar="N"
+        "--seeds", type=whole(), default=20, help="runs of each filter at each size"
+    )
+    parser.add_argument(
+        "--particles", type=whole(2), nargs="+", default=[20, 50, 100, 200, 500, 1000], metavar="N"
     )
     parser.add_argument("--filters", nargs="+", choices=list(LABELS), default=OF_THE_PAPER)
     parser.add_argument("--out", default="results/score_vs_particles", metavar="DIR")
-    parser.add_argument("--seed", type=int, default=0, help="of all the runs")
+    parser.add_argument("--seed", type=seed, default=0, help="of all the runs")
     parser.add_argument(
         "--data-seed",
-        type=int,
+        type=seed,
         default=2,
         help="of the noise in the one data set; how hard it is differs much from draw to draw",
     )
-    options = parser.parse_args(arguments)
-    if options.seeds < 1:
-        parser.error(f"--seeds: {options.seeds} is less than 1")
-    too_few = [n for n in options.particles if n < 2]
-    if too_few:
-        parser.error(f"--particles: {too_few[0]} is less than 2, one for each component")
-    return options
+    return parser.parse_args(arguments)
 
 
 def simulate(seed: int) -> tuple[Float[Array, " t"], Float[Array, " t"]]:

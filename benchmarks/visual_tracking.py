@@ -29,6 +29,7 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
+from benchmarks.arguments import seed, whole
 from benchmarks.detected_tracking import detect_all, make_trackers, track_detected
 from benchmarks.results import exit_status, format_table, write_json
 from benchmarks.tracking_pictures import (
@@ -265,22 +266,26 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     where.add_argument("--video", type=Path, metavar="FILE", help="a video file")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--box", action="append", metavar="x,y,w,h", help="an object, in frame A")
-    what.add_argument("--ids", type=int, nargs="+", metavar="ID", help="objects of gt.txt")
+    what.add_argument("--ids", type=whole(0), nargs="+", metavar="ID", help="objects of gt.txt")
     what.add_argument("--detect", action="store_true", help="find what moves; a still camera")
     parser.add_argument("--frames", metavar="A:B", help="frames A to B, counted from 1, both in")
     parser.add_argument("--preset", choices=sorted(PRESETS), default="default")
     parser.add_argument("--out", type=Path, default=Path("results/visual_tracking"))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seeds", type=int, default=1, help="runs; scores are their means")
+    parser.add_argument("--seed", type=seed, default=0)
+    parser.add_argument("--seeds", type=whole(), default=1, help="runs; scores are their means")
     parser.add_argument("--gif", action="store_true", help="an animated GIF in place of an MP4")
-    return parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
+    if options.box is not None and options.sequence is None and options.video is None:
+        parser.error(
+            "argument --box: without --video FILE or --sequence DIR there is no frame to draw it"
+            " in; add one, or leave --box out for the rendered scene"
+        )
+    return options
 
 
 def open_source(options: argparse.Namespace) -> Source:
     """The frames and the objects, or a `ValueError` that names the argument."""
     first, last = frames.parse_range(options.frames, "--frames")
-    if options.seeds < 1:
-        raise ValueError(f"--seeds: {options.seeds} is less than 1")
     if options.sequence is None and options.video is None:
         return _rendered(options, first, last)
     path = options.sequence or options.video
@@ -308,7 +313,7 @@ def _rendered(options: argparse.Namespace, first: int, last: int | None) -> Sour
     key = jax.random.key(options.seed)
     scene = football_scene(key, num_frames, still_camera=options.detect)
     stills = scene.frames[first - 1 :]
-    if options.ids is None and options.box is None:
+    if options.ids is None:
         options.ids = [id for id, kit in scene.kits.items() if kit == 0]
     return _with_objects(
         options, "rendered scene", lambda: stills, first, last, len(stills), scene.tracks, stills[0]

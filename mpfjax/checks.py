@@ -58,6 +58,13 @@ def check_share(most: float = 1.0, /, **arguments: Any) -> None:
             raise ValueError(f"{name}: {shown(value)} is not a number in [0, {most:g}]")
 
 
+def check_inner_share(**arguments: Any) -> None:
+    """Each argument is a number in (0, 1)."""
+    for name, value in arguments.items():
+        if not (_is_number(value) and 0 < value < 1):
+            raise ValueError(f"{name}: {shown(value)} is not a number in (0, 1)")
+
+
 def check_one_of(choices: Collection[str], /, **arguments: Any) -> None:
     """Each argument is one of some strings."""
     for name, value in arguments.items():
@@ -139,6 +146,45 @@ def check_positive_array(**arguments: Any) -> None:
 def check_finite_array(**arguments: Any) -> None:
     """Each array has numbers, all of them finite, as far as they are known."""
     _check_entries(np.isfinite, "finite", arguments)
+
+
+def check_shape(shape: str, /, **arguments: Any) -> None:
+    """Each argument is an array of this shape, as "n 4" or "... bins".
+
+    Numbers stand for themselves and words for any length; the dots are any axes at all. Traced
+    arrays are checked as well.
+    """
+    axes = shape.removeprefix("...").split()
+    for name, value in arguments.items():
+        lengths = getattr(value, "shape", None)
+        if isinstance(value, type) or not isinstance(lengths, tuple) or not _has_numbers(value):
+            raise ValueError(f"{name}: {shown(value)} is no array of numbers")
+        own = lengths[max(len(lengths) - len(axes), 0) :] if "..." in shape else lengths
+        fits = len(own) == len(axes) and all(
+            not axis.isdigit() or int(axis) == length
+            for axis, length in zip(axes, own, strict=True)
+        )
+        if not fits:
+            raise ValueError(f"{name}: shape {lengths} is not ({', '.join(shape.split())})")
+
+
+def to_rows(width: int, name: str, value: Any) -> np.ndarray:
+    """The argument of this name as rows of so many numbers; nothing is no row, a vector is one."""
+    try:
+        rows = np.asarray(value, float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: {shown(value)} are no rows of {width} numbers") from error
+    if rows.ndim > 0 and rows.size == 0:
+        return np.zeros((0, width))
+    rows = rows[None] if rows.shape == (width,) else rows
+    if rows.ndim != 2 or rows.shape[1] != width:
+        raise ValueError(f"{name}: shape {rows.shape} is not that of rows of {width} numbers")
+    return rows
+
+
+def _has_numbers(array: Any) -> bool:
+    dtype = getattr(array, "dtype", None)
+    return dtype is not None and any(jnp.issubdtype(dtype, kind) for kind in (np.number, np.bool_))
 
 
 def _check_entries(holds: Callable[..., Any], what: str, arguments: dict[str, Any]) -> None:

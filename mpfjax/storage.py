@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import math
 import os
 import re
 import zipfile
@@ -17,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from mpfjax.checks import check_type, shown
+
 _DESCRIPTION = "description"
 
 
@@ -27,8 +30,9 @@ def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
       or a `Filter`. What else it holds, a network's activation say, is only written down by name.
     - `path`: a .npz file without pickles. An interruption leaves the old one or the new one.
 
-    Raises `OSError` where it cannot be written, a full disk say: what was there is still there.
-    Use it every so many steps of a filter that runs for long:
+    Raises `ValueError` for a path that is none, and `OSError` where it cannot be written, a full
+    disk say: what was there is still there. Use it every so many steps of a filter that runs for
+    long:
 
         state = {"mixture": filter.init(key), "t": 0}
         if path.exists():
@@ -39,14 +43,12 @@ def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
             if state["t"] % 1000 == 0:
                 mpfjax.save_checkpoint(path, state)
     """
+    path = as_path(path)
     arrays = {}
     for place, leaf in jax.tree_util.tree_leaves_with_path(state):
         if _is_data(leaf):
             array = _as_numpy(leaf)
-            # numpy has no name of its own for bfloat16 and the like, which would not come back.
-            arrays[jax.tree_util.keystr(place)] = (
-                array.view(f"u{array.itemsize}") if array.dtype.kind == "V" else array
-            )
+            arrays[jax.tree_util.keystr(place)] = array.view(_stored_dtype(array.dtype))
     write_arrays(path, arrays | {_DESCRIPTION: np.array(json.dumps(describe(state)))})
 
 
@@ -58,17 +60,19 @@ def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
       number is taken from it.
 
     Arrays come back on the default device. Raises `FileNotFoundError`, and `ValueError` for a file
-    that is cut off, damaged or no checkpoint, or for one of another state, naming what differs.
+    that is cut off, damaged, no checkpoint or does not hold what it says, or for one of another
+    state, naming what differs.
     """
+    path = as_path(path)
     arrays = load_arrays(path)
-    if _DESCRIPTION not in arrays:
-        raise ValueError(f"{path}: no checkpoint, for it does not describe what it holds")
-    saved, own = json.loads(str(arrays[_DESCRIPTION])), describe(like)
+    saved, own = _description(path, arrays), describe(like)
     if saved != own:
         raise ValueError(f"like: {path} holds another state: {differences(saved, own)}")
     places, structure = jax.tree_util.tree_flatten_with_path(like)
     return structure.unflatten(
-        _as_leaf(arrays[jax.tree_util.keystr(place)], leaf) if _is_data(leaf) else leaf
+        _as_leaf(_found(path, arrays, jax.tree_util.keystr(place), leaf), leaf)
+        if _is_data(leaf)
+        else leaf
         for place, leaf in places
     )
 
@@ -105,6 +109,14 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
 def named(value: Any) -> str:
     """A function, or another thing without a value, in words that are the same in every process."""
     return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+
+
+def as_path(path: str | os.PathLike[str], name: str = "path") -> Path:
+    """The path, or a `ValueError` naming the argument where it is none or empty."""
+    check_type((str, os.PathLike), "a path", **{name: path})
+    if not os.fspath(path):
+        raise ValueError(f"{name}: '' is no path; '.' is the folder that this runs in")
+    return Path(path)
 
 
 def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
@@ -150,22 +162,100 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
 
 
 # What a flipped bit may lead to; where it names an unknown compression or an encryption, the last.
-_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, RuntimeError)
+_DAMAGE = (
+    zipfile.BadZipFile, zlib.error, EOFError, OSError, OverflowError, ValueError, RuntimeError,
+)  # fmt: skip
 
 
 def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file; `ValueError` for one that is cut off, damaged or no such file."""
+    """The arrays of a .npz file; `ValueError` for one that is cut off, damaged or no such file.
+
+    No more memory is taken than for what the file holds, whatever it claims.
+    """
     arrays = {}
     with open(path, "rb") as file:
         try:
             with zipfile.ZipFile(file) as archive:
-                for name in archive.namelist():
-                    with archive.open(name) as member:
-                        array = np.lib.format.read_array(member, allow_pickle=False)
-                    arrays[name.removesuffix(".npy")] = array
+                for member in archive.infolist():
+                    arrays[member.filename.removesuffix(".npy")] = _load_array(archive, member)
         except _DAMAGE as error:
             raise ValueError(f"{path}: cut off, damaged or no .npz file ({error})") from error
     return arrays
+
+
+_PIECE = 2**20
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def _load_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """What `np.lib.format.read_array` reads, which takes the memory that the header claims."""
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{member.filename} is compressed as numpy compresses nothing")
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        if version not in _HEADERS:
+            raise ValueError(f"{member.filename} is of the unknown version {version}")
+        try:
+            shape, is_fortran, dtype = _HEADERS[version](file)
+        except MemoryError as error:
+            raise ValueError(f"{member.filename}'s header is no description") from error
+        if dtype.hasobject or dtype.itemsize == 0:
+            raise ValueError(f"{member.filename} holds {dtype}, which is no array of numbers")
+        claimed, present = math.prod(shape) * dtype.itemsize, member.file_size - file.tell()
+        if claimed != present:
+            raise ValueError(f"{member.filename} claims {claimed} bytes and has {present}")
+        # In pieces, for the archive may claim too much as well.
+        content = bytearray()
+        while piece := file.read(_PIECE):
+            content += piece
+    return np.ndarray(shape, dtype, content, order="F" if is_fortran else "C")
+
+
+def _description(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """What a checkpoint says that it holds."""
+    if _DESCRIPTION not in arrays:
+        raise ValueError(f"{path}: no checkpoint, for it does not describe what it holds")
+    text = str(arrays[_DESCRIPTION])
+    try:
+        description = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: no checkpoint, its description is no JSON ({error})") from error
+    if not isinstance(description, dict):
+        raise ValueError(f"{path}: no checkpoint, its description is {shown(description)}")
+    return description
+
+
+def _found(path: Path, arrays: Mapping[str, np.ndarray], name: str, leaf: Any) -> np.ndarray:
+    """The array of a leaf, in the shape and dtype in which such a leaf is written."""
+    if name not in arrays:
+        raise ValueError(f"{path}: damaged, it describes {name} and does not hold it")
+    array = arrays[name]
+    if _is_number(leaf):
+        shape, fits = (), array.dtype.kind in _KINDS[type(np.asarray(leaf).item())]
+    else:
+        written = jax.eval_shape(jax.random.key_data, _shape_of(leaf)) if _is_key(leaf) else leaf
+        shape, fits = written.shape, array.dtype == _stored_dtype(np.dtype(written.dtype))
+    if array.shape != shape or not fits:
+        raise ValueError(
+            f"{path}: damaged, {name} is {_kind(array)} and not {_kind(leaf)}, as it is described"
+        )
+    return array
+
+
+# What numpy makes of Python's numbers; of whole ones from 2⁶³ on, unsigned ones.
+_KINDS = {bool: "b", int: "iu", float: "f", complex: "c"}
+
+
+def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
+
+
+def _stored_dtype(dtype: np.dtype) -> np.dtype:
+    """The dtype itself, but for bfloat16 and the like, which have no name that numpy can read."""
+    return np.dtype(f"u{dtype.itemsize}") if dtype.kind == "V" else dtype
 
 
 def _is_data(leaf: Any) -> bool:

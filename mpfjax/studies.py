@@ -12,14 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 from tqdm import tqdm
 
+from mpfjax.checks import check_callable, check_key, check_type, check_whole, given, shown
 from mpfjax.filters import Filter, FilterRun, monte_carlo, present_steps
 from mpfjax.mixture import ParticleMixture
 from mpfjax.storage import (
+    as_path,
     describe,
     differences,
     fingerprint,
@@ -34,6 +35,8 @@ Values = Sequence[Any] | np.ndarray | Array
 _MANIFEST = "study.json"
 _CELL = "cell"
 _TAKEN = ("filter", "num_particles", _CELL)
+# Names as `_cells` makes them, none of which leads out of a folder.
+_CELL_FILE = re.compile(r"\d+-[\w.+-]*\.npz")
 
 
 def log_evidence(run: FilterRun) -> dict[str, Array]:
@@ -50,8 +53,9 @@ def nothing(mixture: ParticleMixture) -> None:
 class Study:
     """A grid of filters x N x settings, each cell the Monte Carlo runs of one filter.
 
-    Raises `ValueError` for an empty or repeated axis, a setting that is no number or string, a
-    filter's function that returns none, and what `monte_carlo` does.
+    Raises `ValueError` for an argument of another kind, an empty or repeated axis, numbers of
+    particles that are no whole numbers, a setting that is no number or string, a filter's function
+    that returns none, and what `monte_carlo` does.
     """
 
     filters: Mapping[str, Callable[..., Filter]]
@@ -71,15 +75,26 @@ class Study:
     """as for `run_filter`."""
 
     def __post_init__(self) -> None:
+        check_type(Mapping, "functions by name, {name: function}", filters=self.filters)
+        check_type(Mapping, "values by name, {name: [value, ...]}", settings=self.settings)
+        for name, function in self.filters.items():
+            if not callable(function):
+                raise ValueError(
+                    f"filters: {shown(function)}, for {name!r}, is no function that builds a filter"
+                )
+        for name in self.settings:
+            check_type(str, "the name of a setting", settings=name)
+        check_callable("a function of a cell's runs", measure=self.measure)
+        check_callable("a function of a mixture", **given(collect=self.collect))
+        check_key(self.keys, "keys", batch=True)
         taken = [name for name in self.settings if name in _TAKEN]
         if taken:
             raise ValueError(f"settings: {taken[0]!r} is what a cell has a name for already")
         for name, values in _axes(self).items():
             if not values or len(set(values)) < len(values):
                 raise ValueError(f"{name}: {values} is empty or has the same twice")
-        if jnp.ndim(self.keys) != 1 or self.keys.shape[0] < 1:
-            shape = jnp.shape(self.keys)
-            raise ValueError(f"keys: shape {shape} is not that of one key a run, (seeds,)")
+        for number in _axes(self)["num_particles"]:
+            check_whole(num_particles=number)
         present_steps(self.observations, self.missing)
 
 
@@ -110,18 +125,17 @@ def run_study(
       it, so that a filter compiles once for all these N. For small filters, of which the study
       compiles for longer than it runs; with a filter that fills every slot it is an error.
 
-    Raises `ValueError`, before anything runs, for a `directory` of another study, naming what
-    differs, and for files in it that are cut off: delete those, and only their cells are run
-    again. Raises `OSError` where a cell cannot be written, a full disk say; finished cells stay.
-    Filters are compared by their structure and numbers, `measure` and `collect` only by their
-    names: take a new directory after changing code. Several processes share one directory, which
-    the first writes. Use it where a loop over `monte_carlo` would take long.
+    Raises `ValueError`, before anything runs, for an argument of another kind, for a `directory` of
+    another study, naming what differs, and for files in it that are cut off: delete those, and only
+    their cells are run again. Raises `OSError` where a cell cannot be written, a full disk say;
+    finished cells stay. Filters are compared by their structure and numbers, `measure` and
+    `collect` only by their names: take a new directory after changing code. Several processes share
+    one directory, which the first writes. Use it where a loop over `monte_carlo` would take long.
     """
-    sizes = {"seeds_at_once": seeds_at_once, "cells_at_once": cells_at_once, "slots": slots}
-    for name, number in sizes.items():
-        if number is not None and number < 1:
-            raise ValueError(f"{name}: {number} is less than 1")
-    directory = Path(directory)
+    check_type(Study, "a Study", study=study)
+    check_whole(**given(seeds_at_once=seeds_at_once, slots=slots))
+    check_whole(cells_at_once=cells_at_once)
+    directory = _as_directory(directory)
     cells = _cells(study)
     manifest = _claim(directory, study, cells)
     results = _finished(directory, manifest)
@@ -150,9 +164,9 @@ def read_study(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
     """The finished cells of a study, as `run_study` returns them, without what it was made from.
 
     Also while it runs. Raises `FileNotFoundError` for a directory without a study, and
-    `ValueError` for files in it that are cut off or from another study.
+    `ValueError` for files in it that are cut off, damaged or from another study.
     """
-    directory = Path(directory)
+    directory = _as_directory(directory)
     manifest = _read_manifest(directory / _MANIFEST)
     results = _finished(directory, manifest)
     cells = manifest["cells"]
@@ -190,7 +204,16 @@ def _cells(study: Study) -> list[_Cell]:
 
 def _axes(study: Study) -> dict[str, list[Any]]:
     """The values along each axis of the grid, the filters' names first."""
-    axes = {"filter": study.filters, "num_particles": study.num_particles, **study.settings}
+    axes: dict[str, Any] = {
+        "filter": list(study.filters),
+        "num_particles": study.num_particles,
+        **study.settings,
+    }
+    for name, values in axes.items():
+        # A string is a sequence as well, of its letters.
+        is_array = isinstance(values, np.ndarray | jax.Array) and values.ndim > 0
+        if isinstance(values, str | bytes) or not (is_array or isinstance(values, Sequence)):
+            raise ValueError(f"{name}: {shown(values)} are no values, [value, ...]")
     return {name: [_plain(name, value) for value in values] for name, values in axes.items()}
 
 
@@ -260,11 +283,30 @@ def _difference(there: dict[str, Any], here: dict[str, Any]) -> str:
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: cut off, damaged or no study ({error})") from error
-    if not isinstance(manifest, dict) or "cells" not in manifest:
-        raise ValueError(f"{path}: no study")
+    axes, cells = (_mapping(manifest, name) for name in ("axes", "cells"))
+    if not axes or not cells:
+        raise ValueError(f"{path}: damaged or no study, for it has no axes or no cells")
+    for file, cell in cells.items():
+        if not _CELL_FILE.fullmatch(file):
+            raise ValueError(f"{path}: damaged or no study, for {file!r} is no name of a cell")
+        if _mapping(cell, "is").keys() != axes.keys() or not isinstance(cell.get("filter"), str):
+            raise ValueError(f"{path}: damaged or no study, for {file!r} is {shown(cell)}")
     return manifest
+
+
+def _mapping(content: Any, name: str) -> dict[str, Any]:
+    """What JSON holds by this name, or nothing where it holds something else."""
+    found = content.get(name) if isinstance(content, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
+def _as_directory(directory: str | os.PathLike[str]) -> Path:
+    path = as_path(directory, "directory")
+    if path.exists() and not path.is_dir():
+        raise ValueError(f"directory: {path} is a file")
+    return path
 
 
 def _mark(manifest: dict[str, Any], file: str) -> np.ndarray:

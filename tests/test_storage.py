@@ -1,7 +1,11 @@
 """Checkpoints go on to the bit, and files are whole or an error that names them."""
 
 import errno
+import io
 import os
+import struct
+import tracemalloc
+import zipfile
 
 import equinox as eqx
 import jax
@@ -11,7 +15,7 @@ import pytest
 
 import mpfjax
 from mpfjax.generator import fast_key
-from mpfjax.storage import load_arrays, write_arrays
+from mpfjax.storage import describe, load_arrays, write_arrays
 from tests.examples import make_mixture
 from tests.full_disk import no_room_beyond
 
@@ -196,6 +200,155 @@ class TestFiles:
         write_arrays(tmp_path / "ours.npz", arrays)
         np.savez(tmp_path / "theirs.npz", **arrays)
         assert (tmp_path / "ours.npz").read_bytes() == (tmp_path / "theirs.npz").read_bytes()
+
+
+def npy(shape, dtype="<f8", content=b""):
+    """A .npy file with a header that claims this shape, and this content."""
+    file = io.BytesIO()
+    header = {"descr": dtype, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)
+    return file.getvalue() + content
+
+
+def write_archive(path, members, compression=zipfile.ZIP_STORED):
+    path.parent.mkdir(exist_ok=True)
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, content in members.items():
+            archive.writestr(f"{name}.npy", content)
+
+
+class TestHeadersThatLie:
+    @pytest.mark.parametrize(
+        "content",
+        [
+            npy((10**12,)),
+            npy((10**30,)),
+            npy((2, 10**30), content=bytes(16)),
+            npy((10**9, 10**9, 10**9)),
+            npy((3,), content=bytes(16)),
+            npy((1,), content=bytes(16)),
+            npy((-1, -2), content=bytes(16)),
+            npy((0, 10**30)),
+            npy((10**12,), "<U0"),
+            npy((1,), "|O", bytes(8)),
+            b"\x93NUMPY\x01\x00" + struct.pack("<H", 9000) + b"-" * 8999 + b"1",
+            b"\x93NUMPY\x09\x00" + bytes(100),
+            b"",
+        ],
+        ids=range(13),
+    )
+    @pytest.mark.parametrize("compression", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+    def test_are_errors_that_name_the_file(self, path, content, compression):
+        write_archive(path, {"x": content}, compression)
+        with pytest.raises(ValueError, match=r"checkpoint.npz: cut off, damaged"):
+            load_arrays(path)
+
+    @pytest.mark.parametrize("both", [False, True])
+    def test_allocate_nothing(self, path, both):
+        """Also where the archive's own table claims as much as the header."""
+        size = 300_000_000
+        write_archive(path, {"x": npy((size,), "|u1", bytes(16))})
+        if both:
+            told = len(npy((size,), "|u1")) + size
+            content, true = path.read_bytes(), len(npy((size,), "|u1")) + 16
+            path.write_bytes(content.replace(struct.pack("<L", true), struct.pack("<L", told)))
+        tracemalloc.start()
+        try:
+            with pytest.raises(ValueError, match="cut off, damaged"):
+                load_arrays(path)
+            assert tracemalloc.get_traced_memory()[1] < 10_000_000
+        finally:
+            tracemalloc.stop()
+
+    def test_an_unusual_compression_is_refused(self, path):
+        write_archive(path, {"x": npy((2,), content=bytes(16))}, zipfile.ZIP_LZMA)
+        with pytest.raises(ValueError, match=r"checkpoint.npz: cut off, damaged.*compress"):
+            load_arrays(path)
+
+    @pytest.mark.parametrize("order", ["C", "F"])
+    def test_honest_ones_load_as_by_numpy_and_may_be_written_to(self, path, order):
+        array = np.asarray(np.arange(12, dtype=">i4").reshape(3, 4), order=order)
+        write_archive(path, {})
+        np.savez_compressed(path, x=array, nothing=np.zeros((0, 3)), word=np.array("text"))
+        loaded = load_arrays(path)
+        for name, expected in np.load(path).items():
+            assert loaded[name].dtype == expected.dtype
+            np.testing.assert_array_equal(loaded[name], expected)
+        loaded["x"][0, 0] = 7
+
+
+STATE = {"x": jnp.arange(3.0), "key": jax.random.key(0), "t": 2, "half": jnp.ones(2, "bfloat16")}
+
+
+class TestCheckpointsThatLie:
+    def spoil(self, path, **changes):
+        """A checkpoint of the state with some of its arrays changed or, by None, left out."""
+        mpfjax.save_checkpoint(path, STATE)
+        arrays = load_arrays(path)
+        changed = {
+            name if name == "description" else f"['{name}']": a for name, a in changes.items()
+        }
+        assert changed.keys() <= arrays.keys()
+        arrays |= changed
+        write_arrays(path, {name: array for name, array in arrays.items() if array is not None})
+
+    @pytest.mark.parametrize(
+        "description", ["null", "[]", "3", '"text"', "{", '{"x": 1}', "[" * 100_000, "[[1]]"]
+    )
+    def test_a_description_that_is_none_is_an_error_that_names_the_file(self, path, description):
+        self.spoil(path, description=np.array(description))
+        with pytest.raises(ValueError, match=r"checkpoint.npz"):
+            mpfjax.load_checkpoint(path, like=STATE)
+
+    @pytest.mark.parametrize("description", [np.arange(3), np.array(["{}", "{}"]), np.array(b"{}")])
+    def test_nor_is_an_array_of_something_else(self, path, description):
+        self.spoil(path, description=description)
+        with pytest.raises(ValueError, match=r"checkpoint.npz"):
+            mpfjax.load_checkpoint(path, like=STATE)
+
+    @pytest.mark.parametrize("name", STATE)
+    def test_a_missing_array_is_named(self, path, name):
+        self.spoil(path, **{name: None})
+        with pytest.raises(ValueError, match=rf"checkpoint.npz: .*\['{name}'\]"):
+            mpfjax.load_checkpoint(path, like=STATE)
+
+    @pytest.mark.parametrize(
+        ("name", "array"),
+        [
+            ("x", np.arange(4.0, dtype=np.float32)),
+            ("x", np.arange(3.0)),
+            ("x", np.arange(3, dtype=np.int32)),
+            ("x", np.zeros((3, 1), np.float32)),
+            ("x", np.array("abc")),
+            ("key", np.zeros(3, np.uint32)),
+            ("key", np.zeros(2, np.int32)),
+            ("t", np.array([2])),
+            ("t", np.array(2.5)),
+            ("t", np.array(True)),
+            ("half", np.ones(2, np.float16)),
+            ("half", np.ones(2, np.uint32)),
+        ],
+    )
+    def test_an_array_that_is_not_as_described_is_named(self, path, name, array):
+        self.spoil(path, **{name: array})
+        with pytest.raises(ValueError, match=rf"checkpoint.npz: .*\['{name}'\]"):
+            mpfjax.load_checkpoint(path, like=STATE)
+
+    def test_numbers_of_any_size_come_back(self, path):
+        state = {"small": -3, "large": 2**63, "complex": 1j, "yes": False}
+        mpfjax.save_checkpoint(path, state)
+        like = {"small": 0, "large": 0, "complex": 0j, "yes": True}
+        assert describe(state) == describe(like)
+        assert mpfjax.load_checkpoint(path, like) == state
+
+
+@pytest.mark.usefixtures("as_installed")
+@pytest.mark.parametrize("path", ["", None, 3, b"bytes", ["list"]])
+def test_a_path_that_is_none_is_named(path):
+    with pytest.raises(ValueError, match=r"^path: "):
+        mpfjax.save_checkpoint(path, MIXTURE)
+    with pytest.raises(ValueError, match=r"^path: "):
+        mpfjax.load_checkpoint(path, MIXTURE)
 
 
 class TestFullDisk:

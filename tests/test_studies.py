@@ -5,6 +5,7 @@ import io
 import json
 import multiprocessing
 import os
+import re
 import signal
 import sys
 import time
@@ -132,10 +133,6 @@ class TestResults:
         alone = mpfjax.run_study(one([4, 11]), tmp_path / "four")
         for cell, same in zip(results, alone, strict=True):
             np.testing.assert_allclose(cell["evidence"], same["evidence"], rtol=1e-4)
-
-    def test_slots_below_one_are_an_error(self, tmp_path):
-        with pytest.raises(ValueError, match="slots: 0 is less than 1"):
-            mpfjax.run_study(small_study(1), tmp_path, slots=0)
 
 
 class TestBrokenOff:
@@ -272,12 +269,46 @@ class TestOtherFiles:
         again = [path for path, time in times.items() if path.stat().st_mtime_ns != time]
         assert again == damaged
 
-    @pytest.mark.parametrize("content", ["", '{"axes"', "[]", "{}"])
-    def test_a_description_that_is_cut_off_is_named(self, copy, content):
+    @pytest.mark.parametrize(
+        "content",
+        [
+            "", '{"axes"', "[]", "{}", "null", "3", '"cells"', "[" * 200_000,
+            '{"cells": {}}', '{"cells": null}', '{"cells": []}', '{"cells": "0000-pf.npz"}',
+            *(
+                json.dumps({"axes": axes, "cells": {"0000-pf.npz": cell}})
+                for axes, cell in [
+                    ({"filter": ["pf"]}, None),
+                    ({"filter": ["pf"]}, {}),
+                    ({"filter": ["pf"]}, ["is", "filter"]),
+                    ({"filter": ["pf"]}, {"is": None, "filter": "0"}),
+                    ({"filter": ["pf"]}, {"is": {"noise": 1}, "filter": "0"}),
+                    (None, {"is": {"filter": "pf"}, "filter": "0"}),
+                ]
+            ),
+        ],
+        ids=range(18),
+    )  # fmt: skip
+    def test_a_description_that_is_none_is_named(self, copy, content):
         (copy / "study.json").write_text(content)
-        with pytest.raises(ValueError, match=r"study.json: "):
-            mpfjax.run_study(small_study(NUM_CELLS), copy)
+        for use in (lambda: mpfjax.run_study(small_study(NUM_CELLS), copy),
+                    lambda: studies.read_study(copy)):  # fmt: skip
+            with pytest.raises(ValueError, match=r"study.json: "):
+                use()
         assert len(files_of(copy)) == NUM_CELLS
+
+    @pytest.mark.parametrize(
+        "name", ["../x.npz", "/x.npz", "..", "a/../../x.npz", "a/x.npz", "..\\x.npz", "", "\0.npz",
+                 "study.json"]
+    )  # fmt: skip
+    def test_a_cell_that_leads_out_of_the_folder_is_named(self, copy, name):
+        manifest = json.loads((copy / "study.json").read_text())
+        cells = list(manifest["cells"].values())
+        manifest["cells"] |= {name: cells[0]}
+        (copy / "study.json").write_text(json.dumps(manifest))
+        for use in (lambda: mpfjax.run_study(small_study(NUM_CELLS), copy),
+                    lambda: studies.read_study(copy)):  # fmt: skip
+            with pytest.raises(ValueError, match=r"study.json: .*" + re.escape(repr(name))):
+                use()
 
     def test_a_folder_without_a_study_is_named(self, tmp_path):
         with pytest.raises(FileNotFoundError, match=r"study.json"):
@@ -347,6 +378,39 @@ class TestBadInput:
             ({"keys": jax.random.key(0)}, "keys: "),
             ({"observations": np.array([1.0, np.nan])}, "observations: "),
             ({"missing": "no"}, "missing: "),
+            ({"filters": None}, "filters: None"),
+            ({"filters": 3}, "filters: 3"),
+            ({"filters": "pf"}, "filters: 'pf'"),
+            ({"filters": [build]}, r"filters: \["),
+            ({"filters": {"pf": None}}, "filters: None, for 'pf', "),
+            ({"filters": {"pf": build(8, 0.1)}}, "filters: Filter"),
+            ({"num_particles": None}, "num_particles: None"),
+            ({"num_particles": 8}, "num_particles: 8"),
+            ({"num_particles": "88"}, "num_particles: '88'"),
+            ({"num_particles": {8: 1}}, r"num_particles: \{8: 1\}"),
+            ({"num_particles": np.array(8)}, "num_particles: 8"),
+            ({"num_particles": [8.0]}, "num_particles: 8.0"),
+            ({"num_particles": [8, "9"]}, "num_particles: '9'"),
+            ({"num_particles": [True]}, "num_particles: True"),
+            ({"num_particles": [None]}, "num_particles: None"),
+            ({"num_particles": [float("nan")]}, "num_particles: nan"),
+            ({"settings": None}, "settings: None"),
+            ({"settings": 3}, "settings: 3"),
+            ({"settings": "noise"}, "settings: 'noise'"),
+            ({"settings": ["noise"]}, "settings: "),
+            ({"settings": {"noise": None}}, "noise: None"),
+            ({"settings": {"noise": 0.1}}, "noise: 0.1"),
+            ({"settings": {"noise": "abc"}}, "noise: 'abc'"),
+            ({"settings": {3: [0.1]}}, "settings: 3"),
+            ({"keys": None}, "keys: None"),
+            ({"keys": 4}, "keys: 4"),
+            ({"keys": np.zeros((4, 2), np.uint32)}, "(?s)keys: .*old kind"),
+            ({"measure": None}, "measure: None"),
+            ({"measure": "evidence"}, "measure: 'evidence'"),
+            ({"collect": 3}, "collect: 3"),
+            ({"observations": None}, "observations: "),
+            ({"observations": "1.5"}, "observations: "),
+            ({"missing": None}, "missing: "),
         ],
     )
     def test_to_the_study_is_an_error_at_once(self, changes, named):
@@ -378,7 +442,36 @@ class TestBadInput:
         with pytest.raises(ValueError, match=named):
             mpfjax.run_study(small_study(measure=measured), tmp_path)
 
-    @pytest.mark.parametrize("options", [{"seeds_at_once": 0}, {"cells_at_once": 0}])
-    def test_to_run_study_is_named(self, tmp_path, options):
-        with pytest.raises(ValueError, match=f"{next(iter(options))}: 0 is less than 1"):
-            mpfjax.run_study(small_study(), tmp_path, **options)
+    @pytest.mark.parametrize("name", ["seeds_at_once", "cells_at_once", "slots"])
+    @pytest.mark.parametrize("number", [0, -1, 1.5, 2.0, "2", float("nan"), True, [1]])
+    def test_to_run_study_is_named(self, tmp_path, name, number):
+        with pytest.raises(ValueError, match=rf"^{name}: {re.escape(repr(number))}"):
+            mpfjax.run_study(small_study(), tmp_path, **{name: number})
+        assert not list(tmp_path.iterdir())
+
+    def test_to_cells_at_once_is_named_where_there_is_none(self, tmp_path):
+        with pytest.raises(ValueError, match=r"^cells_at_once: None"):
+            mpfjax.run_study(small_study(), tmp_path, cells_at_once=None)
+
+    @pytest.mark.parametrize("study", [None, "study", {}, mpfjax.Study])
+    def test_what_is_no_study_is_named(self, tmp_path, study):
+        with pytest.raises(ValueError, match=r"^study: "):
+            mpfjax.run_study(study, tmp_path)
+
+    @pytest.mark.parametrize("directory", ["", None, 3, b"results"])
+    def test_what_is_no_directory_is_named(self, tmp_path, monkeypatch, directory):
+        monkeypatch.chdir(tmp_path)
+        for use in (lambda: mpfjax.run_study(small_study(), directory),
+                    lambda: studies.read_study(directory)):  # fmt: skip
+            with pytest.raises(ValueError, match=r"^directory: "):
+                use()
+        assert not list(tmp_path.iterdir())
+
+    def test_a_directory_that_is_a_file_is_named(self, tmp_path):
+        path = tmp_path / "results"
+        path.write_text("mine")
+        for use in (lambda: mpfjax.run_study(small_study(), path),
+                    lambda: studies.read_study(path)):  # fmt: skip
+            with pytest.raises(ValueError, match=r"^directory: .*results is a file"):
+                use()
+        assert path.read_text() == "mine"

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mpfjax.checks import to_rows
+
 REACH = (0.75, 0.5)
 
 
@@ -34,8 +36,10 @@ def coverage(tracks: Float[np.ndarray, "r 6"], objects: Float[np.ndarray, "s 6"]
     In a frame only the objects that have a box there count. The identity of an object is the
     track that it was last assigned to: it keeps that one while the track covers it; where it does
     not, the object is assigned to the nearest covering track that no other object keeps, and a
-    swap is counted if it had another before. Raises `ValueError` where there are no true boxes.
+    swap is counted if it had another before. Raises `ValueError` where there are no true boxes, and
+    for what is no rows of six finite numbers.
     """
+    tracks, objects = _checked(tracks, "tracks"), _checked(objects, "objects")
     if len(objects) == 0:
         raise ValueError("objects: there are no true boxes to score against")
     complete: list[bool] = []
@@ -64,6 +68,13 @@ def covers(
 ) -> Bool[np.ndarray, "r s"]:
     """Which box covers which object: |dx| < 0.75 w and |dy| < 0.5 h of the object's box."""
     return np.all(_offsets(boxes, objects) < np.array(REACH), axis=-1)
+
+
+def _checked(rows: np.ndarray, argument: str) -> np.ndarray:
+    rows = to_rows(6, argument, rows)
+    if not np.all(np.isfinite(rows)):
+        raise ValueError(f"{argument}: holds numbers that are not finite")
+    return rows
 
 
 def _offsets(boxes: np.ndarray, objects: np.ndarray) -> np.ndarray:

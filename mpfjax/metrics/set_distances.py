@@ -5,14 +5,15 @@ compiles once and `jax.vmap` runs over the frames. Both pair estimates with obje
 total cost, each entry in one pair at most, and charge for what is left alone.
 """
 
-import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 from optax.assignment import hungarian_algorithm
+
+from mpfjax.checks import check_callable, check_finite, check_positive, check_shape
 
 # Without this, every call outside of `jax.jit` would compile the search anew.
 _assign = jax.jit(hungarian_algorithm)
@@ -65,10 +66,11 @@ def ospa(
     empty. `cutoff` and `order` are Python numbers. Entries that a mask leaves out may hold
     anything; a NaN in one that counts makes the distance NaN where the other set is not empty.
 
-    Raises `ValueError` for a cutoff that is not positive and finite, and for an order below 1 or
-    infinite. Use it where an error per object is asked for; `gospa` says how many were missed.
+    Raises `ValueError` for sets that are no arrays, masks of another length, a cutoff that is not
+    positive and finite, and an order below 1 or infinite. Use it where an error per object is asked
+    for; `gospa` says how many were missed.
     """
-    _check(cutoff, order)
+    _check(estimates, truths, estimate_mask, truth_mask, cutoff, order, base_distance)
     pairing = _cheapest_pairing(
         base_distance(estimates, truths) / cutoff, estimate_mask, truth_mask, order, 1.0
     )
@@ -97,12 +99,12 @@ def gospa(
     estimate, at c^p / 2 each. With alpha below 2 the parts still add up, but an entry left over
     costs c^p / alpha. Two empty sets are at distance 0. Numbers, masks and NaN are as in `ospa`.
 
-    Raises `ValueError` for a cutoff that is not positive and finite, for an order below 1 or
-    infinite, and for an alpha outside (0, 2]. Use it to score trackers that may lose objects or
-    invent them, with alpha at 2.
+    Raises `ValueError` as `ospa` does, and for an alpha outside (0, 2]. Use it to score trackers
+    that may lose objects or invent them, with alpha at 2.
     """
-    _check(cutoff, order)
-    if not 0 < alpha <= 2:
+    _check(estimates, truths, estimate_mask, truth_mask, cutoff, order, base_distance)
+    check_positive(alpha=alpha)
+    if alpha > 2:
         raise ValueError(f"alpha: {alpha} is not in (0, 2]")
     pairing = _cheapest_pairing(
         base_distance(estimates, truths) / cutoff, estimate_mask, truth_mask, order, 1.0 / alpha
@@ -153,8 +155,28 @@ def _all_unless_given(mask: Bool[Array, " k"] | None, size: int) -> Bool[Array, 
     return jnp.ones(size, bool) if mask is None else mask
 
 
-def _check(cutoff: float, order: float) -> None:
-    if not 0 < cutoff < math.inf:
-        raise ValueError(f"cutoff: {cutoff} is not positive and finite")
-    if not 1 <= order < math.inf:
-        raise ValueError(f"order: {order} is not at least 1 and finite")
+def _check(
+    estimates: Any,
+    truths: Any,
+    estimate_mask: Any,
+    truth_mask: Any,
+    cutoff: float,
+    order: float,
+    base_distance: Any,
+) -> None:
+    sets = {"estimate": ("estimates", estimates), "truth": ("truths", truths)}
+    masks = {"estimate": estimate_mask, "truth": truth_mask}
+    for kind, (name, entries) in sets.items():
+        check_shape("number d", **{name: entries})
+        mask = masks[kind]
+        if mask is not None:
+            check_shape("number", **{f"{kind}_mask": mask})
+            if mask.shape != entries.shape[:1] or mask.dtype != bool:
+                raise ValueError(
+                    f"{kind}_mask: {mask.dtype}{mask.shape} is no mask of {entries.shape[0]} {name}"
+                )
+    check_positive(cutoff=cutoff)
+    check_finite(order=order)
+    if order < 1:
+        raise ValueError(f"order: {order} is less than 1")
+    check_callable("a function of two sets", base_distance=base_distance)

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mpfjax.checks import check_shape, check_whole
+
 
 class TrackingQuality(NamedTuple):
     """What `tracking_quality` found, each of shape (objects,), rates and shares in [0, 1].
@@ -85,8 +87,7 @@ def recovery_rate(
     Raises `ValueError` for no runs or no frames, or `num_last` below 1.
     """
     _check(track_states)
-    if num_last < 1:
-        raise ValueError(f"num_last: {num_last} is less than 1")
+    check_whole(num_last=num_last)
     if present is None:
         present = jnp.ones(track_states.shape[1:], bool)
     to_come = jnp.cumsum(present[::-1].astype(jnp.int32), axis=0)[::-1]
@@ -103,8 +104,16 @@ def tracking_quality(
     """All measures of section 3.1 for each object, over runs.
 
     A frame in which an object's true box holds a NaN has no such object and does not count for
-    it. `num_last` is that of `recovery_rate`. Raises `ValueError` for no runs or no frames.
+    it. `num_last` is that of `recovery_rate`. Raises `ValueError` for no runs or no frames, for
+    boxes of other shapes, and as `recovery_rate` does.
     """
+    check_shape("runs t objects 4", estimates=estimates)
+    check_shape("t objects 4", truth=truth)
+    if truth.shape != estimates.shape[1:]:
+        raise ValueError(
+            f"truth: shape {truth.shape} is not {estimates.shape[1:]}, that of one run's estimates"
+        )
+    check_whole(num_last=num_last)
     present = jnp.all(jnp.isfinite(truth), axis=-1)
     states = track_state(estimates, truth[None])
     _check(states)

@@ -5,6 +5,8 @@ from types import ModuleType
 import numpy as np
 from jaxtyping import Float
 
+from mpfjax.checks import check_type, check_whole, to_rows
+
 _SETTINGS = {"THRESHOLD": 0.5, "PRINT_CONFIG": False}
 
 
@@ -26,13 +28,19 @@ def multi_object_scores(
     - "IDF1", Ristani et al. (2016), at an IoU of 0.5.
 
     Without tracks every object is a miss and every ratio 0. A box without area overlaps nothing.
-    Raises `ValueError` where an id has two boxes in one frame, where a number is not finite,
-    where `frames` ends before it begins, and where there are no true boxes to score against;
+    Raises `ValueError` for what is no rows of six numbers, where an id has two boxes in one frame,
+    where a number is not finite, where `frames` ends before it begins or is no pair of whole
+    numbers, and where there are no true boxes to score against;
     `ImportError` without the extra "trackeval". Use it to compare with published trackers;
     `coverage` is looser about the boxes' size.
     """
     tracks, truth = _checked(tracks, "tracks"), _checked(truth, "truth")
     if frames is not None:
+        check_type((tuple, list), "the first and the last frame", frames=frames)
+        if len(frames) != 2:
+            raise ValueError(f"frames: {frames} is not the first and the last frame")
+        for frame in frames:
+            check_whole(0, frames=frame)
         first, last = frames
         if first > last:
             raise ValueError(f"frames: {last}, the last, comes before {first}, the first")
@@ -70,7 +78,7 @@ def overlap(
 
 
 def _checked(rows: np.ndarray, argument: str) -> np.ndarray:
-    rows = np.asarray(rows, float).reshape(-1, 6)
+    rows = to_rows(6, argument, rows)
     if not np.all(np.isfinite(rows)):
         raise ValueError(f"{argument}: holds numbers that are not finite")
     keys, counts = np.unique(rows[:, :2], axis=0, return_counts=True)

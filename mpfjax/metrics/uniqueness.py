@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree, Shaped
 
+from mpfjax.checks import check_type
 from mpfjax.mixture import ParticleMixture, flatten_states
 
 
@@ -13,8 +14,10 @@ def uniqueness(mixture: ParticleMixture) -> Float[Array, " objects"]:
     Smith and Gatica-Perez (2004), section 3.1. Two particles hold the same hypothesis of object
     j where all of its state is equal. Particles have leaves (n, J, ...); empty slots hold none.
     Pass it as `collect` to see it after every step: a weighted resampling within the step lowers
-    it for the objects that have moved, as in the paper's figure 4.
+    it for the objects that have moved, as in the paper's figure 4. Raises `ValueError` for
+    particles of other shapes.
     """
+    _check(mixture)
     distinct = jax.vmap(lambda states: _distinct_rows(states, mixture), in_axes=1)
     return distinct(mixture.particles) / jnp.asarray(mixture.room, mixture.log_weights.dtype)
 
@@ -25,8 +28,10 @@ def effective_dynamics(mixture: ParticleMixture) -> PyTree:
     Smith and Gatica-Perez (2004), section 3.1, at the end of a step. Every filled slot counts
     the same, whatever its weight: it measures how far the search reaches, and not the posterior.
     Over the variance of the dynamics' noise it is figure 4's percentage, which resampling
-    lowers for the first objects of an order and which may exceed 100% for the last.
+    lowers for the first objects of an order and which may exceed 100% for the last. Raises
+    `ValueError` for particles of other shapes.
     """
+    _check(mixture)
     occupied = mixture.occupied
 
     def variance(leaf: Shaped[Array, "n objects *rest"]) -> Float[Array, "objects *rest"]:
@@ -39,6 +44,13 @@ def effective_dynamics(mixture: ParticleMixture) -> PyTree:
         return jnp.sum(squares, axis=0) / count
 
     return jax.tree.map(variance, mixture.particles)
+
+
+def _check(mixture: ParticleMixture) -> None:
+    check_type(ParticleMixture, "a ParticleMixture", mixture=mixture)
+    shapes = [leaf.shape for leaf in jax.tree.leaves(mixture.particles)]
+    if any(len(shape) < 2 for shape in shapes):
+        raise ValueError(f"mixture: particles of shapes {shapes} are not of objects, (n, J, ...)")
 
 
 def _distinct_rows(states: PyTree, mixture: ParticleMixture) -> Float[Array, ""]:

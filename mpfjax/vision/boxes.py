@@ -5,11 +5,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from mpfjax.checks import check_type, check_whole, shown, to_rows
+
 _COLUMNS = range(7, 11)
 
 
 def parse_box(text: str, argument: str = "box") -> Float[np.ndarray, "4"]:
     """Read "x,y,w,h" in pixels. Raises `ValueError` naming `argument` where it is not that."""
+    check_type(str, "a text x,y,w,h", **{argument: text})
     try:
         box = np.array([float(part) for part in text.split(",")])
     except ValueError:
@@ -22,9 +25,15 @@ def parse_box(text: str, argument: str = "box") -> Float[np.ndarray, "4"]:
 def check_boxes(
     boxes: Float[np.ndarray, "k 4"], height: int, width: int, argument: str = "boxes"
 ) -> None:
-    """Raise `ValueError` for a box without area, or wholly outside a frame of this size."""
-    for x, y, w, h in np.asarray(boxes).tolist():
+    """Raise `ValueError` for a box without area, or wholly outside a frame of this size.
+
+    Also for boxes that are not four finite numbers each, and a size that is no whole number.
+    """
+    check_whole(height=height, width=width)
+    for x, y, w, h in to_rows(4, argument, boxes).tolist():
         named = f"{argument}: {x:g},{y:g},{w:g},{h:g}"
+        if not np.all(np.isfinite([x, y, w, h])):
+            raise ValueError(f"{named} is not finite")
         if not (w > 0 and h > 0):
             raise ValueError(f"{named} has no area")
         # Less than a pixel inside may hold no pixel's centre, and so no colour to track.
@@ -50,6 +59,7 @@ def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     Frames count from 1. Raises `ValueError` naming the file and the line where one does not
     parse, and where the file holds no box at all.
     """
+    check_type((str, Path), "a path", path=path)
     lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
     rows = [_parse_row(path, i, line) for i, line in enumerate(lines, 1) if line.strip()]
     if not rows:
@@ -58,8 +68,16 @@ def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
 
 
 def write_tracks(path: str | Path, rows: Float[np.ndarray, "rows 6"]) -> None:
-    """Write rows (frame, id, x, y, w, h) in MOTChallenge form, in the order of the frames."""
-    rows = np.asarray(rows, float).reshape(-1, 6)
+    """Write rows (frame, id, x, y, w, h) in MOTChallenge form, in the order of the frames.
+
+    Raises `ValueError` for rows that could not be read again: not six finite numbers each, or a
+    frame or an id that is no whole number from 0 on.
+    """
+    check_type((str, Path), "a path", path=path)
+    rows = to_rows(6, "rows", rows)
+    for row in rows:
+        if not np.all(np.isfinite(row)) or np.any(row[:2] < 0) or np.any(row[:2] % 1):
+            raise ValueError(f"rows: {shown(row)} is not frame,id,x,y,w,h")
     ordered = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
     lines = [
         f"{int(frame)},{int(track)},{x:.3f},{y:.3f},{w:.3f},{h:.3f},1,-1,-1,-1\n"

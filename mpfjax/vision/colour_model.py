@@ -1,24 +1,41 @@
 """The colour tracking model of Vermaak et al. (2003), section 5.2, and Lin et al. (2012), 2."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt8
 
+from mpfjax.checks import (
+    check_flag,
+    check_not_negative,
+    check_positive,
+    check_share,
+    check_type,
+    check_whole,
+    given,
+    shown,
+    to_rows,
+)
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
 from mpfjax.vision.boxes import centred, check_boxes
 from mpfjax.vision.colours import AbstractColours, RGBColours
+from mpfjax.vision.frames import check_frame
 from mpfjax.vision.histograms import (
     IntegralHistogram,
     bhattacharyya,
     integral_histogram,
     normalise,
+    num_pixels,
 )
 
 PAPER_VARIANCES = (2.5, 1.5, 0.05, 0.05)
 _SURROUND = 2.0
+# A box of more pixels cannot be counted in 16 bits.
+_LARGEST_NARROW = 2**16 - 1
 
 
 class BoxState(eqx.Module):
@@ -122,8 +139,9 @@ class ColourModel(AbstractBoxModel):
       surround does, so that grass within a box counts for little.
 
     An observation is an RGB frame, uint8 of shape (h, w, 3), or its `IntegralHistogram`. A box
-    outside the frame holds no colour and lies at the largest distance, B = 1. Make one with
-    `from_frame`. Use it for objects that keep their colours, among other colours.
+    outside the frame holds no colour and lies at the largest distance, B = 1; so does a box of more
+    pixels than can be counted, see `wide_counts`. Make one with `from_frame`. Use it for objects
+    that keep their colours, among other colours.
 
     - `reference_boxes`: (k, 4), centre and size in pixels; x_0 scatters about them.
     - `references`, `colour_weights`: h_ref and the weights of its colours, (k, parts, channels,
@@ -135,8 +153,10 @@ class ColourModel(AbstractBoxModel):
     - `colours`: the bins of the histograms.
     - `switch_probability`: with which r is drawn anew, from all references, in a frame.
     - `contrast`: how much it speaks for a box that what lies to its sides, half a width each, does
-      not have the reference's colours; 0, as in the paper, looks at the box alone.
-    - `wide_counts`: count pixels in 32 bits; see `integral_histogram`.
+      not have the reference's colours; 0, as in the paper, looks at the box alone. Sides that
+      cannot be counted, of a box that is too large with them, do not speak for it.
+    - `wide_counts`: count pixels in 32 bits; see `integral_histogram`. Without it a box, or with
+      `contrast` a box and its sides, has at most 65 535 pixels.
     """
 
     reference_boxes: Float[Array, "k 4"]
@@ -180,35 +200,36 @@ class ColourModel(AbstractBoxModel):
         - `switch_probability`: with which a particle's reference is drawn anew in a frame.
         - `contrast`: the weight of the unlikeness of a box's two sides.
 
-        Raises `ValueError` naming the argument for a box of no area or outside the frame, for a
-        number that is not positive, and for a probability outside [0, 1].
+        Raises `ValueError` naming the argument for one of another kind, for a frame that is not
+        (h, w, 3) of type uint8, for a box of no area or outside the frame, for a number that is not
+        positive, and for a probability outside [0, 1].
         """
-        boxes = np.asarray(boxes, float).reshape(-1, 4)
+        check_frame(frame)
+        boxes = to_rows(4, "boxes", boxes)
         if len(boxes) == 0:
             raise ValueError("boxes: there are none")
         check_boxes(boxes, *frame.shape[:2])
         colours = RGBColours() if colours is None else colours
-        deviations = np.sqrt(PAPER_VARIANCES) if deviations is None else np.asarray(deviations)
-        if not sigma > 0:
-            raise ValueError(f"sigma: {sigma} is not positive")
-        if num_parts < 1:
-            raise ValueError(f"num_parts: {num_parts} is less than 1")
-        if not 0 <= switch_probability <= 1:
-            raise ValueError(f"switch_probability: {switch_probability} is not in [0, 1]")
-        if contrast < 0:
-            raise ValueError(f"contrast: {contrast} is negative")
-        if deviations.shape not in ((4,), (len(boxes), 4)) or not np.all(deviations > 0):
-            raise ValueError(f"deviations: {deviations} are not four positive numbers a box")
-        # Room for boxes to grow to twice the area of the largest reference.
-        wide_counts = bool(2 * np.prod(boxes[:, 2:], axis=1).max() >= 2**16)
-        table = integral_histogram(jnp.asarray(frame), colours, wide_counts)
+        check_type(AbstractColours, "AbstractColours such as RGBColours()", colours=colours)
+        kind = "AbstractDynamics such as RandomWalk(deviations)"
+        check_type(AbstractDynamics, kind, **given(dynamics=dynamics))
+        deviations = positive_deviations(
+            np.sqrt(PAPER_VARIANCES) if deviations is None else deviations, len(boxes)
+        )
+        check_positive(sigma=sigma)
+        check_whole(num_parts=num_parts)
+        check_flag(weigh_colours=weigh_colours, share_reference=share_reference)
+        check_share(switch_probability=switch_probability)
+        check_not_negative(contrast=contrast)
         places = jnp.asarray(centred(boxes), float)
-        references, weights = _references(table, places, num_parts, weigh_colours)
+        references, weights = _references(frame, colours, places, num_parts, weigh_colours)
         if share_reference:
             references = jnp.broadcast_to(references.mean(0, keepdims=True), references.shape)
             size = places[:, 2:].mean(0, keepdims=True)
             places = places.at[:, 2:].set(jnp.broadcast_to(size, (len(boxes), 2)))
         steps = jnp.broadcast_to(jnp.asarray(deviations, float), (len(boxes), 4))
+        # Room for boxes to grow to twice the area of the largest reference.
+        room = 2 * np.prod(boxes[:, 2:], axis=1).max() * (_SURROUND if contrast > 0 else 1)
         return cls(
             reference_boxes=places,
             references=references,
@@ -219,7 +240,7 @@ class ColourModel(AbstractBoxModel):
             colours=colours,
             switch_probability=switch_probability,
             contrast=contrast,
-            wide_counts=wide_counts,
+            wide_counts=bool(room > _LARGEST_NARROW),
         )
 
     def log_likelihood(
@@ -233,7 +254,9 @@ class ColourModel(AbstractBoxModel):
             boxes = self.boxes(states)
             wide = boxes * jnp.array([[1.0, 1.0, _SURROUND, 1.0]], boxes.dtype)
             sides = observation.counts(wide, num_parts) - observation.counts(boxes, num_parts)
-            distances -= self.contrast * self._to_reference(sides, states)
+            uncounted = jnp.isnan(sides[:, 0, 0, 0])
+            around = jnp.where(uncounted, 0.0, self._to_reference(sides, states))
+            distances -= self.contrast * around
         return -0.5 * distances / self.sigma**2
 
     def prepare_observation(
@@ -269,6 +292,18 @@ class ColourModel(AbstractBoxModel):
         return jnp.mean(jnp.sum(distances, axis=2), axis=1)
 
 
+def positive_deviations(deviations: Any, num_boxes: int) -> np.ndarray:
+    """Four positive numbers, for all boxes or a row for each, or a `ValueError`."""
+    try:
+        numbers = np.asarray(deviations, float)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    fits = numbers.shape in ((4,), (num_boxes, 4))
+    if not fits or not np.all((numbers > 0) & np.isfinite(numbers)):
+        raise ValueError(f"deviations: {shown(deviations)} are not four positive numbers a box")
+    return numbers
+
+
 def _for_each(dynamics: AbstractDynamics, num_boxes: int) -> AbstractDynamics:
     """The dynamics with a row of parameters for each box."""
     if dynamics.is_shared:
@@ -280,13 +315,19 @@ def _for_each(dynamics: AbstractDynamics, num_boxes: int) -> AbstractDynamics:
 
 
 def _references(
-    table: IntegralHistogram, places: Float[Array, "k 4"], num_parts: int, weigh_colours: bool
+    frame: UInt8[np.ndarray, "h w 3"],
+    colours: AbstractColours,
+    places: Float[Array, "k 4"],
+    num_parts: int,
+    weigh_colours: bool,
 ) -> tuple[Float[Array, "k parts channels bins"], Float[Array, "k parts channels bins"]]:
     """The normalised histograms of the reference boxes, and the weights of their colours."""
+    around = places * jnp.array([[1.0, 1.0, _SURROUND, _SURROUND]], places.dtype)
+    largest = jnp.max(num_pixels(around if weigh_colours else places, *frame.shape[:2]))
+    table = integral_histogram(jnp.asarray(frame), colours, bool(largest > _LARGEST_NARROW))
     counts = table.counts(places, num_parts)
     if not weigh_colours:
         return normalise(counts), jnp.ones_like(counts)
-    around = places * jnp.array([[1.0, 1.0, _SURROUND, _SURROUND]], places.dtype)
     ring = table.counts(around)[:, 0, None] - jnp.sum(counts, axis=1, keepdims=True)
     inside, outside = normalise(counts), normalise(ring)
     share = inside + outside

@@ -6,6 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
+from mpfjax.checks import check_share, check_whole
+
 
 class AbstractColours(eqx.Module):
     """A way to sort the pixels of an RGB frame into bins, in one or more channels.
@@ -74,9 +76,7 @@ class HSVColours(AbstractColours):
             num_saturations=self.num_saturations,
             num_values=self.num_values,
         )
-        for name in ("least_saturation", "least_value"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name}: {getattr(self, name)} is not in [0, 1]")
+        check_share(least_saturation=self.least_saturation, least_value=self.least_value)
 
     @property
     def num_channels(self) -> int:
@@ -126,5 +126,6 @@ def _bin(share: Float[Array, "h w"], num_bins: int) -> Int[Array, "h w"]:
 
 def _check_bins(**numbers: int) -> None:
     for name, number in numbers.items():
-        if not 1 <= number <= 256:
+        check_whole(**{name: number})
+        if number > 256:
             raise ValueError(f"{name}: {number} is not between 1 and 256")

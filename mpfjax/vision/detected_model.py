@@ -6,7 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, UInt8
 
-from mpfjax.models.base import AbstractStateSpaceModel, require_positive
+from mpfjax.checks import (
+    check_positive_array,
+    check_share,
+    check_type,
+    check_whole,
+    to_array,
+    to_rows,
+)
+from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.operations import take
 from mpfjax.proposals import AbstractProposal
 from mpfjax.vision.boxes import centred
@@ -31,12 +39,8 @@ class Detections(eqx.Module):
         They may leave the frame in part or as a whole. Raises `ValueError` for boxes that are not
         four finite numbers each, or without area, and for room for less than one.
         """
-        boxes = np.asarray(boxes, np.float32)
-        boxes = boxes.reshape(-1, 4) if boxes.size == 0 else boxes
-        if max_detections < 1:
-            raise ValueError(f"max_detections: {max_detections} is less than 1")
-        if boxes.ndim != 2 or boxes.shape[1] != 4:
-            raise ValueError(f"boxes: {boxes.shape} is not the shape (k, 4) of boxes x,y,w,h")
+        check_whole(max_detections=max_detections)
+        boxes = to_rows(4, "boxes", boxes).astype(np.float32)
         for box in boxes:
             if not (np.isfinite(box).all() and (box[2:] > 0).all()):
                 raise ValueError(f"boxes: {box.tolist()} has no area, or is not finite")
@@ -76,14 +80,17 @@ class DetectedColourModel(AbstractStateSpaceModel):
 
     colour: ColourModel
     deviations: Float[Array, "4"] = eqx.field(
-        converter=jnp.asarray, default_factory=lambda: jnp.array([0.2, 0.1, 0.25, 0.15])
+        converter=to_array("deviations"), default_factory=lambda: jnp.array([0.2, 0.1, 0.25, 0.15])
     )
-    miss: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.02)
+    miss: Float[Array, ""] = eqx.field(converter=to_array("miss"), default=0.02)
 
     def __check_init__(self) -> None:
+        check_type(ColourModel, "a ColourModel", colour=self.colour)
         if self.deviations.shape != (4,):
             raise ValueError(f"deviations: {self.deviations} are not four numbers")
-        require_positive(deviations=self.deviations, miss=self.miss)
+        if self.miss.shape != ():
+            raise ValueError(f"miss: {self.miss} is not one number")
+        check_positive_array(deviations=self.deviations, miss=self.miss)
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> BoxState:
         """x_0 of the colour model."""
@@ -125,8 +132,10 @@ class DetectionProposal(AbstractProposal):
     share: float = eqx.field(static=True, default=0.8)
 
     def __check_init__(self) -> None:
-        if not 0 <= self.share < 1:
-            raise ValueError(f"share: {self.share} is not in [0, 1)")
+        check_type(DetectedColourModel, "a DetectedColourModel", model=self.model)
+        check_share(share=self.share)
+        if self.share == 1:
+            raise ValueError("share: 1 leaves nothing to the dynamics; it has to be in [0, 1)")
 
     def propose(
         self, key: Key[Array, ""], observation: DetectedFrame, previous_states: BoxState

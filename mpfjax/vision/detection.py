@@ -2,9 +2,21 @@
 
 from collections.abc import Iterable
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+
+from mpfjax.checks import (
+    check_inner_share,
+    check_positive,
+    check_share,
+    check_type,
+    check_whole,
+    given,
+    shown,
+)
+from mpfjax.vision.frames import check_frame
 
 # What OpenCV's mask holds where a pixel is foreground; a shadow has another value.
 _FOREGROUND = 255
@@ -56,25 +68,17 @@ class BackgroundSubtraction:
         cut_aspect: float | None = 2.5,
         cut_depth: float = 0.9,
     ) -> None:
-        for name, count in (("history", history), ("warm_up", warm_up)):
-            if not (1 <= count < np.inf and count == int(count)):
-                raise ValueError(f"{name}: {count} is not a whole number from 1 on")
-        for name, value in (("threshold", threshold), ("cut_aspect", cut_aspect)):
-            if value is not None and not 0 < value < np.inf:
-                raise ValueError(f"{name}: {value} is not positive and finite")
-        for name, value in (
-            ("background_share", background_share),
-            ("shadow_brightness", shadow_brightness),
-            ("cut_depth", cut_depth),
-        ):
-            if value is not None and not 0 < value < 1:
-                raise ValueError(f"{name}: {value} is not in (0, 1)")
-        if not 0 <= largest_gap < 1:
-            raise ValueError(f"largest_gap: {largest_gap} is not in [0, 1)")
-        if not 0 <= area[0] < area[1] <= 1:
-            raise ValueError(f"area: {area} is not a range within [0, 1]")
-        if not 0 < aspect[0] < aspect[1] < np.inf:
-            raise ValueError(f"aspect: {aspect} is not a range of positive numbers")
+        check_whole(history=history, warm_up=warm_up)
+        check_positive(threshold=threshold, **given(cut_aspect=cut_aspect))
+        check_inner_share(background_share=background_share, cut_depth=cut_depth)
+        check_inner_share(**given(shadow_brightness=shadow_brightness))
+        check_share(largest_gap=largest_gap)
+        if largest_gap == 1:
+            raise ValueError("largest_gap: 1 is not in [0, 1)")
+        if not 0 <= _range(area)[0] < _range(area)[1] <= 1:
+            raise ValueError(f"area: {shown(area)} is not a range within [0, 1]")
+        if not 0 < _range(aspect)[0] < _range(aspect)[1] < np.inf:
+            raise ValueError(f"aspect: {shown(aspect)} is not a range of positive numbers")
         self._cv2 = _cv2()
         self.history = int(history)
         self.threshold = threshold
@@ -96,6 +100,7 @@ class BackgroundSubtraction:
         someone who stands still, counts as background. Use it where the whole video is at hand.
         Raises `ValueError` where there are no frames, and for frames as `detect` does.
         """
+        check_type(Iterable, "frames one after the other", frames=frames)
         self._forget()
         for number, frame in enumerate(frames, 1):
             self._subtract(frame, rate=1 / number)
@@ -135,10 +140,7 @@ class BackgroundSubtraction:
     def _subtract(self, frame: np.ndarray, rate: float) -> np.ndarray:
         """1 where a pixel is foreground; the frame joins the background with weight `rate`."""
         frame = np.asarray(frame)
-        if frame.ndim != 3 or frame.shape[2] != 3 or frame.size == 0:
-            raise ValueError(f"frame: {frame.shape} is not the shape (h, w, 3) of a colour image")
-        if frame.dtype != np.uint8:
-            raise ValueError(f"frame: {frame.dtype} is not uint8")
+        check_frame(frame)
         # OpenCV would silently start a new background.
         if self._shape is not None and frame.shape != self._shape:
             raise ValueError(
@@ -195,6 +197,15 @@ class BackgroundSubtraction:
         shares = width * height / pixels
         sized = (shares >= self.area[0]) & (shares <= self.area[1])
         return sized & (height >= self.aspect[0] * width) & (height <= self.aspect[1] * width)
+
+
+def _range(values: Any) -> np.ndarray:
+    """Two numbers, or twice NaN where they are something else, which is in no range."""
+    try:
+        numbers = np.asarray(values, float)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    return numbers if numbers.shape == (2,) else np.full(2, np.nan)
 
 
 def _size(shape: tuple[int, ...]) -> str:

@@ -6,6 +6,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
+from mpfjax.checks import check_key, check_whole
+
 _HEIGHT, _WIDTH = 288, 360
 _SIZE = np.array([32.0, 40.0])  # of every object, width and height
 _STEP_DEVIATION, _MOMENTUM = 3.0, 0.5
@@ -65,8 +67,8 @@ def distracter_scene(key: Key[Array, ""], num_frames: int = 25) -> DistracterSce
 
     Raises `ValueError` for fewer frames than the three up to the distracter.
     """
-    if num_frames < _APPEARS:
-        raise ValueError(f"num_frames: {num_frames} is less than {_APPEARS}")
+    check_key(key)
+    check_whole(_APPEARS, num_frames=num_frames)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
     corners = np.round(_paths(rng, num_frames) - _SIZE / 2)
     corners, bait = corners[:, :-1], corners[:, -1]

@@ -3,9 +3,12 @@
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
+
+from mpfjax.checks import check_positive, check_shape, check_type, check_whole, given
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp")
 
@@ -18,8 +21,10 @@ def read_frames(
     `path` is a video file, a folder of images in the order of their names, or a folder with
     such a folder `img`. Raises `ImportError` where imageio is missing, `FileNotFoundError` where
     `path` is, and `ValueError` naming `path` where it cannot be read, holds no frames, or its
-    frames differ in size.
+    frames differ in size; also for a range that is none.
     """
+    check_type((str, Path), "a path", path=path)
+    check_whole(first=first, **given(last=last))
     if first < 1 or (last is not None and last < first):
         raise ValueError(f"first, last: {first}, {last} is not a range of frames from 1 on")
     path = Path(path)
@@ -56,8 +61,12 @@ def write_video(
 ) -> None:
     """Write RGB frames to an MP4 or, by the ending of `path`, a GIF that loops.
 
-    Raises `ValueError` for another ending, `ImportError` where imageio is missing.
+    Raises `ValueError` for another ending, a frame that is no RGB image and a rate that is not
+    positive, `ImportError` where imageio is missing.
     """
+    check_type((str, Path), "a path", path=path)
+    check_type(Iterable, "frames one after the other", frames=frames)
+    check_positive(frames_per_second=frames_per_second)
     suffix = Path(path).suffix.lower()
     if suffix not in (".gif", ".mp4"):
         raise ValueError(f"path: {path} ends in neither .mp4 nor .gif")
@@ -71,7 +80,17 @@ def write_video(
         writer = get_writer(path, fps=frames_per_second, quality=6, macro_block_size=1)
     with writer:
         for frame in frames:
+            check_frame(frame, "frames")
             writer.append_data(_even(frame) if suffix == ".mp4" else frame)
+
+
+def check_frame(frame: Any, argument: str = "frame", *, eight_bits: bool = True) -> None:
+    """Raise `ValueError` for what is no colour image (h, w, 3), or by default not of eight bits."""
+    check_shape("...", **{argument: frame})
+    if frame.ndim != 3 or frame.shape[2] != 3 or 0 in frame.shape:
+        raise ValueError(f"{argument}: {frame.shape} is not the shape (h, w, 3) of a colour image")
+    if eight_bits and frame.dtype != np.uint8:
+        raise ValueError(f"{argument}: {frame.dtype} is not uint8")
 
 
 def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped, UInt8
 
+from mpfjax.checks import check_flag, check_shape, check_type, check_whole
 from mpfjax.vision.colours import AbstractColours
+from mpfjax.vision.frames import check_frame
 
 _BLOCK = 32
 # XLA for a CPU builds the table up to four times faster if its rows are so wide, in such steps.
@@ -47,27 +49,25 @@ class IntegralHistogram(eqx.Module):
 
         Boxes are (x, y, w, h) about their centre, in pixels, the frame spanning [0, width] x
         [0, height]; a pixel belongs to a box that covers its centre. Boxes that leave the frame
-        are clipped to it, and one that lies wholly outside, has no area, is not finite or holds
-        more than `largest_box` pixels counts nothing.
+        are clipped to it, and one that lies wholly outside, has no area or is not finite counts
+        nothing. The counts of one that holds more than `largest_box` pixels are NaN, for a zero
+        would say that it has none of a colour. Raises `ValueError` for boxes that are no array of
+        four numbers each and a number of parts that is no whole number from 1 on.
         """
-        rows, columns = self._edges(boxes, num_parts)
+        check_shape("n 4", boxes=boxes)
+        check_whole(num_parts=num_parts)
+        rows, columns = _edges(boxes, num_parts, self.height, self.width)
         corners = self.table.at[rows[:, :, None], columns[:, None, :]].get(mode="clip")
         bands = jnp.diff(corners[:, :, 1] - corners[:, :, 0], axis=1)
         pixels = (rows[:, -1] - rows[:, 0]) * (columns[:, 1] - columns[:, 0])
         # An unsigned count is never negative, so an inverted box must be silenced by its edges.
         valid = (columns[:, 1] > columns[:, 0]) & (rows[:, -1] > rows[:, 0])
-        valid &= pixels <= self.largest_box
-        counts = jnp.where(valid[:, None, None], bands, jnp.zeros((), bands.dtype))
-        counts = counts.reshape(boxes.shape[0], num_parts, self.num_channels, -1)
-        return counts[..., : self.num_bins].astype(boxes.dtype)
-
-    def _edges(
-        self, boxes: Float[Array, "n 4"], num_parts: int
-    ) -> tuple[Int[Array, "n rows"], Int[Array, "n 2"]]:
-        x, y, w, h = (boxes[:, i, None] for i in range(4))
-        across = jnp.array([[-0.5, 0.5]], boxes.dtype)
-        down = jnp.linspace(-0.5, 0.5, num_parts + 1, dtype=boxes.dtype)[None]
-        return _pixel(y + h * down, self.height), _pixel(x + w * across, self.width)
+        too_large = valid & (pixels > self.largest_box)
+        instead = jnp.where(too_large, jnp.nan, 0.0).astype(boxes.dtype)
+        counts = bands.reshape(boxes.shape[0], num_parts, self.num_channels, -1)
+        counts = counts[..., : self.num_bins].astype(boxes.dtype)
+        counted = (valid & ~too_large)[:, None, None, None]
+        return jnp.where(counted, counts, instead[:, None, None, None])
 
 
 def integral_histogram(
@@ -78,19 +78,29 @@ def integral_histogram(
     `wide_counts` counts in 32 bits, two to four times slower, for boxes of 65 536 pixels or more.
     Raises `ValueError` for a frame of one channel or not of eight bits.
     """
-    if frame.ndim != 3 or frame.shape[2] != 3:
-        raise ValueError(f"frame: {frame.shape} is not the shape (h, w, 3) of a colour image")
-    if frame.dtype != jnp.uint8:
-        raise ValueError(f"frame: {frame.dtype} is not uint8")
+    check_frame(frame)
+    check_type(AbstractColours, "AbstractColours such as RGBColours()", colours=colours)
+    check_flag(wide_counts=wide_counts)
     height, width, _ = frame.shape
     table = _table(frame, colours, wide_counts)
     return IntegralHistogram(table, colours.num_channels, colours.num_bins, height, width)
 
 
+def num_pixels(boxes: Float[Array, "n 4"], height: int, width: int) -> Int[Array, " n"]:
+    """How many pixels of a frame of this size each box (x, y, w, h) about its centre holds."""
+    sides = [jnp.maximum(edges[:, 1] - edges[:, 0], 0) for edges in _edges(boxes, 1, height, width)]
+    return sides[0] * sides[1]
+
+
 def normalise(
     counts: Float[Array, "... bins"], bin_weights: Float[Array, "... bins"] | None = None
 ) -> Float[Array, "... bins"]:
-    """Counts as shares that sum to one over the bins; all zero where nothing was counted."""
+    """Counts as shares that sum to one over the bins.
+
+    All zero where nothing was counted, or nothing could be: counts of NaN leave none behind, nor in
+    a derivative.
+    """
+    counts = jnp.where(counts >= 0, counts, 0.0)
     if bin_weights is not None:
         counts = counts * jnp.broadcast_to(bin_weights, counts.shape)
     total = jnp.sum(counts, axis=-1, keepdims=True)
@@ -104,7 +114,12 @@ def bhattacharyya(
 
     Vermaak et al. (2003), section 5.2. Between 0, for equal histograms, and 1, for histograms
     that share no colour; an empty histogram shares none. The square is what the likelihood needs.
+    Raises `ValueError` for what is no array, and for another number of bins in one than in the
+    other.
     """
+    check_shape("... bins", histograms=histograms, references=references)
+    if histograms.shape[-1] != references.shape[-1]:
+        raise ValueError(f"references: {references.shape} has not the bins of {histograms.shape}")
     return jnp.clip(1 - jnp.sum(jnp.sqrt(histograms * references), axis=-1), 0.0, 1.0)
 
 
@@ -148,6 +163,16 @@ def _running_sums(terms: list[Array]) -> list[Array]:
     for term in terms[1:]:
         sums.append(sums[-1] + term)
     return sums
+
+
+def _edges(
+    boxes: Float[Array, "n 4"], num_parts: int, height: int, width: int
+) -> tuple[Int[Array, "n rows"], Int[Array, "n 2"]]:
+    """The rows at which the bands of each box begin and end, and its first column and its end."""
+    x, y, w, h = (boxes[:, i, None] for i in range(4))
+    across = jnp.array([[-0.5, 0.5]], boxes.dtype)
+    down = jnp.linspace(-0.5, 0.5, num_parts + 1, dtype=boxes.dtype)[None]
+    return _pixel(y + h * down, height), _pixel(x + w * across, width)
 
 
 def _pixel(edges: Float[Array, "n e"], size: int) -> Int[Array, "n e"]:

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt8
 
+from mpfjax.checks import check_positive, check_type, check_whole, shown, to_rows
 from mpfjax.models.dynamics import Autoregression
-from mpfjax.models.multi_object import MultiObjectModel
-from mpfjax.vision.colour_model import BoxState, ColourModel
+from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
+from mpfjax.vision.colour_model import BoxState, ColourModel, positive_deviations
 from mpfjax.vision.colours import AbstractColours, HSVColours
 
 _MOMENTUM = 0.5
@@ -53,9 +54,12 @@ def joint_colour_model(
     an index in `templates` that is none, and numbers that are not positive. Use it where each
     object has colours of its own.
     """
-    boxes = np.asarray(boxes, float).reshape(-1, 4)
+    boxes = to_rows(4, "boxes", boxes)
     sigma = _sigma(lambda_, num_parts)
-    momentum = Autoregression.with_momentum(_MOMENTUM, jnp.asarray(deviations, float))
+    steps = positive_deviations(deviations, 1).reshape(4)
+    momentum = Autoregression.with_momentum(_MOMENTUM, jnp.asarray(steps, float))
+    templates = {} if templates is None else templates
+    check_type(Mapping, "frames and boxes, {index: (frame, box)}", templates=templates)
 
     def learn(frame: np.ndarray, boxes: np.ndarray) -> ColourModel:
         return ColourModel.from_frame(
@@ -63,16 +67,22 @@ def joint_colour_model(
             boxes,
             colours=HSVColours() if colours is None else colours,
             sigma=sigma,
-            deviations=np.asarray(deviations, float),
+            deviations=steps,
             dynamics=momentum,
             num_parts=num_parts,
         )
 
     model = learn(frame, boxes)
-    for j, (other_frame, box) in ({} if templates is None else templates).items():
+    for j, template in templates.items():
         if j not in range(len(boxes)):
             raise ValueError(f"templates: {j} is none of the {len(boxes)} objects, from 0 on")
-        looks = learn(other_frame, np.asarray(box, float)[None]).references[0]
+        if not isinstance(template, Sequence) or len(template) != 2:
+            raise ValueError(f"templates: {shown(template)}, of object {j}, is no (frame, box)")
+        other_frame, box = template
+        try:
+            looks = learn(other_frame, to_rows(4, "box", box)[:1]).references[0]
+        except ValueError as error:
+            raise ValueError(f"templates: of object {j}, {error}") from error
         model = eqx.tree_at(lambda m: m.references, model, model.references.at[j].set(looks))
     return MultiObjectModel(
         _one_each(model),
@@ -86,8 +96,10 @@ def joint_colour_model(
 def with_lambda(model: MultiObjectModel, lambda_: float) -> MultiObjectModel:
     """A `joint_colour_model` with another λ, whose filters compile to the same programs.
 
-    Raises `ValueError` for a λ that is not positive. Use it to go through several λ.
+    Raises `ValueError` for a λ that is not positive, and for another model. Use it to go through
+    several λ.
     """
+    _check_model(model, "with_lambda")
     colour_model: Any = model.object_model
     sigma = _sigma(lambda_, colour_model.references.shape[-3])
     sigma = jnp.full_like(colour_model.sigma, sigma)
@@ -97,8 +109,14 @@ def with_lambda(model: MultiObjectModel, lambda_: float) -> MultiObjectModel:
 def object_boxes(model: MultiObjectModel, states: BoxState) -> Float[Array, "n objects 4"]:
     """(x, y, w, h) of every object of every particle, (x, y) the top-left corner, in pixels.
 
-    For particles of a `joint_colour_model`, whose leaves are (n, J, ...).
+    For particles of a `joint_colour_model`, whose leaves are (n, J, ...). Raises `ValueError` for
+    another model, and states of another kind or shape.
     """
+    _check_model(model, "object_boxes")
+    check_type(BoxState, "a BoxState", states=states)
+    if jnp.shape(states.box)[1:] != (model.num_objects, 4):
+        shape = jnp.shape(states.box)
+        raise ValueError(f"states: shape {shape} of box is not (n, {model.num_objects}, 4)")
 
     def place(colour_model: ColourModel, states: BoxState) -> Float[Array, "n 4"]:
         boxes = colour_model.boxes(states)
@@ -107,12 +125,16 @@ def object_boxes(model: MultiObjectModel, states: BoxState) -> Float[Array, "n o
     return eqx.filter_vmap(place, in_axes=(0, 1), out_axes=1)(model.object_model, states)
 
 
+def _check_model(model: MultiObjectModel, needed_by: str) -> None:
+    require_multi_object(model, needed_by)
+    if not isinstance(model.object_model, ColourModel):
+        raise ValueError(f"model: {type(model.object_model).__name__} is no ColourModel of objects")
+
+
 def _sigma(lambda_: float, num_parts: int) -> float:
     """σ of exp(-(mean of d²) / 2σ²) for exp(-λ (sum of d²))."""
-    if not 0 < lambda_ < float("inf"):
-        raise ValueError(f"lambda_: {lambda_} is not positive")
-    if num_parts < 1:
-        raise ValueError(f"num_parts: {num_parts} is less than 1")
+    check_positive(lambda_=lambda_)
+    check_whole(num_parts=num_parts)
     return float((2 * lambda_ * num_parts) ** -0.5)
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from mpfjax.models.base import require_positive
+from mpfjax.checks import check_finite, check_key, check_positive, check_type, check_whole, shown
 from mpfjax.vision.boxes import centred
 from mpfjax.vision.colour_model import AbstractBoxModel, BoxState
 
@@ -17,7 +17,11 @@ def labelled_states(model: AbstractBoxModel, boxes: Float[np.ndarray, "t k 4"]) 
     dynamics are of second order the first frame's states have stood still. Raises `ValueError`
     for another number of boxes than of references, and for a box that is not finite or has no area.
     """
-    boxes = np.asarray(boxes, float)
+    check_type(AbstractBoxModel, "a model of boxes, such as a ColourModel", model=model)
+    try:
+        boxes = np.asarray(boxes, float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"boxes: {shown(boxes)} are no numbers") from error
     k = model.reference_boxes.shape[0]
     if boxes.ndim != 3 or boxes.shape[1:] != (k, 4):
         raise ValueError(f"boxes: shape {boxes.shape} is not (t, {k}, 4), for {k} references")
@@ -47,10 +51,13 @@ def boxes_around(
     of wrong sizes it says nothing of size. Raises `ValueError` for fewer than one box, a reach that
     is not positive, and a stretch below one.
     """
-    if num_boxes < 1:
-        raise ValueError(f"num_boxes: {num_boxes} is less than 1")
-    require_positive(reach=reach)
-    if not stretch >= 1:
+    check_key(key)
+    check_type(AbstractBoxModel, "a model of boxes, such as a ColourModel", model=model)
+    check_type(BoxState, "a BoxState", states=states)
+    check_whole(num_boxes=num_boxes)
+    check_positive(reach=reach)
+    check_finite(stretch=stretch)
+    if stretch < 1:
         raise ValueError(f"stretch: {stretch} is less than 1")
 
     def each(leaf: Array) -> Array:

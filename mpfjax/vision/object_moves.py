@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from mpfjax.checks import check_inner_share, check_positive, check_type
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
 
@@ -29,11 +30,12 @@ class ObjectExclusion(AbstractPropagation):
     scale: tuple[float, float] = eqx.field(static=True, default=(1.0, 1.0))
 
     def __check_init__(self) -> None:
-        for name, value in (("strength", self.strength), ("radius", self.radius)):
-            if not value > 0:
-                raise ValueError(f"{name}: {value} is not positive")
-        if not all(unit > 0 for unit in self.scale):
-            raise ValueError(f"scale: {self.scale} is not positive")
+        check_positive(strength=self.strength, radius=self.radius)
+        check_type(tuple, "a tuple (width, height)", scale=self.scale)
+        if len(self.scale) != 2:
+            raise ValueError(f"scale: {self.scale} is not (width, height)")
+        for unit in self.scale:
+            check_positive(scale=unit)
 
     @property
     def approximate(self) -> bool:
@@ -74,8 +76,7 @@ class PruneHypotheses(AbstractPropagation):
     least_share: float = eqx.field(static=True, default=1e-6)
 
     def __check_init__(self) -> None:
-        if not 0 < self.least_share < 1:
-            raise ValueError(f"least_share: {self.least_share} is not in (0, 1)")
+        check_inner_share(least_share=self.least_share)
 
     @property
     def approximate(self) -> bool:

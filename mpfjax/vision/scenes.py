@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
+from mpfjax.checks import check_flag, check_key, check_whole
 from mpfjax.vision.drawing import draw_ellipse, draw_stroke
 
 _PITCH_DEPTH = (22.0, 52.0)
@@ -90,15 +91,13 @@ def football_scene(
     have the ids from 1 on; their opponents follow. The same key gives the same scene. With
     `still_camera` the camera stays where it first looks, as detection of what moves needs it.
 
-    Raises `ValueError` for no frames, fewer than one player or a negative number of opponents.
+    Raises `ValueError` for no frames, no pixels, fewer than one player or a negative number of
+    opponents.
     """
-    for name, value, least in (
-        ("num_frames", num_frames, 1),
-        ("num_players", num_players, 1),
-        ("num_opponents", num_opponents, 0),
-    ):
-        if value < least:
-            raise ValueError(f"{name}: {value} is less than {least}")
+    check_key(key)
+    check_whole(num_frames=num_frames, num_players=num_players, height=height, width=width)
+    check_whole(0, num_opponents=num_opponents)
+    check_flag(still_camera=still_camera)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
     kits = [0] * num_players + [1] * num_opponents
     paths = np.concatenate(

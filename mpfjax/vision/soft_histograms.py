@@ -9,9 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num, UInt8
 
+from mpfjax.checks import check_inner_share, check_positive, check_shape, check_whole
 from mpfjax.models.dynamics import AbstractDynamics
 from mpfjax.vision.colour_model import AbstractBoxModel, BoxState, ColourModel
 from mpfjax.vision.colours import RGBColours
+from mpfjax.vision.frames import check_frame
 from mpfjax.vision.histograms import bhattacharyya, normalise
 
 
@@ -71,10 +73,8 @@ class SoftColourModel(AbstractBoxModel):
         - `bandwidth`, `num_points`, `floor`: see the class.
         - The rest is that of `ColourModel.from_frame`, which also says what is refused.
         """
-        if not bandwidth > 0:
-            raise ValueError(f"bandwidth: {bandwidth} is not positive")
-        if not 0 < floor < 1:
-            raise ValueError(f"floor: {floor} is not in (0, 1)")
+        check_positive(bandwidth=bandwidth)
+        check_inner_share(floor=floor)
         _check_points(num_points, num_parts)
         hard = ColourModel.from_frame(
             frame,
@@ -128,7 +128,6 @@ class SoftColourModel(AbstractBoxModel):
         return jnp.mean(jnp.sum(jnp.where(empty, 1.0, distances), axis=2), axis=1)
 
 
-@partial(jax.jit, static_argnames=("num_bins", "num_points", "num_parts"))
 def soft_histograms(
     frame: Num[Array, "h w 3"],
     boxes: Float[Array, "n 4"],
@@ -149,12 +148,25 @@ def soft_histograms(
     Boxes are (x, y, w, h) about their centre, in pixels; points outside the frame do not count,
     those within half a pixel of its edge count in part. Bands run from top to bottom. A box that
     is not finite counts nothing. Raises `ValueError` for K that is no multiple of `num_parts`, a
-    number of bins outside 1 to 256, and a frame that is not (h, w, 3).
+    number of bins outside 1 to 256, a frame that is not (h, w, 3), and arrays of other shapes.
     """
     _check_points(num_points, num_parts)
     RGBColours(num_bins)
-    if frame.ndim != 3 or frame.shape[2] != 3:
-        raise ValueError(f"frame: {frame.shape} is not the shape (h, w, 3) of a colour image")
+    check_frame(frame, eight_bits=False)
+    check_shape("n 4", boxes=boxes)
+    check_shape("", bandwidth=bandwidth)
+    return _soft_histograms(frame, boxes, num_bins, bandwidth, num_points, num_parts)
+
+
+@partial(jax.jit, static_argnames=("num_bins", "num_points", "num_parts"))
+def _soft_histograms(
+    frame: Num[Array, "h w 3"],
+    boxes: Float[Array, "n 4"],
+    num_bins: int,
+    bandwidth: Float[Array, ""],
+    num_points: int,
+    num_parts: int,
+) -> Float[Array, "n parts 3 bins"]:
     finite = jnp.all(jnp.isfinite(boxes), axis=1, keepdims=True)
     boxes = jnp.where(finite, boxes, -1e6)
     steps = (jnp.arange(num_points, dtype=boxes.dtype)[None] + 0.5) / num_points - 0.5
@@ -223,7 +235,6 @@ def _mixed(histograms: Float[Array, "*batch bins"], floor: float) -> Float[Array
 
 
 def _check_points(num_points: int, num_parts: int) -> None:
-    if num_parts < 1:
-        raise ValueError(f"num_parts: {num_parts} is less than 1")
-    if num_points < 1 or num_points % num_parts:
+    check_whole(num_points=num_points, num_parts=num_parts)
+    if num_points % num_parts:
         raise ValueError(f"num_points: {num_points} is no multiple of num_parts, {num_parts}")

@@ -1,14 +1,15 @@
 """A tracker that starts and ends its components by itself, from detections."""
 
-import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt8
 from optax.assignment import hungarian_algorithm
 
+from mpfjax.checks import check_flag, check_positive, check_share, check_type, check_whole, shown
 from mpfjax.filters import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.dynamics import Autoregression
@@ -88,7 +89,7 @@ class ObjectTracker(eqx.Module):
     - `rejuvenation`: `Resample(particles_per_component=P)` for an MPF, or
       `GaussianRegeneration(P, where=lambda states: (states.box, states.previous))`, the default.
     - `colours`, `sigma`, `num_parts`, `wide_counts`: of the `ColourModel`. Objects of 65 536 pixels
-      or more need the last.
+      or more need the last; without it they have no colours, and nothing of them is learned.
     - `momentum`: the share of a box centre's last step that it repeats in the next, in [0, 1]: 1 is
       constant velocity, 0 a random walk. Sizes have none.
     - `step_deviations`: of the noise of a step, (x, y) in units of the box and (s_x, s_y).
@@ -140,41 +141,33 @@ class ObjectTracker(eqx.Module):
         adaptation: float = 0.05,
         wide_counts: bool = False,
     ) -> None:
-        whole = {
-            "max_objects": max_objects,
-            "particles_per_object": particles_per_object,
-            "num_parts": num_parts,
-            "confirmation": confirmation,
-            "patience": patience,
-            "crowding": crowding,
-        }
-        for name, value in whole.items():
-            if not (1 <= value < math.inf and value == int(value)):
-                raise ValueError(f"{name}: {value} is not a whole number from 1 on")
-        if not 0 < sigma < math.inf:
-            raise ValueError(f"sigma: {sigma} is not positive and finite")
-        for name, values in (
-            ("step_deviations", step_deviations),
-            ("detection_deviations", detection_deviations),
-        ):
-            if len(values) != 4 or not all(0 < value < math.inf for value in values):
-                raise ValueError(f"{name}: {values} are not four positive numbers")
-        if not 0 <= momentum <= 1:
-            raise ValueError(f"momentum: {momentum} is not in [0, 1]")
-        if not 0 <= adaptation < 1:
+        check_whole(
+            max_objects=max_objects,
+            particles_per_object=particles_per_object,
+            num_parts=num_parts,
+            confirmation=confirmation,
+            patience=patience,
+            crowding=crowding,
+        )
+        check_positive(sigma=sigma)
+        check_share(momentum=momentum, adaptation=adaptation)
+        if adaptation == 1:
             raise ValueError(f"adaptation: {adaptation} is not in [0, 1)")
+        check_flag(wide_counts=wide_counts)
+        colours = HSVColours() if colours is None else colours
+        check_type(AbstractColours, "AbstractColours such as HSVColours()", colours=colours)
         if rejuvenation is None:
             rejuvenation = GaussianRegeneration(particles_per_object, where=_motion)
         _check_rejuvenation(rejuvenation, particles_per_object)
         self.rejuvenation = rejuvenation
         self.max_objects = max_objects
         self.particles_per_object = particles_per_object
-        self.colours = HSVColours() if colours is None else colours
+        self.colours = colours
         self.sigma = sigma
         self.momentum = momentum
         self.num_parts = num_parts
-        self.step_deviations = tuple(step_deviations)
-        self.detection_deviations = tuple(detection_deviations)
+        self.step_deviations = _four_positive("step_deviations", step_deviations)
+        self.detection_deviations = _four_positive("detection_deviations", detection_deviations)
         self.confirmation = confirmation
         self.patience = patience
         self.crowding = crowding
@@ -315,8 +308,10 @@ class ObjectTracker(eqx.Module):
         others = ~jnp.eye(self.max_objects, dtype=bool) & alive[None]
         alone = ~jnp.any((_overlap(boxes, boxes) > 0.05) & others, axis=1)
         rate = jnp.where(own.valid & alone, self.adaptation, 0.0)
-        rate = rate[:, None, None, None]
         histograms = normalise(table.counts(boxes, self.num_parts))
+        # What has no pixel, or too many to count, teaches nothing.
+        counted = jnp.sum(histograms, axis=3, keepdims=True) > 0
+        rate = jnp.where(counted, rate[:, None, None, None], 0.0)
         references = (1 - rate) * state.colour.references + rate * histograms
         return _replace(state, colour=_replace(state.colour, references=references))
 
@@ -447,7 +442,18 @@ def _replace(module, **fields):
     )
 
 
+def _four_positive(name: str, values: Any) -> tuple[float, ...]:
+    try:
+        numbers = np.asarray(values, float)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    if numbers.shape != (4,) or not np.all((numbers > 0) & np.isfinite(numbers)):
+        raise ValueError(f"{name}: {shown(values)} are not four positive numbers")
+    return tuple(numbers.tolist())
+
+
 def _check_rejuvenation(rejuvenation: AbstractRejuvenation, particles_per_object: int) -> None:
+    check_type(AbstractRejuvenation, "a rejuvenating move", rejuvenation=rejuvenation)
     number = getattr(rejuvenation, "particles_per_component", None)
     # Another number would leave no empty slots for the newborn.
     if number != particles_per_object:

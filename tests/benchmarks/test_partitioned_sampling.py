@@ -178,9 +178,9 @@ def test_bad_input_is_named_before_anything_compiles(
 @pytest.mark.parametrize(
     ("message", "arguments"),
     [
-        ("--runs: 0 is less than 1", ["--runs", "0"]),
-        ("--particles: 0 is less than 1", ["--particles", "0"]),
-        ("--lambdas: -1.0 is not positive", ["--lambdas", "20", "-1"]),
+        ("--runs: '0' is not a whole number from 1", ["--runs", "0"]),
+        ("--particles: '0' is not a whole number from 1", ["--particles", "0"]),
+        ("--lambdas: '-1' is not a positive", ["--lambdas", "20", "-1"]),
         ("--ids, --frames: without --sequence", ["--ids", "1"]),
         ("invalid choice: 'best'", ["--methods", "best"]),
     ],

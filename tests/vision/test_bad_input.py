@@ -1,0 +1,235 @@
+"""Arguments of the vision part that will not do are errors that name them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpfjax import vision
+from tests.refused import INFINITY, NAN, NOTHING, refused
+
+KEY = jax.random.key(0)
+FRAME = np.random.default_rng(0).integers(0, 256, (40, 50, 3), dtype=np.uint8)
+BOXES = np.array([[5.0, 5, 10, 20], [20, 10, 10, 15]])
+STATES = vision.BoxState(jnp.ones((3, 4)), jnp.zeros(3, jnp.int32))
+OF_FRAME = {"frame": FRAME, "boxes": BOXES}
+COLOUR = {"frame": "array", "boxes": "rows", "sigma": "positive", "num_parts": "count",
+          "deviations": "four?", "dynamics": "kind?", "switch_probability": "share"}  # fmt: skip
+
+
+def built(name):
+    if name == "joint":
+        return vision.joint_colour_model(FRAME, BOXES)
+    return vision.ColourModel.from_frame(FRAME, BOXES, colours=vision.RGBColours(4))
+
+
+def late(function, **builds):
+    """A function of which some arguments are built where they are not given."""
+
+    def call(**arguments):
+        made = {name: built(what) for name, what in builds.items() if name not in arguments}
+        return function(**made | arguments)
+
+    return call
+
+
+def counts(**arguments):
+    table = vision.integral_histogram(jnp.asarray(FRAME), vision.RGBColours(4))
+    return table.counts(**{"boxes": jnp.ones((2, 4))} | arguments)
+
+
+def propose(**arguments):
+    model = {} if "model" in arguments else {"model": vision.DetectedColourModel(built("colour"))}
+    return vision.DetectionProposal(**model | arguments)
+
+
+TABLE = {
+    "RGBColours": (vision.RGBColours, {}, {"num_bins": "count"}),
+    "HSVColours": (
+        vision.HSVColours,
+        {},
+        {"num_hues": "count", "num_saturations": "count", "num_values": "count",
+         "least_saturation": "share", "least_value": "share"},
+    ),
+    "ColourModel": (
+        vision.ColourModel.from_frame,
+        OF_FRAME,
+        COLOUR | {"colours": "kind?", "weigh_colours": "flag", "share_reference": "flag",
+                  "contrast": "not negative"},
+    ),
+    "SoftColourModel": (
+        vision.SoftColourModel.from_frame,
+        OF_FRAME,
+        COLOUR | {"num_bins": "count", "bandwidth": "positive", "num_points": "count",
+                  "floor": "inner share"},
+    ),
+    "joint_colour_model": (
+        vision.joint_colour_model,
+        OF_FRAME,
+        {"frame": "array", "boxes": "rows", "lambda_": "positive", "num_parts": "count",
+         "colours": "kind?", "deviations": "four", "templates": "kind?"},
+    ),
+    "with_lambda": (
+        late(vision.with_lambda, model="joint"),
+        {"lambda_": 3.0},
+        {"model": "kind", "lambda_": "positive"},
+    ),
+    "object_boxes": (
+        late(vision.object_boxes, model="joint"),
+        {"states": STATES},
+        {"model": "kind", "states": "kind"},
+    ),
+    "Detections": (
+        vision.Detections.from_boxes,
+        {"boxes": BOXES, "max_detections": 3},
+        {"boxes": "rows", "max_detections": "count"},
+    ),
+    "DetectedColourModel": (
+        late(vision.DetectedColourModel, colour="colour"),
+        {},
+        {"colour": "kind", "deviations": "four", "miss": "positive"},
+    ),
+    "DetectionProposal": (propose, {}, {"model": "kind", "share": "share"}),
+    "distracter_scene": (vision.distracter_scene, {"key": KEY}, {"key": "key", "num_frames": "count"}),
+    "football_scene": (
+        vision.football_scene,
+        {"key": KEY, "num_frames": 1},
+        {"key": "key", "num_frames": "count", "num_players": "count", "num_opponents": "number",
+         "height": "count", "width": "count", "still_camera": "flag"},
+    ),
+    "check_boxes": (
+        vision.check_boxes,
+        {"boxes": BOXES, "height": 40, "width": 50},
+        {"boxes": "rows", "height": "count", "width": "count"},
+    ),
+    "parse_box": (lambda box: vision.parse_box(box), {}, {"box": "path"}),
+    "read_tracks": (vision.read_tracks, {}, {"path": "path"}),
+    "write_tracks": (vision.write_tracks, {"path": "/nowhere", "rows": []}, {"path": "path", "rows": "rows"}),
+    "read_frames": (
+        vision.read_frames,
+        {"path": "."},
+        {"path": "path", "first": "count", "last": "count?"},
+    ),
+    "write_video": (
+        vision.write_video,
+        {"path": "/nowhere/a.gif", "frames": [FRAME]},
+        {"path": "path", "frames_per_second": "positive"},
+    ),
+    "integral_histogram": (
+        vision.integral_histogram,
+        {"frame": FRAME, "colours": vision.RGBColours(4)},
+        {"frame": "array", "colours": "kind", "wide_counts": "flag"},
+    ),
+    "counts": (counts, {}, {"boxes": "array", "num_parts": "count"}),
+    "bhattacharyya": (
+        vision.bhattacharyya,
+        {"histograms": jnp.ones(4), "references": jnp.ones(4)},
+        {"histograms": "array", "references": "array"},
+    ),
+    "soft_histograms": (
+        vision.soft_histograms,
+        {"frame": jnp.asarray(FRAME), "boxes": jnp.ones((2, 4)), "num_bins": 4,
+         "bandwidth": jnp.array(0.5)},
+        {"frame": "array", "boxes": "array", "num_bins": "count", "bandwidth": "array",
+         "num_points": "count", "num_parts": "count"},
+    ),
+    "boxes_around": (
+        late(vision.boxes_around, model="colour"),
+        {"key": KEY, "states": STATES, "num_boxes": 3},
+        {"key": "key", "model": "kind", "states": "kind", "num_boxes": "count",
+         "reach": "positive", "stretch": "positive"},
+    ),
+    "labelled_states": (
+        late(vision.labelled_states, model="colour"),
+        {"boxes": BOXES[None]},
+        {"model": "kind", "boxes": "rows"},
+    ),
+    "ObjectExclusion": (
+        vision.ObjectExclusion,
+        {},
+        {"strength": "positive", "radius": "positive", "scale": "range"},
+    ),
+    "PruneHypotheses": (vision.PruneHypotheses, {}, {"least_share": "inner share"}),
+    "ObjectTracker": (
+        vision.ObjectTracker,
+        {},
+        {"max_objects": "count", "particles_per_object": "count", "rejuvenation": "kind?",
+         "colours": "kind?", "sigma": "positive", "momentum": "share", "num_parts": "count",
+         "step_deviations": "four", "detection_deviations": "four", "confirmation": "count",
+         "patience": "count", "crowding": "count", "adaptation": "share", "wide_counts": "flag"},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.usefixtures("as_installed")
+@pytest.mark.parametrize(("function", "good", "name", "value"), refused(TABLE))
+def test_what_will_not_do_is_named(function, good, name, value):
+    with pytest.raises(ValueError, match=rf"^{name}: "):
+        function(**good | {name: value})
+
+
+@pytest.mark.usefixtures("as_installed")
+@pytest.mark.parametrize(
+    ("function", "good", "name", "value"),
+    [
+        (vision.RGBColours, {}, "num_bins", 257),
+        (vision.ColourModel.from_frame, OF_FRAME, "boxes", [[5.0, 5, INFINITY, 20]]),
+        (vision.ColourModel.from_frame, OF_FRAME, "boxes", [[NAN, 5, 10, 20]]),
+        (vision.ColourModel.from_frame, OF_FRAME, "frame", FRAME[:, :, 0]),
+        (vision.ColourModel.from_frame, OF_FRAME, "frame", FRAME.astype(float)),
+        (vision.ColourModel.from_frame, OF_FRAME, "frame", FRAME[:0]),
+        (vision.joint_colour_model, OF_FRAME, "templates", {2: (FRAME, BOXES[0])}),
+        (vision.joint_colour_model, OF_FRAME, "templates", {0: FRAME}),
+        (vision.joint_colour_model, OF_FRAME, "templates", {0: (FRAME, None)}),
+        (vision.joint_colour_model, OF_FRAME, "templates", {0: (None, BOXES[0])}),
+        (propose, {}, "share", 1),
+        (vision.ObjectTracker, {}, "adaptation", 1),
+        (vision.distracter_scene, {"key": KEY}, "num_frames", 2),
+        (vision.write_tracks, {"path": "/nowhere"}, "rows", [[0.5, 1, 2, 3, 4, 5]]),
+        (vision.write_tracks, {"path": "/nowhere"}, "rows", [[1, 1, NAN, 3, 4, 5]]),
+        (vision.bhattacharyya, {"histograms": jnp.ones(4)}, "references", jnp.ones(3)),
+        (vision.soft_histograms, TABLE["soft_histograms"][1], "boxes", jnp.ones((2, 3))),
+        (vision.soft_histograms, TABLE["soft_histograms"][1], "bandwidth", jnp.ones(2)),
+        (late(vision.object_boxes, model="joint"), {}, "states", STATES),
+        (late(vision.boxes_around, model="colour"), {"key": KEY, "states": STATES, "num_boxes": 3},
+         "stretch", 0.5),
+    ],
+)  # fmt: skip
+def test_what_does_not_go_with_the_rest_is_named(function, good, name, value):
+    with pytest.raises(ValueError, match=rf"^{name}: "):
+        function(**good | {name: value})
+
+
+@pytest.mark.usefixtures("as_installed")
+class TestBackgroundSubtraction:
+    KINDS = {
+        "history": "count", "warm_up": "count", "threshold": "positive", "cut_aspect": "positive?",
+        "background_share": "inner share", "shadow_brightness": "inner share?",
+        "cut_depth": "inner share", "largest_gap": "share", "area": "range", "aspect": "range",
+    }  # fmt: skip
+    TABLE = {"": (vision.BackgroundSubtraction, {}, KINDS)}
+
+    @pytest.mark.parametrize(("function", "good", "name", "value"), refused(TABLE))
+    def test_settings_that_will_not_do_are_named(self, function, good, name, value):
+        with pytest.raises(ValueError, match=rf"^{name}: "):
+            function(**good | {name: value})
+
+    @pytest.mark.parametrize("frame", [*NOTHING, FRAME[:, :, 0], FRAME[:0], FRAME.astype(float)])
+    def test_frames_that_are_none_are_named(self, frame):
+        pytest.importorskip("cv2")
+        with pytest.raises(ValueError, match=r"^frame: "):
+            vision.BackgroundSubtraction().detect(frame)
+
+    @pytest.mark.parametrize("frames", [None, 3, []])
+    def test_nothing_to_learn_from_is_named(self, frames):
+        pytest.importorskip("cv2")
+        with pytest.raises(ValueError, match=r"^frames: "):
+            vision.BackgroundSubtraction().learn(frames)
+
+
+@pytest.mark.usefixtures("as_installed")
+@pytest.mark.parametrize("frames", [None, 3, [None], [FRAME[0]], [FRAME.astype(float)]])
+def test_a_video_of_no_frames_is_named(tmp_path, frames):
+    pytest.importorskip("imageio")
+    with pytest.raises(ValueError, match=r"^frames: "):
+        vision.write_video(tmp_path / "video.gif", frames)

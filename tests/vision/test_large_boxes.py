@@ -1,0 +1,147 @@
+"""Boxes of so many pixels that counts in 16 bits would not do, against numpy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpfjax.vision import (
+    BoxState,
+    ColourModel,
+    Detections,
+    ObjectTracker,
+    RGBColours,
+    integral_histogram,
+    joint_colour_model,
+)
+from mpfjax.vision.histograms import normalise
+
+HEIGHT, WIDTH, BINS = 600, 620, 4
+COLOURS = RGBColours(BINS)
+# By their number of pixels: on both sides of where a box, its sides and its surround reach 2¹⁶.
+SIZES = {
+    16_383: (127, 129),
+    16_384: (128, 128),
+    32_767: (151, 217),
+    32_768: (128, 256),
+    65_535: (255, 257),
+    65_536: (256, 256),
+}
+
+
+@pytest.fixture(scope="module")
+def frame():
+    """Noise that is brightest in the middle."""
+    rng = np.random.default_rng(0)
+    shades = 20 + 180 * np.exp(-(((np.arange(WIDTH) - WIDTH / 2) / 100) ** 2))[None, :, None]
+    shades = shades + rng.uniform(0, 55, (HEIGHT, WIDTH, 3))
+    return shades.astype(np.uint8)
+
+
+def box_of(pixels):
+    """(x, y, w, h) about the middle of the frame, on whole pixels."""
+    w, h = SIZES[pixels]
+    return np.array([(WIDTH - w) // 2, (HEIGHT - h) // 2, w, h], float)
+
+
+def numpy_shares(frame, box, but_for=None):
+    """The shares of each colour in a box, and of none of another, (3, bins)."""
+    chosen = covered(box) if but_for is None else covered(box) & ~covered(but_for)
+    bins = frame[chosen].astype(int) * BINS // 256
+    counts = np.stack([np.bincount(bins[:, c], minlength=BINS) for c in range(3)])
+    return counts / counts.sum(axis=1, keepdims=True)
+
+
+def covered(box):
+    """The pixels whose centres lie in the box."""
+    x, y, w, h = box
+    columns, rows = np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5
+    across, down = (columns >= x) & (columns < x + w), (rows >= y) & (rows < y + h)
+    return down[:, None] & across[None]
+
+
+def grown(box, across, down=1.0):
+    x, y, w, h = box
+    return np.array([x - (across - 1) * w / 2, y - (down - 1) * h / 2, across * w, down * h])
+
+
+@pytest.mark.parametrize("pixels", SIZES)
+@pytest.mark.parametrize("wide_counts", [False, True])
+def test_a_count_that_cannot_be_made_is_no_zero(frame, pixels, wide_counts):
+    table = integral_histogram(jnp.asarray(frame), COLOURS, wide_counts)
+    x, y, w, h = box = box_of(pixels)
+    counts = np.asarray(table.counts(jnp.asarray([[x + w / 2, y + h / 2, w, h]]))[0, 0])
+    if pixels > table.largest_box:
+        assert np.isnan(counts).all()
+        np.testing.assert_array_equal(normalise(jnp.asarray(counts)), 0)
+    else:
+        np.testing.assert_array_equal(counts, np.round(pixels * numpy_shares(frame, box)))
+
+
+@pytest.mark.parametrize("pixels", SIZES)
+def test_references_and_their_weights_are_numpys(frame, pixels):
+    box = box_of(pixels)
+    model = ColourModel.from_frame(frame, box[None], colours=COLOURS, weigh_colours=True)
+    inside = numpy_shares(frame, box)
+    outside = numpy_shares(frame, grown(box, 2, 2), but_for=box)
+    share = inside + outside
+    weights = np.where(share > 0, inside / np.where(share > 0, share, 1), 0.5)
+    assert 0.1 < weights.min() < 0.45 or 0.55 < weights.max() < 0.9
+    np.testing.assert_allclose(model.colour_weights[0, 0], weights, rtol=1e-5)
+    weighed = inside * weights
+    expected = weighed / weighed.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(model.references[0, 0], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("pixels", SIZES)
+def test_the_likelihood_with_contrast_is_numpys(frame, pixels):
+    box = box_of(pixels)
+    sigma, contrast = 0.15, 0.5
+    model = ColourModel.from_frame(
+        frame, box[None], colours=COLOURS, sigma=sigma, contrast=contrast
+    )
+    x, y, w, h = box
+    state = BoxState(jnp.asarray([[x + w / 2, y + h / 2, 1, 1]]), jnp.zeros(1, jnp.int32))
+    sides = numpy_shares(frame, grown(box, 2), but_for=box)
+    around = np.sum(1 - np.sum(np.sqrt(sides * numpy_shares(frame, box)), axis=1))
+    expected = contrast * around / (2 * sigma**2)
+    assert expected > 1
+    found = float(model.log_likelihood(jnp.asarray(frame), state)[0])
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+
+
+def test_growing_beyond_all_counts_is_not_rewarded(frame):
+    """On one colour throughout, where no size speaks for itself."""
+    plain = np.full_like(frame, 100)
+    box = np.array([[280.0, 280.0, 60.0, 60.0]])
+    model = ColourModel.from_frame(plain, box, colours=COLOURS, contrast=0.5)
+    assert not model.wide_counts
+    scales = np.array([1.0, 2.0, 3.0, 3.5, 4.0, 4.2, 4.3, 5.0, 8.0])
+    boxes = np.stack([np.full_like(scales, 310), np.full_like(scales, 310), scales, scales], axis=1)
+    states = BoxState(jnp.asarray(boxes, jnp.float32), jnp.zeros(len(scales), jnp.int32))
+    found = np.asarray(model.log_likelihood(jnp.asarray(plain), states))
+    countable = (60 * scales) ** 2 < 2**16
+    np.testing.assert_allclose(found[countable], 0.0, atol=1e-3)
+    np.testing.assert_allclose(found[~countable], -3 / (2 * 0.15**2), rtol=1e-5)
+
+
+def test_templates_of_many_pixels_are_learned(frame):
+    box = box_of(65_536)
+    model = joint_colour_model(frame, box[None], num_parts=1, colours=COLOURS)
+    np.testing.assert_allclose(
+        model.object_model.references[0, 0, 0], numpy_shares(frame, box), rtol=1e-5
+    )
+
+
+def test_a_tracker_does_not_unlearn_what_it_cannot_count(frame):
+    """An object that grows beyond all counts keeps the colours that it had."""
+    sure = {"step_deviations": (0.01,) * 4, "detection_deviations": (0.01,) * 4}
+    tracker = ObjectTracker(1, 8, colours=COLOURS, num_parts=1, adaptation=0.5, sigma=100.0, **sure)
+    state = tracker.init()
+    for t, (w, h) in enumerate([(250, 255), (262, 262), (270, 270), (280, 280)]):
+        box = [[(WIDTH - w) / 2, (HEIGHT - h) / 2, w, h]]
+        found = Detections.from_boxes(np.array(box), 1)
+        state, tracks = tracker.step(jax.random.key(t), state, jnp.asarray(frame), found)
+    assert np.prod(tracks.boxes[0, 2:]) > 2**16
+    assert tracks.identities.tolist() == [1]
+    np.testing.assert_allclose(np.sum(state.colour.references, axis=-1), 1.0, rtol=1e-4)
