@@ -1,8 +1,8 @@
 """mpfjax: particle filters that keep many hypotheses alive, in JAX."""
 
-from mpfjax import exact as exact
-from mpfjax import metrics as metrics
-from mpfjax import tuning as tuning
+import importlib as _importlib
+from typing import TYPE_CHECKING
+
 from mpfjax.devices import join_processes as join_processes
 from mpfjax.filters import Filter as Filter
 from mpfjax.filters import FilterRun as FilterRun
@@ -58,4 +58,23 @@ from mpfjax.studies import Study as Study
 from mpfjax.studies import read_study as read_study
 from mpfjax.studies import run_study as run_study
 
+# The one place that says it: pyproject.toml reads it from here.
 __version__ = "0.1.0"
+
+# Imported when they are first asked for: a first filter needs none of them, nor their optax.
+_LATER = ("exact", "metrics", "tuning")
+
+if TYPE_CHECKING:
+    from mpfjax import exact as exact
+    from mpfjax import metrics as metrics
+    from mpfjax import tuning as tuning
+else:  # hidden from type checkers, to which it would say that every name is there
+
+    def __getattr__(name):
+        if name in _LATER:
+            return _importlib.import_module(f"{__name__}.{name}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LATER})

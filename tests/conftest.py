@@ -19,19 +19,22 @@ matplotlib.use("Agg")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 
-def known_to_xla(flags: str) -> bool:
+def known_to_xla(*flags: str) -> bool:
     """Whether this version of XLA has the flags: it ends the process over one that it has not."""
     start = [sys.executable, "-c", "import jax; jax.devices('cpu')"]
-    environment = os.environ | {"XLA_FLAGS": flags}
+    environment = os.environ | {"XLA_FLAGS": " ".join(flags)}
     return subprocess.run(start, env=environment, capture_output=True).returncode == 0
 
 
 # Most programs run once, on little: compiling them is what takes time. Workers, notebooks and
-# other processes inherit it.
+# other processes inherit it. JAX 0.12 has no way around XLA's fusion emitters any more, which take
+# about twice as long to compile a filter as what they replace: there the first flag falls away.
 quick = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1") == "1"
 if quick and "XLA_FLAGS" not in os.environ:
-    half_the_time = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-    os.environ["XLA_FLAGS"] = half_the_time if known_to_xla(half_the_time) else ""
+    flags = ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
+    if not known_to_xla(*flags):
+        flags = [flag for flag in flags if known_to_xla(flag)]
+    os.environ["XLA_FLAGS"] = " ".join(flags)
 
 import jax  # noqa: E402
 

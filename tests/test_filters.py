@@ -253,13 +253,12 @@ class TestSlots:
             shared.log_likelihood_increments, own.log_likelihood_increments, rtol=1e-9, atol=1e-9
         )
         n = filter.num_particles
-        particles, occupied = shared.collected
+        particles, occupied = map(np.asarray, shared.collected)
+        alone, filled = map(np.asarray, own.collected)
         assert occupied.shape[-1] == 70
         assert not occupied[..., n:].any()
-        np.testing.assert_array_equal(occupied[..., :n], own.collected[1])
-        np.testing.assert_allclose(
-            particles[occupied], own.collected[0][own.collected[1]], rtol=1e-9, atol=1e-9
-        )
+        np.testing.assert_array_equal(occupied[..., :n], filled)
+        np.testing.assert_allclose(particles[occupied], alone[filled], rtol=1e-9, atol=1e-9)
 
     def test_are_one_program_whatever_the_number_of_particles(self):
         keys = jax.random.split(jax.random.key(21), 3)

@@ -217,19 +217,29 @@ class TestNetworkProposal:
         assert abs(ratios.mean() - 1) < 4 * standard_error
 
     def test_it_learns_by_the_filters_own_bound(self):
-        """It ends above where it began, and below log Z as every bound must."""
-        filter = self.filter(NetworkProposal.create(jax.random.key(0), 1, 1, 0.8))
+        """It ends above where it began, and below log Z as every bound must.
+
+        The derivative of one run has heavy tails. Over few seeds the rare large ones decide the
+        climb, and the compiler's rounding decides them; so there are many seeds, and steps that
+        end at nothing. Both bounds are of runs that the climb has not seen.
+        """
+        start = self.filter(NetworkProposal.create(jax.random.key(0), 1, 1, 0.8))
         run = mpfjax.tuning.fit(
-            jax.random.key(4), filter, self.OBSERVATIONS, optax.adam(0.03), 60,
+            jax.random.key(4), start, self.OBSERVATIONS,
+            optax.adam(optax.cosine_decay_schedule(0.03, 60)), 60,
             parameters={"network": lambda filter: filter.moves[1].proposal.network},
-            num_seeds=8, progress=False,
+            num_seeds=64, progress=False,
         )  # fmt: skip
-        bound = run.history["log_marginal_likelihood"]
         exact = grid_filter(self.MODEL, self.OBSERVATIONS, jnp.linspace(-4.0, 4.0, 801))
-        gap = float(exact.log_marginal_likelihood) - np.array(
-            [bound[:10].mean(), bound[-10:].mean()]
-        )
-        assert 0 < gap[1] < 0.8 * gap[0]
+        keys = jax.random.split(jax.random.key(5), 1000)
+        gaps, errors = [], []
+        for filter in (start, run.filter):
+            unseen = mpfjax.monte_carlo(keys, filter, self.OBSERVATIONS, lambda mixture: None)
+            gap = np.asarray(exact.log_marginal_likelihood - unseen.log_marginal_likelihood)
+            gaps.append(gap.mean())
+            errors.append(gap.std() / np.sqrt(1000))
+        assert gaps[1] > 4 * errors[1]
+        assert gaps[1] + 4 * np.hypot(*errors) < 0.8 * gaps[0]
 
     def test_a_scale_that_is_not_positive_is_refused(self):
         with pytest.raises(ValueError, match=r"scale: .* is not positive"):

@@ -49,22 +49,23 @@ def short_fit(num_steps=6, *, parameters=NOISE, optimizer=ADAM, start=None, **op
     return fit(**arguments | {"parameters": parameters} | options)
 
 
+@pytest.fixture(scope="module")
+def sequences():
+    rng = np.random.default_rng(0)
+    sequences = []
+    for length in (60, 40):
+        state, rows = 0.5, []
+        for _ in range(length):
+            state = 0.9 * state + 0.6 * rng.normal()
+            rows.append(state + 0.5 * rng.normal())
+        sequences.append(jnp.array(rows))
+    return sequences
+
+
 class TestMaximum:
     """On a linear-Gaussian model, whose likelihood the Kalman filter gives."""
 
     NAMES = ("a", "r")
-
-    @pytest.fixture(scope="class")
-    def sequences(self):
-        rng = np.random.default_rng(0)
-        sequences = []
-        for length in (60, 40):
-            state, rows = 0.5, []
-            for _ in range(length):
-                state = 0.9 * state + 0.6 * rng.normal()
-                rows.append(state + 0.5 * rng.normal())
-            sequences.append(jnp.array(rows))
-        return sequences
 
     def log_evidence(self, reals, sequences):
         a, log_r = reals
