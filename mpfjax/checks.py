@@ -187,6 +187,20 @@ def _has_numbers(array: Any) -> bool:
     return dtype is not None and any(jnp.issubdtype(dtype, kind) for kind in (np.number, np.bool_))
 
 
+def check_scalars(**arguments: Any) -> None:
+    """Each array is a single number."""
+    for name, array in arguments.items():
+        if np.shape(array) != ():
+            raise ValueError(f"{name}: shape {np.shape(array)} is not that of one number, ()")
+
+
+def check_rows(**arguments: Any) -> None:
+    """Each array has one axis at least, and numbers along it."""
+    for name, array in arguments.items():
+        if np.ndim(array) < 1 or 0 in np.shape(array):
+            raise ValueError(f"{name}: shape {np.shape(array)} is not (d,), nor (n, d)")
+
+
 def _check_entries(holds: Callable[..., Any], what: str, arguments: dict[str, Any]) -> None:
     for name, array in arguments.items():
         if isinstance(array, Tracer | jax.ShapeDtypeStruct):

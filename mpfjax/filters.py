@@ -11,6 +11,15 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from mpfjax.checks import (
+    check_callable,
+    check_key,
+    check_one_of,
+    check_type,
+    check_whole,
+    given,
+    shown,
+)
 from mpfjax.devices import (
     choose_devices,
     is_traced,
@@ -25,18 +34,19 @@ from mpfjax.devices import (
 )
 from mpfjax.generator import split
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import AbstractStateSpaceModel, require
+from mpfjax.models.base import AbstractStateSpaceModel, check_model, check_states, mapped
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
 from mpfjax.moves.clusters import PropagateInClusters
 from mpfjax.moves.exchange import Exchange
+from mpfjax.moves.features import Scale
 from mpfjax.moves.gaussian import GaussianRegeneration
 from mpfjax.moves.independent import PropagateIndependently
 from mpfjax.moves.partitioned import Partitioned, check_orders
 from mpfjax.moves.propagation import Predict, Propagate, Weigh
 from mpfjax.moves.regrouping import KMeans, Merge, Pool, RandomPartition, Split
 from mpfjax.moves.resampling import FEW_ROWS, Resample
-from mpfjax.operations import scaled_log_sum_exp
+from mpfjax.operations import default_float, scaled_log_sum_exp
 from mpfjax.proposals import AbstractProposal
 
 
@@ -122,12 +132,12 @@ class Filter(eqx.Module):
         num_components: int = 1,
         initial_moves: Iterable[AbstractRegrouping] = (),
     ) -> None:
-        moves = tuple(moves)
+        check_model(model, "Filter")
+        moves = _as_moves(moves, "moves")
+        initial_moves = _as_moves(initial_moves, "initial_moves")
         _check_sizes(num_particles, num_components)
         if not moves:
             raise ValueError("moves: a filter needs at least one")
-        for method in ("sample_initial", "sample_transition", "log_likelihood"):
-            require(model, method, "Filter")
         for move in moves:
             per_component = getattr(move, "particles_per_component", None)
             if per_component is not None and per_component * num_components > num_particles:
@@ -140,9 +150,9 @@ class Filter(eqx.Module):
             raise ValueError(f"moves: two of them would share one memory, of {sorted(names)}")
         self.model = model
         self._moves = _tie(moves, model)
-        self._initial_moves = _tie(tuple(initial_moves), model)
-        self.num_particles = num_particles
-        self.num_components = num_components
+        self._initial_moves = _tie(initial_moves, model)
+        self.num_particles = int(num_particles)
+        self.num_components = int(num_components)
 
     @property
     def moves(self) -> tuple[Any, ...]:
@@ -156,6 +166,7 @@ class Filter(eqx.Module):
 
     def init(self, key: Key[Array, ""]) -> ParticleMixture:
         """The mixture at time 0: draws of x_0 with equal weights, grouped by the initial moves."""
+        check_key(key)
         return self._init(_Start(key))
 
     def _init(self, start: _Start) -> ParticleMixture:
@@ -173,7 +184,6 @@ class Filter(eqx.Module):
             mixture = move(move_key, mixture)
         return mixture
 
-    @jit_on_wide_vectors
     def step(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> tuple[ParticleMixture, StepInfo]:
@@ -183,22 +193,20 @@ class Filter(eqx.Module):
         every particle has zero likelihood the increment is -inf, the particles move on with the
         weights that they had before, and `degenerate` is true.
         """
-        _require_real(jax.tree.leaves(observation), "observation")
-        observation = jax.tree.map(
-            lambda leaf: (
-                eqx.error_if(
-                    leaf, ~_all_finite(leaf), "observation: NaN or infinite; use predict to skip it"
-                )
-                if jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)
-                else leaf
-            ),
-            observation,
+        check_key(key)
+        check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
+        leaves = jax.tree.leaves(observation)
+        if not leaves:
+            raise ValueError("observation: there is none; use predict to skip it")
+        _require_numbers(leaves, "observation")
+        for leaf in leaves:
+            if _is_plain(leaf):
+                _require_fitting(np.asarray(leaf), "observation")
+        observation = _as_arrays(observation)
+        return with_floats_traced(
+            lambda filter: _checked_step(filter, key, mixture, observation), self
         )
-        moved, info = self._step(key, mixture, observation)
-        broken = ~(info.log_likelihood_increment < jnp.inf)
-        return eqx.error_if((moved, info), broken, _BROKEN_DENSITY)
 
-    @jit_on_wide_vectors
     def predict(
         self, key: Key[Array, ""], mixture: ParticleMixture
     ) -> tuple[ParticleMixture, StepInfo]:
@@ -207,7 +215,9 @@ class Filter(eqx.Module):
         For a missing y_t, or to forecast. The increment is zero. Raises `ValueError` for a move
         that does not say what it does without an observation.
         """
-        return self._predict(key, mixture)
+        check_key(key)
+        check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
+        return with_floats_traced(lambda filter: _checked_predict(filter, key, mixture), self)
 
     def _step(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -252,6 +262,27 @@ class Filter(eqx.Module):
         return mixture, _report(mixture, increment, jnp.zeros(self.num_components, bool))
 
 
+@jit_on_wide_vectors
+def _checked_step(filter, key, mixture, observation):
+    takes_nan = getattr(filter.model, "handles_missing", False)
+    what = "infinite" if takes_nan else "NaN or infinite"
+
+    def check(leaf: Array) -> Array:
+        if not jnp.issubdtype(leaf.dtype, jnp.inexact):
+            return leaf
+        (usable,) = _usable(jnp, [leaf], takes_nan)
+        return eqx.error_if(leaf, ~jnp.all(usable), f"observation: {what}; use predict to skip it")
+
+    moved, info = filter._step(key, mixture, jax.tree.map(check, observation))
+    broken = ~(info.log_likelihood_increment < jnp.inf)
+    return eqx.error_if((moved, info), broken, _BROKEN_DENSITY)
+
+
+@jit_on_wide_vectors
+def _checked_predict(filter, key, mixture):
+    return filter._predict(key, mixture)
+
+
 def run_filter(
     key: Key[Array, ""],
     filter: Filter,
@@ -273,9 +304,12 @@ def run_filter(
     Raises `ValueError` for no observations, leaves of different lengths, or an unknown `missing`,
     before anything compiles, and a RuntimeError where the model's densities give NaN.
     """
-    present = present_steps(observations, missing)
-    run = _run(key, filter, observations, present, collect)
-    return checked(run)
+    check_key(key)
+    check_run(filter, collect)
+    present = present_steps(observations, missing, filter.model)
+    observations = _as_arrays(observations)
+    run = lambda filter: _run(key, filter, observations, present, collect)  # noqa: E731
+    return checked(with_floats_traced(run, filter))
 
 
 def monte_carlo(
@@ -307,16 +341,22 @@ def monte_carlo(
     Raises `ValueError` for more devices than there are, fewer slots than particles, and moves
     that fill every slot, `PropagateIndependently` and `PropagateInClusters`.
     """
-    if jnp.ndim(keys) != 1 or keys.shape[0] < 1:
-        raise ValueError(f"keys: shape {jnp.shape(keys)} is not that of one key a run, (seeds,)")
-    present = present_steps(observations, missing)
-    starts = _Start(keys)
-    if slots is not None:
-        starts, filter = _in_slots(keys, filter, slots)
-    arguments = (filter, observations, present, collect)
-    leave_to_caller = devices is None and is_traced((starts, arguments))
-    chosen = None if leave_to_caller else choose_devices(devices)
-    return checked(over_devices(_run_each, _run_on_threads, starts, arguments, chosen))
+    check_key(keys, "keys", batch=True)
+    check_run(filter, collect)
+    check_whole(**given(slots=slots))
+    present = present_steps(observations, missing, filter.model)
+    observations = _as_arrays(observations)
+
+    def run(filter: Filter) -> FilterRun:
+        starts = _Start(keys)
+        if slots is not None:
+            starts, filter = _in_slots(keys, filter, slots)
+        arguments = (filter, observations, present, collect)
+        leave_to_caller = devices is None and is_traced((starts, arguments))
+        chosen = None if leave_to_caller else choose_devices(devices)
+        return over_devices(_run_each, _run_on_threads, starts, arguments, chosen)
+
+    return checked(with_floats_traced(run, filter))
 
 
 def particle_filter(
@@ -354,6 +394,8 @@ def mixture_particle_filter(
     particles_per_component: int | None = None,
     sort_by: Callable[[PyTree], Array] | None = None,
     gradient: str = "none",
+    features: Callable[[PyTree], Array] | None = None,
+    scale: Scale = 1.0,
     merge: Merge | None = None,
     split: Split | None = None,
     kmeans: KMeans | None = None,
@@ -363,15 +405,17 @@ def mixture_particle_filter(
 
     Vermaak et al. (2003), sections 3 and 4. Components are resampled independently and meet only
     in their mixture weights, so that none can starve another; at every step those that overlap
-    merge, diffuse ones split, and K-means refines the rest. All of it is exact. `merge`, `split`
-    and `kmeans` set thresholds, features and scale; see those moves for the defaults. `gradient`
-    is that of `particle_filter`. Use it where the filtering distribution has several modes that
-    must all be kept.
+    merge, diffuse ones split, and K-means refines the rest. All of it is exact. `features` and
+    `scale` say in which coordinates and units all three see the particles (see `Features`; of one
+    particle where the model is wrapped by `per_particle`). `merge`, `split` and `kmeans` set
+    thresholds, with features and a scale of their own; see those moves for the defaults.
+    `gradient` is that of `particle_filter`. Use it where the filtering distribution has several
+    modes that must all be kept.
     """
     resample = Resample(scheme, ess_threshold, particles_per_component, sort_by, gradient)
     propagate = Propagate(model, proposal, _of_draws(gradient))
     return _mixture_filter(
-        model, num_particles, max_components, [resample, propagate],
+        model, num_particles, max_components, [resample, propagate], features, scale,
         merge, split, kmeans, initial_kmeans,
     )  # fmt: skip
 
@@ -405,6 +449,8 @@ def gaussian_mixture_particle_filter(
     proposal: AbstractProposal | None = None,
     regeneration: GaussianRegeneration | None = None,
     importance: str = "propagated",
+    features: Callable[[PyTree], Array] | None = None,
+    scale: Scale = 1.0,
     merge: Merge | None = None,
     split: Split | None = None,
     kmeans: KMeans | None = None,
@@ -425,7 +471,7 @@ def gaussian_mixture_particle_filter(
     """
     return _mixture_filter(
         model, num_particles, max_components,
-        _gaussian_moves(model, proposal, regeneration, importance),
+        _gaussian_moves(model, proposal, regeneration, importance), features, scale,
         merge, split, kmeans, initial_kmeans,
     )  # fmt: skip
 
@@ -438,12 +484,10 @@ def _gaussian_moves(
 ) -> list[AbstractMove]:
     """Redraw, propagate and weigh, with or without a second redraw between the last two."""
     redraw = GaussianRegeneration() if regeneration is None else regeneration
+    check_type(GaussianRegeneration, "a GaussianRegeneration", regeneration=redraw)
+    check_one_of(("propagated", "predictive_gaussian"), importance=importance)
     if importance == "propagated":
         return [redraw, Propagate(model, proposal)]
-    if importance != "predictive_gaussian":
-        raise ValueError(
-            f"importance: {importance!r} is neither 'propagated' nor 'predictive_gaussian'"
-        )
     if proposal is not None:
         raise ValueError(f"importance: {importance!r} draws from no proposal, but one was given")
     return [redraw, Predict(model), redraw, Weigh(model)]
@@ -577,27 +621,34 @@ def _mixture_filter(
     num_particles: int,
     max_components: int,
     moves: list[AbstractMove],
+    features: Callable[[PyTree], Array] | None,
+    scale: Scale,
     merge: Merge | None,
     split: Split | None,
     kmeans: KMeans | None,
     initial_kmeans: KMeans | None,
 ) -> Filter:
     """The given moves, then regrouping; x_0 grouped by K-means from seeds."""
-    kmeans = KMeans() if kmeans is None else kmeans
-    reseeded = KMeans(
-        10, reseed=True, features=kmeans.features.function, scale=kmeans.features.scale
-    )
+    check_whole(max_components=max_components)
+    check_type(Merge, "a Merge", **given(merge=merge))
+    check_type(Split, "a Split", **given(split=split))
+    check_type(KMeans, "a KMeans", **given(kmeans=kmeans, initial_kmeans=initial_kmeans))
+    seen: dict[str, Any] = {"features": mapped(model, features), "scale": scale}
+    kmeans = KMeans(**seen) if kmeans is None else kmeans
+    if initial_kmeans is None:
+        function, units = kmeans.features.function, kmeans.features.scale
+        initial_kmeans = KMeans(10, reseed=True, features=function, scale=units)
     return Filter(
         model,
         moves=[
             *moves,
-            Merge() if merge is None else merge,
-            Split() if split is None else split,
+            Merge(**seen) if merge is None else merge,
+            Split(**seen) if split is None else split,
             kmeans,
         ],
         num_particles=num_particles,
         num_components=max_components,
-        initial_moves=[reseeded if initial_kmeans is None else initial_kmeans],
+        initial_moves=[initial_kmeans],
     )
 
 
@@ -609,7 +660,7 @@ def _run(key, filter, observations, present, collect):
 def _in_slots(keys: Key[Array, " seeds"], filter: Filter, slots: int) -> tuple[_Start, Filter]:
     """Where the runs start, and the filter, both of so many slots whatever N is."""
     num_particles = filter.num_particles
-    if not isinstance(slots, int | np.integer) or slots < num_particles:
+    if slots < num_particles:
         raise ValueError(f"slots: {slots} is no whole number of at least N, {num_particles}")
     # How a model draws may depend on N: stratified draws do. So this is a program of its own.
     particles = _sample_each(keys, filter.model, num_particles, int(slots))
@@ -722,12 +773,7 @@ def _sample_initial(
 ) -> PyTree:
     """The model's x_0; raises for leaves of another length."""
     particles = model.sample_initial(key, num_particles)
-    for leaf in jax.tree.leaves(particles):
-        if jnp.shape(leaf)[:1] != (num_particles,):
-            raise ValueError(
-                f"model: {type(model).__name__}.sample_initial returned a leaf of shape"
-                f" {jnp.shape(leaf)}; its leading axis is not num_particles, {num_particles}"
-            )
+    check_states(particles, model, "sample_initial", num_particles)
     return particles
 
 
@@ -798,14 +844,26 @@ def _untie(moves: tuple[Any, ...], model: Any) -> tuple[Any, ...]:
     return jax.tree.map(lambda node: model if is_tied(node) else node, moves, is_leaf=is_tied)
 
 
-def _all_finite(leaf: Array) -> Bool[Array, ""]:
-    return jnp.all(jnp.isfinite(leaf))
+def _as_arrays(observations: PyTree) -> PyTree:
+    """Python's numbers as arrays of JAX's own types, everything else as it is."""
+
+    def convert(leaf: Any) -> Any:
+        if isinstance(leaf, jax.Array | np.ndarray | np.generic):
+            return leaf
+        return jnp.asarray(np.asarray(leaf))
+
+    return jax.tree.map(convert, observations)
 
 
-def present_steps(observations: PyTree, missing: str) -> Bool[Array, " t"] | None:
-    """Which observations are there, or None where all are; raises for what cannot be run."""
-    if missing not in ("error", "skip"):
-        raise ValueError(f"missing: {missing!r} is neither 'error' nor 'skip'")
+def present_steps(
+    observations: PyTree, missing: str, model: Any = None
+) -> Bool[Array, " t"] | None:
+    """Which observations are there, or None where all are; raises for what cannot be run.
+
+    To a model that handles missing ones a NaN is one, and only a step that holds nothing else is
+    not there.
+    """
+    check_one_of(("error", "skip"), missing=missing)
     leaves = jax.tree.leaves(observations)
     if not leaves:
         raise ValueError("observations: there are none")
@@ -815,34 +873,57 @@ def present_steps(observations: PyTree, missing: str) -> Bool[Array, " t"] | Non
         raise ValueError(f"observations: shapes {shapes} do not share a leading axis t")
     if lengths == {0}:
         raise ValueError("observations: the leading axis t is empty")
-    _require_real(leaves, "observations")
+    _require_numbers(leaves, "observations")
     inexact = [leaf for leaf in leaves if jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)]
     if not inexact:
         return None
+    takes_nan = getattr(model, "handles_missing", False)
     if any(isinstance(leaf, Tracer) for leaf in inexact):
-        return _present_traced(inexact, missing)
+        return _present_traced(inexact, missing, takes_nan)
     for leaf in inexact:
         _require_fitting(np.asarray(leaf), "observations")
-    finite = [np.isfinite(leaf).reshape(len(leaf), -1).all(axis=1) for leaf in inexact]
-    present = np.logical_and.reduce(finite)
-    if present.all():
-        return None
-    if missing == "error":
+    usable = np.logical_and.reduce(_each_step(np, _usable(np, inexact, takes_nan), "all"))
+    if not usable.all() and (missing == "error" or takes_nan):
+        what = "infinite" if takes_nan else "NaN or infinite"
+        hint = "" if takes_nan else "; missing='skip' takes such steps as missing"
         raise ValueError(
-            f"observations: NaN or infinite at index {int(np.argmin(present))}"
-            " of the leading axis; missing='skip' takes such steps as missing"
+            f"observations: {what} at index {int(np.argmin(usable))} of the leading axis{hint}"
         )
-    return jnp.asarray(present)
+    present = usable
+    if takes_nan and missing == "skip":
+        whole = len(inexact) < len(leaves)  # a leaf of whole numbers is always there
+        seen = [~np.isnan(leaf) for leaf in inexact]
+        present = np.logical_or.reduce(_each_step(np, seen, "any")) | whole
+    return None if present.all() else jnp.asarray(present)
 
 
-def _require_real(leaves: list[Any], name: str) -> None:
-    """Raise a `ValueError` for complex numbers, whose imaginary part a density would drop."""
+def _usable(numpy: Any, leaves: list[Any], takes_nan: bool) -> list[Any]:
+    """Which numbers may be handed to the model."""
+    return [~numpy.isinf(leaf) if takes_nan else numpy.isfinite(leaf) for leaf in leaves]
+
+
+def _each_step(numpy: Any, masks: list[Any], how: str) -> list[Any]:
+    """For every leaf, whether all or any of a step's numbers are in the mask."""
+    return [getattr(numpy, how)(mask.reshape(mask.shape[0], -1), axis=1) for mask in masks]
+
+
+def _require_numbers(leaves: list[Any], name: str) -> None:
+    """Raise a `ValueError` for what is no number, and for complex ones.
+
+    The imaginary part would be dropped, by the density at the latest.
+    """
     for leaf in leaves:
-        dtype = jnp.result_type(leaf)
+        dtype = leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
         if jnp.issubdtype(dtype, jnp.complexfloating):
             raise ValueError(
                 f"{name}: {dtype} is complex; give the real and the imaginary part as two numbers"
             )
+        if not (jnp.issubdtype(dtype, jnp.number) or jnp.issubdtype(dtype, jnp.bool_)):
+            raise ValueError(f"{name}: {shown(leaf)} is no array of numbers")
+
+
+def _is_plain(leaf: Any) -> bool:
+    return not isinstance(leaf, jax.Array | jax.ShapeDtypeStruct)
 
 
 def _require_fitting(leaf: np.ndarray, name: str) -> None:
@@ -860,13 +941,15 @@ def _require_fitting(leaf: np.ndarray, name: str) -> None:
         )
 
 
-def _present_traced(leaves: list[Array], missing: str) -> Bool[Array, " t"] | None:
+def _present_traced(leaves: list[Array], missing: str, takes_nan: bool) -> Bool[Array, " t"] | None:
     """Under the caller's jit the values are not there to name: the check runs with the rest."""
-    finite = [jnp.all(jnp.isfinite(leaf).reshape(leaf.shape[0], -1), axis=1) for leaf in leaves]
-    present = jnp.stack(finite).all(axis=0)
+    usable = jnp.stack(_each_step(jnp, _usable(jnp, leaves, takes_nan), "all")).all(axis=0)
+    if takes_nan and missing == "skip":
+        seen = jnp.stack(_each_step(jnp, [~jnp.isnan(leaf) for leaf in leaves], "any"))
+        return eqx.error_if(seen.any(axis=0), ~usable, "observations: infinite")
     if missing == "skip":
-        return present
-    return eqx.error_if(present, ~present, "observations: NaN or infinite")
+        return usable
+    return eqx.error_if(usable, ~usable, "observations: NaN or infinite")
 
 
 def checked(run: FilterRun) -> FilterRun:
@@ -880,10 +963,49 @@ def checked(run: FilterRun) -> FilterRun:
     return run
 
 
+def _as_moves(moves: Any, name: str) -> tuple[Any, ...]:
+    """The moves as a tuple; a `ValueError` for what is none, or a single one without its list."""
+    if not isinstance(moves, Iterable) or isinstance(moves, str | dict | jax.Array | np.ndarray):
+        raise ValueError(f"{name}: {shown(moves)} is not a list of moves")
+    moves = tuple(moves)
+    for move in moves:
+        check_callable("a move, (key, mixture, observation) -> mixture", **{name: move})
+    return moves
+
+
+def check_run(filter: Any, collect: Any) -> None:
+    """Raise a `ValueError` for what is no filter, or cannot collect."""
+    check_type(Filter, "a Filter", filter=filter)
+    check_callable("a function of a mixture", **given(collect=collect))
+
+
+# What JAX says where Python asks for the value of a number that it traces.
+_NEEDS_VALUE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
+
+def with_floats_traced(run: Callable[[Filter], PyTree], filter: Filter) -> PyTree:
+    """`run(filter)`, compiled once for all values of the Python floats in it.
+
+    Such numbers would otherwise be constants of the program, and each value another program. They
+    stay constants where the model asks for their value in Python, as in `if self.phi > 0`.
+    """
+    arrays = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, default_float()) if type(leaf) is float else leaf, filter
+    )
+    if not any(type(leaf) is float for leaf in jax.tree.leaves(filter)):
+        return run(filter)
+    try:
+        return run(arrays)
+    except _NEEDS_VALUE:
+        return run(filter)
+
+
 def _check_sizes(num_particles: int, num_components: int) -> None:
-    for name, value in (("num_particles", num_particles), ("num_components", num_components)):
-        if not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"{name}: {value} is not a whole number of at least 1")
+    check_whole(num_particles=num_particles, num_components=num_components)
     if num_particles < num_components:
         raise ValueError(
             f"num_particles: {num_particles} is less than num_components, {num_components};"

@@ -5,9 +5,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Key, PyTree
 
+from mpfjax.checks import check_key, check_whole
 from mpfjax.devices import (
     DEVICE_AXIS,
     ISLAND_AXIS,
@@ -16,7 +16,15 @@ from mpfjax.devices import (
     jit_on_wide_vectors,
     over_devices,
 )
-from mpfjax.filters import Filter, FilterRun, checked, present_steps, scan_filter
+from mpfjax.filters import (
+    Filter,
+    FilterRun,
+    check_run,
+    checked,
+    present_steps,
+    scan_filter,
+    with_floats_traced,
+)
 from mpfjax.mixture import ParticleMixture
 
 
@@ -58,15 +66,19 @@ def run_islands(
     Use it where one filter is too large or too slow for one device. For many runs of a filter
     that fits use `monte_carlo`, whose runs share nothing at all.
     """
-    if not isinstance(num_islands, int | np.integer) or num_islands < 1:
-        raise ValueError(f"num_islands: {num_islands} is not a whole number of at least 1")
-    present = present_steps(observations, missing)
+    check_key(key)
+    check_run(filter, collect)
+    check_whole(num_islands=num_islands)
+    present = present_steps(observations, missing, filter.model)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_islands, dtype=jnp.uint32))
-    arguments = (filter, observations, present, collect)
-    leave_to_caller = devices is None and is_traced((key, arguments))
-    chosen = None if leave_to_caller else _dividing(num_islands, devices)
-    run = over_devices(_run_block, _run_on_one, keys, arguments, chosen)
-    return checked(_joined(run, collect is None))
+
+    def run(filter: Filter) -> FilterRun:
+        arguments = (filter, observations, present, collect)
+        leave_to_caller = devices is None and is_traced((key, arguments))
+        chosen = None if leave_to_caller else _dividing(num_islands, devices)
+        return over_devices(_run_block, _run_on_one, keys, arguments, chosen)
+
+    return checked(_joined(with_floats_traced(run, filter), collect is None))
 
 
 def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any]:

@@ -10,8 +10,17 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
+from mpfjax.checks import (
+    check_callable,
+    check_key,
+    check_one_of,
+    check_positive,
+    check_positive_array,
+    check_whole,
+    to_array,
+)
 from mpfjax.generator import normal
-from mpfjax.models.base import require, require_positive
+from mpfjax.models.base import model_name, require
 from mpfjax.models.noise import NOISES
 from mpfjax.operations import cholesky, solve_lower
 
@@ -44,10 +53,11 @@ class NetworkProposal(AbstractProposal):
     """
 
     network: Callable[[Float[Array, " k"]], Float[Array, " two_d"]]
-    scale: Float[Array, "*d"] = eqx.field(converter=jnp.asarray)
+    scale: Float[Array, "*d"] = eqx.field(converter=to_array("scale"))
 
     def __check_init__(self) -> None:
-        require_positive(scale=self.scale)
+        check_callable("a network, from one vector to one", network=self.network)
+        check_positive_array(scale=self.scale)
 
     @classmethod
     def create(
@@ -61,6 +71,9 @@ class NetworkProposal(AbstractProposal):
         depth: int = 2,
     ) -> "NetworkProposal":
         """An untrained one: a small network, whose draws are about N(x_{t-1}, scale²)."""
+        check_key(key)
+        check_whole(state_size=state_size, observation_size=observation_size)
+        check_whole(width=width, depth=depth)
         sizes = (state_size + observation_size, 2 * state_size)
         network = eqx.nn.MLP(*sizes, width, depth, jax.nn.tanh, key=key)
         last = lambda net: (net.layers[-1].weight, net.layers[-1].bias)  # noqa: E731
@@ -114,15 +127,12 @@ class GaussNewtonProposal(AbstractProposal):
         for matrix in ("transition_covariance", "observation_covariance"):
             if not hasattr(self.model, matrix):
                 raise ValueError(
-                    f"model: {type(self.model).__name__} has no {matrix},"
+                    f"model: {model_name(self.model)} has no {matrix},"
                     " which GaussNewtonProposal needs"
                 )
-        if self.num_iterations < 1:
-            raise ValueError(f"num_iterations: {self.num_iterations} is less than 1")
-        if not self.inflation > 0:
-            raise ValueError(f"inflation: {self.inflation} is not positive")
-        if self.noise not in NOISES:
-            raise ValueError(f"noise: {self.noise!r} is not one of {sorted(NOISES)}")
+        check_whole(num_iterations=self.num_iterations)
+        check_positive(inflation=self.inflation)
+        check_one_of(NOISES, noise=self.noise)
 
     def propose(
         self, key: Key[Array, ""], observation: PyTree, previous_states: Float[Array, "n ..."]

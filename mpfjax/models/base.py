@@ -1,13 +1,15 @@
 """The interface of a state-space model, and the wrapper for models of one particle."""
 
 import abc
-from typing import Any, Protocol, runtime_checkable
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import shown
@@ -23,9 +25,14 @@ class AbstractStateSpaceModel(eqx.Module):
     times faster than a key for each. Whoever thinks in one particle writes for one and wraps the
     model with `per_particle`.
 
+    A class that sets `handles_missing = True` takes a NaN in an observation for a value that is
+    missing, and weighs by what is there; runners then hand it such observations.
+
     A model may also define `log_transition(states, previous_states)`, log D of each particle,
     shape (n,). Guided proposals need it; the bootstrap proposal does not.
     """
+
+    handles_missing: ClassVar[bool] = False
 
     @abc.abstractmethod
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
@@ -49,19 +56,95 @@ class HasTransitionDensity(Protocol):
         ...
 
 
-def require(model: Any, method: str, needed_by: str) -> None:
+def require(model: Any, method: str, needed_by: str, argument: str = "model") -> None:
     """Raise a `ValueError` where `model` lacks `method`, before anything compiles."""
     if not callable(getattr(model, method, None)):
+        who = shown(model) if isinstance(model, _NO_MODELS) else model_name(model)
+        raise ValueError(f"{argument}: {who} defines no {method}, which {needed_by} needs")
+
+
+_NO_MODELS = (type(None), str, int, float, list, tuple, dict, jax.Array, np.ndarray)
+
+
+def model_name(model: Any) -> str:
+    """The name of the user's own class, also of one that `per_particle` wraps."""
+    return type(model.model if isinstance(model, _PerParticleModel) else model).__name__
+
+
+def check_model(model: Any, needed_by: str, argument: str = "model") -> None:
+    """Raise a `ValueError` for what is no model, or one that is written for one particle."""
+    if isinstance(model, type):
+        raise ValueError(f"{argument}: {shown(model)} is a class; write {model.__name__}(...)")
+    for method in ("sample_initial", "sample_transition", "log_likelihood"):
+        require(model, method, needed_by, argument)
+    try:
+        signature = inspect.signature(model.sample_initial)
+    except (TypeError, ValueError):  # of what is not written in Python nothing is known
+        return
+    if not _takes(signature, 2):
+        wrap = "it is written for one particle: wrap it, mpfjax.per_particle(model)"
+        hint = wrap if _takes(signature, 1) else "it is sample_initial(key, num_particles)"
         raise ValueError(
-            f"model: {type(model).__name__} defines no {method}, which {needed_by} needs"
+            f"{argument}: {model_name(model)}.sample_initial{signature} takes no (key,"
+            f" num_particles); {hint}"
         )
+
+
+def check_states(states: Any, model: Any, method: str, num_particles: int) -> None:
+    """Raise a `ValueError` for states of another number of particles, or no states at all."""
+    leaves = jax.tree_util.tree_leaves_with_path(states)
+    who = f"model: {model_name(model)}.{method} returned"
+    if not leaves:
+        raise ValueError(f"{who} {shown(states)}, which holds no array of particles")
+    for place, leaf in leaves:
+        if not isinstance(leaf, jax.Array | np.ndarray):
+            raise ValueError(f"{who} {shown(leaf)}{_at(place)}, no array of particles")
+        if leaf.shape[:1] != (num_particles,):
+            raise ValueError(
+                f"{who} a leaf of shape {leaf.shape}{_at(place)}; its leading axis is not"
+                f" num_particles, {num_particles}"
+            )
+
+
+def check_moved(
+    states: Any, previous_states: Any, model: Any, method: str = "sample_transition"
+) -> None:
+    """Raise a `ValueError` where x_t is not of the structure, shapes and types of x_{t-1}."""
+    structures = jax.tree.structure(states), jax.tree.structure(previous_states)
+    who = f"model: {model_name(model)}.{method} returned"
+    if structures[0] != structures[1]:
+        raise ValueError(
+            f"{who} states of another structure, {structures[0]}, than it was given,"
+            f" {structures[1]}; sample_initial's is that of all states"
+        )
+    before = jax.tree.leaves(previous_states)
+    for (place, new), old in zip(jax.tree_util.tree_leaves_with_path(states), before, strict=True):
+        if not isinstance(new, jax.Array | np.ndarray):
+            raise ValueError(f"{who} {shown(new)}{_at(place)}, no array of particles")
+        if (new.shape, new.dtype) != (old.shape, old.dtype):
+            raise ValueError(
+                f"{who} {new.dtype}{list(new.shape)}{_at(place)} and was given"
+                f" {old.dtype}{list(old.shape)}; sample_initial and {method} must agree"
+            )
+
+
+def _at(place: tuple[Any, ...]) -> str:
+    return f" at states{jax.tree_util.keystr(place)}" if place else ""
+
+
+def _takes(signature: inspect.Signature, num_arguments: int) -> bool:
+    try:
+        signature.bind(*range(num_arguments))
+    except TypeError:
+        return False
+    return True
 
 
 def check_log_density(
     values: Any, model: Any, method: str, num_particles: int
 ) -> Float[Array, " n"]:
     """What a density of the model returned; a `ValueError` unless it is one real number each."""
-    who = f"model: {type(model).__name__}.{method} returned"
+    who = f"model: {model_name(model)}.{method} returned"
     if not isinstance(values, jax.Array | np.ndarray):
         raise ValueError(
             f"{who} {shown(values)}, not one value a particle, an array of shape ({num_particles},)"
@@ -75,13 +158,6 @@ def check_log_density(
     return jnp.asarray(values)
 
 
-def require_positive(**parameters: Any) -> None:
-    """Raise a `ValueError` for a parameter that is known not to be positive."""
-    for name, value in parameters.items():
-        if not isinstance(value, Tracer) and not np.all(np.asarray(value) > 0):
-            raise ValueError(f"{name}: {value} is not positive")
-
-
 # What the library looks for in a model beside the three methods: functions of one particle, and
 # what all particles share.
 _BATCHED = ("log_transition", "log_initial", "with_history", "transition_mean", "observation_mean")
@@ -92,6 +168,10 @@ class _PerParticleModel(AbstractStateSpaceModel):
     """A model of one particle, mapped over all of them with a key for each."""
 
     model: Any
+
+    @property
+    def handles_missing(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return getattr(self.model, "handles_missing", False)
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         return jax.vmap(self.model.sample_initial)(split(key, num_particles))
@@ -114,6 +194,23 @@ class _PerParticleModel(AbstractStateSpaceModel):
         raise AttributeError(f"{type(model).__name__} (per_particle) has no attribute {name!r}")
 
 
+@dataclass(frozen=True)
+class _OverParticles:
+    """A function of one particle, mapped over all of them; equal where the functions are."""
+
+    function: Callable[[Any], Any]
+
+    def __call__(self, particles: PyTree) -> PyTree:
+        return jax.vmap(self.function)(particles)
+
+
+def mapped(model: Any, function: Any) -> Any:
+    """A function of the particles from one in the terms of the model: of one, or of all."""
+    if not isinstance(model, _PerParticleModel) or not callable(function):
+        return function
+    return _OverParticles(function)
+
+
 def per_particle(model: Any) -> AbstractStateSpaceModel:
     """Make a batched model of one that is written for a single particle.
 
@@ -128,6 +225,8 @@ def per_particle(model: Any) -> AbstractStateSpaceModel:
 
     Raises `ValueError` where one of the three methods is missing.
     """
+    if isinstance(model, type):
+        raise ValueError(f"model: {shown(model)} is a class; write {model.__name__}(...)")
     for method in ("sample_initial", "sample_transition", "log_likelihood"):
         require(model, method, "per_particle")
     return _PerParticleModel(model)

@@ -6,8 +6,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from mpfjax.checks import (
+    check_finite,
+    check_finite_array,
+    check_positive_array,
+    check_rows,
+    to_array,
+)
 from mpfjax.generator import normal
-from mpfjax.models.base import require_positive
 from mpfjax.operations import cholesky, row_sums, solve_lower
 
 
@@ -61,10 +67,11 @@ class RandomWalk(AbstractDynamics):
     it where motion is too erratic to be carried over from the last frame.
     """
 
-    deviations: Float[Array, "*n d"] = eqx.field(converter=jnp.asarray)
+    deviations: Float[Array, "*n d"] = eqx.field(converter=to_array("deviations"))
 
     def __check_init__(self) -> None:
-        require_positive(deviations=self.deviations)
+        check_positive_array(deviations=self.deviations)
+        check_rows(deviations=self.deviations)
 
     @property
     def order(self) -> int:
@@ -120,12 +127,14 @@ class Autoregression(AbstractDynamics):
     direction last over several frames.
     """
 
-    A1: Float[Array, "*n d d"] = eqx.field(converter=jnp.asarray)
-    A2: Float[Array, "*n d d"] = eqx.field(converter=jnp.asarray)
-    B: Float[Array, "*n d d"] = eqx.field(converter=jnp.asarray)
-    mean: Float[Array, "*n d"] = eqx.field(converter=jnp.asarray)
+    A1: Float[Array, "*n d d"] = eqx.field(converter=to_array("A1"))
+    A2: Float[Array, "*n d d"] = eqx.field(converter=to_array("A2"))
+    B: Float[Array, "*n d d"] = eqx.field(converter=to_array("B"))
+    mean: Float[Array, "*n d"] = eqx.field(converter=to_array("mean"))
 
     def __check_init__(self) -> None:
+        check_rows(mean=self.mean)
+        check_finite_array(mean=self.mean)
         expected = (*self.mean.shape, self.mean.shape[-1])
         for name in ("A1", "A2", "B"):
             if getattr(self, name).shape != expected:
@@ -133,19 +142,23 @@ class Autoregression(AbstractDynamics):
                     f"{name}: shape {getattr(self, name).shape} is not {expected},"
                     f" for a mean of shape {self.mean.shape}"
                 )
+            check_finite_array(**{name: getattr(self, name)})
 
     @classmethod
-    def with_momentum(cls, momentum: float, deviations: Float[Array, " d"]) -> "Autoregression":
+    def with_momentum(cls, momentum: float, deviations: Float[Array, "*n d"]) -> "Autoregression":
         """x_t = x_{t-1} + momentum (x_{t-1} - x_{t-2}) + diag(deviations) ω_t.
 
         Momentum 1 is constant velocity, 0 the random walk; Smith and Gatica-Perez (2004) have 0.5.
+        `deviations` are one row for all, or a row for each particle or box, as in `RandomWalk`.
         """
-        deviations = jnp.asarray(deviations)
-        require_positive(deviations=deviations)
-        eye = jnp.eye(len(deviations), dtype=deviations.dtype)
-        return cls(
-            (1 + momentum) * eye, -momentum * eye, jnp.diag(deviations), jnp.zeros_like(deviations)
-        )
+        check_finite(momentum=momentum)
+        deviations = to_array("deviations")(deviations)
+        check_positive_array(deviations=deviations)
+        check_rows(deviations=deviations)
+        d = deviations.shape[-1]
+        eye = jnp.broadcast_to(jnp.eye(d, dtype=deviations.dtype), (*deviations.shape, d))
+        zero = jnp.zeros_like(deviations)
+        return cls((1 + momentum) * eye, -momentum * eye, deviations[..., None] * eye, zero)
 
     @property
     def order(self) -> int:

@@ -6,8 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from mpfjax.checks import check_callable, check_flag, check_positive_array, given, to_array
 from mpfjax.mixture import flatten_states
-from mpfjax.models.base import require_positive
 from mpfjax.operations import row_sums
 
 
@@ -29,13 +29,15 @@ class PairwiseRepulsion(eqx.Module):
     the compact form lets a filter see that objects do not touch.
     """
 
-    strength: Float[Array, ""] = eqx.field(converter=jnp.asarray)
-    radius: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    strength: Float[Array, ""] = eqx.field(converter=to_array("strength"))
+    radius: Float[Array, ""] = eqx.field(converter=to_array("radius"))
     position: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None)
     compact: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self) -> None:
-        require_positive(strength=self.strength, radius=self.radius)
+        check_positive_array(strength=self.strength, radius=self.radius)
+        check_callable("a function of the states", **given(position=self.position))
+        check_flag(compact=self.compact)
 
     def __call__(self, states: PyTree, other_states: PyTree) -> Float[Array, " n"]:
         """log ψ of each row of the states with the same row of the other states."""

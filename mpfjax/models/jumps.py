@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from mpfjax.generator import normal
-from mpfjax.models.base import require_positive
+from mpfjax.checks import check_inner_share, check_positive_array, check_rows, to_array
+from mpfjax.generator import normal, split
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
 
 
@@ -26,19 +26,19 @@ class RandomWalkWithJumps(AbstractDynamics):
     and for a probability outside (0, 1). Use it where objects vanish and come back elsewhere.
     """
 
-    deviations: Float[Array, "*n d"] = eqx.field(converter=jnp.asarray)
-    jump_deviations: Float[Array, "*n d"] = eqx.field(converter=jnp.asarray)
+    deviations: Float[Array, "*n d"] = eqx.field(converter=to_array("deviations"))
+    jump_deviations: Float[Array, "*n d"] = eqx.field(converter=to_array("jump_deviations"))
     jump_probability: float = eqx.field(static=True, default=0.03)
 
     def __check_init__(self) -> None:
-        require_positive(deviations=self.deviations, jump_deviations=self.jump_deviations)
+        check_positive_array(deviations=self.deviations, jump_deviations=self.jump_deviations)
+        check_rows(deviations=self.deviations)
         if self.jump_deviations.shape != self.deviations.shape:
             raise ValueError(
                 f"jump_deviations: shape {self.jump_deviations.shape} is not that of deviations,"
                 f" {self.deviations.shape}"
             )
-        if not 0 < self.jump_probability < 1:
-            raise ValueError(f"jump_probability: {self.jump_probability} is not in (0, 1)")
+        check_inner_share(jump_probability=self.jump_probability)
 
     @property
     def order(self) -> int:

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from mpfjax.checks import check_finite_array, to_array
 from mpfjax.generator import normal
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.operations import row_sums, solve_lower
@@ -19,12 +20,12 @@ class LinearGaussianModel(AbstractStateSpaceModel):
     Kalman filter, or where the system is linear.
     """
 
-    A: Float[Array, "d d"] = eqx.field(converter=jnp.asarray)
-    Q: Float[Array, "d d"] = eqx.field(converter=jnp.asarray)
-    H: Float[Array, "p d"] = eqx.field(converter=jnp.asarray)
-    R: Float[Array, "p p"] = eqx.field(converter=jnp.asarray)
-    m0: Float[Array, " d"] = eqx.field(converter=jnp.asarray)
-    P0: Float[Array, "d d"] = eqx.field(converter=jnp.asarray)
+    A: Float[Array, "d d"] = eqx.field(converter=to_array("A"))
+    Q: Float[Array, "d d"] = eqx.field(converter=to_array("Q"))
+    H: Float[Array, "p d"] = eqx.field(converter=to_array("H"))
+    R: Float[Array, "p p"] = eqx.field(converter=to_array("R"))
+    m0: Float[Array, " d"] = eqx.field(converter=to_array("m0"))
+    P0: Float[Array, "d d"] = eqx.field(converter=to_array("P0"))
 
     def __check_init__(self) -> None:
         d = self.m0.shape[-1] if self.m0.ndim == 1 else None
@@ -35,6 +36,7 @@ class LinearGaussianModel(AbstractStateSpaceModel):
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name}: shape {getattr(self, name).shape} is not {shape}")
+            check_finite_array(**{name: getattr(self, name)})
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n d"]:
         """x_0 ~ N(m0, P0)."""

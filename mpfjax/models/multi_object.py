@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
+from mpfjax.checks import check_callable, check_flag, check_whole, given, shown
 from mpfjax.generator import split
-from mpfjax.models.base import AbstractStateSpaceModel, require
+from mpfjax.models.base import AbstractStateSpaceModel, check_model
 
 # A number of particles that no parameter has by chance as the length of an axis.
 _TRIAL = 1_000_003
@@ -58,12 +59,11 @@ class MultiObjectModel(AbstractStateSpaceModel):
         *,
         per_object: bool | None = None,
     ) -> None:
-        if not isinstance(num_objects, int | np.integer) or num_objects < 1:
-            raise ValueError(f"num_objects: {num_objects} is not a whole number of at least 1")
-        for method in ("sample_initial", "sample_transition", "log_likelihood"):
-            require(object_model, method, "MultiObjectModel")
-        if interaction is not None and not callable(interaction):
-            raise ValueError(f"interaction: {interaction!r} is not callable")
+        check_whole(num_objects=num_objects)
+        check_model(object_model, "MultiObjectModel", "object_model")
+        potential = "a function of the states of two objects, such as PairwiseRepulsion(...)"
+        check_callable(potential, **given(interaction=interaction))
+        check_flag(shared_observation=shared_observation, **given(per_object=per_object))
         self.object_model = object_model
         self.num_objects = int(num_objects)
         self.interaction = interaction
@@ -76,6 +76,11 @@ class MultiObjectModel(AbstractStateSpaceModel):
                 f" axis of num_objects, {num_objects}"
             )
         self.per_object = per_object
+
+    @property
+    def handles_missing(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether the objects' model does."""
+        return getattr(self.object_model, "handles_missing", False)
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         """x_0 of every object, independent: every leaf (n, J, ...)."""
@@ -235,7 +240,8 @@ def require_multi_object(model: Any, needed_by: str) -> None:
     """Raise a `ValueError` where `model` is not of several objects."""
     if not isinstance(model, MultiObjectModel):
         raise ValueError(
-            f"model: {type(model).__name__} is no MultiObjectModel, which {needed_by} needs"
+            f"model: {shown(model)} is no MultiObjectModel, which {needed_by} needs;"
+            " MultiObjectModel(object_model, num_objects) makes one"
         )
 
 

@@ -4,8 +4,15 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from mpfjax.checks import (
+    check_finite,
+    check_one_of,
+    check_positive_array,
+    check_scalars,
+    to_array,
+)
 from mpfjax.generator import normal, uniform
-from mpfjax.models.base import AbstractStateSpaceModel, require_positive
+from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.noise import stratified_uniform
 
 
@@ -25,20 +32,19 @@ class QuadraticModel(AbstractStateSpaceModel):
     not positive, an empty range or an unknown draw. Use it to see who keeps both modes.
     """
 
-    sigma_x: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.1)
-    sigma_y: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.1)
+    sigma_x: Float[Array, ""] = eqx.field(converter=to_array("sigma_x"), default=0.1)
+    sigma_y: Float[Array, ""] = eqx.field(converter=to_array("sigma_y"), default=0.1)
     low: float = eqx.field(static=True, default=-2.5)
     high: float = eqx.field(static=True, default=2.5)
     initial_draw: str = eqx.field(static=True, default="stratified")
 
     def __check_init__(self) -> None:
-        require_positive(sigma_x=self.sigma_x, sigma_y=self.sigma_y)
+        check_positive_array(sigma_x=self.sigma_x, sigma_y=self.sigma_y)
+        check_scalars(sigma_x=self.sigma_x, sigma_y=self.sigma_y)
+        check_finite(low=self.low, high=self.high)
         if not self.low < self.high:
             raise ValueError(f"high: {self.high} is not above low, {self.low}")
-        if self.initial_draw not in ("stratified", "independent"):
-            raise ValueError(
-                f"initial_draw: {self.initial_draw!r} is neither 'stratified' nor 'independent'"
-            )
+        check_one_of(("stratified", "independent"), initial_draw=self.initial_draw)
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, " n"]:
         """x_0, uniform on [low, high]."""

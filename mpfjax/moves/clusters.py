@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from mpfjax.checks import check_one_of, check_whole, given
 from mpfjax.generator import split, uniform
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import check_log_density, require
@@ -91,10 +92,8 @@ class PropagateInClusters(AbstractPropagation):
     def __check_init__(self) -> None:
         require_multi_object(self.model, "PropagateInClusters")
         Resample(self.scheme)  # raises where there is no such scheme
-        if self.start not in STARTS:
-            raise ValueError(f"start: {self.start!r} is not one of {STARTS}")
-        if self.split_after is not None and self.split_after < 1:
-            raise ValueError(f"split_after: {self.split_after} is less than 1")
+        check_one_of(STARTS, start=self.start)
+        check_whole(**given(split_after=self.split_after))
         if self._may_be_joint:
             require(self.model.object_model, "log_transition", "PropagateInClusters")
 
@@ -181,7 +180,7 @@ class PropagateInClusters(AbstractPropagation):
     ) -> tuple[PyTree, Float[Array, ""]]:
         """The clusters' new rows, of equal weight, and log of their factors of Ẑ."""
         keys_rows, key_inside = keys
-        key_cross, key_last = split(key_inside)
+        key_cross, key_last = split(key_inside, 2)
         together = _together(labels)
         alone = jnp.sum(together, axis=1) == 1
         log_totals, log_sums = self._scores(particles, points, log_likelihoods, alone)
@@ -286,7 +285,7 @@ class PropagateInClusters(AbstractPropagation):
     ) -> tuple[PyTree, Float[Array, "objects n"]]:
         """The points that each row takes, and what its cluster's weight is multiplied by."""
         num_objects, num_particles = log_sums.shape
-        key_start, key_points = split(key)
+        key_start, key_points = split(key, 2)
         ks = jnp.arange(num_particles, dtype=jnp.int32)
         starts = _rotated(key_start, jnp.arange(num_objects, dtype=jnp.int32))[ks % num_objects]
         alone = jnp.sum(together, axis=1) == 1

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Key, PyTree
 
+from mpfjax.checks import check_share
 from mpfjax.devices import deal_to_islands, num_islands, over_islands
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
@@ -34,8 +35,7 @@ class Exchange(AbstractMove):
     threshold: float = eqx.field(static=True, default=0.5)
 
     def __check_init__(self) -> None:
-        if not 0.0 <= self.threshold <= 1.0:
-            raise ValueError(f"threshold: {self.threshold} is not in [0, 1]")
+        check_share(threshold=self.threshold)
 
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, ""]:
         """Whether the masses of the islands are uneven enough, the same for each."""

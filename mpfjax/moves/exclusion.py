@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
+from mpfjax.checks import check_positive
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.features import Features, Scale, summarise
@@ -40,9 +41,7 @@ class Exclusion(AbstractPropagation):
         features: Callable[[PyTree], Array] | None = None,
         scale: Scale = 1.0,
     ) -> None:
-        for name, value in (("strength", strength), ("radius", radius)):
-            if not value > 0:
-                raise ValueError(f"{name}: {value} is not positive")
+        check_positive(strength=strength, radius=radius)
         self.strength = strength
         self.radius = radius
         self.features = Features(features, scale)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from mpfjax.checks import check_callable, check_positive_array, given, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations import as_inexact, segment_sum, spread
 
@@ -15,7 +16,10 @@ Scale = ArrayLike | Sequence[float]
 
 
 def _as_units(scale: Any) -> tuple[float, ...]:
-    return tuple(map(float, np.ravel(scale)))
+    try:
+        return tuple(map(float, np.ravel(scale)))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"scale: {shown(scale)} is no number, nor one a feature") from error
 
 
 class Features(eqx.Module):
@@ -33,8 +37,8 @@ class Features(eqx.Module):
     scale: tuple[float, ...] = eqx.field(static=True, default=(1.0,), converter=_as_units)
 
     def __check_init__(self) -> None:
-        if not all(unit > 0 for unit in self.scale):
-            raise ValueError(f"scale: {self.scale} is not positive")
+        check_callable("a function of the particles", **given(features=self.function))
+        check_positive_array(scale=np.asarray(self.scale))
 
     def __call__(self, mixture: ParticleMixture) -> Float[Array, "n k"]:
         """The features of every particle, counted from their average, zero in an empty slot.

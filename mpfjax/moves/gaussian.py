@@ -8,13 +8,14 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Key, PyTree
 
+from mpfjax.checks import check_callable, check_one_of, check_positive, check_whole, given
 from mpfjax.generator import split
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import AbstractRejuvenation
 from mpfjax.moves.features import origin, summarise
 from mpfjax.moves.resampling import Resample
-from mpfjax.moves.slots import check_particles_per_component, deal_slots, place_slots
+from mpfjax.moves.slots import deal_slots, place_slots
 from mpfjax.operations import cholesky, segment_argmax, spread, take
 
 
@@ -46,11 +47,10 @@ class GaussianRegeneration(AbstractRejuvenation):
     noise: str = eqx.field(static=True, default="independent")
 
     def __check_init__(self) -> None:
-        check_particles_per_component(self.particles_per_component)
-        if not self.inflation > 0:
-            raise ValueError(f"inflation: {self.inflation} is not positive")
-        if self.noise not in NOISES:
-            raise ValueError(f"noise: {self.noise!r} is not one of {sorted(NOISES)}")
+        check_whole(**given(particles_per_component=self.particles_per_component))
+        check_callable("a function that chooses from the state", **given(where=self.where))
+        check_positive(inflation=self.inflation)
+        check_one_of(NOISES, noise=self.noise)
 
     @property
     def approximate(self) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from mpfjax.checks import check_one_of
 from mpfjax.generator import split
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import check_log_density, require
@@ -70,8 +71,7 @@ class Partitioned(AbstractPropagation):
         reassembly: str = "evidence",
         gradient: str = "none",
     ) -> None:
-        if reassembly not in REASSEMBLIES:
-            raise ValueError(f"reassembly: {reassembly!r} is not one of {REASSEMBLIES}")
+        check_one_of(REASSEMBLIES, reassembly=reassembly)
         require_multi_object(model, "Partitioned")
         if isinstance(orders, str):
             if orders not in ("circular", "random"):

@@ -7,11 +7,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
+from mpfjax.checks import check_one_of, check_type
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     HasTransitionDensity,
     check_log_density,
+    check_model,
+    check_moved,
     require,
 )
 from mpfjax.moves.base import AbstractPropagation
@@ -42,8 +45,11 @@ class Propagate(AbstractPropagation):
     gradient: str = eqx.field(static=True, default="none")
 
     def __check_init__(self) -> None:
+        check_model(self.model, type(self).__name__)
         check_propagated_gradient(self.gradient, self.model)
         if self.proposal is not None:
+            what = "a proposal, such as GaussNewtonProposal(model)"
+            check_type(AbstractProposal, what, proposal=self.proposal)
             require(self.model, "log_transition", f"proposal {type(self.proposal).__name__}")
 
     def __call__(
@@ -54,6 +60,7 @@ class Propagate(AbstractPropagation):
             return _weigh(self.model, self.predict(key, mixture), observation)
         previous = mixture.particles
         states, log_density = self.proposal.propose(key, observation, previous)
+        check_moved(states, previous, self.proposal, "propose")
         if self.gradient == "stop":
             states, log_density = jax.lax.stop_gradient((states, log_density))
         log_ratio = log_transition(self.model, states, previous) - log_density
@@ -76,6 +83,7 @@ class Predict(AbstractPropagation):
     gradient: str = eqx.field(static=True, default="none")
 
     def __check_init__(self) -> None:
+        check_model(self.model, type(self).__name__)
         check_propagated_gradient(self.gradient, self.model)
 
     def __call__(
@@ -98,6 +106,9 @@ class Weigh(AbstractPropagation):
 
     model: AbstractStateSpaceModel
 
+    def __check_init__(self) -> None:
+        check_model(self.model, "Weigh")
+
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
@@ -113,8 +124,7 @@ class Weigh(AbstractPropagation):
 
 def check_propagated_gradient(gradient: str, model: object) -> None:
     """Raise a `ValueError` for an unknown gradient, or one whose density the model lacks."""
-    if gradient not in ("none", "stop"):
-        raise ValueError(f"gradient: {gradient!r} is neither 'none' nor 'stop'")
+    check_one_of(("none", "stop"), gradient=gradient)
     if gradient == "stop":
         require(model, "log_transition", "gradient='stop'")
 
@@ -124,6 +134,7 @@ def predict(
 ) -> ParticleMixture:
     """Draws of x_t, with the weights' derivatives times D / ⊥D where the draws have none."""
     states = model.sample_transition(key, mixture.particles)
+    check_moved(states, mixture.particles, model)
     if gradient == "none":
         return mixture.replace(particles=states)
     states = jax.lax.stop_gradient(states)

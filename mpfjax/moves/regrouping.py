@@ -7,6 +7,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from mpfjax.checks import (
+    check_flag,
+    check_not_negative,
+    check_positive,
+    check_share,
+    check_whole,
+    given,
+)
 from mpfjax.generator import bits
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
@@ -49,8 +57,8 @@ class KMeans(AbstractRegrouping):
         features: Callable[[PyTree], Array] | None = None,
         scale: Scale = 1.0,
     ) -> None:
-        if num_iterations < 1:
-            raise ValueError(f"num_iterations: {num_iterations} is less than 1")
+        check_whole(num_iterations=num_iterations)
+        check_flag(reseed=reseed)
         self.num_iterations = num_iterations
         self.reseed = reseed
         self.features = Features(features, scale)
@@ -109,9 +117,8 @@ class Merge(AbstractRegrouping):
     ) -> None:
         if max_deviations is None and max_distance is None:
             raise ValueError("max_deviations, max_distance: at least one must be given")
-        _require_positive(max_deviations=max_deviations, max_distance=max_distance)
-        if patience < 1:
-            raise ValueError(f"patience: {patience} is less than 1")
+        check_positive(**given(max_deviations=max_deviations, max_distance=max_distance))
+        check_whole(patience=patience)
         self.max_deviations = max_deviations
         self.max_distance = max_distance
         self.patience = patience
@@ -196,13 +203,9 @@ class Split(AbstractRegrouping):
         features: Callable[[PyTree], Array] | None = None,
         scale: Scale = 1.0,
     ) -> None:
-        for name, value in (("min_deviations", min_deviations), ("min_distance", min_distance)):
-            if value < 0:
-                raise ValueError(f"{name}: {value} is negative")
-        if not 0 <= min_share <= 0.5:
-            raise ValueError(f"min_share: {min_share} is not in [0, 0.5]")
-        if num_iterations < 1:
-            raise ValueError(f"num_iterations: {num_iterations} is less than 1")
+        check_not_negative(min_deviations=min_deviations, min_distance=min_distance)
+        check_share(0.5, min_share=min_share)
+        check_whole(num_iterations=num_iterations)
         self.min_deviations = min_deviations
         self.min_distance = min_distance
         self.min_share = min_share
@@ -284,8 +287,7 @@ class RandomPartition(AbstractRegrouping):
     num_sets: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
-        if self.num_sets is not None and self.num_sets < 1:
-            raise ValueError(f"num_sets: {self.num_sets} is less than 1")
+        check_whole(**given(num_sets=self.num_sets))
 
     def regroup(
         self, key: Key[Array, ""], mixture: ParticleMixture
@@ -408,9 +410,3 @@ def _farthest_members(
     distance = jnp.sum((features - spread(points, parent)) ** 2, axis=1)
     distance = jnp.where(mixture.occupied, distance, -1.0)
     return take(features, segment_argmax(distance, parent, mixture.num_components))
-
-
-def _require_positive(**thresholds: float | None) -> None:
-    for name, value in thresholds.items():
-        if value is not None and not value > 0:
-            raise ValueError(f"{name}: {value} is not positive")

@@ -8,12 +8,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
+from mpfjax.checks import (
+    check_callable,
+    check_one_of,
+    check_positive,
+    check_share,
+    check_whole,
+    given,
+)
 from mpfjax.generator import uniform
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRejuvenation
 from mpfjax.moves.slots import (
     Slots,
-    check_particles_per_component,
     deal_slots,
     place_slots,
 )
@@ -95,17 +102,13 @@ class Resample(AbstractRejuvenation):
     regularisation: float = eqx.field(static=True, default=0.5)
 
     def __check_init__(self) -> None:
-        if self.scheme not in SCHEMES:
-            raise ValueError(f"scheme: {self.scheme!r} is not one of {sorted(SCHEMES)}")
-        if not 0.0 <= self.ess_threshold <= 1.0:
-            raise ValueError(f"ess_threshold: {self.ess_threshold} is not in [0, 1]")
-        check_particles_per_component(self.particles_per_component)
-        if self.gradient not in GRADIENTS:
-            raise ValueError(f"gradient: {self.gradient!r} is not one of {GRADIENTS}")
-        if not 0.0 < self.softness <= 1.0:
-            raise ValueError(f"softness: {self.softness} is not in (0, 1]")
-        if not self.regularisation > 0:
-            raise ValueError(f"regularisation: {self.regularisation} is not positive")
+        check_one_of(SCHEMES, scheme=self.scheme)
+        check_share(ess_threshold=self.ess_threshold)
+        check_whole(**given(particles_per_component=self.particles_per_component))
+        check_callable("a function of the particles", **given(sort_by=self.sort_by))
+        check_one_of(GRADIENTS, gradient=self.gradient)
+        check_positive(softness=self.softness, regularisation=self.regularisation)
+        check_share(softness=self.softness)
         if self.gradient == "ot":
             require_ott()
 

@@ -60,9 +60,3 @@ def require_all_slots(mixture: ParticleMixture, who: str) -> None:
     """Raise a `ValueError` where some slots must stay empty."""
     if mixture.limit is not None:
         raise ValueError(f"slots: {who} fills every slot, and cannot leave some of them empty")
-
-
-def check_particles_per_component(value: int | None) -> None:
-    """Raise a `ValueError` for a number below one."""
-    if value is not None and value < 1:
-        raise ValueError(f"particles_per_component: {value} is less than 1")
