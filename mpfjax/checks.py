@@ -4,8 +4,9 @@ Arguments are given by name: `check_whole(1, num_particles=num_particles)`. What
 checked through `given`, which leaves it out: `check_positive(**given(max_distance=None))`.
 """
 
+import contextlib
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import jax
@@ -15,6 +16,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 _LONGEST = 200
+_MOST = 2**31 - 1
 
 
 def given(**arguments: Any) -> dict[str, Any]:
@@ -23,11 +25,16 @@ def given(**arguments: Any) -> dict[str, Any]:
 
 
 def check_whole(least: int = 1, /, **arguments: Any) -> None:
-    """Each argument is a whole number (a Python or numpy integer, no boolean) from `least` on."""
+    """Each argument is a whole number (a Python or numpy integer, no boolean) from `least` on.
+
+    It fits into 32 bits, which indices have.
+    """
     for name, value in arguments.items():
         is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
         if not is_whole or value < least:
             raise ValueError(f"{name}: {shown(value)} is not a whole number of at least {least}")
+        if value > _MOST:
+            raise ValueError(f"{name}: {shown(value)} is more than {_MOST}, the most there can be")
 
 
 def check_positive(**arguments: Any) -> None:
@@ -209,6 +216,16 @@ def _check_entries(holds: Callable[..., Any], what: str, arguments: dict[str, An
             raise ValueError(f"{name}: shape {np.shape(array)} holds no number")
         if not np.all(holds(np.asarray(array))):
             raise ValueError(f"{name}: {shown(array)} is not {what} throughout")
+
+
+@contextlib.contextmanager
+def saying(what: str) -> Iterator[None]:
+    """Add to an error from a user's own function which argument it came from."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"mpfjax: {what}")
+        raise
 
 
 def shown(value: Any) -> str:

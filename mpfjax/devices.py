@@ -101,12 +101,13 @@ def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
     available = jax.devices()
     if devices is None:
         chosen = _default_devices(available)
-    elif isinstance(devices, int | np.integer):
+    elif isinstance(devices, int | np.integer) and not isinstance(devices, bool):
         if not 1 <= devices <= len(available):
             raise ValueError(f"devices: {devices} asked for, and there are {len(available)}")
         chosen = available[: int(devices)]
     else:
-        chosen = list(devices) if isinstance(devices, Iterable) else []
+        is_several = isinstance(devices, Iterable) and not _is_array(devices)
+        chosen = list(devices) if is_several else []
         if not chosen or not all(isinstance(device, jax.Device) for device in chosen):
             raise ValueError(f"devices: {devices} is not a number or some of jax.devices()")
         if len(set(chosen)) < len(chosen):
@@ -336,6 +337,10 @@ def largest_of_islands(value: Float[Array, ""], counts: Bool[Array, ""]) -> Floa
     if num_islands() == 1:
         return value
     return finite_max(over_islands(jnp.where(counts, value, -jnp.inf)))
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, jax.Array | np.ndarray)
 
 
 def _default_devices(available: list[Any]) -> list[Any]:

@@ -18,6 +18,7 @@ from mpfjax.checks import (
     check_type,
     check_whole,
     given,
+    saying,
     shown,
 )
 from mpfjax.devices import (
@@ -751,7 +752,8 @@ def _scan(
                 lambda: filter._step(step_key, mixture, observation),
                 lambda: filter._predict(step_key, mixture),
             )
-        kept = mixture if collect is None else collect(mixture)
+        with saying("in collect, which is called with the mixture after each step"):
+            kept = mixture if collect is None else collect(mixture)
         return mixture, (kept, info.log_likelihood_increment, info.resampled, info.degenerate)
 
     inputs = (jax.random.split(key_steps, length), observations, present)

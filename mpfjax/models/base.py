@@ -4,7 +4,7 @@ import abc
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -32,7 +32,7 @@ class AbstractStateSpaceModel(eqx.Module):
     shape (n,). Guided proposals need it; the bootstrap proposal does not.
     """
 
-    handles_missing: ClassVar[bool] = False
+    handles_missing = False
 
     @abc.abstractmethod
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:

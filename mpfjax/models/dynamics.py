@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import (
-    check_finite,
     check_finite_array,
     check_positive_array,
     check_rows,
+    check_scalars,
     to_array,
 )
 from mpfjax.generator import normal
@@ -151,7 +151,9 @@ class Autoregression(AbstractDynamics):
         Momentum 1 is constant velocity, 0 the random walk; Smith and Gatica-Perez (2004) have 0.5.
         `deviations` are one row for all, or a row for each particle or box, as in `RandomWalk`.
         """
-        check_finite(momentum=momentum)
+        momentum = to_array("momentum")(momentum)
+        check_scalars(momentum=momentum)
+        check_finite_array(momentum=momentum)
         deviations = to_array("deviations")(deviations)
         check_positive_array(deviations=deviations)
         check_rows(deviations=deviations)

@@ -6,7 +6,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.checks import check_callable, check_flag, check_positive_array, given, to_array
+from mpfjax.checks import (
+    check_callable,
+    check_flag,
+    check_positive_array,
+    check_scalars,
+    given,
+    to_array,
+)
 from mpfjax.mixture import flatten_states
 from mpfjax.operations import row_sums
 
@@ -36,6 +43,7 @@ class PairwiseRepulsion(eqx.Module):
 
     def __check_init__(self) -> None:
         check_positive_array(strength=self.strength, radius=self.radius)
+        check_scalars(strength=self.strength, radius=self.radius)
         check_callable("a function of the states", **given(position=self.position))
         check_flag(compact=self.compact)
 

@@ -35,7 +35,10 @@ class LinearGaussianModel(AbstractStateSpaceModel):
         }  # fmt: skip
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
-                raise ValueError(f"{name}: shape {getattr(self, name).shape} is not {shape}")
+                raise ValueError(
+                    f"{name}: shape {getattr(self, name).shape} is not {shape}, for m0 of shape"
+                    f" {self.m0.shape} and H of shape {self.H.shape}"
+                )
             check_finite_array(**{name: getattr(self, name)})
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n d"]:

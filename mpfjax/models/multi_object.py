@@ -73,7 +73,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
         elif per_object and not _has_axis(object_model, self.num_objects):
             raise ValueError(
                 f"object_model: not every array of {type(object_model).__name__} has a leading"
-                f" axis of num_objects, {num_objects}"
+                f" axis of num_objects, {num_objects}, as per_object=True says"
             )
         self.per_object = per_object
 

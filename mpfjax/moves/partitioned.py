@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_one_of
+from mpfjax.checks import check_one_of, shown
 from mpfjax.generator import split
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import check_log_density, require
@@ -236,11 +236,11 @@ def check_orders(orders: Any, num_objects: int, name: str = "orders") -> Int[Arr
         permutations = permutations and bool(
             (np.sort(table, axis=1) == np.arange(num_objects)[None]).all()
         )
-    except ValueError:  # rows of different lengths
+    except (TypeError, ValueError):  # rows of different lengths, or no numbers
         permutations = False
     if not permutations:
         raise ValueError(
-            f"{name}: {orders} is no permutation of the objects 0 to {num_objects - 1}"
+            f"{name}: {shown(orders)} is no permutation of the objects 0 to {num_objects - 1}"
         )
     return jnp.asarray(table, jnp.int32)
 

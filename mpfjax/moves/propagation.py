@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_one_of, check_type
+from mpfjax.checks import check_one_of, check_type, saying
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -15,6 +15,7 @@ from mpfjax.models.base import (
     check_log_density,
     check_model,
     check_moved,
+    model_name,
     require,
 )
 from mpfjax.moves.base import AbstractPropagation
@@ -161,6 +162,10 @@ def _weigh(
     log_ratio: Float[Array, " n"] | None = None,
 ) -> ParticleMixture:
     """The weights times L, and times D / q where the draw was not from D."""
-    log_factors = model.log_likelihood(observation, mixture.particles)
+    leaves = [f"{leaf.dtype}{list(leaf.shape)}" for leaf in jax.tree.leaves(observation)]
+    seen = f"{', '.join(leaves)} in {jax.tree.structure(observation)}"
+    who = f"model: {model_name(model)}.log_likelihood"
+    with saying(f"in {who}, of an observation (a step of the observations) that is {seen}"):
+        log_factors = model.log_likelihood(observation, mixture.particles)
     log_factors = check_log_density(log_factors, model, "log_likelihood", mixture.num_particles)
     return mixture.weighed(*[log_factors] if log_ratio is None else [log_factors, log_ratio])
