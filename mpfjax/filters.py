@@ -872,7 +872,9 @@ def present_steps(
     lengths = {jnp.shape(leaf)[0] if jnp.ndim(leaf) else None for leaf in leaves}
     if len(lengths) > 1 or None in lengths:
         shapes = [jnp.shape(leaf) for leaf in leaves]
-        raise ValueError(f"observations: shapes {shapes} do not share a leading axis t")
+        is_list = isinstance(observations, list | tuple)
+        hint = "; a list is so many arrays, jnp.asarray(observations) is one" if is_list else ""
+        raise ValueError(f"observations: shapes {shapes} do not share a leading axis t{hint}")
     if lengths == {0}:
         raise ValueError("observations: the leading axis t is empty")
     _require_numbers(leaves, "observations")

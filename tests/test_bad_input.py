@@ -7,7 +7,7 @@ import pytest
 
 import mpfjax
 from mpfjax import Filter, KMeans, Merge, Propagate, Resample, Split
-from tests.user_models import TRACES, TrickyQuadraticModel
+from tests.user_models import TRACES, DriftOfOne, TrickyQuadraticModel
 
 MODEL = TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0)
 FILTER = mpfjax.particle_filter(MODEL, 20)
@@ -87,11 +87,12 @@ def test_as_many_units_as_features():
     [
         (jnp.zeros((0,)), "observations: the leading axis t is empty"),
         (jnp.array(1.0), "observations: shapes"),
+        ([0.0, 1.0], r"observations: shapes .* jnp.asarray\(observations\)"),
         ({"a": jnp.zeros(3), "b": jnp.zeros(4)}, "observations: shapes"),
         ({}, "observations: there are none"),
         (np.array([0.0, np.nan, 1.0]), "observations: NaN or infinite at index 1"),
         (np.array([0.0, 1.0, -np.inf]), "observations: NaN or infinite at index 2"),
-        (np.array([0.0, 1j]), "observations: complex64 is complex"),
+        (np.array([0.0, 1j]), "observations: complex128 is complex"),
         (np.array([0.0, 1e300, 1.0]), r"observations: 1e\+300 at index 1 is more than float32"),
         ({"a": np.array([[0.0, 1.0], [-1e39, 0.0]])}, r"observations: -1e\+39 at index \(1, 0\)"),
     ],
@@ -115,7 +116,73 @@ def test_keys_that_are_not_one_each_run():
         mpfjax.monte_carlo(jax.random.split(KEY, 2)[:0], FILTER, jnp.zeros(3))
 
 
+def scalar_model(**methods):
+    """A model of a scalar with some of its methods replaced."""
+    good = {
+        "sample_initial": lambda self, key, n: jnp.zeros(n),
+        "sample_transition": lambda self, key, states: states,
+        "log_likelihood": lambda self, observation, states: -states,
+    }
+    return type("Wrong", (mpfjax.AbstractStateSpaceModel,), good | methods)()
+
+
 class TestAModelThatIsNotOne:
+    @pytest.mark.parametrize("states", [None, {}, [], 0.0, "x", {"a": 1.0}])
+    def test_no_states(self, states):
+        model = scalar_model(sample_initial=lambda self, key, n: states)
+        with pytest.raises(ValueError, match=r"model: Wrong.sample_initial returned"):
+            mpfjax.particle_filter(model, 10).init(KEY)
+
+    @pytest.mark.parametrize(
+        "moved",
+        [
+            lambda states: states.astype(jnp.int32),
+            lambda states: states[:, None],
+            lambda states: {"x": states},
+            lambda states: None,
+            lambda states: 0.0,
+        ],
+    )
+    def test_states_that_change_type_or_structure(self, moved):
+        model = scalar_model(sample_transition=lambda self, key, states: moved(states))
+        with pytest.raises(ValueError, match=r"model: Wrong.sample_transition returned"):
+            mpfjax.run_filter(KEY, mpfjax.particle_filter(model, 10), jnp.zeros(2))
+
+    @pytest.mark.parametrize("values", [None, 0.0, [0.0] * 10, "x"])
+    def test_a_likelihood_that_is_no_array(self, values):
+        model = scalar_model(log_likelihood=lambda self, observation, states: values)
+        with pytest.raises(ValueError, match=r"model: Wrong.log_likelihood returned"):
+            mpfjax.run_filter(KEY, mpfjax.particle_filter(model, 10), jnp.zeros(2))
+
+    def test_a_density_of_the_dynamics_that_is_not_one_number_each_particle(self):
+        model = scalar_model(log_transition=lambda self, states, previous_states: jnp.zeros(3))
+        filter = mpfjax.particle_filter(model, 10, gradient="stop")
+        with pytest.raises(ValueError, match=r"model: Wrong.log_transition returned shape \(3,\)"):
+            mpfjax.run_filter(KEY, filter, jnp.zeros(2))
+
+    def test_a_model_of_one_particle_that_is_not_wrapped(self):
+        with pytest.raises(ValueError, match=r"model: DriftOfOne.sample_initial.*per_particle"):
+            mpfjax.particle_filter(DriftOfOne(), 10)
+
+    def test_a_wrapped_model_is_named_by_its_own_class(self):
+        class Wrong(DriftOfOne):
+            def log_likelihood(self, observation, state):
+                return jnp.zeros(2)
+
+        filter = mpfjax.particle_filter(mpfjax.per_particle(Wrong()), 10)
+        with pytest.raises(ValueError, match=r"model: Wrong.log_likelihood returned shape"):
+            mpfjax.run_filter(KEY, filter, jnp.zeros(2))
+
+    def test_a_class_in_place_of_a_model(self):
+        with pytest.raises(ValueError, match=r"model: .* is a class; write QuadraticModel\("):
+            mpfjax.particle_filter(mpfjax.QuadraticModel, 10)
+
+    def test_an_error_within_the_likelihood_says_what_it_was_given(self):
+        filter = mpfjax.particle_filter(mpfjax.QuadraticModel(), 10)
+        with pytest.raises(TypeError) as caught:
+            filter.step(KEY, filter.init(KEY), {"y": 1.0})
+        assert any("log_likelihood" in note and "'y'" in note for note in caught.value.__notes__)
+
     def test_a_missing_method(self):
         class Half:
             def sample_initial(self, key, num_particles):

@@ -5,6 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.scipy.stats import norm
+from scipy.stats import multivariate_normal
 
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter
@@ -15,6 +17,7 @@ from tests.user_models import (
     BROKEN,
     DRIFT_AS_LINEAR_GAUSSIAN,
     TRACES,
+    Drift,
     DriftOfOne,
     TrickyQuadraticModel,
 )
@@ -453,3 +456,140 @@ class TestGradients:
 def log_evidence(filter, observations):
     run = mpfjax.run_filter(jax.random.key(18), filter, observations, mean)
     return run.log_marginal_likelihood
+
+
+class TestWhatAUserHandsIt:
+    """Python's own numbers, features given once, observations in part."""
+
+    class Walk(mpfjax.AbstractStateSpaceModel):
+        """Parameters that are Python floats, as a first version of a model has them."""
+
+        phi: float
+        sigma: float
+
+        def sample_initial(self, key, num_particles):
+            TRACES.append("walk")
+            return jax.random.normal(key, (num_particles,))
+
+        def sample_transition(self, key, states):
+            return self.phi * states + self.sigma * jax.random.normal(key, states.shape)
+
+        def log_likelihood(self, observation, states):
+            return -0.5 * (observation - states) ** 2
+
+    class Branching(Walk):
+        """Python asks for the value of one of them."""
+
+        def sample_transition(self, key, states):
+            noise = self.sigma * jax.random.normal(key, states.shape)
+            return noise if self.phi == 0 else self.phi * states + noise
+
+    @pytest.mark.parametrize("run", ["run_filter", "monte_carlo", "step"])
+    def test_floats_of_a_model_are_no_constants_of_the_program(self, run):
+        found, traced = [], []
+        for phi in (0.5, 0.9, 0.95):
+            filter = mpfjax.particle_filter(self.Walk(phi, 0.3), 10)
+            key, observations = jax.random.key(0), jnp.array([1.0, 2.0])
+            before = len(TRACES)
+            if run == "step":
+                mixture = filter.init(key)
+                before = len(TRACES)
+                found.append(filter.step(key, mixture, 2.0)[1].log_likelihood_increment)
+            elif run == "run_filter":
+                found.append(mpfjax.run_filter(key, filter, observations).log_marginal_likelihood)
+            else:
+                runs = mpfjax.monte_carlo(key[None], filter, observations)
+                found.append(runs.log_marginal_likelihood[0])
+            traced.append(len(TRACES) - before)
+        assert traced[1:] == [0, 0]
+        assert len(set(map(float, found))) == 3
+
+    def test_floats_that_python_asks_for_stay_python_floats(self):
+        for phi in (0.0, 0.9):
+            filter = mpfjax.particle_filter(self.Branching(phi, 0.3), 10)
+            run = mpfjax.run_filter(jax.random.key(0), filter, [1.0, 2.0])
+            assert np.isfinite(run.log_marginal_likelihood)
+
+    @pytest.mark.parametrize(
+        "make", ["mixture_particle_filter", "gaussian_mixture_particle_filter"]
+    )
+    def test_features_and_scale_are_given_once(self, make):
+        first = lambda states: states[:, 0]  # noqa: E731
+        filter = getattr(mpfjax, make)(Drift(), 20, 2, features=first, scale=3.0)
+        regrouping = [m for m in (*filter.moves, *filter._initial_moves) if hasattr(m, "features")]
+        assert len(regrouping) == 4
+        for move in regrouping:
+            assert move.features.function is first
+            assert move.features.scale == (3.0,)
+        own = mpfjax.KMeans(2, features=lambda states: states[:, 1])
+        filter = getattr(mpfjax, make)(Drift(), 20, 2, features=first, kmeans=own)
+        assert own in filter.moves
+
+    def test_features_of_a_wrapped_model_are_of_one_particle(self):
+        options = {"num_particles": 20, "max_components": 2, "scale": 0.5}
+        one = mpfjax.mixture_particle_filter(
+            mpfjax.per_particle(DriftOfOne()), features=lambda state: state[0], **options
+        )
+        many = mpfjax.mixture_particle_filter(
+            mpfjax.per_particle(DriftOfOne()),
+            kmeans=mpfjax.KMeans(features=lambda states: states[:, 0], scale=0.5),
+            merge=mpfjax.Merge(features=lambda states: states[:, 0], scale=0.5),
+            split=mpfjax.Split(features=lambda states: states[:, 0], scale=0.5),
+            **options,
+        )
+        runs = [mpfjax.run_filter(jax.random.key(2), f, jnp.zeros(3)) for f in (one, many)]
+        labels = [run.final.component_indicators for run in runs]
+        np.testing.assert_array_equal(*labels)
+
+    class TwoSensors(Drift):
+        """Either of two sensors may be missing; what is there is weighed."""
+
+        handles_missing = True
+
+        def log_likelihood(self, observation, states):
+            seen = ~jnp.isnan(observation)
+            residuals = jnp.where(seen, observation, 0.0)[None] - states
+            terms = norm.logpdf(residuals, scale=0.7)
+            return jnp.sum(jnp.where(seen[None], terms, 0.0), axis=1)
+
+    def test_one_of_two_sensors_may_be_missing(self):
+        """Against the Kalman filter, whose missing sensor has a variance of 10⁸."""
+        observations = np.array([[1.0, np.nan], [np.nan, 0.3], [0.4, 0.1], [np.nan, np.nan]])
+        filter = mpfjax.particle_filter(self.TwoSensors(), 4000)
+        keys = jax.random.split(jax.random.key(3), 200)
+        runs = {
+            missing: mpfjax.monte_carlo(
+                keys, filter, observations, lambda m: m.mean(), missing=missing
+            )
+            for missing in ("error", "skip")
+        }
+        mean, log_evidence = DRIFT_AS_LINEAR_GAUSSIAN.m0, 0.0
+        covariance = DRIFT_AS_LINEAR_GAUSSIAN.P0
+        A, Q = (np.asarray(getattr(DRIFT_AS_LINEAR_GAUSSIAN, name), float) for name in "AQ")
+        for y in observations:
+            mean, covariance = A @ mean, A @ covariance @ A.T + Q
+            seen = np.flatnonzero(~np.isnan(y))
+            if seen.size:
+                H = np.eye(2)[seen]
+                S = H @ covariance @ H.T + 0.49 * np.eye(seen.size)
+                gain = covariance @ H.T @ np.linalg.inv(S)
+                residual = y[seen] - H @ mean
+                log_evidence += multivariate_normal(np.zeros(seen.size), S).logpdf(residual)
+                mean, covariance = mean + gain @ residual, covariance - gain @ H @ covariance
+        for run in runs.values():
+            ratios = np.exp(np.asarray(run.log_marginal_likelihood) - log_evidence)
+            assert abs(ratios.mean() - 1) < 4 * ratios.std() / np.sqrt(len(ratios))
+            last = np.asarray(run.collected)[:, -1]
+            error = np.abs(last.mean(axis=0) - mean)
+            assert (error < 4 * last.std(axis=0) / np.sqrt(len(last)) + 1e-3).all()
+        assert float(runs["skip"].log_likelihood_increments[0, -1]) == 0.0
+
+    def test_infinity_is_no_missing_number(self):
+        filter = mpfjax.particle_filter(self.TwoSensors(), 10)
+        with pytest.raises(ValueError, match="observations: infinite at index 1"):
+            mpfjax.run_filter(jax.random.key(0), filter, np.array([[0.0, np.nan], [np.inf, 0.0]]))
+        mixture = filter.init(jax.random.key(0))
+        _, info = filter.step(jax.random.key(1), mixture, np.array([0.0, np.nan]))
+        assert np.isfinite(info.log_likelihood_increment)
+        with pytest.raises(RuntimeError, match="observation: infinite"):
+            filter.step(jax.random.key(1), mixture, np.array([np.inf, np.nan]))
