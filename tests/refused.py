@@ -11,6 +11,7 @@ REFUSED = {
     "count": (*NO_NUMBERS, 0, -1, 2.5, 2.0, NAN, INFINITY, True),
     "number": (*NO_NUMBERS, -1, 2.5, 2.0, NAN, INFINITY, True),
     "positive": (*NO_NUMBERS, 0, -1.0, NAN, INFINITY, True),
+    "scalar": (*NO_NUMBERS, 0, -1.0, NAN, INFINITY),
     "not negative": (*NO_NUMBERS, -1.0, NAN, INFINITY, True),
     "finite": (*NO_NUMBERS, NAN, INFINITY, True),
     "share": (*NO_NUMBERS, -0.1, 1.1, NAN, INFINITY, True),
@@ -25,8 +26,6 @@ REFUSED = {
     "range": (*NOTHING, 2.5, NAN, [1], [3, 2], [NAN, 1], [0.1, INFINITY], [1, 2, 3], np.zeros(0)),
 }
 OPTIONAL = {f"{kind}?": [v for v in REFUSED[kind] if v is not None] for kind in REFUSED}
-    f"{kind}?": tuple(v for v in values if v is not None) for kind, values in REFUSED.items()
-}
 
 
 def refused(table):

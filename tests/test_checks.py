@@ -13,6 +13,15 @@ REFUSED = {
     "not negative": (checks.check_not_negative, (-1e-9, np.nan, np.inf, False, None)),
     "finite": (checks.check_finite, (np.nan, -np.inf, 1j, None)),
     "share": (lambda **a: checks.check_share(0.5, **a), (-0.1, 0.6, np.nan, None, "0")),
+    "inner share": (checks.check_inner_share, (0, 1, -0.1, np.nan, True, None, "0.5")),
+    "shape": (
+        lambda size: checks.check_shape("n 4", size=size),
+        (None, 1.0, [[1, 2, 3, 4]], np.ones(4), np.ones((4, 3)), np.full((1, 4), "a"), jnp.ndarray),
+    ),
+    "rows": (
+        lambda size: checks.to_rows(2, "size", size),
+        (None, "a", 1.0, [1.0], np.ones((2, 3)), [[1.0, 2.0], [1.0]], np.ones((1, 2, 2))),
+    ),
     "one of": (lambda **a: checks.check_one_of(("up", "down"), **a), ("left", None, 1, ["up"])),
     "flag": (checks.check_flag, (0, 1.0, None, "yes")),
     "callable": (lambda **a: checks.check_callable("a function", **a), (None, 3, int, "f")),
@@ -38,6 +47,9 @@ ACCEPTED = {
     "not negative": (0, 1.5),
     "finite": (-1.5, 0),
     "share": (0, 0.5, np.float64(0.25)),
+    "inner share": (0.5, np.float32(0.1)),
+    "shape": (np.ones((2, 4)), jnp.zeros((0, 4)), jax.ShapeDtypeStruct((3, 4), jnp.float32)),
+    "rows": ([], [1.0, 2.0], [[1.0, 2.0]], np.zeros((3, 2))),
     "one of": ("up",),
     "flag": (True, False, np.bool_(True)),
     "callable": (len, lambda: None),
@@ -72,6 +84,19 @@ def test_what_is_not_given_is_not_checked():
 def test_whole_numbers_become_floating_point():
     assert checks.to_array("size")([1, 2]).dtype == jnp.float32
     assert checks.to_array("size", floating=False)([1, 2]).dtype == jnp.int32
+
+
+def test_shapes_may_leave_axes_open():
+    checks.check_shape("... 2", one=np.ones(2), two=np.ones((5, 3, 2)))
+    checks.check_shape("", one=jnp.array(1.0))
+    jax.jit(lambda value: checks.check_shape("n", size=value))(jnp.ones(3))
+    with pytest.raises(ValueError, match=r"^size: shape \(3,\) is not \(..., 2\)"):
+        checks.check_shape("... 2", size=np.ones(3))
+
+
+def test_rows_are_copied_into_one_form():
+    assert checks.to_rows(2, "size", []).shape == (0, 2)
+    assert checks.to_rows(2, "size", [1, 2]).tolist() == [[1.0, 2.0]]
 
 
 def test_traced_values_pass():

@@ -40,7 +40,11 @@ class Detections(eqx.Module):
         four finite numbers each, or without area, and for room for less than one.
         """
         check_whole(max_detections=max_detections)
-        boxes = to_rows(4, "boxes", boxes).astype(np.float32)
+        rows = to_rows(4, "boxes", boxes).astype(np.float32)
+        # One box alone is more likely a slip than meant.
+        if len(rows) > 0 and np.ndim(boxes) != 2:
+            raise ValueError(f"boxes: shape {np.shape(boxes)} is not (k, 4), of boxes x,y,w,h")
+        boxes = rows
         for box in boxes:
             if not (np.isfinite(box).all() and (box[2:] > 0).all()):
                 raise ValueError(f"boxes: {box.tolist()} has no area, or is not finite")

@@ -74,7 +74,7 @@ class BackgroundSubtraction:
         check_inner_share(**given(shadow_brightness=shadow_brightness))
         check_share(largest_gap=largest_gap)
         if largest_gap == 1:
-            raise ValueError("largest_gap: 1 is not in [0, 1)")
+            raise ValueError(f"largest_gap: {largest_gap} is not in [0, 1)")
         if not 0 <= _range(area)[0] < _range(area)[1] <= 1:
             raise ValueError(f"area: {shown(area)} is not a range within [0, 1]")
         if not 0 < _range(aspect)[0] < _range(aspect)[1] < np.inf:

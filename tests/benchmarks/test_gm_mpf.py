@@ -91,8 +91,8 @@ def test_an_interrupted_run_leaves_the_times(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["--seeds", "0"], "--seeds: 0"),
-        (["--particles", "1"], "--particles: 1"),
+        (["--seeds", "0"], "--seeds: '0'"),
+        (["--particles", "1"], "--particles: '1'"),
         (["--frames", "1:3", "--ids", "1", "9"], "--ids: object 9 has no box in frame 1"),
         (["--sequence", "/nowhere"], "nowhere"),
     ],

@@ -45,4 +45,4 @@ class TestBesideOpenCV:
 def test_none_is_too_few(option, capsys):
     with pytest.raises(SystemExit):
         histograms.main([option, "0"])
-    assert f"{option}: 0" in capsys.readouterr().err
+    assert f"{option}: '0'" in capsys.readouterr().err

@@ -206,11 +206,11 @@ def test_a_rival_that_is_not_installed_is_named(monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["--seeds", "2"], "--seeds: 2"),
-        (["--particles", "100", "1"], "--particles: 1"),
-        (["--repeats", "0"], "--repeats: 0"),
-        (["--devices", "0"], "--devices: 0"),
-        (["--time-limit", "0"], "--time-limit: 0"),
+        (["--seeds", "2"], "--seeds: '2'"),
+        (["--particles", "100", "1"], "--particles: '1'"),
+        (["--repeats", "0"], "--repeats: '0'"),
+        (["--devices", "0"], "--devices: '0'"),
+        (["--time-limit", "0"], "--time-limit: '0'"),
         (["--skip", "mpfjax"], "--skip"),
     ],
 )

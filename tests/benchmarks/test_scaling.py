@@ -101,8 +101,8 @@ def test_processes_share_the_seeds():
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["--repeats", "0"], "--repeats: 0"),
-        (["--devices", "0"], "--devices: 0"),
+        (["--repeats", "0"], "--repeats: '0'"),
+        (["--devices", "0"], "--devices: '0'"),
         (["--filters", "kalman"], "--filters"),
     ],
 )

@@ -326,8 +326,8 @@ def test_a_detection_may_leave_the_frame_in_part_or_as_a_whole():
         ([[np.nan, 1, 4, 5]], 3, r"boxes: \[nan, 1.0, 4.0, 5.0\] .* not finite"),
         ([[1.0, 1, np.inf, 5]], 3, r"boxes: \[1.0, 1.0, inf, 5.0\] .* not finite"),
         ([[1.0, 1, 4, 5]], 0, "max_detections: 0"),
-        ([[1.0] * 8], 3, r"boxes: \(1, 8\) is not the shape"),
-        ([1.0] * 4, 3, r"boxes: \(4,\) is not the shape"),
+        ([[1.0] * 8], 3, r"boxes: shape \(1, 8\)"),
+        ([1.0] * 4, 3, r"boxes: shape \(4,\)"),
     ],
 )
 def test_bad_detections_are_named(as_installed, boxes, room, said):

@@ -97,6 +97,6 @@ def test_the_template_is_the_distracter_over_object_one(scene):
 
 
 def test_too_few_frames_are_named():
-    with pytest.raises(ValueError, match="num_frames: 2 is less than 3"):
+    with pytest.raises(ValueError, match="num_frames: 2 is not a whole number of at least 3"):
         distracter_scene(jax.random.key(0), 2)
     assert np.isfinite(distracter_scene(jax.random.key(0), 3).distracter[2]).all()
