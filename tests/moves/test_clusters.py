@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import chex
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -271,8 +272,7 @@ def test_gradient_is_finite_through_meeting_objects():
         return mpfjax.run_filter(KEY, filter, OBSERVATIONS[:2, :2]).log_marginal_likelihood
 
     gradient = slope(filter)
-    leaves = jax.tree.leaves(gradient)
-    assert all(np.isfinite(leaf).all() for leaf in leaves)
+    chex.assert_tree_all_finite(gradient)
     assert float(gradient.model.interaction.strength) != 0
 
 
