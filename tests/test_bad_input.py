@@ -7,7 +7,7 @@ import pytest
 
 import mpfjax
 from mpfjax import Filter, KMeans, Merge, Propagate, Resample, Split
-from tests.user_models import TRACES, DriftOfOne, TrickyQuadraticModel
+from tests.user_models import DriftOfOne, TrickyQuadraticModel, nothing_traced
 
 MODEL = TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0)
 FILTER = mpfjax.particle_filter(MODEL, 20)
@@ -19,9 +19,8 @@ pytestmark = pytest.mark.usefixtures("as_installed")
 @pytest.fixture(autouse=True)
 def nothing_is_traced():
     """No error here may wait for the model to be traced."""
-    before = len(TRACES)
-    yield
-    assert len(TRACES) == before
+    with nothing_traced():
+        yield
 
 
 @pytest.mark.parametrize("num_particles", [0, -3, 2.5])

@@ -20,9 +20,9 @@ from tests.user_models import (
     BROKEN,
     DRIFT_AS_LINEAR_GAUSSIAN,
     EXPLODING,
-    TRACES,
     Drift,
     TrickyQuadraticModel,
+    nothing_traced,
 )
 
 NUM_RUNS = 2000
@@ -223,19 +223,17 @@ class TestOnline:
         filter = chain_filter(chain, "quadratic")
         mixture = started(filter)
         filter.step(jax.random.key(6), mixture, OBSERVATIONS[0])
-        traced = len(TRACES)
-        for t, observation in enumerate((2.0, 1.0, 0.0, 0.0, 0.0, 3.0, BLINDED, 1.0)):
-            mixture, _ = filter.step(jax.random.key(t), mixture, observed(observation))
-        assert len(TRACES) == traced
+        with nothing_traced():
+            for t, observation in enumerate((2.0, 1.0, 0.0, 0.0, 0.0, 3.0, BLINDED, 1.0)):
+                mixture, _ = filter.step(jax.random.key(t), mixture, observed(observation))
 
     def test_another_filter_of_the_same_shape_compiles_nothing(self, chain):
         filter = chain_filter(chain, "quadratic")
         mixture = started(filter)
         filter.step(jax.random.key(6), mixture, OBSERVATIONS[0])
-        traced = len(TRACES)
         other = CHAINS[chain](TrickyQuadraticModel(0.4, 0.2, -2.0, 2.0))
-        other.step(jax.random.key(6), mixture, OBSERVATIONS[1])
-        assert len(TRACES) == traced
+        with nothing_traced():
+            other.step(jax.random.key(6), mixture, OBSERVATIONS[1])
 
 
 def observed(value):

@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -167,9 +168,7 @@ class TestIslands:
         filter, key = island_chains()["pf, exchange"], jax.random.key(4)
         islands = mpfjax.run_islands(key, filter, OBSERVATIONS, num_islands=1)
         run = mpfjax.run_filter(jax.random.fold_in(key, 0), filter, OBSERVATIONS)
-        assert jax.tree.structure(islands) == jax.tree.structure(run)
-        for one, other in zip(jax.tree.leaves(islands), jax.tree.leaves(run), strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+        chex.assert_trees_all_close(islands, run, rtol=1e-4, atol=1e-5)
 
     def test_the_whole_is_one_normalised_mixture(self):
         filter = island_chains()["mixture, exchange"]
@@ -282,8 +281,7 @@ class TestExchange:
     )
     def test_does_nothing_while_masses_are_even_enough(self, threshold, log_masses):
         before, after = self.exchanged(threshold, log_masses)
-        for one, other in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
-            np.testing.assert_array_equal(one, other)
+        chex.assert_trees_all_equal(before, after)
 
     def test_outside_islands_does_nothing(self):
         mixture = make_mixture(np.zeros(5), np.zeros(5), np.zeros(5), 1)

@@ -1,5 +1,6 @@
 """The runners, and the filters of the literature against references of their own."""
 
+import chex
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,10 +17,10 @@ from tests.user_models import (
     BLINDED,
     BROKEN,
     DRIFT_AS_LINEAR_GAUSSIAN,
-    TRACES,
     Drift,
     DriftOfOne,
     TrickyQuadraticModel,
+    nothing_traced,
 )
 
 QUADRATIC = TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0)
@@ -47,9 +48,7 @@ def occupied_particles(mixture):
 
 def assert_same(run, other, **tolerance):
     """Every leaf of two runs is the same, to the bit where no tolerance is given."""
-    assert jax.tree.structure(run) == jax.tree.structure(other)
-    for one, two in zip(jax.tree.leaves(run), jax.tree.leaves(other), strict=True):
-        np.testing.assert_allclose(one, two, **(tolerance or {"rtol": 0, "atol": 0}))
+    chex.assert_trees_all_close(run, other, **(tolerance or {"rtol": 0, "atol": 0}))
 
 
 class TestAgainstReferences:
@@ -273,9 +272,8 @@ class TestSlots:
             return run.log_marginal_likelihood
 
         evidence(20)
-        traced = len(TRACES)
-        others = [evidence(n) for n in (33, 61)]
-        assert len(TRACES) == traced
+        with nothing_traced():
+            others = [evidence(n) for n in (33, 61)]
         assert np.isfinite(others).all()
 
     def test_fewer_than_particles_are_an_error(self):
@@ -397,8 +395,7 @@ class TestGradients:
     def test_of_the_log_evidence_is_finite(self):
         filter = CHAINS["guided pf"](mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0))
         gradient = eqx.filter_jit(eqx.filter_grad(log_evidence))(filter, OBSERVATIONS)
-        for leaf in jax.tree.leaves(gradient):
-            assert np.isfinite(leaf).all()
+        chex.assert_tree_all_finite(gradient)
         assert gradient.model.sigma_y != 0
 
     def test_is_finite_with_dead_components_and_a_step_of_zero_likelihood_left_out(self):
@@ -413,7 +410,7 @@ class TestGradients:
         differentiate = eqx.filter_jit(eqx.filter_grad(evidence_of_the_rest, has_aux=True))
         gradient, alive = differentiate(filter, blinded)
         assert not alive.all()
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+        chex.assert_tree_all_finite(gradient)
 
     def test_is_that_of_the_exact_evidence_without_resampling(self):
         """Weights alone are differentiable without bias; N is large enough to see it."""
@@ -458,6 +455,9 @@ def log_evidence(filter, observations):
     return run.log_marginal_likelihood
 
 
+WALKS_TRACED = []
+
+
 class TestWhatAUserHandsIt:
     """Python's own numbers, features given once, observations in part."""
 
@@ -468,7 +468,7 @@ class TestWhatAUserHandsIt:
         sigma: float
 
         def sample_initial(self, key, num_particles):
-            TRACES.append("walk")
+            WALKS_TRACED.append(num_particles)
             return jax.random.normal(key, (num_particles,))
 
         def sample_transition(self, key, states):
@@ -490,17 +490,17 @@ class TestWhatAUserHandsIt:
         for phi in (0.5, 0.9, 0.95):
             filter = mpfjax.particle_filter(self.Walk(phi, 0.3), 10)
             key, observations = jax.random.key(0), jnp.array([1.0, 2.0])
-            before = len(TRACES)
+            before = len(WALKS_TRACED)
             if run == "step":
                 mixture = filter.init(key)
-                before = len(TRACES)
+                before = len(WALKS_TRACED)
                 found.append(filter.step(key, mixture, 2.0)[1].log_likelihood_increment)
             elif run == "run_filter":
                 found.append(mpfjax.run_filter(key, filter, observations).log_marginal_likelihood)
             else:
                 runs = mpfjax.monte_carlo(key[None], filter, observations)
                 found.append(runs.log_marginal_likelihood[0])
-            traced.append(len(TRACES) - before)
+            traced.append(len(WALKS_TRACED) - before)
         assert traced[1:] == [0, 0]
         assert len(set(map(float, found))) == 3
 

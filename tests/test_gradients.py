@@ -3,6 +3,7 @@
 import sys
 from functools import cache
 
+import chex
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -128,7 +129,7 @@ def test_resampling_with_stopped_gradients_is_the_same_to_the_bit(options):
             for gradient in ("none", "stop", "straight_through")
         ]
         for other in moved[1:]:
-            assert_same(moved[0], other)
+            chex.assert_trees_all_equal(moved[0], other)
 
 
 @pytest.mark.parametrize("kind", ["bootstrap", "guided", "halves", "partitioned"])
@@ -148,12 +149,7 @@ def test_propagation_with_stopped_gradients_is_the_same_to_the_bit(kind):
         eqx.filter_jit(make(gradient))(jax.random.key(7), mixture, observation)
         for gradient in ("none", "stop")
     ]
-    assert_same(*moved)
-
-
-def assert_same(mixture, other):
-    for one, two in zip(jax.tree.leaves(mixture), jax.tree.leaves(other), strict=True):
-        np.testing.assert_array_equal(one, two)
+    chex.assert_trees_all_equal(*moved)
 
 
 def test_steps_without_an_observation_keep_the_score_unbiased():

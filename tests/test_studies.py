@@ -18,7 +18,7 @@ import mpfjax
 from mpfjax import studies
 from tests.full_disk import no_room_beyond
 from tests.small_study import OBSERVATIONS, build, mean, measure, run_in_process, small_study
-from tests.user_models import TRACES, TrickyQuadraticModel
+from tests.user_models import TrickyQuadraticModel, nothing_traced
 
 NUM_CELLS = 5
 
@@ -111,9 +111,9 @@ class TestResults:
             return mpfjax.particle_filter(model, num_particles)
 
         mpfjax.run_study(small_study(1, filters={"pf": tricky}), tmp_path / "one", seeds_at_once=3)
-        before = len(TRACES)
-        mpfjax.run_study(small_study(4, filters={"pf": tricky}), tmp_path / "two", seeds_at_once=3)
-        assert len(TRACES) == before
+        four = small_study(4, filters={"pf": tricky})
+        with nothing_traced():
+            mpfjax.run_study(four, tmp_path / "two", seeds_at_once=3)
 
     def test_of_many_sizes_compile_once_within_shared_slots(self, tmp_path):
         def tricky(num_particles, noise):
@@ -124,11 +124,11 @@ class TestResults:
             return small_study(1, filters={"pf": tricky}, num_particles=sizes)
 
         mpfjax.run_study(one([5]), tmp_path / "one", slots=9)
-        before = len(TRACES)
-        mpfjax.run_study(one([4, 7, 9]), tmp_path / "two", slots=9)
-        assert len(TRACES) == before
+        with nothing_traced():
+            mpfjax.run_study(one([4, 7, 9]), tmp_path / "two", slots=9)
+        with pytest.raises(AssertionError, match="traced > 0 times"), nothing_traced():
+            mpfjax.run_study(one([4, 11]), tmp_path / "three", slots=9)  # eleven do not fit
         mpfjax.run_study(one([4, 11]), tmp_path / "three", slots=9)
-        assert len(TRACES) > before  # eleven do not fit
         results = studies.read_study(tmp_path / "three")
         alone = mpfjax.run_study(one([4, 11]), tmp_path / "four")
         for cell, same in zip(results, alone, strict=True):

@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import chex
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -173,7 +174,10 @@ def test_objects_apart_are_independent_filters_row_order_aside():
     mixture, own = apart.step(KEY, apart.init(KEY), seen)
     np.testing.assert_allclose(own.log_likelihood_increment, info.log_likelihood_increment)
     rows = np.asarray(mixture.particles)
-    np.testing.assert_array_equal(np.sort(rows, axis=0), np.sort(expected.particles, axis=0))
+    # Two programs: some versions of XLA round their sums differently.
+    np.testing.assert_allclose(
+        np.sort(rows, axis=0), np.sort(expected.particles, axis=0), rtol=1e-5, atol=1e-6
+    )
     assert not np.array_equal(rows, expected.particles)
     assert labels_of(mixture).tolist() == [0, 1, 2]
 
@@ -271,8 +275,7 @@ def test_gradient_is_finite_through_meeting_objects():
         return mpfjax.run_filter(KEY, filter, OBSERVATIONS[:2, :2]).log_marginal_likelihood
 
     gradient = slope(filter)
-    leaves = jax.tree.leaves(gradient)
-    assert all(np.isfinite(leaf).all() for leaf in leaves)
+    chex.assert_tree_all_finite(gradient)
     assert float(gradient.model.interaction.strength) != 0
 
 
