@@ -106,8 +106,7 @@ def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
             raise ValueError(f"devices: {devices} asked for, and there are {len(available)}")
         chosen = available[: int(devices)]
     else:
-        is_several = isinstance(devices, Iterable) and not _is_array(devices)
-        chosen = list(devices) if is_several else []
+        chosen = list(devices) if isinstance(devices, Iterable) and not _is_array(devices) else []
         if not chosen or not all(isinstance(device, jax.Device) for device in chosen):
             raise ValueError(f"devices: {devices} is not a number or some of jax.devices()")
         if len(set(chosen)) < len(chosen):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 from tqdm import tqdm
@@ -35,6 +36,7 @@ Values = Sequence[Any] | np.ndarray | Array
 _MANIFEST = "study.json"
 _CELL = "cell"
 _TAKEN = ("filter", "num_particles", _CELL)
+_ARGUMENTS = {"filter": "filters", "num_particles": "num_particles"}  # what sets each axis
 # Names as `_cells` makes them, none of which leads out of a folder.
 _CELL_FILE = re.compile(r"\d+-[\w.+-]*\.npz")
 
@@ -92,7 +94,8 @@ class Study:
             raise ValueError(f"settings: {taken[0]!r} is what a cell has a name for already")
         for name, values in _axes(self).items():
             if not values or len(set(values)) < len(values):
-                raise ValueError(f"{name}: {values} is empty or has the same twice")
+                argument = _ARGUMENTS.get(name, f"settings: {name}")
+                raise ValueError(f"{argument}: {values} is empty or has the same twice")
         for number in _axes(self)["num_particles"]:
             check_whole(num_particles=number)
         present_steps(self.observations, self.missing)
@@ -213,13 +216,15 @@ def _axes(study: Study) -> dict[str, list[Any]]:
         # A string is a sequence as well, of its letters.
         is_array = isinstance(values, np.ndarray | jax.Array) and values.ndim > 0
         if isinstance(values, str | bytes) or not (is_array or isinstance(values, Sequence)):
-            raise ValueError(f"{name}: {shown(values)} are no values, [value, ...]")
+            argument = _ARGUMENTS.get(name, f"settings: {name}")
+            raise ValueError(f"{argument}: {shown(values)} are no values, [value, ...]")
     return {name: [_plain(name, value) for value in values] for name, values in axes.items()}
 
 
 def _plain(name: str, value: Any) -> Any:
     """A value of an axis as JSON can hold it."""
-    if isinstance(value, np.generic | np.ndarray | jax.Array) and value.ndim == 0:
+    is_array = isinstance(value, np.generic | np.ndarray | jax.Array)
+    if is_array and value.ndim == 0 and not jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         value = value.item()
     if value is not None and not isinstance(value, str | int | float | bool):
         raise ValueError(

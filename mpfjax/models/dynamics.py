@@ -151,16 +151,16 @@ class Autoregression(AbstractDynamics):
         Momentum 1 is constant velocity, 0 the random walk; Smith and Gatica-Perez (2004) have 0.5.
         `deviations` are one row for all, or a row for each particle or box, as in `RandomWalk`.
         """
-        momentum = to_array("momentum")(momentum)
-        check_scalars(momentum=momentum)
-        check_finite_array(momentum=momentum)
+        kept = to_array("momentum")(momentum)
+        check_scalars(momentum=kept)
+        check_finite_array(momentum=kept)
         deviations = to_array("deviations")(deviations)
         check_positive_array(deviations=deviations)
         check_rows(deviations=deviations)
         d = deviations.shape[-1]
         eye = jnp.broadcast_to(jnp.eye(d, dtype=deviations.dtype), (*deviations.shape, d))
         zero = jnp.zeros_like(deviations)
-        return cls((1 + momentum) * eye, -momentum * eye, deviations[..., None] * eye, zero)
+        return cls((1 + kept) * eye, -kept * eye, deviations[..., None] * eye, zero)
 
     @property
     def order(self) -> int:
