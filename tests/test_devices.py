@@ -30,6 +30,7 @@ from mpfjax.exact import grid_filter
 from tests import on_devices
 from tests.examples import make_mixture
 from tests.precision import float64
+from tests.user_models import TrickyQuadraticModel
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 NUM_ISLANDS = on_devices.NUM_ISLANDS
@@ -430,3 +431,23 @@ class TestChoosingDevices:
     def test_the_default_device_is_the_only_one(self):
         with jax.default_device(jax.devices()[0]):
             assert choose_devices(None) == jax.devices()[:1]
+
+
+@pytest.mark.parametrize("num_components", [3, 6])
+def test_a_constant_moves_the_evidence_of_islands_and_nothing_else(num_components):
+    """Every island has a scale of its own, beside which none may be rounded away."""
+
+    def run(constant, taken_off):
+        model = TrickyQuadraticModel(0.3, 0.5, constant=constant, taken_off=taken_off)
+        moves = [mpfjax.Exchange(0.9), mpfjax.Resample(), mpfjax.Propagate(model), mpfjax.KMeans(2)]
+        filter = mpfjax.Filter(model, moves, 32, num_components, [mpfjax.KMeans(2, reseed=True)])
+        return mpfjax.run_islands(
+            jax.random.key(1), filter, jnp.array([1.5, 1.0, 0.4]), num_islands=4
+        )
+
+    for constant in map(np.float32, (1e3, -1e6, 1e9, -1e30)):
+        with_it, without = run(constant, np.float32(0)), run(constant, constant)
+        assert float(with_it.final.weights.sum()) == pytest.approx(1, rel=1e-5)
+        np.testing.assert_allclose(with_it.final.weights, without.final.weights, atol=1e-7)
+        increments = without.log_likelihood_increments + constant
+        np.testing.assert_allclose(with_it.log_likelihood_increments, increments, rtol=1e-6)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mpfjax import Resample
-from tests.examples import example_mixtures, log_masses
+from tests.examples import example_mixtures, log_masses, make_mixture
 from tests.registry import REGROUPINGS, REJUVENATIONS
 
 # On either side of the number of components up to which they are worked on as rows.
@@ -182,3 +182,34 @@ def test_resampling_works_with_any_pytree_of_particles(name):
     copied = np.asarray(after.ancestor_indices)[filled]
     np.testing.assert_array_equal(np.asarray(after.particles["age"][0])[filled], copied)
     assert after.particles["age"][1].shape == (40, 2, 3)
+
+
+@pytest.mark.parametrize("num_components", [3, 6])
+@pytest.mark.parametrize("n", [31, 32, 33, 127, 128, 129, 1023, 1025, 8193])
+def test_resampling_on_either_side_of_every_block_size(n, num_components):
+    rng = np.random.default_rng(n)
+    labels = rng.integers(0, num_components, n)
+    log_weights = np.where(rng.random(n) < 0.2, -np.inf, 3 * rng.normal(size=n))
+    mixture = make_mixture(rng.normal(size=(n, 1)), log_weights, labels, num_components)
+    moved = eqx.filter_jit(Resample())(jax.random.key(n), mixture)
+    filled = np.asarray(moved.occupied)
+    assert filled.all()
+    np.testing.assert_allclose(log_masses(moved), log_masses(mixture), rtol=1e-6, atol=2e-5)
+    parents = np.asarray(moved.ancestor_indices)
+    assert (labels[parents] == np.asarray(moved.component_indicators)).all()
+    # A systematic draw has as many offspring as expected, to within one.
+    weights = np.exp(np.asarray(mixture.log_component_weights, float))
+    shares = np.bincount(np.asarray(moved.component_indicators), minlength=num_components)
+    offspring = np.bincount(parents, minlength=n)
+    assert (np.abs(offspring - shares[labels] * weights) <= 1 + 1e-3).all()
+
+
+@pytest.mark.parametrize("name", ["kmeans", "merge by deviations", "split", "eager split"])
+def test_regrouping_treats_every_copy_of_a_particle_alike(name):
+    """A mixture in which each particle stands twice is that of the particles with N doubled."""
+    one = MIXTURES["ordinary"]
+    twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), one)
+    twice = twice.replace(log_weights=twice.log_weights - np.log(2).astype(np.float32))
+    labels = np.asarray(compiled(name)(jax.random.key(0), one).component_indicators)
+    found = np.asarray(compiled(name)(jax.random.key(0), twice).component_indicators)
+    np.testing.assert_array_equal(found, np.concatenate([labels, labels]))
