@@ -7,7 +7,15 @@ import pytest
 from scipy.special import erfinv, log_ndtr
 
 import mpfjax
-from mpfjax.generator import fast_key, normal, normal_quantile, threefry
+from mpfjax.generator import (
+    bits,
+    fast_key,
+    normal,
+    normal_quantile,
+    split,
+    threefry,
+    uniform,
+)
 from tests.precision import float64
 
 KEY = jax.random.key(7)
@@ -114,8 +122,18 @@ class KeySpy(mpfjax.QuadraticModel):
 seen: list[str] = []
 
 
-def test_the_models_own_draws_use_it():
+def test_a_model_is_handed_ordinary_keys():
+    """Which all of `jax.random` takes; the library wraps a key where it draws."""
     filter = mpfjax.particle_filter(KeySpy(), 64)
     mpfjax.run_filter(KEY, filter, jnp.ones(2), lambda mixture: mixture.mean())
     assert seen
-    assert all("utf" in impl or "unrolled" in impl for impl in seen), seen
+    assert set(seen) == {"threefry2x32"}
+
+
+def test_splits_and_draws_are_those_of_ordinary_keys():
+    keys = split(KEY, 5)
+    assert keys.dtype == KEY.dtype
+    expected = jax.random.split(KEY, 5)
+    np.testing.assert_array_equal(jax.random.key_data(keys), jax.random.key_data(expected))
+    np.testing.assert_array_equal(uniform(KEY, (7,)), jax.random.uniform(KEY, (7,)))
+    np.testing.assert_array_equal(bits(KEY, (7,)), jax.random.bits(KEY, (7,)))

@@ -208,7 +208,7 @@ class TestWhetherParametersAreEachObjectsOwn:
             MultiObjectModel(OBJECTS[0], 0)
         with pytest.raises(ValueError, match="model: object defines no sample_initial"):
             MultiObjectModel(object(), 2)
-        with pytest.raises(ValueError, match=r"interaction: 3\.0 is not callable"):
+        with pytest.raises(ValueError, match=r"interaction: 3\.0 is not a function"):
             MultiObjectModel(OBJECTS[0], 2, 3.0)
         with pytest.raises(ValueError, match=r"observation: shape \(2, 1\) has no leading axis"):
             MODEL.log_likelihood(OBSERVATION[:2], STATES)
