@@ -20,7 +20,7 @@ from jax.core import Tracer
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from mpfjax.operations import finite_max, log_sum_exp
 
@@ -326,16 +326,24 @@ def deal_to_islands(values: Array) -> Array:
     return dealt.reshape(values.shape)
 
 
-def log_sum_over_islands(log_value: Float[Array, ""]) -> Float[Array, ""]:
-    """log Σ exp over the islands: O(1) numbers from each. Itself outside `run_islands`."""
-    return log_value if num_islands() == 1 else log_sum_exp(over_islands(log_value))
+def excess_over_islands(
+    log_scale: Float[Array, ""], log_largest: Float[Array, ""], log_sum: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """How far an island's own scale is above that of all, and log of all mass in two parts.
 
-
-def largest_of_islands(value: Float[Array, ""], counts: Bool[Array, ""]) -> Float[Array, ""]:
-    """The largest value of the islands that count, 0 if none does. Itself outside `run_islands`."""
+    The mass of an island is given in three parts, scale + largest + sum, and that of all islands
+    comes out as total + scale, so that none rounds another away. O(1) numbers from each island;
+    outside `run_islands` there is one, and nothing above it.
+    """
     if num_islands() == 1:
-        return value
-    return finite_max(over_islands(jnp.where(counts, value, -jnp.inf)))
+        return jnp.zeros_like(log_sum), log_sum, log_scale + log_largest
+    scales, largest, sums = over_islands(jnp.stack([log_scale, log_largest, log_sum])).T
+    counts = sums > -jnp.inf
+    # Part by part, exactly: an island without mass has no say.
+    common = finite_max(jnp.where(counts, scales, -jnp.inf))
+    shift = finite_max(jnp.where(counts, (scales - common) + largest, -jnp.inf))
+    log_total = log_sum_exp(sums + (((scales - common) + largest) - shift))
+    return ((log_scale - common) + log_largest) - shift, log_total, common + shift
 
 
 def _is_array(value: Any) -> bool:

@@ -23,11 +23,10 @@ from mpfjax.checks import (
 )
 from mpfjax.devices import (
     choose_devices,
+    excess_over_islands,
     is_traced,
     island_index,
     jit_on_wide_vectors,
-    largest_of_islands,
-    log_sum_over_islands,
     num_islands,
     num_processors,
     over_devices,
@@ -788,19 +787,14 @@ def _normalise(
     """
     log_sum, log_largest = scaled_log_sum_exp(mixture.log_weights)
     own_scale = jnp.zeros_like(log_sum) if mixture.log_scale is None else mixture.log_scale
-    # Islands are held against each other part by part, of which none rounds another away.
-    log_scale = largest_of_islands(own_scale, log_sum > -jnp.inf)
-    above = (own_scale - log_scale) + log_largest
-    log_shift = largest_of_islands(above, log_sum > -jnp.inf)
-    log_total = log_sum_over_islands(log_sum + (above - log_shift))
+    log_excess, log_total, log_scale = excess_over_islands(own_scale, log_largest, log_sum)
     has_mass = log_total > -jnp.inf
-    log_share = (above - log_shift) - jnp.where(has_mass, log_total, 0.0)
+    log_share = log_excess - jnp.where(has_mass, log_total, 0.0)
     normalised = (mixture.log_weights - log_largest) + log_share
     # NaN compares false, and must not be taken for a step of zero likelihood.
     keep = has_mass | jnp.isnan(log_total)
     log_weights = jnp.where(keep, normalised, previous_log_weights)
-    log_growth = log_scale + (log_shift + log_total)
-    return mixture.replace(log_weights=log_weights, log_scale=None), log_growth
+    return mixture.replace(log_weights=log_weights, log_scale=None), log_scale + log_total
 
 
 def _report(

@@ -325,10 +325,11 @@ class TestManyDevices:
 class TestTheCompiledProgram:
     """Of islands of 256 particles in two components each, on eight devices."""
 
-    def test_sends_a_number_an_island_twice_a_step_and_no_more(self, started):
-        """For the total mass, and for whether an exchange is due."""
+    def test_sends_four_numbers_an_island_a_step_and_no_more(self, started):
+        """Three parts of its mass, at once, and its mass, for whether an exchange is due."""
         everywhere = [c[:2] for c in started["eight"][1]["collectives"] if not c[2]]
-        assert everywhere == [["all-gather", NUM_ISLANDS]] * 2
+        gathered = [["all-gather", NUM_ISLANDS], ["all-gather", 3 * NUM_ISLANDS]]
+        assert sorted(everywhere) == gathered
 
     def test_sends_particles_in_the_branch_that_exchanges_them(self, started):
         """Every slot's state, weight, label and ancestor."""

@@ -507,7 +507,7 @@ class TestWhatAUserHandsIt:
     def test_floats_that_python_asks_for_stay_python_floats(self):
         for phi in (0.0, 0.9):
             filter = mpfjax.particle_filter(self.Branching(phi, 0.3), 10)
-            run = mpfjax.run_filter(jax.random.key(0), filter, [1.0, 2.0])
+            run = mpfjax.run_filter(jax.random.key(0), filter, np.array([1.0, 2.0]))
             assert np.isfinite(run.log_marginal_likelihood)
 
     @pytest.mark.parametrize(

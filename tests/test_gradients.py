@@ -260,7 +260,7 @@ def test_a_model_without_the_density_is_refused(make):
 def test_bad_options_are_refused_by_name(options, named):
     with pytest.raises(ValueError, match=named):
         mpfjax.Resample(**options)
-    with pytest.raises(ValueError, match="gradient: 'soft' is neither"):
+    with pytest.raises(ValueError, match="gradient: 'soft' is not one of"):
         mpfjax.Propagate(MODEL, gradient="soft")
 
 

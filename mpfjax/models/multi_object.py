@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.checks import check_callable, check_flag, check_whole, given, shown
 from mpfjax.generator import split
-from mpfjax.models.base import AbstractStateSpaceModel, check_model
+from mpfjax.models.base import AbstractStateSpaceModel, check_model, model_name
 
 # A number of particles that no parameter has by chance as the length of an axis.
 _TRIAL = 1_000_003
@@ -239,8 +239,9 @@ class MultiObjectModel(AbstractStateSpaceModel):
 def require_multi_object(model: Any, needed_by: str) -> None:
     """Raise a `ValueError` where `model` is not of several objects."""
     if not isinstance(model, MultiObjectModel):
+        who = model_name(model) if hasattr(model, "sample_initial") else shown(model)
         raise ValueError(
-            f"model: {shown(model)} is no MultiObjectModel, which {needed_by} needs;"
+            f"model: {who} is no MultiObjectModel, which {needed_by} needs;"
             " MultiObjectModel(object_model, num_objects) makes one"
         )
 

@@ -284,7 +284,7 @@ def test_bad_input():
     named = mpfjax.clustered_particle_filter
     with pytest.raises(ValueError, match="start: 'anywhere' is not one of"):
         named(APART, 10, start="anywhere")
-    with pytest.raises(ValueError, match="split_after: 0 is less than 1"):
+    with pytest.raises(ValueError, match="split_after: 0 is not a whole"):
         named(APART, 10, split_after=0)
     with pytest.raises(ValueError, match="scheme: 'optimal'"):
         named(APART, 10, scheme="optimal")

@@ -38,5 +38,5 @@ def test_one_component_alone_is_left_as_it_is():
 
 @pytest.mark.parametrize("name", ["strength", "radius"])
 def test_a_parameter_that_is_not_positive_is_named(name):
-    with pytest.raises(ValueError, match=f"{name}: 0.0 is not positive"):
+    with pytest.raises(ValueError, match=f"{name}: 0.0 is not a positive"):
         Exclusion(**{name: 0.0})

@@ -149,7 +149,8 @@ class TestWeights:
         before = mixture.log_weights[moved.ancestor_indices]
         expected = before + REPELLING.log_likelihood(OBSERVATIONS[0], moved.particles)
         filled = np.asarray(moved.occupied)
-        np.testing.assert_allclose(moved.log_weights[filled], expected[filled], rtol=1e-5)
+        found = moved.log_weights + moved.log_scale
+        np.testing.assert_allclose(found[filled], expected[filled], rtol=1e-5)
         parents = np.asarray(moved.ancestor_indices)[filled]
         assert sorted(parents) == sorted(np.flatnonzero(log_weights > -np.inf))
         np.testing.assert_array_equal(moved.component_indicators[filled], labels[parents])

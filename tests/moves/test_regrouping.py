@@ -263,7 +263,7 @@ class TestPoolAndRandomPartition:
 
     @pytest.mark.usefixtures("as_installed")
     def test_bad_input(self):
-        with pytest.raises(ValueError, match="num_sets: 0 is less than 1"):
+        with pytest.raises(ValueError, match="num_sets: 0 is not a whole"):
             RandomPartition(0)
         with pytest.raises(ValueError, match="num_sets: 7 is more than num_components, 6"):
             RandomPartition(7)(KEY, self.MIXTURE)
