@@ -369,7 +369,7 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("changes", "named"),
         [
-            ({"filters": {}}, "filter: "),
+            ({"filters": {}}, "filters: "),
             ({"num_particles": []}, "num_particles: "),
             ({"num_particles": [8, 8]}, "num_particles: .* the same twice"),
             ({"settings": {"noise": []}}, "noise: "),

@@ -208,7 +208,7 @@ def test_wrong_types_are_refused_by_name():
     ):
         with pytest.raises(ValueError, match=named):
             LabelLikelihood(*arguments)
-    with pytest.raises(ValueError, match="model: NoneType defines no log_likelihood"):
+    with pytest.raises(ValueError, match="model: None defines no log_likelihood"):
         label_log_posteriors(None, observations, present, rivals)
     for arguments, named in (
         ((0, Unnormalised(), labels, 2), "key: 0"),
