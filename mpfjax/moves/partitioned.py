@@ -169,11 +169,12 @@ class Partitioned(AbstractPropagation):
         log_factors = check_log_density(
             log_factors, model.object_model, "log_likelihood", mixture.num_particles
         )
-        log_potentials = self._log_potentials(states, mixture, orders, rank)
         if self._stops_draws:
             log_density = model.object_log_transition(states, previous, objects)
-            log_potentials = add_gradient(log_potentials, log_density.astype(log_potentials.dtype))
-        moved = mixture.weighed(log_factors, log_potentials)
+            log_factors = add_gradient(log_factors, log_density.astype(log_factors.dtype))
+        moved = mixture.weighed(log_factors)
+        if model.interaction is not None and model.num_objects > 1:
+            moved = moved.weighed(self._log_potentials(states, mixture, orders, rank))
         moved = moved.replace(particles=model.replace_object(particles, objects, states))
         return moved, jnp.any(~(moved.log_weights < jnp.inf))
 
@@ -186,8 +187,7 @@ class Partitioned(AbstractPropagation):
     ) -> Float[Array, " n"]:
         """Σ log ψ of the object of this rank with those that moved before it."""
         interaction, dtype = self.model.interaction, mixture.log_weights.dtype
-        if interaction is None or self.model.num_objects == 1:
-            return jnp.zeros(mixture.num_particles, dtype)
+        assert interaction is not None
         ranks = jnp.arange(self.model.num_objects - 1, dtype=jnp.int32)
         has_moved = ranks < rank
         # A rank that is still to come stands in by the first, so that no object ever meets
