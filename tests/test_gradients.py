@@ -280,11 +280,11 @@ REGROUPED = {
 }
 
 
-@pytest.mark.parametrize("m", [3, 6])
 @pytest.mark.parametrize(
-    ("make", "gradient"),
-    [("mpf", "none"), ("mpf", "stop"), ("mpf", "soft"), ("mpf", "straight_through"),
-     ("gm-mpf", "none")],
+    ("make", "gradient", "m"),
+    [("mpf", "none", 3), ("mpf", "none", 6), ("mpf", "stop", 3), ("mpf", "stop", 6),
+     ("gm-mpf", "none", 3), ("gm-mpf", "none", 6), ("mpf", "soft", 6),
+     ("mpf", "straight_through", 6)],
 )  # fmt: skip
 def test_derivatives_in_both_modes_and_of_second_order(make, gradient, m):
     """On either side of the number of components up to which sums are unrolled.

@@ -169,6 +169,7 @@ class Partitioned(AbstractPropagation):
         log_factors = check_log_density(
             log_factors, model.object_model, "log_likelihood", mixture.num_particles
         )
+        log_factors = log_factors.astype(mixture.log_weights.dtype)
         if self._stops_draws:
             log_density = model.object_log_transition(states, previous, objects)
             log_factors = add_gradient(log_factors, log_density.astype(log_factors.dtype))
