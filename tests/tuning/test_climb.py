@@ -232,9 +232,13 @@ class TestResuming:
             short_fit(checkpoint=path)
 
     def test_an_optimiser_with_a_key_and_short_floats_goes_on(self, tmp_path):
-        noisy = optax.chain(
-            optax.add_noise(0.01, 0.5, jax.random.key(3)), optax.adam(0.05, mu_dtype=jnp.bfloat16)
-        )
+        def disturb(updates, key, params=None):
+            own, following = jax.random.split(key)
+            noise = 0.01 * jax.random.normal(own)
+            return jax.tree.map(lambda leaf: leaf + noise.astype(leaf.dtype), updates), following
+
+        with_key = optax.GradientTransformation(lambda params: jax.random.key(3), disturb)
+        noisy = optax.chain(with_key, optax.adam(0.05, mu_dtype=jnp.bfloat16))
         whole = short_fit(4, optimizer=noisy)
         short_fit(2, optimizer=noisy, checkpoint=tmp_path / "fit.npz")
         resumed = short_fit(4, optimizer=noisy, checkpoint=tmp_path / "fit.npz")
