@@ -212,7 +212,7 @@ def test_wrong_types_are_refused_by_name():
         label_log_posteriors(None, observations, present, rivals)
     for arguments, named in (
         ((0, Unnormalised(), labels, 2), "key: 0"),
-        ((key, None, labels, 2), "model: NoneType"),
+        ((key, None, labels, 2), "model: None"),
         ((key, Unnormalised(), None, 2), "labels: None"),
         ((key, Unnormalised(), labels[:, 0], 2), "labels: leading axes"),
         ((key, Unnormalised(), labels, 2.5), "num_candidates: 2.5"),
