@@ -202,7 +202,7 @@ class Filter(eqx.Module):
         for leaf in leaves:
             if _is_plain(leaf):
                 _require_fitting(np.asarray(leaf), "observation")
-        observation = _as_arrays(observation)
+        observation = as_arrays(observation)
         return with_floats_traced(
             lambda filter: _checked_step(filter, key, mixture, observation), self
         )
@@ -307,7 +307,7 @@ def run_filter(
     check_key(key)
     check_run(filter, collect)
     present = present_steps(observations, missing, filter.model)
-    observations = _as_arrays(observations)
+    observations = as_arrays(observations)
     run = lambda filter: _run(key, filter, observations, present, collect)  # noqa: E731
     return checked(with_floats_traced(run, filter))
 
@@ -345,7 +345,7 @@ def monte_carlo(
     check_run(filter, collect)
     check_whole(**given(slots=slots))
     present = present_steps(observations, missing, filter.model)
-    observations = _as_arrays(observations)
+    observations = as_arrays(observations)
 
     def run(filter: Filter) -> FilterRun:
         starts = _Start(keys)
@@ -844,7 +844,7 @@ def _untie(moves: tuple[Any, ...], model: Any) -> tuple[Any, ...]:
     return jax.tree.map(lambda node: model if is_tied(node) else node, moves, is_leaf=is_tied)
 
 
-def _as_arrays(observations: PyTree) -> PyTree:
+def as_arrays(observations: PyTree) -> PyTree:
     """Python's numbers as arrays of JAX's own types, everything else as it is."""
 
     def convert(leaf: Any) -> Any:
@@ -995,11 +995,11 @@ def with_floats_traced(run: Callable[[Filter], PyTree], filter: Filter) -> PyTre
     Such numbers would otherwise be constants of the program, and each value another program. They
     stay constants where the model asks for their value in Python, as in `if self.phi > 0`.
     """
+    if not any(type(leaf) is float for leaf in jax.tree.leaves(filter)):
+        return run(filter)
     arrays = jax.tree.map(
         lambda leaf: jnp.asarray(leaf, default_float()) if type(leaf) is float else leaf, filter
     )
-    if not any(type(leaf) is float for leaf in jax.tree.leaves(filter)):
-        return run(filter)
     try:
         return run(arrays)
     except _NEEDS_VALUE:

@@ -19,6 +19,7 @@ from mpfjax.devices import (
 from mpfjax.filters import (
     Filter,
     FilterRun,
+    as_arrays,
     check_run,
     checked,
     present_steps,
@@ -70,6 +71,7 @@ def run_islands(
     check_run(filter, collect)
     check_whole(num_islands=num_islands)
     present = present_steps(observations, missing, filter.model)
+    observations = as_arrays(observations)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_islands, dtype=jnp.uint32))
 
     def run(filter: Filter) -> FilterRun:

@@ -3,8 +3,8 @@
 import math
 from collections.abc import Callable
 from functools import partial, reduce
-from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -598,7 +598,7 @@ def _add_gradient_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 def without_gradient(tree: PyTree) -> PyTree:
     """The same values, all of them constants to a derivative."""
     return jax.tree.map(
-        lambda leaf: jax.lax.stop_gradient(leaf) if _is_inexact_array(leaf) else leaf, tree
+        lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, tree
     )
 
 
@@ -611,10 +611,6 @@ def as_inexact(values: Shaped[Array, "*shape"]) -> Inexact[Array, "*shape"]:
 def default_float() -> jnp.dtype:
     """The floating point type of new arrays: float32, or float64 where JAX is set to it."""
     return jnp.result_type(float)
-
-
-def _is_inexact_array(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jnp.inexact)
 
 
 def _finite(largest: Float[Array, " *shape"]) -> Float[Array, " *shape"]:

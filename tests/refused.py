@@ -39,3 +39,9 @@ def refused(table):
         for name, kind in kinds.items()
         for i, value in enumerate((REFUSED | OPTIONAL)[kind])
     ]
+
+
+def assert_named(function, good, name, value):
+    """A good call with one argument that will not do is an error that begins with its name."""
+    with pytest.raises(ValueError, match=rf"^{name}: "):
+        function(**good | {name: value})

@@ -514,7 +514,9 @@ class TestWhatAUserHandsIt:
         "make", ["mixture_particle_filter", "gaussian_mixture_particle_filter"]
     )
     def test_features_and_scale_are_given_once(self, make):
-        first = lambda states: states[:, 0]  # noqa: E731
+        def first(states):
+            return states[:, 0]
+
         filter = getattr(mpfjax, make)(Drift(), 20, 2, features=first, scale=3.0)
         regrouping = [m for m in (*filter.moves, *filter._initial_moves) if hasattr(m, "features")]
         assert len(regrouping) == 4

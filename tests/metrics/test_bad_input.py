@@ -8,7 +8,7 @@ import pytest
 from mpfjax import metrics
 from mpfjax.metrics.coverage import coverage
 from tests.examples import make_mixture
-from tests.refused import refused
+from tests.refused import assert_named, refused
 
 ROWS = np.array([[1.0, 1, 2, 2, 5, 5], [2, 1, 2, 2, 5, 5]])
 MIXTURE = make_mixture([0.1, 0.9], [0.0, 1.0], [0, 0], 1)
@@ -59,8 +59,7 @@ TABLE = {
 @pytest.mark.usefixtures("as_installed")
 @pytest.mark.parametrize(("function", "good", "name", "value"), refused(TABLE))
 def test_what_will_not_do_is_named(function, good, name, value):
-    with pytest.raises(ValueError, match=rf"^{name}: "):
-        function(**good | {name: value})
+    assert_named(function, good, name, value)
 
 
 @pytest.mark.usefixtures("as_installed")
@@ -84,8 +83,7 @@ def test_what_will_not_do_is_named(function, good, name, value):
     ],
 )  # fmt: skip
 def test_what_does_not_go_with_the_rest_is_named(function, good, name, value):
-    with pytest.raises(ValueError, match=rf"^{name}: "):
-        function(**good | {name: value})
+    assert_named(function, good, name, value)
 
 
 @pytest.mark.usefixtures("as_installed")

@@ -328,7 +328,9 @@ class TestOptimisers:
         assert not self.same(one, other)
 
     def test_numbers_of_the_module_that_a_schedule_names_count(self, monkeypatch):
-        schedule = lambda step: RATE / (1 + step)  # noqa: E731
+        def schedule(step):
+            return RATE / (1 + step)
+
         before = contents_of("optimizer", optax.sgd(schedule))
         monkeypatch.setitem(globals(), "RATE", 0.7)
         assert contents_of("optimizer", optax.sgd(schedule)) != before

@@ -106,9 +106,11 @@ def test_a_step_is_no_shorter_than_what_rounding_leaves():
 
 def test_too_few_seeds_are_said_to_be_too_few():
     """Eight particles and six seeds, which differ by half and more from key to key."""
-    run = lambda key: standard_errors(  # noqa: E731
-        key, filter_in(1.0, 1.0, 8), jnp.asarray(OBSERVATIONS), parameters=picked("r"), num_seeds=6
-    )
+
+    def run(key):
+        filter, observations = filter_in(1.0, 1.0, 8), jnp.asarray(OBSERVATIONS)
+        return standard_errors(key, filter, observations, parameters=picked("r"), num_seeds=6)
+
     with pytest.warns(UserWarning, match=r"6 seeds leave them uncertain.*raise num_seeds"):
         found = run(jax.random.key(1))
     assert np.isfinite(found["r"])
