@@ -189,9 +189,10 @@ class Filter(eqx.Module):
     ) -> tuple[ParticleMixture, StepInfo]:
         """The mixture at t and a report, from the mixture at t-1 and y_t.
 
-        A NaN or infinite observation is an error; a step that has none is `predict`'s. Where
-        every particle has zero likelihood the increment is -inf, the particles move on with the
-        weights that they had before, and `degenerate` is true.
+        A NaN or infinite observation is an error, unless the model says that it takes NaN for what
+        is missing; a step that has no observation is `predict`'s. Where every particle has zero
+        likelihood the increment is -inf, the particles move on with the weights that they had
+        before, and `degenerate` is true.
         """
         check_key(key)
         check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
@@ -299,10 +300,14 @@ def run_filter(
       What is derived from a mixture is written for one: `jax.vmap(lambda m: m.mean())` maps it over
       a collected stack.
     - `missing`: "error" raises a `ValueError` that names the first step whose observation holds a
-      NaN or an infinity; "skip" takes such steps as missing, and only predicts.
+      NaN or an infinity; "skip" takes such steps as missing, and only predicts. A model with
+      `handles_missing = True` is given the NaN, and with "skip" only a step of nothing else is
+      missing.
 
-    Raises `ValueError` for no observations, leaves of different lengths, or an unknown `missing`,
-    before anything compiles, and a RuntimeError where the model's densities give NaN.
+    Raises `ValueError` for an argument of another kind, no observations, leaves of different
+    lengths, complex numbers or ones beyond what JAX's type holds, before anything compiles; for a
+    model whose draws or densities are of the wrong shape or type, as it is traced; and a
+    RuntimeError where its densities give NaN.
     """
     check_key(key)
     check_run(filter, collect)

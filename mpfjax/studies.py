@@ -36,7 +36,6 @@ Values = Sequence[Any] | np.ndarray | Array
 _MANIFEST = "study.json"
 _CELL = "cell"
 _TAKEN = ("filter", "num_particles", _CELL)
-_ARGUMENTS = {"filter": "filters", "num_particles": "num_particles"}  # what sets each axis
 # Names as `_cells` makes them, none of which leads out of a folder.
 _CELL_FILE = re.compile(r"\d+-[\w.+-]*\.npz")
 
@@ -94,8 +93,7 @@ class Study:
             raise ValueError(f"settings: {taken[0]!r} is what a cell has a name for already")
         for name, values in _axes(self).items():
             if not values or len(set(values)) < len(values):
-                argument = _ARGUMENTS.get(name, f"settings: {name}")
-                raise ValueError(f"{argument}: {values} is empty or has the same twice")
+                raise ValueError(f"{_argument(name)}: {values} is empty or has the same twice")
         for number in _axes(self)["num_particles"]:
             check_whole(num_particles=number)
         present_steps(self.observations, self.missing)
@@ -216,9 +214,13 @@ def _axes(study: Study) -> dict[str, list[Any]]:
         # A string is a sequence as well, of its letters.
         is_array = isinstance(values, np.ndarray | jax.Array) and values.ndim > 0
         if isinstance(values, str | bytes) or not (is_array or isinstance(values, Sequence)):
-            argument = _ARGUMENTS.get(name, f"settings: {name}")
-            raise ValueError(f"{argument}: {shown(values)} are no values, [value, ...]")
+            raise ValueError(f"{_argument(name)}: {shown(values)} are no values, [value, ...]")
     return {name: [_plain(name, value) for value in values] for name, values in axes.items()}
+
+
+def _argument(axis: str) -> str:
+    """The argument of `Study` that sets an axis."""
+    return {"filter": "filters", "num_particles": "num_particles"}.get(axis, f"settings: {axis}")
 
 
 def _plain(name: str, value: Any) -> Any:

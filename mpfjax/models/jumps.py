@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import check_inner_share, check_positive_array, check_rows, to_array
-from mpfjax.generator import normal, split
+from mpfjax.generator import fast_key, normal, split
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
 
 
@@ -59,7 +59,9 @@ class RandomWalkWithJumps(AbstractDynamics):
         """x_{t-1} plus a step, long for the particles that jump."""
         del previous
         key_noise, key_jump = split(key, 2)
-        jumps = jax.random.bernoulli(key_jump, self.jump_probability, (current.shape[0], 1))
+        jumps = jax.random.bernoulli(
+            fast_key(key_jump), self.jump_probability, (current.shape[0], 1)
+        )
         steps = jnp.where(
             jumps,
             jnp.broadcast_to(self.jump_deviations, current.shape),

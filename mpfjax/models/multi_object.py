@@ -11,7 +11,12 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.checks import check_callable, check_flag, check_whole, given, shown
 from mpfjax.generator import split
-from mpfjax.models.base import AbstractStateSpaceModel, check_model, model_name
+from mpfjax.models.base import (
+    AbstractStateSpaceModel,
+    check_log_density,
+    check_model,
+    model_name,
+)
 
 # A number of particles that no parameter has by chance as the length of an axis.
 _TRIAL = 1_000_003
@@ -200,6 +205,13 @@ class MultiObjectModel(AbstractStateSpaceModel):
         self, observation: PyTree, states: PyTree, objects: Int[Array, "*n"]
     ) -> Float[Array, " n"]:
         """log L(y_t | x_t^j) of one object of each particle; y_t as prepared."""
+        values = self._object_log_likelihood(observation, states, objects)
+        num_particles = jax.tree.leaves(states)[0].shape[0]
+        return check_log_density(values, self.object_model, "log_likelihood", num_particles)
+
+    def _object_log_likelihood(
+        self, observation: PyTree, states: PyTree, objects: Int[Array, "*n"]
+    ) -> Any:
         if self.shared_observation and not self.per_object:
             return self.object_model.log_likelihood(observation, states)
         if objects.ndim == 0:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.checks import check_one_of, check_whole, given
 from mpfjax.generator import split, uniform
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import check_log_density, require
+from mpfjax.models.base import require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling import Resample
@@ -136,9 +136,6 @@ class PropagateInClusters(AbstractPropagation):
         def move(key: Key[Array, ""], states: PyTree, j: Int[Array, ""]) -> tuple:
             points = self.model.sample_object_transition(key, states, j)
             log_likelihood = self.model.object_log_likelihood(seen, points, j)
-            log_likelihood = check_log_density(
-                log_likelihood, self.model.object_model, "log_likelihood", mixture.num_particles
-            )
             return points, log_likelihood.astype(default_float())
 
         points, log_likelihoods = jax.vmap(move, in_axes=(0, 1, 0), out_axes=(1, 0))(

@@ -7,7 +7,6 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.generator import split
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import check_log_density
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling import Resample
@@ -58,9 +57,6 @@ class PropagateIndependently(AbstractPropagation):
         ) -> tuple[PyTree, Float[Array, ""]]:
             states = self.model.sample_object_transition(key, states, j)
             log_likelihood = self.model.object_log_likelihood(seen, states, j)
-            log_likelihood = check_log_density(
-                log_likelihood, self.model.object_model, "log_likelihood", mixture.num_particles
-            )
             cloud = single_component(states).weighed(log_likelihood)
             drawn = Resample(self.scheme)(key_resample, cloud).particles
             # An object whose particles all have zero likelihood moves by its dynamics alone.

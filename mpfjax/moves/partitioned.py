@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.checks import check_one_of, shown
 from mpfjax.generator import split
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import check_log_density, require
+from mpfjax.models.base import require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation import predict
@@ -166,9 +166,6 @@ class Partitioned(AbstractPropagation):
         if self._stops_draws:
             states = jax.lax.stop_gradient(states)
         log_factors = model.object_log_likelihood(seen, states, objects)
-        log_factors = check_log_density(
-            log_factors, model.object_model, "log_likelihood", mixture.num_particles
-        )
         log_factors = log_factors.astype(mixture.log_weights.dtype)
         if self._stops_draws:
             log_density = model.object_log_transition(states, previous, objects)

@@ -19,6 +19,7 @@ from mpfjax.checks import (
     shown,
     to_rows,
 )
+from mpfjax.generator import fast_key
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
 from mpfjax.vision.boxes import centred, check_boxes
@@ -78,7 +79,7 @@ class AbstractBoxModel(AbstractStateSpaceModel):
 
     def sample_transition(self, key: Key[Array, ""], states: BoxState) -> BoxState:
         """x_t from the dynamics, and r drawn anew with the switch probability."""
-        key_noise, key_switch, key_reference = jax.random.split(key, 3)
+        key_noise, key_switch, key_reference = jax.random.split(fast_key(key), 3)
         reference = states.reference
         if self.switch_probability > 0:
             k = self.reference_boxes.shape[0]

@@ -14,6 +14,7 @@ from mpfjax.checks import (
     to_array,
     to_rows,
 )
+from mpfjax.generator import fast_key
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.operations import take
 from mpfjax.proposals import AbstractProposal
@@ -145,7 +146,7 @@ class DetectionProposal(AbstractProposal):
         self, key: Key[Array, ""], observation: DetectedFrame, previous_states: BoxState
     ) -> tuple[BoxState, Float[Array, " n"]]:
         """x_t from the mixture, and its log density."""
-        key_moved, key_noise, key_which = jax.random.split(key, 3)
+        key_moved, key_noise, key_which = jax.random.split(fast_key(key), 3)
         moved = self.model.sample_transition(key_moved, previous_states)
         mean, deviations = self._agreement(observation.detections, previous_states)
         noise = jax.random.normal(key_noise, mean.shape, mean.dtype)

@@ -11,6 +11,7 @@ from optax.assignment import hungarian_algorithm
 
 from mpfjax.checks import check_flag, check_positive, check_share, check_type, check_whole, shown
 from mpfjax.filters import Filter
+from mpfjax.generator import fast_key
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.dynamics import Autoregression
 from mpfjax.moves.base import AbstractRejuvenation
@@ -350,7 +351,7 @@ class ObjectTracker(eqx.Module):
         )
         centre = jnp.concatenate([places[:, :2], jnp.ones_like(places[:, 2:])], axis=1)
         # The box of the frame before is as uncertain as a step: so is the speed at birth.
-        noise = jax.random.normal(key, (2, *mixture.particles.box.shape), centre.dtype)
+        noise = jax.random.normal(fast_key(key), (2, *mixture.particles.box.shape), centre.dtype)
         drawn = take(centre, seats)[None] + take(deviations, seats)[None] * noise
         num_alive = jnp.maximum(jnp.sum(alive | born), 1)
         log_share = -jnp.log((num_alive * self.particles_per_object).astype(centre.dtype))
