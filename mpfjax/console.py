@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mpfjax.storage import write_whole
+from mpfjax.running.storage import write_whole
 
 
 def whole(least: int = 1, most: int = 2**31 - 1) -> Callable[[str], int]:
