@@ -23,9 +23,7 @@ sybil = Sybil(parsers=[PythonCodeBlockParser(), SkipParser()], path=str(REPOSITO
 
 
 @pytest.mark.usefixtures("as_installed")
-@pytest.mark.parametrize(
-    "page", [page for page in PAGES if with_python(page)], ids=lambda p: p.stem
-)
+@pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: page.stem)
 def test_the_code_of_a_page_runs(page):
     """All blocks of a page in their order, as a reader runs them: without the tests' strictness."""
     document = sybil.parse(page)

@@ -19,7 +19,7 @@ SYMBOLS = {
     "α": r"\alpha ", "γ": r"\gamma ", "ε": r"\epsilon ", "θ": r"\theta ", "Θ": r"\Theta ",
     "λ": r"\lambda ", "Λ": r"\Lambda ", "μ": r"\mu ", "π": r"\pi ", "ρ": r"\rho ", "σ": r"\sigma ",
     "τ": r"\tau ", "φ": r"\phi ", "ψ": r"\psi ", "ω": r"\omega ", "<=": r"\le ", ">=": r"\ge ",
-    "~": r"\sim ", "<": r"\lt ", ">": r"\gt ", "|": r"\mid ", "⟨": r"\langle ", "⟩": r"\rangle ",
+    "~": r"\sim ", "|": r"\mid ", "⟨": r"\langle ", "⟩": r"\rangle ",
 }  # fmt: skip
 FUNCTIONS = {"log", "exp", "min", "max", "det"}
 # What no English word holds: such a token is a formula, or part of one.
@@ -59,7 +59,9 @@ def latex(formula: str) -> str:
 
 def _word(found: re.Match[str]) -> str:
     word = found[0]
-    return rf"\{word} " if word in FUNCTIONS else r"\mathrm{" + word.replace("_", r"\_") + "}"
+    if word in FUNCTIONS:
+        return rf"\{word} " if found.string[found.end() :].startswith("(") else rf"\{word} \,"
+    return r"\mathrm{" + word.replace("_", r"\_") + "}"
 
 
 def _depth(text: str) -> int:
@@ -95,13 +97,13 @@ def _end_of_formula(tokens: list[str], start: int) -> int | None:
             position += 1
             continue
         bare = token.strip("()[]{},.;:")
-        is_strong = bool(STRONG.search(token)) and not re.search(r"[A-Za-z]{4,}_", token)
+        is_strong = bool(STRONG.search(token)) and not re.search(r"[A-Za-z]{3,}_", token)
         is_weak = bool(WEAK.fullmatch(bare)) or bare == "" or bool(re.match(r"\(?a[,)]", token))
         if strong and not is_strong and _is_factor(tokens, position):
             is_weak = True
         if not (is_strong or is_weak or (depth > 0 and strong)):
             break
-        if position == start and (not is_strong and not re.match(r"[A-Za-z(|]", token)):
+        if position == start and (not is_strong and not re.match(r"[\dA-Za-z(|]", token)):
             break
         strong |= is_strong
         depth += _depth(token)
@@ -110,7 +112,9 @@ def _end_of_formula(tokens: list[str], start: int) -> int | None:
             last = position
         if depth <= 0 and token[-1] in ",.;:":
             break
-    return last if strong and last is not None else None
+    if not strong or last is None or not re.search(r"\w|ℓ", "".join(tokens[start:last])):
+        return None
+    return last
 
 
 def _is_factor(tokens: list[str], position: int) -> bool:

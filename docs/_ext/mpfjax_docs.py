@@ -95,6 +95,13 @@ def process_signature(
     return short[0], short[1]
 
 
+def shorten_types(app: Sphinx, doctree: nodes.document) -> None:
+    """The same in the types of properties, which are no signatures."""
+    for text in list(doctree.findall(nodes.Text)):
+        if "jaxlib._jax." in text:
+            text.parent.replace(text, nodes.Text(text.replace("jaxlib._jax.", "")))
+
+
 def _mathml(self: HTML5Translator, node: nodes.Element, as_block: bool) -> None:
     try:
         self.body.append(tex2mathml(node.astext(), as_block=as_block))
@@ -124,4 +131,5 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_transform(LinkCode)
     app.connect("autodoc-process-docstring", process_docstring)
     app.connect("autodoc-process-signature", process_signature)
+    app.connect("doctree-read", shorten_types)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
