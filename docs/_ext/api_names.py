@@ -1,0 +1,38 @@
+"""The public names of mpfjax: what the API pages show, and what code in pages links to."""
+
+import importlib
+import importlib.util
+from functools import cache
+from typing import Any
+
+MODULES = ("mpfjax", "vision", "tuning", "metrics", "exact", "plotting", "smoothing")
+
+
+@cache
+def public_names() -> dict[str, str]:
+    """The full name of everything public, by its name with and without the module's."""
+    found: dict[str, str] = {}
+    for name in MODULES:
+        full = name if name == "mpfjax" else f"mpfjax.{name}"
+        if importlib.util.find_spec(full) is None:
+            continue
+        for each in _public_in(importlib.import_module(full), full):
+            found[f"{full}.{each}"] = found[f"{name}.{each}"] = f"{full}.{each}"
+            found.setdefault(each, f"{full}.{each}")
+    return found
+
+
+def _public_in(module: Any, full: str) -> list[str]:
+    """The classes and functions that a module offers: what it defines, or hands on.
+
+    What another of the modules shows already, as the top does of some, is shown once.
+    """
+    is_package = hasattr(module, "__path__")
+    return [
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_")
+        and callable(value)
+        and getattr(value, "__module__", "").startswith("mpfjax.")
+        and (is_package or value.__module__ == full)
+    ]
