@@ -19,6 +19,7 @@ ORDER = (
     "filter",
     "filters",
     "running",
+    "smoothing",
     "console",
     "exact",
     "metrics",

@@ -108,6 +108,7 @@ def _joined(run: FilterRun, whole: bool) -> FilterRun:
         log_marginal_likelihood=run.log_marginal_likelihood[0],
         log_likelihood_increments=run.log_likelihood_increments[0],
         collected=collected,
+        initial=_whole_mixture(run.initial),
         final=_whole_mixture(run.final),
         resampled=resampled.reshape(resampled.shape[0], -1),
         degenerate=run.degenerate[0],
