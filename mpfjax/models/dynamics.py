@@ -59,7 +59,23 @@ class AbstractDynamics(eqx.Module):
         """Mean and standard deviation of every coordinate of x_t."""
 
 
-class RandomWalk(AbstractDynamics):
+class AbstractRandomWalk(AbstractDynamics):
+    """Dynamics whose expected x_t is x_{t-1}, with steps of given `deviations`."""
+
+    deviations: eqx.AbstractVar[Float[Array, "*n d"]]
+
+    @property
+    def order(self) -> int:
+        """1."""
+        return 1
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether `deviations` is one row for all."""
+        return self.deviations.ndim == 1
+
+
+class RandomWalk(AbstractRandomWalk):
     """x_t = x_{t-1} + diag(deviations) ω_t, ω_t ~ N(0, I).
 
     Vermaak et al. (2003), section 5.2. `deviations`: (d,), or (n, d) with a row for each
@@ -72,16 +88,6 @@ class RandomWalk(AbstractDynamics):
     def __check_init__(self) -> None:
         check_positive_array(deviations=self.deviations)
         check_rows(deviations=self.deviations)
-
-    @property
-    def order(self) -> int:
-        """1."""
-        return 1
-
-    @property
-    def is_shared(self) -> bool:
-        """Whether `deviations` is one row for all."""
-        return self.deviations.ndim == 1
 
     def sample(
         self,

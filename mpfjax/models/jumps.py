@@ -6,11 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import check_inner_share, check_positive_array, check_rows, to_array
-from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
+from mpfjax.models.dynamics import AbstractRandomWalk, RandomWalk
 from mpfjax.operations.generator import fast_key, normal, split
 
 
-class RandomWalkWithJumps(AbstractDynamics):
+class RandomWalkWithJumps(AbstractRandomWalk):
     """x_t = x_{t-1} + diag(s) ω_t, ω_t ~ N(0, I), s long with a small probability.
 
     The contaminated normal of Tukey (1960) as dynamics: (1 - p) N(x_{t-1}, diag(deviations²))
@@ -39,16 +39,6 @@ class RandomWalkWithJumps(AbstractDynamics):
                 f" {self.deviations.shape}"
             )
         check_inner_share(jump_probability=self.jump_probability)
-
-    @property
-    def order(self) -> int:
-        """1."""
-        return 1
-
-    @property
-    def is_shared(self) -> bool:
-        """Whether `deviations` is one row for all."""
-        return self.deviations.ndim == 1
 
     def sample(
         self,

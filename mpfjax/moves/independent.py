@@ -5,11 +5,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
+from mpfjax.checks import check_one_of
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling import Resample
-from mpfjax.moves.slots import require_all_slots
+from mpfjax.moves.resampling_schemes import SCHEMES
+from mpfjax.moves.slots import require_equal_rows
 from mpfjax.operations.generator import split
 
 
@@ -33,7 +35,7 @@ class PropagateIndependently(AbstractPropagation):
 
     def __check_init__(self) -> None:
         require_multi_object(self.model, "PropagateIndependently")
-        Resample(self.scheme)  # raises where there is no such scheme
+        check_one_of(SCHEMES, scheme=self.scheme)
 
     @property
     def approximate(self) -> bool:
@@ -44,9 +46,7 @@ class PropagateIndependently(AbstractPropagation):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
         """One step of every object's filter."""
-        if mixture.num_components != 1:
-            raise ValueError(f"mixture: {mixture.num_components} components, not one")
-        require_all_slots(mixture, "PropagateIndependently")
+        require_equal_rows(mixture, "PropagateIndependently")
         num_objects = self.model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = split(key, 2 * num_objects)

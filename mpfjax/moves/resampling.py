@@ -6,7 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import (
     check_callable,
@@ -18,24 +18,14 @@ from mpfjax.checks import (
 )
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRejuvenation
-from mpfjax.moves.slots import (
-    Slots,
-    deal_slots,
-    place_slots,
-)
+from mpfjax.moves.lines import AsTheyStand, SideBySide, as_they_are, side_by_side
+from mpfjax.moves.resampling_schemes import SCHEMES
+from mpfjax.moves.slots import Slots, deal_slots, place_slots
 from mpfjax.moves.transport import require_ott, transport
-from mpfjax.operations.generator import uniform
 from mpfjax.operations.gradients import add_gradient
 from mpfjax.operations.indexing import take
 from mpfjax.operations.prefix_sums import count_starts, sum_before
-from mpfjax.operations.segments import (
-    order_by_segment,
-    segment_counts,
-    segment_log_sum_exp,
-    segment_sum,
-    spread,
-)
-from mpfjax.operations.stored import stored, to_int, whole_blocks
+from mpfjax.operations.segments import segment_log_sum_exp, spread
 
 # Up to so many components are resampled as they stand, each in a pass of its own.
 FEW_ROWS = 4
@@ -161,7 +151,8 @@ class Resample(AbstractRejuvenation):
         as_they_stand = num_components == 1 or (num_components <= FEW_ROWS and all_are_due)
         as_they_stand &= self.sort_by is None
         as_they_stand &= self.gradient != "ot"  # which needs places without gaps
-        line = _as_they_stand(mixture) if as_they_stand else self._side_by_side(mixture, due)
+        stays = None if all_are_due else ~spread(due, mixture.component_indicators)
+        line = as_they_are(mixture) if as_they_stand else side_by_side(mixture, stays, self.sort_by)
         # Where all that live are due, none keeps what it has.
         counts = due.astype(jnp.int32) if all_are_due else line.counts
         targets = deal_slots(counts, due, mixture, self.particles_per_component)
@@ -182,30 +173,6 @@ class Resample(AbstractRejuvenation):
             parents = jnp.where(spread(due, slots.components), parents, unmoved)
         parents = line.particles_at(jnp.clip(parents, 0, num_particles - 1))
         return _Drawn(parents, slots, targets, line)
-
-    def _side_by_side(self, mixture: ParticleMixture, due: Bool[Array, " m"]) -> "_SideBySide":
-        """One row of components, without particles that only a rounding error could draw.
-
-        A weight may underflow to zero where its logarithm does not. Such a particle is left out of
-        the row of a component that is resampled, and kept with one that is not.
-        """
-        m = mixture.num_components
-        weights = mixture.component_weights
-        stands = weights > 0
-        if self.ess_threshold < 1.0:
-            stands |= mixture.occupied & ~spread(due, mixture.component_indicators)
-        labels = jnp.where(stands, mixture.component_indicators, m)
-        if self.sort_by is None:
-            order, counts = order_by_segment(_padded(labels, m), m)
-        else:
-            order = jnp.lexsort((self.sort_by(mixture.particles), labels)).astype(jnp.int32)
-            order = _padded(order, mixture.num_particles - 1)
-            counts = segment_counts(stands, mixture.component_indicators, m)
-        num_standing = jnp.sum(counts, dtype=jnp.int32)
-        is_filled = jnp.arange(order.shape[0], dtype=jnp.int32) < num_standing
-        weights = jnp.where(is_filled, take(_padded(weights, 0.0), order), 0.0)
-        components = take(_padded(mixture.component_indicators, 0), order)
-        return _SideBySide(weights[None], counts, jnp.cumsum(counts) - counts, order, components)
 
     def _drawn_from(self, mixture: ParticleMixture) -> ParticleMixture:
         """The mixture whose weights the offspring are drawn in proportion to."""
@@ -247,7 +214,7 @@ class _Drawn(NamedTuple):
     parents: Int[Array, " n"]
     slots: Slots
     targets: Int[Array, " m"]  # how many slots each component has
-    line: "_AsTheyStand | _SideBySide"
+    line: AsTheyStand | SideBySide
 
 
 def _copies(mixture: ParticleMixture, drawn: _Drawn) -> ParticleMixture:
@@ -303,170 +270,3 @@ def _where(
             ancestor_indices=pick(redrawn.ancestor_indices, copies.ancestor_indices),
         )
     return redrawn.replace(log_weights=pick(redrawn.log_weights, copies.log_weights))
-
-
-class _AsTheyStand(NamedTuple):
-    """The particles as they stand, in a row for each component, where only its own have a weight.
-
-    A row has p places, as many as make whole blocks for the prefix sums.
-    """
-
-    weights: Float[Array, "m p"]  # within the component, zero at another's place and an empty one
-    counts: Int[Array, " m"]
-
-    def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, "m 1"]:
-        """For each row the value of its component."""
-        return values[:, None]
-
-    def sums(self, values: Float[Array, "m p"]) -> Float[Array, " m"]:
-        """The sum over each component's places."""
-        return jnp.sum(values, axis=1)
-
-    def first_slots(self, slots: Slots) -> Int[Array, "m 1"]:
-        """Where the slots of each row begin."""
-        return slots.firsts[:, None]
-
-    def num_slots(self, targets: Int[Array, " m"], num_particles: int) -> Int[Array, "m 1"]:
-        """How many slots each row has."""
-        del num_particles
-        return targets[:, None]
-
-    def places_of(self, parents: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
-        """The place in its row of each slot's parent, counted over all rows."""
-        return parents - self.weights.shape[1] * slots.components
-
-    def places_by_rank(self, ranks: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
-        """The place of a rank in each slot's component, which is the only one."""
-        del slots
-        return ranks
-
-    def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
-        """Which particles stand at these places."""
-        return places
-
-
-class _SideBySide(NamedTuple):
-    """The particles in one row of p places, component by component, and empty places at the end."""
-
-    weights: Float[Array, "1 p"]  # within the component, zero at an empty place
-    counts: Int[Array, " m"]
-    firsts: Int[Array, " m"]  # the place of each component's first particle
-    order: Int[Array, " p"]  # which particle stands at each place
-    components: Int[Array, " p"]
-
-    def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, "1 p"]:
-        """At each place the value of its component."""
-        return spread(values, self.components)[None]
-
-    def sums(self, values: Float[Array, "1 p"]) -> Float[Array, " m"]:
-        """The sum over each component's places."""
-        return segment_sum(values[0], self.components, self.counts.shape[0])
-
-    def first_slots(self, slots: Slots) -> Int[Array, "1 1"]:
-        """Where the slots of the row begin."""
-        del slots
-        return jnp.zeros((1, 1), jnp.int32)
-
-    def num_slots(self, targets: Int[Array, " m"], num_particles: int) -> Int[Array, "1 1"]:
-        """How many slots the row has."""
-        del targets
-        return jnp.full((1, 1), num_particles, jnp.int32)
-
-    def places_of(self, parents: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
-        """The place of each slot's parent; rounding must not cross a border of components."""
-        firsts = spread(self.firsts, slots.components)
-        return jnp.clip(parents, firsts, firsts + spread(self.counts, slots.components) - 1)
-
-    def places_by_rank(self, ranks: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
-        """The place of a rank in each slot's component."""
-        return spread(self.firsts, slots.components) + ranks
-
-    def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
-        """Which particles stand at these places."""
-        return take(self.order, stored(places, self.order.shape[0]))
-
-
-def _as_they_stand(mixture: ParticleMixture) -> _AsTheyStand:
-    m = mixture.num_components
-    is_member = mixture.component_indicators[None] == jnp.arange(m, dtype=jnp.int32)[:, None]
-    weights = mixture.component_weights[None]
-    if m > 1:
-        weights = jnp.where(is_member, weights, 0.0)
-    padded = jax.vmap(lambda row: _padded(row, 0.0))(weights)
-    return _AsTheyStand(padded, mixture.component_counts)
-
-
-def _padded(values: Array, fill: float) -> Array:
-    n = values.shape[0]
-    return jnp.pad(values, (0, whole_blocks(n) - n), constant_values=fill)
-
-
-# A scheme gives the first slot of every particle's offspring, counted from the first slot of its
-# row. It sees the expected offspring k_m w_i laid end to end in each row, and where each particle's
-# stretch begins there, and places one point in each slot's share.
-
-
-def _systematic(key, expected, before, targets, slots, line):
-    shift = stored(uniform(key, targets.shape, expected.dtype))
-    return _points_before(before, line.of_places(shift))
-
-
-def _stratified(key, expected, before, targets, slots, line):
-    shift = uniform(key, slots.components.shape, expected.dtype)
-    slot = line.first_slots(slots) + before.astype(jnp.int32)
-    slot = jnp.clip(slot, 0, shift.shape[0] - 1)
-    return _points_before(before, take(shift, slot.reshape(-1)).reshape(slot.shape))
-
-
-def _points_before(
-    before: Float[Array, "rows p"], shift: Float[Array, "rows #p"]
-) -> Int[Array, "rows p"]:
-    """How many of the points s + shift, one in each slot s, come before a particle's stretch."""
-    whole = jnp.floor(before)
-    return to_int(whole, before.shape[-1]) + (shift < before - whole).astype(jnp.int32)
-
-
-def _multinomial(key, expected, before, targets, slots, line):
-    points = _sorted_points(key, slots, targets, expected.dtype)
-    return _sorted_points_before(before, points, line.first_slots(slots))
-
-
-def _residual(key, expected, before, targets, slots, line):
-    # A weight of 1 / k comes out as a hair less in floating point, and is meant to be certain.
-    whole = jnp.floor(expected * (1 + 16 * jnp.finfo(expected.dtype).eps))
-    certain, _ = jax.vmap(sum_before)(whole)
-    left = jnp.maximum(targets - line.sums(whole).astype(jnp.int32), 0)
-    rest = place_slots(left, slots.components.shape[0])
-    points = _sorted_points(key, rest, left, expected.dtype)
-    rests_before, _ = jax.vmap(sum_before)(jnp.maximum(expected - whole, 0.0))
-    drawn = _sorted_points_before(rests_before, points, line.first_slots(rest))
-    return certain.astype(jnp.int32) + drawn
-
-
-def _sorted_points_before(
-    before: Float[Array, "rows p"], points: Float[Array, " n"], first_slots: Int[Array, "rows 1"]
-) -> Int[Array, "rows p"]:
-    """How many of the points of its row come before a particle's stretch."""
-    found = jnp.searchsorted(points, before + first_slots.astype(before.dtype), side="left")
-    return found.astype(jnp.int32) - first_slots
-
-
-def _sorted_points(
-    key: Key[Array, ""], slots: Slots, targets: Int[Array, " m"], dtype: jnp.dtype
-) -> Float[Array, " n"]:
-    """Independent uniform points on each component's stretch of slots, in ascending order."""
-    shares = uniform(key, slots.components.shape, dtype)
-    firsts = spread(slots.firsts, slots.components).astype(dtype)
-    lengths = spread(targets, slots.components).astype(dtype)
-    # Rounding must not take the last of them for the first of the next component.
-    before_end = jnp.nextafter(firsts + lengths, jnp.zeros_like(firsts))
-    points = jnp.minimum(firsts + lengths * shares, before_end)
-    return jnp.sort(jnp.where(slots.filled, points, jnp.inf))
-
-
-SCHEMES: dict[str, Callable[..., Int[Array, " n"]]] = {
-    "systematic": _systematic,
-    "stratified": _stratified,
-    "multinomial": _multinomial,
-    "residual": _residual,
-}

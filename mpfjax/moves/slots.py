@@ -57,7 +57,9 @@ def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:
     )
 
 
-def require_all_slots(mixture: ParticleMixture, who: str) -> None:
-    """Raise a `ValueError` where some slots must stay empty."""
+def require_equal_rows(mixture: ParticleMixture, who: str) -> None:
+    """Raise a `ValueError` unless there is one component, which may fill every slot."""
+    if mixture.num_components != 1:
+        raise ValueError(f"mixture: {mixture.num_components} components, not one")
     if mixture.limit is not None:
         raise ValueError(f"slots: {who} fills every slot, and cannot leave some of them empty")
