@@ -64,7 +64,9 @@ class Filter(eqx.Module):
     - `model`: draws x_0. Moves that hold the very same model share it: the filter is a pytree
       with one copy of the model's parameters, so that its gradient is the gradient.
     - `moves`: callables `(key, mixture, observation) -> mixture`, usually `AbstractMove`s.
-    - `num_particles`, `num_components`: N slots, and M, the most components.
+    - `num_particles`: N.
+    - `num_components`: M, the most components; the filters of the literature call it
+      `max_components`.
     - `initial_moves`: regrouping of x_0, such as `KMeans(reseed=True)`.
 
     Raises `ValueError` for N < 1, M < 1, N < M, no moves, or fewer slots than
@@ -106,6 +108,11 @@ class Filter(eqx.Module):
         self._initial_moves = _tie(initial_moves, model)
         self.num_particles = int(num_particles)
         self.num_components = int(num_components)
+
+    @property
+    def max_components(self) -> int:
+        """M, the most components; the same as `num_components`."""
+        return self.num_components
 
     @property
     def moves(self) -> tuple[Any, ...]:

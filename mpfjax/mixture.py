@@ -29,9 +29,11 @@ class ParticleMixture(eqx.Module):
     - `log_weights`: ℓ, shape (n,), -inf in an empty slot.
     - `component_indicators`: C, shape (n,), in [0, num_components).
     - `ancestor_indices`: shape (n,), which slot of the previous step's mixture each came from.
-    - `num_components`: M, the most components there can be; static.
+    - `num_components`: M, the most components that there can be, dead ones included; static. The
+      filters of the literature call it `max_components`, and so may you.
     - `memory`: what moves with a memory carry from step to step, by the move's name.
-    - `limit`: how many slots may be filled, where that is fewer than there are; None is all.
+    - `usable_slots`: how many slots a move may fill, the first ones; None is all of them. Only
+      `monte_carlo(..., slots=...)` sets it.
     - `log_scale`: within a step, log of a factor of all weights that ℓ leaves out, since beside a
       log-likelihood of a million ℓ would be rounded away; None, which is zero, once normalised.
 
@@ -45,7 +47,7 @@ class ParticleMixture(eqx.Module):
     ancestor_indices: Int[Array, " n"]
     num_components: int = eqx.field(static=True)
     memory: dict[str, PyTree] = eqx.field(default_factory=dict)
-    limit: Int[Array, ""] | None = None
+    usable_slots: Int[Array, ""] | None = None
     log_scale: Float[Array, ""] | None = None
 
     @property
@@ -55,9 +57,24 @@ class ParticleMixture(eqx.Module):
         return self.log_weights.shape[0]
 
     @property
+    def max_components(self) -> int:
+        """M, the most components; the same as `num_components`."""
+        return self.num_components
+
+    @property
+    def num_usable_slots(self) -> int | Int[Array, ""]:
+        """How many slots a move may fill: `usable_slots`, or N where that is None."""
+        return self.num_particles if self.usable_slots is None else self.usable_slots
+
+    @property
+    def limit(self) -> Int[Array, ""] | None:
+        """The name that `usable_slots` had before."""
+        return self.usable_slots
+
+    @property
     def room(self) -> int | Int[Array, ""]:
-        """How many slots may be filled."""
-        return self.num_particles if self.limit is None else self.limit
+        """The name that `num_usable_slots` had before."""
+        return self.num_usable_slots
 
     @property
     def occupied(self) -> Bool[Array, " n"]:
@@ -197,9 +214,8 @@ class ParticleMixture(eqx.Module):
 
     def replace(self, **fields: PyTree) -> "ParticleMixture":
         """A copy with some fields changed."""
-        return type(self)(
-            **{name: fields.get(name, getattr(self, name)) for name in self.__dataclass_fields__}
-        )
+        own = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return type(self)(**own | fields)
 
     def _require_one(self) -> None:
         shape = self.log_weights.shape
@@ -212,26 +228,26 @@ class ParticleMixture(eqx.Module):
 
 
 def single_component(
-    particles: PyTree, num_components: int = 1, limit: Int[Array, ""] | None = None
+    particles: PyTree, num_components: int = 1, usable_slots: Int[Array, ""] | None = None
 ) -> ParticleMixture:
     """Equally weighted particles, all in component 0, each its own ancestor.
 
-    With a `limit` only the first so many are particles, and the slots of the rest are empty.
+    With `usable_slots` only the first so many are particles; the other slots stay empty.
     """
     num_slots = jax.tree.leaves(particles)[0].shape[0]
     slot = jnp.arange(num_slots, dtype=jnp.int32)
-    if limit is None:
+    if usable_slots is None:
         log_weights = jnp.full(num_slots, -jnp.log(num_slots), default_float())
     else:
-        log_share = -jnp.log(limit.astype(default_float()))
-        log_weights = jnp.where(slot < limit, log_share, -jnp.inf)
+        log_share = -jnp.log(usable_slots.astype(default_float()))
+        log_weights = jnp.where(slot < usable_slots, log_share, -jnp.inf)
     return ParticleMixture(
         particles=particles,
         log_weights=log_weights,
         component_indicators=jnp.zeros(num_slots, jnp.int32),
         ancestor_indices=slot,
         num_components=num_components,
-        limit=limit,
+        usable_slots=usable_slots,
     )
 
 

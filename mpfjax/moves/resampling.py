@@ -109,8 +109,8 @@ class Resample(AbstractRejuvenation):
         if self.ess_threshold == 1.0:
             return mixture.active
         counts = mixture.component_counts
-        limit = self.ess_threshold * counts.astype(mixture.log_weights.dtype)
-        due = mixture.component_effective_sample_sizes < limit
+        least = self.ess_threshold * counts.astype(mixture.log_weights.dtype)
+        due = mixture.component_effective_sample_sizes < least
         if self.particles_per_component is not None:
             due = due | (counts != self.particles_per_component)
         return due & (counts > 0)

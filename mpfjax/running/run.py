@@ -78,10 +78,11 @@ def monte_carlo(
       first one, and each process has all of it. Under the caller's own jit, grad or vmap None is
       one device. One device that is a CPU is kept busy by a thread for each processor, if there
       is enough to do.
-    - `slots`: keep the particles in so many slots, of which all but N stay empty. Filters that
-      differ in N alone then share one compiled program, at the cost of as many particles as there
-      are slots. The particles are those of a run without, up to rounding, and `collect` sees the
-      empty slots as well.
+    - `slots`: the length of the particle arrays, at least N; the slots after the first N stay
+      empty. None is N. Filters that differ in N alone compile once if they have the same `slots`:
+      1000, for example, for N = 50, 200 and 1000. Each then costs as much as 1000 particles. The
+      particles are those of a run without `slots`, up to rounding. `collect` sees the empty slots
+      as well, with `occupied` false.
 
     Raises `ValueError` for more devices than there are, fewer slots than particles, and moves
     that fill every slot, `PropagateIndependently` and `PropagateInClusters`.

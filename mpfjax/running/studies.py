@@ -125,9 +125,10 @@ def run_study(
     - `seeds_at_once`: how many seeds share one `vmap`, where memory is short; None is all.
     - `cells_at_once`: with 2, one cell compiles while another runs; a kill may lose both. Several
       processes, which must meet in the same cell, run one at a time.
-    - `slots`: filters of at most so many particles run within so many slots, as `monte_carlo` has
-      it, so that a filter compiles once for all these N. For small filters, of which the study
-      compiles for longer than it runs; with a filter that fills every slot it is an error.
+    - `slots`: the length of the particle arrays, as for `monte_carlo`, in all cells with at most
+      so many particles. A filter then compiles once for all these N. Use it for small filters,
+      where the study spends more time on compiling than on running. A filter that fills every
+      slot, such as `independent_particle_filters`, raises an error.
 
     Raises `ValueError`, before anything runs, for an argument of another kind, for a `directory` of
     another study, naming what differs, and for files in it that are cut off: delete those, and only
