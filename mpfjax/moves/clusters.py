@@ -26,14 +26,14 @@ STARTS = ("apart", "together")
 class PropagateInClusters(AbstractPropagation):
     """Propagate, weigh and resample clusters of objects, which merge where objects meet.
 
-    The objects are parted into clusters, and the joint distribution is the product of the
-    clusters' clouds of N rows each. At the start every object is a cluster. One step, from rows
-    of equal weight:
+    Each object belongs to one cluster. A cluster has N rows, and a row holds a state of each of
+    its objects. The joint distribution is the product of the clusters' distributions. At the
+    start every object is a cluster of its own. One step, from rows of equal weight:
 
     1. *Predict.* Object j's point x^{jl} is drawn by its dynamics from row l, and L_j evaluated.
     2. *Merge.* Clusters become one where log ψ ≠ 0 between any points of two of their objects,
        directly or through others. Row l of the new cluster is row l of each.
-    3. *An object alone* is resampled by its likelihood, whose mean is its factor of Ẑ.
+    3. *An object alone* is resampled by its likelihood. The mean likelihood is its factor of Ẑ.
     4. *Objects in a cluster cross between rows.* Object j's N points are a draw of
        q_j(x) = N⁻¹ Σ_r f_j(x | row r), the deterministic mixture of Owen and Zhou (2000), and
        serve every row r with the weight
@@ -41,43 +41,43 @@ class PropagateInClusters(AbstractPropagation):
            b_rjl = L_j(x^{jl}) f_j(x^{jl} | row r) / Σ_r' f_j(x^{jl} | row r').
 
        The update of row r is Σ b_r1l b_r2m ... ψ(x^{1l}, x^{2m}) ... over all combinations of
-       points. N rows are drawn ∝ Π_j Σ_l b_rjl, and then for each its objects' points, ∝ b times
-       ψ with the points already chosen, the row's weight multiplied by Σ_l b ψ / Σ_l b. A row
-       starts with an object of its own and goes round, so that no object goes first in all of
-       them. The weighted rows are resampled; the factor of Ẑ is the mean score times the mean
+       points. First, N rows are drawn with probability ∝ Π_j Σ_l b_rjl. Then each row draws a
+       point for one object after the other, ∝ b times ψ with the points that it has already, and
+       its weight is multiplied by Σ_l b ψ / Σ_l b. Different rows start with different objects.
+       Last, the weighted rows are resampled. The factor of Ẑ is the mean score times the mean
        weight.
-    5. Every cluster's rows are turned by a random number of places.
+    5. The rows of every cluster are shifted, in a circle, by a random number of places.
 
-    Unbiased: given the rows, points of different objects are independent and each object's
-    weighted points are an unbiased estimate of its prediction under any row, so the sum over
-    combinations is one of the cluster's update. Given the past, clusters are independent, so
-    that the expectation of their product is the product of the exact updates, and where no ψ
-    between clusters differs from 1 on any combination of their points, that product is the joint
-    update already. After step 5 all pairs of rows of two clusters are equally likely to stand
-    side by side, so a merged cluster is an unbiased estimate of the product; and whether they
-    merge depends on the points alone, not on who stands beside whom.
+    Why it is unbiased. Given the rows, the points of different objects are independent. Each
+    object's weighted points are an unbiased estimate of its prediction under any row. So the sum
+    over combinations is an unbiased estimate of the cluster's update. Given the past, clusters
+    are independent, so the expectation of their product is the product of the exact updates.
+    Where ψ is 1 for all combinations of points of two clusters, that product is the joint update.
+    After step 5 all pairs of rows of two clusters are equally likely to stand side by side, so a
+    merged cluster is an unbiased estimate of the product. Whether two clusters merge depends on
+    the points alone, not on which rows stand side by side.
 
-    What a row loses by the evidence of one object costs another object no hypotheses, which is
-    what partitioned sampling in any order suffers from; and no object goes first in all rows.
+    In partitioned sampling, the evidence of one object removes hypotheses about another, in any
+    order. Here it does not, and no object goes first in all rows.
 
     - `start`: every object "apart", or all "together" in one cluster, as for an x_0 under which
       the objects are not independent.
-    - `split_after`: None never splits a cluster, which is exact. A number s parts what had no
-      contact for s steps, directly or through others, and goes on with the product of the
-      marginals: an approximation (`approximate` is true).
+    - `split_after`: None never splits a cluster, which is exact. With a number s, objects that had
+      no contact for s steps, directly or through others, go into separate clusters. The filter
+      goes on with the product of their marginals: an approximation (`approximate` is true).
     - `scheme`: of resampling, as in `Resample`.
 
     Cost: J x N likelihoods a step, J(J-1) N² / 2 potentials to find contact, and 2 N² J
     transition densities and J² N² potentials where there is a cluster of several.
 
-    Particle i holds row i of every cluster, all with equal weight; the particles that the move
-    is given must be so, as those of x_0 and its own are. A row has no single ancestor, and is
-    its own. The clusters are in `memory["clusters"]["labels"]`, (J,): the first object of each
-    object's cluster.
+    Particle i holds row i of every cluster. The move needs particles of equal weight, as x_0 has
+    and as it returns them. A row has no single ancestor, so every particle is named as its own
+    ancestor. `memory["clusters"]["labels"]`, (J,), holds the first object of each object's
+    cluster.
 
-    Clusters need the object model's `log_transition`, and where its state holds more of the
-    past than x_t also `with_history(states, previous_states)`, the states with their past
-    replaced by that which follows from the previous states.
+    Clusters need `log_transition` of the object model. A model whose state holds more than x_t,
+    such as x_{t-1}, also needs `with_history(states, previous_states)`: the states with their past
+    taken from the previous states.
 
     Raises `ValueError` for a mixture of several components, a model of one object, a model
     without `log_transition` where it is needed, and an unknown `start` or scheme, or
@@ -121,7 +121,7 @@ class PropagateInClusters(AbstractPropagation):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
-        """One step of every cluster's filter, those that meet merged before."""
+        """Merge the clusters that meet, then make one step of every cluster's filter."""
         require_equal_rows(mixture, "PropagateInClusters")
         num_objects = self.model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.

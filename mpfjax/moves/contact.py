@@ -19,7 +19,7 @@ def touching(
 ) -> Bool[Array, "objects objects"]:
     """Which objects have points between which ψ ≠ 1, over all pairs of their points.
 
-    Within a cluster that never splits nobody asks.
+    It is not computed within a cluster that can never split.
     """
     num_objects, interaction = model.num_objects, model.interaction
     if interaction is None:

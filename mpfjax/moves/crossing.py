@@ -31,7 +31,7 @@ def scores(
 ) -> tuple[Float[Array, "objects n"], Float[Array, "objects n"]]:
     """log Σ_r f_j(x^{jl} | row r) of each point, and log Σ_l b_rjl of each row.
 
-    An object alone needs neither: its row is worth what its own point is.
+    An object alone needs neither: the score of its row is the likelihood of its own point.
     """
 
     def score(carry: None, j: Int[Array, ""]) -> tuple[None, tuple]:
@@ -84,7 +84,7 @@ def crossed(
         log_psi = _log_potentials(model, chosen, partners, own)
         picked, log_gain = _draw_columns(key, log_b + log_psi)
         before = log_sums[objects, parent_rows]
-        # A row without weight is in line only where the whole cluster has none.
+        # A row without weight is drawn only if no row of the cluster has any.
         counts = jnp.any(partners, axis=1) & (before != -jnp.inf)
         log_gain = jnp.where(counts, log_gain - jnp.where(counts, before, 0.0), 0.0)
         picked = jnp.where(alone[objects], parent_rows, picked)
@@ -148,8 +148,8 @@ def _draw_columns(
 ) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
     """A column of each line, drawn in proportion to its entries, and log of the line's sum.
 
-    One shift is drawn for all lines, whose quantiles follow each other in golden strides: each is
-    uniform, and any stretch of lines that are equal draws evenly.
+    One random shift serves all lines. The quantile of each next line is a golden-ratio step
+    further, modulo 1. So each quantile is uniform, and a run of equal lines draws evenly.
     """
     strides = _GOLDEN * np.arange(log_table.shape[0])
     shift = uniform(key, (), log_table.dtype)

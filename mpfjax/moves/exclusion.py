@@ -39,12 +39,12 @@ class Exclusion(AbstractExclusion):
     components, with μ_m the plain mean of the propagated particles of component m: the mean of
     its prediction when every step resamples. Distances are in units of `scale`.
 
-    This is NOT part of the exact recursion of any paper here. It makes components interact, as a
-    Markov random field between objects does, through their means and not their states; the
-    filtering distribution is no longer that of the model and the marginal likelihood is biased
-    (`approximate` is true). Use it, after `Propagate`, where components stand for objects that
-    cannot share a place and look-alikes would otherwise collect several components; a mixture
-    of hypotheses about ONE object must not have it.
+    This is NOT part of the exact recursion of any paper here. Components interact as objects do in
+    a Markov random field, but through their means instead of their states. The filtering
+    distribution is then not that of the model, and the marginal likelihood is biased
+    (`approximate` is true). Use it after `Propagate`, where each component stands for an object,
+    objects cannot share a place, and several components would otherwise end on one look-alike.
+    Never use it where components are hypotheses about ONE object.
 
     Raises `ValueError` for a strength or radius that is not positive.
     """

@@ -21,13 +21,13 @@ class PropagateIndependently(AbstractPropagation):
     For every object j: x_t^j ~ D, weights L(y_t | x_t^j), resampled by these weights alone.
     Objects that do not interact are independent given the observations, so the product of their
     N-particle clouds is the joint cloud, with Ẑ = Π_j Ẑ_j. Particle i holds the i-th particle
-    of every object: a row is one of the N^J combinations, each as good as another, and all of
-    equal weight. A row has no single ancestor, and is its own.
+    of every object: it is one of N^J combinations of equal weight. It has no single ancestor, so
+    every particle is named as its own ancestor.
 
-    The particles that it is given must have equal weights, as those of x_0 and its own have; it
-    needs no other resampling. An interaction of the model is left out, and `approximate` is then
-    true. Raises `ValueError` for a mixture of several components, a model of one object, and an
-    unknown scheme.
+    The move needs particles of equal weight, as x_0 has and as it returns them; the chain needs no
+    other resampling. It ignores an interaction of the model, and `approximate` is then true.
+    Raises `ValueError` for a mixture of several components, a model of one object, and an unknown
+    scheme.
     """
 
     model: MultiObjectModel

@@ -1,9 +1,9 @@
 """How particles stand in line to be resampled: a row for each component, or all in one row.
 
-Resampling is a walk along a line: each particle owns a stretch as long as its expected number of
-offspring, and every slot picks the particle whose stretch holds its point. Few components are
-walked as the particles stand, each in a pass of its own over all of them (`AsTheyStand`); many are
-put next to each other first, by component (`SideBySide`).
+Imagine the particles along a line, each with a stretch as long as its expected number of offspring.
+Every slot places a point on the line and takes the particle whose stretch holds it. With few
+components, each has a line of its own, over all particles, as they stand (`AsTheyStand`). With
+many, the particles are first put side by side, component by component, on one line (`SideBySide`).
 """
 
 from collections.abc import Callable
@@ -119,7 +119,7 @@ def side_by_side(
     """One row of components, without particles that only a rounding error could draw.
 
     A weight may underflow to zero where its logarithm does not. Such a particle is left out of
-    the row where its component is resampled, and kept where it `stays` as it is.
+    the row where its component is resampled, and kept where its component `stays` as it is.
     """
     m = mixture.num_components
     weights = mixture.component_weights
@@ -141,6 +141,6 @@ def side_by_side(
 
 
 def padded(values: Array, fill: float) -> Array:
-    """The values, and fill up to whole blocks of the prefix sums."""
+    """The values, filled up to whole blocks of the prefix sums."""
     n = values.shape[0]
     return jnp.pad(values, (0, whole_blocks(n) - n), constant_values=fill)

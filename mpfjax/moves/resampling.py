@@ -27,7 +27,7 @@ from mpfjax.operations.indexing import take
 from mpfjax.operations.prefix_sums import count_starts, sum_before
 from mpfjax.operations.segments import segment_log_sum_exp, spread
 
-# Up to so many components are resampled as they stand, each in a pass of its own.
+# Up to this number of components, each is resampled in a pass of its own over all particles.
 FEW_ROWS = 4
 GRADIENTS = ("none", "stop", "soft", "ot", "straight_through")
 
@@ -42,36 +42,38 @@ class Resample(AbstractRejuvenation):
 
     - `scheme`: "systematic" (the default: least noise, O(n)), "stratified", "multinomial" (the
       textbook's, most noise) or "residual".
-    - `ess_threshold`: a component is resampled where its effective sample size is below this
-      share of its particles; 1.0 resamples at every step. Under `vmap` an adaptive threshold
-      saves noise, not time.
-    - `particles_per_component`: None deals the slots equally to the living components that are
-      resampled; a number k gives each living component k particles and leaves the rest of the
-      slots empty, the paper's habit in section 5.2.
-    - `sort_by`: maps the particles to a number each, (n,), by which they stand in line within
-      their component. Systematic and stratified resampling of a sorted line change the
-      distribution least (Kitagawa 1996), and neighbours in line are neighbours in space when
-      `stratified_normal` spreads their noise, the array form of randomised quasi-Monte Carlo
-      (L'Ecuyer, Lécot and Tuffin 2008). Worth its sort where masses or likelihoods must be exact:
-      it cut the error of the modes' mass on the quadratic model by four or five.
+    - `ess_threshold`: a component is resampled if its effective sample size is below this share of
+      its particles. 1.0 resamples at every step. Under `vmap`, a lower threshold reduces the noise
+      but not the time.
+    - `particles_per_component`: None shares the slots equally among the living components that are
+      resampled. A number k gives each living component k particles and leaves the other slots
+      empty, as section 5.2 of the paper does.
+    - `sort_by`: a function that gives each particle a number, (n,). Within their component the
+      particles are resampled in the order of these numbers. Systematic and stratified resampling
+      in a good order change the distribution least (Kitagawa 1996). With `stratified_normal`
+      noise, it is the array form of randomised quasi-Monte Carlo (L'Ecuyer, Lécot and Tuffin
+      2008). Use it where masses or likelihoods must be accurate and a sort is worth its time: on
+      the quadratic model it made the error of the modes' masses four or five times smaller.
     - `gradient`: what a derivative of the filter sees of the resampling, one of
-        - "none": nothing. The indices that were drawn are taken for constants, and the derivative
-          of the log marginal likelihood is NOT an estimate of the score: its bias does not go
-          away with more particles, and may have the wrong sign.
-        - "stop": new weights w_a / ⊥w_a times the old share, ⊥ being `stop_gradient` (Ścibior and
-          Wood 2021, DPF-SGR). Values are the same to the bit; derivatives of Ẑ are unbiased.
-          `Propagate` and `Partitioned` have it as well, for parameters of the dynamics.
-        - "soft": draws from q = (1 - s) w + s / k and weighs by w / q, s the `softness` (Karkus,
-          Hsu and Lee 2018). Noisier weights, and still biased: what is left out grows as s falls.
-        - "ot": no draws: particles move to the barycentres of an entropy-regularised transport
-          plan from the weights to equal ones (Corenflos et al. 2021), by ott-jax, the extra `ot`.
-          Differentiable throughout, O(n²), and biased in value and gradient by the entropy.
-        - "straight_through": resampling in value; the derivative is that of particles moved by
-          Σ_j w_j ⊥x_j, as if every offspring were the component's mean (Bengio et al. 2013).
-          Biased, and it may grow exponentially with t, as on the quadratic model.
-      The masses of components carry their derivative in all of them. Component indicators are
-      whole numbers and have none: what a parameter does to the grouping is not seen, which is
-      no error, since regrouping does not change the distribution.
+        - "none": nothing. The drawn indices are constants, and the derivative of the log marginal
+          likelihood is NOT an estimate of the score: its bias stays however many particles there
+          are, and it may have the wrong sign.
+        - "stop": the new weights are w_a / ⊥w_a times the old share, where ⊥ is `stop_gradient`
+          (Ścibior and Wood 2021, DPF-SGR). Values are the same to the bit; derivatives of Ẑ are
+          unbiased. For parameters of the dynamics, `Propagate` and `Partitioned` have it too.
+        - "soft": particles are drawn from q = (1 - s) w + s / k and weighted by w / q, where s is
+          the `softness` (Karkus, Hsu and Lee 2018). The weights are noisier, and the derivative is
+          still biased, the more the smaller s is.
+        - "ot": nothing is drawn. Particles move to the barycentres of an entropy-regularised
+          transport plan from the weights to equal ones (Corenflos et al. 2021), computed by
+          ott-jax, the extra `ot`. It is differentiable throughout and O(n²); the entropy biases
+          the value and the gradient.
+        - "straight_through": the values are those of resampling. The derivative is that of
+          particles moved by Σ_j w_j ⊥x_j, as if every offspring were the component's mean (Bengio
+          et al. 2013). It is biased, and may grow exponentially with t, as on the quadratic model.
+      The masses of the components have their derivative in all of these. Component indicators are
+      whole numbers and have none. That is no error, since regrouping does not change the
+      distribution.
     - `softness`: s, in (0, 1]. `regularisation`: ε of the transport, positive, in units of the
       mean squared spread of a component's particles, as Corenflos et al. scale it.
 
@@ -121,7 +123,7 @@ class Resample(AbstractRejuvenation):
         """Resample every component that is due."""
         due = self.is_due(mixture)
         drawn_from = self._drawn_from(mixture)
-        # Who is drawn is a whole number, through which no derivative passes.
+        # The drawn indices are whole numbers and have no derivative.
         drawn = self._draw(key, jax.lax.stop_gradient(drawn_from), due)
         slots = drawn.slots
         copies = _copies(mixture, drawn)
@@ -146,14 +148,14 @@ class Resample(AbstractRejuvenation):
     ) -> "_Drawn":
         """Each slot's parent: drawn by weight where its component is due, itself elsewhere."""
         num_particles, num_components = mixture.num_particles, mixture.num_components
-        # A component that keeps its particles needs them side by side, unless it has all slots.
+        # A component that keeps its particles needs them side by side, unless it is the only one.
         all_are_due = self.ess_threshold == 1.0
         as_they_stand = num_components == 1 or (num_components <= FEW_ROWS and all_are_due)
         as_they_stand &= self.sort_by is None
         as_they_stand &= self.gradient != "ot"  # which needs places without gaps
         stays = None if all_are_due else ~spread(due, mixture.component_indicators)
         line = as_they_are(mixture) if as_they_stand else side_by_side(mixture, stays, self.sort_by)
-        # Where all that live are due, none keeps what it has.
+        # If all living components are due, none keeps its particles.
         counts = due.astype(jnp.int32) if all_are_due else line.counts
         targets = deal_slots(counts, due, mixture, self.particles_per_component)
         if as_they_stand and num_components == 1:
@@ -163,7 +165,7 @@ class Resample(AbstractRejuvenation):
         expected = line.weights * line.of_places(targets).astype(line.weights.dtype)
         before, total = jax.vmap(sum_before)(expected)
         starts = SCHEMES[self.scheme](key, expected, before, targets, slots, line)
-        # Rounding must not leave a slot to those that stand past all weight.
+        # Rounding must not give a slot to particles after the last weight.
         num_slots = line.num_slots(targets, num_particles)
         starts = jnp.minimum(starts, num_slots)
         starts = jnp.where(before < total[:, None], starts, num_slots) + line.first_slots(slots)
@@ -245,7 +247,7 @@ def _importance_weighted(
 
 
 def _following_the_mean(redrawn: ParticleMixture, mixture: ParticleMixture) -> ParticleMixture:
-    """The same particles, whose derivatives are also those of the component's mean by weight."""
+    """The same particles, with the derivative of their component's weighted mean added."""
 
     def follow(leaf: Array, drawn: Array) -> Array:
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -259,7 +261,7 @@ def _following_the_mean(redrawn: ParticleMixture, mixture: ParticleMixture) -> P
 def _where(
     is_redrawn: Bool[Array, " n"], redrawn: ParticleMixture, copies: ParticleMixture
 ) -> ParticleMixture:
-    """What was redrawn, and of the components that were not due the particles as they were."""
+    """The redrawn particles, or the old ones where a component was not due."""
 
     def pick(new: Array, old: Array) -> Array:
         return jnp.where(is_redrawn.reshape(-1, *[1] * (new.ndim - 1)), new, old)

@@ -1,9 +1,9 @@
 """The schemes of resampling: systematic, stratified, multinomial, residual.
 
-A scheme gives the first slot of every particle's offspring, counted from the first slot of its
-row. It sees the expected offspring k_m w_i laid end to end in each row, and where each particle's
-stretch begins there, and places one point in each slot's share. To add a scheme, write such a
-function and name it in `SCHEMES`.
+A scheme returns the first slot of every particle's offspring, counted from the first slot of its
+row. Each particle has a stretch of its row, as long as its expected number of offspring k_m w_i.
+The scheme knows where each stretch begins, and places one point in the share of each slot. To add
+a scheme, write such a function and name it in `SCHEMES`.
 """
 
 from collections.abc import Callable
@@ -46,7 +46,7 @@ def multinomial(key, expected, before, targets, slots, line):
 
 
 def residual(key, expected, before, targets, slots, line):
-    # A weight of 1 / k comes out as a hair less in floating point, and is meant to be certain.
+    # In floating point, k times a weight of 1 / k may be a little less than 1; it must count as 1.
     whole = jnp.floor(expected * (1 + 16 * jnp.finfo(expected.dtype).eps))
     certain, _ = jax.vmap(sum_before)(whole)
     left = jnp.maximum(targets - line.sums(whole).astype(jnp.int32), 0)
@@ -72,7 +72,7 @@ def sorted_points(
     shares = uniform(key, slots.components.shape, dtype)
     firsts = spread(slots.firsts, slots.components).astype(dtype)
     lengths = spread(targets, slots.components).astype(dtype)
-    # Rounding must not take the last of them for the first of the next component.
+    # Rounding must not move the last point into the next component.
     before_end = jnp.nextafter(firsts + lengths, jnp.zeros_like(firsts))
     points = jnp.minimum(firsts + lengths * shares, before_end)
     return jnp.sort(jnp.where(slots.filled, points, jnp.inf))

@@ -27,8 +27,8 @@ def deal_slots(
 ) -> Int[Array, " m"]:
     """How many slots each component gets.
 
-    Those that are not due keep what they have, `counts`; the others share the rest of the slots
-    that may be filled equally, or get `particles_per_component` each where that is a number.
+    Components that are not due keep their slots, `counts`. The others share the rest of the usable
+    slots equally, or get `particles_per_component` each if that is a number.
     """
     usable, num_slots = mixture.num_usable_slots, mixture.num_particles
     if particles_per_component is not None:
