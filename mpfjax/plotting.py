@@ -19,8 +19,8 @@ MARKERS = "osD^vP*X<>"
 
 
 @dataclass(frozen=True)
-class Trace:
-    """The particles of one run over time, (t, n), of a scalar state."""
+class ParticleHistory:
+    """The particles of one run over time, (t, n), of a scalar state; once called `Trace`."""
 
     positions: np.ndarray
     occupied: np.ndarray
@@ -28,41 +28,44 @@ class Trace:
     score: float
 
 
+Trace = ParticleHistory  # the name that it had before
+
+
 def draw_typical_run(
-    traces: Mapping[str, Trace],
+    histories: Mapping[str, ParticleHistory],
     truth: np.ndarray,
     observations: np.ndarray,
     labels: Mapping[str, str],
 ) -> Figure:
     """Figure 1 of Vermaak et al. (2003): the data, and every filter's particles over time."""
-    num_rows = 1 + len(traces)
-    figure = Figure(figsize=(7.0, 1.6 + 2.1 * len(traces)), layout="constrained")
+    num_rows = 1 + len(histories)
+    figure = Figure(figsize=(7.0, 1.6 + 2.1 * len(histories)), layout="constrained")
     axes = figure.subplots(
-        num_rows, 1, sharex=True, squeeze=False, height_ratios=[1.3] + [2.0] * len(traces)
+        num_rows, 1, sharex=True, squeeze=False, height_ratios=[1.3] + [2.0] * len(histories)
     )[:, 0]
     times = np.arange(1, len(truth) + 1)
     axes[0].plot(times, truth, color="black", label="true state $x^*_t$")
     axes[0].plot(times, observations, ".", color=COLOURS[4], ms=4, label="observations $y_t$")
     axes[0].set_ylabel("data")
     axes[0].legend(loc="lower left", fontsize=8, ncols=2, framealpha=0.9)
-    for axis, (name, trace) in zip(axes[1:], traces.items(), strict=True):
-        _draw_trace(axis, trace, truth)
-        num_particles = trace.positions.shape[1]
+    for axis, (name, history) in zip(axes[1:], histories.items(), strict=True):
+        _draw_history(axis, history, truth)
+        num_particles = history.positions.shape[1]
         axis.set_title(
             f"{labels[name]}, N = {num_particles}: both modes at"
-            f" {100 * trace.score:.0f}% of the steps",
+            f" {100 * history.score:.0f}% of the steps",
             fontsize=10,
         )
     axes[-1].set_xlabel("time step $t$")
     return figure
 
 
-def _draw_trace(axis: Axes, trace: Trace, truth: np.ndarray) -> None:
-    times = np.broadcast_to(np.arange(1, len(truth) + 1)[:, None], trace.positions.shape)
-    for component in np.unique(trace.component_indicators):
-        chosen = trace.occupied & (trace.component_indicators == component)
+def _draw_history(axis: Axes, history: ParticleHistory, truth: np.ndarray) -> None:
+    times = np.broadcast_to(np.arange(1, len(truth) + 1)[:, None], history.positions.shape)
+    for component in np.unique(history.component_indicators):
+        chosen = history.occupied & (history.component_indicators == component)
         axis.plot(
-            times[chosen], trace.positions[chosen], MARKERS[component % len(MARKERS)], ms=2.0,
+            times[chosen], history.positions[chosen], MARKERS[component % len(MARKERS)], ms=2.0,
             mew=0, alpha=0.5, color=COLOURS[component % len(COLOURS)],
             label=f"particles of component {component + 1}",
         )  # fmt: skip

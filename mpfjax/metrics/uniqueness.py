@@ -19,7 +19,9 @@ def uniqueness(mixture: ParticleMixture) -> Float[Array, " objects"]:
     """
     _check(mixture)
     distinct = jax.vmap(lambda states: _distinct_rows(states, mixture), in_axes=1)
-    return distinct(mixture.particles) / jnp.asarray(mixture.room, mixture.log_weights.dtype)
+    return distinct(mixture.particles) / jnp.asarray(
+        mixture.num_usable_slots, mixture.log_weights.dtype
+    )
 
 
 def effective_dynamics(mixture: ParticleMixture) -> PyTree:

@@ -85,7 +85,7 @@ def scan(
 
 
 def _share_of_islands(mixture: ParticleMixture) -> ParticleMixture:
-    """The mixture's share of a whole that is made of as many as there are islands."""
+    """The mixture with its mass divided by the number of islands, as a part of the whole."""
     if num_islands() == 1:
         return mixture
     return mixture.replace(log_weights=mixture.log_weights - math.log(num_islands()))

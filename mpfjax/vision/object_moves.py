@@ -7,9 +7,10 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.checks import check_inner_share, check_positive, check_type
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.exclusion import AbstractExclusion
 
 
-class ObjectExclusion(AbstractPropagation):
+class ObjectExclusion(AbstractExclusion):
     """Lower the weights of particles near where the other objects probably are.
 
     log-weight_i -= strength · Σ_m s_m exp(-|x_i - μ_m|² / (2 radius²)) over the components m of
@@ -37,11 +38,6 @@ class ObjectExclusion(AbstractPropagation):
         for unit in self.scale:
             check_positive(scale=unit)
 
-    @property
-    def approximate(self) -> bool:
-        """True: an interaction between objects, on top of the model."""
-        return True
-
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
@@ -54,7 +50,7 @@ class ObjectExclusion(AbstractPropagation):
         means = mixture.component_sums(filled * centres) / counts
         shares = jnp.exp(_log_shares(mixture, owners)).astype(centres.dtype)
         squares = jnp.sum((centres[:, None] - means[None]) ** 2, axis=-1)
-        nearness = shares[None] * jnp.exp(-squares / (2 * self.radius**2))
+        nearness = shares[None] * self.nearness(squares)
         others = states.reference[:, None] != owners[None]
         total = jnp.sum(jnp.where(others, nearness, 0.0), axis=1)
         penalty = self.strength * total.astype(mixture.log_weights.dtype)

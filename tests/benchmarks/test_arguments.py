@@ -2,16 +2,12 @@
 
 import pytest
 
-from benchmarks import (
-    gm_mpf,
-    histograms,
-    interacting_objects,
-    likelihood_tuning,
-    partitioned_sampling,
-    peers,
-    scaling,
-    score_vs_particles,
-)
+from benchmarks import histograms, partitioned_sampling, score_vs_particles
+from benchmarks.gm_mpf import __main__ as gm_mpf
+from benchmarks.interacting_objects import __main__ as interacting_objects
+from benchmarks.likelihood_tuning import __main__ as likelihood_tuning
+from benchmarks.peers import __main__ as peers
+from benchmarks.scaling import __main__ as scaling
 from benchmarks.visual_tracking import __main__ as visual_tracking
 
 COUNTS = {

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mpfjax import Resample
-from mpfjax.moves.resampling import _sorted_points
+from mpfjax.moves.resampling_schemes import sorted_points
 from mpfjax.moves.slots import place_slots
 from tests.examples import make_mixture
 
@@ -266,7 +266,7 @@ def test_points_stay_within_their_components_stretch_of_slots():
     """
     targets = jnp.full(4, 25_000, jnp.int32)
     slots = place_slots(targets, 100_000)
-    draw = jax.jit(lambda key: _sorted_points(key, slots, targets, jnp.dtype("float32")))
+    draw = jax.jit(lambda key: sorted_points(key, slots, targets, jnp.dtype("float32")))
     borders = np.asarray(slots.firsts) + 25_000
     for seed in (44, 118, 249):
         points = np.asarray(draw(jax.random.key(seed))).reshape(4, -1)

@@ -16,7 +16,7 @@ import numpy as np
 import particles
 from particles import collectors
 
-from benchmarks.peer_jobs import ConstantVelocity, Job, Quadratic
+from benchmarks.peers.jobs import ConstantVelocity, Job, Quadratic
 
 LOG_2_PI = np.log(2 * np.pi)
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.peer_jobs import Job, Quadratic
+from benchmarks.peers.jobs import Job, Quadratic
 
 LIBRARIES = {
     "mpfjax": "mpfjax",
@@ -39,10 +39,10 @@ class Prepared(NamedTuple):
 def prepare(library: str, job: Job, num_particles: int, num_seeds: int) -> Prepared:
     """The job through one of the `LIBRARIES`."""
     if library.startswith("particles"):
-        from benchmarks import peer_particles
+        from benchmarks.peers import through_particles
 
         num_processes = 2 if library == "particles_2" else 1
-        run = peer_particles.prepare(job, num_particles, num_seeds, num_processes)
+        run = through_particles.prepare(job, num_particles, num_seeds, num_processes)
         return Prepared(np.random.seed, lambda _: run())
 
     import jax

@@ -1,4 +1,4 @@
-"""Part c of `likelihood_tuning`: a colour likelihood tuned on labelled frames, judged on others."""
+"""Part c: a colour likelihood tuned on labelled frames, and judged on other frames."""
 
 import os
 import sys

@@ -17,9 +17,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
 
-from benchmarks.peer_jobs import JOBS
+from benchmarks.peers.jobs import JOBS
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 10.0
 
 
@@ -37,7 +37,7 @@ class Worker:
         num_devices: int | None = None,
         processes: tuple[str, int, int] | None = None,
     ) -> None:
-        command = [sys.executable, "-m", "benchmarks.peer_worker", library, job]
+        command = [sys.executable, "-m", "benchmarks.peers.worker", library, job]
         if num_devices is not None:
             command += ["--devices", str(num_devices)]
         if processes is not None:
@@ -107,7 +107,7 @@ def stop_all(workers: Iterable[Worker]) -> None:
 
 def main() -> None:
     """Say what there is, then run what is asked for until no more is."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.peer_worker")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.peers.worker")
     parser.add_argument("library")
     parser.add_argument("job", choices=list(JOBS))
     parser.add_argument("--devices", type=int)
@@ -135,7 +135,7 @@ def main() -> None:
 
 def introduce(options: argparse.Namespace) -> dict[str, Any]:
     """Versions and devices; imports what the library needs, so that jobs are not charged for it."""
-    from benchmarks import peer_libraries
+    from benchmarks.peers import libraries
 
     name = options.library.removesuffix("_2")
     found: dict[str, Any] = {"version": metadata.version(name)}
@@ -150,7 +150,7 @@ def introduce(options: argparse.Namespace) -> dict[str, Any]:
             address, number, index = options.processes
             mpfjax.join_processes(address, int(number), int(index))
         found["devices"] = [device.device_kind for device in jax.devices()]
-    peer_libraries.prepare(options.library, JOBS[options.job], 2, 2)
+    libraries.prepare(options.library, JOBS[options.job], 2, 2)
     return found
 
 
@@ -160,12 +160,12 @@ def answer(
     """Seconds of one run of the job, and what came out of it for each seed."""
     import numpy as np
 
-    from benchmarks import peer_libraries
+    from benchmarks.peers import libraries
 
     job = JOBS[options.job]
     size = request["particles"], request["seeds"]
     if size not in prepared:
-        prepared[size] = peer_libraries.prepare(options.library, job, *size)
+        prepared[size] = libraries.prepare(options.library, job, *size)
     given = prepared[size].make_input(request["seed"])
     start = time.perf_counter()
     result = prepared[size].run(given)
