@@ -15,8 +15,7 @@ DOCS = REPOSITORY / "docs"
 PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"]
 PAGES += sorted(path for path in DOCS.rglob("*.md") if "notebooks" not in path.parts)
 NAMES = [str(page.relative_to(REPOSITORY)) for page in PAGES]
-COMMAND = re.compile(r"python -m (benchmarks\.\w+|mpfjax\b)")
-
+COMMAND = re.compile(r"python -m (benchmarks\.\w+|mpfjax\b)((?: [^\n`|#]*)?)")
 WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
 
 sybil = Sybil(parsers=[PythonCodeBlockParser(), SkipParser()], path=str(REPOSITORY))
@@ -36,9 +35,16 @@ def test_the_code_of_a_page_runs(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_the_commands_of_a_page_exist(page):
-    for name in set(COMMAND.findall(page.read_text(encoding="utf-8"))):
-        module = name if name.startswith("benchmarks") else "mpfjax.__main__"
-        assert importlib.util.find_spec(module) is not None, name
+    """Each module, and each option that a command gives it."""
+    for name, arguments in COMMAND.findall(page.read_text(encoding="utf-8")):
+        module = importlib.util.find_spec(name if name != "mpfjax" else "mpfjax.__main__")
+        assert module is not None, name
+        place = Path(module.origin)
+        is_folder = place.name in ("__init__.py", "__main__.py")
+        sources = place.parent.rglob("*.py") if is_folder else [place]
+        text = "".join(source.read_text(encoding="utf-8") for source in sources)
+        for option in re.findall(r"(?<=\s)--[a-z-]+", arguments):
+            assert f'"{option}"' in text, f"{name} {option}"
 
 
 def test_readme_is_short_and_keeps_its_two_commands():
