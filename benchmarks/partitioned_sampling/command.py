@@ -12,8 +12,8 @@ from benchmarks.partitioned_sampling import sensitivity
 from benchmarks.partitioned_sampling.events import Event, find_events
 from benchmarks.partitioned_sampling.pictures import write_pictures
 from benchmarks.partitioned_sampling.scenes import MOST_TRIED, Scene
-from benchmarks.partitioned_sampling.study import Row, filters, num_rows, study
-from benchmarks.partitioned_sampling.tables import content_of
+from benchmarks.partitioned_sampling.study import filters, num_rows, study
+from benchmarks.partitioned_sampling.tables import Measured, content_of, measure_row
 from benchmarks.partitioned_sampling.text import print_tables
 from mpfjax.console import write_json
 from mpfjax.vision.frames import parse_range
@@ -30,21 +30,22 @@ def run(options: argparse.Namespace) -> None:
         return
     synthetic = not options.sequence
     cycles = synthetic and "ps" in options.methods
-    settings = {
+    passed_over: list[Any] = []
+    settings: dict[str, Any] = {
         "orders": "objects in the order in which they move, counted from 1",
         "num_particles": options.particles,
         "runs": options.runs,
         "seed": options.seed,
         "lambdas": options.lambdas,
-        "passed_over": [],
     }
+    settings["passed_over"] = passed_over
     path = options.out / "partitioned_sampling.json"
     scenes: list[Scene] = []
-    rows: list[Row] = []
+    measured: list[Measured] = []
     started = time.perf_counter()
     for number, (name, scene) in enumerate(_scenes(options)):
         if scene is None:
-            settings["passed_over"].append(name)
+            passed_over.append(name)
             continue
         # Numbers that do not fit come to light here, before anything compiles.
         filters(scene, options.lambdas[0], options.particles, options.methods)
@@ -55,16 +56,16 @@ def run(options: argparse.Namespace) -> None:
             options.seed, cycles=cycles,
         )  # fmt: skip
         for row in tqdm(made, desc=scene.name, total=total, unit="row", disable=None):
-            rows.append(row)
+            measured.append(measure_row(scene, row, synthetic))
         settings["seconds"] = round(time.perf_counter() - started, 1)
-        content = content_of(scenes, rows, synthetic)
+        content = content_of(scenes, measured)
         write_json(path, {"settings": settings} | content)
     if not scenes:
         raise ValueError("--keys: the exact posterior keeps the scene of none of them")
     print_tables(content)
-    write_pictures(options.out, scenes, rows, content)
-    if synthetic and settings["passed_over"]:
-        print(f"\n{len(settings['passed_over'])} keys were passed over", settings["passed_over"])
+    write_pictures(options.out, scenes, [row for row, _ in measured], content)
+    if passed_over:
+        print(f"\n{len(passed_over)} keys were passed over: {passed_over}")
     print(f"{settings['seconds']} s; written to {options.out}")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.partitioned_sampling.scenes import Kept, Scene
-from benchmarks.partitioned_sampling.study import CYCLE, Order, Row
+from benchmarks.partitioned_sampling.study import Order, Row
 from benchmarks.partitioned_sampling.tables import label
 from benchmarks.partitioned_sampling.text import TITLES
 from mpfjax import plotting
@@ -54,7 +54,7 @@ def draw_impoverishment(scene: Scene, rows: Sequence[Row], content: dict[str, An
     """
     chosen = {}
     for row in rows:
-        if row.scene != scene.key or row.lambda_ != rows[0].lambda_ or row.method == CYCLE:
+        if row.scene != scene.key or row.kept.uniqueness is None:
             continue
         if row.order is not None and scene.hard not in (row.order[0], row.order[-1]):
             continue

@@ -17,6 +17,7 @@ _FASTEST = 14  # pixels a frame and axis
 # Rows and columns of the lattice with less are dropped. So far out: when the distracter goes,
 # nothing looks like object 1 but itself, and the likelihood weighs up tails of 1e-20.
 _LEAST_MASS = 1e-24
+_TOTAL, _NOTHING = 1e30, 1e-36  # of all mass, and of a cell: within the range of 32 bits
 JUDGED_AT = 20.0  # λ
 BACK_FROM = 11  # the frame from which on the posterior may be back
 
@@ -58,11 +59,11 @@ def posterior_means(
     velocities = np.arange(-_FASTEST, _FASTEST + 1)
     noise = velocities[:, None] - momentum * velocities[None]
     kernel = np.exp(-0.5 * (noise / deviation) ** 2)
-    kernel /= kernel.sum(axis=0)
+    kernel = _rounded(kernel / kernel.sum(axis=0))
     corner = np.round(np.asarray(start) - np.array(sides) / 2).astype(int)
     spread = np.exp(-0.5 * (velocities / deviation) ** 2)
-    mass = np.zeros((len(velocities),) * 4)  # of row, column, their velocities
-    mass[:, :, _FASTEST, _FASTEST] = np.outer(spread, spread) / spread.sum() ** 2
+    mass = np.zeros((len(velocities),) * 4, np.float32)  # of row, column, their velocities
+    mass[:, :, _FASTEST, _FASTEST] = np.outer(spread, spread) * (_TOTAL / spread.sum() ** 2)
     top, left = corner[1] - _FASTEST, corner[0] - _FASTEST
     means = []
     for frame in bins:
@@ -70,15 +71,17 @@ def posterior_means(
         top, left = top - _FASTEST, left - _FASTEST
         window = Window(top, top + mass.shape[0], left, left + mass.shape[1])
         distances = distance_maps(frame, reference[None], sides, window)[0]
-        mass *= np.exp(-lambda_ * (distances - distances.min()))[:, :, None, None]
-        mass /= mass.sum()
-        places = mass.sum(axis=(2, 3))
+        mass *= np.exp(-lambda_ * (distances - distances.min()), dtype=np.float32)[:, :, None, None]
+        places = mass.sum(axis=(2, 3), dtype=float)
+        total = places.sum()
+        places /= total
         rows, columns = top + np.arange(len(places)), left + np.arange(places.shape[1])
         mean = np.array([places.sum(axis=0) @ columns, places.sum(axis=1) @ rows])
         means.append(mean + np.array(sides) / 2)
         first, last = _held(places.sum(axis=1))
         begin, end = _held(places.sum(axis=0))
-        mass, top, left = mass[first:last, begin:end], top + first, left + begin
+        mass = _rounded(mass[first:last, begin:end] * np.float32(_TOTAL / total))
+        top, left = top + first, left + begin
     return np.array(means)
 
 
@@ -103,6 +106,11 @@ def _moved(mass: np.ndarray) -> np.ndarray:
     for v in range(speeds):
         across[:, v : v + columns, :, v] = down[:, :, :, v]
     return across
+
+
+def _rounded(values: np.ndarray) -> np.ndarray:
+    """In 32 bits, without the numbers that are too small for them to be fast."""
+    return np.where(values > _NOTHING, values, 0).astype(np.float32)
 
 
 def _held(masses: np.ndarray) -> tuple[int, int]:

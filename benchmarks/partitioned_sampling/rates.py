@@ -52,19 +52,23 @@ class Rates(NamedTuple):
 def measure(estimates: np.ndarray, truth: np.ndarray) -> Rates:
     """The measures of section 3.1 from boxes (runs, t, objects, 4) and (t, objects, 4)."""
     truth = np.asarray(truth, estimates.dtype)
-    present = jnp.asarray(np.isfinite(truth).all(axis=-1))
-    states = track_state(jnp.asarray(estimates), jnp.asarray(truth[None]))
+    return Rates(*map(np.asarray, _measure(jnp.asarray(estimates), jnp.asarray(truth))))
+
+
+@jax.jit
+def _measure(estimates, truth) -> tuple:
+    present = jnp.all(jnp.isfinite(truth), axis=-1)
+    states = track_state(estimates, truth[None])
 
     def outcomes(states):
         recovery = recovery_rate(states[None], present, num_last=NUM_LAST)
-        return success_rate(states[None], present), recovery
+        return success_rate(states[None], present) > 0.5, recovery > 0.5
 
-    success, recovered = (np.asarray(found) > 0.5 for found in jax.vmap(outcomes)(states))
-    boxes, places = jnp.asarray(estimates), jnp.asarray(truth[None])
+    success, recovered = jax.vmap(outcomes)(states)
     inside, covered = (
-        np.asarray(share(boxes, places)).sum(axis=(1, 2)) for share in (precision, recall)
+        jnp.sum(share(estimates, truth[None]), axis=(1, 2)) for share in (precision, recall)
     )
-    return Rates(success, recovered, inside, covered, np.asarray(states).sum(axis=(1, 2)))
+    return success, recovered, inside, covered, jnp.sum(states, axis=(1, 2))
 
 
 def pool(rates: Sequence[Rates]) -> Rates:

@@ -24,6 +24,7 @@ METHODS: dict[str, Callable[[mpfjax.MultiObjectModel, int, Order], mpfjax.Filter
     "clusters": lambda model, n, _: mpfjax.clustered_particle_filter(model, n),
 }
 ORDERED = ("ps",)
+SHOWN = ("joint", "ps", "dps")  # in figure 4 or 8 and in the animation
 CYCLE = "cycle"  # a row of PS in an order that is no circular shift of the others
 NUM_CYCLES = 20
 
@@ -81,8 +82,8 @@ def study(
 ) -> Iterator[Row]:
     """All runs of every filter on the scene of this number, a row's under one vmap.
 
-    Everything is kept at the first λ, and the boxes at the others. With `cycles`, PS in other
-    orders as well, at the first λ.
+    Of the filters that are shown everything is kept at the first λ, and otherwise the boxes.
+    With `cycles`, PS in other orders as well, at the first λ.
     """
     for lambda_ in lambdas:
         made = filters(scene, lambda_, num_particles, methods)
@@ -93,7 +94,7 @@ def study(
                 for order in other_cycles(scene.num_objects)
             }
         for place, ((method, order), filter) in enumerate(made.items()):
-            everything = lambda_ == lambdas[0] and method != CYCLE
+            everything = lambda_ == lambdas[0] and method in SHOWN
             keys = row_keys(seed, number, lambda_, place, num_runs)
             run = mpfjax.monte_carlo(keys, filter, scene.observations, scene.collector(everything))
             kept = jax.tree.map(np.asarray, run.collected)

@@ -1,7 +1,7 @@
 """What goes into the file: every scene's rows, means over scenes, and what becomes of orders."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -26,32 +26,43 @@ PLACES: dict[str, Callable[[int], int]] = {
 }
 
 
-def content_of(scenes: Sequence[Scene], rows: Sequence[Row], synthetic: bool) -> dict[str, Any]:
-    """Tables, their summaries over orders, means over scenes, and figure 4 or 8."""
-    hard = {scene.key: [scene.hard] for scene in scenes}
-    chosen = {"3": hard}
+class Measured(NamedTuple):
+    """A row, and its rates in each table."""
+
+    row: Row
+    rates: dict[str, Rates]
+
+
+def measure_row(scene: Scene, row: Row, synthetic: bool) -> Measured:
+    """The hard object's rates, and on synthetic scenes those of the others."""
+    objects = {"3": [scene.hard]}
     if synthetic:
-        chosen = {"1": {scene.key: _others(scene) for scene in scenes}, "2": hard}
+        objects = {"1": [j for j in range(scene.num_objects) if j != scene.hard]}
+        objects["2"] = [scene.hard]
+    rates = {
+        table: measure(row.kept.boxes[:, :, chosen], scene.truth[:, chosen])
+        for table, chosen in objects.items()
+    }
+    return Measured(row, rates)
+
+
+def content_of(scenes: Sequence[Scene], measured: Sequence[Measured]) -> dict[str, Any]:
+    """Tables, their summaries over orders, means over scenes, and figure 4 or 8."""
     tables, summary, means = {}, {}, {}
-    cycles: dict[str, Any] = {}
-    circular: list[dict[str, Any]] = []
-    for table, objects in chosen.items():
-        rates = _measured(scenes, rows, objects)
-        own = [(row, found) for row, found in rates if row.method != CYCLE]
+    for table in measured[0].rates:
+        own = [(row, rates[table]) for row, rates in measured if row.method != CYCLE]
         tables[table] = [table_row(row, found) for row, found in own]
         summary[table] = [entry for scene in scenes for entry in _over_orders(scene, own)]
         means[table] = _means(tables[table] + summary[table])
-        if objects is hard:
-            circular = circular_orders_of(own)
-            cycles = cycles_of([(row, found) for row, found in rates if row.method == CYCLE])
+    hard = [(row, rates[table]) for row, rates in measured]  # the last table is the hard object's
     content = {
         "scenes": [_scene_entry(scene) for scene in scenes],
         "tables": tables,
         "summary": summary,
         "means": means,
-        "circular_orders": circular,
-        "other_cycles": cycles,
-    } | impoverishment(scenes, rows)
+        "circular_orders": circular_orders_of([pair for pair in hard if pair[0].method != CYCLE]),
+        "other_cycles": cycles_of([pair for pair in hard if pair[0].method == CYCLE]),
+    } | impoverishment(scenes, [row for row, _ in measured])
     return content | {"checks": checks_of(content)}
 
 
@@ -65,19 +76,6 @@ def table_row(row: Row, rates: Rates) -> dict[str, Any]:
 def label(method: str, order: Order) -> str:
     """The name of a row: "ps 2,3,1", "dps"."""
     return method + ("" if order is None else " " + ",".join(str(j + 1) for j in order))
-
-
-def _others(scene: Scene) -> list[int]:
-    return [j for j in range(scene.num_objects) if j != scene.hard]
-
-
-def _measured(
-    scenes: Sequence[Scene], rows: Sequence[Row], objects: dict[int | str, list[int]]
-) -> list[tuple[Row, Rates]]:
-    truth = {scene.key: scene.truth[:, objects[scene.key]] for scene in scenes}
-    return [
-        (row, measure(row.kept.boxes[:, :, objects[row.scene]], truth[row.scene])) for row in rows
-    ]
 
 
 def _scene_entry(scene: Scene) -> dict[str, Any]:
