@@ -10,11 +10,11 @@
 A joint particle filter ("Non-PS"), partitioned sampling in every circular order and in a sample of
 others, distributed partitioned sampling with both reassemblies, independent filters and clusters,
 all with the same model and the same number of likelihoods a frame, 50 runs each. Synthetic scenes
-are rendered from the keys 0, 1, 2, ..., and kept where the exact posterior of object 1 leaves it
-and is back at frame 11 or later. In folders with img/ and gt.txt, the events are those in which an
-object is hidden by another and comes out elsewhere; or the first of --ids is the hidden one. Into
---out DIR go partitioned_sampling.json, the figures, and an animation of a PS run that fails beside
-a DPS run that recovers. Objects are counted from 1.
+are rendered from the keys 0, 1, 2, ..., and kept where the posterior of object 1, by 20 000
+particles on it alone, leaves it and is back at frame 11 or later. In folders with img/ and gt.txt,
+the events are those in which an object is hidden by another and comes out elsewhere; or the first
+of --ids is the hidden one. Into --out DIR go partitioned_sampling.json, the figures, and an
+animation of a PS run that fails beside a DPS run that recovers. Objects are counted from 1.
 """
 
 import argparse

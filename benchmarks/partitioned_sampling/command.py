@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
         content = content_of(scenes, measured)
         write_json(path, {"settings": settings} | content)
     if not scenes:
-        raise ValueError("--keys: the exact posterior keeps the scene of none of them")
+        raise ValueError("--keys: the posterior keeps the scene of none of them")
     print_tables(content)
     write_pictures(options.out, scenes, [row for row, _ in measured], content)
     if passed_over:

@@ -82,6 +82,8 @@ def _scene_entry(scene: Scene) -> dict[str, Any]:
     entry: dict[str, Any] = {"scene": scene.key, "source": scene.name}
     if scene.verdict is not None:
         entry |= {"left": scene.verdict.left, "back": scene.verdict.back}
+    if scene.exact is not None:
+        entry |= {"exact_left": scene.exact.left, "exact_back": scene.exact.back}
     return entry
 
 

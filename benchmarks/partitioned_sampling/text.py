@@ -61,13 +61,14 @@ def scene_lines(content: dict[str, Any], table: str) -> list[str]:
     names = ("joint", "PS mean", "dps", "dps_evidence", "independent", "clusters")
     columns = {name: recoveries(content, table, name) for name in names}
     columns = {name: found for name, found in columns.items() if found}
+    verdict = ("left", "back", "exact_back")
     lines = [
-        [str(scene["scene"]), str(scene.get("left", "-")), str(scene.get("back", "-")),
+        [str(scene["scene"]), *[str(scene.get(name, "-")) for name in verdict],
          *[f"{100 * found[scene['scene']]:.0f}" for found in columns.values()]]
         for scene in content["scenes"]
         if all(scene["scene"] in found for found in columns.values())
     ]  # fmt: skip
-    header = ["scene", "posterior left", "back", *columns]
+    header = ["scene", "posterior left", "back", "exactly", *columns]
     return ["recovery in per cent, means over λ:", format_table(header, lines)]
 
 
