@@ -35,8 +35,8 @@ def find_events(folder: Path) -> list[Event]:
 
     Its objects are the hidden one, those that hide it, and, up to four, the others with a box in
     every frame, in the order of their ids. It starts ten frames before, or when all who hide it
-    are there, and ends ten frames after, or with the object. Raises `ValueError` for a sequence
-    without any.
+    are there, and ends ten frames after, or with the object; who comes only to hide it is none of
+    its objects. Raises `ValueError` for a sequence without any.
     """
     if not folder.is_dir():
         raise ValueError(f"--sequence: {folder} is not a folder")
@@ -93,7 +93,7 @@ def _events_of(j: int, ids: list[int], boxes: np.ndarray) -> list[Event]:
         hidden_by = list(dict.fromkeys(hiding[covers[first:end].max(axis=1) >= LEAST_COVER]))
         start = int(max(first - AROUND, 1))
         stop = int(min(end - 1 + AROUND, len(boxes) - 1))
-        while not there[start, [j, *hidden_by]].all() and start < first:
+        while not there[start, [j, *hidden_by]].all() and start < before:
             start += 1
         while not there[stop, j]:
             stop -= 1

@@ -45,7 +45,7 @@ class MappedModel(mpfjax.AbstractStateSpaceModel):
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PlaceState:
         """x_0 about the start, at rest."""
         noise = mpfjax.normal(key, (num_particles, 2))
-        place = self.start + self.deviations * noise
+        place = self.start[None] + self.deviations[None] * noise
         return PlaceState(place, place)
 
     def sample_transition(self, key: Key[Array, ""], states: PlaceState) -> PlaceState:
@@ -56,7 +56,8 @@ class MappedModel(mpfjax.AbstractStateSpaceModel):
         self, observation: Float[Array, "rows columns"], states: PlaceState
     ) -> Float[Array, " n"]:
         """-λ d² of each box; of one outside the map, that of the map's border, where d² is P."""
-        corners = jnp.ceil(states.place - 0.5 * self.sides - 0.5) + self.sides
+        sides = self.sides[None]
+        corners = jnp.ceil(states.place - 0.5 * sides - 0.5) + sides
         height, width = observation.shape
         # Bounded before it is an integer: a place may be anything.
         column = jnp.clip(corners[:, 0], 0, width - 1).astype(jnp.int32)

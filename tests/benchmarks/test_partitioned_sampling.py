@@ -9,9 +9,7 @@ import pytest
 from scipy import stats
 
 import mpfjax
-from benchmarks.partitioned_sampling import (
-    __main__ as partitioned_sampling,
-)
+from benchmarks.partitioned_sampling import __main__ as partitioned_sampling
 from benchmarks.partitioned_sampling import (
     claims,
     command,
@@ -181,11 +179,8 @@ def test_sensitivity_has_the_tables_scene_on_every_axis_and_the_old_one():
 class TestMaps:
     """The likelihood read off a map is the colour model's."""
 
-    @pytest.fixture(scope="class")
-    def drawn(self):
-        return distracter_scene(jax.random.key(0), 4)
-
-    def test_is_that_of_the_colour_model(self, drawn):
+    def test_is_that_of_the_colour_model(self):
+        drawn = distracter_scene(jax.random.key(0), 4)
         model = joint_colour_model(drawn.frames[0], drawn.boxes[0], lambda_=30.0)
         references = np.asarray(model.object_model.references)[:, 0, :, 0]
         bins = np.asarray(HSVColours().bins(drawn.frames[3]))[:, :, 0]
