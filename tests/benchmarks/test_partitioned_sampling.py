@@ -183,7 +183,7 @@ class TestMaps:
         drawn = distracter_scene(jax.random.key(0), 4)
         model = joint_colour_model(drawn.frames[0], drawn.boxes[0], lambda_=30.0)
         references = np.asarray(model.object_model.references)[:, 0, :, 0]
-        bins = np.asarray(HSVColours().bins(drawn.frames[3]))[:, :, 0]
+        bins = np.asarray(HSVColours().bins(jnp.asarray(drawn.frames[3])))[:, :, 0]
         sides = (24, 24)
         whole = maps.Window.whole(bins, sides)
         found = maps.distance_maps(bins, references[[4]], sides, whole)[0]
