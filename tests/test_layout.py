@@ -117,16 +117,12 @@ def test_no_file_is_longer_than_a_visitor_reads(path):
     assert len(path.read_text(encoding="utf-8").splitlines()) <= most
 
 
-# Holds the tables of `partitioned_sampling`, until that command is a folder.
-NO_COMMANDS_YET = {"partitioned_tables.py"}
-
-
 @pytest.mark.parametrize(
     "path",
     [
         path
         for path in sorted(BENCHMARKS.iterdir())
-        if path.name not in {"__init__.py", "__pycache__"} | NO_COMMANDS_YET
+        if path.name not in {"__init__.py", "__pycache__"}
     ],
     ids=lambda path: path.name,
 )

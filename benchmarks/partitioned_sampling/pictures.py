@@ -69,11 +69,11 @@ def draw_impoverishment(scene: Scene, rows: Sequence[Row], content: dict[str, An
 def draw_recovery(content: dict[str, Any]) -> Any:
     """The hard object's recovery rate by every filter against λ, means over scenes."""
     (table,) = [name for name in content["means"] if name != "1"]
-    ends = {None: "", "mean": ", mean of orders", "worst": ", worst order"}
+    ends: dict[str | None, str] = {None: "", "mean": ", mean of orders", "worst": ", worst order"}
     lines: dict[str, list[tuple[float, float, float, float]]] = {}
     for entry in content["means"][table]:
         if entry["order"] in ends:
-            name = TITLES.get(entry["method"], entry["method"]) + ends[entry["order"]]
+            name = str(TITLES.get(entry["method"], entry["method"])) + ends[entry["order"]]
             point = (entry["lambda"], entry["recovery"], *entry["recovery_interval"])
             lines.setdefault(name, []).append(point)
     num = len(content["scenes"])

@@ -51,9 +51,10 @@ def table_text(table: str, means: list[dict[str, Any]]) -> str:
 
 def row_name(row: dict[str, Any]) -> str:
     """The filter of a row of means."""
-    name = TITLES.get(row["method"], row["method"])
-    end = {None: "", "mean": ", mean of orders", "worst": ", worst order of each scene"}
-    return name + end.get(row["order"], f", hard object {row['order']}")
+    name = str(TITLES.get(row["method"], row["method"]))
+    ends: dict[Any, str] = {None: "", "mean": ", mean of orders"}
+    ends["worst"] = ", worst order of each scene"
+    return name + ends.get(row["order"], f", hard object {row['order']}")
 
 
 def scene_lines(content: dict[str, Any], table: str) -> list[str]:

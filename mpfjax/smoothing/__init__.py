@@ -3,5 +3,4 @@
 from mpfjax.smoothing.ancestors import Genealogy as Genealogy
 from mpfjax.smoothing.ancestors import trace_ancestors as trace_ancestors
 from mpfjax.smoothing.forecasts import Forecast as Forecast
-from mpfjax.smoothing.forecasts import forecast as forecast
 from mpfjax.smoothing.trajectories import sample_trajectories as sample_trajectories

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import mpfjax
+from mpfjax import forecast
 from mpfjax.exact import kalman_filter
-from mpfjax.smoothing import forecast
 
 LINEAR = mpfjax.LinearGaussianModel(
     A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.4]], m0=[0.5], P0=[[1.0]]
