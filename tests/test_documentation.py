@@ -15,7 +15,7 @@ DOCS = REPOSITORY / "docs"
 PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"]
 PAGES += sorted(path for path in DOCS.rglob("*.md") if "notebooks" not in path.parts)
 NAMES = [str(page.relative_to(REPOSITORY)) for page in PAGES]
-COMMAND = re.compile(r"python -m (benchmarks\.\w+|mpfjax\b)((?: [^\n`|#]*)?)")
+COMMAND = re.compile(r"python -m (benchmarks\.[a-z_]+|mpfjax\b)((?: [^\n`|#]*)?)")
 WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
 
 sybil = Sybil(parsers=[PythonCodeBlockParser(), SkipParser()], path=str(REPOSITORY))
