@@ -5,28 +5,39 @@ import importlib.util
 from functools import cache
 from typing import Any
 
-MODULES = ("mpfjax", "vision", "tuning", "metrics", "exact", "plotting", "smoothing")
+MODULES = (
+    "vision",
+    "tuning",
+    "metrics",
+    "exact",
+    "plotting",
+    "smoothing",
+    "mpfjax",
+)  # the top last
 
 
 @cache
 def public_names() -> dict[str, str]:
-    """The full name of everything public, by its name with and without the module's."""
+    """The full name of everything public, by its name with and without the module's.
+
+    What the top has from one of the other modules is shown once, there.
+    """
     found: dict[str, str] = {}
+    shown: dict[int, str] = {}
     for name in MODULES:
         full = name if name == "mpfjax" else f"mpfjax.{name}"
         if importlib.util.find_spec(full) is None:
             continue
-        for each in _public_in(importlib.import_module(full), full):
-            found[f"{full}.{each}"] = found[f"{name}.{each}"] = f"{full}.{each}"
-            found.setdefault(each, f"{full}.{each}")
+        module = importlib.import_module(full)
+        for each in _public_in(module, full):
+            target = shown.setdefault(id(getattr(module, each)), f"{full}.{each}")
+            found[f"{full}.{each}"] = found[f"{name}.{each}"] = target
+            found.setdefault(each, target)
     return found
 
 
 def _public_in(module: Any, full: str) -> list[str]:
-    """The classes and functions that a module offers: what it defines, or hands on.
-
-    What another of the modules shows already, as the top does of some, is shown once.
-    """
+    """The classes and functions that a module offers: what it defines, or hands on."""
     is_package = hasattr(module, "__path__")
     return [
         name
