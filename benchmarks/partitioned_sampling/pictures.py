@@ -132,7 +132,7 @@ def draw_sensitivity(entries: Sequence[dict[str, Any]], chosen: dict[str, Any]) 
     `entries` hold `axis`, `value`, `filter` and the rates with intervals; `chosen` is the value
     of each axis in the tables, at the dotted line.
     """
-    axes_names = list(chosen)
+    axes_names = [name for name in chosen if any(entry["axis"] == name for entry in entries)]
     panels = [("recovery", "recovery of object 1"), ("precision", "precision of objects 2-7")]
     figure = Figure(figsize=(3.4 * len(axes_names), 5.4), layout="constrained")
     axes = figure.subplots(len(panels), len(axes_names), squeeze=False, sharex="col", sharey="row")

@@ -154,7 +154,7 @@ def test_pictures_are_written(finished):
     assert pictures[0].shape == (288, 2 * 360 + 4, 3)
 
 
-def test_sensitivity_has_every_filter_in_every_case(finished, tmp_path, monkeypatch):
+def test_sensitivity_has_every_filter_in_every_case(tmp_path, monkeypatch):
     monkeypatch.setattr(scenes, "synthetic_scene", few_objects)
     monkeypatch.setattr(sensitivity, "FILTERS", {"ps": "PS", "dps": "DPS"})
     cases = [case for case in sensitivity.CASES if case.axis == sensitivity.SPEED][:2]

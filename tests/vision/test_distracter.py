@@ -136,7 +136,7 @@ def test_coloured_noise():
     [
         ("size", (24, 0)),
         ("size", (120, 90)),
-        ("size", (90, 24)),
+        ("size", (102, 24)),
         ("speed", -1.0),
         ("speed", np.nan),
         ("speed", 30.0),
@@ -150,7 +150,7 @@ def test_coloured_noise():
 )
 def test_what_leaves_no_scene_is_named(monkeypatch, name, value):
     monkeypatch.setattr("mpfjax.vision.distracter._TRIES", 1000)
-    with pytest.raises(ValueError, match=f"^(\\w+ of )?{name}"):
+    with pytest.raises(ValueError, match=f"^{name}"):
         distracter_scene(jax.random.key(0), **{name: value})
 
 
