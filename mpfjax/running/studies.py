@@ -169,8 +169,9 @@ def run_study(
 def read_study(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
     """The finished cells of a study, as `run_study` returns them.
 
-    It does not need the `Study`, and works while the study runs. Raises `FileNotFoundError` for a directory without a study, and
-    `ValueError` for files in it that are cut off, damaged or from another study.
+    It does not need the `Study`, and works while the study runs. Raises `FileNotFoundError` for a
+    directory without a study, and `ValueError` for files in it that are cut off, damaged or from
+    another study.
     """
     directory = _as_directory(directory)
     manifest = _read_manifest(directory / _MANIFEST)
