@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-# Okabe and Ito's palette (2008), told apart with every common kind of colour blindness.
+# Okabe and Ito's palette (2008), which people with colour blindness can tell apart.
 COLOURS = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00",
     "#56B4E9", "#F0E442", "#8B4513", "#5E3C99", "#666666",
@@ -99,7 +99,7 @@ def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str])
         stds = np.array([np.std(entry["scores"]) for entry in entries])
         # A score lies in [0, 1]: the bars end there too.
         bars = np.minimum(stds, [means, 1 - means])
-        # A few per cent apart, so that bars at the same N can be told from each other.
+        # A few per cent apart, so that bars at the same N stay apart.
         score.errorbar(sizes * 1.04 ** (index - 1), means, yerr=bars, capsize=2, **style)
         mass.plot(sizes, [entry["mode_mass_error"] for entry in entries], **style)
         if name != "pf":
@@ -136,8 +136,8 @@ def draw_contact_sheet(
 ) -> Figure:
     """Figure 3 of Vermaak et al. (2003): a named row of pictures for each filter.
 
-    `rows` holds a name and as many RGB pictures, all of one size, as there are `titles`, which
-    stand above every picture.
+    Each row is a name and its RGB pictures, all of one size, one for each of the `titles`, which
+    stand above the pictures.
     """
     height, width, _ = rows[0][1][0].shape
     panel = 3.2
@@ -217,8 +217,8 @@ def draw_errors_by_size(
 def draw_object_bars(rows: Mapping[str, Sequence[np.ndarray]], titles: Sequence[str]) -> Figure:
     """Figures 4 and 8 of Smith and Gatica-Perez (2004): a bar for each object.
 
-    A row for each filter by name, a panel in it for each of the `titles`, from an array of one
-    value an object; panels below each other share their axes.
+    There is a row for each filter, by name, with a panel for each of the `titles`. A panel shows an
+    array of one value for each object. Panels below each other share their axes.
     """
     figure = Figure(figsize=(3.1 * len(titles), 0.4 + 1.5 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), len(titles), squeeze=False, sharex=True, sharey="col")

@@ -66,7 +66,7 @@ class Climb:
         checkpoint_every: int,
         progress: bool,
     ) -> End:
-        """All steps, from the start or from where the checkpoint stands."""
+        """All steps, from the start or from the step of the checkpoint."""
         self.common_random_numbers = common_random_numbers
         state = self.start()
         path = None if checkpoint is None else Path(checkpoint)
@@ -75,7 +75,7 @@ class Climb:
         if state.fault is not None:
             self.warn(state.fault, stacklevel=4)
         saved = state
-        # Of a climb that has ended before: the same values end it again.
+        # A climb that has ended before ends again, by the same values.
         stopped = state.fault or _converged(state.values, patience, tolerance)
         bar = tqdm(total=num_steps, initial=state.step, disable=not progress, unit="step")
         try:
@@ -109,7 +109,7 @@ class Climb:
         return State(0, reals, self.optimizer.init(reals))
 
     def batches(self, key: Key[Array, ""], num_seeds: int) -> list[Key[Array, " seeds"]]:
-        """At least so many seeds, in batches of a shape that is compiled already."""
+        """At least this number of seeds, in batches of a shape that is compiled already."""
         num_batches = -(-num_seeds // self.num_seeds)
         return list(jax.random.split(key, (num_batches, self.num_seeds)))
 
@@ -138,7 +138,7 @@ class Climb:
                 " with gradient='stop' no filter's ever does on a proposal's"
             )
         descent = jax.tree.map(jnp.negative, gradient)
-        # Optimisers are written for JAX's default promotion, whatever the caller has set.
+        # Optimisers need JAX's default promotion, whatever the caller has set.
         with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
             updates, optimizer = self.optimizer.update(descent, state.optimizer, state.reals)
             reals: Any = optax.apply_updates(state.reals, updates)
@@ -152,7 +152,7 @@ class Climb:
         )
 
     def back(self, state: State, fault: str) -> State:
-        """The last good parameters, whose own update is not to be had."""
+        """The last good parameters, those before the step with the fault."""
         if state.step == 0:
             raise RuntimeError(f"{self.caller}: {fault} at the start")
         fault = f"{fault} at step {state.step}"
@@ -165,7 +165,7 @@ class Climb:
         warnings.warn(message, stacklevel=stacklevel)
 
     def finish(self, state: State) -> tuple[State, float]:
-        """The end, and the objective there; that of the step before where there is none."""
+        """The end and the objective there; if that is not finite, the step before."""
         if state.fault is None:
             values, _, fault = self.evaluate(state)
             if fault is None:

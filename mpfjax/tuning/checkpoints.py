@@ -1,4 +1,4 @@
-"""The file in which a climb is kept: all of its state, and what it is a climb of."""
+"""The file of a climb: all of its state, and a description of what it is a climb of."""
 
 import json
 from dataclasses import dataclass
@@ -27,11 +27,11 @@ class State:
     deviations: tuple[float, ...] = ()
     path: tuple[Reals, ...] = ()
     fault: str | None = None
-    """what was not finite, which no further step mends."""
+    """what was not finite; no further step can repair it."""
 
 
 def save(path: Path, identity: dict[str, str], state: State, stopped: str | None) -> None:
-    """Write all of the state, and why it ended where it has."""
+    """Write the whole state, and why the climb ended, if it has."""
     arrays = {"fit": np.array(json.dumps(identity)), "step": np.array(state.step)}
     arrays["stopped"] = np.array(stopped or "")
     arrays["broken"] = np.array(state.fault is not None)
@@ -78,7 +78,7 @@ def load(path: Path, identity: dict[str, str], start: State, caller: str) -> Sta
 
 
 def _check_arrays(path: Path, arrays: dict[str, np.ndarray], start: State) -> int:
-    """The step, of a file whose arrays are all there and as they should be."""
+    """The step; raises `ValueError` for arrays that are missing or of another kind."""
     step = arrays.get("step", np.array(-1))
     if step.shape != () or step.dtype.kind != "i" or step < 1:
         raise ValueError(f"checkpoint: {path} is damaged: its step is {shown(step)}")
@@ -107,12 +107,12 @@ def _written(leaf: Any) -> np.ndarray:
     if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         leaf = jax.random.key_data(leaf)
     array = np.asarray(leaf)
-    # numpy has no name of its own for bfloat16 and the like, which would not come back.
+    # numpy has no name for bfloat16 and the like, and could not read them back.
     return array.view(f"u{array.itemsize}") if array.dtype.kind == "V" else array
 
 
 def _read(array: np.ndarray, like: Any) -> Array:
-    """The number that was written, of the kind of another."""
+    """The number that was written, with the type of `like`."""
     if isinstance(like, jax.Array) and jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(jnp.asarray(array), impl=jax.random.key_impl(like))
     return jnp.asarray(array.view(like.dtype) if hasattr(like, "dtype") else array)

@@ -37,11 +37,11 @@ class TuningRun:
     """What `fit` found, and how it got there."""
 
     filter: Filter
-    """with the parameters of the end, or the last good ones where it was stopped."""
+    """with the parameters at the end; if it was stopped, the last good ones."""
     parameters: dict[str, np.ndarray]
     """the same, by name, on their own scale."""
     standard_errors: dict[str, np.ndarray] | None
-    """of every number in them; None where not asked for, or where there is no maximum."""
+    """of every number in them; None if not asked for, or if there is no maximum."""
     log_marginal_likelihood: float
     """with these parameters: the mean over seeds, summed over sequences."""
     history: dict[str, np.ndarray]
@@ -72,41 +72,43 @@ def fit(
 ) -> TuningRun:
     """Climb the log marginal likelihood in some of a filter's parameters.
 
-    Maximises the mean over seeds of log Ẑ(θ), summed over sequences, by the derivatives that the
-    filter's moves have. Build the filter with `gradient="stop"`: those estimate the score. With
-    the default, "none", the climb ends elsewhere, however many particles there are, and a warning
-    says so; not where all that is tuned belongs to a proposal, such as a `NetworkProposal`.
+    Maximises the mean over seeds of log Ẑ(θ), summed over sequences, with the derivatives of the
+    filter's moves. Build the filter with `gradient="stop"`: its derivatives estimate the score.
+    With the default, "none", the climb ends somewhere else, however many particles there are, and
+    a warning says so. For the parameters of a proposal, such as a `NetworkProposal`, "none" is
+    right, and there is no warning.
 
     - `observations`: as for `run_filter`; a list is several sequences, each run on its own.
-    - `optimizer`: of optax. It steps in the transforms' unconstrained numbers.
-    - `parameters`: what is tuned, by name: `{"sigma_y": lambda f: f.model.sigma_y}`; a node such
-      as a network stands for all its arrays. Or a filter spec, a pytree of booleans like the
-      filter. None is every floating point array of the model. What is named may be a Python float
-      too, which becomes an array.
-    - `transforms`: by name, such as `Positive()` for a scale; without one, no constraint.
-    - `num_seeds`: runs a step, under one vmap. `common_random_numbers` takes the same seeds at
-      every step: no noise between steps, but the error of those seeds stays.
+    - `optimizer`: an optimiser of optax. It steps in the unconstrained numbers of the transforms.
+    - `parameters`: what is tuned, by name: `{"sigma_y": lambda f: f.model.sigma_y}`. A node, such
+      as a network, stands for all its arrays. Or a filter spec, a pytree of booleans like the
+      filter. None is every floating point array of the model. A named Python float becomes an
+      array.
+    - `transforms`: by name, such as `Positive()` for a scale. A parameter without one has no
+      constraint.
+    - `num_seeds`: the number of runs in each step, under one vmap. `common_random_numbers` takes
+      the same seeds in every step: there is no noise between steps, but the error of those seeds
+      stays.
     - `missing`: as for `run_filter`.
-    - `patience`: end when the mean of so many steps is not more than `tolerance` nats above that
-      of as many before them.
-    - `curvature_seeds`: for `standard_errors` at the end, in whole batches of `num_seeds`; 0 for
-      none.
-    - `checkpoint`: a .npz file, without pickles, written every `checkpoint_every` steps and when
-      it ends or is interrupted. Where it exists the climb goes on from it, the same to the bit as
-      if it had not been interrupted, and one that has ended is returned as it ended. Take another
-      `num_steps` to go on further (a smaller one goes nowhere and returns where the file stands),
-      or another `patience` or `tolerance` to go on until those end it; what ended at a number that
-      is not finite stays there. All else must be the same: the filter and the observations to the
-      bit, the parameters, transforms, key and seeds, and the optimiser, by the numbers in its
-      closures, schedules' as well. Of functions of your own the code counts, of classes and of
-      libraries' functions the names: take a new file after changing what these do. Another
-      version of Python or optax may not know its own again.
+    - `patience`: a number of steps. The climb ends when the mean of the last so many steps is not
+      more than `tolerance` nats above the mean of as many steps before them.
+    - `curvature_seeds`: the seeds for `standard_errors` at the end, in whole batches of
+      `num_seeds`; 0 for none.
+    - `checkpoint`: a .npz file, without pickles. It is written every `checkpoint_every` steps, and
+      when the climb ends or is interrupted. If the file exists, the climb goes on from it, the
+      same to the bit as without the interruption. A climb that has ended is returned as it ended.
+      To go on, take a larger `num_steps`, or another `patience` or `tolerance`. A climb that ended
+      at a number that is not finite stays there. All else must be the same: the filter and the
+      observations to the bit, the parameters, transforms, key and seeds, and the optimiser with
+      the numbers in its closures and schedules. Your own functions are compared by their code;
+      classes and functions of libraries by their names. Take a new file after you change what
+      those do. With another version of Python or optax, the file may be refused.
 
-    A log marginal likelihood or gradient that is not finite ends the climb with the last good
+    If the log marginal likelihood or the gradient is not finite, the climb ends with the last good
     parameters, a warning, and the step in `stopped`. Raises `ValueError` for a parameter that is
-    no floating point number, is static, starts outside its domain or has no effect, for a
-    checkpoint of another fit, naming what differs, or one that is cut off or lacks an array, and
-    what `run_filter` does; `RuntimeError` where the start itself is not finite.
+    no floating point number, is static, starts outside its domain or has no effect. Raises it for
+    a checkpoint of another fit, naming what differs, for one that is cut off or lacks an array,
+    and where `run_filter` does. Raises `RuntimeError` if the start itself is not finite.
     """
     _check_climb(
         key, optimizer, num_steps, num_seeds, common_random_numbers, patience, tolerance,
@@ -150,7 +152,7 @@ class Maximisation:
     """What `maximise` found, and how it got there."""
 
     model: Any
-    """with the parameters of the end, or the last good ones where it was stopped."""
+    """with the parameters at the end; if it was stopped, the last good ones."""
     parameters: dict[str, np.ndarray]
     """the same, by name, on their own scale."""
     value: float
@@ -182,18 +184,18 @@ def maximise(
     """Climb any objective in some of a model's, or a filter's, parameters.
 
     Maximises the mean over seeds of `objective(key, model)`, a scalar that JAX can differentiate,
-    as `fit` does the log marginal likelihood: same arguments, same checks, same report. Use it
-    where the marginal likelihood is not what to maximise, as for an unnormalised likelihood on
-    labelled frames (`LabelLikelihood`).
+    as `fit` does for the log marginal likelihood: same arguments, same checks, same report. Use it
+    for another objective, such as that of an unnormalised likelihood on labelled frames
+    (`LabelLikelihood`).
 
-    - `objective`: an `equinox.Module` with a `__call__`, whose arrays are the data, or a function;
-      one without randomness ignores its key, and needs one seed.
-    - `model`: the pytree that it is a function of.
+    - `objective`: a function, or an `equinox.Module` with a `__call__`, whose arrays are the data.
+      An objective without randomness ignores its key, and needs one seed.
+    - `model`: the pytree that the objective is a function of.
     - `parameters`: as for `fit`, picked from `model`; None is every floating point array of it.
 
-    Raises what `fit` does for the same arguments, and `ValueError` for an objective that is no
-    floating point scalar. For a `checkpoint` the objective has to be the same as well: a function
-    in its code and closure, an `equinox.Module` in its fields.
+    Raises what `fit` does for the same arguments, and `ValueError` for an objective that is not a
+    floating point scalar. For a `checkpoint` the objective must also be the same: the code and
+    closure of a function, the fields of an `equinox.Module`.
     """
     _check_climb(
         key, optimizer, num_steps, num_seeds, common_random_numbers, patience, tolerance,
