@@ -76,7 +76,7 @@ def cover(
 def _events_of(j: int, ids: list[int], boxes: np.ndarray) -> list[Event]:
     covers = cover(boxes[:, j], boxes)
     is_hidden = covers.max(axis=1) >= LEAST_COVER
-    there: np.ndarray = np.isfinite(boxes).all(axis=-1)
+    there = np.asarray(np.isfinite(boxes).all(axis=-1))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_hidden, [False]]).astype(int)))
     events = []
     for first, end in edges.reshape(-1, 2):
