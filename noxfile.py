@@ -22,6 +22,7 @@ OLDEST = (3, 11)
 # an optional extra, other processes, or a benchmark.
 CORE = (
     "tests/models",
+    "tests/smoothing",
     "tests/moves",
     "--ignore=tests/moves/test_transport.py",
     "tests/test_bad_input.py",
