@@ -1,5 +1,7 @@
 """Colour and detections together: what a detector says of a box, as a likelihood."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ from mpfjax.checks import (
     check_share,
     check_type,
     check_whole,
+    shown,
     to_array,
     to_rows,
 )
@@ -28,17 +31,26 @@ class Detections(eqx.Module):
 
     - `boxes`: (d, 4), centre and size in pixels.
     - `valid`: (d,), which rows are detections.
+    - `scores`: (d,), how sure the detector was of each, on any scale, higher for surer.
     """
 
     boxes: Float[Array, "d 4"]
     valid: Bool[Array, " d"]
+    scores: Float[Array, " d"]
 
     @classmethod
-    def from_boxes(cls, boxes: Float[np.ndarray, "k 4"], max_detections: int) -> "Detections":
-        """Boxes (x, y, w, h), top-left corner first; of too many, the largest are kept.
+    def from_boxes(
+        cls,
+        boxes: Float[np.ndarray, "k 4"],
+        max_detections: int,
+        scores: Float[np.ndarray, " k"] | None = None,
+    ) -> "Detections":
+        """Boxes (x, y, w, h), top-left corner first, and a score for each, all equal where None.
 
-        They may leave the frame in part or as a whole. Raises `ValueError` for boxes that are not
-        four finite numbers each, or without area, and for room for less than one.
+        Of too many, the strongest are kept, and of equally strong ones the largest. They may leave
+        the frame in part or as a whole. Raises `ValueError` for boxes that are not four finite
+        numbers each, or without area, for scores that are not one finite number for each box, and
+        for room for less than one.
         """
         check_whole(max_detections=max_detections)
         rows = to_rows(4, "boxes", boxes).astype(np.float32)
@@ -49,20 +61,24 @@ class Detections(eqx.Module):
         for box in boxes:
             if not (np.isfinite(box).all() and (box[2:] > 0).all()):
                 raise ValueError(f"boxes: {box.tolist()} has no area, or is not finite")
-        largest = np.argsort(-boxes[:, 2] * boxes[:, 3], kind="stable")[:max_detections]
-        kept = centred(boxes[largest])
+        strengths = _checked_scores(scores, len(boxes))
+        strongest = np.lexsort((-boxes[:, 2] * boxes[:, 3], -strengths))[:max_detections]
         padded = np.ones((max_detections, 4), np.float32)
-        padded[: len(kept)] = kept
-        return cls(jnp.asarray(padded), jnp.arange(max_detections) < len(kept))
+        padded[: len(strongest)] = centred(boxes[strongest])
+        padded_scores = np.zeros(max_detections, np.float32)
+        padded_scores[: len(strongest)] = strengths[strongest]
+        valid = np.arange(max_detections) < len(strongest)
+        return cls(jnp.asarray(padded), jnp.asarray(valid), jnp.asarray(padded_scores))
 
 
 class DetectedFrame(eqx.Module):
     """A frame and what was detected in it: the observation of a `DetectedColourModel`.
 
     `detections` has a row for each of the model's references: the detection that is taken for it.
+    Where `frame` is None there are no pixels, and the detections speak alone.
     """
 
-    frame: IntegralHistogram | UInt8[Array, "h w 3"]
+    frame: IntegralHistogram | UInt8[Array, "h w 3"] | None
     detections: Detections
 
 
@@ -110,13 +126,15 @@ class DetectedColourModel(AbstractStateSpaceModel):
         return self.colour.log_transition(states, previous_states)
 
     def log_likelihood(self, observation: DetectedFrame, states: BoxState) -> Float[Array, " n"]:
-        """log L_colour + log(miss + exp(-½ ...))."""
-        log_colour = self.colour.log_likelihood(observation.frame, states)
+        """log L_colour + log(miss + exp(-½ ...)), without L_colour where there are no pixels."""
         own = take(observation.detections.boxes, states.reference)
         gaps = box_differences(own, self.colour.boxes(states)) / self.deviations[None]
         nearness = jnp.exp(-0.5 * jnp.sum(gaps**2, axis=1))
         detected = take(observation.detections.valid, states.reference)
-        return log_colour + jnp.log(self.miss + jnp.where(detected, nearness, 0.0))
+        log_detected = jnp.log(self.miss + jnp.where(detected, nearness, 0.0))
+        if observation.frame is None:
+            return log_detected
+        return self.colour.log_likelihood(observation.frame, states) + log_detected
 
 
 class DetectionProposal(AbstractProposal):
@@ -187,6 +205,21 @@ class DetectionProposal(AbstractProposal):
         prior = 1 / deviations**2
         total = precision + prior
         return (precision * detected + prior * predicted) / total, 1 / jnp.sqrt(total)
+
+
+def _checked_scores(scores: Any, number: int) -> np.ndarray:
+    """A finite score for each of so many boxes, all one where there are none given."""
+    if scores is None:
+        return np.ones(number, np.float32)
+    try:
+        values = np.asarray(scores, np.float32)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"scores: {shown(scores)} are no numbers") from error
+    if values.shape != (number,):
+        raise ValueError(f"scores: shape {values.shape} is not that of one a box, ({number},)")
+    if not np.isfinite(values).all():
+        raise ValueError(f"scores: {shown(values)} are not all finite")
+    return values
 
 
 def box_differences(

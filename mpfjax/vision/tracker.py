@@ -46,12 +46,19 @@ class Tracks(NamedTuple):
     - `identities`: (m,), a number that an object keeps for life, 0 for a dead component.
     - `confirmed`: (m,), whether detections have borne it out often enough to be believed.
     - `unseen`: (m,), for how many frames none has.
+    - `full`: whether a detection that would have founded a component found no room.
     """
 
     boxes: Float[Array, "m 4"]
     identities: Int[Array, " m"]
     confirmed: Bool[Array, " m"]
     unseen: Int[Array, " m"]
+    full: Bool[Array, ""]
+
+    @property
+    def corner_boxes(self) -> Float[Array, "m 4"]:
+        """The boxes (x, y, w, h) with (x, y) the top-left corner, as files have them."""
+        return jnp.concatenate([self.boxes[:, :2] - self.boxes[:, 2:] / 2, self.boxes[:, 2:]], 1)
 
 
 class TrackerState(eqx.Module):
@@ -103,6 +110,7 @@ class ObjectTracker(eqx.Module):
     - `crowding`: in which frame in a row of covering an older component the younger one dies.
     - `adaptation`: the share of a reference that is learned anew in each frame in which one
       detection, and no other component, bears it out, in [0, 1).
+    - `frames_per_second`: of the video.
 
     Raises `ValueError` for a count that is not a whole number from 1 on, a deviation or σ that is
     not positive and finite, a share outside its range, and a rejuvenation that does not give every
@@ -123,6 +131,7 @@ class ObjectTracker(eqx.Module):
     crowding: int = eqx.field(static=True)
     adaptation: float = eqx.field(static=True)
     wide_counts: bool = eqx.field(static=True)
+    frames_per_second: float = eqx.field(static=True)
 
     def __init__(
         self,
@@ -141,6 +150,7 @@ class ObjectTracker(eqx.Module):
         crowding: int = 8,
         adaptation: float = 0.05,
         wide_counts: bool = False,
+        frames_per_second: float = 25.0,
     ) -> None:
         check_whole(
             max_objects=max_objects,
@@ -150,7 +160,7 @@ class ObjectTracker(eqx.Module):
             patience=patience,
             crowding=crowding,
         )
-        check_positive(sigma=sigma)
+        check_positive(sigma=sigma, frames_per_second=frames_per_second)
         check_share(momentum=momentum, adaptation=adaptation)
         if adaptation == 1:
             raise ValueError(f"adaptation: {adaptation} is not in [0, 1)")
@@ -174,6 +184,7 @@ class ObjectTracker(eqx.Module):
         self.crowding = crowding
         self.adaptation = adaptation
         self.wide_counts = wide_counts
+        self.frames_per_second = frames_per_second
 
     def init(self) -> TrackerState:
         """Nothing tracked yet: every component dead, every slot empty."""
@@ -204,29 +215,31 @@ class ObjectTracker(eqx.Module):
         self,
         key: Key[Array, ""],
         state: TrackerState,
-        frame: UInt8[Array, "h w 3"],
+        frame: UInt8[Array, "h w 3"] | None,
         detections: Detections,
     ) -> tuple[TrackerState, Tracks]:
         """The state after a frame and its detections, and what is tracked in it.
 
-        Frames may have any size, which should not change: each new one compiles anew, and boxes
-        stay where they are in pixels. Raises `ValueError` for a frame that is not (h, w, 3) of
-        type uint8.
+        Where `frame` is None detections are tracked alone, without colours. Frames may have any
+        size, which should not change: each new one compiles anew, and boxes stay where they are in
+        pixels. Raises `ValueError` for a frame that is not (h, w, 3) of type uint8.
         """
         key_filter, key_births = jax.random.split(key)
-        table = integral_histogram(frame, self.colours, self.wide_counts)
+        table = None
+        if frame is not None:
+            table = integral_histogram(frame, self.colours, self.wide_counts)
         own, taken = self._assigned(state, detections, table)
         state = self._filtered(key_filter, state, DetectedFrame(table, own))
         boxes = _mean_boxes(state)
         state = self._bury(state, boxes, own, table)
         state = self._learn(state, boxes, own, table)
-        unexplained = Detections(detections.boxes, detections.valid & ~taken)
-        state = self._bear(key_births, state, boxes, unexplained, table)
+        unexplained = _replace(detections, valid=detections.valid & ~taken)
+        state, full = self._bear(key_births, state, boxes, unexplained, table)
         confirmed = (state.identities > 0) & (state.seen >= self.confirmation)
-        return state, Tracks(_mean_boxes(state), state.identities, confirmed, state.unseen)
+        return state, Tracks(_mean_boxes(state), state.identities, confirmed, state.unseen, full)
 
     def _assigned(
-        self, state: TrackerState, detections: Detections, table: IntegralHistogram
+        self, state: TrackerState, detections: Detections, table: IntegralHistogram | None
     ) -> tuple[Detections, Bool[Array, " d"]]:
         """The detection of each component, and which detections are taken.
 
@@ -235,10 +248,12 @@ class ObjectTracker(eqx.Module):
         """
         boxes = _mean_boxes(state)
         gaps = box_differences(detections.boxes[None], boxes[:, None]) / jnp.array([[GATE]])
-        seen = normalise(table.counts(detections.boxes, self.num_parts))
-        unlike = jnp.mean(
-            jnp.sum(bhattacharyya(seen[None], state.colour.references[:, None]), axis=3), axis=2
-        )
+        unlike = 0.0
+        if table is not None:
+            seen = normalise(table.counts(detections.boxes, self.num_parts))
+            unlike = jnp.mean(
+                jnp.sum(bhattacharyya(seen[None], state.colour.references[:, None]), axis=3), axis=2
+            )
         far = jnp.sum(gaps**2, axis=2)
         possible = (state.identities > 0)[:, None] & detections.valid[None] & (far < 1)
         cost = jnp.where(possible, far + COLOUR_COST * unlike, IMPOSSIBLE)
@@ -247,7 +262,8 @@ class ObjectTracker(eqx.Module):
         source = jnp.zeros(self.max_objects, jnp.int32).at[rows].set(columns.astype(jnp.int32))
         assigned = jnp.zeros(self.max_objects, bool).at[rows].set(pair)
         taken = jnp.zeros(detections.valid.shape, bool).at[columns].set(pair)
-        return Detections(take(detections.boxes, source), assigned), taken
+        scores = take(detections.scores, source)
+        return Detections(take(detections.boxes, source), assigned, scores), taken
 
     def _filtered(
         self, key: Key[Array, ""], state: TrackerState, observation: DetectedFrame
@@ -270,7 +286,7 @@ class ObjectTracker(eqx.Module):
         state: TrackerState,
         boxes: Float[Array, "m 4"],
         own: Detections,
-        table: IntegralHistogram,
+        table: IntegralHistogram | None,
     ) -> TrackerState:
         """End what no detection bears out, what has left the frame, and doubles."""
         alive = state.identities > 0
@@ -300,10 +316,10 @@ class ObjectTracker(eqx.Module):
         state: TrackerState,
         boxes: Float[Array, "m 4"],
         own: Detections,
-        table: IntegralHistogram,
+        table: IntegralHistogram | None,
     ) -> TrackerState:
         """Move the references of well seen components towards what they see now."""
-        if self.adaptation == 0:
+        if self.adaptation == 0 or table is None:
             return state
         alive = state.identities > 0
         others = ~jnp.eye(self.max_objects, dtype=bool) & alive[None]
@@ -322,11 +338,12 @@ class ObjectTracker(eqx.Module):
         state: TrackerState,
         boxes: Float[Array, "m 4"],
         detections: Detections,
-        table: IntegralHistogram,
-    ) -> TrackerState:
+        table: IntegralHistogram | None,
+    ) -> tuple[TrackerState, Bool[Array, ""]]:
         """Found a component on every detection in the frame that none covers, while there is room.
 
-        Of more detections than there is room for, the first are chosen.
+        Of more detections than there is room for, the first are chosen, the strongest; and whether
+        there were.
         """
         alive = state.identities > 0
         covered = _inside(boxes, detections.boxes) | (_overlap(boxes, detections.boxes) > 0.2)
@@ -334,6 +351,7 @@ class ObjectTracker(eqx.Module):
         new = detections.valid & _within(detections.boxes, table)
         new &= ~jnp.any(covered & alive[:, None], axis=0)
         source, born = _matched(new, ~alive)
+        full = jnp.sum(new) > jnp.sum(born)
         places = take(detections.boxes, source)
         mixture, colour = state.mixture, state.colour
         seats, filled = self._seats(mixture, born)
@@ -343,9 +361,7 @@ class ObjectTracker(eqx.Module):
         colour = _replace(
             colour,
             reference_boxes=_where(born, places, colour.reference_boxes),
-            references=_where(
-                born, normalise(table.counts(places, self.num_parts)), colour.references
-            ),
+            references=self._references(places, born, colour.references, table),
             dynamics=self._dynamics(step),
             initial_deviations=step,
         )
@@ -356,7 +372,7 @@ class ObjectTracker(eqx.Module):
         num_alive = jnp.maximum(jnp.sum(alive | born), 1)
         log_share = -jnp.log((num_alive * self.particles_per_object).astype(centre.dtype))
         log_old = mixture.log_component_weights - jnp.log(num_alive.astype(centre.dtype))
-        return _replace(
+        born_state = _replace(
             state,
             colour=colour,
             mixture=mixture.replace(
@@ -374,6 +390,19 @@ class ObjectTracker(eqx.Module):
             last_identity=state.last_identity + jnp.sum(born, dtype=jnp.int32),
             seen=jnp.where(born, 1, state.seen),
         )
+        return born_state, full
+
+    def _references(
+        self,
+        places: Float[Array, "m 4"],
+        born: Bool[Array, " m"],
+        references: Float[Array, "m parts channels bins"],
+        table: IntegralHistogram | None,
+    ) -> Float[Array, "m parts channels bins"]:
+        """The references, with those of the newborn as they look in their first box."""
+        if table is None:
+            return _where(born, jnp.zeros_like(references), references)
+        return _where(born, normalise(table.counts(places, self.num_parts)), references)
 
     def _dynamics(self, deviations: Float[Array, "m 4"]) -> Autoregression:
         """Momentum of the centre; the size only diffuses."""
@@ -411,8 +440,10 @@ def _mean_boxes(state: TrackerState) -> Float[Array, "m 4"]:
     return state.mixture.component_averages(state.colour.boxes(state.mixture.particles))
 
 
-def _within(boxes: Float[Array, "k 4"], table: IntegralHistogram) -> Bool[Array, " k"]:
-    """Whether the centre of each box lies in the frame."""
+def _within(boxes: Float[Array, "k 4"], table: IntegralHistogram | None) -> Bool[Array, " k"]:
+    """Whether the centre of each box lies in the frame, where there is one."""
+    if table is None:
+        return jnp.ones(len(boxes), bool)
     x, y = boxes[:, 0], boxes[:, 1]
     return (x > 0) & (x < table.width) & (y > 0) & (y < table.height)
 

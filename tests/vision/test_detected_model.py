@@ -69,7 +69,7 @@ def model_of(dynamics="random walk", switch_probability=0.0):
 
 def observation_of(boxes=FOUND, valid=(True, True)):
     centres = np.concatenate([boxes[:, :2] + boxes[:, 2:] / 2, boxes[:, 2:]], axis=1)
-    found = Detections(jnp.asarray(centres, jnp.float32), jnp.array(valid))
+    found = Detections(jnp.asarray(centres, jnp.float32), jnp.array(valid), jnp.ones(len(valid)))
     return DetectedFrame(integral_histogram(jnp.asarray(FRAME), HSVColours(4, 2, 2)), found)
 
 
