@@ -9,10 +9,10 @@ from mpfjax.vision.colour_model import ColourModel as ColourModel
 from mpfjax.vision.colours import AbstractColours as AbstractColours
 from mpfjax.vision.colours import HSVColours as HSVColours
 from mpfjax.vision.colours import RGBColours as RGBColours
-from mpfjax.vision.detected_model import DetectedColourModel as DetectedColourModel
-from mpfjax.vision.detected_model import DetectedFrame as DetectedFrame
-from mpfjax.vision.detected_model import DetectionProposal as DetectionProposal
-from mpfjax.vision.detected_model import Detections as Detections
+
+
+
+from mpfjax.vision.detections import Detections as Detections
 from mpfjax.vision.detection import BackgroundSubtraction as BackgroundSubtraction
 from mpfjax.vision.distracter import DistracterScene as DistracterScene
 from mpfjax.vision.distracter import distracter_scene as distracter_scene
@@ -33,5 +33,4 @@ from mpfjax.vision.scenes import football_scene as football_scene
 from mpfjax.vision.soft_histograms import SoftColourModel as SoftColourModel
 from mpfjax.vision.soft_histograms import soft_histograms as soft_histograms
 from mpfjax.vision.tracker import ObjectTracker as ObjectTracker
-from mpfjax.vision.tracker import TrackerState as TrackerState
 from mpfjax.vision.tracker import Tracks as Tracks
