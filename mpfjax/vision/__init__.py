@@ -9,11 +9,8 @@ from mpfjax.vision.colour_model import ColourModel as ColourModel
 from mpfjax.vision.colours import AbstractColours as AbstractColours
 from mpfjax.vision.colours import HSVColours as HSVColours
 from mpfjax.vision.colours import RGBColours as RGBColours
-
-
-
-from mpfjax.vision.detections import Detections as Detections
 from mpfjax.vision.detection import BackgroundSubtraction as BackgroundSubtraction
+from mpfjax.vision.detections import Detections as Detections
 from mpfjax.vision.distracter import DistracterScene as DistracterScene
 from mpfjax.vision.distracter import distracter_scene as distracter_scene
 from mpfjax.vision.frames import read_frames as read_frames

@@ -1,5 +1,6 @@
 """A tracker that starts and ends its components by itself, from detections: a chain of moves."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -26,7 +27,9 @@ from mpfjax.vision.tracking.motion import PropagateObjects
 from mpfjax.vision.tracking.observation import TrackedFrame
 from mpfjax.vision.tracking.scores import RankScores
 
-# In 16 bits a box of this size is counted exactly.
+# A box that no detection has borne out for more frames than this is a guess.
+LONGEST_GUESS = 3
+# A box of so many pixels cannot be counted in 16 bits.
 _LARGEST_NARROW = 2**16
 
 
@@ -38,6 +41,8 @@ class Tracks(NamedTuple):
     - `confirmed`: (m,), whether detections have borne it out often enough to be believed.
     - `unseen`: (m,), for how many frames none has.
     - `full`: whether a detection that would have founded a component found no room.
+
+    A box that is confirmed and was seen within the last three frames is worth showing: `shown`.
     """
 
     boxes: Float[Array, "m 4"]
@@ -47,13 +52,52 @@ class Tracks(NamedTuple):
     full: Bool[Array, ""]
 
     @property
+    def shown(self) -> Bool[Array, " m"]:
+        """Which are confirmed, and were seen in this frame or in one of the three before."""
+        return self.confirmed & (self.unseen <= LONGEST_GUESS)
+
+    @property
     def corner_boxes(self) -> Float[Array, "m 4"]:
         """The boxes (x, y, w, h) with (x, y) the top-left corner, as files have them."""
         return jnp.concatenate([self.boxes[:, :2] - self.boxes[:, 2:] / 2, self.boxes[:, 2:]], 1)
 
 
 class ObjectTracker(eqx.Module):
-    """PLACEHOLDER"""
+    """A mixture particle filter with a component for each object, born and ended by detections.
+
+    A step is a chain of moves on a `ParticleMixture`, each with a memory of its own:
+
+    - `RankScores`: which detections are strong, by the scores seen so far;
+    - `Assign`: at most one detection for each component, at the least total cost;
+    - a rejuvenation, of the GM-MPF (Lin et al. 2012) or of the MPF (Vermaak et al. 2003);
+    - `PropagateObjects`: draw x_t and weigh it by the component's detection, exactly;
+    - `Bury`: end what no detection bears out, or has left the frame;
+    - `Found`: a component for each strong detection that no component explains;
+    - `LearnColours`: of objects that stand alone;
+    - `ShareMass`: the same for every object.
+
+    Lengths are in boxes, so that nothing depends on the size of a frame or of the objects. All but
+    `PropagateObjects` and the resampling is outside the exact recursion (`approximate`). Use it to
+    track an unknown and changing number of objects, with any detector.
+
+    - `max_objects`: M; `particles_per_object`: P.
+    - `frames_per_second`: of the video. Above 25, objects move less in a frame, and wait for
+      more frames; from 7 to 25 the same settings hold.
+    - `rejuvenation`: `Resample(particles_per_component=P)` for an MPF, or
+      `GaussianRegeneration(P, where=lambda states: (states.place, states.velocity))`, the default.
+    - `colours`: the bins of the histograms.
+    - `exact_colours`: count every pixel of a box by an integral histogram, at a cost that grows
+      with the frame, and not the grid of points of a `SampledHistogram`.
+    - `sigma`: weigh particles by their colours as well, as a `DetectedObjectModel` does; None, the
+      default, looks at colours only to assign detections, which costs less.
+    - `strong_score`, `weak_score`: the scores from which a detection founds a component, and from
+      which it counts at all; None takes them from the scores seen so far.
+    - `moves`: a chain of your own in place of all of these; it needs a `LearnColours` for colours.
+
+    Raises `ValueError` for a count that is no whole number from 1 on, a rate or σ that is not
+    positive and finite, a weak score above the strong one, and a rejuvenation that does not give
+    every component P particles or would redraw their labels.
+    """
 
     moves: tuple[AbstractMove, ...]
     colours: AbstractColours
@@ -73,46 +117,42 @@ class ObjectTracker(eqx.Module):
         sigma: float | None = None,
         strong_score: float | None = None,
         weak_score: float | None = None,
-        S: dict | None = None,
+        moves: Iterable[AbstractMove] | None = None,
     ) -> None:
         check_whole(max_objects=max_objects, particles_per_object=particles_per_object)
-        check_positive(frames_per_second=frames_per_second)
+        check_positive(frames_per_second=frames_per_second, **given(sigma=sigma))
         check_flag(exact_colours=exact_colours)
         colours = HSVColours(8, 4, 6) if colours is None else colours
         check_type(AbstractColours, "AbstractColours such as HSVColours()", colours=colours)
         if rejuvenation is None:
             rejuvenation = GaussianRegeneration(particles_per_object, where=_motion)
         _check_rejuvenation(rejuvenation, particles_per_object)
-        S = S or {}
-        g = S.get
-        model = DetectedObjectModel(
-            position_noise=jnp.array([g("qx", 0.03), g("qy", 0.015)]),
-            velocity_noise=jnp.array([g("qv", 0.03), g("qvy", 0.015)]),
-            size_noise=jnp.array([g("qs", 0.03), g("qsh", 0.015)]),
-            detection_deviations=jnp.array(
-                [g("rx", 0.2), g("ry", 0.1), g("rw", 0.2), g("rh", 0.12)]
-            ),
-            miss=g("miss", 0.01), weak_error=g("Rweak",1.75),
-            sigma=sigma,
-        )
-        confirmation, patience = g("conf", 3), g("patience", 25)
-        self.moves = (
-            RankScores(g("hi", 0.5), g("lo", 0.2), strong_score, weak_score),
-            Assign(
-                model, g("gate", 25.0), g("colour", 12.0), g("weakpen", 5.0), g("newcost", 3.0),
-                confirmation,
-            ),
-            rejuvenation,
-            PropagateObjects(model),
-            Bury(confirmation, patience),
-            Found(model, particles_per_object, g("birth_iou", 0.4)),
-            LearnColours(colours, 3, g("adapt", 0.1), g("contact", 0.2)),
-            ShareMass(),
-        )
+        if moves is None:
+            model = object_model(frames_per_second, sigma)
+            patience = round(20 * max(frames_per_second / 25, 1.0))
+            moves = (
+                RankScores(strong_score=strong_score, weak_score=weak_score),
+                Assign(model),
+                rejuvenation,
+                PropagateObjects(model),
+                Bury(patience=patience),
+                Found(model, particles_per_object),
+                LearnColours(colours),
+                ShareMass(),
+            )
+        check_type(Iterable, "a sequence of moves", moves=moves)
+        self.moves = tuple(moves)
+        for move in self.moves:
+            check_type(AbstractMove, "a sequence of moves", moves=move)
         self.colours = colours
-        self.max_objects = max_objects
-        self.particles_per_object = particles_per_object
-        self.exact_colours = exact_colours
+        self.max_objects = int(max_objects)
+        self.particles_per_object = int(particles_per_object)
+        self.exact_colours = bool(exact_colours)
+
+    @property
+    def approximate(self) -> bool:
+        """Whether any move departs from the exact recursion."""
+        return any(move.approximate for move in self.moves)
 
     def init(self) -> ParticleMixture:
         """Nothing tracked yet: every component dead, every slot empty."""
@@ -121,9 +161,7 @@ class ObjectTracker(eqx.Module):
         for move in self.moves:
             memory |= move.initial_memory(m)
         return ParticleMixture(
-            particles=ObjectState(
-                jnp.zeros((n, 4)), jnp.zeros((n, 2)), jnp.zeros(n, jnp.int32)
-            ),
+            particles=ObjectState(jnp.zeros((n, 4)), jnp.zeros((n, 2)), jnp.zeros(n, jnp.int32)),
             log_weights=jnp.full(n, -jnp.inf, default_float()),
             component_indicators=jnp.zeros(n, jnp.int32),
             ancestor_indices=jnp.arange(n, dtype=jnp.int32),
@@ -139,22 +177,32 @@ class ObjectTracker(eqx.Module):
         frame: UInt8[Array, "h w 3"] | None,
         detections: Detections,
     ) -> tuple[ParticleMixture, Tracks]:
-        """The state after a frame and its detections, and what is tracked in it."""
+        """The state after a frame and its detections, and what is tracked in it.
+
+        Where `frame` is None detections are tracked alone, without colours. Frames may have any
+        size, which should not change: each new one compiles anew, and boxes stay where they are in
+        pixels. Raises `ValueError` for a frame that is not (h, w, 3) of type uint8, and for
+        detections that are none.
+        """
+        check_type(Detections, "Detections, as from_boxes makes them", detections=detections)
         seen = TrackedFrame(detections, self._pixels(frame))
         for move_key, move in zip(jax.random.split(key, len(self.moves)), self.moves, strict=True):
-            state = move(move_key, state, seen)
-            state = self._forgetting(state)
-        lives = state.memory[LIVES]
-        confirmed = lives.alive & (lives.seen >= 3)
+            state = self._forgetting(move(move_key, state, seen))
+        lives: Lives = state.memory[LIVES]
         return state, Tracks(
-            mean_boxes(state), lives.identities, confirmed, lives.unseen, jnp.array(False)
+            boxes=mean_boxes(state),
+            identities=lives.identities,
+            confirmed=lives.confirmed,
+            unseen=lives.unseen,
+            full=lives.full,
         )
 
     def _pixels(self, frame: UInt8[Array, "h w 3"] | None) -> Pixels | None:
         if frame is None:
             return None
         if self.exact_colours:
-            return integral_histogram(frame, self.colours, True)
+            wide = frame.shape[0] * frame.shape[1] >= _LARGEST_NARROW
+            return integral_histogram(frame, self.colours, wide)
         return SampledHistogram(frame, self.colours)
 
     def _forgetting(self, mixture: ParticleMixture) -> ParticleMixture:
@@ -163,6 +211,25 @@ class ObjectTracker(eqx.Module):
         for move in self.moves:
             memory = move.forget(memory, dead)
         return mixture.replace(memory=memory)
+
+
+def object_model(
+    frames_per_second: float = 25.0, sigma: float | None = None
+) -> DetectedObjectModel:
+    """The tracker's model of people and of what moves like them, at a frame rate.
+
+    Chosen at 7 and 25 frames a second together; above 25, noise shrinks as that of a path with
+    random accelerations does. Raises `ValueError` for a rate or σ that is not positive.
+    """
+    check_positive(frames_per_second=frames_per_second)
+    step = min(25 / frames_per_second, 1.0)
+    return DetectedObjectModel(
+        position_noise=jnp.array([0.06, 0.03]) * step**0.5,
+        velocity_noise=jnp.array([0.02, 0.01]) * step**1.5,
+        size_noise=jnp.array([0.03, 0.015]) * step**0.5,
+        detection_deviations=jnp.array([0.2, 0.1, 0.2, 0.12]),
+        sigma=sigma,
+    )
 
 
 def _check_rejuvenation(rejuvenation: AbstractRejuvenation, particles_per_object: int) -> None:

@@ -34,11 +34,10 @@ class Assign(AbstractMove):
     """
 
     model: DetectedObjectModel
-    gate: float = eqx.field(static=True, default=25.0)
-    colour_cost: float = eqx.field(static=True, default=12.0)
-    weak_cost: float = eqx.field(static=True, default=5.0)
-    doubt_cost: float = eqx.field(static=True, default=3.0)
-    confirmation: int = eqx.field(static=True, default=3)
+    gate: float = eqx.field(static=True, default=35.0)
+    colour_cost: float = eqx.field(static=True, default=28.0)
+    weak_cost: float = eqx.field(static=True, default=10.0)
+    doubt_cost: float = eqx.field(static=True, default=8.0)
 
     def __check_init__(self) -> None:
         check_positive(gate=self.gate)
@@ -78,7 +77,7 @@ class Assign(AbstractMove):
         squares, volumes = self._distances(mixture, found.boxes)
         cost = squares + volumes[:, None] + self._unlikeness(mixture, observation)
         cost += self.weak_cost * (found.scores < scores.strong)[None].astype(cost.dtype)
-        doubtful = (lives.seen < self.confirmation)[:, None]
+        doubtful = ~lives.confirmed[:, None]
         cost += self.doubt_cost * doubtful.astype(cost.dtype)
         counts = found.valid & (found.scores >= scores.weak)
         possible = lives.alive[:, None] & counts[None] & (squares < self.gate)
@@ -119,6 +118,4 @@ class Assign(AbstractMove):
 def own_detections(source: Int[Array, " m"], detections: Detections) -> Detections:
     """The detection of each component, not valid where it has none."""
     rows = jnp.maximum(source, 0)
-    return Detections(
-        take(detections.boxes, rows), source >= 0, take(detections.scores, rows)
-    )
+    return Detections(take(detections.boxes, rows), source >= 0, take(detections.scores, rows))

@@ -9,9 +9,16 @@ from mpfjax.checks import check_share, check_type, check_whole, to_array
 from mpfjax.generator import fast_key
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
-from mpfjax.operations import spread, take
-from mpfjax.vision.detections import Detections
-from mpfjax.vision.tracking.memory import ASSIGNED, EXTENT, LIVES, SCORES, Lives, mean_boxes, remember
+from mpfjax.operations import take
+from mpfjax.vision.tracking.memory import (
+    ASSIGNED,
+    EXTENT,
+    LIVES,
+    SCORES,
+    Lives,
+    mean_boxes,
+    remember,
+)
 from mpfjax.vision.tracking.model import DetectedObjectModel, ObjectState
 from mpfjax.vision.tracking.observation import TrackedFrame, overlap, within
 
@@ -34,7 +41,7 @@ class Found(AbstractMove):
 
     model: DetectedObjectModel
     particles_per_object: int = eqx.field(static=True, default=50)
-    birth_overlap: float = eqx.field(static=True, default=0.4)
+    birth_overlap: float = eqx.field(static=True, default=0.5)
     velocity_deviations: Float[Array, "2"] = eqx.field(
         converter=to_array("velocity_deviations"), default=(0.15, 0.05)
     )
@@ -51,9 +58,7 @@ class Found(AbstractMove):
         """True: mass appears where a detection is."""
         return True
 
-    def founding(
-        self, mixture: ParticleMixture, observation: TrackedFrame
-    ) -> Bool[Array, " d"]:
+    def founding(self, mixture: ParticleMixture, observation: TrackedFrame) -> Bool[Array, " d"]:
         """Which detections would found a component, if there were room for all."""
         found, source = observation.detections, mixture.memory[ASSIGNED]
         lives: Lives = mixture.memory[LIVES]
@@ -89,11 +94,12 @@ class Found(AbstractMove):
             component_indicators=jnp.where(filled, seats, mixture.component_indicators),
         )
         number = jnp.cumsum(born, dtype=jnp.int32)
-        lives = Lives(
+        lives = lives._replace(
             identities=jnp.where(born, lives.last_identity + number, lives.identities),
             last_identity=lives.last_identity + number[-1],
             seen=jnp.where(born, 1, lives.seen),
             unseen=jnp.where(born, 0, lives.unseen),
+            full=jnp.sum(founding, dtype=jnp.int32) > number[-1],
         )
         assigned = jnp.where(born, source, mixture.memory[ASSIGNED])
         return remember(mixture, lives=lives, assigned=assigned)

@@ -29,8 +29,8 @@ class LearnColours(AbstractMove):
 
     colours: AbstractColours
     num_parts: int = eqx.field(static=True, default=3)
-    adaptation: float = eqx.field(static=True, default=0.1)
-    contact: float = eqx.field(static=True, default=0.2)
+    adaptation: float = eqx.field(static=True, default=0.14)
+    contact: float = eqx.field(static=True, default=0.12)
 
     def __check_init__(self) -> None:
         check_whole(num_parts=self.num_parts)

@@ -25,8 +25,8 @@ class Bury(AbstractMove):
     frames that is not whole, or below 1.
     """
 
-    confirmation: int = eqx.field(static=True, default=3)
-    patience: int = eqx.field(static=True, default=25)
+    confirmation: int = eqx.field(static=True, default=2)
+    patience: int = eqx.field(static=True, default=20)
 
     def __check_init__(self) -> None:
         check_whole(confirmation=self.confirmation, patience=self.patience)
@@ -44,10 +44,13 @@ class Bury(AbstractMove):
     def forget(self, memory: dict, dead: Bool[Array, " m"]) -> dict:
         """The dead have no name, and were never seen."""
         lives: Lives = memory[LIVES]
-        identities, seen, unseen = (
-            jnp.where(dead, 0, kept) for kept in (lives.identities, lives.seen, lives.unseen)
+        kept = lives._replace(
+            identities=jnp.where(dead, 0, lives.identities),
+            seen=jnp.where(dead, 0, lives.seen),
+            unseen=jnp.where(dead, 0, lives.unseen),
+            confirmed=lives.confirmed & ~dead,
         )
-        return memory | {LIVES: Lives(identities, lives.last_identity, seen, unseen)}
+        return memory | {LIVES: kept}
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
@@ -58,11 +61,12 @@ class Bury(AbstractMove):
         borne_out = mixture.memory[ASSIGNED] >= 0
         seen = lives.seen + borne_out.astype(jnp.int32)
         unseen = jnp.where(borne_out, 0, lives.unseen + 1)
-        patience = jnp.where(seen >= self.confirmation, self.patience, 0)
+        confirmed = lives.alive & (seen >= self.confirmation)
+        patience = jnp.where(confirmed, self.patience, 0)
         stays = lives.alive & mixture.active & (unseen <= patience)
         extent = observation.extent(mixture.memory[EXTENT])
         stays &= within(mean_boxes(mixture), extent)
         dies = ~spread(stays, mixture.component_indicators)
         log_weights = jnp.where(dies, -jnp.inf, mixture.log_weights)
-        lives = lives._replace(seen=seen, unseen=unseen)
+        lives = lives._replace(seen=seen, unseen=unseen, confirmed=confirmed)
         return remember(mixture.replace(log_weights=log_weights), lives=lives, extent=extent)

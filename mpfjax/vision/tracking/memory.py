@@ -25,18 +25,23 @@ class Lives(NamedTuple):
 
     - `identities`: 0 for a dead component; `last_identity`: the highest ever given.
     - `seen`, `unseen`: in how many frames a detection bore it out, and for how many none has.
+    - `confirmed`: whether it was borne out often enough to be believed.
+    - `full`: whether there was no room for a component in the last frame.
     """
 
     identities: Int[Array, " m"]
     last_identity: Int[Array, ""]
     seen: Int[Array, " m"]
     unseen: Int[Array, " m"]
+    confirmed: Bool[Array, " m"]
+    full: Bool[Array, ""]
 
     @classmethod
     def none(cls, num_components: int) -> "Lives":
         """Nobody lives yet."""
         nobody = jnp.zeros(num_components, jnp.int32)
-        return cls(nobody, jnp.zeros((), jnp.int32), nobody, nobody)
+        zero = jnp.zeros((), jnp.int32)
+        return cls(nobody, zero, nobody, nobody, nobody > 0, zero > 0)
 
     @property
     def alive(self) -> Bool[Array, " m"]:

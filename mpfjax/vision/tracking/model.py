@@ -76,7 +76,7 @@ class DetectedObjectModel(AbstractStateSpaceModel):
     velocity_noise: Float[Array, "2"] = eqx.field(converter=to_array("velocity_noise"))
     size_noise: Float[Array, "2"] = eqx.field(converter=to_array("size_noise"))
     detection_deviations: Float[Array, "4"] = eqx.field(converter=to_array("detection_deviations"))
-    weak_error: float = eqx.field(static=True, default=1.75)
+    weak_error: float = eqx.field(static=True, default=1.35)
     miss: float = eqx.field(static=True, default=0.01)
     sigma: float | None = eqx.field(static=True, default=None)
 
@@ -152,7 +152,9 @@ class DetectedObjectModel(AbstractStateSpaceModel):
         places = jnp.concatenate([found.boxes[:, :2], jnp.log(found.boxes[:, 2:])], axis=1)
         unit = jnp.concatenate([found.boxes[:, 2:], jnp.ones_like(found.boxes[:, 2:])], axis=1)
         unit = jnp.where(observation.weak[:, None], self.weak_error, 1.0) * unit
-        deviations = jnp.where(found.valid[:, None], unit * self.detection_deviations[None], jnp.inf)
+        deviations = jnp.where(
+            found.valid[:, None], unit * self.detection_deviations[None], jnp.inf
+        )
         return take(places, states.label), take(deviations, states.label)
 
     def log_likelihood(self, observation: AssignedFrame, states: ObjectState) -> Float[Array, " n"]:

@@ -1,6 +1,5 @@
 """The proposal that knows the detection: for one detection an object, the best there is."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
@@ -59,7 +58,10 @@ class DetectionProposal(AbstractProposal):
         return states, log_place + self.model.log_velocity(states, previous_states)
 
     def _share(
-        self, gaps: Float[Array, "n 4"], deviations: Float[Array, "n 4"], errors: Float[Array, "n 4"]
+        self,
+        gaps: Float[Array, "n 4"],
+        deviations: Float[Array, "n 4"],
+        errors: Float[Array, "n 4"],
     ) -> Float[Array, " n"]:
         """Z / (Z + miss), with Z = Π_k N(d_k; ...) relative to the bump's height of one."""
         total = deviations**2 + errors**2

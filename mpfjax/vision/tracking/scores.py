@@ -30,7 +30,7 @@ class RankScores(AbstractMove):
     """
 
     strong_share: float = eqx.field(static=True, default=0.5)
-    weak_share: float = eqx.field(static=True, default=0.2)
+    weak_share: float = eqx.field(static=True, default=0.25)
     strong_score: float | None = eqx.field(static=True, default=None)
     weak_score: float | None = eqx.field(static=True, default=None)
 
