@@ -26,11 +26,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
-from benchmarks.arguments import whole
 from benchmarks.peer_worker import Worker, stop_all
-from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
-from mpfjax.devices import wide_vectors
+from mpfjax.console import exit_status, format_table, whole, write_json
+from mpfjax.operations.compiling import wide_vectors
 
 FILTERS = {
     "pf": "PF",

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt8
 
 from mpfjax.checks import check_shape, check_type, check_whole
-from mpfjax.operations import segment_counts
+from mpfjax.operations.segments import segment_counts
 from mpfjax.vision.colours import AbstractColours
 from mpfjax.vision.frames import check_frame
 

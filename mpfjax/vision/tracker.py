@@ -12,7 +12,7 @@ from mpfjax.checks import check_flag, check_positive, check_type, check_whole, g
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractRejuvenation
 from mpfjax.moves.gaussian import GaussianRegeneration
-from mpfjax.operations import default_float
+from mpfjax.operations.floats import default_float
 from mpfjax.vision.colours import AbstractColours, HSVColours
 from mpfjax.vision.detections import Detections
 from mpfjax.vision.histograms import integral_histogram

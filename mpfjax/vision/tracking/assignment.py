@@ -8,7 +8,7 @@ from optax.assignment import hungarian_algorithm
 from mpfjax.checks import check_not_negative, check_positive
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
-from mpfjax.operations import take
+from mpfjax.operations.indexing import take
 from mpfjax.vision.detections import Detections
 from mpfjax.vision.histograms import bhattacharyya, normalise
 from mpfjax.vision.tracking.memory import ASSIGNED, LIVES, REFERENCES, SCORES, remember

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mpfjax.checks import check_share, check_type, check_whole, to_array
-from mpfjax.generator import fast_key
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
-from mpfjax.operations import take
+from mpfjax.operations.generator import fast_key
+from mpfjax.operations.indexing import take
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
     EXTENT,

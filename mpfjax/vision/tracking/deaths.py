@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Key
 from mpfjax.checks import check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
-from mpfjax.operations import spread
+from mpfjax.operations.segments import spread
 from mpfjax.vision.tracking.memory import ASSIGNED, EXTENT, LIVES, Lives, mean_boxes, remember
 from mpfjax.vision.tracking.observation import TrackedFrame, within
 
@@ -18,8 +18,8 @@ class Bury(AbstractMove):
     A component dies where no detection has been assigned to it for more than `patience` frames in a
     row, for more than none while it is not confirmed; where its centre has left the frame; and
     where all its particles have zero likelihood. It is confirmed once detections have borne it out
-    in `confirmation` frames. Where there are no pixels, the frame reaches as far as the centres of all
-    detections so far. Memory: `Lives`, with `Found`, and that extent.
+    in `confirmation` frames. Where there are no pixels, the frame reaches as far as the centres of
+    all detections so far. Memory: `Lives`, with `Found`, and that extent.
 
     Deaths are decided and not sampled (`approximate` is true). Raises `ValueError` for a number of
     frames that is not whole, or below 1.

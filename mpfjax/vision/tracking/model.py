@@ -9,7 +9,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from mpfjax.checks import check_positive, check_positive_array, given, to_array
 from mpfjax.models.base import AbstractStateSpaceModel
-from mpfjax.operations import row_sums, take
+from mpfjax.operations.indexing import take
+from mpfjax.operations.matrices import row_sums
 from mpfjax.vision.detections import Detections
 from mpfjax.vision.histograms import IntegralHistogram, bhattacharyya, normalise
 from mpfjax.vision.sampled_histograms import SampledHistogram

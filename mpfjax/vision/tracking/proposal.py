@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import check_type
-from mpfjax.generator import fast_key
-from mpfjax.operations import row_sums
+from mpfjax.operations.generator import fast_key
+from mpfjax.operations.matrices import row_sums
 from mpfjax.proposals import AbstractProposal
 from mpfjax.vision.tracking.model import (
     AssignedFrame,

@@ -12,9 +12,10 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
-from benchmarks.tracking_pictures import Snapshot, Source
+from benchmarks.visual_tracking.source import Source
 from mpfjax.vision import BackgroundSubtraction, Detections, ObjectTracker, Tracks
 from mpfjax.vision import boxes as box_files
+from mpfjax.vision.snapshots import Snapshot
 
 MAX_DETECTIONS = 32
 # A box that no detection has borne out for longer than this is a guess, and not written.
@@ -85,11 +86,9 @@ def track_detected(
 def _advance(tracker, keys, t, states, frame, found):
     def step(key, state):
         state, tracks = tracker.step(jax.random.fold_in(key, t), state, frame, found)
-        mixture = state.mixture
-        labels = jnp.where(mixture.occupied, mixture.component_indicators, -1)
-        points = state.colour.boxes(mixture.particles)[:, :2]
-        believed = tracks.confirmed & (tracks.unseen <= LONGEST_GUESS)
-        return state, tracks, Snapshot(tracks.boxes, believed, points, labels)
+        labels = jnp.where(state.occupied, state.component_indicators, -1)
+        points = state.particles.place[:, :2]
+        return state, tracks, Snapshot(tracks.boxes, tracks.shown, points, labels)
 
     # The frame is not mapped over, so that its histogram is built once for all runs.
     return jax.vmap(step)(keys, states)
