@@ -25,7 +25,7 @@ class Bury(AbstractMove):
     frames that is not whole, or below 1.
     """
 
-    confirmation: int = eqx.field(static=True, default=3)
+    confirmation: int = eqx.field(static=True, default=2)
     patience: int = eqx.field(static=True, default=20)
 
     def __check_init__(self) -> None:
