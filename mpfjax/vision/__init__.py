@@ -2,6 +2,7 @@
 
 from mpfjax.vision.boxes import check_boxes as check_boxes
 from mpfjax.vision.boxes import parse_box as parse_box
+from mpfjax.vision.boxes import read_detections as read_detections
 from mpfjax.vision.boxes import read_tracks as read_tracks
 from mpfjax.vision.boxes import write_tracks as write_tracks
 from mpfjax.vision.colour_model import BoxState as BoxState
@@ -35,3 +36,4 @@ from mpfjax.vision.soft_histograms import soft_histograms as soft_histograms
 from mpfjax.vision.tracker import ObjectTracker as ObjectTracker
 from mpfjax.vision.tracker import TrackerState as TrackerState
 from mpfjax.vision.tracker import Tracks as Tracks
+from mpfjax.vision.tracking import track as track
