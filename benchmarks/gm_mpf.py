@@ -27,9 +27,8 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
-from benchmarks.arguments import seed, whole
-from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
+from mpfjax.console import exit_status, format_table, seed, whole, write_json
 from mpfjax.metrics.coverage import REACH
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision import boxes as box_files

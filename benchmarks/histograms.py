@@ -21,8 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
-from benchmarks.arguments import whole
-from benchmarks.results import exit_status, format_table, write_json
+from mpfjax.console import exit_status, format_table, whole, write_json
 from mpfjax.devices import wide_vectors
 from mpfjax.vision import RGBColours
 from mpfjax.vision.histograms import integral_histogram

@@ -21,8 +21,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 import mpfjax
-from benchmarks.arguments import seed, whole
-from benchmarks.results import format_table, write_json
+from mpfjax.console import format_table, seed, whole, write_json
 from mpfjax.metrics.tracking_quality import recovery_rate, track_state
 
 # The scenes' constants, chosen once for all methods. Pixels and frames.

@@ -15,8 +15,8 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
-from benchmarks.results import format_table, write_json
 from mpfjax import plotting
+from mpfjax.console import format_table, write_json
 from mpfjax.metrics.coverage import covers
 from mpfjax.metrics.tracking_quality import intersection_area
 from mpfjax.tuning import (

@@ -22,12 +22,11 @@ from scipy.optimize import minimize
 from tqdm import tqdm
 
 import mpfjax
-from benchmarks.arguments import fill_in, seed, whole
 from benchmarks.label_tuning import CLIMB_STEPS as LABEL_STEPS
 from benchmarks.label_tuning import SEQUENCES, run_labels
-from benchmarks.results import format_table, write_json
 from benchmarks.score_vs_particles import HIGH, LOW, position, simulate
 from mpfjax import plotting
+from mpfjax.console import fill_in, format_table, seed, whole, write_json
 from mpfjax.exact import grid_filter, kalman_filter
 from mpfjax.tuning import Positive, TuningRun, fit
 

@@ -26,7 +26,6 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
-from benchmarks.arguments import fill_in, positive, seed, whole
 from benchmarks.partitioned_tables import (
     Rates,
     checks_of,
@@ -35,8 +34,8 @@ from benchmarks.partitioned_tables import (
     print_tables,
     worst_order,
 )
-from benchmarks.results import exit_status, write_json
 from mpfjax import plotting
+from mpfjax.console import exit_status, fill_in, positive, seed, whole, write_json
 from mpfjax.metrics.uniqueness import effective_dynamics, uniqueness
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.multi_object import MultiObjectModel

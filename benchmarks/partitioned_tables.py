@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.results import format_table
+from mpfjax.console import format_table
 from mpfjax.metrics.tracking_quality import (
     precision,
     recall,

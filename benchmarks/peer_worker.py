@@ -17,7 +17,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
 
-from benchmarks.arguments import whole
 from benchmarks.peer_jobs import JOBS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -111,7 +110,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.peer_worker")
     parser.add_argument("library")
     parser.add_argument("job", choices=list(JOBS))
-    parser.add_argument("--devices", type=whole())
+    parser.add_argument("--devices", type=int)
     parser.add_argument("--processes", nargs=3, metavar=("ADDRESS", "NUMBER", "INDEX"))
     options = parser.parse_args()
     # Answers go out on a descriptor of their own: what libraries print is no answer.

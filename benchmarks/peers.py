@@ -24,12 +24,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from benchmarks.arguments import positive, whole
 from benchmarks.peer_jobs import JOBS, Job, Quadratic
 from benchmarks.peer_libraries import LIBRARIES, model_of
 from benchmarks.peer_worker import Worker, stop_all
-from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
+from mpfjax.console import exit_status, format_table, positive, whole, write_json
 from mpfjax.exact import grid_filter, kalman_filter
 
 RIVALS = {  # and how each is installed

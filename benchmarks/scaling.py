@@ -26,10 +26,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
-from benchmarks.arguments import whole
 from benchmarks.peer_worker import Worker, stop_all
-from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
+from mpfjax.console import exit_status, format_table, whole, write_json
 from mpfjax.devices import wide_vectors
 
 FILTERS = {

@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 import mpfjax
-from benchmarks.arguments import seed, whole
-from benchmarks.results import exit_status, format_table, write_json
 from mpfjax import plotting
+from mpfjax.console import exit_status, format_table, seed, whole, write_json
 from mpfjax.exact import grid_filter
 from mpfjax.metrics import mass_above, modes_represented
 

@@ -14,6 +14,7 @@ ORDER = (
     "devices",
     "generator",
     "storage",
+    "console",
     "mixture",
     "models",
     "proposals",

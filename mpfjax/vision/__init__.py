@@ -29,8 +29,13 @@ from mpfjax.vision.labels import boxes_around as boxes_around
 from mpfjax.vision.labels import labelled_states as labelled_states
 from mpfjax.vision.object_moves import ObjectExclusion as ObjectExclusion
 from mpfjax.vision.object_moves import PruneHypotheses as PruneHypotheses
+from mpfjax.vision.recipes import PRESETS as PRESETS
 from mpfjax.vision.scenes import Scene as Scene
 from mpfjax.vision.scenes import football_scene as football_scene
+from mpfjax.vision.snapshots import Snapshot as Snapshot
+from mpfjax.vision.snapshots import annotate as annotate
+from mpfjax.vision.snapshots import follow as follow
+from mpfjax.vision.snapshots import track_rows as track_rows
 from mpfjax.vision.soft_histograms import SoftColourModel as SoftColourModel
 from mpfjax.vision.soft_histograms import soft_histograms as soft_histograms
 from mpfjax.vision.tracker import ObjectTracker as ObjectTracker

@@ -11,8 +11,8 @@ from benchmarks import (
     peers,
     scaling,
     score_vs_particles,
-    visual_tracking,
 )
+from benchmarks.visual_tracking import __main__ as visual_tracking
 
 COUNTS = {
     gm_mpf: ["particles", "seeds"],

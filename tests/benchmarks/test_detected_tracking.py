@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from tqdm import tqdm
 
-from benchmarks import visual_tracking
-from benchmarks.detected_tracking import (
+from benchmarks.visual_tracking import __main__ as visual_tracking
+from benchmarks.visual_tracking.detected import (
     LONGEST_GUESS,
     Detected,
     detect_all,
     make_trackers,
     track_detected,
 )
-from benchmarks.tracking_pictures import Source
+from benchmarks.visual_tracking.source import Source
 from mpfjax.vision.boxes import read_tracks, write_tracks
 from mpfjax.vision.frames import read_frames, write_image, write_video
 
@@ -188,7 +188,7 @@ def test_who_is_seen_once_only_is_not_believed(sequence):
     assert rows.shape == (0, 6)
     result = visual_tracking.score("gm_mpf", [rows], NUM, [0.1] * NUM, source)
     assert result["all_covered"] == 0
-    scores = visual_tracking._tracking_scores([rows], source, NUM)
+    scores = visual_tracking.tracking_scores([rows], source, NUM)
     assert scores["HOTA"] in (None, 0)
 
 

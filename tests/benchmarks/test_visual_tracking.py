@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks import visual_tracking
+from benchmarks.visual_tracking import __main__ as visual_tracking
 from mpfjax.metrics.coverage import coverage
 from mpfjax.vision.boxes import read_tracks, write_tracks
 from mpfjax.vision.frames import read_frames, write_image, write_video

@@ -12,9 +12,10 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
-from benchmarks.tracking_pictures import Snapshot, Source
+from benchmarks.visual_tracking.source import Source
 from mpfjax.vision import BackgroundSubtraction, Detections, ObjectTracker, Tracks
 from mpfjax.vision import boxes as box_files
+from mpfjax.vision.snapshots import Snapshot
 
 MAX_DETECTIONS = 32
 # A box that no detection has borne out for longer than this is a guess, and not written.

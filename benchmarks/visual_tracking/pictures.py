@@ -1,14 +1,15 @@
-"""What the benchmarks that track objects in video keep of a run, and the pictures of it."""
+"""The pictures of a run: an annotated video, and a contact sheet of its key frames."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.visual_tracking.source import Source
 from mpfjax.plotting import draw_contact_sheet
 from mpfjax.vision import boxes as box_files
-from mpfjax.vision import drawing, frames
+from mpfjax.vision import frames
+from mpfjax.vision.snapshots import Snapshot, annotate
 
 NAMES = {
     "pf": "Particle filter",
@@ -16,49 +17,6 @@ NAMES = {
     "gm_mpf": "Gaussian mixture particle filter",
 }
 KEY_FRAMES = 4
-
-
-class Source(NamedTuple):
-    """Where the frames come from, and what is known of the objects in them."""
-
-    name: str
-    read: Callable[[], Iterable[np.ndarray]]
-    first: int  # the number of the first frame
-    num_frames: int | None  # None where only reading on will tell
-    boxes: np.ndarray  # (k, 4), where the objects start
-    truth: np.ndarray | None  # rows of the objects to score against
-    all_labelled: bool  # whether the truth knows every object that was started
-
-
-class Snapshot(NamedTuple):
-    """What one run keeps of one frame, and the same with a leading axis of runs."""
-
-    means: Any  # (m, 4), mean box of each component, centre and size
-    active: Any  # (m,)
-    points: Any  # (n, 2), centres of the particles
-    labels: Any  # (n,), the component of each, -1 in an empty slot
-
-
-def annotate(
-    still: np.ndarray,
-    snapshot: Snapshot,
-    zoom: int,
-    crop: tuple[slice, slice] = (slice(None), slice(None)),
-) -> np.ndarray:
-    """A frame, cropped and enlarged, with one run's particles and mean boxes.
-
-    Both are drawn in the colour of their component.
-    """
-    canvas = still[crop].repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
-    corner = np.array([crop[1].start or 0, crop[0].start or 0], float)
-    labels, palette = snapshot.labels[0], drawing.PALETTE
-    for m in np.flatnonzero(snapshot.active[0]):
-        box = box_files.top_left(snapshot.means[0][m][None])[0] - [*corner, 0, 0]
-        drawing.draw_box(canvas, zoom * box, palette[m % len(palette)], thickness=2)
-    filled = labels >= 0
-    points = zoom * (snapshot.points[0][filled] - corner)
-    drawing.draw_points(canvas, points, palette[labels[filled] % len(palette)], 0.9 * zoom)
-    return np.clip(canvas, 0, 255).astype(np.uint8)
 
 
 def write_video(path: Path, source: Source, tracked: dict[str, list[Snapshot]]) -> None:

@@ -1,0 +1,96 @@
+"""What every command does: read its numbers, write its results whole, end with one line of error.
+
+A number that will not do is argparse's error, and exit status 2.
+"""
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mpfjax.storage import write_whole
+
+
+def whole(least: int = 1, most: int = 2**31 - 1) -> Callable[[str], int]:
+    """The type of an option that is a whole number in this range, by default a count."""
+
+    def read(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            number = least - 1
+        if not least <= number <= most:
+            raise argparse.ArgumentTypeError(
+                f"{text!r} is not a whole number from {least} to {most}"
+            )
+        return number
+
+    return read
+
+
+# JAX makes a key of the last 32 bits alone, so that larger seeds would be smaller ones.
+seed = whole(0, 2**32 - 1)
+
+
+def positive(text: str) -> float:
+    """The type of an option that is a positive, finite number."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive, finite number")
+    return number
+
+
+def fill_in(
+    parser: argparse.ArgumentParser,
+    options: argparse.Namespace,
+    is_used: bool,
+    why: str,
+    /,
+    **defaults: Any,
+) -> None:
+    """Give options that are None their defaults; one that was given and is not used is an error."""
+    for name, default in defaults.items():
+        if getattr(options, name) is None:
+            setattr(options, name, default)
+        elif not is_used:
+            parser.error(f"argument --{name.replace('_', '-')}: does nothing {why}")
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write `content` so that an interruption leaves the old file or the new one, never half."""
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    write_whole(path, lambda file: file.write(text.encode()))
+
+
+def format_table(header: list[str], rows: list[list[str]]) -> str:
+    """A table in plain text, columns aligned to the right but for the first."""
+    widths = [max(len(line[i]) for line in [header, *rows]) for i in range(len(header))]
+
+    def format_line(cells: list[str]) -> str:
+        first, *rest = (
+            cell.ljust(width) if i == 0 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(cells, widths, strict=True))
+        )
+        return "  ".join([first, *rest])
+
+    rule = "  ".join("-" * width for width in widths)
+    return "\n".join([format_line(header), rule, *map(format_line, rows)])
+
+
+def exit_status(run: Callable[[], None]) -> int:
+    """Run a command: bad input is one line on the error stream and 2, an interruption 130."""
+    try:
+        run()
+    except (ValueError, OSError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted; what was finished is written", file=sys.stderr)
+        return 130
+    return 0

@@ -1,0 +1,151 @@
+"""Recipes for tracking boxes in video by their colours: a PF and an MPF, ready to run.
+
+Each recipe takes the first frame and a box for each object, and gives two filters with the same
+model and the same particles at the start: a particle filter of 200 particles, and a mixture
+particle filter of at most 10 components of 20. `PRESETS` has them by name.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from mpfjax.filters import Filter, mixture_particle_filter, particle_filter
+from mpfjax.models.jumps import RandomWalkWithJumps
+from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.exclusion import Exclusion
+from mpfjax.moves.propagation import Propagate
+from mpfjax.moves.regrouping import KMeans, Merge, Split
+from mpfjax.moves.resampling import Resample
+from mpfjax.vision.colour_model import BoxState, ColourModel
+from mpfjax.vision.colours import RGBColours
+from mpfjax.vision.object_moves import ObjectExclusion, PruneHypotheses
+
+NUM_PARTICLES, MAX_COMPONENTS, PARTICLES_PER_COMPONENT = 200, 10, 20
+
+
+def paper_filters(
+    frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
+) -> dict[str, Filter]:
+    """The model with the paper's parameters; the rest of the MPF in units of the mean box."""
+    model = ColourModel.from_frame(frame, boxes, sigma=0.15, deviations=None, share_reference=True)
+    where: dict[str, Any] = {"features": _centre, "scale": boxes[:, 2:].mean(axis=0)}
+    mixture = mixture_particle_filter(
+        model,
+        NUM_PARTICLES,
+        MAX_COMPONENTS,
+        particles_per_component=PARTICLES_PER_COMPONENT,
+        merge=Merge(None, 0.5, **where),
+        split=Split(4.0, 0.5, min_share=0.15, **where),
+        kmeans=KMeans(5, **where),
+    )
+    return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
+
+
+def default_filters(
+    frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
+) -> dict[str, Filter]:
+    """The recipe that covers most on real video: any component may come to stand for any object.
+
+    A particle is compared with one of the given boxes, and now and then with another, and takes a
+    long step now and then; components exclude each other, part where they straddle two places,
+    and merge only after ten frames on the same one.
+    """
+    size = boxes[:, 2:].mean(axis=0)
+    steps = _steps(boxes)
+    model = _own_references(
+        frame,
+        boxes,
+        colours=RGBColours(16),
+        sigma=0.2,
+        num_parts=8,
+        contrast=0.25,
+        switch_probability=0.05,
+        dynamics=RandomWalkWithJumps(steps, steps * np.array([6.0, 6.0, 1.0, 1.0]), 0.05),
+    )
+    where: dict[str, Any] = {"features": _centre, "scale": size}
+    moves = [
+        Exclusion(strength=4.0, radius=0.5, **where),
+        Merge(None, 0.25, patience=10, **where),
+        Split(4.0, 0.5, min_share=0.15, **where),
+    ]
+    return _started_at_the_boxes(model, moves, size)
+
+
+def objects_filters(
+    frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
+) -> dict[str, Filter]:
+    """The recipe with the fewest strays and swaps: every component keeps to its object.
+
+    Every particle carries which box it was started from and is compared with that one alone, so
+    that the components of an object are rival hypotheses about it: only those merge, a component
+    splits where they part, and those that came to nothing are pruned. Objects exclude each other.
+    """
+    size = boxes[:, 2:].mean(axis=0)
+    model = _own_references(frame, boxes, sigma=0.15, num_parts=5, contrast=0.25)
+    apart = _apart(size)
+    moves = [
+        ObjectExclusion(strength=3.0, radius=0.5, scale=(float(size[0]), float(size[1]))),
+        Merge(None, 0.25, patience=10, **apart),
+        PruneHypotheses(least_share=1e-6),
+        Split(4.0, 0.5, min_share=0.15, **apart),
+    ]
+    return _started_at_the_boxes(model, moves, size)
+
+
+def _own_references(frame: np.ndarray, boxes: np.ndarray, **options: Any) -> ColourModel:
+    return ColourModel.from_frame(
+        frame, boxes, deviations=_steps(boxes), weigh_colours=True, **options
+    )
+
+
+def _steps(boxes: np.ndarray) -> np.ndarray:
+    """Deviations of the random walk: 0.4 widths and 0.08 heights of each box, sizes hardly any."""
+    still = np.full(len(boxes), 0.01)
+    return np.stack([0.4 * boxes[:, 2], 0.08 * boxes[:, 3], still, still], axis=1)
+
+
+def _started_at_the_boxes(
+    model: ColourModel, moves: list[AbstractMove], size: np.ndarray
+) -> dict[str, Filter]:
+    """Both filters; the mixture starts with one component for each box."""
+    mixture = Filter(
+        model,
+        moves=[
+            Resample(particles_per_component=PARTICLES_PER_COMPONENT),
+            Propagate(model),
+            *moves,
+        ],
+        num_particles=NUM_PARTICLES,
+        num_components=MAX_COMPONENTS,
+        initial_moves=[
+            KMeans(10, reseed=True, **_apart(size)),
+            Merge(None, 0.5, features=_reference),
+        ],
+    )
+    return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
+
+
+def _apart(size: np.ndarray) -> dict[str, Any]:
+    """Features by which particles of different references are never near each other."""
+    return {"features": _centre_and_reference, "scale": (*size, 1e-5)}
+
+
+PRESETS = {
+    "default": default_filters,
+    "objects": objects_filters,
+    "paper": paper_filters,
+}
+
+
+def _centre(states: BoxState) -> Array:
+    return states.box[:, :2]
+
+
+def _reference(states: BoxState) -> Array:
+    return states.reference[:, None].astype(states.box.dtype)
+
+
+def _centre_and_reference(states: BoxState) -> Array:
+    return jnp.concatenate([_centre(states), _reference(states)], axis=1)

@@ -1,0 +1,115 @@
+"""Boxes followed through a video: what is kept of each frame, as tracks and as pictures."""
+
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key, UInt8
+
+from mpfjax.checks import check_key, check_type, check_whole
+from mpfjax.filters import Filter
+from mpfjax.vision import boxes as box_files
+from mpfjax.vision import drawing
+
+
+class Snapshot(NamedTuple):
+    """What is kept of one frame of several runs; of one run, the same without the leading axis.
+
+    - `means`: (runs, m, 4), the mean box of each component, centre and size in pixels.
+    - `active`: (runs, m), which components are alive.
+    - `points`: (runs, n, 2), the centres of the particles.
+    - `labels`: (runs, n), the component of each particle, -1 in an empty slot.
+    """
+
+    means: Any
+    active: Any
+    points: Any
+    labels: Any
+
+
+def follow(
+    filter: Filter, keys: Key[Array, " runs"], frames: Iterable[UInt8[np.ndarray, "h w 3"]]
+) -> Iterator[Snapshot]:
+    """Run a filter of boxes online, once for each key, and yield a snapshot for each frame.
+
+    The filter's model has a method `boxes(states)`, as `ColourModel` does. A frame is read only
+    when the one before it is done, so that a camera will do. Raises `TypeError` for a filter that
+    is none and `ValueError` for keys that are no stack of keys. Use it with the `PRESETS`, and
+    `track_rows` to make tracks of what it yields.
+    """
+    check_type(Filter, "a Filter", filter=filter)
+    check_key(keys, "keys", batch=True)
+    return _follow(filter, keys, frames)
+
+
+def _follow(filter: Filter, keys: Array, frames: Iterable[np.ndarray]) -> Iterator[Snapshot]:
+    mixtures = jax.vmap(filter.init)(keys)
+    for t, frame in enumerate(frames):
+        step = jnp.asarray(t)  # an array, since a new Python number would compile anew
+        mixtures, snapshot = _advance(filter, keys, step, mixtures, jnp.asarray(frame))
+        yield jax.tree.map(np.asarray, snapshot)
+
+
+@eqx.filter_jit
+def _advance(filter, keys, t, mixtures, frame):
+    def step(key, mixture):
+        mixture, _ = filter.step(jax.random.fold_in(key, t), mixture, frame)
+        places = filter.model.boxes(mixture.particles)
+        labels = jnp.where(mixture.occupied, mixture.component_indicators, -1)
+        means = mixture.component_averages(places)
+        return mixture, Snapshot(means, mixture.active, places[:, :2], labels)
+
+    # The frame is not mapped over, so that its histogram is built once for all runs.
+    return jax.vmap(step)(keys, mixtures)
+
+
+def track_rows(
+    snapshots: list[Snapshot], run: int = 0, first: int = 1
+) -> Float[np.ndarray, "rows 6"]:
+    """Rows (frame, id, x, y, w, h) of one run: an id for each life of each component.
+
+    (x, y) is the top-left corner in pixels, as `write_tracks` takes it; the first snapshot is of
+    frame `first`. Raises `ValueError` for a run or a frame that is not a whole number from 0 on.
+    """
+    check_whole(0, run=run, first=first)
+    rows, alive, next_id = [], {}, 1
+    for frame, snapshot in enumerate(snapshots, first):
+        for m, (mean, active) in enumerate(
+            zip(snapshot.means[run], snapshot.active[run], strict=True)
+        ):
+            if not active:
+                alive.pop(m, None)
+                continue
+            if m not in alive:
+                alive[m], next_id = next_id, next_id + 1
+            rows.append([frame, alive[m], *box_files.top_left(mean[None])[0]])
+    # Rounded as the file is, so that scores from the file are the scores.
+    return np.round(np.array(rows, float).reshape(-1, 6), 3)
+
+
+def annotate(
+    frame: UInt8[np.ndarray, "h w 3"],
+    snapshot: Snapshot,
+    zoom: int = 1,
+    crop: tuple[slice, slice] = (slice(None), slice(None)),
+) -> UInt8[np.ndarray, "zh zw 3"]:
+    """A frame, cropped and enlarged, with the particles and mean boxes of the first run.
+
+    Both are drawn in the colour of their component. `crop` is of rows and columns; `zoom` is how
+    many pixels a pixel becomes, each way. Raises `ValueError` for a zoom that is not a whole
+    number from 1 on.
+    """
+    check_whole(zoom=zoom)
+    canvas = frame[crop].repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
+    corner = np.array([crop[1].start or 0, crop[0].start or 0], float)
+    labels, palette = snapshot.labels[0], drawing.PALETTE
+    for m in np.flatnonzero(snapshot.active[0]):
+        box = box_files.top_left(snapshot.means[0][m][None])[0] - [*corner, 0, 0]
+        drawing.draw_box(canvas, zoom * box, palette[m % len(palette)], thickness=2)
+    filled = labels >= 0
+    points = zoom * (snapshot.points[0][filled] - corner)
+    drawing.draw_points(canvas, points, palette[labels[filled] % len(palette)], 0.9 * zoom)
+    return np.clip(canvas, 0, 255).astype(np.uint8)
