@@ -7,9 +7,12 @@ import argparse
 import json
 import math
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from tqdm import tqdm
 
 from mpfjax.storage import write_whole
 
@@ -43,6 +46,17 @@ def positive(text: str) -> float:
         number = math.nan
     if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive, finite number")
+    return number
+
+
+def finite(text: str) -> float:
+    """The type of an option that is a finite number."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
     return number
 
 
@@ -94,3 +108,20 @@ def exit_status(run: Callable[[], None]) -> int:
         print("interrupted; what was finished is written", file=sys.stderr)
         return 130
     return 0
+
+
+def say_warnings(category: type[Warning]) -> None:
+    """From here on show warnings of this kind as one line each, every time, clear of any bar.
+
+    Call it inside `warnings.catch_warnings()`, which ends it.
+    """
+    before = warnings.showwarning
+
+    def show(message: Any, kind: type[Warning], *rest: Any) -> None:
+        if issubclass(kind, category):
+            tqdm.write(f"warning: {message}", file=sys.stderr)
+        else:
+            before(message, kind, *rest)
+
+    warnings.filterwarnings("always", category=category)
+    warnings.showwarning = show

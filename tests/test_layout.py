@@ -27,6 +27,8 @@ ORDER = (
     "vision",
     "tuning",
     "plotting",
+    "command",
+    "__main__",
 )
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 

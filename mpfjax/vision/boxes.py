@@ -67,7 +67,7 @@ def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     return np.array(rows)
 
 
-def read_detections(path: str | Path) -> Float[np.ndarray, "rows 7"]:
+def read_detections(path: str | Path) -> Float[np.ndarray, "rows columns"]:
     """Read a MOTChallenge file of detections into rows (frame, id, x, y, w, h, score).
 
     The id, -1 in such files, means nothing. Without scores, in files of six columns, there are six
@@ -102,11 +102,16 @@ def write_tracks(path: str | Path, rows: Float[np.ndarray, "rows 6"]) -> None:
         if not np.all(np.isfinite(row)) or np.any(row[:2] < 0) or np.any(row[:2] % 1):
             raise ValueError(f"rows: {shown(row)} is not frame,id,x,y,w,h")
     ordered = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+    Path(path).write_text(format_tracks(ordered), encoding="utf-8")
+
+
+def format_tracks(rows: Float[np.ndarray, "rows 6"]) -> str:
+    """The lines of rows (frame, id, x, y, w, h) in MOTChallenge form."""
     lines = [
         f"{int(frame)},{int(track)},{x:.3f},{y:.3f},{w:.3f},{h:.3f},1,-1,-1,-1\n"
-        for frame, track, x, y, w, h in ordered
+        for frame, track, x, y, w, h in rows
     ]
-    Path(path).write_text("".join(lines), encoding="utf-8")
+    return "".join(lines)
 
 
 def boxes_of_frame(rows: Float[np.ndarray, "rows 6"], frame: int) -> dict[int, np.ndarray]:

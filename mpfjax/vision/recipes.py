@@ -94,6 +94,11 @@ def objects_filters(
     return _started_at_the_boxes(model, moves, size)
 
 
+def drawn_filter(frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]) -> Filter:
+    """The recipe of `follow_boxes`."""
+    return objects_filters(frame, boxes)["mpf"]
+
+
 def _own_references(frame: np.ndarray, boxes: np.ndarray, **options: Any) -> ColourModel:
     return ColourModel.from_frame(
         frame, boxes, deviations=_steps(boxes), weigh_colours=True, **options

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import check_flag, check_key, check_type, check_whole, given
+from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole, given
+from mpfjax.moves.resampling import Resample
 from mpfjax.vision.detected_model import Detections
-from mpfjax.vision.detectors import AbstractDetector, Found, Once, Sieve, as_detector
-from mpfjax.vision.frames import check_frame
+from mpfjax.vision.detectors import LEAST_ROOM, AbstractDetector, Found, Once, Sieve, as_detector
+from mpfjax.vision.frames import of_one_kind
 from mpfjax.vision.tracker import ObjectTracker, Tracks
 
 # A box that no detection has borne out for longer than this is a guess, and not written.
@@ -70,7 +71,7 @@ def track(
     key = jax.random.key(0) if key is None else key
     check_key(key)
     room = 2 * tracker.max_objects if max_detections is None else max_detections
-    stills = None if frames is None else _of_one_kind(frames, first)
+    stills = None if frames is None else of_one_kind(frames, first)
     return _tracked(stills, detector, sieve, tracker, key, first, room, use_colours)
 
 
@@ -125,21 +126,25 @@ def _observed(
         yield number, None, found
 
 
-def _of_one_kind(frames: Iterable[Any], first: int) -> Iterator[np.ndarray]:
-    """The frames in RGB, or an error at the first that is no image or has another size."""
-    shape = None
-    for number, frame in enumerate(frames, first):
-        frame = np.asarray(frame)
-        if frame.ndim == 2 or frame.shape[2:] == (1,):
-            frame = np.repeat(frame.reshape(*frame.shape[:2], 1), 3, axis=2)
-        check_frame(frame, "frames")
-        shape = shape or frame.shape
-        if frame.shape != shape:
-            raise ValueError(
-                f"frames: frame {number} is {frame.shape[1]} x {frame.shape[0]}, and those before"
-                f" it {shape[1]} x {shape[0]}"
-            )
-        yield frame
+def make_tracker(
+    filter: str = "gm_mpf",
+    max_objects: int = LEAST_ROOM,
+    frames_per_second: float | None = None,
+    **settings: Any,
+) -> ObjectTracker:
+    """The tracker by the name of its filter, "gm_mpf" or "mpf", with room for so many objects.
+
+    They differ in how a component's particles are redrawn: from a Gaussian, or by resampling.
+    `settings` are the tracker's own. Raises `ValueError` for another name.
+    """
+    check_one_of(("gm_mpf", "mpf"), filter=filter)
+    if frames_per_second is not None:
+        settings["frames_per_second"] = frames_per_second
+    tracker = ObjectTracker(max_objects, **settings)
+    if filter == "gm_mpf":
+        return tracker
+    resample = Resample(particles_per_component=tracker.particles_per_object)
+    return ObjectTracker(max_objects, rejuvenation=resample, **settings)
 
 
 # --- tracks as files have them -------------------------------------------------------------
