@@ -25,8 +25,8 @@ def read_frames(
 
     `path` is a video file, a folder of images in the order of their names, or a folder with
     such a folder `img` or `img1`. Raises `ImportError` where imageio is missing,
-    `FileNotFoundError` where `path` is, and `ValueError` naming `path` where it cannot be read, holds no frames, or its
-    frames differ in size; also for a range that is none.
+    `FileNotFoundError` where `path` is, and `ValueError` naming `path` where it cannot be read,
+    holds no frames, or its frames differ in size; also for a range that is none.
     """
     check_type((str, Path), "a path", path=path)
     check_whole(first=first, **given(last=last))
