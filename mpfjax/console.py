@@ -4,11 +4,13 @@ A number that will not do is argparse's error, and exit status 2.
 """
 
 import argparse
+import contextlib
 import json
 import math
 import sys
+import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -125,3 +127,30 @@ def say_warnings(category: type[Warning]) -> None:
 
     warnings.filterwarnings("always", category=category)
     warnings.showwarning = show
+
+
+class Clock:
+    """The seconds that went into each part of the work."""
+
+    def __init__(self, *parts: str) -> None:
+        self.seconds = dict.fromkeys(parts, 0.0)
+
+    @contextlib.contextmanager
+    def of(self, part: str) -> Iterator[None]:
+        """Count the time in the block for this part, and for no part around it."""
+        start, before = time.perf_counter(), sum(self.seconds.values())
+        try:
+            yield
+        finally:
+            within = sum(self.seconds.values()) - before
+            self.seconds[part] += time.perf_counter() - start - within
+
+    def over(self, part: str, items: Iterable[Any]) -> Iterator[Any]:
+        """The items, the time to get each counted for this part."""
+        iterator = iter(items)
+        while True:
+            with self.of(part):
+                item = next(iterator, None)
+            if item is None:
+                return
+            yield item

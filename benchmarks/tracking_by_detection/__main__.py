@@ -22,7 +22,16 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.tracking_by_detection.peers import Peer, peers
-from mpfjax.console import exit_status, finite, format_table, positive, seed, whole, write_json
+from mpfjax.console import (
+    Clock,
+    exit_status,
+    finite,
+    format_table,
+    positive,
+    seed,
+    whole,
+    write_json,
+)
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import frames
@@ -142,28 +151,19 @@ def _ours(
     rows = Rows(sequence.rows, sequence.first)
     tracker = make_tracker(filter, rows.most_objects(), sequence.frames_per_second)
     for number in range(options.seed, options.seed + options.seeds):
-        reading = 0.0
-
-        def stills() -> Iterator[np.ndarray]:
-            nonlocal reading
-            start = time.perf_counter()
-            for still in sequence.stills():
-                reading += time.perf_counter() - start
-                yield still
-                start = time.perf_counter()
-
+        clock = Clock("read", "track")
         tracked = track(
-            stills(), rows, tracker, key=jax.random.key(number), first=sequence.first,
-            min_score=least, use_colours=not options.no_colour,
+            clock.over("read", sequence.stills()), rows, tracker, key=jax.random.key(number),
+            first=sequence.first, min_score=least, use_colours=not options.no_colour,
         )  # fmt: skip
-        kept, start, before = [], time.perf_counter(), 0.0
-        bar = tqdm(tracked, desc=f"{sequence.folder.name} {OURS[filter]}", disable=None)
-        for frame, tracks in enumerate(bar, sequence.first):
+        kept, compiling = [], 0.0
+        bar = tqdm(total=sequence.last - sequence.first + 1, desc=OURS[filter], disable=None)
+        for frame, tracks in enumerate(clock.over("track", tracked), sequence.first):
             kept.append(online_rows(frame, tracks))
-            if frame == sequence.first:
-                start, before = time.perf_counter(), reading
-        seconds = time.perf_counter() - start - (reading - before)
-        yield Run(np.concatenate(kept), _rate(len(kept) - 1, seconds))
+            compiling = compiling or clock.seconds["track"]
+            bar.update()
+        bar.close()
+        yield Run(np.concatenate(kept), _rate(len(kept) - 1, clock.seconds["track"] - compiling))
 
 
 def _theirs(sequence: Sequence, peer: Peer, least: float | None) -> Run:

@@ -116,7 +116,8 @@ def read_detections(options: argparse.Namespace, source: Source) -> np.ndarray:
 def read_boxes(options: argparse.Namespace, still: np.ndarray) -> np.ndarray:
     """The drawn boxes, each of which has to lie in the first frame."""
     boxes = np.stack([box_files.parse_box(text, "--box") for text in options.box])
-    box_files.check_boxes(boxes, *still.shape[:2], "--box")
+    height, width, _ = still.shape
+    box_files.check_boxes(boxes, height, width, "--box")
     return boxes
 
 

@@ -4,7 +4,6 @@ import argparse
 import contextlib
 import resource
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mpfjax.command.arguments import Source, open_source, read_boxes, read_detections
-from mpfjax.console import format_table, write_json
+from mpfjax.console import Clock, format_table, write_json
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import drawing, frames
@@ -26,45 +25,13 @@ from mpfjax.vision.tracking import make_tracker, offline_rows, online_rows, trac
 _SCORES = ("HOTA", "MOTA", "IDF1")
 
 
-class Clock:
-    """The seconds that went into each part of the work."""
-
-    def __init__(self) -> None:
-        self.seconds = dict.fromkeys(("read", "detect", "track", "write"), 0.0)
-        self.first = 0.0  # of detecting and tracking in the first frame, which compiles
-
-    @contextlib.contextmanager
-    def of(self, part: str) -> Iterator[None]:
-        """Count the time in the block for this part, and for no part around it."""
-        start, before = time.perf_counter(), sum(self.seconds.values())
-        try:
-            yield
-        finally:
-            within = sum(self.seconds.values()) - before
-            self.seconds[part] += time.perf_counter() - start - within
-
-    def over(self, part: str, items: Iterable[Any]) -> Iterator[Any]:
-        """The items, the time to get each counted for this part."""
-        iterator = iter(items)
-        while True:
-            with self.of(part):
-                item = next(iterator, None)
-            if item is None:
-                return
-            yield item
-
-    @property
-    def working(self) -> float:
-        """Seconds of detecting and tracking."""
-        return self.seconds["detect"] + self.seconds["track"]
-
-
 class Results:
     """What is written of a run: rows as they come, the video, and the summary at the end."""
 
     def __init__(self, options: argparse.Namespace, source: Source) -> None:
         self.options, self.source = options, source
-        self.clock = Clock()
+        self.clock = Clock("read", "detect", "track", "write")
+        self.compiling = 0.0  # seconds of detecting and tracking in the first frame
         self.rows: list[np.ndarray] = []
         self.kept: list[Tracks] = []  # for --offline alone
         self.num_frames = 0
@@ -77,8 +44,11 @@ class Results:
             self.kept.append(tracks)
         self.num_frames += 1
         if self.num_frames == 1:
-            self.clock.first = self.clock.working
+            self.compiling = self._working()
         return rows
+
+    def _working(self) -> float:
+        return self.clock.seconds["detect"] + self.clock.seconds["track"]
 
     def all_rows(self) -> np.ndarray:
         """The rows of tracks.txt."""
@@ -89,7 +59,8 @@ class Results:
     def summary(self) -> dict[str, Any]:
         """The content of summary.json."""
         rows, clock, n = self.all_rows(), self.clock, self.num_frames
-        rate = (n - 1) / (clock.working - clock.first) if n > 1 else 1 / clock.first
+        # The first frame compiles, and says nothing of the others.
+        rate = (n - 1) / (self._working() - self.compiling) if n > 1 else 1 / self.compiling
         summary = {
             "frames": n,
             "objects": len(np.unique(rows[:, 1])),

@@ -1,6 +1,8 @@
 """The loop over frames for boxes drawn in the first: one track for each box, in their order."""
 
+import itertools
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,7 +20,7 @@ from mpfjax.vision.tracker import Tracks
 
 
 def follow_boxes(
-    frames: Iterable[UInt8[np.ndarray, "h w 3"]],
+    frames: Iterable[UInt8[np.ndarray, "..."]],
     boxes: Float[np.ndarray, "k 4"],
     *,
     key: Key[Array, ""] | None = None,
@@ -46,11 +48,12 @@ def follow_boxes(
 
 
 def _followed(stills: Iterator[np.ndarray], boxes: np.ndarray, key: Array) -> Iterator[Tracks]:
-    filter, mixture = None, None
-    for t, still in enumerate(stills):
-        if filter is None:
-            filter = drawn_filter(still, boxes)
-            mixture = filter.init(key)
+    first = next(stills, None)
+    if first is None:
+        return
+    filter = drawn_filter(first, boxes)
+    mixture = filter.init(key)
+    for t, still in enumerate(itertools.chain([first], stills)):
         step_key = jax.random.fold_in(key, t)
         mixture, tracks = _advance(filter, step_key, mixture, jnp.asarray(still), len(boxes))
         yield jax.device_get(tracks)
@@ -61,8 +64,9 @@ def _advance(
     filter: Filter, key: Array, mixture: ParticleMixture, frame: Array, num_objects: int
 ) -> tuple[ParticleMixture, Tracks]:
     mixture, _ = filter.step(key, mixture, frame)
+    model: Any = filter.model
     best, held = best_components(mixture, num_objects)
-    means = mixture.component_averages(filter.model.boxes(mixture.particles))
+    means = mixture.component_averages(model.boxes(mixture.particles))
     identities = jnp.where(held, jnp.arange(1, num_objects + 1, dtype=jnp.int32), 0)
     unseen = jnp.zeros(num_objects, jnp.int32)
     return mixture, Tracks(means[best], identities, held, unseen, jnp.zeros((), bool))

@@ -20,7 +20,7 @@ LONGEST_GUESS = 3
 
 
 def track(
-    frames: Iterable[UInt8[np.ndarray, "h w 3"]] | None,
+    frames: Iterable[UInt8[np.ndarray, "..."]] | None,
     detections: Any,
     tracker: ObjectTracker | None = None,
     *,
