@@ -22,7 +22,7 @@ import numpy as np
 
 import mpfjax
 from mpfjax.console import exit_status, format_table, whole, write_json
-from mpfjax.devices import wide_vectors
+from mpfjax.operations.compiling import wide_vectors
 from mpfjax.vision import RGBColours
 from mpfjax.vision.histograms import integral_histogram
 

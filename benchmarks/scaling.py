@@ -29,7 +29,7 @@ import mpfjax
 from benchmarks.peer_worker import Worker, stop_all
 from mpfjax import plotting
 from mpfjax.console import exit_status, format_table, whole, write_json
-from mpfjax.devices import wide_vectors
+from mpfjax.operations.compiling import wide_vectors
 
 FILTERS = {
     "pf": "PF",

@@ -3,22 +3,16 @@
 import importlib as _importlib
 from typing import TYPE_CHECKING
 
-from mpfjax.devices import join_processes as join_processes
-from mpfjax.filters import Filter as Filter
-from mpfjax.filters import FilterRun as FilterRun
-from mpfjax.filters import StepInfo as StepInfo
+from mpfjax.filter import Filter as Filter
+from mpfjax.filter import StepInfo as StepInfo
 from mpfjax.filters import clustered_particle_filter as clustered_particle_filter
 from mpfjax.filters import distributed_partitioned_sampling as distributed_partitioned_sampling
 from mpfjax.filters import gaussian_mixture_particle_filter as gaussian_mixture_particle_filter
 from mpfjax.filters import gaussian_particle_filter as gaussian_particle_filter
 from mpfjax.filters import independent_particle_filters as independent_particle_filters
 from mpfjax.filters import mixture_particle_filter as mixture_particle_filter
-from mpfjax.filters import monte_carlo as monte_carlo
 from mpfjax.filters import particle_filter as particle_filter
 from mpfjax.filters import partitioned_sampling as partitioned_sampling
-from mpfjax.filters import run_filter as run_filter
-from mpfjax.generator import normal as normal
-from mpfjax.islands import run_islands as run_islands
 from mpfjax.mixture import ParticleMixture as ParticleMixture
 from mpfjax.models import AbstractDynamics as AbstractDynamics
 from mpfjax.models import AbstractStateSpaceModel as AbstractStateSpaceModel
@@ -49,14 +43,20 @@ from mpfjax.moves import RandomPartition as RandomPartition
 from mpfjax.moves import Resample as Resample
 from mpfjax.moves import Split as Split
 from mpfjax.moves import Weigh as Weigh
+from mpfjax.operations.generator import normal as normal
 from mpfjax.proposals import AbstractProposal as AbstractProposal
 from mpfjax.proposals import GaussNewtonProposal as GaussNewtonProposal
 from mpfjax.proposals import NetworkProposal as NetworkProposal
-from mpfjax.storage import load_checkpoint as load_checkpoint
-from mpfjax.storage import save_checkpoint as save_checkpoint
-from mpfjax.studies import Study as Study
-from mpfjax.studies import read_study as read_study
-from mpfjax.studies import run_study as run_study
+from mpfjax.running.islands import run_islands as run_islands
+from mpfjax.running.processes import join_processes as join_processes
+from mpfjax.running.run import monte_carlo as monte_carlo
+from mpfjax.running.run import run_filter as run_filter
+from mpfjax.running.scan import FilterRun as FilterRun
+from mpfjax.running.storage import load_checkpoint as load_checkpoint
+from mpfjax.running.storage import save_checkpoint as save_checkpoint
+from mpfjax.running.studies import Study as Study
+from mpfjax.running.studies import read_study as read_study
+from mpfjax.running.studies import run_study as run_study
 
 # The one place that says it: pyproject.toml reads it from here.
 __version__ = "0.1.0"

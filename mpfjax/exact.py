@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from mpfjax.models.base import require
 from mpfjax.models.linear_gaussian import LinearGaussianModel
-from mpfjax.operations import log_sum_exp
+from mpfjax.operations.logarithms import log_sum_exp
 
 
 class GridFilterRun(eqx.Module):

@@ -5,18 +5,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree, Shaped
 
-from mpfjax.operations import (
-    as_inexact,
-    default_float,
-    exp,
-    finite_max,
-    log_sum_exp,
-    scaled_exp,
+from mpfjax.operations.floats import as_inexact, default_float
+from mpfjax.operations.logarithms import exp, finite_max, log_sum_exp, scaled_exp, softmax
+from mpfjax.operations.segments import (
     segment_counts,
     segment_log_sum_exp,
     segment_softmax,
     segment_sum,
-    softmax,
     spread,
 )
 

@@ -19,10 +19,10 @@ from mpfjax.checks import (
     check_whole,
     to_array,
 )
-from mpfjax.generator import normal
 from mpfjax.models.base import model_name, require
 from mpfjax.models.noise import NOISES
-from mpfjax.operations import cholesky, solve_lower
+from mpfjax.operations.generator import normal
+from mpfjax.operations.matrices import cholesky, solve_lower
 
 
 class AbstractProposal(eqx.Module):

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
-from mpfjax.devices import over_devices
-from mpfjax.islands import _run_block, _run_on_one
+from mpfjax.running.devices import over_devices
+from mpfjax.running.islands import _run_block, _run_on_one
 
 OBSERVATIONS = (1.5, 1.0, 0.4, 0.9)
 NUM_KEYS = 11  # neither 2 nor 8 divides it

@@ -15,18 +15,18 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.devices import (
+from mpfjax.exact import grid_filter
+from mpfjax.operations.across_islands import (
     DEVICE_AXIS,
     ISLAND_AXIS,
-    choose_devices,
     deal_to_islands,
     island_index,
     num_islands,
     over_islands,
-    over_threads,
-    wide_vectors,
 )
-from mpfjax.exact import grid_filter
+from mpfjax.operations.compiling import wide_vectors
+from mpfjax.running.devices import choose_devices
+from mpfjax.running.threads import over_threads
 from tests import on_devices
 from tests.examples import make_mixture
 from tests.precision import float64
@@ -385,8 +385,8 @@ class TestThreads:
             over_threads(fail, jax.random.split(jax.random.key(6), 4), (), 2)
 
     def test_a_study_on_threads_is_that_of_each_key(self, monkeypatch):
-        monkeypatch.setattr(mpfjax.filters, "_WORTH_A_THREAD", 1)
-        monkeypatch.setattr(mpfjax.filters, "num_processors", lambda: 3)
+        monkeypatch.setattr(mpfjax.running.run, "_WORTH_A_THREAD", 1)
+        monkeypatch.setattr(mpfjax.running.run, "num_processors", lambda: 3)
         keys = jax.random.split(jax.random.key(7), 5)
         filter = mpfjax.particle_filter(mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0), 32)
         mean = mpfjax.ParticleMixture.mean

@@ -367,9 +367,9 @@ class TestGroupsOfRuns:
         keys = jax.random.split(jax.random.key(20), 6)
         filter = mpfjax.particle_filter(mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0), 32)
         together = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean)
-        monkeypatch.setattr(mpfjax.filters, "_IN_CACHE", 100)
-        monkeypatch.setattr(mpfjax.filters, "_IN_NEAR_CACHE", 80)
-        assert mpfjax.filters._group_size(6, filter) == 2
+        monkeypatch.setattr(mpfjax.running.run, "_IN_CACHE", 100)
+        monkeypatch.setattr(mpfjax.running.run, "_IN_NEAR_CACHE", 80)
+        assert mpfjax.running.run._group_size(6, filter) == 2
         in_groups = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, lambda mixture: mean(mixture))
         assert_same(in_groups, together, rtol=1e-5)
 
@@ -388,7 +388,7 @@ class TestGroupsOfRuns:
     def test_sizes_divide_and_fit(self, num_runs, num_particles, num_components, size):
         model = mpfjax.QuadraticModel()
         filter = mpfjax.mixture_particle_filter(model, num_particles, num_components)
-        assert mpfjax.filters._group_size(num_runs, filter) == size
+        assert mpfjax.running.run._group_size(num_runs, filter) == size
 
 
 class TestGradients:

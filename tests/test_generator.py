@@ -7,7 +7,7 @@ import pytest
 from scipy.special import erfinv, log_ndtr
 
 import mpfjax
-from mpfjax.generator import (
+from mpfjax.operations.generator import (
     bits,
     fast_key,
     normal,

@@ -11,17 +11,15 @@ PACKAGE = Path(__file__).resolve().parents[1] / "mpfjax"
 ORDER = (
     "checks",
     "operations",
-    "devices",
-    "generator",
-    "storage",
-    "console",
     "mixture",
     "models",
     "proposals",
     "moves",
+    "observations",
+    "filter",
     "filters",
-    "islands",
-    "studies",
+    "running",
+    "console",
     "exact",
     "metrics",
     "vision",
@@ -30,6 +28,16 @@ ORDER = (
     "command",
     "__main__",
 )
+# Inside the two folders that hold several floors.
+FLOORS = {
+    "operations": (
+        "floats", "gradients", "stored", "indexing", "prefix_sums", "logarithms", "segments",
+        "matrices", "across_islands", "generator", "compiling",
+    ),
+    "running": (
+        "storage", "processes", "devices", "threads", "scan", "run", "islands", "studies",
+    ),
+}  # fmt: skip
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 
 
@@ -54,6 +62,16 @@ def name(path):
     return str(path.relative_to(PACKAGE))
 
 
+def assert_goes_upward_inside(path, module):
+    """Within `operations` and `running` a file imports from those listed before it."""
+    folder, own = path.parent.name, path.stem
+    _, part, *rest = module.split(".")
+    if part == folder and folder in FLOORS:
+        floors = FLOORS[folder]
+        assert rest, f"{path} imports the folder it is in"
+        assert floors.index(rest[0]) <= floors.index(own), f"{path} imports {module} from below"
+
+
 @pytest.mark.parametrize("path", FILES, ids=name)
 def test_imports_go_upward(path):
     own = ORDER.index(part_of(path))
@@ -63,6 +81,7 @@ def test_imports_go_upward(path):
             part = module.split(".")[1]
             assert part in ORDER, f"{path} imports {module}, which has no place in the layout"
             assert ORDER.index(part) <= own, f"{path} imports {module} from further down"
+            assert_goes_upward_inside(path, module)
 
 
 @pytest.mark.parametrize("path", FILES, ids=name)
@@ -79,3 +98,25 @@ def test_the_library_imports_neither_its_tests_nor_its_benchmarks(path):
 
 def test_every_part_of_the_package_has_a_place_in_the_layout():
     assert {part_of(path) for path in FILES} <= set(ORDER)
+
+
+def test_every_file_of_a_folder_of_several_floors_has_one():
+    for folder, floors in FLOORS.items():
+        files = {path.stem for path in (PACKAGE / folder).glob("*.py")} - {"__init__"}
+        assert files == set(floors)
+
+
+@pytest.mark.parametrize("path", FILES, ids=name)
+def test_no_file_is_longer_than_a_visitor_reads(path):
+    """About four hundred lines; what is longer says here why."""
+    reasons = {
+        # One step of one algorithm, whose parts have no meaning apart from it.
+        "moves/clusters.py": 460,
+        # Every scheme is a few lines; what they share is the layout of rows of components.
+        "moves/resampling.py": 480,
+        # One climb, its checkpoints and its two entrances.
+        "tuning/climb.py": 570,
+        "vision/tracker.py": 480,
+    }
+    most = reasons.get(str(path.relative_to(PACKAGE).as_posix()), 400)
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= most

@@ -5,7 +5,29 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax import operations
+from mpfjax.operations.floats import default_float
+from mpfjax.operations.indexing import count_places, take
+from mpfjax.operations.logarithms import exp, log_sum_exp, softmax
+from mpfjax.operations.matrices import cholesky, draw_columns, row_sums, solve_lower
+from mpfjax.operations.prefix_sums import (
+    _blocked_sum_before,
+    _scanned_sum_before,
+    count_starts,
+    count_upto,
+    sum_before,
+)
+from mpfjax.operations.segments import (
+    order_by_segment,
+    segment_argmax,
+    segment_counts,
+    segment_log_sum_exp,
+    segment_max,
+    segment_softmax,
+    segment_sum,
+    segments_in_order,
+    spread,
+)
+from mpfjax.operations.stored import to_int, whole_blocks
 from tests.precision import float64
 
 RNG = np.random.default_rng(0)
@@ -18,7 +40,7 @@ FEW_AND_MANY = (1, 3, 4, 5, 17)
 def test_sums_before(n):
     values = RNG.random(n).astype(np.float32)
     upto = np.cumsum(values.astype(float))
-    before, total = operations.sum_before(jnp.asarray(values))
+    before, total = sum_before(jnp.asarray(values))
     np.testing.assert_allclose(before, np.concatenate([[0], upto[:-1]]), rtol=1e-5)
     np.testing.assert_allclose(total, upto[-1], rtol=1e-5)
 
@@ -26,7 +48,7 @@ def test_sums_before(n):
 def test_sums_before_in_float64_and_under_vmap():
     values = RNG.random((3, 200))
     with float64():
-        before, total = jax.vmap(operations.sum_before)(jnp.asarray(values))
+        before, total = jax.vmap(sum_before)(jnp.asarray(values))
         assert before.dtype == np.float64
         upto = np.cumsum(values, axis=1)
         np.testing.assert_allclose(before, upto - values, rtol=1e-13, atol=1e-14)
@@ -42,7 +64,7 @@ def test_sums_never_fall_and_zeros_add_nothing(n, how):
     rows[runs | (RNG.random((20, n)) < 0.3)] = 0
     rows[:3] = 0
     rows[1, n // 2] = rows[2, -1] = 1
-    sums = {"blocked": operations._blocked_sum_before, "scanned": operations._scanned_sum_before}
+    sums = {"blocked": _blocked_sum_before, "scanned": _scanned_sum_before}
     values = jnp.asarray(rows, jnp.float32)
     before, total = map(np.asarray, jax.vmap(sums[how])(values))
     line = np.concatenate([before, total[:, None]], axis=1)
@@ -53,7 +75,7 @@ def test_sums_never_fall_and_zeros_add_nothing(n, how):
 
 def test_exponentials_are_never_subnormal():
     powers = jnp.asarray([0.0, -70.0, -80.0, -95.0, -200.0, -jnp.inf, jnp.nan])
-    values = np.asarray(operations.exp(powers))
+    values = np.asarray(exp(powers))
     np.testing.assert_allclose(values[:2], np.exp([0.0, -70.0]), rtol=1e-5)
     assert (values[2:6] == 0).all()
     assert np.isnan(values[6])
@@ -65,25 +87,25 @@ def test_exponentials_are_never_subnormal():
 def test_count_upto_is_exact(n):
     ones = RNG.integers(0, 2, n)
     for values in (jnp.asarray(ones, jnp.int32), jnp.asarray(ones, bool)):
-        np.testing.assert_array_equal(operations.count_upto(values, n), np.cumsum(ones))
+        np.testing.assert_array_equal(count_upto(values, n), np.cumsum(ones))
 
 
 def test_count_upto_is_exact_where_float32_is_not():
     counts = np.array([2**23 - 1, 1, 2**24, 1, 0, 3])
-    found = operations.count_upto(jnp.asarray(counts, jnp.int32), int(counts.sum()))
+    found = count_upto(jnp.asarray(counts, jnp.int32), int(counts.sum()))
     np.testing.assert_array_equal(found, np.cumsum(counts))
 
 
 def test_whole_numbers_become_integers():
     whole = np.array([0, 1, 2, 3, 2**22, 2**23 - 1])
-    found = operations.to_int(jnp.asarray(whole, jnp.float32))
+    found = to_int(jnp.asarray(whole, jnp.float32))
     assert found.dtype == jnp.int32
     np.testing.assert_array_equal(found, whole)
 
 
 def test_more_places_than_float32_can_number():
     firsts = np.array([0, 1, 2**24 + 1, 2**24 + 3, 2**24 + 7])
-    segments = operations.segments_in_order(jnp.asarray(firsts, jnp.int32), 2**24 + 40)
+    segments = segments_in_order(jnp.asarray(firsts, jnp.int32), 2**24 + 40)
     np.testing.assert_array_equal(segments[firsts], np.arange(5))
     np.testing.assert_array_equal(segments[firsts[1:] - 1], np.arange(4))
 
@@ -92,15 +114,15 @@ def test_more_places_than_float32_can_number():
 def test_count_starts_is_a_search_for_the_last_start(n):
     starts = np.sort(RNG.integers(0, n + 3, n))
     expected = np.searchsorted(starts, np.arange(n), side="right") - 1
-    found = operations.count_starts(jnp.asarray(starts, jnp.int32), n)
+    found = count_starts(jnp.asarray(starts, jnp.int32), n)
     np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("n", [1, 7, 8, 31, 32, 1000, 1025])
 def test_whole_blocks_need_no_filling_up(n):
-    length = operations.whole_blocks(n)
+    length = whole_blocks(n)
     assert n <= length < n + 32
-    assert operations.whole_blocks(length) == length
+    assert whole_blocks(length) == length
 
 
 def test_places_are_counted_alone_and_under_two_vmaps():
@@ -109,7 +131,7 @@ def test_places_are_counted_alone_and_under_two_vmaps():
     places = jnp.asarray(places, jnp.int32)
 
     def count(row):
-        return operations.count_places(row, 9)
+        return count_places(row, 9)
 
     np.testing.assert_array_equal(jax.vmap(jax.vmap(count))(places), expected)
     np.testing.assert_array_equal(count(places[1, 2]), expected[1, 2])
@@ -128,25 +150,25 @@ class TestSegments:
         values, labels = labelled(90, m)
         rows = np.stack([values, values**2], axis=1)
         expected = np.stack([rows[labels == s].sum(axis=0) for s in range(m)])
-        found = operations.segment_sum(jnp.asarray(rows), jnp.asarray(labels, jnp.int32), m)
+        found = segment_sum(jnp.asarray(rows), jnp.asarray(labels, jnp.int32), m)
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
     def test_spread_gives_each_entry_its_segments_value(self, m):
         _, labels = labelled(90, m)
         of_segments = RNG.normal(size=(m, 2)).astype(np.float32)
-        found = operations.spread(jnp.asarray(of_segments), jnp.asarray(labels, jnp.int32))
+        found = spread(jnp.asarray(of_segments), jnp.asarray(labels, jnp.int32))
         np.testing.assert_array_equal(found, of_segments[labels])
 
     def test_labels_out_of_range_are_left_out(self, m):
         labels = jnp.array([0, m, m - 1], jnp.int32)
-        total = operations.segment_sum(jnp.ones(3), labels, m)
+        total = segment_sum(jnp.ones(3), labels, m)
         assert float(total.sum()) == 2
 
     def test_max_and_argmax(self, m):
         values, labels = labelled(90, m)
         arrays = jnp.asarray(values), jnp.asarray(labels, jnp.int32)
-        largest = operations.segment_max(*arrays, m)
-        index = np.asarray(operations.segment_argmax(*arrays, m))
+        largest = segment_max(*arrays, m)
+        index = np.asarray(segment_argmax(*arrays, m))
         for s in range(m):
             members = values[labels == s]
             if members.size:
@@ -158,9 +180,7 @@ class TestSegments:
 
     def test_counts(self, m):
         values, labels = labelled(90, m)
-        found = operations.segment_counts(
-            jnp.asarray(values > 0), jnp.asarray(labels, jnp.int32), m
-        )
+        found = segment_counts(jnp.asarray(values > 0), jnp.asarray(labels, jnp.int32), m)
         np.testing.assert_array_equal(
             found, [((labels == s) & (values > 0)).sum() for s in range(m)]
         )
@@ -169,9 +189,7 @@ class TestSegments:
         values, labels = labelled(90, m)
         values = 100 * values
         values[::7] = -np.inf
-        found = operations.segment_log_sum_exp(
-            jnp.asarray(values), jnp.asarray(labels, jnp.int32), m
-        )
+        found = segment_log_sum_exp(jnp.asarray(values), jnp.asarray(labels, jnp.int32), m)
         expected = [
             np.logaddexp.reduce(values[labels == s].astype(float), initial=-np.inf)
             for s in range(m)
@@ -181,7 +199,7 @@ class TestSegments:
     def test_order_by_segment_is_a_stable_argsort(self, m):
         _, labels = labelled(90, m)
         labels[::5] = m  # the empty slots, which come last
-        order, counts = operations.order_by_segment(jnp.asarray(labels, jnp.int32), m)
+        order, counts = order_by_segment(jnp.asarray(labels, jnp.int32), m)
         np.testing.assert_array_equal(order, np.argsort(labels, kind="stable"))
         np.testing.assert_array_equal(counts, np.bincount(labels.astype(int), minlength=m + 1)[:m])
 
@@ -197,7 +215,7 @@ def test_order_by_segment_counts_and_sorts_alike(n, m):
         np.zeros(n),
         np.arange(n)[::-1] % m,
     ):
-        order, counts = operations.order_by_segment(jnp.asarray(labels, jnp.int32), m)
+        order, counts = order_by_segment(jnp.asarray(labels, jnp.int32), m)
         np.testing.assert_array_equal(order, np.argsort(labels, kind="stable"))
         np.testing.assert_array_equal(counts, np.bincount(labels.astype(int), minlength=m + 1)[:m])
 
@@ -207,9 +225,9 @@ def test_runs_of_one_segment_are_added_up_in_lanes():
     rng = np.random.default_rng(5)
     labels = np.sort(rng.integers(-1, 8, (3, 200)), axis=1)
     values = rng.normal(size=(3, 200)).astype(np.float32)
-    own = jax.vmap(lambda v, s: operations.segment_sum(v, s, 7))
-    shared = jax.vmap(lambda v, s: operations.segment_sum(v, s, 7), (0, None))
-    largest = jax.vmap(lambda v, s: operations.segment_max(v, s, 7))
+    own = jax.vmap(lambda v, s: segment_sum(v, s, 7))
+    shared = jax.vmap(lambda v, s: segment_sum(v, s, 7), (0, None))
+    largest = jax.vmap(lambda v, s: segment_max(v, s, 7))
     expected = [[v[s == m].sum() for m in range(7)] for v, s in zip(values, labels, strict=True)]
     every = jnp.asarray(values), jnp.asarray(labels, jnp.int32)
     np.testing.assert_allclose(own(*every), expected, rtol=1e-4, atol=1e-5)
@@ -228,27 +246,23 @@ class TestSoftmax:
     @pytest.mark.parametrize("m", FEW_AND_MANY)
     def test_shares_sum_to_one_in_every_segment_that_has_any(self, m):
         labels = np.array([0, 0, m - 1, 0, m - 1, m - 1])
-        found = operations.segment_softmax(
-            jnp.asarray(self.VALUES), jnp.asarray(labels, jnp.int32), m
-        )
+        found = segment_softmax(jnp.asarray(self.VALUES), jnp.asarray(labels, jnp.int32), m)
         for s in np.unique(labels):
             weights = np.exp(self.VALUES[labels == s].astype(float))
             np.testing.assert_allclose(found[labels == s], weights / weights.sum(), rtol=1e-5)
 
     def test_one_segment_is_softmax(self):
-        alone = operations.softmax(jnp.asarray(self.VALUES))
+        alone = softmax(jnp.asarray(self.VALUES))
         segments = jnp.zeros(6, jnp.int32)
-        np.testing.assert_array_equal(
-            alone, operations.segment_softmax(jnp.asarray(self.VALUES), segments, 1)
-        )
-        assert (operations.softmax(jnp.full(3, -jnp.inf)) == 0).all()
+        np.testing.assert_array_equal(alone, segment_softmax(jnp.asarray(self.VALUES), segments, 1))
+        assert (softmax(jnp.full(3, -jnp.inf)) == 0).all()
 
     @pytest.mark.parametrize("m", FEW_AND_MANY)
     def test_gradient_is_finite_where_that_of_what_uses_the_shares_is_not(self, m):
         segments = jnp.zeros(6, jnp.int32)
 
         def entropy(values):
-            shares = operations.segment_softmax(values, segments, m)
+            shares = segment_softmax(values, segments, m)
             return jnp.sum(jnp.where(jnp.asarray(self.VALUES) > -100, jnp.log(shares), 0.0))
 
         assert np.isfinite(jax.grad(entropy)(jnp.asarray(self.VALUES))).all()
@@ -257,40 +271,40 @@ class TestSoftmax:
 class TestLogSumExp:
     def test_of_nothing_but_minus_infinity_is_minus_infinity_with_a_finite_gradient(self):
         values = jnp.full(5, -jnp.inf)
-        assert operations.log_sum_exp(values) == -jnp.inf
-        assert np.isfinite(jax.grad(operations.log_sum_exp)(values)).all()
+        assert log_sum_exp(values) == -jnp.inf
+        assert np.isfinite(jax.grad(log_sum_exp)(values)).all()
 
     def test_its_gradient_is_the_softmax(self):
         values = jnp.array([1.0, -jnp.inf, 3.0, -200.0])
-        gradient = jax.grad(operations.log_sum_exp)(values)
+        gradient = jax.grad(log_sum_exp)(values)
         np.testing.assert_allclose(gradient, jax.nn.softmax(values), rtol=1e-6)
 
     @pytest.mark.parametrize("scale", [1e4, -1e4])
     def test_neither_overflows_nor_underflows(self, scale):
         values = jnp.array([scale, scale + 1.0])
         expected = scale + np.log(1 + np.e)
-        np.testing.assert_allclose(operations.log_sum_exp(values), expected, rtol=1e-6)
+        np.testing.assert_allclose(log_sum_exp(values), expected, rtol=1e-6)
 
     def test_lets_nan_and_infinity_through(self):
-        assert np.isnan(operations.log_sum_exp(jnp.array([0.0, jnp.nan])))
-        assert operations.log_sum_exp(jnp.array([0.0, jnp.inf])) == jnp.inf
+        assert np.isnan(log_sum_exp(jnp.array([0.0, jnp.nan])))
+        assert log_sum_exp(jnp.array([0.0, jnp.inf])) == jnp.inf
 
 
 def test_take_is_indexing():
     values, indices = jnp.arange(12.0).reshape(6, 2), jnp.array([5, 0, 5], jnp.int32)
-    np.testing.assert_array_equal(operations.take(values, indices), np.asarray(values)[[5, 0, 5]])
+    np.testing.assert_array_equal(take(values, indices), np.asarray(values)[[5, 0, 5]])
 
 
 def test_default_float_follows_the_precision():
-    assert operations.default_float() == np.float32
+    assert default_float() == np.float32
     with float64():
-        assert operations.default_float() == np.float64
+        assert default_float() == np.float64
 
 
 def test_cholesky_of_many_small_matrices():
     factors = np.tril(RNG.normal(size=(50, 4, 4))).astype(np.float32)
     matrices = factors @ np.swapaxes(factors, 1, 2)
-    found = np.asarray(operations.cholesky(jnp.asarray(matrices)))
+    found = np.asarray(cholesky(jnp.asarray(matrices)))
     np.testing.assert_array_equal(found, np.tril(found))
     np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), matrices, rtol=1e-3, atol=1e-3)
 
@@ -300,7 +314,7 @@ def test_cholesky_does_not_depend_on_the_units():
     units = np.array([30.0, 20.0, 0.02, 0.01])
     correlations = np.full((4, 4), 0.5) + 0.5 * np.eye(4)
     matrix = (units[:, None] * correlations * units).astype(np.float32)
-    found = np.asarray(operations.cholesky(jnp.asarray(matrix)[None])[0])
+    found = np.asarray(cholesky(jnp.asarray(matrix)[None])[0])
     np.testing.assert_allclose(found, units[:, None] * np.linalg.cholesky(correlations), rtol=1e-4)
 
 
@@ -308,7 +322,7 @@ def test_cholesky_of_a_singular_matrix_leaves_out_the_direction():
     """Two coordinates that are one, in other units, and one that does not vary at all."""
     direction = np.array([2.0, 6e-3, 0.0], np.float32)
     matrix = np.outer(direction, direction)
-    found = np.asarray(operations.cholesky(jnp.asarray(matrix)[None])[0])
+    found = np.asarray(cholesky(jnp.asarray(matrix)[None])[0])
     np.testing.assert_allclose(found, np.stack([direction, 0 * direction, 0 * direction], axis=1))
 
 
@@ -316,9 +330,9 @@ def test_solve_lower_is_numpys():
     factors = np.tril(RNG.normal(size=(20, 3, 3)) + 3 * np.eye(3)).astype(np.float32)
     vectors = RNG.normal(size=(20, 3)).astype(np.float32)
     expected = np.linalg.solve(factors, vectors[:, :, None])[:, :, 0]
-    found = operations.solve_lower(jnp.asarray(factors), jnp.asarray(vectors))
+    found = solve_lower(jnp.asarray(factors), jnp.asarray(vectors))
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
-    shared = operations.solve_lower(jnp.asarray(factors[:1]), jnp.asarray(vectors))
+    shared = solve_lower(jnp.asarray(factors[:1]), jnp.asarray(vectors))
     expected = np.linalg.solve(factors[0], vectors.T).T
     np.testing.assert_allclose(shared, expected, rtol=1e-4, atol=1e-5)
 
@@ -326,9 +340,7 @@ def test_solve_lower_is_numpys():
 @pytest.mark.parametrize("columns", [1, 2, 16, 17, 40])
 def test_row_sums(columns):
     values = np.random.default_rng(0).normal(size=(9, columns)).astype(np.float32)
-    np.testing.assert_allclose(
-        operations.row_sums(jnp.asarray(values)), values.sum(axis=1), atol=1e-5
-    )
+    np.testing.assert_allclose(row_sums(jnp.asarray(values)), values.sum(axis=1), atol=1e-5)
 
 
 @pytest.mark.parametrize("columns", [1, 2, 7, 16, 50])
@@ -337,9 +349,7 @@ def test_draw_columns_finds_the_column_of_each_quantile(columns):
     weights = rng.exponential(size=(200, columns)) * (rng.random((200, columns)) < 0.6)
     weights[np.arange(200), rng.integers(0, columns, 200)] += 0.1
     uniform = rng.random(200)
-    drawn = np.asarray(
-        operations.draw_columns(*(jnp.asarray(a, jnp.float32) for a in (uniform, weights)))
-    )
+    drawn = np.asarray(draw_columns(*(jnp.asarray(a, jnp.float32) for a in (uniform, weights))))
     upto = np.cumsum(weights, axis=1)
     rows = np.arange(200)
     target = uniform * upto[:, -1]
@@ -350,9 +360,7 @@ def test_draw_columns_finds_the_column_of_each_quantile(columns):
 
 def test_draw_columns_at_the_ends():
     weights = jnp.array([[0.0, 1.0, 0.0, 0.0, 2.0, 0.0]])
-    first, last = (
-        int(operations.draw_columns(jnp.array([u]), weights)[0]) for u in (0.0, 0.99999994)
-    )
+    first, last = (int(draw_columns(jnp.array([u]), weights)[0]) for u in (0.0, 0.99999994))
     assert (first, last) == (1, 4)
 
 
@@ -364,7 +372,7 @@ class TestSumsOfAMillion:
 
     def test_of_equal_values(self, num_segments):
         segments = np.arange(self.n) % num_segments
-        found = operations.segment_sum(
+        found = segment_sum(
             jnp.full(self.n, 0.3, jnp.float32), jnp.asarray(segments, jnp.int32), num_segments
         )
         expected = np.float64(np.float32(0.3)) * np.bincount(segments)
@@ -373,9 +381,7 @@ class TestSumsOfAMillion:
     def test_of_values_far_from_zero(self, num_segments):
         segments = RNG.integers(0, num_segments, self.n)
         values = (1000 + RNG.normal(size=self.n)).astype(np.float32)
-        found = operations.segment_sum(
-            jnp.asarray(values), jnp.asarray(segments, jnp.int32), num_segments
-        )
+        found = segment_sum(jnp.asarray(values), jnp.asarray(segments, jnp.int32), num_segments)
         expected = np.bincount(segments, weights=values.astype(float))
         np.testing.assert_allclose(found, expected, rtol=2e-5)
 
@@ -391,7 +397,7 @@ def test_columns_of_no_weight_are_not_drawn_at_the_borders_of_blocks():
         quantiles = np.concatenate([upto[np.arange(400), border] / upto[:, -1], np.zeros(400)])
         quantiles = np.concatenate([quantiles, np.full(400, np.nextafter(np.float32(1), 0))])
         table = np.tile(weights, (3, 1))
-        found = operations.draw_columns(
+        found = draw_columns(
             jnp.asarray(np.minimum(quantiles, np.nextafter(np.float32(1), 0)), jnp.float32),
             jnp.asarray(table),
         )
@@ -399,5 +405,5 @@ def test_columns_of_no_weight_are_not_drawn_at_the_borders_of_blocks():
 
 
 def test_the_last_column_is_drawn_of_a_row_without_weight():
-    found = operations.draw_columns(jnp.array([0.0, 0.7]), jnp.zeros((2, 11)))
+    found = draw_columns(jnp.array([0.0, 0.7]), jnp.zeros((2, 11)))
     np.testing.assert_array_equal(found, [10, 10])

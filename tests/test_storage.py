@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.generator import fast_key
-from mpfjax.storage import describe, load_arrays, write_arrays
+from mpfjax.operations.generator import fast_key
+from mpfjax.running.storage import describe, load_arrays, write_arrays
 from tests.examples import make_mixture
 from tests.full_disk import no_room_beyond
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax import studies
+from mpfjax.running import studies
 from tests.full_disk import no_room_beyond
 from tests.small_study import OBSERVATIONS, build, mean, measure, run_in_process, small_study
 from tests.user_models import TrickyQuadraticModel, nothing_traced

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import shown
-from mpfjax.generator import split
+from mpfjax.operations.generator import split
 
 
 class AbstractStateSpaceModel(eqx.Module):

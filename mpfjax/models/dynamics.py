@@ -13,8 +13,8 @@ from mpfjax.checks import (
     check_scalars,
     to_array,
 )
-from mpfjax.generator import normal
-from mpfjax.operations import cholesky, row_sums, solve_lower
+from mpfjax.operations.generator import normal
+from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
 
 
 class AbstractDynamics(eqx.Module):

@@ -15,7 +15,7 @@ from mpfjax.checks import (
     to_array,
 )
 from mpfjax.mixture import flatten_states
-from mpfjax.operations import row_sums
+from mpfjax.operations.matrices import row_sums
 
 
 class PairwiseRepulsion(eqx.Module):

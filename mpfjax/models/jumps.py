@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import check_inner_share, check_positive_array, check_rows, to_array
-from mpfjax.generator import fast_key, normal, split
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
+from mpfjax.operations.generator import fast_key, normal, split
 
 
 class RandomWalkWithJumps(AbstractDynamics):

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import check_finite_array, to_array
-from mpfjax.generator import normal
 from mpfjax.models.base import AbstractStateSpaceModel
-from mpfjax.operations import row_sums, solve_lower
+from mpfjax.operations.generator import normal
+from mpfjax.operations.matrices import row_sums, solve_lower
 
 
 class LinearGaussianModel(AbstractStateSpaceModel):

@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.checks import check_callable, check_flag, check_whole, given, shown
-from mpfjax.generator import split
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     check_log_density,
     check_model,
     model_name,
 )
+from mpfjax.operations.generator import split
 
 # A number of particles that no parameter has by chance as the length of an axis.
 _TRIAL = 1_000_003

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from mpfjax.generator import bits, normal, normal_quantile, uniform
+from mpfjax.operations.generator import bits, normal, normal_quantile, uniform
 
 
 def independent_normal(

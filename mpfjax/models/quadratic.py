@@ -11,9 +11,9 @@ from mpfjax.checks import (
     check_scalars,
     to_array,
 )
-from mpfjax.generator import normal, uniform
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.noise import stratified_uniform
+from mpfjax.operations.generator import normal, uniform
 
 
 class QuadraticModel(AbstractStateSpaceModel):

@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.operations import without_gradient
+from mpfjax.operations.gradients import without_gradient
 
 
 class AbstractMove(eqx.Module):

@@ -10,14 +10,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import check_one_of, check_whole, given
-from mpfjax.generator import split, uniform
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling import Resample
 from mpfjax.moves.slots import require_all_slots
-from mpfjax.operations import default_float, draw_columns, finite_max, take
+from mpfjax.operations.floats import default_float
+from mpfjax.operations.generator import split, uniform
+from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import finite_max
+from mpfjax.operations.matrices import draw_columns
 
 STARTS = ("apart", "together")
 _GOLDEN = (np.sqrt(5) - 1) / 2

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Key, PyTree
 
 from mpfjax.checks import check_share
-from mpfjax.devices import deal_to_islands, num_islands, over_islands
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
-from mpfjax.operations import softmax
+from mpfjax.operations.across_islands import deal_to_islands, num_islands, over_islands
+from mpfjax.operations.logarithms import softmax
 
 
 class Exchange(AbstractMove):

@@ -10,7 +10,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from mpfjax.checks import check_callable, check_positive_array, given, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
-from mpfjax.operations import as_inexact, segment_sum, spread
+from mpfjax.operations.floats import as_inexact
+from mpfjax.operations.segments import segment_sum, spread
 
 Scale = ArrayLike | Sequence[float]
 

@@ -9,14 +9,16 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_callable, check_one_of, check_positive, check_whole, given
-from mpfjax.generator import split
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import AbstractRejuvenation
 from mpfjax.moves.features import origin, summarise
 from mpfjax.moves.resampling import Resample
 from mpfjax.moves.slots import deal_slots, place_slots
-from mpfjax.operations import cholesky, segment_argmax, spread, take
+from mpfjax.operations.generator import split
+from mpfjax.operations.indexing import take
+from mpfjax.operations.matrices import cholesky
+from mpfjax.operations.segments import segment_argmax, spread
 
 
 class GaussianRegeneration(AbstractRejuvenation):

@@ -5,12 +5,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.generator import split
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling import Resample
 from mpfjax.moves.slots import require_all_slots
+from mpfjax.operations.generator import split
 
 
 class PropagateIndependently(AbstractPropagation):

@@ -11,14 +11,17 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import check_one_of, shown
-from mpfjax.generator import split
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation import predict
 from mpfjax.moves.resampling import Resample
-from mpfjax.operations import add_gradient, log_sum_exp, spread, take, without_gradient
+from mpfjax.operations.generator import split
+from mpfjax.operations.gradients import add_gradient, without_gradient
+from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import log_sum_exp
+from mpfjax.operations.segments import spread
 
 REASSEMBLIES = ("evidence", "prior")
 

@@ -19,7 +19,7 @@ from mpfjax.models.base import (
     require,
 )
 from mpfjax.moves.base import AbstractPropagation
-from mpfjax.operations import add_gradient
+from mpfjax.operations.gradients import add_gradient
 from mpfjax.proposals import AbstractProposal
 
 

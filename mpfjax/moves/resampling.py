@@ -16,7 +16,6 @@ from mpfjax.checks import (
     check_whole,
     given,
 )
-from mpfjax.generator import uniform
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRejuvenation
 from mpfjax.moves.slots import (
@@ -25,20 +24,18 @@ from mpfjax.moves.slots import (
     place_slots,
 )
 from mpfjax.moves.transport import require_ott, transport
-from mpfjax.operations import (
-    add_gradient,
-    count_starts,
+from mpfjax.operations.generator import uniform
+from mpfjax.operations.gradients import add_gradient
+from mpfjax.operations.indexing import take
+from mpfjax.operations.prefix_sums import count_starts, sum_before
+from mpfjax.operations.segments import (
     order_by_segment,
     segment_counts,
     segment_log_sum_exp,
     segment_sum,
     spread,
-    stored,
-    sum_before,
-    take,
-    to_int,
-    whole_blocks,
 )
+from mpfjax.operations.stored import stored, to_int, whole_blocks
 
 # Up to so many components are resampled as they stand, each in a pass of its own.
 FEW_ROWS = 4

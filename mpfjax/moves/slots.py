@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.operations import segments_in_order, spread, stored
+from mpfjax.operations.segments import segments_in_order, spread
+from mpfjax.operations.stored import stored
 
 
 class Slots(NamedTuple):

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.operations import spread, take
+from mpfjax.operations.indexing import take
+from mpfjax.operations.segments import spread
 
 # In units of the regularisation: e^-APART is nothing in any floating point type.
 _APART = 1e4

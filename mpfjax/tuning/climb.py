@@ -27,8 +27,8 @@ from mpfjax.checks import (
     given,
     shown,
 )
-from mpfjax.filters import Filter
-from mpfjax.storage import fingerprint, load_arrays, write_arrays
+from mpfjax.filter import Filter
+from mpfjax.running.storage import fingerprint, load_arrays, write_arrays
 from mpfjax.tuning.curvature import errors_at
 from mpfjax.tuning.identity import contents_of, unlike
 from mpfjax.tuning.problem import (

@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_key, check_whole
-from mpfjax.filters import Filter
+from mpfjax.filter import Filter
 from mpfjax.tuning.problem import (
     Parameters,
     Problem,

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpfjax.storage import differences, fingerprint, named
+from mpfjax.running.storage import differences, fingerprint, named
 
 # Functions of these are what their names say; of others the code counts as well.
 _LIBRARIES = ("chex", "equinox", "jax", "jaxlib", "mpfjax", "numpy", "optax")

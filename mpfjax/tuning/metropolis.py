@@ -22,7 +22,7 @@ from mpfjax.checks import (
     check_whole,
     shown,
 )
-from mpfjax.filters import Filter
+from mpfjax.filter import Filter
 from mpfjax.tuning.problem import Parameters, Problem, pose_evidence
 from mpfjax.tuning.transforms import AbstractTransform
 

@@ -13,11 +13,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_type, shown
-from mpfjax.filters import Filter, present_steps, scan_filter
+from mpfjax.filter import Filter
 from mpfjax.moves.clusters import PropagateInClusters
 from mpfjax.moves.independent import PropagateIndependently
 from mpfjax.moves.resampling import Resample
+from mpfjax.observations import present_steps
 from mpfjax.proposals import AbstractProposal
+from mpfjax.running.scan import scan_filter
 from mpfjax.tuning.transforms import AbstractTransform, Unconstrained
 
 _DECLARED = "eqx.field(converter=jnp.asarray)"

@@ -19,9 +19,9 @@ from mpfjax.checks import (
     shown,
     to_rows,
 )
-from mpfjax.generator import fast_key
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
+from mpfjax.operations.generator import fast_key
 from mpfjax.vision.boxes import centred, check_boxes
 from mpfjax.vision.colours import AbstractColours, RGBColours
 from mpfjax.vision.frames import check_frame

@@ -17,9 +17,9 @@ from mpfjax.checks import (
     to_array,
     to_rows,
 )
-from mpfjax.generator import fast_key
 from mpfjax.models.base import AbstractStateSpaceModel
-from mpfjax.operations import take
+from mpfjax.operations.generator import fast_key
+from mpfjax.operations.indexing import take
 from mpfjax.proposals import AbstractProposal
 from mpfjax.vision.boxes import centred
 from mpfjax.vision.colour_model import BoxState, ColourModel

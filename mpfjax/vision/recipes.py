@@ -11,13 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from mpfjax.filters import Filter, mixture_particle_filter, particle_filter
+from mpfjax.filter import Filter
+from mpfjax.filters import mixture_particle_filter, particle_filter
 from mpfjax.models.jumps import RandomWalkWithJumps
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.exclusion import Exclusion
+from mpfjax.moves.kmeans import KMeans
+from mpfjax.moves.merge import Merge
 from mpfjax.moves.propagation import Propagate
-from mpfjax.moves.regrouping import KMeans, Merge, Split
 from mpfjax.moves.resampling import Resample
+from mpfjax.moves.split import Split
 from mpfjax.vision.colour_model import BoxState, ColourModel
 from mpfjax.vision.colours import RGBColours
 from mpfjax.vision.object_moves import ObjectExclusion, PruneHypotheses

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
 from mpfjax.checks import check_key, check_type, check_whole
-from mpfjax.filters import Filter
+from mpfjax.filter import Filter
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import drawing
 

@@ -10,14 +10,15 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt8
 from optax.assignment import hungarian_algorithm
 
 from mpfjax.checks import check_flag, check_positive, check_share, check_type, check_whole, shown
-from mpfjax.filters import Filter
-from mpfjax.generator import fast_key
+from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.dynamics import Autoregression
 from mpfjax.moves.base import AbstractRejuvenation
 from mpfjax.moves.gaussian import GaussianRegeneration
 from mpfjax.moves.propagation import Propagate
-from mpfjax.operations import default_float, take
+from mpfjax.operations.floats import default_float
+from mpfjax.operations.generator import fast_key
+from mpfjax.operations.indexing import take
 from mpfjax.vision.colour_model import BoxState, ColourModel
 from mpfjax.vision.colours import AbstractColours, HSVColours
 from mpfjax.vision.detected_model import (

@@ -56,7 +56,7 @@ def test_draws_both_figures(finished):
 def test_an_interruption_leaves_what_was_finished_and_the_next_run_goes_on(
     finished, tmp_path, monkeypatch, capsys
 ):
-    real, built = mpfjax.studies.monte_carlo, []
+    real, built = mpfjax.running.studies.monte_carlo, []
 
     def interrupted(keys, filter, *rest, **options):
         built.append(filter.num_particles)
@@ -65,7 +65,7 @@ def test_an_interruption_leaves_what_was_finished_and_the_next_run_goes_on(
         return real(keys, filter, *rest, **options)
 
     arguments = ["--seeds", "3", "--particles", "20", "40", "--out", str(tmp_path)]
-    monkeypatch.setattr(mpfjax.studies, "monte_carlo", interrupted)
+    monkeypatch.setattr(mpfjax.running.studies, "monte_carlo", interrupted)
     assert benchmark.main(arguments) == 130
     written = json.loads((tmp_path / "score_vs_particles.json").read_text())
     names = [(entry["filter"], entry["particles"]) for entry in written["results"]]
@@ -79,7 +79,7 @@ def test_an_interruption_leaves_what_was_finished_and_the_next_run_goes_on(
         return real(keys, filter, *rest, **options)
 
     built.clear()
-    monkeypatch.setattr(mpfjax.studies, "monte_carlo", noted)
+    monkeypatch.setattr(mpfjax.running.studies, "monte_carlo", noted)
     assert benchmark.main(arguments) == 0
     assert built == [40, 40, 40]
     assert json.loads((tmp_path / "score_vs_particles.json").read_text()) == finished[1]

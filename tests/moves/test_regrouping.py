@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from mpfjax import Filter, KMeans, Merge, Pool, QuadraticModel, RandomPartition, Split
-from mpfjax.moves.regrouping import farthest_first, free_labels, lowest_connected
+from mpfjax.moves.kmeans import farthest_first
+from mpfjax.moves.merge import lowest_connected
+from mpfjax.moves.split import free_labels
 from tests.examples import make_mixture
 
 KEY = jax.random.key(0)

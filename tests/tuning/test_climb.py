@@ -219,15 +219,15 @@ class TestResuming:
     def test_a_file_with_other_arrays_is_damaged(self, tmp_path, name, array):
         path = tmp_path / "fit.npz"
         short_fit(2, checkpoint=path)
-        arrays = mpfjax.storage.load_arrays(path)
+        arrays = mpfjax.running.storage.load_arrays(path)
         del arrays[name]
-        mpfjax.storage.write_arrays(path, arrays | ({} if array is None else {name: array}))
+        mpfjax.running.storage.write_arrays(path, arrays | ({} if array is None else {name: array}))
         with pytest.raises(ValueError, match=r"checkpoint: .*fit\.npz is damaged"):
             short_fit(checkpoint=path)
 
     def test_a_file_of_something_else_is_refused(self, tmp_path):
         path = tmp_path / "fit.npz"
-        mpfjax.storage.write_arrays(path, {"step": np.array(3)})
+        mpfjax.running.storage.write_arrays(path, {"step": np.array(3)})
         with pytest.raises(ValueError, match=r"fit\.npz is no checkpoint of a climb"):
             short_fit(checkpoint=path)
 

@@ -18,9 +18,12 @@ from jaxtyping import Array, Key, PyTree
 from tqdm import tqdm
 
 from mpfjax.checks import check_callable, check_key, check_type, check_whole, given, shown
-from mpfjax.filters import Filter, FilterRun, monte_carlo, present_steps
+from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.storage import (
+from mpfjax.observations import present_steps
+from mpfjax.running.run import monte_carlo
+from mpfjax.running.scan import FilterRun
+from mpfjax.running.storage import (
     as_path,
     describe,
     differences,

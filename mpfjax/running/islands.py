@@ -8,25 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_key, check_whole
-from mpfjax.devices import (
-    DEVICE_AXIS,
-    ISLAND_AXIS,
-    choose_devices,
-    is_traced,
-    jit_on_wide_vectors,
-    over_devices,
-)
-from mpfjax.filters import (
-    Filter,
-    FilterRun,
-    as_arrays,
-    check_run,
-    checked,
-    present_steps,
-    scan_filter,
-    with_floats_traced,
-)
+from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
+from mpfjax.observations import as_arrays, present_steps
+from mpfjax.operations.across_islands import DEVICE_AXIS, ISLAND_AXIS
+from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
+from mpfjax.running.devices import choose_devices, over_devices
+from mpfjax.running.scan import FilterRun, check_run, checked, scan_filter
 
 
 def run_islands(

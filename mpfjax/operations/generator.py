@@ -12,7 +12,8 @@ from jax.extend.random import define_prng_impl, threefry_prng_impl
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Key, UInt32
 
-from mpfjax.operations import default_float, stored
+from mpfjax.operations.floats import default_float
+from mpfjax.operations.stored import stored
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA

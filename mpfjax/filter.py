@@ -1,0 +1,309 @@
+"""A filter: a chain of moves on a particle mixture, one step at a time."""
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from mpfjax.checks import check_callable, check_key, check_type, check_whole, shown
+from mpfjax.mixture import ParticleMixture, single_component
+from mpfjax.models.base import AbstractStateSpaceModel, check_model, check_states
+from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
+from mpfjax.moves.exchange import Exchange
+from mpfjax.moves.resampling import Resample
+from mpfjax.observations import checked_observation, one_observation
+from mpfjax.operations.across_islands import excess_over_islands, island_index, num_islands
+from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
+from mpfjax.operations.generator import split
+from mpfjax.operations.logarithms import scaled_log_sum_exp
+
+
+class StepInfo(eqx.Module):
+    """What a step reports beside the mixture it returns."""
+
+    log_likelihood_increment: Float[Array, ""]
+    """log p(y_t | y_1..y_{t-1}), estimated; -inf where every particle has zero likelihood."""
+    effective_sample_sizes: Float[Array, " m"]
+    """of each component of the new mixture, zero for a dead one."""
+    mixture_weights: Float[Array, " m"]
+    """the mass of each component of the new mixture."""
+    resampled: Bool[Array, " m"]
+    """which components of the mixture that the step was given were resampled."""
+    degenerate: Bool[Array, ""]
+    """whether every particle had zero likelihood: the weights are then those of the prediction."""
+
+
+# Moves that leave the total mass as it is, so that there is nothing to normalise.
+_KEEP_MASS = (AbstractRegrouping, AbstractRejuvenation, Exchange)
+BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
+
+
+class Start(NamedTuple):
+    """Where a run starts: its key, and x_0 where that was drawn before."""
+
+    key: Key[Array, "*seeds"]
+    particles: PyTree = None
+    """as many as there are slots, of which those after the first `num_particles` are empty."""
+    num_particles: Int[Array, "*seeds"] | None = None
+
+
+class _Tied(eqx.Module):
+    """Stands in a move where the filter's own model belongs, so that it is stored only once."""
+
+
+class Filter(eqx.Module):
+    """A particle filter: a chain of moves on a particle mixture.
+
+    One step applies the moves in order and normalises. The growth of the total mass is the
+    increment of the marginal likelihood, whatever the moves are.
+
+    - `model`: draws x_0. Moves that hold the very same model share it: the filter is a pytree
+      with one copy of the model's parameters, so that its gradient is the gradient.
+    - `moves`: callables `(key, mixture, observation) -> mixture`, usually `AbstractMove`s.
+    - `num_particles`, `num_components`: N slots, and M, the most components.
+    - `initial_moves`: regrouping of x_0, such as `KMeans(reseed=True)`.
+
+    Raises `ValueError` for N < 1, M < 1, N < M, no moves, or fewer slots than
+    `particles_per_component` asks for.
+    """
+
+    model: AbstractStateSpaceModel
+    _moves: tuple[Any, ...]
+    _initial_moves: tuple[Any, ...]
+    num_particles: int = eqx.field(static=True)
+    num_components: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        model: AbstractStateSpaceModel,
+        moves: Iterable[Callable[..., ParticleMixture]],
+        num_particles: int,
+        num_components: int = 1,
+        initial_moves: Iterable[AbstractRegrouping] = (),
+    ) -> None:
+        check_model(model, "Filter")
+        moves = _as_moves(moves, "moves")
+        initial_moves = _as_moves(initial_moves, "initial_moves")
+        _check_sizes(num_particles, num_components)
+        if not moves:
+            raise ValueError("moves: a filter needs at least one")
+        for move in moves:
+            per_component = getattr(move, "particles_per_component", None)
+            if per_component is not None and per_component * num_components > num_particles:
+                raise ValueError(
+                    f"particles_per_component: {per_component} for each of {num_components}"
+                    f" components needs more than num_particles, {num_particles}"
+                )
+        names = [n for move in moves if isinstance(move, AbstractMove) for n in _memory_of(move)]
+        if len(set(names)) < len(names):
+            raise ValueError(f"moves: two of them would share one memory, of {sorted(names)}")
+        self.model = model
+        self._moves = _tie(moves, model)
+        self._initial_moves = _tie(initial_moves, model)
+        self.num_particles = int(num_particles)
+        self.num_components = int(num_components)
+
+    @property
+    def moves(self) -> tuple[Any, ...]:
+        """The moves of one step, each with the filter's model where it shares it."""
+        return untie(self._moves, self.model)
+
+    @property
+    def approximate(self) -> bool:
+        """Whether any move departs from the exact recursion."""
+        return any(getattr(move, "approximate", True) for move in self.moves)
+
+    def init(self, key: Key[Array, ""]) -> ParticleMixture:
+        """The mixture at time 0: draws of x_0 with equal weights, grouped by the initial moves."""
+        check_key(key)
+        return self._init(Start(key))
+
+    def _init(self, start: Start) -> ParticleMixture:
+        keys = split_keys(start.key, 1 + len(self._initial_moves))
+        particles = start.particles
+        if particles is None:
+            particles = sample_initial(keys[0], self.model, self.num_particles)
+        memory = {}
+        for move in self.moves:
+            if isinstance(move, AbstractMove):
+                memory |= move.initial_memory(self.num_components)
+        mixture = single_component(particles, self.num_components, start.num_particles)
+        mixture = mixture.replace(memory=memory)
+        for move_key, move in zip(keys[1:], untie(self._initial_moves, self.model), strict=True):
+            mixture = move(move_key, mixture)
+        return mixture
+
+    def step(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> tuple[ParticleMixture, StepInfo]:
+        """The mixture at t and a report, from the mixture at t-1 and y_t.
+
+        A NaN or infinite observation is an error, unless the model says that it takes NaN for what
+        is missing; a step that has no observation is `predict`'s. Where every particle has zero
+        likelihood the increment is -inf, the particles move on with the weights that they had
+        before, and `degenerate` is true.
+        """
+        check_key(key)
+        check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
+        observation = one_observation(observation)
+        return with_floats_traced(
+            lambda filter: _checked_step(filter, key, mixture, observation), self
+        )
+
+    def predict(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[ParticleMixture, StepInfo]:
+        """One step without an observation: the particles propagate, the weights stay.
+
+        For a missing y_t, or to forecast. The increment is zero. Raises `ValueError` for a move
+        that does not say what it does without an observation.
+        """
+        check_key(key)
+        check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
+        return with_floats_traced(lambda filter: _checked_predict(filter, key, mixture), self)
+
+    def _step(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> tuple[ParticleMixture, StepInfo]:
+        if mixture.num_components != self.num_components:
+            raise ValueError(
+                f"mixture: its num_components, {mixture.num_components}, is not the filter's,"
+                f" {self.num_components}"
+            )
+        mixture = _own_ancestors(mixture)
+        resampled = jnp.zeros(self.num_components, bool)
+        increment = jnp.zeros((), mixture.log_weights.dtype)
+        for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
+            if isinstance(move, Resample):
+                resampled |= move.is_due(mixture)
+            moved = move(move_key, mixture, observation)
+            if not isinstance(move, _KEEP_MASS):
+                moved, log_growth = _normalise(moved, mixture.log_weights)
+                increment += log_growth
+            mixture = self._forgetting(moved)
+        return mixture, _report(mixture, increment, resampled)
+
+    def _forgetting(self, mixture: ParticleMixture) -> ParticleMixture:
+        """The mixture, in whose memory there is nothing of components that have died."""
+        if not mixture.memory:
+            return mixture
+        memory, dead = mixture.memory, ~mixture.active
+        for move in self.moves:
+            if isinstance(move, AbstractMove):
+                memory = move.forget(memory, dead)
+        return mixture.replace(memory=memory)
+
+    def _predict(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[ParticleMixture, StepInfo]:
+        mixture = _own_ancestors(mixture)
+        for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
+            if not isinstance(move, AbstractMove):
+                raise ValueError(f"moves: {move!r} does not define predict, for a missing y_t")
+            mixture = self._forgetting(move.predict(move_key, mixture))
+        increment = jnp.zeros((), mixture.log_weights.dtype)
+        return mixture, _report(mixture, increment, jnp.zeros(self.num_components, bool))
+
+
+@jit_on_wide_vectors
+def _checked_step(filter, key, mixture, observation):
+    observation = checked_observation(observation, filter.model)
+    moved, info = filter._step(key, mixture, observation)
+    broken = ~(info.log_likelihood_increment < jnp.inf)
+    return eqx.error_if((moved, info), broken, BROKEN_DENSITY)
+
+
+@jit_on_wide_vectors
+def _checked_predict(filter, key, mixture):
+    return filter._predict(key, mixture)
+
+
+def sample_initial(
+    key: Key[Array, ""], model: AbstractStateSpaceModel, num_particles: int
+) -> PyTree:
+    """The model's x_0; raises for leaves of another length."""
+    particles = model.sample_initial(key, num_particles)
+    check_states(particles, model, "sample_initial", num_particles)
+    return particles
+
+
+def _normalise(
+    mixture: ParticleMixture, previous_log_weights: Float[Array, " n"]
+) -> tuple[ParticleMixture, Float[Array, ""]]:
+    """Remove the mass's growth; where no mass is left, go on with the weights of before.
+
+    The scale goes first, and exactly: with it the sum of the weights would be rounded away.
+    """
+    log_sum, log_largest = scaled_log_sum_exp(mixture.log_weights)
+    own_scale = jnp.zeros_like(log_sum) if mixture.log_scale is None else mixture.log_scale
+    log_excess, log_total, log_scale = excess_over_islands(own_scale, log_largest, log_sum)
+    has_mass = log_total > -jnp.inf
+    log_share = log_excess - jnp.where(has_mass, log_total, 0.0)
+    normalised = (mixture.log_weights - log_largest) + log_share
+    # NaN compares false, and must not be taken for a step of zero likelihood.
+    keep = has_mass | jnp.isnan(log_total)
+    log_weights = jnp.where(keep, normalised, previous_log_weights)
+    return mixture.replace(log_weights=log_weights, log_scale=None), log_scale + log_total
+
+
+def _report(
+    mixture: ParticleMixture, increment: Float[Array, ""], resampled: Bool[Array, " m"]
+) -> StepInfo:
+    return StepInfo(
+        log_likelihood_increment=increment,
+        effective_sample_sizes=mixture.component_effective_sample_sizes,
+        mixture_weights=mixture.mixture_weights,
+        resampled=resampled,
+        degenerate=increment == -jnp.inf,
+    )
+
+
+def _own_ancestors(mixture: ParticleMixture) -> ParticleMixture:
+    own = jnp.arange(mixture.num_particles, dtype=jnp.int32)
+    if num_islands() > 1:
+        own += mixture.num_particles * island_index()
+    return mixture.replace(ancestor_indices=own)
+
+
+def split_keys(key: Key[Array, ""], num: int) -> list[Key[Array, ""]]:
+    """One key for each move; the first ones are the same whatever their number, so that a longer
+    chain draws alike.
+    """
+    return list(split(key, num))
+
+
+def _memory_of(move: AbstractMove) -> list[str]:
+    return list(move.initial_memory(1))
+
+
+def _tie(moves: tuple[Any, ...], model: Any) -> tuple[Any, ...]:
+    is_model = lambda node: node is model  # noqa: E731
+    return jax.tree.map(lambda node: _Tied() if node is model else node, moves, is_leaf=is_model)
+
+
+def untie(moves: tuple[Any, ...], model: Any) -> tuple[Any, ...]:
+    is_tied = lambda node: isinstance(node, _Tied)  # noqa: E731
+    return jax.tree.map(lambda node: model if is_tied(node) else node, moves, is_leaf=is_tied)
+
+
+def _as_moves(moves: Any, name: str) -> tuple[Any, ...]:
+    """The moves as a tuple; a `ValueError` for what is none, or a single one without its list."""
+    if not isinstance(moves, Iterable) or isinstance(moves, str | dict | jax.Array | np.ndarray):
+        raise ValueError(f"{name}: {shown(moves)} is not a list of moves")
+    moves = tuple(moves)
+    for move in moves:
+        check_callable("a move, (key, mixture, observation) -> mixture", **{name: move})
+    return moves
+
+
+def _check_sizes(num_particles: int, num_components: int) -> None:
+    check_whole(num_particles=num_particles, num_components=num_components)
+    if num_particles < num_components:
+        raise ValueError(
+            f"num_particles: {num_particles} is less than num_components, {num_components};"
+            " every component needs a particle"
+        )

@@ -1,0 +1,95 @@
+"""K-means: every particle to the nearest centroid, each centroid to the mean of its particles."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from mpfjax.checks import check_flag, check_whole
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractRegrouping
+from mpfjax.moves.features import Features, Scale
+from mpfjax.moves.nearest import nearest
+from mpfjax.operations.segments import segment_counts, segment_sum
+
+
+class KMeans(AbstractRegrouping):
+    """A fixed number of K-means iterations, from the components as they are.
+
+    Vermaak et al. (2003), section 4. Each particle counts the same whatever its weight: the
+    groups are to cover the places that hold particles, and on the quadratic model weighting
+    loses modes. A component without a particle is dead and stays so; a component keeps its label.
+
+    - `num_iterations`: assignments of all particles; the centroids move in between.
+    - `reseed`: start from all M components instead, seeded by farthest-first traversal from the
+      particle farthest from the mean. For the grouping of x_0.
+    - `features`, `scale`: see `Features`.
+
+    Raises `ValueError` for fewer than one iteration.
+    """
+
+    num_iterations: int = eqx.field(static=True)
+    reseed: bool = eqx.field(static=True)
+    features: Features
+
+    def __init__(
+        self,
+        num_iterations: int = 5,
+        *,
+        reseed: bool = False,
+        features: Callable[[PyTree], Array] | None = None,
+        scale: Scale = 1.0,
+    ) -> None:
+        check_whole(num_iterations=num_iterations)
+        check_flag(reseed=reseed)
+        self.num_iterations = num_iterations
+        self.reseed = reseed
+        self.features = Features(features, scale)
+
+    def regroup(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+        """Each particle to the component whose centroid is nearest."""
+        del key
+        features, occupied, m = self.features(mixture), mixture.occupied, mixture.num_components
+        if self.reseed:
+            alive = jnp.ones(m, bool)
+            labels = nearest(features, farthest_first(features, occupied, m), alive)
+        else:
+            labels = mixture.component_indicators
+
+        def iterate(_: int | Int[Array, ""], labels: Int[Array, " n"]) -> Int[Array, " n"]:
+            centroids, alive = _centroids(features, occupied, labels, m)
+            return nearest(features, centroids, alive)
+
+        labels = jax.lax.fori_loop(0, self.num_iterations, iterate, labels)
+        return labels, mixture.memory
+
+
+def farthest_first(
+    features: Float[Array, "n k"], occupied: Bool[Array, " n"], num_seeds: int
+) -> Float[Array, "num_seeds k"]:
+    """Seeds for K-means: the particle farthest from the mean, then each farthest from all."""
+    weight = occupied.astype(features.dtype)[:, None]
+    mean = jnp.sum(weight * features, axis=0) / jnp.maximum(jnp.sum(weight), 1.0)
+    distance = jnp.sum((features - mean[None]) ** 2, axis=1)
+    seeds = []
+    for m in range(num_seeds):
+        seed = features[jnp.argmax(jnp.where(occupied, distance, -1.0))]
+        to_seed = jnp.sum((features - seed[None]) ** 2, axis=1)
+        distance = to_seed if m == 0 else jnp.minimum(distance, to_seed)
+        seeds.append(seed)
+    return jnp.stack(seeds)
+
+
+def _centroids(
+    features: Float[Array, "n k"],
+    occupied: Bool[Array, " n"],
+    labels: Int[Array, " n"],
+    num_components: int,
+) -> tuple[Float[Array, "m k"], Bool[Array, " m"]]:
+    counts = segment_counts(occupied, labels, num_components)
+    sums = segment_sum(jnp.where(occupied[:, None], features, 0.0), labels, num_components)
+    return sums / jnp.maximum(counts, 1).astype(features.dtype)[:, None], counts > 0

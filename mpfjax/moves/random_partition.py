@@ -1,0 +1,55 @@
+"""Random partition: the particles dealt into sets of equal size."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, Key, PyTree
+
+from mpfjax.checks import check_whole, given
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractRegrouping
+from mpfjax.operations.generator import bits
+from mpfjax.operations.indexing import take
+from mpfjax.operations.prefix_sums import count_upto
+
+
+class RandomPartition(AbstractRegrouping):
+    """The particles dealt at random into sets of equal size, without replacement.
+
+    Smith and Gatica-Perez (2004), section 4: C sets of N/C particles each, sizes differing by one
+    where C does not divide N; empty slots are dealt after the filled ones. A set's mass is that
+    of its particles (eq. 5), so that the distribution stays as it is.
+
+    - `num_sets`: C; None takes as many as the mixture has components.
+
+    Raises `ValueError` for C < 1, or more sets than components. Use it where components are to
+    stand for the same distribution, such as `Partitioned` in one order each.
+    """
+
+    num_sets: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        check_whole(**given(num_sets=self.num_sets))
+
+    def regroup(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+        """A random set for every particle."""
+        n = mixture.num_particles
+        num_sets = mixture.num_components if self.num_sets is None else self.num_sets
+        if num_sets > mixture.num_components:
+            raise ValueError(
+                f"num_sets: {num_sets} is more than num_components, {mixture.num_components}"
+            )
+        # Sets dealt in turn, in an order drawn by sorting: the set stands in a word's lowest bits,
+        # random bits above it, and the sets for the empty slots come after all others.
+        width = (num_sets - 1).bit_length()
+        occupied, index = mixture.occupied, jnp.arange(n, dtype=jnp.int32)
+        num_filled = jnp.sum(occupied, dtype=jnp.int32)
+        noise = bits(key, (n,)) >> (width + 1) << width
+        is_last = (index >= num_filled).astype(jnp.uint32) << 31
+        words = jax.lax.sort(is_last | noise | (index % num_sets).astype(jnp.uint32))
+        dealt = (words & jnp.uint32((1 << width) - 1)).astype(jnp.int32)
+        filled_before = count_upto(occupied, n) - occupied.astype(jnp.int32)
+        turn = jnp.where(occupied, filled_before, num_filled + index - filled_before)
+        return take(dealt, turn), mixture.memory

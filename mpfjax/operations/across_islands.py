@@ -1,0 +1,73 @@
+"""What islands of particles tell each other; outside `run_islands` there is one island.
+
+In numpy islands are a leading axis: `sums.sum(axis=0)`. Here they are two named axes, of devices
+and of islands on a device, and every function says what goes over them.
+"""
+
+import jax.extend.core
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from mpfjax.operations.logarithms import finite_max, log_sum_exp
+
+DEVICE_AXIS = "mpfjax_devices"
+ISLAND_AXIS = "mpfjax_islands"
+
+
+def num_islands() -> int:
+    """Into how many islands the particles are dealt; 1 outside `run_islands`."""
+    try:
+        # Constants, known as the program is traced.
+        return jax.lax.psum(1, ISLAND_AXIS) * jax.lax.psum(1, DEVICE_AXIS)
+    except NameError:
+        return 1
+
+
+def island_index() -> Int[Array, ""]:
+    """Which island this is, from 0. Only inside `run_islands`."""
+    first = jax.lax.axis_index(DEVICE_AXIS) * jax.lax.psum(1, ISLAND_AXIS)
+    return first + jax.lax.axis_index(ISLAND_AXIS)
+
+
+def over_islands(value: Array) -> Array:
+    """The values of all islands, in their order, on a new leading axis; the same for each.
+
+    The order does not depend on how many devices there are, so that neither does a sum.
+    """
+    on_device = jax.lax.all_gather(value, ISLAND_AXIS)
+    everywhere = jax.lax.all_gather(on_device, DEVICE_AXIS)
+    return everywhere.reshape(-1, *value.shape)
+
+
+def deal_to_islands(values: Array) -> Array:
+    """Row i of every island to island i mod G; the leading axis must be a multiple of G.
+
+    Dealing twice brings the rows of an island back to it, in another order.
+    """
+    num_devices, on_device = jax.lax.psum(1, DEVICE_AXIS), jax.lax.psum(1, ISLAND_AXIS)
+    # Under vmap JAX 0.10 gets the shape wrong of a value that is known to be the same everywhere.
+    values = jnp.where(island_index() >= 0, values, values)
+    dealt = values.reshape(-1, num_devices, on_device, *values.shape[1:])
+    dealt = jax.lax.all_to_all(dealt, ISLAND_AXIS, split_axis=2, concat_axis=2)
+    dealt = jax.lax.all_to_all(dealt, DEVICE_AXIS, split_axis=1, concat_axis=1)
+    return dealt.reshape(values.shape)
+
+
+def excess_over_islands(
+    log_scale: Float[Array, ""], log_largest: Float[Array, ""], log_sum: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """How far an island's own scale is above that of all, and log of all mass in two parts.
+
+    The mass of an island is given in three parts, scale + largest + sum, and that of all islands
+    comes out as total + scale, so that none rounds another away. O(1) numbers from each island;
+    outside `run_islands` there is one, and nothing above it.
+    """
+    if num_islands() == 1:
+        return jnp.zeros_like(log_sum), log_sum, log_scale + log_largest
+    scales, largest, sums = over_islands(jnp.stack([log_scale, log_largest, log_sum])).T
+    counts = sums > -jnp.inf
+    # Part by part, exactly: an island without mass has no say.
+    common = finite_max(jnp.where(counts, scales, -jnp.inf))
+    shift = finite_max(jnp.where(counts, (scales - common) + largest, -jnp.inf))
+    log_total = log_sum_exp(sums + (((scales - common) + largest) - shift))
+    return ((log_scale - common) + log_largest) - shift, log_total, common + shift

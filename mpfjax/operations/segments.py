@@ -1,0 +1,248 @@
+"""Sums, maxima and orders by component.
+
+In numpy: `[values[labels == m].sum() for m in range(M)]`, `per_component[labels]` and
+`np.argsort(labels, kind="stable")`. Few components are M masks, which XLA fuses into its loops; for
+many there is one scatter, dealt to lanes, so that neighbours do not wait for each other and long
+sums do not drift.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Shaped
+
+from mpfjax.operations.floats import default_float
+from mpfjax.operations.indexing import (
+    count_places,
+    from_the_start,
+    in_rows,
+    inverse_permutation,
+    take,
+)
+from mpfjax.operations.logarithms import exp, finite_or_zero, log_or_nothing, masked_shares
+from mpfjax.operations.prefix_sums import count_starts, count_upto
+from mpfjax.operations.stored import EXACT_IN_FLOAT32, whole_blocks
+
+FEW_SEGMENTS = 4
+# Neighbours that are added to the same place go to different lanes, each with a place of its own: a
+# CPU would wait at every one of them for the last to be done.
+_LANES = 8
+# One after the other, a million equal numbers add up to a thousandth too much in float32.
+_LONGEST_SUM = 2**10
+_COUNTED_BLOCK = 32
+_MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # of which a block's counts are eight a particle
+
+
+def spread(
+    values: Shaped[Array, "m *rest"], segments: Int[Array, " n"]
+) -> Shaped[Array, "n *rest"]:
+    """values[segments], each entry its segment's value; a label out of range gets some value.
+
+    Few segments are chosen between, many are gathered: on a CPU a gather keeps all that is
+    computed along with it from running on vectors.
+    """
+    num_segments = values.shape[0]
+    if num_segments > FEW_SEGMENTS:
+        return take(values, segments)
+    chosen = jnp.broadcast_to(values[0], (*segments.shape, *values.shape[1:]))
+    for m in range(1, num_segments):
+        is_member = (segments == m).reshape(-1, *[1] * (values.ndim - 1))
+        chosen = jnp.where(is_member, values[m][None], chosen)
+    return chosen
+
+
+def segment_sum(
+    values: Float[Array, "n *rest"], segments: Int[Array, " n"], num_segments: int
+) -> Float[Array, "num_segments *rest"]:
+    """The sum of the values in each segment; a label outside [0, num_segments) is left out."""
+    if num_segments > FEW_SEGMENTS:
+        columns = values.reshape(values.shape[0], -1).T
+        sums = jax.vmap(lambda column: _scattered_sum(column, segments, num_segments))(columns)
+        return sums.T.reshape(num_segments, *values.shape[1:])
+    member = _members(segments, num_segments, values.ndim - 1)
+    return jnp.sum(jnp.where(member, values[None], jnp.zeros((), values.dtype)), axis=1)
+
+
+def segment_max(
+    values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Float[Array, " num_segments"]:
+    """The largest value in each segment, -inf in an empty one."""
+    if num_segments > FEW_SEGMENTS:
+        return _scattered("max", values, segments, num_segments, -jnp.inf)
+    member = _members(segments, num_segments)
+    return jnp.max(jnp.where(member, values[None], jnp.array(-jnp.inf, values.dtype)), axis=1)
+
+
+def segment_counts(
+    mask: Bool[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Int[Array, " num_segments"]:
+    """How many of the masked entries lie in each segment."""
+    if mask.shape[0] >= EXACT_IN_FLOAT32:
+        return _scattered("add", mask.astype(jnp.int32), segments, num_segments, 0)
+    return segment_sum(mask.astype(default_float()), segments, num_segments).astype(jnp.int32)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _scattered_sum(
+    values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Float[Array, " num_segments"]:
+    return _scattered("add", values, segments, num_segments, 0)
+
+
+@_scattered_sum.defjvp
+def _scattered_sum_jvp(num_segments: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    values, segments = primals
+    # In JAX's own form, which can be transposed.
+    tangent = jax.ops.segment_sum(tangents[0], segments, num_segments)
+    return _scattered_sum(values, segments, num_segments), tangent
+
+
+def _scattered(
+    how: str,
+    values: Shaped[Array, " n"],
+    segments: Int[Array, " n"],
+    num_segments: int,
+    initial: float,
+) -> Shaped[Array, " num_segments"]:
+    """The values of each segment added up, or their "max" or "min", beginning at `initial`.
+
+    Where there are many in a segment they are dealt to lanes.
+    """
+    n = values.shape[0]
+    num_lanes = _num_lanes(n) if n >= _LANES * num_segments else 1
+    padding = ((0, 0), (0, -n % num_lanes))
+
+    def scatter(
+        rows: Shaped[Array, "k n"], labels: Int[Array, "k n"]
+    ) -> Shaped[Array, "k num_segments"]:
+        num_rows = rows.shape[0]
+        # One more, for what is in no segment.
+        labels = jnp.where((labels >= 0) & (labels < num_segments), labels, num_segments)
+        labels = jnp.pad(labels, padding, constant_values=num_segments)
+        labels = labels.reshape(num_rows, -1, num_lanes)
+        # Row and lane are added as they are: XLA would take arithmetic on them out of a filter's
+        # loop, and then no longer see that two sums by the same labels have the same places.
+        row, lane = (jax.lax.broadcasted_iota(jnp.int32, labels.shape, axis) for axis in (0, 2))
+        places = (labels * num_lanes + lane) * num_rows + row
+        line = jnp.full((num_segments + 1) * num_lanes * num_rows, initial, rows.dtype)
+        combine = getattr(line.at[from_the_start(places.reshape(-1))], how)
+        lines = combine(jnp.pad(rows, padding).reshape(-1), mode="promise_in_bounds")
+        lines = lines.reshape(-1, num_lanes, num_rows)[:num_segments]
+        return _OVER_LANES[how](lines, axis=1).T.astype(rows.dtype)
+
+    return in_rows(scatter)(values, segments)
+
+
+def _num_lanes(n: int) -> int:
+    """A power of two, of which no lane gets more than so many: a long sum would drift."""
+    return max(_LANES, 1 << max(-(-n // _LONGEST_SUM) - 1, 0).bit_length())
+
+
+_OVER_LANES: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": jnp.max, "min": jnp.min}
+
+
+def segment_log_sum_exp(
+    log_values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Float[Array, " num_segments"]:
+    """log Σ exp in each segment, -inf in one that is empty or holds nothing but -inf."""
+    shift = finite_or_zero(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
+    total = segment_sum(exp(log_values - spread(shift, segments)), segments, num_segments)
+    return log_or_nothing(total) + shift
+
+
+def segment_softmax(
+    log_values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Float[Array, " n"]:
+    """exp of the values as shares of their segment's sum, zero where that sum is zero."""
+    shift = finite_or_zero(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
+    values = exp(log_values - spread(shift, segments))
+    totals = segment_sum(values, segments, num_segments)
+    shares = values / spread(jnp.where(totals == 0, 1.0, totals), segments)
+    return masked_shares(log_values, shares)
+
+
+def segment_argmax(
+    values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Int[Array, " num_segments"]:
+    """The index of the largest value in each segment, some index where it is empty."""
+    n = values.shape[0]
+    values = jax.lax.stop_gradient(values)  # an index has no derivative
+    is_largest = values >= spread(segment_max(values, segments, num_segments), segments)
+    index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
+    if num_segments > FEW_SEGMENTS:
+        return _scattered("min", index, segments, num_segments, n - 1)
+    member = _members(segments, num_segments)
+    return jnp.min(jnp.where(member, index[None], n - 1), axis=1)
+
+
+def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, " num_places"]:
+    """Each place's segment, where segments lie side by side from ascending first places.
+
+    An empty segment has no place, and places past the last segment's are the last one's.
+    """
+    num_segments = firsts.shape[0]
+    if num_segments > FEW_SEGMENTS:
+        return count_starts(firsts, num_places)
+    place = jnp.arange(num_places, dtype=jnp.int32)
+    segments = jnp.zeros(num_places, jnp.int32)
+    for m in range(1, num_segments):
+        segments = segments + (place >= firsts[m]).astype(jnp.int32)
+    return segments
+
+
+def order_by_segment(
+    segments: Int[Array, " n"], num_segments: int
+) -> tuple[Int[Array, " n"], Int[Array, " num_segments"]]:
+    """The indices that make segments contiguous and ascending, and how many each segment has.
+
+    The original order is kept within each; a label equal to `num_segments` comes last. Up to a few
+    hundred segments it is counted which place an entry comes to, in O(n); for more, label and
+    index are packed into one integer where they fit, since sorting one array is several times
+    faster than sorting pairs.
+    """
+    n = segments.shape[0]
+    if num_segments <= _MOST_COUNTED_SEGMENTS and n < EXACT_IN_FLOAT32:
+        places, counts = _places_by_segment(segments, num_segments)
+        return inverse_permutation(places), counts
+    counts = segment_counts(jnp.ones(n, bool), segments, num_segments)
+    if (num_segments + 1) * n >= 2**31:
+        return jnp.argsort(segments, stable=True).astype(jnp.int32), counts
+    index = jnp.arange(n, dtype=jnp.int32)
+    return jax.lax.sort(segments.astype(jnp.int32) * n + index) % n, counts
+
+
+def _places_by_segment(
+    segments: Int[Array, " n"], num_segments: int
+) -> tuple[Int[Array, " n"], Int[Array, " num_segments"]]:
+    """Each entry's place in the order, which is how many come before it, and segments' counts.
+
+    A table holds how many of each segment every block of entries has, a row for each segment. In
+    one prefix sum over all of it, row after row, a cell's share of the order begins; an entry's
+    rank within its cell is how many of those before it in the block are of its segment.
+    """
+    n = segments.shape[0]
+    # Odd, since rows a power of two apart would share a few places of a cache.
+    num_blocks = -(-n // _COUNTED_BLOCK) | 1
+    cells = segments * num_blocks + jnp.arange(n, dtype=jnp.int32) // _COUNTED_BLOCK
+    num_cells = whole_blocks((num_segments + 1) * num_blocks + 1)
+    # One place further on, so that what is summed up to a cell is what is before it.
+    before = count_upto(count_places(cells + 1, num_cells, jnp.float32), n)
+    # The start of the first block is filled up with what names no cell.
+    line = jnp.pad(cells, (_COUNTED_BLOCK, 0), constant_values=-1)
+    ranks = jnp.zeros(n, jnp.int32)
+    for back in range(1, _COUNTED_BLOCK):
+        earlier = jax.lax.slice_in_dim(line, _COUNTED_BLOCK - back, _COUNTED_BLOCK - back + n)
+        ranks = ranks + (earlier == cells).astype(jnp.int32)
+    firsts = before[: (num_segments + 1) * num_blocks : num_blocks]
+    return take(before, cells) + ranks, jnp.diff(firsts)
+
+
+def _members(
+    segments: Int[Array, " n"], num_segments: int, trailing: int = 0
+) -> Bool[Array, "num_segments n ..."]:
+    """Who belongs to which segment; XLA fuses the mask into its reduction and never stores it."""
+    labels = jnp.arange(num_segments, dtype=segments.dtype)
+    member = segments[None] == labels[:, None]
+    return member.reshape(member.shape + (1,) * trailing)

@@ -1,0 +1,166 @@
+"""Runs dealt to devices, of this process or of all."""
+
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.extend.core
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Array, PyTree
+
+from mpfjax.operations.across_islands import DEVICE_AXIS
+from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors
+
+
+def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
+    """The devices that are meant: all, the first few, or those given.
+
+    None is every device of every process; JAX's default device alone where one is set. Raises
+    `ValueError` for more devices than there are, none at all, a device twice, and, under several
+    processes, for devices that leave a process out.
+    """
+    available = jax.devices()
+    if devices is None:
+        chosen = _default_devices(available)
+    elif isinstance(devices, int | np.integer) and not isinstance(devices, bool):
+        if not 1 <= devices <= len(available):
+            raise ValueError(f"devices: {devices} asked for, and there are {len(available)}")
+        chosen = available[: int(devices)]
+    else:
+        chosen = list(devices) if isinstance(devices, Iterable) and not _is_array(devices) else []
+        if not chosen or not all(isinstance(device, jax.Device) for device in chosen):
+            raise ValueError(f"devices: {devices} is not a number or some of jax.devices()")
+        if len(set(chosen)) < len(chosen):
+            raise ValueError(f"devices: {devices} names one twice")
+    idle = jax.process_count() - len({device.process_index for device in chosen})
+    if jax.process_count() > 1 and idle:
+        raise ValueError(f"devices: {chosen} leaves {idle} of the processes without any")
+    return chosen
+
+
+def over_devices(
+    run: Callable[..., PyTree],
+    run_on_one: Callable[..., PyTree],
+    inputs: PyTree,
+    arguments: tuple[PyTree, ...],
+    devices: list[Any] | None,
+) -> PyTree:
+    """`run(inputs, *arguments)` with the inputs dealt to the devices in blocks of equal size.
+
+    Every leaf of the result has a leading axis k, like the inputs, and lies on the first device,
+    or on the first one of each process. The last input is repeated where the number of devices
+    does not divide k, and its results are dropped. Devices tell each other only what `run` has
+    them tell. `run_on_one`, compiled already, does all on one device; None leaves which to JAX.
+    """
+    traced = is_traced((inputs, arguments))
+    if devices is None or len(devices) == 1:
+        if not traced and devices not in (None, jax.devices()[:1]):
+            inputs, arguments = _placed((inputs, arguments), devices[0])
+        return run_on_one(inputs, *arguments)
+    num_inputs = length_of(inputs)
+    padding = -num_inputs % len(devices)
+    padded = _filled_up(inputs, num_inputs + padding)
+    mesh = Mesh(np.array(devices), (DEVICE_AXIS,))
+    if not traced:
+        padded = _placed(padded, NamedSharding(mesh, P(DEVICE_AXIS)))
+        arguments = _placed(arguments, NamedSharding(mesh, P()))
+    result = _spread(run, padded, arguments, mesh)
+    if not traced:
+        result = _gathered(result, mesh)
+    if padding:
+        result = jax.tree.map(lambda leaf: leaf[:num_inputs], result)
+    return result
+
+
+def length_of(inputs: PyTree) -> int:
+    return jax.tree.leaves(inputs)[0].shape[0]
+
+
+def _filled_up(inputs: PyTree, length: int) -> PyTree:
+    """As many inputs, of which the last is repeated."""
+    last = length_of(inputs) - 1
+    if length == last + 1:
+        return inputs
+    return jax.tree.map(lambda leaf: leaf[np.minimum(np.arange(length), last)], inputs)
+
+
+@jit_on_wide_vectors
+def _spread(run, inputs, arguments, mesh):
+    arrays, rest = eqx.partition(arguments, eqx.is_array)
+
+    def on_each(inputs: PyTree, arrays: PyTree) -> PyTree:
+        return run(inputs, *eqx.combine(arrays, rest))
+
+    # The check of what varies over devices would ask every loop in a user's model to declare it.
+    mapped = jax.shard_map(
+        on_each,
+        mesh=mesh,
+        in_specs=(P(DEVICE_AXIS), P()),
+        out_specs=P(DEVICE_AXIS),
+        check_vma=False,
+    )
+    return mapped(inputs, arrays)
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, jax.Array | np.ndarray)
+
+
+def _default_devices(available: list[Any]) -> list[Any]:
+    default = getattr(jax.config, "jax_default_device", None)
+    if default is None:
+        return available
+    return jax.devices(default) if isinstance(default, str) else [default]
+
+
+def _placed(tree: PyTree, where: Any) -> PyTree:
+    """Every array of the tree on a device or as a sharding says, wherever it was."""
+    is_array = lambda leaf: isinstance(leaf, jax.Array | np.ndarray)  # noqa: E731
+    arrays, rest = eqx.partition(tree, is_array)
+    if jax.process_count() == 1:
+        return eqx.combine(jax.device_put(arrays, where), rest)
+    _require_same_everywhere(arrays)
+    return eqx.combine(jax.tree.map(lambda leaf: _global(leaf, where), arrays), rest)
+
+
+def _require_same_everywhere(arrays: PyTree) -> None:
+    """Raise where the processes do not hold the same numbers; a digest is all that they send."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(arrays):
+        if not _is_global(leaf):
+            values = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+            digest.update(f"{values.dtype} {values.shape}".encode() + values.tobytes())
+    own = np.frombuffer(digest.digest(), np.uint8)
+    if (multihost_utils.process_allgather(own) != own[None]).any():
+        raise ValueError("keys, filter, observations: not the same in every process")
+
+
+def _global(leaf: Any, sharding: NamedSharding) -> Array:
+    """An array over all processes, of which each holds a copy of the whole."""
+    if _is_global(leaf):
+        return leaf
+    if _is_key(leaf):
+        data = _global(jax.random.key_data(leaf), sharding)
+        return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
+    values = np.asarray(jnp.asarray(leaf))
+    return jax.make_array_from_callback(values.shape, sharding, lambda index: values[index])
+
+
+def _is_global(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array) and not leaf.is_fully_addressable
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _gathered(tree: PyTree, mesh: Mesh) -> PyTree:
+    if jax.process_count() == 1:
+        return jax.device_put(tree, mesh.devices.flat[0])
+    everywhere = jax.jit(lambda tree: tree, out_shardings=NamedSharding(mesh, P()))(tree)
+    return jax.tree.map(lambda leaf: leaf.addressable_data(0), everywhere)

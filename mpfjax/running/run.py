@@ -1,0 +1,172 @@
+"""Running a filter over observations: once, or once for each of many keys."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key, PyTree
+
+from mpfjax.checks import check_key, check_whole, given
+from mpfjax.filter import Filter, Start, sample_initial, split_keys, untie
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.resampling import FEW_ROWS
+from mpfjax.observations import as_arrays, present_steps
+from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
+from mpfjax.running.devices import choose_devices, over_devices
+from mpfjax.running.scan import FilterRun, check_run, checked, scan, scan_filter
+from mpfjax.running.threads import num_processors, over_threads
+
+# Particles, times the components where these are few and have a row of them each: what a CPU's
+# caches hold of all that a step makes of them.
+_IN_NEAR_CACHE, _IN_CACHE = 2**15, 2**16
+_WORTH_A_THREAD = 2**9  # particles, of all its runs
+
+
+def run_filter(
+    key: Key[Array, ""],
+    filter: Filter,
+    observations: PyTree,
+    collect: Callable[[ParticleMixture], PyTree] | None = None,
+    *,
+    missing: str = "error",
+) -> FilterRun:
+    """Run a filter over observations y_1..y_t in one scan.
+
+    - `observations`: a pytree whose leaves have a leading axis t.
+    - `collect`: what to keep of the mixture after each step, stacked over t; None keeps all of
+      it. The same function object compiles once; a new lambda at every call compiles anew.
+      What is derived from a mixture is written for one: `jax.vmap(lambda m: m.mean())` maps it over
+      a collected stack.
+    - `missing`: "error" raises a `ValueError` that names the first step whose observation holds a
+      NaN or an infinity; "skip" takes such steps as missing, and only predicts. A model with
+      `handles_missing = True` is given the NaN, and with "skip" only a step of nothing else is
+      missing.
+
+    Raises `ValueError` for an argument of another kind, no observations, leaves of different
+    lengths, complex numbers or ones beyond what JAX's type holds, before anything compiles; for a
+    model whose draws or densities are of the wrong shape or type, as it is traced; and a
+    RuntimeError where its densities give NaN.
+    """
+    check_key(key)
+    check_run(filter, collect)
+    present = present_steps(observations, missing, filter.model)
+    observations = as_arrays(observations)
+    run = lambda filter: _run(key, filter, observations, present, collect)  # noqa: E731
+    return checked(with_floats_traced(run, filter))
+
+
+def monte_carlo(
+    keys: Key[Array, " seeds"],
+    filter: Filter,
+    observations: PyTree,
+    collect: Callable[[ParticleMixture], PyTree] | None = None,
+    *,
+    missing: str = "error",
+    devices: int | Sequence[Any] | None = None,
+    slots: int | None = None,
+) -> FilterRun:
+    """Run a filter once for each key, all on the same observations, under `vmap`.
+
+    Every field of the result has a leading axis of seeds. Arguments and errors are those of
+    `run_filter`; run k equals `run_filter(keys[k], ...)`.
+
+    - `devices`: what the runs are spread over. None is every device there is, of all processes
+      after `join_processes`; a number means the first few, a sequence those of `jax.devices()`.
+      Any number of keys will do. Devices tell each other nothing; the result is gathered on the
+      first one, and each process has all of it. Under the caller's own jit, grad or vmap None is
+      one device. One device that is a CPU is kept busy by a thread for each processor, if there
+      is enough to do.
+    - `slots`: keep the particles in so many slots, of which all but N stay empty. Filters that
+      differ in N alone then share one compiled program, at the cost of as many particles as there
+      are slots. The particles are those of a run without, up to rounding, and `collect` sees the
+      empty slots as well.
+
+    Raises `ValueError` for more devices than there are, fewer slots than particles, and moves
+    that fill every slot, `PropagateIndependently` and `PropagateInClusters`.
+    """
+    check_key(keys, "keys", batch=True)
+    check_run(filter, collect)
+    check_whole(**given(slots=slots))
+    present = present_steps(observations, missing, filter.model)
+    observations = as_arrays(observations)
+
+    def run(filter: Filter) -> FilterRun:
+        starts = Start(keys)
+        if slots is not None:
+            starts, filter = _in_slots(keys, filter, slots)
+        arguments = (filter, observations, present, collect)
+        leave_to_caller = devices is None and is_traced((starts, arguments))
+        chosen = None if leave_to_caller else choose_devices(devices)
+        return over_devices(_run_each, _run_on_threads, starts, arguments, chosen)
+
+    return checked(with_floats_traced(run, filter))
+
+
+@jit_on_wide_vectors
+def _run(key, filter, observations, present, collect):
+    return scan_filter(key, filter, observations, present, collect)
+
+
+def _in_slots(keys: Key[Array, " seeds"], filter: Filter, slots: int) -> tuple[Start, Filter]:
+    """Where the runs start, and the filter, both of so many slots whatever N is."""
+    num_particles = filter.num_particles
+    if slots < num_particles:
+        raise ValueError(f"slots: {slots} is no whole number of at least N, {num_particles}")
+    # How a model draws may depend on N: stratified draws do. So this is a program of its own.
+    particles = _sample_each(keys, filter.model, num_particles, int(slots))
+    limits = jnp.full(keys.shape, num_particles, jnp.int32)
+    initial_moves = untie(filter._initial_moves, filter.model)
+    filter = Filter(filter.model, filter.moves, int(slots), filter.num_components, initial_moves)
+    return Start(keys, particles, limits), filter
+
+
+@jit_on_wide_vectors
+def _sample_each(keys, model, num_particles, slots):
+    """x_0 of each run; the slots that stay empty hold one of its states as well."""
+
+    def sample(key: Key[Array, ""]) -> PyTree:
+        key_initial = split_keys(split_keys(key, 2)[0], 1)[0]
+        particles = sample_initial(key_initial, model, num_particles)
+        index = np.minimum(np.arange(slots), num_particles - 1)
+        return jax.tree.map(lambda leaf: leaf[index], particles)
+
+    return jax.vmap(sample)(keys)
+
+
+def _run_each(starts, filter, observations, present, collect):
+    run_together = jax.vmap(lambda start: scan(start, filter, observations, present, collect))
+    num_runs = starts.key.shape[0]
+    size = _group_size(num_runs, filter)
+    if size == num_runs:
+        return run_together(starts)
+    in_groups = jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), starts)
+    runs = jax.lax.map(run_together, in_groups)
+    return jax.tree.map(lambda leaf: leaf.reshape(num_runs, *leaf.shape[2:]), runs)
+
+
+def _group_size(num_runs: int, filter: Filter) -> int:
+    """How many runs go on together: on a CPU no more than leaves their particles in its cache."""
+    num_rows = filter.num_components if filter.num_components <= FEW_ROWS else 1
+    one_run = filter.num_particles * num_rows
+    if jax.default_backend() != "cpu" or num_runs * one_run <= _IN_CACHE:
+        return num_runs
+    sizes = [size for size in range(1, num_runs + 1) if num_runs % size == 0]
+    return max(size for size in sizes if size == 1 or size * one_run <= _IN_NEAR_CACHE)
+
+
+_run_all = jit_on_wide_vectors(_run_each)
+
+
+def _run_on_threads(starts, filter, observations, present, collect):
+    """All runs on one device, which on a CPU is kept busy by several threads."""
+    num_runs = starts.key.shape[0]
+    num_worth_it = num_runs * filter.num_particles // _WORTH_A_THREAD
+    num_threads = min(num_processors(), num_runs, num_worth_it)
+    keeps_all = collect is None  # of which there had better not be two copies for a while
+    arguments = (filter, observations, present, collect)
+    leave_to_caller = is_traced((starts, arguments)) or jax.default_backend() != "cpu"
+    if num_threads < 2 or keeps_all or leave_to_caller:
+        return _run_all(starts, *arguments)
+    return over_threads(_run_each, starts, arguments, num_threads)

@@ -1,0 +1,105 @@
+"""One run of a filter as one scan, and its result."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Key, PyTree
+
+from mpfjax.checks import check_callable, check_type, given, saying
+from mpfjax.filter import BROKEN_DENSITY, Filter, Start, split_keys
+from mpfjax.mixture import ParticleMixture
+from mpfjax.operations.across_islands import num_islands
+
+
+class FilterRun(eqx.Module):
+    """The result of running a filter over observations y_1..y_t."""
+
+    log_marginal_likelihood: Float[Array, ""]
+    """log p(y_1..y_t), estimated: the sum of the increments."""
+    log_likelihood_increments: Float[Array, " t"]
+    collected: PyTree
+    """what `collect` made of each step's mixture, stacked over t."""
+    final: ParticleMixture
+    resampled: Bool[Array, "t m"]
+    """which components each step resampled."""
+    degenerate: Bool[Array, " t"]
+    """the steps at which every particle had zero likelihood."""
+
+
+def scan_filter(
+    key: Key[Array, ""],
+    filter: Filter,
+    observations: PyTree,
+    present: Bool[Array, " t"] | None,
+    collect: Callable[[ParticleMixture], PyTree] | None,
+) -> FilterRun:
+    """`run_filter` under the caller's jit, unchecked; `present` is what `present_steps` gives."""
+    return scan(Start(key), filter, observations, present, collect)
+
+
+def scan(
+    start: Start,
+    filter: Filter,
+    observations: PyTree,
+    present: Bool[Array, " t"] | None,
+    collect: Callable[[ParticleMixture], PyTree] | None,
+) -> FilterRun:
+    key_initial, key_steps = split_keys(start.key, 2)
+    length = jax.tree.leaves(observations)[0].shape[0]
+
+    def advance(mixture: ParticleMixture, inputs: PyTree) -> tuple[ParticleMixture, PyTree]:
+        step_key, observation, is_present = inputs
+        if is_present is None:
+            mixture, info = filter._step(step_key, mixture, observation)
+        else:
+            mixture, info = jax.lax.cond(
+                is_present,
+                lambda: filter._step(step_key, mixture, observation),
+                lambda: filter._predict(step_key, mixture),
+            )
+        with saying("in collect, which is called with the mixture after each step"):
+            kept = mixture if collect is None else collect(mixture)
+        return mixture, (kept, info.log_likelihood_increment, info.resampled, info.degenerate)
+
+    inputs = (jax.random.split(key_steps, length), observations, present)
+    initial = filter._init(start._replace(key=key_initial))
+    final, outputs = jax.lax.scan(advance, _share_of_islands(initial), inputs)
+    collected, increments, resampled, degenerate = outputs
+    return FilterRun(
+        log_marginal_likelihood=jnp.sum(increments),
+        log_likelihood_increments=increments,
+        collected=collected,
+        final=final,
+        resampled=resampled,
+        degenerate=degenerate,
+    )
+
+
+def _share_of_islands(mixture: ParticleMixture) -> ParticleMixture:
+    """The mixture's share of a whole that is made of as many as there are islands."""
+    if num_islands() == 1:
+        return mixture
+    return mixture.replace(log_weights=mixture.log_weights - math.log(num_islands()))
+
+
+def checked(run: FilterRun) -> FilterRun:
+    """The run, or an error where a density of the model was NaN or infinite."""
+    increments = run.log_likelihood_increments
+    if isinstance(increments, Tracer):
+        return eqx.error_if(run, ~(increments < jnp.inf), BROKEN_DENSITY)
+    bad = ~(np.asarray(increments) < np.inf).all(axis=tuple(range(increments.ndim - 1)))
+    if bad.any():
+        raise RuntimeError(f"{BROKEN_DENSITY}, first at index {int(np.argmax(bad))} of the steps")
+    return run
+
+
+def check_run(filter: Any, collect: Any) -> None:
+    """Raise a `ValueError` for what is no filter, or cannot collect."""
+    check_type(Filter, "a Filter", filter=filter)
+    check_callable("a function of a mixture", **given(collect=collect))

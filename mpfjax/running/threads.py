@@ -1,0 +1,79 @@
+"""Runs dealt to threads of this process, for a CPU that is one device of many cores."""
+
+import functools
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+import jax.extend.core
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from mpfjax.operations.compiling import jit_on_wide_vectors
+from mpfjax.running.devices import length_of
+
+
+def over_threads(
+    run: Callable[..., PyTree],
+    inputs: PyTree,
+    arguments: tuple[PyTree, ...],
+    num_threads: int,
+) -> PyTree:
+    """`run(inputs, *arguments)`, compiled, with the inputs dealt to threads of this process.
+
+    For programs of many short operations, which a CPU device does mostly one after the other. The
+    blocks are of equal size; the last input fills up the last of them, and what comes of that is
+    dropped. This thread takes the first block, and all that are left by threads which would not
+    see what it sees: a setting of JAX that holds for it alone, or a transformation of the caller's.
+    """
+    num_inputs = length_of(inputs)
+    size = -(-num_inputs // num_threads)
+    seen = _seen_by_thread()
+
+    def run_block(first: int) -> PyTree:
+        if _seen_by_thread() == seen:
+            block = _run_block(run, np.asarray(first), size, inputs, arguments)
+            return jax.block_until_ready(block)
+
+    first, *others = range(0, num_inputs, size)
+    started = [_threads().submit(run_block, other) for other in others]
+    blocks = [run_block(first)]
+    for other, thread in zip(others, started, strict=True):
+        block = thread.result()
+        blocks.append(run_block(other) if block is None else block)
+    return _end_to_end(blocks, num_inputs)
+
+
+@jit_on_wide_vectors
+def _run_block(run, first, size, inputs, arguments):
+    index = jnp.minimum(first + np.arange(size), length_of(inputs) - 1)
+    return run(jax.tree.map(lambda leaf: leaf[index], inputs), *arguments)
+
+
+def num_processors() -> int:
+    """How many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@functools.cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max(2, num_processors()), thread_name_prefix="mpfjax")
+
+
+def _seen_by_thread() -> tuple[Any, ...]:
+    """JAX's settings, and which transformations go on. Of an old JAX it cannot be told."""
+    trace_state = getattr(jax.extend.core, "get_opaque_trace_state", None)
+    if trace_state is None:
+        return (threading.get_ident(),)
+    return dict(jax.config.values), trace_state(convention="nnx")
+
+
+@partial(jax.jit, static_argnums=1)
+def _end_to_end(runs: list[PyTree], length: int) -> PyTree:
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:length], *runs)
