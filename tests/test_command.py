@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpfjax import command
-from mpfjax.command import run as command_run
+from mpfjax.command import loop as command_loop
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import frames as frame_files
 from mpfjax.vision.boxes import read_tracks, write_tracks
@@ -201,7 +201,7 @@ DETECTIONS = ["--detections", "DET"]
 def test_bad_arguments_are_named_before_anything_is_written(
     sequence, tmp_path, capsys, monkeypatch, message, arguments
 ):
-    monkeypatch.setattr(command_run, "_track", nothing_tracked)
+    monkeypatch.setattr(command_loop, "_track", nothing_tracked)
     arguments = [sequence / "det.txt" if argument == "DET" else argument for argument in arguments]
     assert run(sequence, "--out", tmp_path / "out", *arguments) == 2
     assert message in capsys.readouterr().err
@@ -222,7 +222,7 @@ def test_bad_arguments_are_named_before_anything_is_written(
 def test_bad_detections_are_named_with_their_line(
     sequence, tmp_path, capsys, monkeypatch, message, text
 ):
-    monkeypatch.setattr(command_run, "_track", nothing_tracked)
+    monkeypatch.setattr(command_loop, "_track", nothing_tracked)
     (tmp_path / "det.txt").write_text(text)
     least = ["--min-score", 1] if "--min-score" in message else []
     out = tmp_path / "out"

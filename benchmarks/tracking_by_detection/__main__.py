@@ -36,7 +36,7 @@ from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import frames
 from mpfjax.vision.detectors import Rows
-from mpfjax.vision.tracking import make_tracker, online_rows, track
+from mpfjax.vision.loop import make_tracker, online_rows, track
 
 OURS = {"gm_mpf": "GM-MPF", "mpf": "MPF"}
 SCORES = ("HOTA", "MOTA", "IDF1", "id_switches")

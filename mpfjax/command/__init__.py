@@ -3,7 +3,7 @@
 import warnings
 
 from mpfjax.command.arguments import parse_arguments
-from mpfjax.command.run import run
+from mpfjax.command.loop import run
 from mpfjax.console import exit_status, say_warnings
 
 

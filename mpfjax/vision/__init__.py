@@ -41,4 +41,4 @@ from mpfjax.vision.soft_histograms import soft_histograms as soft_histograms
 from mpfjax.vision.tracker import ObjectTracker as ObjectTracker
 from mpfjax.vision.tracker import TrackerState as TrackerState
 from mpfjax.vision.tracker import Tracks as Tracks
-from mpfjax.vision.tracking import track as track
+from mpfjax.vision.loop import track as track

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
 from mpfjax.checks import check_key, check_type, to_rows
-from mpfjax.filters import Filter
+from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision.frames import of_one_kind
 from mpfjax.vision.object_moves import best_components

@@ -20,7 +20,7 @@ from mpfjax.vision.detection import BackgroundSubtraction
 from mpfjax.vision.detectors import LEAST_ROOM, Rows
 from mpfjax.vision.drawn import follow_boxes
 from mpfjax.vision.tracker import Tracks
-from mpfjax.vision.tracking import make_tracker, offline_rows, online_rows, track
+from mpfjax.vision.loop import make_tracker, offline_rows, online_rows, track
 
 _SCORES = ("HOTA", "MOTA", "IDF1")
 
