@@ -19,8 +19,8 @@ from mpfjax.vision import drawing, frames
 from mpfjax.vision.detection import BackgroundSubtraction
 from mpfjax.vision.detectors import LEAST_ROOM, Rows
 from mpfjax.vision.drawn import follow_boxes
-from mpfjax.vision.tracker import Tracks
 from mpfjax.vision.loop import make_tracker, offline_rows, online_rows, track
+from mpfjax.vision.tracker import Tracks
 
 _SCORES = ("HOTA", "MOTA", "IDF1")
 

@@ -27,6 +27,7 @@ from mpfjax.vision.joint_colour import object_boxes as object_boxes
 from mpfjax.vision.joint_colour import with_lambda as with_lambda
 from mpfjax.vision.labels import boxes_around as boxes_around
 from mpfjax.vision.labels import labelled_states as labelled_states
+from mpfjax.vision.loop import track as track
 from mpfjax.vision.object_moves import ObjectExclusion as ObjectExclusion
 from mpfjax.vision.object_moves import PruneHypotheses as PruneHypotheses
 from mpfjax.vision.recipes import PRESETS as PRESETS
@@ -41,4 +42,3 @@ from mpfjax.vision.soft_histograms import soft_histograms as soft_histograms
 from mpfjax.vision.tracker import ObjectTracker as ObjectTracker
 from mpfjax.vision.tracker import TrackerState as TrackerState
 from mpfjax.vision.tracker import Tracks as Tracks
-from mpfjax.vision.loop import track as track
