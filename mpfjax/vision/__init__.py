@@ -10,11 +10,8 @@ from mpfjax.vision.colour_model import ColourModel as ColourModel
 from mpfjax.vision.colours import AbstractColours as AbstractColours
 from mpfjax.vision.colours import HSVColours as HSVColours
 from mpfjax.vision.colours import RGBColours as RGBColours
-from mpfjax.vision.detected_model import DetectedColourModel as DetectedColourModel
-from mpfjax.vision.detected_model import DetectedFrame as DetectedFrame
-from mpfjax.vision.detected_model import DetectionProposal as DetectionProposal
-from mpfjax.vision.detected_model import Detections as Detections
 from mpfjax.vision.detection import BackgroundSubtraction as BackgroundSubtraction
+from mpfjax.vision.detections import Detections as Detections
 from mpfjax.vision.distracter import DistracterScene as DistracterScene
 from mpfjax.vision.distracter import distracter_scene as distracter_scene
 from mpfjax.vision.frames import read_frames as read_frames
@@ -40,5 +37,4 @@ from mpfjax.vision.snapshots import track_rows as track_rows
 from mpfjax.vision.soft_histograms import SoftColourModel as SoftColourModel
 from mpfjax.vision.soft_histograms import soft_histograms as soft_histograms
 from mpfjax.vision.tracker import ObjectTracker as ObjectTracker
-from mpfjax.vision.tracker import TrackerState as TrackerState
 from mpfjax.vision.tracker import Tracks as Tracks

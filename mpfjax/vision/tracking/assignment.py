@@ -1,0 +1,121 @@
+"""Which detection is whose: one for each component, at the least total cost."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
+from optax.assignment import hungarian_algorithm
+
+from mpfjax.checks import check_not_negative, check_positive
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractMove
+from mpfjax.operations.indexing import take
+from mpfjax.vision.detections import Detections
+from mpfjax.vision.histograms import bhattacharyya, normalise
+from mpfjax.vision.tracking.memory import ASSIGNED, LIVES, REFERENCES, SCORES, remember
+from mpfjax.vision.tracking.model import DetectedObjectModel
+from mpfjax.vision.tracking.observation import TrackedFrame
+
+_NONE, _IMPOSSIBLE = -1, 1e4
+
+
+class Assign(AbstractMove):
+    """Give every component at most one detection, and every detection to at most one component.
+
+    The assignment of the least total cost (Kuhn 1955), where component m and detection d cost
+    -2 log N(d; μ_m, S_m), up to a constant, with μ_m and S_m the moments of the component's
+    prediction and of the detector's error, `colour_cost` times the mean B² of the detection's
+    colours from the component's, `weak_cost` for a weak detection, and `doubt_cost` for a component
+    that is not yet confirmed. A detection whose squared distance is beyond `gate` is impossible.
+    So objects that meet are settled together. It leaves the particles as they are; memory: the row
+    of each component's detection, -1 for none.
+
+    One assignment stands for all that there are (`approximate` is true). Raises `ValueError` for a
+    gate that is not positive and a cost below zero.
+    """
+
+    model: DetectedObjectModel
+    gate: float = eqx.field(static=True, default=35.0)
+    colour_cost: float = eqx.field(static=True, default=28.0)
+    weak_cost: float = eqx.field(static=True, default=10.0)
+    doubt_cost: float = eqx.field(static=True, default=8.0)
+
+    def __check_init__(self) -> None:
+        check_positive(gate=self.gate)
+        check_not_negative(
+            colour_cost=self.colour_cost, weak_cost=self.weak_cost, doubt_cost=self.doubt_cost
+        )
+
+    @property
+    def approximate(self) -> bool:
+        """True: the likeliest assignment is taken for the only one."""
+        return True
+
+    def initial_memory(self, num_components: int) -> dict[str, Array]:
+        """Nobody has a detection."""
+        return {ASSIGNED: jnp.full(num_components, _NONE, jnp.int32)}
+
+    def forget(self, memory: dict, dead: Array) -> dict:
+        """The dead have none."""
+        return memory | {ASSIGNED: jnp.where(dead, _NONE, memory[ASSIGNED])}
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
+    ) -> ParticleMixture:
+        """Settle whose each detection is."""
+        del key
+        cost = self.costs(mixture, observation)
+        rows, columns = hungarian_algorithm(cost)
+        possible = cost[rows, columns] < _IMPOSSIBLE
+        source = jnp.full(mixture.num_components, _NONE, jnp.int32)
+        chosen = jnp.where(possible, columns.astype(jnp.int32), _NONE)
+        return remember(mixture, assigned=source.at[rows].set(chosen))
+
+    def costs(self, mixture: ParticleMixture, observation: TrackedFrame) -> Float[Array, "m d"]:
+        """What each pair costs, or a number beyond all costs where it is impossible."""
+        found, lives = observation.detections, mixture.memory[LIVES]
+        scores = mixture.memory[SCORES]
+        squares, volumes = self._distances(mixture, found.boxes)
+        cost = squares + volumes[:, None] + self._unlikeness(mixture, observation)
+        cost += self.weak_cost * (found.scores < scores.strong)[None].astype(cost.dtype)
+        doubtful = ~lives.confirmed[:, None]
+        cost += self.doubt_cost * doubtful.astype(cost.dtype)
+        counts = found.valid & (found.scores >= scores.weak)
+        possible = lives.alive[:, None] & counts[None] & (squares < self.gate)
+        return jnp.where(possible, cost, _IMPOSSIBLE)
+
+    def _distances(
+        self, mixture: ParticleMixture, boxes: Float[Array, "d 4"]
+    ) -> tuple[Float[Array, "m d"], Float[Array, " m"]]:
+        """Squared distance of each detection in deviations of the prediction, and log |S_m| / |R|.
+
+        Coordinates are taken for independent.
+        """
+        moved, noise = self.model.predicted(mixture.particles)
+        means = mixture.component_averages(moved)
+        # About the mean, or rounding would drown the spread of a box at a thousand pixels.
+        offsets = moved - take(means, mixture.component_indicators)
+        variances = mixture.component_averages(offsets**2 + noise**2)
+        unit = jnp.concatenate([jnp.exp(means[:, 2:]), jnp.ones_like(means[:, 2:])], axis=1)
+        errors = (unit * self.model.detection_deviations[None]) ** 2
+        total = variances + errors
+        places = jnp.concatenate([boxes[:, :2], jnp.log(boxes[:, 2:])], axis=1)
+        gaps = places[None] - means[:, None]
+        squares = jnp.sum(gaps**2 / total[:, None], axis=2)
+        return squares, jnp.sum(jnp.log(total / errors), axis=1)
+
+    def _unlikeness(
+        self, mixture: ParticleMixture, observation: TrackedFrame
+    ) -> Float[Array, "m d"]:
+        if observation.pixels is None or self.colour_cost == 0:
+            return jnp.zeros((mixture.num_components, len(observation.detections.boxes)))
+        references = mixture.memory[REFERENCES]
+        counts = observation.pixels.counts(observation.detections.boxes, references.shape[1])
+        distances = bhattacharyya(normalise(counts)[None], references[:, None])
+        known = jnp.any(references > 0, axis=(1, 2, 3))[:, None]
+        return self.colour_cost * jnp.where(known, jnp.mean(jnp.sum(distances, 3), 2), 0.0)
+
+
+def own_detections(source: Int[Array, " m"], detections: Detections) -> Detections:
+    """The detection of each component, not valid where it has none."""
+    rows = jnp.maximum(source, 0)
+    return Detections(take(detections.boxes, rows), source >= 0, take(detections.scores, rows))

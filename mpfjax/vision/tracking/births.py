@@ -1,0 +1,168 @@
+"""Births: a component for every strong detection that no component explains."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from mpfjax.checks import check_share, check_type, check_whole, to_array
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractMove
+from mpfjax.operations.generator import fast_key
+from mpfjax.operations.indexing import take
+from mpfjax.vision.tracking.memory import (
+    ASSIGNED,
+    EXTENT,
+    LIVES,
+    SCORES,
+    Lives,
+    mean_boxes,
+    remember,
+)
+from mpfjax.vision.tracking.model import DetectedObjectModel, ObjectState
+from mpfjax.vision.tracking.observation import TrackedFrame, overlap, within
+
+
+class Found(AbstractMove):
+    """Found a component on each strong detection that is nobody's, while there is room.
+
+    Its particles scatter about the detection as the detector errs, with velocities that scatter
+    about zero. A detection that overlaps a living component's box by more than `birth_overlap`
+    (intersection over union), or a stronger founding detection, founds none: it is a second one of
+    the same object. Of more than there is room for, the strongest are chosen. Memory: `Lives`, with
+    `Bury`, which keeps it; the assignments, so that a founding detection is its component's own.
+
+    - `velocity_deviations`: of x and y at birth, in boxes a frame.
+    - `particles_per_object`: P.
+
+    Births are decided and not sampled (`approximate` is true). Raises `ValueError` for a share
+    outside [0, 1] and deviations that are not two.
+    """
+
+    model: DetectedObjectModel
+    particles_per_object: int = eqx.field(static=True, default=50)
+    birth_overlap: float = eqx.field(static=True, default=0.5)
+    velocity_deviations: Float[Array, "2"] = eqx.field(
+        converter=to_array("velocity_deviations"), default=(0.15, 0.05)
+    )
+
+    def __check_init__(self) -> None:
+        check_type(DetectedObjectModel, "a DetectedObjectModel", model=self.model)
+        check_whole(particles_per_object=self.particles_per_object)
+        check_share(birth_overlap=self.birth_overlap)
+        if self.velocity_deviations.shape != (2,):
+            raise ValueError(f"velocity_deviations: {self.velocity_deviations} are not two numbers")
+
+    @property
+    def approximate(self) -> bool:
+        """True: mass appears where a detection is."""
+        return True
+
+    def founding(self, mixture: ParticleMixture, observation: TrackedFrame) -> Bool[Array, " d"]:
+        """Which detections would found a component, if there were room for all."""
+        found, source = observation.detections, mixture.memory[ASSIGNED]
+        lives: Lives = mixture.memory[LIVES]
+        rows = jnp.where(source >= 0, source, len(found.valid))
+        free = jnp.ones(len(found.valid), bool).at[rows].set(False, mode="drop")
+        strong = found.valid & (found.scores >= mixture.memory[SCORES].strong)
+        covered = overlap(mean_boxes(mixture), found.boxes) > self.birth_overlap
+        wanted = free & strong & within(found.boxes, mixture.memory[EXTENT])
+        wanted &= ~jnp.any(covered & lives.alive[:, None], axis=0)
+        # One that a stronger one covers is its double, even where that one founds none either.
+        doubles = (overlap(found.boxes, found.boxes) > self.birth_overlap) & wanted[:, None]
+        return wanted & ~jnp.any(doubles & _stronger(found.scores), axis=0)
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
+    ) -> ParticleMixture:
+        """Found components, and give them names."""
+        found, lives = observation.detections, mixture.memory[LIVES]
+        founding = self.founding(mixture, observation)
+        source, born = _matched(founding, found.scores, ~lives.alive)
+        seats, filled = self._seats(mixture, born)
+        drawn = self._drawn(key, seats, take(found.boxes, source))
+        particles = jax.tree.map(
+            lambda new, old: jnp.where(filled.reshape(-1, *[1] * (new.ndim - 1)), new, old),
+            drawn,
+            mixture.particles,
+        )
+        # The weight of a slot within its component; `ShareMass` settles that of the components.
+        log_share = -jnp.log(jnp.asarray(self.particles_per_object, mixture.log_weights.dtype))
+        mixture = mixture.replace(
+            particles=particles,
+            log_weights=jnp.where(filled, log_share, mixture.log_weights),
+            component_indicators=jnp.where(filled, seats, mixture.component_indicators),
+        )
+        number = jnp.cumsum(born, dtype=jnp.int32)
+        lives = lives._replace(
+            identities=jnp.where(born, lives.last_identity + number, lives.identities),
+            last_identity=lives.last_identity + number[-1],
+            seen=jnp.where(born, 1, lives.seen),
+            unseen=jnp.where(born, 0, lives.unseen),
+            full=jnp.sum(founding, dtype=jnp.int32) > number[-1],
+        )
+        assigned = jnp.where(born, source, mixture.memory[ASSIGNED])
+        return remember(mixture, lives=lives, assigned=assigned)
+
+    def _drawn(
+        self, key: Key[Array, ""], seats: Int[Array, " n"], boxes: Float[Array, "m 4"]
+    ) -> ObjectState:
+        """Particles for every slot about the founding detection of its component."""
+        key_place, key_velocity = jax.random.split(fast_key(key))
+        places = jnp.concatenate([boxes[:, :2], jnp.log(boxes[:, 2:])], axis=1)
+        unit = jnp.concatenate([boxes[:, 2:], jnp.ones_like(boxes[:, 2:])], axis=1)
+        deviations = take(unit * self.model.detection_deviations[None], seats)
+        speeds = take(boxes[:, 2:] * self.velocity_deviations[None], seats)
+        place = take(places, seats) + deviations * jax.random.normal(key_place, deviations.shape)
+        velocity = speeds * jax.random.normal(key_velocity, speeds.shape)
+        return ObjectState(place, velocity, seats)
+
+    def _seats(
+        self, mixture: ParticleMixture, born: Bool[Array, " m"]
+    ) -> tuple[Int[Array, " n"], Bool[Array, " n"]]:
+        """Deal empty slots to the newborn, P each: the component of every slot, and whether."""
+        empty = ~mixture.occupied
+        number = (jnp.cumsum(empty, dtype=jnp.int32) - 1) // self.particles_per_object
+        order = jnp.argsort(~born, stable=True).astype(jnp.int32)  # the newborn first
+        filled = empty & (number < jnp.sum(born, dtype=jnp.int32))
+        return take(order, jnp.clip(number, 0, len(born) - 1)), filled
+
+
+class ShareMass(AbstractMove):
+    """Give every living component the same mass, one share of the whole each.
+
+    Components stand for objects that all exist, and are not rival hypotheses: the prior reassembly
+    of Smith and Gatica-Pérez (2004). What the likelihood says of one object against another is
+    dropped (`approximate` is true).
+    """
+
+    @property
+    def approximate(self) -> bool:
+        """True: the masses that the likelihood gave are replaced."""
+        return True
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
+    ) -> ParticleMixture:
+        """The same mass for each."""
+        del key, observation
+        number = jnp.maximum(jnp.sum(mixture.active), 1).astype(mixture.log_weights.dtype)
+        log_weights = mixture.log_component_weights - jnp.log(number)
+        return mixture.replace(log_weights=log_weights, log_scale=None)
+
+
+def _stronger(scores: Float[Array, " d"]) -> Bool[Array, "d d"]:
+    """Whether the first of a pair has the higher score, or an equal one and comes first."""
+    first = jnp.triu(jnp.ones((len(scores), len(scores)), bool), 1)
+    higher, equal = scores[:, None] > scores[None], scores[:, None] == scores[None]
+    return higher | (equal & first)
+
+
+def _matched(
+    wanted: Bool[Array, " d"], scores: Float[Array, " d"], free: Bool[Array, " m"]
+) -> tuple[Int[Array, " m"], Bool[Array, " m"]]:
+    """For each free place the wanted row that it takes, strongest first, and whether it does."""
+    rows = jnp.argsort(jnp.where(wanted, -scores, jnp.inf), stable=True).astype(jnp.int32)
+    rank = jnp.cumsum(free, dtype=jnp.int32) - 1
+    taken = free & (rank < jnp.sum(wanted, dtype=jnp.int32))
+    return take(rows, jnp.clip(rank, 0, len(wanted) - 1)), taken

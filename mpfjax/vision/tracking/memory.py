@@ -1,0 +1,60 @@
+"""What the tracker's moves remember of each component, and how they name it."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mpfjax.mixture import ParticleMixture
+
+SCORES, ASSIGNED, LIVES, REFERENCES = "scores", "assigned", "lives", "references"
+EXTENT = "extent"
+
+
+class Scores(NamedTuple):
+    """Of `RankScores`: recent scores, how many there were ever, and the thresholds from them."""
+
+    recent: Float[Array, " k"]
+    count: Int[Array, ""]
+    weak: Float[Array, ""]
+    strong: Float[Array, ""]
+
+
+class Lives(NamedTuple):
+    """Of `Bury` and `Found`: who each component is, and how well it is borne out.
+
+    - `identities`: 0 for a dead component; `last_identity`: the highest ever given.
+    - `seen`, `unseen`: in how many frames a detection bore it out, and for how many none has.
+    - `confirmed`: whether it was borne out often enough to be believed.
+    - `full`: whether there was no room for a component in the last frame.
+    """
+
+    identities: Int[Array, " m"]
+    last_identity: Int[Array, ""]
+    seen: Int[Array, " m"]
+    unseen: Int[Array, " m"]
+    confirmed: Bool[Array, " m"]
+    full: Bool[Array, ""]
+
+    @classmethod
+    def none(cls, num_components: int) -> "Lives":
+        """Nobody lives yet."""
+        nobody = jnp.zeros(num_components, jnp.int32)
+        zero = jnp.zeros((), jnp.int32)
+        return cls(nobody, zero, nobody, nobody, nobody > 0, zero > 0)
+
+    @property
+    def alive(self) -> Bool[Array, " m"]:
+        """Which components stand for an object."""
+        return self.identities > 0
+
+
+def mean_boxes(mixture: ParticleMixture) -> Float[Array, "m 4"]:
+    """The box of each component, centre and size in pixels: the mean place of its particles."""
+    places = mixture.component_averages(mixture.particles.place)
+    return jnp.concatenate([places[:, :2], jnp.exp(places[:, 2:])], axis=1)
+
+
+def remember(mixture: ParticleMixture, **memory: Any) -> ParticleMixture:
+    """The mixture with some of its memory changed."""
+    return mixture.replace(memory=mixture.memory | memory)

@@ -1,0 +1,43 @@
+"""What a tracker is shown of a frame, and how boxes lie to each other."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mpfjax.vision.detections import Detections
+from mpfjax.vision.tracking.model import Pixels
+
+
+class TrackedFrame(NamedTuple):
+    """One frame: what was detected in it, and its pixels, None where nobody looks at them."""
+
+    detections: Detections
+    pixels: Pixels | None
+
+    def extent(self, known: Float[Array, "4"]) -> Float[Array, "4"]:
+        """Left, top, right and bottom of the frame, or of `known` and the detections' centres."""
+        if self.pixels is not None:
+            size = [0, 0, self.pixels.width, self.pixels.height]
+            return jnp.asarray(size, known.dtype)
+        valid, centres = self.detections.valid[:, None], self.detections.boxes[:, :2]
+        lowest = jnp.min(jnp.where(valid, centres, jnp.inf), axis=0, initial=jnp.inf)
+        highest = jnp.max(jnp.where(valid, centres, -jnp.inf), axis=0, initial=-jnp.inf)
+        return jnp.concatenate(
+            [jnp.minimum(known[:2], lowest), jnp.maximum(known[2:], highest)]
+        ).astype(known.dtype)
+
+
+def within(boxes: Float[Array, "k 4"], extent: Float[Array, "4"]) -> Bool[Array, " k"]:
+    """Whether the centre of each box lies inside left, top, right and bottom."""
+    centres = boxes[:, :2]
+    return jnp.all((centres >= extent[None, :2]) & (centres <= extent[None, 2:]), axis=1)
+
+
+def overlap(a: Float[Array, "m 4"], b: Float[Array, "d 4"]) -> Float[Array, "m d"]:
+    """Intersection over union of every box with every other, 0 where one has no area."""
+    low = jnp.maximum(a[:, None, :2] - a[:, None, 2:] / 2, b[None, :, :2] - b[None, :, 2:] / 2)
+    high = jnp.minimum(a[:, None, :2] + a[:, None, 2:] / 2, b[None, :, :2] + b[None, :, 2:] / 2)
+    common = jnp.prod(jnp.maximum(high - low, 0.0), axis=2)
+    union = jnp.prod(a[:, 2:], axis=1)[:, None] + jnp.prod(b[:, 2:], axis=1)[None] - common
+    return jnp.where(union > 0, common / jnp.where(union > 0, union, 1.0), 0.0)
