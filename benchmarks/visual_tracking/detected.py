@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,12 +11,15 @@ import numpy as np
 from jaxtyping import Array
 from tqdm import tqdm
 
+import mpfjax
 from benchmarks.visual_tracking.source import Source
 from mpfjax.vision import BackgroundSubtraction, Detections, ObjectTracker, Tracks
-from mpfjax.vision.loop import LONGEST_GUESS, make_tracker, offline_rows
+from mpfjax.vision import boxes as box_files
 from mpfjax.vision.snapshots import Snapshot
 
 MAX_DETECTIONS = 32
+# A box that no detection has borne out for longer than this is a guess, and not written.
+LONGEST_GUESS = 3
 
 
 class Detected(NamedTuple):
@@ -43,7 +46,12 @@ def make_trackers(detected: Detected) -> dict[str, ObjectTracker]:
     # Room for boxes to grow to twice the area of the largest detection.
     largest = max(np.prod(boxes[:, 2:], axis=1).max(initial=0) for boxes in detected.boxes)
     wide_counts = bool(2 * largest >= 2**16)
-    return {name: make_tracker(name, wide_counts=wide_counts) for name in ("mpf", "gm_mpf")}
+    gaussian = ObjectTracker(wide_counts=wide_counts)
+    resample = mpfjax.Resample(particles_per_component=gaussian.particles_per_object)
+    return {
+        "mpf": ObjectTracker(rejuvenation=resample, wide_counts=wide_counts),
+        "gm_mpf": gaussian,
+    }
 
 
 def track_detected(
@@ -69,11 +77,7 @@ def track_detected(
             yield snapshot, time.perf_counter() - start + detected.seconds[t]
 
     def rows_of_run(snapshots: list[Snapshot]) -> list[np.ndarray]:
-        done = kept[: len(snapshots)]
-        return [
-            offline_rows([Tracks(*(leaf[run] for leaf in tracks)) for tracks in done], source.first)
-            for run in range(len(keys))
-        ]
+        return [_rows(kept[: len(snapshots)], run, source.first) for run in range(len(keys))]
 
     return frames_of_run, rows_of_run
 
@@ -82,9 +86,30 @@ def track_detected(
 def _advance(tracker, keys, t, states, frame, found):
     def step(key, state):
         state, tracks = tracker.step(jax.random.fold_in(key, t), state, frame, found)
-        labels = jnp.where(state.occupied, state.component_indicators, -1)
-        points = state.particles.place[:, :2]
-        return state, tracks, Snapshot(tracks.boxes, tracks.shown, points, labels)
+        mixture = state.mixture
+        labels = jnp.where(mixture.occupied, mixture.component_indicators, -1)
+        points = state.colour.boxes(mixture.particles)[:, :2]
+        believed = tracks.confirmed & (tracks.unseen <= LONGEST_GUESS)
+        return state, tracks, Snapshot(tracks.boxes, believed, points, labels)
 
     # The frame is not mapped over, so that its histogram is built once for all runs.
     return jax.vmap(step)(keys, states)
+
+
+def _rows(kept: list[Tracks], run: int, first: int) -> np.ndarray:
+    """Rows (frame, id, x, y, w, h) of the objects that were believed in at some time.
+
+    Their first frames, before they were, are among them.
+    """
+    believed: set[int] = set()
+    rows: list[list[Any]] = []
+    for frame, tracks in enumerate(kept, first):
+        boxes = box_files.top_left(np.asarray(tracks.boxes[run]))
+        for m in np.flatnonzero(tracks.identities[run]):
+            identity = int(tracks.identities[run][m])
+            if tracks.confirmed[run][m]:
+                believed.add(identity)
+            if tracks.unseen[run][m] <= LONGEST_GUESS:
+                rows.append([frame, identity, *boxes[m]])
+    chosen = np.array([row for row in rows if row[1] in believed]).reshape(-1, 6)
+    return np.round(chosen, 3)

@@ -10,13 +10,10 @@ from jaxtyping import Array, Float, Key, UInt8
 
 from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole, given
 from mpfjax.moves.resampling import Resample
-from mpfjax.vision.detected_model import Detections
+from mpfjax.vision.detections import Detections
 from mpfjax.vision.detectors import LEAST_ROOM, AbstractDetector, Found, Once, Sieve, as_detector
 from mpfjax.vision.frames import of_one_kind
-from mpfjax.vision.tracker import ObjectTracker, Tracks
-
-# A box that no detection has borne out for longer than this is a guess, and not written.
-LONGEST_GUESS = 3
+from mpfjax.vision.tracker import LONGEST_GUESS, ObjectTracker, Tracks
 
 
 def track(
@@ -153,9 +150,9 @@ def make_tracker(
 def online_rows(number: int, tracks: Tracks) -> Float[np.ndarray, "k 6"]:
     """Rows (frame, id, x, y, w, h) of the objects that are believed in when the frame comes.
 
-    Those that are confirmed and were detected in the last frames; see `LONGEST_GUESS`.
+    Those that are confirmed and were detected in the last frames, `Tracks.shown`.
     """
-    return _rows(number, tracks, tracks.confirmed & (tracks.unseen <= LONGEST_GUESS))
+    return _rows(number, tracks, tracks.shown)
 
 
 def offline_rows(kept: Iterable[Tracks], first: int = 1) -> Float[np.ndarray, "r 6"]:

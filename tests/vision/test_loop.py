@@ -9,11 +9,12 @@ import pytest
 from mpfjax.vision import ObjectTracker, Tracks, track
 from mpfjax.vision.detectors import LEAST_ROOM, MOST_ROOM, Rows
 from mpfjax.vision.drawn import follow_boxes
-from mpfjax.vision.loop import LONGEST_GUESS, make_tracker, offline_rows, online_rows
+from mpfjax.vision.loop import make_tracker, offline_rows, online_rows
+from mpfjax.vision.tracker import LONGEST_GUESS
 
 SHAPE = (48, 64, 3)
 NUM_FRAMES = 8
-TRACKER = ObjectTracker(3, 10, num_parts=1, confirmation=2)
+TRACKER = ObjectTracker(3, 10)
 
 
 def walks(num_frames=NUM_FRAMES):
@@ -321,9 +322,10 @@ def test_room_is_made_for_what_a_file_holds():
 
 def test_trackers_are_made_by_the_name_of_their_filter():
     gaussian, resampling = make_tracker("gm_mpf", 5), make_tracker("mpf", 5, 30.0)
-    assert type(gaussian.rejuvenation).__name__ == "GaussianRegeneration"
-    assert type(resampling.rejuvenation).__name__ == "Resample"
-    assert (gaussian.max_objects, resampling.frames_per_second) == (5, 30.0)
+    names = [[type(move).__name__ for move in one.moves] for one in (gaussian, resampling)]
+    assert "GaussianRegeneration" in names[0]
+    assert "Resample" in names[1]
+    assert gaussian.max_objects == resampling.max_objects == 5
     with pytest.raises(ValueError, match="filter: 'pf' is not one of"):
         make_tracker("pf")
 
