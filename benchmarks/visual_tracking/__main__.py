@@ -127,7 +127,7 @@ def _detected_runs(options, source: Source, keys: Array) -> tuple[dict[str, Any]
     still = next(frame for t, frame in enumerate(source.read()) if t == first)
     filter = PRESETS[options.preset](still, boxes)["pf"]
     runs: dict[str, Any] = {"pf": _plain_run(filter, source, keys)}
-    for name, tracker in make_trackers(detected).items():
+    for name, tracker in make_trackers().items():
         runs[name] = track_detected(tracker, keys, source, detected)
     return runs, source
 

@@ -16,10 +16,9 @@ from benchmarks.visual_tracking.source import Source
 from mpfjax.vision import BackgroundSubtraction, Detections, ObjectTracker, Tracks
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision.snapshots import Snapshot
+from mpfjax.vision.tracker import LONGEST_GUESS
 
 MAX_DETECTIONS = 32
-# A box that no detection has borne out for longer than this is a guess, and not written.
-LONGEST_GUESS = 3
 
 
 class Detected(NamedTuple):
@@ -41,17 +40,11 @@ def detect_all(source: Source) -> Detected:
     return Detected(boxes, seconds)
 
 
-def make_trackers(detected: Detected) -> dict[str, ObjectTracker]:
+def make_trackers() -> dict[str, ObjectTracker]:
     """The same tracker with resampling and with Gaussian regeneration."""
-    # Room for boxes to grow to twice the area of the largest detection.
-    largest = max(np.prod(boxes[:, 2:], axis=1).max(initial=0) for boxes in detected.boxes)
-    wide_counts = bool(2 * largest >= 2**16)
-    gaussian = ObjectTracker(wide_counts=wide_counts)
+    gaussian = ObjectTracker()
     resample = mpfjax.Resample(particles_per_component=gaussian.particles_per_object)
-    return {
-        "mpf": ObjectTracker(rejuvenation=resample, wide_counts=wide_counts),
-        "gm_mpf": gaussian,
-    }
+    return {"mpf": ObjectTracker(rejuvenation=resample), "gm_mpf": gaussian}
 
 
 def track_detected(

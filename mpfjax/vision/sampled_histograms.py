@@ -71,7 +71,8 @@ class SampledHistogram(eqx.Module):
         n, channels, bins = len(boxes), self.colours.num_channels, self.colours.num_bins
         drawn = self.colours.bins(pixels.reshape(n, -1, 3)).reshape(n, num_parts, -1, channels)
         group = jnp.arange(n * num_parts, dtype=jnp.int32).reshape(n, num_parts, 1, 1)
-        bin = (group * channels + jnp.arange(channels, dtype=jnp.int32)) * bins + drawn
+        channel = jnp.arange(channels, dtype=jnp.int32)[None, None, None]
+        bin = (group * channels + channel) * bins + drawn
         seen = jnp.broadcast_to(inside.reshape(n, num_parts, -1, 1), bin.shape)
         total = n * num_parts * channels * bins
         counted = segment_counts(seen.ravel(), bin.ravel(), total)

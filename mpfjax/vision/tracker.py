@@ -144,6 +144,8 @@ class ObjectTracker(eqx.Module):
         self.moves = tuple(moves)
         for move in self.moves:
             check_type(AbstractMove, "a sequence of moves", moves=move)
+            if isinstance(move, AbstractRejuvenation):
+                _check_rejuvenation(move, particles_per_object, "moves")
         self.colours = colours
         self.max_objects = int(max_objects)
         self.particles_per_object = int(particles_per_object)
@@ -232,18 +234,20 @@ def object_model(
     )
 
 
-def _check_rejuvenation(rejuvenation: AbstractRejuvenation, particles_per_object: int) -> None:
-    check_type(AbstractRejuvenation, "a rejuvenating move", rejuvenation=rejuvenation)
+def _check_rejuvenation(
+    rejuvenation: AbstractRejuvenation, particles_per_object: int, argument: str = "rejuvenation"
+) -> None:
+    check_type(AbstractRejuvenation, "a rejuvenating move", **{argument: rejuvenation})
     number = getattr(rejuvenation, "particles_per_component", None)
     # Another number would leave no empty slots for the newborn.
     if number != particles_per_object:
         raise ValueError(
-            f"rejuvenation: its particles_per_component, {number}, is not particles_per_object,"
+            f"{argument}: its particles_per_component, {number}, is not particles_per_object,"
             f" {particles_per_object}"
         )
     if isinstance(rejuvenation, GaussianRegeneration) and rejuvenation.where is None:
         raise ValueError(
-            "rejuvenation: where is None, but which object a particle is of is no Gaussian"
+            f"{argument}: where is None, but which object a particle is of is no Gaussian"
         )
 
 

@@ -140,7 +140,7 @@ def tracked(sequence, boxes_of_frames, truth=None):
     source = Source("street", lambda: frames, 1, NUM, np.zeros((0, 4)), truth, False)
     detected = Detected(boxes_of_frames, [0.0] * NUM)
     keys = jax.random.split(jax.random.key(0), 1)
-    tracker = make_trackers(detected)["gm_mpf"]
+    tracker = make_trackers()["gm_mpf"]
     frames_of_run, rows_of_run = track_detected(tracker, keys, source, detected)
     with tqdm(disable=True) as bar:
         (rows,) = rows_of_run([snapshot for snapshot, _ in frames_of_run(bar)])
@@ -190,12 +190,6 @@ def test_who_is_seen_once_only_is_not_believed(sequence):
     assert result["all_covered"] == 0
     scores = visual_tracking.tracking_scores([rows], source, NUM)
     assert scores["HOTA"] in (None, 0)
-
-
-def test_large_detections_are_counted_wide():
-    for size, expected in ((20, False), (200, True)):
-        detected = Detected([np.zeros((0, 4)), np.array([[0.0, 0, size, size]])], [0.0, 0.0])
-        assert {each.wide_counts for each in make_trackers(detected).values()} == {expected}
 
 
 # --- nothing to track: an error before anything compiles ---------------------------------------

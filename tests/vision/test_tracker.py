@@ -1,15 +1,19 @@
 """The object tracker on tiny drawn frames: who is born, who lives on, who dies, and no leaks."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import linear_sum_assignment
 
 import mpfjax
-from mpfjax.vision import Detections, HSVColours, ObjectTracker, integral_histogram, tracker
-from mpfjax.vision.tracker import GATE, IMPOSSIBLE
+from mpfjax.vision import Detections, HSVColours, ObjectTracker
+from mpfjax.vision.tracker import object_model
+from mpfjax.vision.tracking.assignment import Assign
+from mpfjax.vision.tracking.births import Found, ShareMass
+from mpfjax.vision.tracking.colours import LearnColours
+from mpfjax.vision.tracking.deaths import Bury
+from mpfjax.vision.tracking.motion import PropagateObjects
+from mpfjax.vision.tracking.scores import RankScores
 
 HEIGHT, WIDTH, ROOM = 48, 64, 6
 M, P = 4, 10
@@ -19,16 +23,29 @@ SHIRTS = [(220, 30, 30), (30, 30, 220), (30, 200, 30), (220, 200, 30), (200, 30,
 KEYS = jax.random.split(jax.random.key(0), 200)
 
 
-def tracker_of(rejuvenation="gaussian", **options):
-    if rejuvenation == "resample":
-        options["rejuvenation"] = mpfjax.Resample(particles_per_component=P)
-    defaults = {"colours": COLOURS, "num_parts": 2, "confirmation": 2, "patience": 3}
-    defaults |= {"crowding": 3}
-    return ObjectTracker(M, P, **defaults | options)
+def motion(states):
+    return states.place, states.velocity
+
+
+def tracker_of(rejuvenation, patience=3):
+    """The default chain with few particles, and a patience that tests can wait for."""
+    model = object_model()
+    moves = [
+        RankScores(),
+        Assign(model),
+        rejuvenation,
+        PropagateObjects(model),
+        Bury(2, patience),
+        Found(model, P),
+        LearnColours(COLOURS, 2, adaptation=0.05),
+        ShareMass(),
+    ]
+    return ObjectTracker(M, P, colours=COLOURS, moves=moves)
 
 
 # Shared by the tests, since every tracker of other settings compiles anew.
-TRACKER, RESAMPLING = tracker_of(), tracker_of("resample")
+TRACKER = tracker_of(mpfjax.GaussianRegeneration(P, where=motion))
+RESAMPLING = tracker_of(mpfjax.Resample(particles_per_component=P))
 
 
 def draw(corners):
@@ -46,17 +63,22 @@ def boxes_at(corners):
     return np.array(rows, float).reshape(-1, 4)
 
 
-def detections(boxes, room=ROOM):
-    return Detections.from_boxes(np.asarray(boxes, float).reshape(-1, 4), room)
+def detections(boxes, scores=None):
+    scores = None if scores is None else np.asarray(scores, float)
+    return Detections.from_boxes(np.asarray(boxes, float).reshape(-1, 4), ROOM, scores)
 
 
-def run(corners_of_frames, chosen=TRACKER, seen=None):
-    """The tracks of each frame. `seen(t, corners)` says what is detected, all by default."""
+def run(corners_of_frames, chosen=TRACKER, seen=None, pixels=True, scores=None):
+    """The tracks of each frame.
+
+    `seen(t, corners)` says what is detected, all by default, and `scores(t)` how surely.
+    """
     state, tracks = chosen.init(), []
     for t, corners in enumerate(corners_of_frames):
         found = boxes_at(corners) if seen is None else seen(t, corners)
-        frame = jnp.asarray(draw(corners))
-        state, track = chosen.step(KEYS[t], state, frame, detections(found))
+        frame = jnp.asarray(draw(corners)) if pixels else None
+        found = detections(found, None if scores is None else scores(t))
+        state, track = chosen.step(KEYS[t], state, frame, found)
         tracks.append(jax.tree.map(np.asarray, track))
         assert_sound(state, tracks[-1])
     return tracks
@@ -64,8 +86,8 @@ def run(corners_of_frames, chosen=TRACKER, seen=None):
 
 def assert_sound(state, tracks):
     """Exactly P particles in each living component, none in a dead one, weights that sum to one."""
-    alive = np.asarray(state.identities) > 0
-    mixture = state.mixture
+    lives, mixture = state.memory["lives"], state
+    alive = np.asarray(lives.identities) > 0
     np.testing.assert_array_equal(mixture.component_counts, np.where(alive, P, 0))
     if alive.any():
         expected = np.where(alive, 1 / alive.sum(), 0)
@@ -73,16 +95,17 @@ def assert_sound(state, tracks):
     filled = np.asarray(mixture.occupied)
     particles = mixture.particles
     np.testing.assert_array_equal(
-        np.asarray(particles.reference)[filled], np.asarray(mixture.component_indicators)[filled]
+        np.asarray(particles.label)[filled], np.asarray(mixture.component_indicators)[filled]
     )
-    assert np.isfinite(np.asarray(particles.box)).all()
-    assert np.isfinite(np.asarray(state.colour.references)).all()
-    identities = np.asarray(state.identities)[alive]
+    assert np.isfinite(np.asarray(particles.place)).all()
+    identities = np.asarray(lives.identities)[alive]
     assert len(np.unique(identities)) == len(identities)
-    assert identities.max(initial=0) <= int(state.last_identity)
-    np.testing.assert_array_equal(tracks.identities, state.identities)
+    assert identities.max(initial=0) <= int(lives.last_identity)
+    np.testing.assert_array_equal(tracks.identities, lives.identities)
     assert not tracks.confirmed[~alive].any()
-    for memory in (state.seen, state.unseen, state.crowded):
+    assert (np.asarray(state.memory["assigned"])[~alive] == -1).all()
+    assert np.isfinite(np.asarray(state.memory["references"])).all()
+    for memory in (lives.seen, lives.unseen, state.memory["references"]):
         assert not np.asarray(memory)[~alive].any()
 
 
@@ -122,7 +145,7 @@ def test_components_are_born_confirmed_and_keep_their_identities(rejuvenation):
     assert [living(each) for each in tracks] == [[1, 2]] * 5 + [[1, 2, 3]] * 7
     assert [believed(each) for each in tracks] == [[]] + [[1, 2]] * 5 + [[1, 2, 3]] * 6
     assert all((each.unseen == 0).all() for each in tracks)
-    for t, each in enumerate(tracks[2:], 2):
+    for t, each in enumerate(tracks[6:], 6):
         ids = [1, 2] if abs(box_of(each, 1)[0] - 8 - t) < 3 else [2, 1]
         for identity, corner in zip(ids, corners(t)[:2], strict=True):
             np.testing.assert_allclose(box_of(each, identity)[:2], centre_of(corner), atol=1.5)
@@ -168,15 +191,6 @@ def test_a_detection_outside_the_frame_founds_nothing():
     for tracks in run([[]] * 3, seen=lambda t, c: np.array([*outside, in_part], float)):
         assert living(tracks) == [1]
         assert box_of(tracks, 1)[0] < WIDTH
-
-
-def test_of_two_on_one_object_the_younger_dies_of_crowding():
-    """Two detections walk into each other and are one place from frame 7 on."""
-    tracks = run([[(10, 20), (max(24 - 2 * t, 10), 20)] for t in range(24)])
-    lives = [living(each) for each in tracks]
-    assert lives[:4] == [[1, 2]] * 4
-    assert lives[-1] == [1]
-    assert {identity for life in lives for identity in life} == {1, 2}
 
 
 def test_a_full_house_takes_no_more_and_the_next_free_place_is_filled():
@@ -227,13 +241,13 @@ def test_nothing_leaks_over_many_random_frames(rejuvenation):
         gone |= ever - now
         ever |= now
     assert len(ever) > 20
-    assert max(ever) == int(state.last_identity) == len(ever)
+    assert max(ever) == int(state.memory["lives"].last_identity) == len(ever)
 
 
 def test_nothing_compiles_again_as_objects_come_and_go(monkeypatch):
     """Python runs a compiled step only to trace it for new shapes or settings."""
     run([[]])
-    monkeypatch.setattr(tracker, "integral_histogram", lambda *_: pytest.fail("traced again"))
+    monkeypatch.setattr(Assign, "costs", lambda *_: pytest.fail("traced again"))
     run([[], [(5, 5)], [(5, 5), (20, 20)], [], [(30, 5)]] + [[]] * 5)
 
 
@@ -281,75 +295,105 @@ def test_a_frame_without_colours_is_named(as_installed, frame, said):
         TRACKER.step(KEYS[0], TRACKER.init(), jnp.asarray(frame), detections([]))
 
 
-def test_the_assignment_is_scipys():
-    """Three components and four detections near them, and one that is near nobody."""
-    corners = [(10, 10), (17, 10), (40, 20)]
-    state = TRACKER.init()
-    frame = jnp.asarray(draw(corners))
-    for t in range(3):
-        state, tracks = TRACKER.step(KEYS[t], state, frame, detections(boxes_at(corners)))
-    shifted = [
-        [13.2, 10, 6, 12],
-        [16.5, 11, 7, 12],
-        [41, 19, 6, 13],
-        [11, 9.5, 5, 12],
-        [20, 35, 6, 9],
-    ]
-    found, table = detections(shifted), integral_histogram(frame, COLOURS)
-    own, taken = jax.jit(lambda *a: TRACKER._assigned(*a))(state, found, table)
-
-    boxes, seen = np.asarray(tracks.boxes, float), np.asarray(found.boxes, float)
-    cost = np.full((M, ROOM), IMPOSSIBLE)
-    for m in range(M):
-        for d in range(ROOM):
-            gap = np.r_[
-                (seen[d, :2] - boxes[m, :2]) / np.maximum(boxes[m, 2:], 1e-3),
-                np.log(seen[d, 2:] / np.maximum(boxes[m, 2:], 1e-3)),
-            ] / np.array(GATE)
-            if tracks.identities[m] > 0 and found.valid[d] and (gap**2).sum() < 1:
-                counts = np.asarray(table.counts(found.boxes[d][None], 2))[0, :, 0]
-                shares = counts / counts.sum(axis=1, keepdims=True)
-                references = np.asarray(state.colour.references[m, :, 0])
-                unlike = (1 - np.sqrt(shares * references).sum(axis=1)).mean()
-                cost[m, d] = (gap**2).sum() + unlike
-    pairs = [(m, d) for m, d in zip(*linear_sum_assignment(cost), strict=True) if cost[m, d] < 10]
-    assert len(pairs) == 3
-    assert ((cost < 10).sum(axis=1) > 1).any()
-    np.testing.assert_array_equal(np.flatnonzero(own.valid), sorted(m for m, _ in pairs))
-    np.testing.assert_array_equal(np.flatnonzero(taken), sorted(d for _, d in pairs))
-    for m, d in pairs:
-        np.testing.assert_allclose(own.boxes[m], seen[d], rtol=1e-6)
-
-
 def test_references_are_learned_from_who_stands_alone():
-    """A shirt that changes its colour: 5% of what is new joins the reference in each frame."""
+    """Trousers that change their colour: 5% of what is new joins the reference in each frame."""
     state, learned = TRACKER.init(), []
     for t in range(6):
         frame = draw([(20, 20)])
-        frame[20:32, 20:26] = (220, 30, 30) if t < 2 else (30, 200, 30)
+        frame[26:32, 20:26] = (220, 30, 30) if t < 2 else (30, 200, 30)
         state, _ = TRACKER.step(KEYS[t], state, jnp.asarray(frame), detections([[20, 20, *SIZE]]))
-        learned.append(np.asarray(state.colour.references[0, :, 0]))
+        learned.append(np.asarray(state.memory["references"][0, :, 0]))
     red, green = 1, 3
     assert learned[1][:, green].max() == 0
     np.testing.assert_allclose(learned[-1].sum(axis=1), 1, rtol=1e-5)
-    # The mean box may stand half a pixel off and see some of the background.
-    np.testing.assert_allclose(learned[-1][:, green], 1 - 0.95**4, rtol=0.25)
-    assert (learned[-1][:, red] < learned[1][:, red]).all()
+    np.testing.assert_allclose(learned[-1][:, green], [0, 1 - 0.95**4], rtol=1e-4)
+    np.testing.assert_allclose(learned[-1][:, red], [1, 0.95**4], rtol=1e-4)
 
 
-def test_large_objects_are_counted_wide(monkeypatch):
-    """16 bits would count nothing of 65 536 pixels or more."""
-    asked = []
+def test_who_is_in_contact_teaches_nobody():
+    """Two who walk into each other: once they overlap their references stay what they were."""
+    state, references, both = TRACKER.init(), [], []
+    for t in range(8):
+        corners = [(10 + t, 20), (26 - t, 20)]
+        frame = jnp.asarray(draw(corners))
+        state, tracks = TRACKER.step(KEYS[t], state, frame, detections(boxes_at(corners)))
+        references.append(np.asarray(state.memory["references"]))
+        both.append((np.asarray(tracks.unseen) == 0)[np.asarray(tracks.identities) > 0].sum())
+    assert both == [2] * 8
+    assert not np.array_equal(references[6], references[5])
+    np.testing.assert_array_equal(references[7], references[6])
 
-    def counted(frame, colours, wide_counts):
-        asked.append(wide_counts)
-        return integral_histogram(frame, colours, wide_counts)
 
-    monkeypatch.setattr(tracker, "integral_histogram", counted)
-    wide, frame = tracker_of(wide_counts=True), jnp.asarray(draw([]))
-    eqx.filter_eval_shape(wide.step, KEYS[0], wide.init(), frame, detections([]))
-    assert asked == [True]
-    assert wide.init().colour.wide_counts
+def test_a_weak_detection_sustains_a_component_and_founds_none():
+    """Two walk; the scores of one fall to a third of the other's, and it is not lost for that."""
+    corners = [[(5 + t, 5), (50 - t, 30)] for t in range(10)]
+    both = run(corners, scores=lambda t: [1.0, 1.0 if t < 4 else 0.35])
+    assert all(living(each) == [1, 2] for each in both)
+    assert all((each.unseen == 0).all() for each in both)
+    late = run(
+        corners,
+        seen=lambda t, c: boxes_at(c[:1] if t < 4 else c),
+        scores=lambda t: [1.0] if t < 4 else [1.0, 0.35],
+    )
+    assert all(living(each) == [1] for each in late)
+
+
+def test_what_the_detector_hardly_believes_sustains_nobody():
+    corners = [[(5 + t, 5), (50 - t, 30)] for t in range(8)]
+    tracks = run(corners, scores=lambda t: [1.0, 1.0 if t < 4 else 0.1])
+    assert [int(each.unseen.max()) for each in tracks] == [0] * 4 + [1, 2, 3, 0]
+    assert living(tracks[-1]) == [1]
+
+
+def test_scores_of_any_scale_are_the_same():
+    """Times 90, as some detectors score: thresholds come from the scores themselves."""
+    corners = [[(5 + t, 5), (50 - t, 30)] for t in range(6)]
+    scores = np.random.default_rng(0).uniform(0.1, 1, (6, 2))
+    once = run(corners, scores=lambda t: scores[t])
+    again = run(corners, scores=lambda t: 90 * scores[t])
+    for a, b in zip(once, again, strict=True):
+        np.testing.assert_array_equal(a.identities, b.identities)
+        np.testing.assert_array_equal(a.unseen, b.unseen)
+
+
+def test_without_pixels_detections_are_tracked_alone():
+    """Who walks out of the region where detections ever were is gone."""
+
+    def corners(t):
+        return [(5 + 3 * t, 5), (50 - t, 30)]
+
+    tracks = run([corners(t) for t in range(8)], pixels=False)
+    assert all(living(each) == [1, 2] for each in tracks)
+    for identity in (1, 2):
+        places = [box_of(each, identity)[:2] for each in tracks]
+        own = min(corners(0), key=lambda c: abs(centre_of(c) - places[0]).sum())
+        which = corners(0).index(own)
+        np.testing.assert_allclose(places[-1], centre_of(corners(7)[which]), atol=1.5)
+    gone = run(
+        [corners(t) for t in range(9)],
+        pixels=False,
+        seen=lambda t, c: boxes_at(c if t < 6 else c[1:]),
+    )
+    assert len(living(gone[-1])) == 1
+
+
+def test_of_more_than_there_is_room_for_the_strongest_are_tracked_and_it_is_said():
+    corners = [(2, 2), (14, 2), (26, 2), (38, 2), (50, 2), (2, 30)]
+    scores = [0.9, 0.8, 1.0, 0.6, 0.95, 0.85]
+    tracks = run([corners] * 2, scores=lambda t: scores)
+    assert all(each.full for each in tracks)
+    centres = sorted(box[0] for box in tracks[-1].boxes)
+    np.testing.assert_allclose(centres, [5, 5, 29, 53], atol=1.5)
+    assert not run([corners[:4]])[-1].full
+
+
+def test_corner_boxes_are_the_boxes():
+    tracks = jax.tree.map(jnp.asarray, run([[(20, 20)]] * 3)[-1])
+    (m,) = np.flatnonzero(tracks.identities)
+    np.testing.assert_allclose(
+        tracks.corner_boxes[m, :2] + tracks.boxes[m, 2:] / 2, tracks.boxes[m, :2], rtol=1e-6
+    )
+    np.testing.assert_array_equal(tracks.shown, tracks.confirmed)
 
 
 @pytest.mark.parametrize(
@@ -357,28 +401,21 @@ def test_large_objects_are_counted_wide(monkeypatch):
     [
         ("max_objects", 0),
         ("particles_per_object", 0),
-        ("num_parts", 0),
-        ("confirmation", 0),
-        ("patience", 0),
-        ("crowding", -1),
-        ("patience", 2.5),
+        ("frames_per_second", 0.0),
+        ("frames_per_second", float("nan")),
         ("sigma", 0.0),
-        ("sigma", float("nan")),
         ("sigma", float("inf")),
-        ("momentum", -0.1),
-        ("momentum", 1.1),
-        ("adaptation", 1.0),
-        ("adaptation", -0.1),
-        ("step_deviations", (0.1, 0.1, 0.1)),
-        ("step_deviations", (0.1, 0.1, 0.1, 0.0)),
-        ("detection_deviations", (0.1, 0.1, 0.1, -1.0)),
-        ("detection_deviations", (0.1, 0.1, 0.1, float("inf"))),
+        ("exact_colours", 2),
+        ("strong_score", float("nan")),
+        ("weak_score", float("inf")),
+        ("colours", "red"),
+        ("moves", 3),
+        ("moves", (3,)),
     ],
 )
 def test_a_bad_setting_is_named(as_installed, name, value):
-    with pytest.raises(ValueError, match=f"^{name}: ") as caught:
+    with pytest.raises(ValueError, match=f"^{name}: "):
         ObjectTracker(**{name: value})
-    assert str(value) in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -25,16 +25,17 @@ class Assign(AbstractMove):
     -2 log N(d; μ_m, S_m), up to a constant, with μ_m and S_m the moments of the component's
     prediction and of the detector's error, `colour_cost` times the mean B² of the detection's
     colours from the component's, `weak_cost` for a weak detection, and `doubt_cost` for a component
-    that is not yet confirmed. A detection whose squared distance is beyond `gate` is impossible.
-    So objects that meet are settled together. It leaves the particles as they are; memory: the row
-    of each component's detection, -1 for none.
+    that is not yet confirmed. A pair that costs more than `gate` is impossible: the detection is
+    rather that of a newcomer, above all where the component has been unseen for long. So objects
+    that meet are settled together. It leaves the particles as they are; memory: the row of each
+    component's detection, -1 for none.
 
     One assignment stands for all that there are (`approximate` is true). Raises `ValueError` for a
     gate that is not positive and a cost below zero.
     """
 
     model: DetectedObjectModel
-    gate: float = eqx.field(static=True, default=35.0)
+    gate: float = eqx.field(static=True, default=20.0)
     colour_cost: float = eqx.field(static=True, default=28.0)
     weak_cost: float = eqx.field(static=True, default=10.0)
     doubt_cost: float = eqx.field(static=True, default=8.0)
@@ -80,7 +81,7 @@ class Assign(AbstractMove):
         doubtful = ~lives.confirmed[:, None]
         cost += self.doubt_cost * doubtful.astype(cost.dtype)
         counts = found.valid & (found.scores >= scores.weak)
-        possible = lives.alive[:, None] & counts[None] & (squares < self.gate)
+        possible = lives.alive[:, None] & counts[None] & (cost < self.gate)
         return jnp.where(possible, cost, _IMPOSSIBLE)
 
     def _distances(

@@ -18,8 +18,8 @@ class Bury(AbstractMove):
     A component dies where no detection has been assigned to it for more than `patience` frames in a
     row, for more than none while it is not confirmed; where its centre has left the frame; and
     where all its particles have zero likelihood. It is confirmed once detections have borne it out
-    in `confirmation` frames. Where there are no pixels, the frame reaches as far as the centres of
-    all detections so far. Memory: `Lives`, with `Found`, and that extent.
+    in `confirmation` frames. Where there are no pixels, the frame reaches as far as all
+    detections so far. Memory: `Lives`, with `Found`, and that extent.
 
     Deaths are decided and not sampled (`approximate` is true). Raises `ValueError` for a number of
     frames that is not whole, or below 1.

@@ -78,7 +78,7 @@ class DetectedObjectModel(AbstractStateSpaceModel):
     size_noise: Float[Array, "2"] = eqx.field(converter=to_array("size_noise"))
     detection_deviations: Float[Array, "4"] = eqx.field(converter=to_array("detection_deviations"))
     weak_error: float = eqx.field(static=True, default=1.35)
-    miss: float = eqx.field(static=True, default=0.01)
+    miss: float = eqx.field(static=True, default=1e-4)
     sigma: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:

@@ -16,13 +16,14 @@ class TrackedFrame(NamedTuple):
     pixels: Pixels | None
 
     def extent(self, known: Float[Array, "4"]) -> Float[Array, "4"]:
-        """Left, top, right and bottom of the frame, or of `known` and the detections' centres."""
+        """Left, top, right and bottom of the frame, or else of `known` and the detections."""
         if self.pixels is not None:
             size = [0, 0, self.pixels.width, self.pixels.height]
             return jnp.asarray(size, known.dtype)
-        valid, centres = self.detections.valid[:, None], self.detections.boxes[:, :2]
-        lowest = jnp.min(jnp.where(valid, centres, jnp.inf), axis=0, initial=jnp.inf)
-        highest = jnp.max(jnp.where(valid, centres, -jnp.inf), axis=0, initial=-jnp.inf)
+        valid, boxes = self.detections.valid[:, None], self.detections.boxes
+        low, high = boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2
+        lowest = jnp.min(jnp.where(valid, low, jnp.inf), axis=0, initial=jnp.inf)
+        highest = jnp.max(jnp.where(valid, high, -jnp.inf), axis=0, initial=-jnp.inf)
         return jnp.concatenate(
             [jnp.minimum(known[:2], lowest), jnp.maximum(known[2:], highest)]
         ).astype(known.dtype)
