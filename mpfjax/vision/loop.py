@@ -152,7 +152,7 @@ def online_rows(number: int, tracks: Tracks) -> Float[np.ndarray, "k 6"]:
 
     Those that are confirmed and were detected in the last frames, `Tracks.shown`.
     """
-    return _rows(number, tracks, tracks.shown)
+    return _rows(number, tracks, tracks.confirmed & (tracks.unseen <= LONGEST_GUESS))
 
 
 def offline_rows(kept: Iterable[Tracks], first: int = 1) -> Float[np.ndarray, "r 6"]:

@@ -186,7 +186,8 @@ def test_more_objects_than_room_are_flagged_and_the_strongest_kept():
     places = np.stack([np.arange(6) * 10, np.full(6, 10), np.full(6, 6), np.full(6, 12)], axis=1)
     scores = np.arange(6.0)
     with pytest.warns(RuntimeWarning, match="frame 1 has more objects than the 3 .* max_objects"):
-        run = tracked(None, [(places, scores)] * 3)
+        tracker = ObjectTracker(3, 10, strong_score=0.0, weak_score=0.0)
+        run = list(track(None, [(places, scores)] * 3, tracker))
     assert run[0].full
     np.testing.assert_allclose(np.sort(run[-1].boxes[:, 0]), [33, 43, 53], atol=3)
 
