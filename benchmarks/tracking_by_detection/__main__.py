@@ -141,7 +141,7 @@ def _runs(
         for peer in others:
             if peer.setting == "defaults":
                 run = _theirs(sequence, peer, least)
-                yield f"{peer.name}, score >= {least:.3g}", iter([run])
+                yield f"{peer.name}, defaults, score >= {least:.3g}", iter([run])
 
 
 def _ours(
@@ -175,7 +175,7 @@ def _theirs(sequence: Sequence, peer: Peer, least: float | None) -> Run:
     # Thresholds that a documentation advises are for scores up to one.
     if peer.setting == "advised" and scores.max(initial=0.0) > 1:
         scores = scores / scores.max()
-    step = peer.make(sequence.frames_per_second)
+    step = peer.make(sequence.frames_per_second if peer.setting == "advised" else None)
     kept, seconds = [], 0.0
     for frame in range(sequence.first, sequence.last + 1):
         here = rows[:, 0] == frame

@@ -20,12 +20,8 @@ TRACKER = ObjectTracker(3, 10)
 def walks(num_frames=NUM_FRAMES):
     """Rows of two boxes that walk past each other at some distance, the second the stronger."""
     t = np.arange(num_frames)
-    one = np.column_stack(
-        [t + 1, 0 * t - 1, 4 + 3 * t, 0 * t + 5, 0 * t + 8, 0 * t + 14, 0 * t + 1]
-    )
-    two = np.column_stack(
-        [t + 1, 0 * t - 1, 48 - 3 * t, 0 * t + 28, 0 * t + 8, 0 * t + 14, 0 * t + 2]
-    )
+    one = np.column_stack([t + 1, 0 * t - 1, 20 + t, 0 * t + 5, 0 * t + 8, 0 * t + 14, 0 * t + 1])
+    two = np.column_stack([t + 1, 0 * t - 1, 44 - t, 0 * t + 28, 0 * t + 8, 0 * t + 14, 0 * t + 2])
     return np.concatenate([one, two]).astype(float)
 
 
@@ -185,8 +181,8 @@ def test_two_thousand_detections_leave_the_strongest():
 def test_more_objects_than_room_are_flagged_and_the_strongest_kept():
     places = np.stack([np.arange(6) * 10, np.full(6, 10), np.full(6, 6), np.full(6, 12)], axis=1)
     scores = np.arange(6.0)
+    tracker = ObjectTracker(3, 10, strong_score=0.0, weak_score=0.0)
     with pytest.warns(RuntimeWarning, match="frame 1 has more objects than the 3 .* max_objects"):
-        tracker = ObjectTracker(3, 10, strong_score=0.0, weak_score=0.0)
         run = list(track(None, [(places, scores)] * 3, tracker))
     assert run[0].full
     np.testing.assert_allclose(np.sort(run[-1].boxes[:, 0]), [33, 43, 53], atol=3)
