@@ -3,6 +3,8 @@
 import contextlib
 import math
 import re
+import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -114,10 +116,28 @@ def open_video(
 
     def append(frame: np.ndarray) -> None:
         check_frame(frame, "frames")
-        writer.append_data(_even(frame) if suffix == ".mp4" else frame)
+        # imageio kills the encoder that is interrupted while it is fed, and the video with it.
+        with _uninterrupted():
+            writer.append_data(_even(frame) if suffix == ".mp4" else frame)
 
     with writer:
         yield append
+
+
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Put off a Ctrl-C that comes within the block to its end."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # Python tells the main thread alone
+        return
+    pending: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: pending.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
+        if pending and before is not signal.SIG_IGN:
+            signal.raise_signal(signal.SIGINT)
 
 
 def check_frame(frame: Any, argument: str = "frame", *, eight_bits: bool = True) -> None:

@@ -47,10 +47,11 @@ def sequence(tmp_path_factory):
 
 
 def perfect(frames_per_second):
-    """A peer that names boxes by where they are."""
+    """A peer that names boxes by where they are, and weak ones otherwise."""
 
     def step(boxes, scores):
-        return np.column_stack([np.where(boxes[:, 1] < 20, 1, 2), boxes])
+        ids = np.where(scores < 0.5 * scores.max(), 3, np.where(boxes[:, 1] < 20, 1, 2))
+        return np.column_stack([ids, boxes])
 
     return step
 
