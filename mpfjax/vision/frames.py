@@ -68,6 +68,7 @@ def frame_rate(path: str | Path) -> float | None:
 
     None where nothing says it. Raises `ValueError` for a file that is no video.
     """
+    check_type((str, Path), "a path", path=path)
     path = Path(path)
     if path.is_dir():
         return _rate_of_folder(path)
