@@ -84,7 +84,8 @@ class ObjectTracker(eqx.Module):
     - `frames_per_second`: of the video. Above 25, objects move less in a frame, and wait for
       more frames; from 7 to 25 the same settings hold.
     - `rejuvenation`: `Resample(particles_per_component=P)` for an MPF, or
-      `GaussianRegeneration(P, where=lambda states: (states.place, states.velocity))`, the default.
+      `GaussianRegeneration(P, where=lambda states: (states.place, states.velocity))`, by default
+      with stratified noise.
     - `colours`: the bins of the histograms.
     - `exact_colours`: count every pixel of a box by an integral histogram, at a cost that grows
       with the frame, and not the grid of points of a `SampledHistogram`.
@@ -108,7 +109,7 @@ class ObjectTracker(eqx.Module):
     def __init__(
         self,
         max_objects: int = 24,
-        particles_per_object: int = 50,
+        particles_per_object: int = 64,
         *,
         frames_per_second: float = 25.0,
         rejuvenation: AbstractRejuvenation | None = None,
@@ -125,7 +126,9 @@ class ObjectTracker(eqx.Module):
         colours = HSVColours(8, 4, 6) if colours is None else colours
         check_type(AbstractColours, "AbstractColours such as HSVColours()", colours=colours)
         if rejuvenation is None:
-            rejuvenation = GaussianRegeneration(particles_per_object, where=_motion)
+            rejuvenation = GaussianRegeneration(
+                particles_per_object, where=_motion, noise="stratified"
+            )
         _check_rejuvenation(rejuvenation, particles_per_object)
         if moves is None:
             model = object_model(frames_per_second, sigma)
