@@ -79,12 +79,13 @@ class Rows(AbstractDetector):
             )
         self.first = first
         self.frames = rows[:, 0].astype(int)
+        self.last = int(self.frames.max(initial=0))
         order = np.argsort(self.frames, kind="stable")
         self._rows, self._sorted = rows[order], self.frames[order]
 
     def find(self, number: int, frame: Any) -> Found:
         """The rows of this frame."""
-        if frame is None and number > self.frames.max(initial=0):
+        if frame is None and number > self.last:
             raise StopIteration
         begin, end = np.searchsorted(self._sorted, [number, number + 1])
         rows = self._rows[begin:end]

@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key, UInt8
+from jaxtyping import Array, Float, Int, Key, PyTree, UInt8
 
 from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole, given
 from mpfjax.moves.resampling import Resample
@@ -92,8 +92,9 @@ def _tracked(
                 " there is room for, max_detections; the strongest are kept",
             )
         observation = Detections.from_boxes(found.boxes, room, found.scores)
-        pixels = jnp.asarray(still) if use_colours and still is not None else None
-        state, tracks = tracker.step(jax.random.fold_in(key, number), state, pixels, observation)
+        pixels = still if use_colours else None
+        # An array, since a new Python number would compile anew.
+        state, tracks = _advance(tracker, key, np.asarray(number), state, pixels, observation)
         tracks = jax.device_get(tracks)
         if tracks.full:
             once.warn(
@@ -102,6 +103,19 @@ def _tracked(
                 " there is room for, max_objects; the strongest are kept",
             )
         yield tracks
+
+
+@eqx.filter_jit
+def _advance(
+    tracker: ObjectTracker,
+    key: Key[Array, ""],
+    number: Int[Array, ""],
+    state: PyTree,
+    pixels: UInt8[Array, "h w 3"] | None,
+    observation: Detections,
+) -> tuple[PyTree, Tracks]:
+    """A step, with the key of the frame drawn in the same program: a call is half a millisecond."""
+    return tracker.step(jax.random.fold_in(key, number), state, pixels, observation)
 
 
 def _observed(
