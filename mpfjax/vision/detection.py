@@ -1,5 +1,6 @@
 """Moving objects found by background subtraction, which start a tracker without a drawn box."""
 
+from collections import deque
 from collections.abc import Iterable
 from types import ModuleType
 from typing import Any
@@ -9,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from mpfjax.checks import (
     check_inner_share,
+    check_not_negative,
     check_positive,
     check_share,
     check_type,
@@ -20,6 +22,12 @@ from mpfjax.vision.frames import check_frame
 
 # What OpenCV's mask holds where a pixel is foreground; a shadow has another value.
 _FOREGROUND = 255
+# How many blobs are remembered for their shape, and from how many on it counts.
+_REMEMBERED, _ENOUGH = 500, 20
+# A blob may be several where it is lower than this share of what is usual, in widths.
+_TOO_WIDE = 0.8
+# A part of a blob may be so much narrower than one is.
+_NARROWEST = 2.4
 
 
 class BackgroundSubtraction:
@@ -27,9 +35,10 @@ class BackgroundSubtraction:
 
     Lin et al. (2012), section 5, detect their targets like this; the mixture is OpenCV's MOG2
     (Zivkovic 2004). Pixels that fit none of the background's Gaussians and are no shadow make
-    blobs, gaps in a blob's height are closed, a blob of people side by side is cut between their
-    heads, and what does not have the size or the shape of a person is dropped. Two people one
-    behind the other stay one blob, and whoever stands still long enough becomes background.
+    blobs, gaps in a blob's height are closed, a blob that is too wide for one is cut where its
+    outline dips, as between two heads, and what does not have the size is dropped. What too wide
+    means is learned from the video, unless it is given: people or cars, most blobs are one. Two
+    one behind the other stay one blob, and what stands still long enough becomes background.
 
     - `history`: frames over which the background is forgotten.
     - `threshold`: how many standard deviations from a Gaussian a pixel still belongs to it.
@@ -41,11 +50,15 @@ class BackgroundSubtraction:
       None where shadows count as foreground.
     - `warm_up`: first frames that only teach the background, at least 1, the first of all.
     - `area`: least and most area of a box, as shares of the frame's.
-    - `aspect`: least and most height of a box, in widths.
+    - `aspect`: least and most height of a box, in widths; None is any shape.
     - `largest_gap`: height of the gaps that are closed, as a share of the frame's height.
-    - `cut_aspect`: a blob lower than this many widths may be cut; None cuts none.
+    - `cut_aspect`: a blob lower than this many widths may be cut; None takes four fifths of the
+      median of the blobs so far, once there are a few, and 0 cuts none.
     - `cut_depth`: how high the outline may reach between two heads, as a share of the lower one's
       height above the blob's foot, in (0, 1).
+
+    - `most_pixels`: a larger frame is reduced to at most so many before anything is looked for, by
+      a whole number along both sides; boxes are in pixels of the frame that is given.
 
     Defaults are tuned on people before a street camera. One object serves one video, since it
     keeps that video's background; colours may come in any fixed order of the three channels. Use
@@ -63,13 +76,15 @@ class BackgroundSubtraction:
         shadow_brightness: float | None = 0.6,
         warm_up: int = 1,
         area: tuple[float, float] = (0.0015, 0.3),
-        aspect: tuple[float, float] = (1.0, 6.0),
+        aspect: tuple[float, float] | None = None,
         largest_gap: float = 0.02,
-        cut_aspect: float | None = 2.5,
+        cut_aspect: float | None = None,
         cut_depth: float = 0.9,
+        most_pixels: int = 640 * 480,
     ) -> None:
-        check_whole(history=history, warm_up=warm_up)
-        check_positive(threshold=threshold, **given(cut_aspect=cut_aspect))
+        check_whole(history=history, warm_up=warm_up, most_pixels=most_pixels)
+        check_positive(threshold=threshold)
+        check_not_negative(**given(cut_aspect=cut_aspect))
         check_inner_share(background_share=background_share, cut_depth=cut_depth)
         check_inner_share(**given(shadow_brightness=shadow_brightness))
         check_share(largest_gap=largest_gap)
@@ -77,7 +92,7 @@ class BackgroundSubtraction:
             raise ValueError(f"largest_gap: {largest_gap} is not in [0, 1)")
         if not 0 <= _range(area)[0] < _range(area)[1] <= 1:
             raise ValueError(f"area: {shown(area)} is not a range within [0, 1]")
-        if not 0 < _range(aspect)[0] < _range(aspect)[1] < np.inf:
+        if aspect is not None and not 0 < _range(aspect)[0] < _range(aspect)[1] < np.inf:
             raise ValueError(f"aspect: {shown(aspect)} is not a range of positive numbers")
         self._cv2 = _cv2()
         self.history = int(history)
@@ -86,10 +101,11 @@ class BackgroundSubtraction:
         self.shadow_brightness = shadow_brightness
         self.warm_up = int(warm_up)
         self.area = area
-        self.aspect = aspect
+        self.aspect = (0.0, np.inf) if aspect is None else aspect
         self.largest_gap = largest_gap
         self.cut_aspect = cut_aspect
         self.cut_depth = cut_depth
+        self.most_pixels = int(most_pixels)
         self._forget()
 
     def learn(self, frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
@@ -124,8 +140,11 @@ class BackgroundSubtraction:
         if self._frames_seen <= self.warm_up:
             return np.zeros((0, 4))
         boxes = np.array(self._blobs(foreground), float).reshape(-1, 4)
-        boxes = boxes[self._like_a_person(boxes, foreground.size)]
-        return boxes[np.lexsort((boxes[:, 1], boxes[:, 0]))]
+        boxes = boxes[self._fitting(boxes, foreground.size)]
+        boxes = boxes[np.lexsort((boxes[:, 1], boxes[:, 0]))]
+        height, width = np.asarray(frame).shape[:2]
+        scale = np.array([width / foreground.shape[1], height / foreground.shape[0]])
+        return boxes * np.concatenate([scale, scale])
 
     def _forget(self) -> None:
         shadows = self.shadow_brightness is not None
@@ -136,6 +155,7 @@ class BackgroundSubtraction:
         if self.shadow_brightness is not None:
             self._background.setShadowThreshold(self.shadow_brightness)
         self._frames_seen, self._shape = 0, None
+        self._aspects: deque[float] = deque(maxlen=_REMEMBERED)
 
     def _subtract(self, frame: np.ndarray, rate: float) -> np.ndarray:
         """1 where a pixel is foreground; the frame joins the background with weight `rate`."""
@@ -148,8 +168,19 @@ class BackgroundSubtraction:
                 f"{_size(self._shape)}"
             )
         self._shape = frame.shape
-        mask = self._background.apply(np.ascontiguousarray(frame), learningRate=rate)
+        mask = self._background.apply(self._reduced(frame), learningRate=rate)
         return (mask == _FOREGROUND).astype(np.uint8)
+
+    def _reduced(self, frame: np.ndarray) -> np.ndarray:
+        """The frame, or means over squares of its pixels where it has too many."""
+        height, width, _ = frame.shape
+        factor = int(np.ceil(np.sqrt(height * width / self.most_pixels)))
+        if factor == 1:
+            return np.ascontiguousarray(frame)
+        size = (max(width // factor, 1), max(height // factor, 1))
+        return self._cv2.resize(
+            np.ascontiguousarray(frame), size, interpolation=self._cv2.INTER_AREA
+        )
 
     def _blobs(self, foreground: np.ndarray) -> list[tuple[int, int, int, int]]:
         gap = round(self.largest_gap * len(foreground))
@@ -159,18 +190,35 @@ class BackgroundSubtraction:
             foreground = self._cv2.morphologyEx(foreground, self._cv2.MORPH_CLOSE, line)
         _, labels, found, _ = self._cv2.connectedComponentsWithStats(foreground, connectivity=8)
         boxes = []
-        for label, (x, y, w, h, _) in enumerate(found[1:].tolist(), 1):
-            # No part of a blob can be larger than the blob.
-            if w * h >= self.area[0] * foreground.size:
-                blob = labels[y : y + h, x : x + w] == label
-                boxes += [(x + i, y + j, *size) for i, j, *size in self._cut(blob)]
+        # No part of a blob can be larger than the blob.
+        large = [
+            (label, *place[:4])
+            for label, place in enumerate(found[1:].tolist(), 1)
+            if place[2] * place[3] >= self.area[0] * foreground.size
+        ]
+        # Who leaves the frame in part does not show its shape.
+        bottom, right = foreground.shape
+        self._aspects.extend(
+            h / w for _, x, y, w, h in large if x > 0 and y > 0 and x + w < right and y + h < bottom
+        )
+        widest = self._cut_aspect()
+        for label, x, y, w, h in large:
+            blob = labels[y : y + h, x : x + w] == label
+            boxes += [(x + i, y + j, *size) for i, j, *size in self._cut(blob, widest)]
         return boxes
 
-    def _cut(self, blob: Bool[np.ndarray, "h w"]) -> list[tuple[int, int, int, int]]:
-        """The boxes of the people side by side in a blob that fills its array."""
+    def _cut_aspect(self) -> float:
+        """The height of one, in widths, below which a blob may be several; 0 where unknown."""
+        if self.cut_aspect is not None:
+            return self.cut_aspect
+        return _TOO_WIDE * float(np.median(self._aspects)) if len(self._aspects) >= _ENOUGH else 0.0
+
+    def _cut(self, blob: Bool[np.ndarray, "h w"], widest: float) -> list[tuple[int, int, int, int]]:
+        """The boxes of those side by side in a blob that fills its array."""
         height, width = blob.shape
-        narrowest = max(int(np.ceil(height / self.aspect[1])), 1)
-        if self.cut_aspect is None or height >= self.cut_aspect * width or width <= 2 * narrowest:
+        most = min(self.aspect[1], _NARROWEST * widest)
+        narrowest = max(int(np.ceil(height / most)), 1) if most > 0 else width
+        if height >= widest * width or width <= 2 * narrowest:
             return [(0, 0, width, height)]
         # How high the blob reaches in each column. It dips between two heads; the legs of one
         # person who strides do not show.
@@ -182,17 +230,20 @@ class BackgroundSubtraction:
         cut = narrowest + int(np.argmin(depths[narrowest : width - narrowest]))
         if depths[cut] > self.cut_depth:
             return [(0, 0, width, height)]
-        return self._cut_part(blob[:, :cut], 0) + self._cut_part(blob[:, cut:], cut)
+        left_part = self._cut_part(blob[:, :cut], 0, widest)
+        return left_part + self._cut_part(blob[:, cut:], cut, widest)
 
-    def _cut_part(self, part: np.ndarray, start: int) -> list[tuple[int, int, int, int]]:
+    def _cut_part(
+        self, part: np.ndarray, start: int, widest: float
+    ) -> list[tuple[int, int, int, int]]:
         rows, columns = (np.flatnonzero(part.any(axis=axis)) for axis in (1, 0))
         if len(rows) == 0:
             return []
         tight = part[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         x, y = start + int(columns[0]), int(rows[0])
-        return [(x + i, y + j, w, h) for i, j, w, h in self._cut(tight)]
+        return [(x + i, y + j, w, h) for i, j, w, h in self._cut(tight, widest)]
 
-    def _like_a_person(self, boxes: np.ndarray, pixels: int) -> np.ndarray:
+    def _fitting(self, boxes: np.ndarray, pixels: int) -> np.ndarray:
         width, height = boxes[:, 2], boxes[:, 3]
         shares = width * height / pixels
         sized = (shares >= self.area[0]) & (shares <= self.area[1])

@@ -39,11 +39,6 @@ def counts(**arguments):
     return table.counts(**{"boxes": jnp.ones((2, 4))} | arguments)
 
 
-def propose(**arguments):
-    model = {} if "model" in arguments else {"model": vision.DetectedColourModel(built("colour"))}
-    return vision.DetectionProposal(**model | arguments)
-
-
 TABLE = {
     "RGBColours": (vision.RGBColours, {}, {"num_bins": "count"}),
     "HSVColours": (
@@ -85,12 +80,11 @@ TABLE = {
         {"boxes": BOXES, "max_detections": 3},
         {"boxes": "rows", "max_detections": "count"},
     ),
-    "DetectedColourModel": (
-        late(vision.DetectedColourModel, colour="colour"),
-        {},
-        {"colour": "kind", "deviations": "four", "miss": "scalar"},
+    "SampledHistogram": (
+        vision.SampledHistogram,
+        {"frame": FRAME, "colours": vision.RGBColours(4)},
+        {"colours": "kind", "rows": "count", "columns": "count"},
     ),
-    "DetectionProposal": (propose, {}, {"model": "kind", "share": "share"}),
     "distracter_scene": (
         vision.distracter_scene,
         {"key": KEY},
@@ -180,18 +174,17 @@ TABLE = {
         vision.BackgroundSubtraction,
         {},
         {"history": "count", "warm_up": "count", "threshold": "positive",
-         "cut_aspect": "positive?", "background_share": "inner share",
+         "most_pixels": "count", "background_share": "inner share",
          "shadow_brightness": "inner share?", "cut_depth": "inner share", "largest_gap": "share",
-         "area": "range", "aspect": "range"},
+         "area": "range", "aspect": "range?"},
     ),
     "PruneHypotheses": (vision.PruneHypotheses, {}, {"least_share": "inner share"}),
     "ObjectTracker": (
         vision.ObjectTracker,
         {},
         {"max_objects": "count", "particles_per_object": "count", "rejuvenation": "kind?",
-         "colours": "kind?", "sigma": "positive", "momentum": "share", "num_parts": "count",
-         "step_deviations": "four", "detection_deviations": "four", "confirmation": "count",
-         "patience": "count", "crowding": "count", "adaptation": "share", "wide_counts": "flag"},
+         "colours": "kind?", "sigma": "positive?", "frames_per_second": "positive",
+         "exact_colours": "flag", "moves": "kind?"},
     ),
 }  # fmt: skip
 
@@ -216,8 +209,7 @@ def test_what_will_not_do_is_named(function, good, name, value):
         (vision.joint_colour_model, OF_FRAME, "templates", {0: FRAME}),
         (vision.joint_colour_model, OF_FRAME, "templates", {0: (FRAME, None)}),
         (vision.joint_colour_model, OF_FRAME, "templates", {0: (None, BOXES[0])}),
-        (propose, {}, "share", 1),
-        (vision.ObjectTracker, {}, "adaptation", 1),
+        (vision.ObjectTracker, {"weak_score": 2.0}, "strong_score", NAN),
         (vision.distracter_scene, {"key": KEY}, "num_frames", 2),
         (vision.write_tracks, {"path": "/nowhere"}, "rows", [[0.5, 1, 2, 3, 4, 5]]),
         (vision.write_tracks, {"path": "/nowhere"}, "rows", [[1, 1, NAN, 3, 4, 5]]),

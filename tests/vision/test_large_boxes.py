@@ -133,10 +133,10 @@ def test_templates_of_many_pixels_are_learned(frame):
     )
 
 
-def test_a_tracker_does_not_unlearn_what_it_cannot_count(frame):
-    """An object that grows beyond all counts keeps the colours that it had."""
-    sure = {"step_deviations": (0.01,) * 4, "detection_deviations": (0.01,) * 4}
-    tracker = ObjectTracker(1, 8, colours=COLOURS, num_parts=1, adaptation=0.5, sigma=100.0, **sure)
+@pytest.mark.parametrize("exact_colours", [False, True])
+def test_a_tracker_learns_the_colours_of_large_objects(frame, exact_colours):
+    """An object that grows beyond what 16 bits count."""
+    tracker = ObjectTracker(1, 8, colours=COLOURS, exact_colours=exact_colours)
     state = tracker.init()
     for t, (w, h) in enumerate([(250, 255), (262, 262), (270, 270), (280, 280)]):
         box = [[(WIDTH - w) / 2, (HEIGHT - h) / 2, w, h]]
@@ -144,4 +144,5 @@ def test_a_tracker_does_not_unlearn_what_it_cannot_count(frame):
         state, tracks = tracker.step(jax.random.key(t), state, jnp.asarray(frame), found)
     assert np.prod(tracks.boxes[0, 2:]) > 2**16
     assert tracks.identities.tolist() == [1]
-    np.testing.assert_allclose(np.sum(state.colour.references, axis=-1), 1.0, rtol=1e-4)
+    references = np.asarray(state.memory["references"])
+    np.testing.assert_allclose(references.sum(axis=-1), 1.0, rtol=1e-4)

@@ -239,7 +239,7 @@ def test_what_only_remembers_leaves_the_distribution_as_it_is(name):
 
 
 def test_what_decides_is_approximate_and_what_follows_is_not():
-    approximate = {Assign(MODEL), Bury(), Found(MODEL, P), LearnColours(COLOURS), ShareMass()}
+    approximate = [Assign(MODEL), Bury(), Found(MODEL, P), LearnColours(COLOURS), ShareMass()]
     assert all(move.approximate for move in approximate)
     assert not PropagateObjects(MODEL).approximate
     assert not RankScores().approximate
