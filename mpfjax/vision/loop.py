@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int, Key, PyTree, UInt8
+from jaxtyping import Array, Float, Key, PyTree, UInt8
 
 from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole, given
 from mpfjax.moves.resampling import Resample
@@ -109,9 +109,9 @@ def _tracked(
 def _advance(
     tracker: ObjectTracker,
     key: Key[Array, ""],
-    number: Int[Array, ""],
+    number: Any,
     state: PyTree,
-    pixels: UInt8[Array, "h w 3"] | None,
+    pixels: Any,
     observation: Detections,
 ) -> tuple[PyTree, Tracks]:
     """A step, with the key of the frame drawn in the same program: a call is half a millisecond."""
