@@ -62,8 +62,10 @@ def coverage(
         hits = covers(boxes[:, 2:], truth[:, 2:])
         complete.append(bool(hits.any(axis=0).all()))
         on_object += [bool(row.any()) for row in hits]
-        strays = covers(boxes[:, 2:], others[others[:, 0] == frame, 2:]).any(axis=1)
-        on_other += (strays & ~hits.any(axis=1)).tolist()
+        strays = covers(boxes[:, 2:], others[others[:, 0] == frame, 2:])
+        on_other += [
+            bool(other.any() and not own.any()) for other, own in zip(strays, hits, strict=True)
+        ]
         for row, column in zip(truth, hits.T, strict=True):
             covered.setdefault(int(row[1]), []).append(bool(column.any()))
         swaps += _reassign(identity, boxes, truth, hits)
