@@ -15,7 +15,7 @@ import nox
 from packaging.requirements import Requirement
 
 nox.needs_version = ">=2025.2.9"
-nox.options.sessions = ["lint", "wheel", "lowest", "tests"]
+nox.options.sessions = ["lint", "docs", "wheel", "lowest", "tests"]
 
 OLDEST = (3, 11)
 # What the lower bounds are held to: the library's own parts, without those of its tests that need
@@ -112,6 +112,17 @@ def lint(session: nox.Session) -> None:
     session.run("ruff", "check")
     session.run("ruff", "format", "--check")
     session.run("pyright")
+
+
+@nox.session(python=sys.executable)
+def docs(session: nox.Session) -> None:
+    """The site, with warnings as errors, to site/index.html; it asks nothing of the network."""
+    session.install("-e", ".[docs]")
+    doctrees = Path(session.create_tmp()).resolve() / "doctrees"
+    session.run(
+        "sphinx-build", "--fail-on-warning", "--keep-going", "--fresh-env",
+        "--doctree-dir", str(doctrees), "docs", "site",
+    )  # fmt: skip
 
 
 @nox.session(python=OLDEST_PYTHON)

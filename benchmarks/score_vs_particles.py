@@ -224,7 +224,8 @@ def summarise(
 
 def num_particles(runs: mpfjax.ParticleMixture) -> int:
     """N of these runs, which may have more slots."""
-    return runs.log_weights.shape[-1] if runs.limit is None else int(runs.limit[0])
+    usable = runs.usable_slots
+    return runs.log_weights.shape[-1] if usable is None else int(usable[0])
 
 
 def shared_slots(sizes: list[int]) -> int | None:
@@ -238,11 +239,11 @@ def typical_size(sizes: list[int]) -> int:
     return min(sizes, key=lambda n: abs(n - TYPICAL_NUM_PARTICLES))
 
 
-def typical_run(runs: dict[str, np.ndarray]) -> "plotting.Trace":
+def typical_run(runs: dict[str, np.ndarray]) -> "plotting.ParticleHistory":
     """The particles of the run whose score is the median one."""
     scores = runs["both"].mean(axis=1)
     index = int(np.argsort(scores, kind="stable")[(len(scores) - 1) // 2])
-    return plotting.Trace(
+    return plotting.ParticleHistory(
         positions=runs["positions"][index],
         occupied=runs["occupied"][index],
         component_indicators=runs["component_indicators"][index],

@@ -57,6 +57,7 @@ from mpfjax.running.storage import save_checkpoint as save_checkpoint
 from mpfjax.running.studies import Study as Study
 from mpfjax.running.studies import read_study as read_study
 from mpfjax.running.studies import run_study as run_study
+from mpfjax.smoothing.forecasts import forecast as forecast
 
 # The one place that says it: pyproject.toml reads it from here.
 __version__ = "0.1.0"

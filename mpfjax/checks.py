@@ -1,7 +1,8 @@
-"""Checks of arguments, each raising a `ValueError` with the argument, its value and what would do.
+"""Checks of arguments. Each raises a `ValueError` that names the argument and its value, and says
+what is allowed.
 
-Arguments are given by name: `check_whole(1, num_particles=num_particles)`. What may be None is
-checked through `given`, which leaves it out: `check_positive(**given(max_distance=None))`.
+Arguments are given by name: `check_whole(1, num_particles=num_particles)`. An argument that may be
+None goes through `given`, which leaves out None: `check_positive(**given(max_distance=None))`.
 """
 
 import contextlib
@@ -176,7 +177,7 @@ def check_shape(shape: str, /, **arguments: Any) -> None:
 
 
 def to_rows(width: int, name: str, value: Any) -> np.ndarray:
-    """The argument of this name as rows of so many numbers; nothing is no row, a vector is one."""
+    """The argument as rows of `width` numbers; a vector is one row, and an empty list is none."""
     try:
         rows = np.asarray(value, float)
     except (TypeError, ValueError) as error:
@@ -220,7 +221,7 @@ def _check_entries(holds: Callable[..., Any], what: str, arguments: dict[str, An
 
 @contextlib.contextmanager
 def saying(what: str) -> Iterator[None]:
-    """Add to an error from a user's own function which argument it came from."""
+    """Add to an error from the user's own function the argument that it came from."""
     try:
         yield
     except Exception as error:

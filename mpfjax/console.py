@@ -1,6 +1,6 @@
-"""What every command does: read its numbers, write its results whole, end with one line of error.
+"""What all commands share: read numbers, write whole files, end an error with one line.
 
-A number that will not do is argparse's error, and exit status 2.
+A number out of range is an error of argparse, with exit status 2.
 """
 
 import argparse
@@ -36,7 +36,7 @@ def whole(least: int = 1, most: int = 2**31 - 1) -> Callable[[str], int]:
     return read
 
 
-# JAX makes a key of the last 32 bits alone, so that larger seeds would be smaller ones.
+# JAX makes a key of the last 32 bits only: a larger seed would be the same as a smaller one.
 seed = whole(0, 2**32 - 1)
 
 
@@ -70,7 +70,7 @@ def fill_in(
     /,
     **defaults: Any,
 ) -> None:
-    """Give options that are None their defaults; one that was given and is not used is an error."""
+    """Set options that are None to their defaults; a given option without effect is an error."""
     for name, default in defaults.items():
         if getattr(options, name) is None:
             setattr(options, name, default)

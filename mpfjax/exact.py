@@ -32,7 +32,7 @@ class GridFilterRun(eqx.Module):
         return self.probabilities @ self.grid**2 - self.means**2
 
     def mass_above(self, threshold: float) -> Float[Array, " t"]:
-        """P(x_t > threshold | y_1..y_t); the cell across the threshold counts in part."""
+        """P(x_t > threshold | y_1..y_t); of the cell at the threshold, the part above it counts."""
         cell = self.grid[1] - self.grid[0]
         return self.probabilities @ jnp.clip((self.grid - threshold) / cell + 0.5, 0.0, 1.0)
 
@@ -50,9 +50,10 @@ def grid_filter(
 
     - `model`: has `log_transition` and `log_likelihood`; its states are scalars of shape
       `state_shape`, () or (1,).
-    - `grid`: evenly spaced points that cover every place x_t can be, several to the smallest
-      standard deviation of the model; the error then falls faster than any power of the spacing.
-    - `log_initial`: log p(x_0) at the grid points; None asks the model's own `log_initial`.
+    - `grid`: evenly spaced points that cover all values that x_t can have, with several points in
+      the smallest standard deviation of the model. The error then falls faster than any power of
+      the spacing.
+    - `log_initial`: log p(x_0) at the grid points; None calls the model's own `log_initial`.
 
     Costs O(t g²). Differentiable in the model's parameters. Raises `ValueError` for a grid that
     is not one ascending row, or a model without these densities. Use it as the truth for a

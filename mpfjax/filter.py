@@ -23,7 +23,7 @@ from mpfjax.operations.logarithms import scaled_log_sum_exp
 
 
 class StepInfo(eqx.Module):
-    """What a step reports beside the mixture it returns."""
+    """What a step reports beside the mixture that it returns."""
 
     log_likelihood_increment: Float[Array, ""]
     """log p(y_t | y_1..y_{t-1}), estimated; -inf where every particle has zero likelihood."""
@@ -37,7 +37,7 @@ class StepInfo(eqx.Module):
     """whether every particle had zero likelihood: the weights are then those of the prediction."""
 
 
-# Moves that leave the total mass as it is, so that there is nothing to normalise.
+# Moves that do not change the total mass; there is nothing to normalise after them.
 _KEEP_MASS = (AbstractRegrouping, AbstractRejuvenation, Exchange)
 BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
@@ -47,7 +47,7 @@ class Start(NamedTuple):
 
     key: Key[Array, "*seeds"]
     particles: PyTree = None
-    """as many as there are slots, of which those after the first `num_particles` are empty."""
+    """one for each slot; the slots after the first `num_particles` are empty."""
     num_particles: Int[Array, "*seeds"] | None = None
 
 
@@ -58,13 +58,15 @@ class _Tied(eqx.Module):
 class Filter(eqx.Module):
     """A particle filter: a chain of moves on a particle mixture.
 
-    One step applies the moves in order and normalises. The growth of the total mass is the
-    increment of the marginal likelihood, whatever the moves are.
+    One step applies the moves in order and normalises. The increment of the marginal likelihood is
+    the growth of the total mass, whatever the moves are.
 
-    - `model`: draws x_0. Moves that hold the very same model share it: the filter is a pytree
-      with one copy of the model's parameters, so that its gradient is the gradient.
+    - `model`: draws x_0. Moves that hold the very same model share it. The filter is then a pytree
+      with one copy of the model's parameters, and a gradient with respect to them is complete.
     - `moves`: callables `(key, mixture, observation) -> mixture`, usually `AbstractMove`s.
-    - `num_particles`, `num_components`: N slots, and M, the most components.
+    - `num_particles`: N.
+    - `num_components`: M, the most components; the filters of the literature call it
+      `max_components`.
     - `initial_moves`: regrouping of x_0, such as `KMeans(reseed=True)`.
 
     Raises `ValueError` for N < 1, M < 1, N < M, no moves, or fewer slots than
@@ -108,8 +110,13 @@ class Filter(eqx.Module):
         self.num_components = int(num_components)
 
     @property
+    def max_components(self) -> int:
+        """M, the most components; the same as `num_components`."""
+        return self.num_components
+
+    @property
     def moves(self) -> tuple[Any, ...]:
-        """The moves of one step, each with the filter's model where it shares it."""
+        """The moves of one step; those that share the filter's model hold it."""
         return untie(self._moves, self.model)
 
     @property
@@ -142,10 +149,10 @@ class Filter(eqx.Module):
     ) -> tuple[ParticleMixture, StepInfo]:
         """The mixture at t and a report, from the mixture at t-1 and y_t.
 
-        A NaN or infinite observation is an error, unless the model says that it takes NaN for what
-        is missing; a step that has no observation is `predict`'s. Where every particle has zero
-        likelihood the increment is -inf, the particles move on with the weights that they had
-        before, and `degenerate` is true.
+        A NaN or infinite observation is an error, unless the model has `handles_missing`. For a
+        step without an observation call `predict`. If every particle has zero likelihood, the
+        increment is -inf, the particles keep the weights that they had before, and `degenerate`
+        is true.
         """
         check_key(key)
         check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
@@ -159,8 +166,8 @@ class Filter(eqx.Module):
     ) -> tuple[ParticleMixture, StepInfo]:
         """One step without an observation: the particles propagate, the weights stay.
 
-        For a missing y_t, or to forecast. The increment is zero. Raises `ValueError` for a move
-        that does not say what it does without an observation.
+        Use it for a missing y_t, or to forecast. The increment is zero. Raises `ValueError` for a
+        move without a method `predict`.
         """
         check_key(key)
         check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
@@ -188,7 +195,7 @@ class Filter(eqx.Module):
         return mixture, _report(mixture, increment, resampled)
 
     def _forgetting(self, mixture: ParticleMixture) -> ParticleMixture:
-        """The mixture, in whose memory there is nothing of components that have died."""
+        """The mixture without any memory of components that have died."""
         if not mixture.memory:
             return mixture
         memory, dead = mixture.memory, ~mixture.active
@@ -234,9 +241,10 @@ def sample_initial(
 def _normalise(
     mixture: ParticleMixture, previous_log_weights: Float[Array, " n"]
 ) -> tuple[ParticleMixture, Float[Array, ""]]:
-    """Remove the mass's growth; where no mass is left, go on with the weights of before.
+    """Remove the growth of the mass; if no mass is left, take the previous weights.
 
-    The scale goes first, and exactly: with it the sum of the weights would be rounded away.
+    The scale is removed first, which is exact. Added to it, the sum of the weights would be lost to
+    rounding.
     """
     log_sum, log_largest = scaled_log_sum_exp(mixture.log_weights)
     own_scale = jnp.zeros_like(log_sum) if mixture.log_scale is None else mixture.log_scale
@@ -244,7 +252,7 @@ def _normalise(
     has_mass = log_total > -jnp.inf
     log_share = log_excess - jnp.where(has_mass, log_total, 0.0)
     normalised = (mixture.log_weights - log_largest) + log_share
-    # NaN compares false, and must not be taken for a step of zero likelihood.
+    # A comparison with NaN is false, but NaN is not a step of zero likelihood.
     keep = has_mass | jnp.isnan(log_total)
     log_weights = jnp.where(keep, normalised, previous_log_weights)
     return mixture.replace(log_weights=log_weights, log_scale=None), log_scale + log_total
@@ -270,8 +278,8 @@ def _own_ancestors(mixture: ParticleMixture) -> ParticleMixture:
 
 
 def split_keys(key: Key[Array, ""], num: int) -> list[Key[Array, ""]]:
-    """One key for each move; the first ones are the same whatever their number, so that a longer
-    chain draws alike.
+    """One key for each move. The first keys do not depend on `num`: a longer chain starts with the
+    same draws.
     """
     return list(split(key, num))
 

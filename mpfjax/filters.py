@@ -38,8 +38,8 @@ def particle_filter(
     """The standard particle filter: resample, propagate.
 
     Vermaak et al. (2003), section 3, with one component; bootstrap unless a proposal is given.
-    The right filter for a filtering distribution of one mode; it loses all but one of several.
-    `gradient` is that of `Resample`, and "stop" that of `Propagate` as well: the one to tune by.
+    Use it for a filtering distribution with one mode; of several modes it loses all but one.
+    `gradient` is that of `Resample`. "stop" is also that of `Propagate`: take it for tuning.
     """
     resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
     return Filter(
@@ -69,14 +69,15 @@ def mixture_particle_filter(
 ) -> Filter:
     """The mixture particle filter: resample within components, propagate, regroup.
 
-    Vermaak et al. (2003), sections 3 and 4. Components are resampled independently and meet only
-    in their mixture weights, so that none can starve another; at every step those that overlap
-    merge, diffuse ones split, and K-means refines the rest. All of it is exact. `features` and
-    `scale` say in which coordinates and units all three see the particles (see `Features`; of one
-    particle where the model is wrapped by `per_particle`). `merge`, `split` and `kmeans` set
-    thresholds, with features and a scale of their own; see those moves for the defaults.
-    `gradient` is that of `particle_filter`. Use it where the filtering distribution has several
-    modes that must all be kept.
+    Vermaak et al. (2003), sections 3 and 4. Each component is resampled on its own and competes
+    with the others only through its mixture weight. So no component takes particles from another.
+    At every step components that overlap merge, diffuse components split, and K-means refines the
+    grouping. All of it is exact. `features` and `scale` are the coordinates and units in which
+    these three moves see the particles (see `Features`; features of one particle, if the model
+    is wrapped by `per_particle`). `merge`, `split` and `kmeans` replace those moves, for example
+    with other thresholds, and bring their own features and scale. `gradient` is that of
+    `particle_filter`. Use it where the filtering distribution has several modes and all of them
+    must be kept.
     """
     resample = Resample(scheme, ess_threshold, particles_per_component, sort_by, gradient)
     propagate = Propagate(model, proposal, _of_draws(gradient))
@@ -96,8 +97,8 @@ def gaussian_particle_filter(
 ) -> Filter:
     """The Gaussian particle filter: redraw from the Gaussian of the moments, propagate.
 
-    Kotecha and Djuric (2003); Lin et al. (2012), section 3. An approximation, for a filtering
-    distribution that is close to one Gaussian; it cannot keep two modes. `importance` is that of
+    Kotecha and Djuric (2003); Lin et al. (2012), section 3. It is an approximation for a filtering
+    distribution close to one Gaussian, and cannot keep two modes. `importance` is that of
     `gaussian_mixture_particle_filter`.
     """
     return Filter(
@@ -125,15 +126,16 @@ def gaussian_mixture_particle_filter(
     """GM-MPF: each component redrawn from the Gaussian of its moments, propagated, regrouped.
 
     Lin et al. (2012), section 4: the mixture particle filter with Gaussian regeneration in place
-    of resampling. The paper leaves open what the sample of the importance function q of eqs. 8
-    and 9 is, and `importance` offers both readings. "propagated": draws from the Gaussian of the
-    filtering distribution, moved by the dynamics (or by `proposal`), are the sample, and weighed
-    by L (or L D / q). "predictive_gaussian": those draws only give the moments of the prediction
-    (eqs. 12 and 13), and the sample is drawn afresh from its Gaussian, N(μ̄, Σ̄), which stands in
-    numerator and denominator of eq. 8 and cancels; one more approximation and one more draw.
+    of resampling. The paper can be read in two ways about what is drawn from the importance
+    function q of eqs. 8 and 9, and `importance` chooses one. "propagated": particles are drawn
+    from the Gaussian of the filtering distribution, moved by the dynamics (or by `proposal`), and
+    weighted by L (or L D / q). "predictive_gaussian": these particles only give the moments of
+    the prediction (eqs. 12 and 13). New particles are drawn from its Gaussian, N(μ̄, Σ̄), and
+    weighted by L, since the Gaussian cancels in eq. 8. That is one more approximation and one
+    more draw.
 
-    An approximation, good where each mode is close to a Gaussian. Raises `ValueError` for another
-    `importance`, and for the second with a `proposal`, which it has no use for.
+    The filter is an approximation, good where each mode is close to a Gaussian. Raises
+    `ValueError` for another `importance`, and for "predictive_gaussian" with a `proposal`.
     """
     return _mixture_filter(
         model, num_particles, max_components,
@@ -154,12 +156,11 @@ def partitioned_sampling(
     """Partitioned sampling: resample, then move one object after the other.
 
     MacCormick and Blake (1999); Smith and Gatica-Perez (2004), section 3. `order` is a
-    permutation of the objects 0, ..., J-1, their own order for None, or "random" for a new one
-    at every step. Needs far fewer particles than the joint particle filter, which is
-    `particle_filter` on the same model; but the early objects of the order keep only a few
-    distinct hypotheses, and hardly recover from an occlusion. Unbiased in every order, with an
-    interaction as well. `ess_threshold` and `gradient` are those of the resampling between steps
-    and objects.
+    permutation of the objects 0, ..., J-1; None is 0, ..., J-1, and "random" a new permutation at
+    every step. It needs far fewer particles than the joint particle filter, `particle_filter` on
+    the same model. But the first objects of the order keep only a few distinct hypotheses, and
+    hardly recover from an occlusion. It is unbiased in every order, also with an interaction.
+    `ess_threshold` and `gradient` are those of the resampling between steps and objects.
     """
     require_multi_object(model, "partitioned_sampling")
     orders: Any = order
@@ -189,16 +190,16 @@ def distributed_partitioned_sampling(
     ess_threshold: float = 1.0,
     gradient: str = "none",
 ) -> Filter:
-    """DPS: the particles dealt into C sets, in each of which the objects move in another order.
+    """DPS: the particles are dealt into C sets, and the objects move in another order in each.
 
-    Smith and Gatica-Perez (2004), section 4: pool and resample, deal into C sets at random, do
-    partitioned sampling in each, reassemble. The impoverishment that a fixed order puts on its
-    first objects falls on all alike. `orders` are C permutations of the objects, the J circular
-    shifts for None, or "random" for J new ones at every step. `reassembly` is "prior", the
-    paper's, where every set returns to its mass (an approximation: the marginal likelihood is
-    biased), or "evidence", which is exact, and whose gradient can be; see `Partitioned`, for
-    `gradient` as well. Use it where it is not known which object will be hard, and with enough
-    particles for each set of N/C to track.
+    Smith and Gatica-Perez (2004), section 4: pool and resample, deal the particles into C sets at
+    random, do partitioned sampling in each, reassemble. A fixed order leaves its first objects few
+    distinct hypotheses; here this loss is shared by all objects. `orders` are C permutations of
+    the objects; None is the J circular shifts, and "random" J new permutations at every step.
+    `reassembly` is "prior", the paper's, where every set returns to its mass (an approximation:
+    the marginal likelihood is biased), or "evidence", which is exact. See `Partitioned` for both,
+    and for `gradient`. Use it where you do not know which object will be hard to track, with
+    enough particles that each set of N/C can track.
     """
     require_multi_object(model, "distributed_partitioned_sampling")
     if orders is None:
@@ -225,9 +226,10 @@ def independent_particle_filters(
 ) -> Filter:
     """A small particle filter for each object, as if there were no other.
 
-    N particles an object, so the cost of a joint filter of N. Exact where the objects do not
-    interact, and then the one to beat; an interaction is left out, and look-alikes that cross
-    end on the same object. Estimates are after resampling; see `PropagateIndependently`.
+    Each object has N particles, so the cost is that of a joint filter of N. It is exact where the
+    objects do not interact, and then the best choice. It ignores an interaction, and look-alikes
+    that cross may end on the same object. Estimates are after resampling; see
+    `PropagateIndependently`.
     """
     require_multi_object(model, "independent_particle_filters")
     return Filter(model, moves=[PropagateIndependently(model, scheme)], num_particles=num_particles)
@@ -241,20 +243,20 @@ def clustered_particle_filter(
     split_after: int | None = None,
     scheme: str = "systematic",
 ) -> Filter:
-    """A joint filter of clusters of objects, each on its own until it meets another.
+    """A joint filter of clusters of objects; clusters merge where objects meet.
 
-    Every object starts with a particle filter of its own. Where the predicted clouds of two
-    meet, that is, where the interaction ψ between any of their points is not 1, they become one
-    joint filter, weighted by ψ, in which objects still cross between rows: each of an object's N
-    points serves every row, with the weight L f(point | row) / Σ f(point | any row). It is
-    `independent_particle_filters` where nothing interacts, and unbiased where something does,
-    at the N x J likelihood evaluations a step of partitioned sampling. The derivation, the
-    options and what it asks of the object model are in `PropagateInClusters`.
+    Every object starts with a particle filter of its own. Two objects meet if the interaction ψ
+    between any of their predicted points is not 1. Then they become one joint filter, weighted by
+    ψ. In it, objects still cross between rows: each of an object's N points serves every row,
+    with the weight L f(point | row) / Σ f(point | any row). Without interaction it is
+    `independent_particle_filters`; with interaction it is unbiased. A step costs N x J likelihood
+    evaluations, as in partitioned sampling. `PropagateInClusters` has the derivation, the options
+    and what the object model must define.
 
-    Use it in place of a joint filter, PS or DPS wherever ψ has compact support, as that of
-    `PairwiseRepulsion` has; with a ψ that never ends all objects become one cluster at once.
-    Estimates are after resampling. A cluster's distribution may have several modes, such as
-    look-alikes in either order, and their mean is then nobody's place: take a median.
+    Use it instead of a joint filter, PS or DPS wherever ψ has compact support, as in
+    `PairwiseRepulsion(compact=True)`. Otherwise all objects become one cluster at once. Estimates
+    are after resampling. A cluster's distribution may have several modes, such as two look-alikes
+    in either order. Their mean is then a place where no object is: take a median.
     """
     move = PropagateInClusters(model, start, split_after, scheme)
     return Filter(model, moves=[move], num_particles=num_particles)
@@ -266,7 +268,7 @@ def _gaussian_moves(
     regeneration: GaussianRegeneration | None,
     importance: str,
 ) -> list[AbstractMove]:
-    """Redraw, propagate and weigh, with or without a second redraw between the last two."""
+    """Redraw, propagate and weigh; for some, redraw again before weighing."""
     redraw = GaussianRegeneration() if regeneration is None else regeneration
     check_type(GaussianRegeneration, "a GaussianRegeneration", regeneration=redraw)
     check_one_of(("propagated", "predictive_gaussian"), importance=importance)

@@ -21,22 +21,25 @@ class ParticleMixture(eqx.Module):
 
     It holds ONE set of joint log-weights ℓ_i = log(π_{c_i} w_i), normalised over all particles.
     Mixture weights π_m = Σ_{c_i = m} exp ℓ_i and particle weights w_i = exp(ℓ_i) / π_{c_i} are
-    derived and never stored, so that the exact re-weighting after a reclustering (section 4) is
-    nothing but new indicators. Shapes are fixed: a slot of weight zero (ℓ = -inf) is empty, and a
+    derived and never stored. So a reclustering (section 4) only changes the indicators, and the
+    exact re-weighting follows. Shapes are fixed: a slot of weight zero (ℓ = -inf) is empty, and a
     component without a filled slot is dead.
 
     - `particles`: a pytree whose leaves have a leading axis n, the states X.
     - `log_weights`: ℓ, shape (n,), -inf in an empty slot.
     - `component_indicators`: C, shape (n,), in [0, num_components).
     - `ancestor_indices`: shape (n,), which slot of the previous step's mixture each came from.
-    - `num_components`: M, the most components there can be; static.
+    - `num_components`: M, the most components that there can be, dead ones included; static. The
+      filters of the literature call it `max_components`.
     - `memory`: what moves with a memory carry from step to step, by the move's name.
-    - `limit`: how many slots may be filled, where that is fewer than there are; None is all.
-    - `log_scale`: within a step, log of a factor of all weights that ℓ leaves out, since beside a
-      log-likelihood of a million ℓ would be rounded away; None, which is zero, once normalised.
+    - `usable_slots`: how many slots a move may fill, the first ones; None is all of them. Only
+      `monte_carlo(..., slots=...)` sets it.
+    - `log_scale`: within a step, the logarithm of a common factor of all weights. It is kept apart
+      from ℓ, which rounding would destroy if a log-likelihood of a million were added. After a
+      step it is None, which stands for zero.
 
-    Properties are those of one mixture: for a stack of them, as `monte_carlo` and `collect=None`
-    give, they raise a `ValueError` that says to `jax.vmap` over the leading axes.
+    The properties are those of one mixture. For a stack of mixtures, as `monte_carlo` and
+    `collect=None` return, they raise a `ValueError` that says to `jax.vmap` over the leading axes.
     """
 
     particles: PyTree
@@ -45,7 +48,7 @@ class ParticleMixture(eqx.Module):
     ancestor_indices: Int[Array, " n"]
     num_components: int = eqx.field(static=True)
     memory: dict[str, PyTree] = eqx.field(default_factory=dict)
-    limit: Int[Array, ""] | None = None
+    usable_slots: Int[Array, ""] | None = None
     log_scale: Float[Array, ""] | None = None
 
     @property
@@ -55,9 +58,24 @@ class ParticleMixture(eqx.Module):
         return self.log_weights.shape[0]
 
     @property
+    def max_components(self) -> int:
+        """M, the most components; the same as `num_components`."""
+        return self.num_components
+
+    @property
+    def num_usable_slots(self) -> int | Int[Array, ""]:
+        """How many slots a move may fill: `usable_slots`, or N where that is None."""
+        return self.num_particles if self.usable_slots is None else self.usable_slots
+
+    @property
+    def limit(self) -> Int[Array, ""] | None:
+        """The name that `usable_slots` had before."""
+        return self.usable_slots
+
+    @property
     def room(self) -> int | Int[Array, ""]:
-        """How many slots may be filled."""
-        return self.num_particles if self.limit is None else self.limit
+        """The name that `num_usable_slots` had before."""
+        return self.num_usable_slots
 
     @property
     def occupied(self) -> Bool[Array, " n"]:
@@ -97,7 +115,7 @@ class ParticleMixture(eqx.Module):
         self._require_one()
         labels = self.component_indicators
         if self.num_components == 1:
-            # Labels that nothing reads need not be copied from step to step.
+            # Labels that nothing reads are then not copied from step to step.
             labels = jnp.zeros_like(labels)
         return segment_counts(self.occupied, labels, self.num_components)
 
@@ -169,22 +187,22 @@ class ParticleMixture(eqx.Module):
     def average(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, " *rest"]:
         """Σ_i exp(ℓ_i) v_i, the estimate of an expectation under the filtering distribution.
 
-        Of an event it is the probability: `m.average(m.particles["mode"] == 2)`. Whole numbers and
-        booleans are averaged as floating point numbers.
+        The average of an event is its probability: `m.average(m.particles["mode"] == 2)`. Whole
+        numbers and booleans are averaged as floating point numbers.
         """
         values = as_inexact(values)
         is_filled, zero = _rows(self.occupied, values), jnp.zeros((), values.dtype)
         products = _rows(self.weights.astype(values.dtype), values) * jnp.where(
             is_filled, values, zero
         )
-        # XLA for a CPU may take thirty times as long for a sum that does the multiplying.
+        # On a CPU, XLA may take thirty times as long for a sum that also multiplies.
         return jnp.sum(jnp.where(is_filled, products, zero), axis=0)
 
     def weighed(self, *log_factors: Float[Array, "#n"]) -> "ParticleMixture":
         """The mixture with its weights multiplied by exp of the factors, one array or several.
 
-        What the filled slots have in common of each array goes to `log_scale`, so that a constant
-        of any size changes nothing but the mass. An empty slot stays empty whatever its factor is.
+        The largest factor of the filled slots goes to `log_scale`. So a constant of any size only
+        changes the mass. An empty slot stays empty whatever its factor is.
         """
         log_weights, log_scale = self.log_weights, self.log_scale
         for factors in log_factors:
@@ -197,9 +215,8 @@ class ParticleMixture(eqx.Module):
 
     def replace(self, **fields: PyTree) -> "ParticleMixture":
         """A copy with some fields changed."""
-        return type(self)(
-            **{name: fields.get(name, getattr(self, name)) for name in self.__dataclass_fields__}
-        )
+        own = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return type(self)(**own | fields)
 
     def _require_one(self) -> None:
         shape = self.log_weights.shape
@@ -212,26 +229,26 @@ class ParticleMixture(eqx.Module):
 
 
 def single_component(
-    particles: PyTree, num_components: int = 1, limit: Int[Array, ""] | None = None
+    particles: PyTree, num_components: int = 1, usable_slots: Int[Array, ""] | None = None
 ) -> ParticleMixture:
     """Equally weighted particles, all in component 0, each its own ancestor.
 
-    With a `limit` only the first so many are particles, and the slots of the rest are empty.
+    With `usable_slots` only the first so many are particles; the other slots stay empty.
     """
     num_slots = jax.tree.leaves(particles)[0].shape[0]
     slot = jnp.arange(num_slots, dtype=jnp.int32)
-    if limit is None:
+    if usable_slots is None:
         log_weights = jnp.full(num_slots, -jnp.log(num_slots), default_float())
     else:
-        log_share = -jnp.log(limit.astype(default_float()))
-        log_weights = jnp.where(slot < limit, log_share, -jnp.inf)
+        log_share = -jnp.log(usable_slots.astype(default_float()))
+        log_weights = jnp.where(slot < usable_slots, log_share, -jnp.inf)
     return ParticleMixture(
         particles=particles,
         log_weights=log_weights,
         component_indicators=jnp.zeros(num_slots, jnp.int32),
         ancestor_indices=slot,
         num_components=num_components,
-        limit=limit,
+        usable_slots=usable_slots,
     )
 
 

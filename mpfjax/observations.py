@@ -1,4 +1,4 @@
-"""Observations as a user hands them: arrays of finite numbers, and which of them are missing."""
+"""The observations that a user gives: arrays of finite numbers, and which steps are missing."""
 
 from typing import Any
 
@@ -36,7 +36,7 @@ def one_observation(observation: PyTree) -> PyTree:
 
 
 def checked_observation(observation: PyTree, model: Any) -> PyTree:
-    """y_t, or an error as the program runs, where it holds what the model does not take."""
+    """y_t; an error at run time if it holds a number that the model does not take."""
     takes_nan = getattr(model, "handles_missing", False)
     what = "infinite" if takes_nan else "NaN or infinite"
 
@@ -54,8 +54,8 @@ def present_steps(
 ) -> Bool[Array, " t"] | None:
     """Which observations are there, or None where all are; raises for what cannot be run.
 
-    To a model that handles missing ones a NaN is one, and only a step that holds nothing else is
-    not there.
+    For a model with `handles_missing`, a NaN is a missing number, and a step is missing only if
+    all its numbers are.
     """
     check_one_of(("error", "skip"), missing=missing)
     leaves = jax.tree.leaves(observations)
@@ -106,7 +106,7 @@ def _each_step(numpy: Any, masks: list[Any], how: str) -> list[Any]:
 def _require_numbers(leaves: list[Any], name: str) -> None:
     """Raise a `ValueError` for what is no number, and for complex ones.
 
-    The imaginary part would be dropped, by the density at the latest.
+    Without this check, the imaginary part would be dropped, at the latest in the density.
     """
     for leaf in leaves:
         dtype = leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
@@ -138,7 +138,7 @@ def _require_fitting(leaf: np.ndarray, name: str) -> None:
 
 
 def _present_traced(leaves: list[Array], missing: str, takes_nan: bool) -> Bool[Array, " t"] | None:
-    """Under the caller's jit the values are not there to name: the check runs with the rest."""
+    """Under the caller's jit no value can be named: the check runs with the program."""
     usable = jnp.stack(_each_step(jnp, _usable(jnp, leaves, takes_nan), "all")).all(axis=0)
     if takes_nan and missing == "skip":
         seen = jnp.stack(_each_step(jnp, [~jnp.isnan(leaf) for leaf in leaves], "any"))

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-# Okabe and Ito's palette (2008), told apart with every common kind of colour blindness.
+# Okabe and Ito's palette (2008), which people with colour blindness can tell apart.
 COLOURS = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00",
     "#56B4E9", "#F0E442", "#8B4513", "#5E3C99", "#666666",
@@ -19,8 +19,8 @@ MARKERS = "osD^vP*X<>"
 
 
 @dataclass(frozen=True)
-class Trace:
-    """The particles of one run over time, (t, n), of a scalar state."""
+class ParticleHistory:
+    """The particles of one run over time, (t, n), of a scalar state; once called `Trace`."""
 
     positions: np.ndarray
     occupied: np.ndarray
@@ -28,41 +28,44 @@ class Trace:
     score: float
 
 
+Trace = ParticleHistory  # the name that it had before
+
+
 def draw_typical_run(
-    traces: Mapping[str, Trace],
+    histories: Mapping[str, ParticleHistory],
     truth: np.ndarray,
     observations: np.ndarray,
     labels: Mapping[str, str],
 ) -> Figure:
     """Figure 1 of Vermaak et al. (2003): the data, and every filter's particles over time."""
-    num_rows = 1 + len(traces)
-    figure = Figure(figsize=(7.0, 1.6 + 2.1 * len(traces)), layout="constrained")
+    num_rows = 1 + len(histories)
+    figure = Figure(figsize=(7.0, 1.6 + 2.1 * len(histories)), layout="constrained")
     axes = figure.subplots(
-        num_rows, 1, sharex=True, squeeze=False, height_ratios=[1.3] + [2.0] * len(traces)
+        num_rows, 1, sharex=True, squeeze=False, height_ratios=[1.3] + [2.0] * len(histories)
     )[:, 0]
     times = np.arange(1, len(truth) + 1)
     axes[0].plot(times, truth, color="black", label="true state $x^*_t$")
     axes[0].plot(times, observations, ".", color=COLOURS[4], ms=4, label="observations $y_t$")
     axes[0].set_ylabel("data")
     axes[0].legend(loc="lower left", fontsize=8, ncols=2, framealpha=0.9)
-    for axis, (name, trace) in zip(axes[1:], traces.items(), strict=True):
-        _draw_trace(axis, trace, truth)
-        num_particles = trace.positions.shape[1]
+    for axis, (name, history) in zip(axes[1:], histories.items(), strict=True):
+        _draw_history(axis, history, truth)
+        num_particles = history.positions.shape[1]
         axis.set_title(
             f"{labels[name]}, N = {num_particles}: both modes at"
-            f" {100 * trace.score:.0f}% of the steps",
+            f" {100 * history.score:.0f}% of the steps",
             fontsize=10,
         )
     axes[-1].set_xlabel("time step $t$")
     return figure
 
 
-def _draw_trace(axis: Axes, trace: Trace, truth: np.ndarray) -> None:
-    times = np.broadcast_to(np.arange(1, len(truth) + 1)[:, None], trace.positions.shape)
-    for component in np.unique(trace.component_indicators):
-        chosen = trace.occupied & (trace.component_indicators == component)
+def _draw_history(axis: Axes, history: ParticleHistory, truth: np.ndarray) -> None:
+    times = np.broadcast_to(np.arange(1, len(truth) + 1)[:, None], history.positions.shape)
+    for component in np.unique(history.component_indicators):
+        chosen = history.occupied & (history.component_indicators == component)
         axis.plot(
-            times[chosen], trace.positions[chosen], MARKERS[component % len(MARKERS)], ms=2.0,
+            times[chosen], history.positions[chosen], MARKERS[component % len(MARKERS)], ms=2.0,
             mew=0, alpha=0.5, color=COLOURS[component % len(COLOURS)],
             label=f"particles of component {component + 1}",
         )  # fmt: skip
@@ -96,7 +99,7 @@ def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str])
         stds = np.array([np.std(entry["scores"]) for entry in entries])
         # A score lies in [0, 1]: the bars end there too.
         bars = np.minimum(stds, [means, 1 - means])
-        # A few per cent apart, so that bars at the same N can be told from each other.
+        # A few per cent apart, so that bars at the same N stay apart.
         score.errorbar(sizes * 1.04 ** (index - 1), means, yerr=bars, capsize=2, **style)
         mass.plot(sizes, [entry["mode_mass_error"] for entry in entries], **style)
         if name != "pf":
@@ -133,8 +136,8 @@ def draw_contact_sheet(
 ) -> Figure:
     """Figure 3 of Vermaak et al. (2003): a named row of pictures for each filter.
 
-    `rows` holds a name and as many RGB pictures, all of one size, as there are `titles`, which
-    stand above every picture.
+    Each row is a name and its RGB pictures, all of one size, one for each of the `titles`, which
+    stand above the pictures.
     """
     height, width, _ = rows[0][1][0].shape
     panel = 3.2
@@ -214,8 +217,8 @@ def draw_errors_by_size(
 def draw_object_bars(rows: Mapping[str, Sequence[np.ndarray]], titles: Sequence[str]) -> Figure:
     """Figures 4 and 8 of Smith and Gatica-Perez (2004): a bar for each object.
 
-    A row for each filter by name, a panel in it for each of the `titles`, from an array of one
-    value an object; panels below each other share their axes.
+    There is a row for each filter, by name, with a panel for each of the `titles`. A panel shows an
+    array of one value for each object. Panels below each other share their axes.
     """
     figure = Figure(figsize=(3.1 * len(titles), 0.4 + 1.5 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), len(titles), squeeze=False, sharex=True, sharey="col")

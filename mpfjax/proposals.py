@@ -26,7 +26,7 @@ from mpfjax.operations.matrices import cholesky, solve_lower
 
 
 class AbstractProposal(eqx.Module):
-    """A way to draw x_t that looks at y_t, and knows the density of what it drew."""
+    """A way to draw x_t given x_{t-1} and y_t, with the density of each draw."""
 
     @abc.abstractmethod
     def propose(
@@ -38,18 +38,19 @@ class AbstractProposal(eqx.Module):
 class NetworkProposal(AbstractProposal):
     """A Gaussian whose mean and deviations a network gives, from x_{t-1} and y_t.
 
-    q = N(x_{t-1} + s a, diag(s exp b)²), (a, b) = network(x_{t-1}, y_t), for each particle. It
-    learns by the filter's own bound: E[log Ẑ] <= log Z rises as q comes to fit, and `tuning.fit`
-    climbs it in the network's arrays (Maddison et al. 2017, FIVO), with `gradient="none"`, which
-    differentiates the draws and leaves out the resampling, as they do. The filter stays exact
-    whatever the network is.
+    q = N(x_{t-1} + s a, diag(s exp b)²), (a, b) = network(x_{t-1}, y_t), for each particle. The
+    network learns from the bound E[log Ẑ] <= log Z: the better q fits, the higher is E[log Ẑ].
+    `tuning.fit` maximises it in the network's arrays (Maddison et al. 2017, FIVO). Take
+    `gradient="none"`, which differentiates the draws and not the resampling, as they do. The
+    filter is exact whatever the network is.
 
-    - `network`: one vector, the flattened state before the flattened observation, to one of
-      twice the state's size: a, then b. Such as the `eqx.nn.MLP` that `create` makes.
-    - `scale`: s, (d,) or a scalar, positive, in units of the state: about as long as a step is.
+    - `network`: a function of one vector, the flattened state followed by the flattened
+      observation. It returns a vector of twice the state's size: a, then b. `create` makes such
+      an `eqx.nn.MLP`.
+    - `scale`: s, (d,) or a scalar, positive, in units of the state: about the length of a step.
 
-    Raises `ValueError` for a scale that is not positive. Use it where the likelihood is narrow and
-    no `GaussNewtonProposal` fits, and the same model will be run often.
+    Raises `ValueError` for a scale that is not positive. Use it where the likelihood is narrow,
+    no `GaussNewtonProposal` fits, and the same model runs often enough to repay the training.
     """
 
     network: Callable[[Float[Array, " k"]], Float[Array, " two_d"]]
@@ -104,13 +105,13 @@ class GaussNewtonProposal(AbstractProposal):
     Each iteration linearises h at the current point, its Jacobian H by JAX, and solves for the
     mean of the resulting Gaussian, whose precision is Λ = Q⁻¹ + Hᵀ R⁻¹ H (Doucet, Godsill and
     Andrieu 2000, section II.D, local linearisation). The draw is from
-    N(mean, inflation² Λ⁻¹); an inflation above one keeps the weights bounded where the fit is
-    narrower than its target.
+    N(mean, inflation² Λ⁻¹). An inflation above one keeps the weights bounded if the Gaussian is
+    narrower than the target.
 
     - `model`: has `transition_mean`, `observation_mean`, `transition_covariance`, (d, d), and
       `observation_covariance`, (p, p). States are one array, (n,) or (n, d); Q is invertible.
-    - `noise`: "independent", or "stratified", which spreads the draws of all particles evenly
-      and leaves the distribution of each, and so the unbiasedness, untouched.
+    - `noise`: "independent", or "stratified", which spreads the draws of all particles evenly. The
+      distribution of each draw stays the same, so the filter stays unbiased.
 
     Raises `ValueError` for a model without these, no iterations, or an inflation not above 0.
     Use it where bootstrap particles mostly miss the likelihood.

@@ -36,6 +36,12 @@ if quick and "XLA_FLAGS" not in os.environ:
         flags = [flag for flag in flags if known_to_xla(flag)]
     os.environ["XLA_FLAGS"] = " ".join(flags)
 
+# What was compiled once, by any worker or run, is read back: a second run takes less time.
+compiled = Path(__file__).resolve().parents[1] / ".pytest_cache" / "compiled"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(compiled))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+
 import jax  # noqa: E402
 
 jax.config.update("jax_disable_most_optimizations", quick)

@@ -236,10 +236,8 @@ class TestSlots:
         [
             "pf adaptive",
             "mpf",
-            "mpf fixed number",
             "random labels, residual",
             "gaussian mixture",
-            "exclusion",
             "ps adaptive, random order",
             "dps",
         ],

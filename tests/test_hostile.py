@@ -26,6 +26,7 @@ MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
 JOINT = mpfjax.MultiObjectModel(MODEL, 2, shared_observation=True)
 FILTER = mpfjax.particle_filter(MODEL, 4)
 MIXTURE = FILTER.init(KEY)
+HISTORY = mpfjax.run_filter(KEY, FILTER, np.ones(2, np.float32))
 EYE = np.eye(1)
 
 
@@ -191,6 +192,17 @@ RUN = {
         lambda key, mixture: FILTER.predict(key, mixture), {"key": KEY, "mixture": MIXTURE}
     ),
     "init": (FILTER.init, {"key": KEY}),
+    "forecast": (
+        mpfjax.forecast,
+        {"key": KEY, "filter": FILTER, "mixture": MIXTURE, "num_steps": 2,
+         "simulate_observation": None},
+    ),
+    "sample_trajectories": (
+        mpfjax.smoothing.sample_trajectories,
+        {"key": KEY, "model": MODEL, "mixtures": HISTORY, "num_trajectories": 2,
+         "component": None, "method": "exact", "num_steps": None},
+    ),
+    "trace_ancestors": (mpfjax.smoothing.trace_ancestors, {"mixtures": HISTORY}),
 }  # fmt: skip
 # What an argument is called further down.
 ALSO = {"max_components": "num_components", "order": "orders", "object_model": "model"}

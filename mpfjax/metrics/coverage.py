@@ -1,8 +1,8 @@
 """How well tracks cover objects: coverage, strays, and changes of identity.
 
-All of it is about boxes (x, y, w, h) with (x, y) the top-left corner, in rows (frame, id, x, y,
-w, h) as MOTChallenge files have them. A track covers an object in a frame where the centre of its
-box lies within |dx| < 0.75 w and |dy| < 0.5 h of the centre of the object's box.
+Boxes are (x, y, w, h) with (x, y) the top-left corner, in rows (frame, id, x, y, w, h) as in
+MOTChallenge files. A track covers an object in a frame if the centre of its box lies within
+|dx| < 0.75 w and |dy| < 0.5 h of the centre of the object's box.
 """
 
 from typing import NamedTuple
@@ -40,12 +40,12 @@ def coverage(
 ) -> Coverage:
     """Score tracks against the true boxes, over the frames in which there is an object.
 
-    In a frame only the objects that have a box there count. The identity of an object is the
-    track that it was last assigned to: it keeps that one while the track covers it; where it does
-    not, the object is assigned to the nearest covering track that no other object keeps, and a
-    swap is counted if it had another before. `others` are true boxes of what nobody asked to
-    track: a box on one of them is a stray of another kind than one on nothing. Raises `ValueError`
-    where there are no true boxes, and for what is no rows of six finite numbers.
+    In each frame only the objects with a box there count. Every object is assigned to a track, and
+    keeps it while the track covers it. Otherwise it is assigned to the nearest covering track that
+    no other object keeps, and if it had another track before, a swap is counted. `others` are true
+    boxes of what nobody asked to track: a box on one of them is a stray of another kind than one on
+    nothing. Raises `ValueError` where there are no true boxes, and for what is no rows of six
+    finite numbers.
     """
     tracks, objects = _checked(tracks, "tracks"), _checked(objects, "objects")
     others = _checked(np.zeros((0, 6)) if others is None else others, "others")

@@ -36,7 +36,7 @@ def modes_represented(
 
 
 def mass_above(mixture: ParticleMixture, threshold: float) -> Float[Array, ""]:
-    """P(x_t > threshold | y_1..y_t) of a scalar state, a particle at the threshold counting half.
+    """P(x_t > threshold | y_1..y_t) of a scalar state; a particle at the threshold counts half.
 
     The particles' estimate of `GridFilterRun.mass_above`. With a threshold between two modes it
     is the mass of the upper one. Raises `ValueError` for a threshold that is not finite, and for a

@@ -1,8 +1,8 @@
 """Distances between a set of estimates and a set of true objects: OSPA and GOSPA.
 
-Both sets are arrays of fixed shape with a mask for the entries that are there, so that `jax.jit`
-compiles once and `jax.vmap` runs over the frames. Both pair estimates with objects at the least
-total cost, each entry in one pair at most, and charge for what is left alone.
+Both sets are arrays of fixed shape with a mask for the entries that exist, so `jax.jit` compiles
+once and `jax.vmap` runs over the frames. Both distances pair estimates with objects at the least
+total cost, with each entry in at most one pair, and add a cost for each entry without a partner.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from optax.assignment import hungarian_algorithm
 
 from mpfjax.checks import check_callable, check_finite, check_positive, check_shape
 
-# Without this, every call outside of `jax.jit` would compile the search anew.
+# Without this, every call outside of `jax.jit` would compile the search again.
 _assign = jax.jit(hungarian_algorithm)
 
 
@@ -67,8 +67,8 @@ def ospa(
     anything; a NaN in one that counts makes the distance NaN where the other set is not empty.
 
     Raises `ValueError` for sets that are no arrays, masks of another length, a cutoff that is not
-    positive and finite, and an order below 1 or infinite. Use it where an error per object is asked
-    for; `gospa` says how many were missed.
+    positive and finite, and an order below 1 or infinite. Use it for an error per object;
+    `gospa` says how many objects were missed.
     """
     _check(estimates, truths, estimate_mask, truth_mask, cutoff, order, base_distance)
     pairing = _cheapest_pairing(
@@ -90,7 +90,7 @@ def gospa(
     truth_mask: Bool[Array, " l"] | None = None,
     base_distance: Callable[[Array, Array], Array] = euclidean,
 ) -> GOSPA:
-    """The generalised OSPA distance, and what of it is localisation, misses and false estimates.
+    """The generalised OSPA distance, with its parts: localisation, misses and false estimates.
 
     Rahmathullah, García-Fernández and Svensson (2017), eq. 1: for m <= n entries in the two sets,
     the least over pairings of (sum_i min(d_i, c)^p + (c^p / alpha) (n - m))^(1/p), with c the
@@ -133,8 +133,8 @@ def _cheapest_pairing(
 ) -> _Pairing:
     """Pair all entries, in a square matrix in which those that are not there cost nothing.
 
-    Pairing two entries that are there costs 1 at most and leaving both alone at least that (alpha
-    is at most 2), so the cheapest pairing leaves no more of them alone than it must.
+    A pair of entries that exist costs at most 1. To leave both without a partner costs at least 1,
+    since alpha is at most 2. So the cheapest pairing leaves as few entries alone as possible.
     """
     num_estimates, num_truths = distances.shape
     size = max(num_estimates, num_truths)
@@ -146,7 +146,7 @@ def _cheapest_pairing(
     costs = jnp.where(is_estimate[:, None] & is_truth[None], capped, alone.astype(capped.dtype))
     # The search for the pairing would not end on a NaN, so it never sees one.
     costs = jnp.where(jnp.any(jnp.isnan(costs)), jnp.nan, costs)
-    # It works in the default precision, and does not convert by itself under strict promotion.
+    # It works in the default precision, and under strict promotion it converts nothing itself.
     i, j = _assign(jnp.nan_to_num(costs).astype(float))
     return _Pairing(costs[i, j], is_estimate[i], is_truth[j])
 

@@ -83,7 +83,7 @@ def recovery_rate(
     """The share of runs that are tracked throughout or have recovered from a loss.
 
     The paper leaves open when a loss is over. Here it is when T = 1 in each of the last
-    `num_last` frames that have a true box; who is tracked throughout is so there as well.
+    `num_last` frames that have a true box. An object that is tracked throughout fulfils this too.
     Raises `ValueError` for no runs or no frames, or `num_last` below 1.
     """
     _check(track_states)
@@ -135,7 +135,7 @@ def tracking_quality(
 
 def _share(area: Float[Array, "*batch"], boxes: Float[Array, "*#batch 4"]) -> Float[Array, "..."]:
     whole = boxes[..., 2] * boxes[..., 3]
-    # A part of a box has no more area than the box, but for rounding.
+    # Apart from rounding, a part of a box has no more area than the box.
     meets = area > 0
     return jnp.where(meets, jnp.minimum(area / jnp.where(meets, whole, 1.0), 1.0), 0.0)
 

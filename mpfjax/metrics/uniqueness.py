@@ -1,4 +1,4 @@
-"""How much of a joint filter's particle set is left of each object: impoverishment measured."""
+"""How many distinct hypotheses of each object a joint filter keeps: its impoverishment."""
 
 import jax
 import jax.numpy as jnp
@@ -11,15 +11,17 @@ from mpfjax.mixture import ParticleMixture, flatten_states
 def uniqueness(mixture: ParticleMixture) -> Float[Array, " objects"]:
     """U/N of each object: its distinct hypotheses as a share of all particles.
 
-    Smith and Gatica-Perez (2004), section 3.1. Two particles hold the same hypothesis of object
-    j where all of its state is equal. Particles have leaves (n, J, ...); empty slots hold none.
-    Pass it as `collect` to see it after every step: a weighted resampling within the step lowers
-    it for the objects that have moved, as in the paper's figure 4. Raises `ValueError` for
-    particles of other shapes.
+    Smith and Gatica-Perez (2004), section 3.1. Two particles hold the same hypothesis of object j
+    if its whole state is equal in both. Particles have leaves (n, J, ...); empty slots hold no
+    hypothesis. Pass it as `collect` to get it after every step. A weighted resampling within the
+    step lowers it for the objects that have moved, as in the paper's figure 4. Raises `ValueError`
+    for particles of other shapes.
     """
     _check(mixture)
     distinct = jax.vmap(lambda states: _distinct_rows(states, mixture), in_axes=1)
-    return distinct(mixture.particles) / jnp.asarray(mixture.room, mixture.log_weights.dtype)
+    return distinct(mixture.particles) / jnp.asarray(
+        mixture.num_usable_slots, mixture.log_weights.dtype
+    )
 
 
 def effective_dynamics(mixture: ParticleMixture) -> PyTree:
@@ -27,8 +29,8 @@ def effective_dynamics(mixture: ParticleMixture) -> PyTree:
 
     Smith and Gatica-Perez (2004), section 3.1, at the end of a step. Every filled slot counts
     the same, whatever its weight: it measures how far the search reaches, and not the posterior.
-    Over the variance of the dynamics' noise it is figure 4's percentage, which resampling
-    lowers for the first objects of an order and which may exceed 100% for the last. Raises
+    Divided by the variance of the dynamics' noise, it is the percentage of figure 4. Resampling
+    lowers it for the first objects of an order; for the last it may exceed 100%. Raises
     `ValueError` for particles of other shapes.
     """
     _check(mixture)

@@ -20,13 +20,13 @@ class AbstractStateSpaceModel(eqx.Module):
     """A Markov state x_t seen through observations y_t, all methods batched over particles.
 
     p(x_0), D(x_t | x_{t-1}) and L(y_t | x_t) of Vermaak et al. (2003), section 2. x_0 is the
-    prior, before any observation; the first observation is y_1. States are any pytree whose
-    leaves have a leading axis n of particles, and one key serves all n of them, which is several
-    times faster than a key for each. Whoever thinks in one particle writes for one and wraps the
-    model with `per_particle`.
+    prior, before any observation; the first observation is y_1. The states are a pytree whose
+    leaves have a leading axis n of particles. One key serves all n particles, which is several
+    times faster than a key for each. If you prefer to write the model for one particle, wrap it
+    with `per_particle`.
 
-    A class that sets `handles_missing = True` takes a NaN in an observation for a value that is
-    missing, and weighs by what is there; runners then hand it such observations.
+    A class may set `handles_missing = True`. It then gets observations with NaN where values are
+    missing, and its likelihood must use the values that are there.
 
     A model may also define `log_transition(states, previous_states)`, log D of each particle,
     shape (n,). Guided proposals need it; the bootstrap proposal does not.
@@ -67,7 +67,7 @@ _NO_MODELS = (type(None), str, int, float, list, tuple, dict, jax.Array, np.ndar
 
 
 def model_name(model: Any) -> str:
-    """The name of the user's own class, also of one that `per_particle` wraps."""
+    """The name of the user's own class, whether `per_particle` wraps it or not."""
     return type(model.model if isinstance(model, _PerParticleModel) else model).__name__
 
 
@@ -158,8 +158,8 @@ def check_log_density(
     return jnp.asarray(values)
 
 
-# What the library looks for in a model beside the three methods: functions of one particle, and
-# what all particles share.
+# What a model may define beside the three methods: functions of one particle, and what all
+# particles share.
 _BATCHED = ("log_transition", "log_initial", "with_history", "transition_mean", "observation_mean")
 _SHARED = ("transition_covariance", "observation_covariance", "prepare_observation")
 
@@ -215,13 +215,12 @@ def per_particle(model: Any) -> AbstractStateSpaceModel:
     """Make a batched model of one that is written for a single particle.
 
     `model` has `sample_initial(key)`, `sample_transition(key, state)` and
-    `log_likelihood(observation, state)`, each for one particle. What else the library looks for
-    in a model is passed on where it is there: `log_transition(state, previous_state)`,
-    `log_initial(state)`, `with_history(state, previous_state)`, `transition_mean(state)` and
-    `observation_mean(state)`, of one particle as well; `transition_covariance`,
-    `observation_covariance` and `prepare_observation(observation)`, as they are. Use it for a first
-    version of a model: a key for each particle makes the draws four to five times slower than a
-    batched one.
+    `log_likelihood(observation, state)`, each for one particle. It may also have, for one particle,
+    `log_transition(state, previous_state)`, `log_initial(state)`, `with_history(state,
+    previous_state)`, `transition_mean(state)` and `observation_mean(state)`, and, for all
+    particles, `transition_covariance`, `observation_covariance` and
+    `prepare_observation(observation)`. Use it for a first version of a model: with a key for each
+    particle, draws take four to five times as long as those of a batched model.
 
     Raises `ValueError` where one of the three methods is missing.
     """

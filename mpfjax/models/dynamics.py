@@ -18,10 +18,10 @@ from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
 
 
 class AbstractDynamics(eqx.Module):
-    """D(x_t | x_{t-1}, x_{t-2}) of a vector: a part that models are made of, no model itself.
+    """D(x_t | x_{t-1}, x_{t-2}) of a vector: a part of a model, not a model itself.
 
-    Parameters are one set for all particles, or carry a leading axis with one set for each. A
-    model keeps x_{t-1} beside x_t in its state where `order` is 2.
+    There is one set of parameters for all particles, or one for each, along a leading axis. Where
+    `order` is 2, a model keeps x_{t-1} beside x_t in its state.
     """
 
     @property
@@ -59,19 +59,10 @@ class AbstractDynamics(eqx.Module):
         """Mean and standard deviation of every coordinate of x_t."""
 
 
-class RandomWalk(AbstractDynamics):
-    """x_t = x_{t-1} + diag(deviations) ω_t, ω_t ~ N(0, I).
+class AbstractRandomWalk(AbstractDynamics):
+    """Dynamics whose expected x_t is x_{t-1}, with steps of given `deviations`."""
 
-    Vermaak et al. (2003), section 5.2. `deviations`: (d,), or (n, d) with a row for each
-    particle, in units of the state a frame. Raises `ValueError` where one is not positive. Use
-    it where motion is too erratic to be carried over from the last frame.
-    """
-
-    deviations: Float[Array, "*n d"] = eqx.field(converter=to_array("deviations"))
-
-    def __check_init__(self) -> None:
-        check_positive_array(deviations=self.deviations)
-        check_rows(deviations=self.deviations)
+    deviations: eqx.AbstractVar[Float[Array, "*n d"]]
 
     @property
     def order(self) -> int:
@@ -82,6 +73,21 @@ class RandomWalk(AbstractDynamics):
     def is_shared(self) -> bool:
         """Whether `deviations` is one row for all."""
         return self.deviations.ndim == 1
+
+
+class RandomWalk(AbstractRandomWalk):
+    """x_t = x_{t-1} + diag(deviations) ω_t, ω_t ~ N(0, I).
+
+    Vermaak et al. (2003), section 5.2. `deviations`: (d,), or (n, d) with a row for each
+    particle, in units of the state a frame. Raises `ValueError` where one is not positive. Use
+    it where the last motion says little about the next.
+    """
+
+    deviations: Float[Array, "*n d"] = eqx.field(converter=to_array("deviations"))
+
+    def __check_init__(self) -> None:
+        check_positive_array(deviations=self.deviations)
+        check_rows(deviations=self.deviations)
 
     def sample(
         self,
@@ -117,8 +123,8 @@ class RandomWalk(AbstractDynamics):
 class Autoregression(AbstractDynamics):
     """x_t - x̄ = A1 (x_{t-1} - x̄) + A2 (x_{t-2} - x̄) + B ω_t, ω_t ~ N(0, I).
 
-    Lin et al. (2012), eq. 4. With A1 + A2 = I, as in `with_momentum`, x̄ cancels and nothing pulls
-    the state anywhere; otherwise it is what the state returns to.
+    Lin et al. (2012), eq. 4. The state returns to x̄. With A1 + A2 = I, as in `with_momentum`, x̄
+    cancels, and the state returns nowhere.
 
     - `A1`, `A2`, `B`: (d, d); `mean`: x̄, (d,); or each with a leading axis, a set for each
       particle. `log_density` needs an invertible B.
@@ -208,7 +214,7 @@ class Autoregression(AbstractDynamics):
 
 
 def _times(matrices: Float[Array, "*n d d"], vectors: Float[Array, "n d"]) -> Float[Array, "n d"]:
-    """A x of every row, as sums that fuse: a batch of tiny matrix products does not."""
+    """A x of every row, as sums, which XLA fuses; it does not fuse many tiny matrix products."""
     if matrices.ndim == 2:
         return vectors @ matrices.T
     return jnp.sum(matrices * vectors[:, None, :], axis=2)

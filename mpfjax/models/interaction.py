@@ -22,18 +22,18 @@ class PairwiseRepulsion(eqx.Module):
     """log ψ(x_i, x_j) = -strength · k(|p_i - p_j| / radius), p the positions of two objects.
 
     The pairwise Markov random field of Khan, Balch and Dellaert (2004), for objects that cannot
-    share a place. It is symmetric, 1 where the objects are far apart, and smooth, so that it
-    has a gradient everywhere, on the same spot as well.
+    share a place. ψ is symmetric, 1 where the objects are far apart, and smooth: it has a gradient
+    everywhere, even where the objects are at the same point.
 
-    - `strength`: of two objects on the same spot, in nats; positive.
-    - `radius`: in the unit of the positions; positive. `compact` takes k(r) = (1 - r²)² inside
-      the radius and exactly 0 from there on; otherwise k(r) = exp(-r²/2), which never ends.
+    - `strength`: -log ψ of two objects at the same point, in nats; positive.
+    - `radius`: in the unit of the positions; positive. With `compact`, k(r) = (1 - r²)² inside the
+      radius and exactly 0 outside it. Without it, k(r) = exp(-r²/2), which is positive everywhere.
     - `position`: maps the states of one object, leading axis n, to (n, k) or (n,); None takes
       the whole state.
 
     Called with the states of two objects, it gives (n,). Raises `ValueError` for a strength or
-    radius that is not positive. Use it where look-alikes cross and must not be tracked as one;
-    the compact form lets a filter see that objects do not touch.
+    radius that is not positive. Use it where look-alikes cross and must not be tracked as one.
+    With the compact form a filter can tell that objects do not touch.
     """
 
     strength: Float[Array, ""] = eqx.field(converter=to_array("strength"))

@@ -1,4 +1,4 @@
-"""A random walk that now and then takes a long step."""
+"""A random walk that sometimes takes a long step."""
 
 import equinox as eqx
 import jax
@@ -6,20 +6,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import check_inner_share, check_positive_array, check_rows, to_array
-from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
+from mpfjax.models.dynamics import AbstractRandomWalk, RandomWalk
 from mpfjax.operations.generator import fast_key, normal, split
 
 
-class RandomWalkWithJumps(AbstractDynamics):
-    """x_t = x_{t-1} + diag(s) ω_t, ω_t ~ N(0, I), s long with a small probability.
+class RandomWalkWithJumps(AbstractRandomWalk):
+    """x_t = x_{t-1} + diag(s) ω_t, ω_t ~ N(0, I); s is long with a small probability.
 
     The contaminated normal of Tukey (1960) as dynamics: (1 - p) N(x_{t-1}, diag(deviations²))
-    + p N(x_{t-1}, diag(jump_deviations²)). The few particles that jump find an object again that
-    was hidden for some frames, or that a filter had lost to a look-alike; the recursion stays
-    exact.
+    + p N(x_{t-1}, diag(jump_deviations²)). A few particles jump. They find an object again that
+    was hidden for some frames, or that the filter lost to a look-alike. The recursion stays exact.
 
-    - `deviations`, `jump_deviations`: of an ordinary and of a long step, (d,), or (n, d) with a
-      row for each particle, in units of the state a frame.
+    - `deviations`, `jump_deviations`: standard deviations of an ordinary and of a long step, (d,),
+      or (n, d) with a row for each particle, in units of the state per frame.
     - `jump_probability`: p.
 
     Raises `ValueError` for a deviation that is not positive, for deviations of different shapes,
@@ -39,16 +38,6 @@ class RandomWalkWithJumps(AbstractDynamics):
                 f" {self.deviations.shape}"
             )
         check_inner_share(jump_probability=self.jump_probability)
-
-    @property
-    def order(self) -> int:
-        """1."""
-        return 1
-
-    @property
-    def is_shared(self) -> bool:
-        """Whether `deviations` is one row for all."""
-        return self.deviations.ndim == 1
 
     def sample(
         self,

@@ -16,8 +16,8 @@ class LinearGaussianModel(AbstractStateSpaceModel):
     - `A`, `Q`: (d, d); `H`: (p, d); `R`: (p, p); `m0`: (d,); `P0`: (d, d). Covariances are
       positive definite. States have shape (n, d), observations (p,).
 
-    Raises `ValueError` for shapes that do not fit together. Use it to hold a filter against the
-    Kalman filter, or where the system is linear.
+    Raises `ValueError` for shapes that do not fit together. Use it to compare a filter
+    with the Kalman filter, or where the system is linear.
     """
 
     A: Float[Array, "d d"] = eqx.field(converter=to_array("A"))

@@ -18,30 +18,30 @@ from mpfjax.models.base import (
 )
 from mpfjax.operations.generator import split
 
-# A number of particles that no parameter has by chance as the length of an axis.
+# A number of particles that is hardly ever the length of a parameter's axis.
 _TRIAL = 1_000_003
 
 
 class MultiObjectModel(AbstractStateSpaceModel):
     """x_t = (x_t^1, ..., x_t^J): J objects, each with its own dynamics and likelihood.
 
-    Smith and Gatica-Perez (2004), section 2: D factorises over the objects, and so does
-    L(y_t | x_t) = Π_j L(y_t | x_t^j), unless an interaction is given: the target of every step
-    then has the further factor Π_{i<j} ψ(x_t^i, x_t^j), a Markov random field (Khan, Balch and
-    Dellaert 2004). It counts as part of L, so that every filter treats it alike and Ẑ estimates
-    the same number; a step without an observation has neither.
+    Smith and Gatica-Perez (2004), section 2: D is a product over the objects, and so is
+    L(y_t | x_t) = Π_j L(y_t | x_t^j). An interaction adds the factor Π_{i<j} ψ(x_t^i, x_t^j) to
+    every step, a Markov random field (Khan, Balch and Dellaert 2004). It counts as part of L, so
+    Ẑ estimates the same number with every filter. A step without an observation has neither L nor
+    ψ.
 
     - `object_model`: one model for all objects, or one whose arrays all carry a leading object
       axis, as `jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)` makes it.
     - `num_objects`: J.
     - `interaction`: log ψ of the states of two objects, `(states, other_states) -> (n,)`,
       symmetric; such as `PairwiseRepulsion`.
-    - `shared_observation`: object j sees `observation[j]`, every leaf indexed by j, or with True
-      all see the whole observation, an image. If `object_model` then has a method
-      `prepare_observation(observation)`, it is called once a step for all particles and all
-      objects, and `log_likelihood` is given what it returns.
-    - `per_object`: whether the arrays carry an object axis. None finds out by tracing the
-      model's draws both ways, which costs no arithmetic.
+    - `shared_observation`: with False, object j sees `observation[j]`, every leaf indexed by j.
+      With True, all objects see the whole observation, such as an image. If `object_model` then
+      has a method `prepare_observation(observation)`, it is called once in each step, for all
+      particles and objects, and its result goes to `log_likelihood`.
+    - `per_object`: whether the arrays have an object axis. None finds it out by tracing the
+      model's draws both ways, without computing them.
 
     Particles have leaves (n, J, ...). Raises `ValueError` for J < 1, an object model that works
     neither way or, for `per_object=None`, both ways, and one that lacks a method. Use it where
@@ -95,8 +95,8 @@ class MultiObjectModel(AbstractStateSpaceModel):
             states = self.object_at(j).sample_initial(key, num_particles)
             if self.num_objects == 1:
                 return states
-            # Draws that are spread out evenly, as stratified ones are, may stand in line: side
-            # by side as they come, objects would not be independent.
+            # Stratified draws may come in order. Put side by side in that order, the objects would
+            # not be independent.
             order = jax.random.permutation(key_order, num_particles)
             return jax.tree.map(lambda leaf: leaf[order], states)
 

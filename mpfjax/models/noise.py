@@ -18,11 +18,12 @@ def stratified_normal(
 ) -> Float[Array, "n d"]:
     """Standard normal draws, one row a particle, that together cover the normal evenly.
 
-    Row i is the Gaussian quantile of the fractional part of i α + U, a lattice shifted by one
-    uniform U a dimension; α_j = φ_d^{-j} with φ_d the root of x^{d+1} = x + 1, the golden ratio
-    for d = 1. Every row on its own is exactly normal and independent of the past, so a sum over
-    particles keeps its expectation; rows are negatively dependent, so it loses variance, most of
-    it between the offspring of one parent, which stand side by side after resampling.
+    Row i is the Gaussian quantile of the fractional part of i α + U: a lattice shifted by one
+    uniform number U in each dimension. α_j = φ_d^{-j}, where φ_d solves x^{d+1} = x + 1; for d = 1
+    it is the golden ratio. Every single row is exactly normal and independent of the past, so a
+    sum over particles keeps its expectation. Rows are negatively dependent, so the sum has less
+    variance. Most is gained among the offspring of one parent, which are neighbours after
+    resampling.
     """
     n, d = shape
     # Fractions of 2^32 in integers: floating point would lose the fraction of i α for large i.
@@ -37,8 +38,8 @@ def stratified_normal(
 def stratified_uniform(key: Key[Array, ""], num_points: int) -> Float[Array, " n"]:
     """Uniform draws on [0, 1), one in each of n equal cells.
 
-    As a set they are uniform, whatever the order; for draws that all carry the same weight, as
-    those of x_0 do, they leave no gap wider than two cells.
+    The set is uniform; the order of the draws is that of the cells. No gap is wider than two cells.
+    Use it for draws of equal weight, such as x_0.
     """
     cells = jnp.arange(num_points).astype(jnp.result_type(float))
     return (cells + uniform(key, (num_points,))) / num_points

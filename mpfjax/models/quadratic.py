@@ -19,17 +19,17 @@ from mpfjax.operations.generator import normal, uniform
 class QuadraticModel(AbstractStateSpaceModel):
     """A random walk seen through its square: D = N(x_{t-1}, σ_x²), L = N(y_t; x_t², σ_y²).
 
-    Vermaak et al. (2003), section 5.1. The sign of x_t cannot be seen, so that with the symmetric
-    prior the filtering distribution has two modes of exactly equal mass, at about ± sqrt(y_t).
+    Vermaak et al. (2003), section 5.1. The observation does not depend on the sign of x_t. With a
+    symmetric prior, the filtering distribution thus has two modes of exactly equal mass, at about
+    ± sqrt(y_t).
 
     - `sigma_x`, `sigma_y`: standard deviations, positive.
     - `low`, `high`: x_0 is uniform on [low, high].
-    - `initial_draw`: "stratified" puts one x_0 in each of n equal cells, still uniform but
-      without the gaps of "independent" draws, which at small n can leave a mode uncovered before
-      the first observation.
+    - `initial_draw`: "stratified" draws one x_0 in each of n equal cells. "independent" draws have
+      gaps, and with small n they may miss a mode before the first observation.
 
     States have shape (n,), observations are scalars. Raises `ValueError` for a deviation that is
-    not positive, an empty range or an unknown draw. Use it to see who keeps both modes.
+    not positive, an empty range or an unknown draw. Use it to see which filters keep both modes.
     """
 
     sigma_x: Float[Array, ""] = eqx.field(converter=to_array("sigma_x"), default=0.1)

@@ -12,11 +12,10 @@ from mpfjax.operations.gradients import without_gradient
 class AbstractMove(eqx.Module):
     """A step of a filter, `(key, mixture, observation) -> mixture`.
 
-    A move is of one of three kinds, and its kind is its contract: an `AbstractRegrouping` leaves
-    the distribution as it is, an `AbstractRejuvenation` leaves the mass of every component as it
-    is, an `AbstractPropagation` takes the particles from t-1 to t. `approximate` declares a move
-    that is not part of the exact recursion, so that the estimate of the marginal likelihood is
-    no longer unbiased.
+    A move is of one of three kinds, and its kind is its contract. An `AbstractRegrouping` does not
+    change the distribution. An `AbstractRejuvenation` does not change the mass of any component.
+    An `AbstractPropagation` takes the particles from t-1 to t. A move is `approximate` if it is
+    not part of the exact recursion; the marginal likelihood is then no longer unbiased.
     """
 
     @property
@@ -31,19 +30,19 @@ class AbstractMove(eqx.Module):
         """Move the mixture, given y_t."""
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """What is left of the move where y_t is missing; nothing, unless it propagates."""
+        """The move when y_t is missing. Only a propagation does anything then."""
         del key
         return mixture
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """What the move carries from step to step, under its own name; most carry nothing."""
+        """What the move remembers from step to step, under its own name; most remember nothing."""
         del num_components
         return {}
 
     def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
-        """The mixture's memory without what the move knows of dead components.
+        """The mixture's memory without what the move remembers of dead components.
 
-        A filter asks for it after each move, so that a label which is taken again has no past.
+        A filter calls this after each move. So a label that is used again has no past.
         """
         del dead
         return memory
@@ -52,8 +51,8 @@ class AbstractMove(eqx.Module):
 class AbstractRegrouping(AbstractMove):
     """A move that rewrites the component indicators and nothing else, so that it is exact.
 
-    The reclustering F of Vermaak et al. (2003), section 4: with joint weights the new mixture
-    equals the old one in distribution whatever the new indicators are.
+    This is the reclustering F of Vermaak et al. (2003), section 4. With joint weights, the new
+    mixture has the same distribution as the old one, whatever the new indicators are.
     """
 
     @abc.abstractmethod
@@ -68,7 +67,7 @@ class AbstractRegrouping(AbstractMove):
         """Regroup the particles; the observation plays no part."""
         if mixture.num_components == 1:
             return mixture
-        # Indicators are whole numbers, through which no derivative passes.
+        # Indicators are whole numbers and have no derivative.
         indicators, memory = self.regroup(key, without_gradient(mixture))
         return mixture.replace(component_indicators=indicators, memory=memory)
 

@@ -15,21 +15,21 @@ from mpfjax.operations.logarithms import softmax
 class Exchange(AbstractMove):
     """Deal every island's particles to all islands, where their masses have drifted apart.
 
-    For `run_islands`; outside it there is one island, and nothing happens. An island resamples
-    within itself and keeps its mass, so that in time few islands hold it all and the others work
-    for nothing. Where the effective number of islands, (Σ π_g)² / Σ π_g² with π_g the mass of
-    island g, falls below `threshold` times their number G, particle i of every island goes to
-    island i mod G, with its joint weight, its component's label and its ancestor. All islands
-    then hold nearly the same mass. Exact: the particles of the whole mixture are the same ones,
-    in other places (compare Whiteley, Lee and Heine 2016, on when islands should interact).
+    It is for `run_islands`; elsewhere there is one island, and it does nothing. An island resamples
+    within itself and keeps its mass. So in time a few islands hold all the mass, and the others
+    work for nothing. The effective number of islands is (Σ π_g)² / Σ π_g², with π_g the mass of
+    island g. Where it falls below `threshold` times the number of islands G, particle i of every
+    island goes to island i mod G, with its joint weight, component label and ancestor. All
+    islands then hold nearly the same mass. Exact: the whole mixture has the same particles, in
+    other places (Whiteley, Lee and Heine 2016, say when islands should interact).
 
     - `threshold`: in [0, 1]; 0 never exchanges.
 
-    It is the only move that sends particles between devices, all of them at once, and it does
-    so only in the steps that need it. Put it before `Resample`, which then spreads the heavy
-    particles over all islands' slots; in a mixture before the step's regrouping, since
-    components of the same label become one. Raises `ValueError` for a threshold out of range,
-    and where G does not divide an island's number of slots.
+    No other move sends particles between devices. This one sends all of them at once, but only in
+    the steps that need it. Put it before `Resample`, which then spreads the heavy particles over
+    the slots of all islands. In a mixture, put it before the moves that regroup, since components
+    of the same label become one. Raises `ValueError` for a threshold out of range, and where G
+    does not divide the number of slots of an island.
     """
 
     threshold: float = eqx.field(static=True, default=0.5)

@@ -12,19 +12,39 @@ from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.features import Features, Scale, summarise
 
 
-class Exclusion(AbstractPropagation):
+class AbstractExclusion(AbstractPropagation):
+    """Weights that fall by `strength` times how near a particle is to the means of others.
+
+    Nearness to one mean μ is exp(-|x - μ|² / (2 radius²)): 1 there, and next to nothing from
+    three times the radius on. No exact recursion has this; `approximate` is true.
+    """
+
+    strength: eqx.AbstractVar[float]
+    radius: eqx.AbstractVar[float]
+
+    @property
+    def approximate(self) -> bool:
+        """True: it makes components interact, on top of the model."""
+        return True
+
+    def nearness(self, squared_distances: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
+        """exp(-d² / (2 radius²)), of squared distances to a mean."""
+        return jnp.exp(-squared_distances / (2 * self.radius**2))
+
+
+class Exclusion(AbstractExclusion):
     """Lower the weights of particles near the predicted means of the other components.
 
     log-weight_i -= strength · Σ_{m ≠ c_i} exp(-|x_i - μ_m|² / (2 radius²)), summed over living
     components, with μ_m the plain mean of the propagated particles of component m: the mean of
     its prediction when every step resamples. Distances are in units of `scale`.
 
-    This is NOT part of the exact recursion of any paper here. It makes components interact, as a
-    Markov random field between objects does, through their means and not their states; the
-    filtering distribution is no longer that of the model and the marginal likelihood is biased
-    (`approximate` is true). Use it, after `Propagate`, where components stand for objects that
-    cannot share a place and look-alikes would otherwise collect several components; a mixture
-    of hypotheses about ONE object must not have it.
+    This is NOT part of the exact recursion of any paper here. Components interact as objects do in
+    a Markov random field, but through their means instead of their states. The filtering
+    distribution is then not that of the model, and the marginal likelihood is biased
+    (`approximate` is true). Use it after `Propagate`, where each component stands for an object,
+    objects cannot share a place, and several components would otherwise end on one look-alike.
+    Never use it where components are hypotheses about ONE object.
 
     Raises `ValueError` for a strength or radius that is not positive.
     """
@@ -46,11 +66,6 @@ class Exclusion(AbstractPropagation):
         self.radius = radius
         self.features = Features(features, scale)
 
-    @property
-    def approximate(self) -> bool:
-        """True: an interaction between components, on top of the model."""
-        return True
-
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
@@ -58,9 +73,9 @@ class Exclusion(AbstractPropagation):
         del key, observation
         if mixture.num_components == 1:
             return mixture
-        return mixture.weighed(-self.strength * self._nearness(mixture))
+        return mixture.weighed(-self.strength * self._nearness_to_others(mixture))
 
-    def _nearness(self, mixture: ParticleMixture) -> Float[Array, " n"]:
+    def _nearness_to_others(self, mixture: ParticleMixture) -> Float[Array, " n"]:
         features = self.features(mixture)
         own = mixture.component_indicators
         groups = summarise(
@@ -69,6 +84,5 @@ class Exclusion(AbstractPropagation):
         total = jnp.zeros(mixture.num_particles, features.dtype)
         for m in range(mixture.num_components):
             square = jnp.sum((features - groups.means[m][None]) ** 2, axis=1)
-            bump = jnp.exp(-square / (2 * self.radius**2))
-            total += jnp.where((own != m) & groups.alive[m], bump, 0.0)
+            total += jnp.where((own != m) & groups.alive[m], self.nearness(square), 0.0)
         return total

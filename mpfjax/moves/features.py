@@ -29,7 +29,7 @@ class Features(eqx.Module):
     - `function`: maps the particles to (n,) or (n, k) features; None takes the whole state,
       flattened.
     - `scale`: a number, or one a feature: the unit of each, such as the width and height of a box
-      in pixels. Distances, and with them all thresholds of distance, are in this unit.
+      in pixels. All distances and thresholds of distance are in this unit.
 
     Raises `ValueError` for a scale that is not positive.
     """
@@ -44,7 +44,7 @@ class Features(eqx.Module):
     def __call__(self, mixture: ParticleMixture) -> Float[Array, "n k"]:
         """The features of every particle, counted from their average, zero in an empty slot.
 
-        Regrouping asks for differences alone, and far from zero these would drown in rounding.
+        Regrouping needs only differences. Of values far from zero, rounding would hide them.
         """
         particles = mixture.particles
         values = flatten_states(particles) if self.function is None else self.function(particles)
@@ -56,7 +56,7 @@ class Features(eqx.Module):
 
 
 def origin(values: Float[Array, "n k"], mixture: ParticleMixture) -> Float[Array, " k"]:
-    """The average of the filled slots' values, each counting the same."""
+    """The average over the filled slots, with equal weights."""
     filled = mixture.occupied[:, None]
     total = jnp.sum(jnp.where(filled, values, 0.0), axis=0)
     return total / jnp.maximum(jnp.sum(filled), 1).astype(values.dtype)
@@ -100,9 +100,9 @@ def separation(
     """How far apart two groups are: the distance of their means, and the same in deviations.
 
     The second is |μ_a - μ_b| over the pooled standard deviation along the line that joins them,
-    sqrt(uᵀ (Σ_a + Σ_b) u / 2): Ashman's D, of which 2 is the usual border below which two
-    Gaussians of equal mass show no clean gap. Two points apart are infinitely many deviations
-    apart; two on the same spot none.
+    sqrt(uᵀ (Σ_a + Σ_b) u / 2). It is Ashman's D: below 2, two Gaussians of equal mass are usually
+    said to have no clear gap. Two groups of one point each are infinitely many deviations apart,
+    or zero if the points are the same.
     """
     gap = means_a - means_b
     distance = jnp.sqrt(jnp.sum(gap**2, axis=-1))

@@ -26,21 +26,21 @@ class GaussianRegeneration(AbstractRejuvenation):
 
     μ_m = Σ w_i x_i and Σ_m = Σ w_i (x_i - μ_m)(x_i - μ_m)ᵀ, over the particles of component m
     (Lin et al. 2012, eqs. 10 and 11; Kotecha and Djuric 2003 for one component). The component
-    keeps its mass, which its new particles share equally. An approximation unless the component
-    is Gaussian (`approximate` is true): what lies between the points of the state space is
-    filled in, and any shape but the ellipse is lost. Use it where components are unimodal and
-    resampling would leave too few distinct particles.
+    keeps its mass, which its new particles share equally. It is an approximation unless the
+    component is Gaussian (`approximate` is true): any shape other than an ellipse is lost. Use it
+    where components are unimodal and resampling would leave too few distinct particles.
 
     - `particles_per_component`: as for `Resample`.
-    - `where`: chooses from the states what is regenerated, such as `lambda state: state.box`; the
-      rest (angles, bounded or whole numbers) comes along from resampled particles. None is all.
+    - `where`: selects the part of the state that is redrawn, such as `lambda state: state.box`.
+      The rest (angles, bounded or whole numbers) is copied from resampled particles. None redraws
+      the whole state.
     - `inflation`: of the standard deviations; above 1 it counters the loss of spread.
     - `noise`: "independent" or "stratified", see `stratified_normal`.
 
-    A singular Σ_m draws within its own plane, and a component of one particle, or of copies of
-    one, draws that particle again. Ancestors are resampled particles where `where` is given, and
-    the heaviest of the component, as its representative, where it is not. Raises `ValueError`
-    for an inflation that is not positive, an unknown noise or particles_per_component < 1.
+    With a singular Σ_m, draws stay in its plane; a component of one particle, or of copies of one,
+    gives that particle again. With `where`, ancestors are the resampled particles; without it,
+    the heaviest particle of the component. Raises `ValueError` for an inflation that is not
+    positive, an unknown noise or particles_per_component < 1.
     """
 
     particles_per_component: int | None = eqx.field(static=True, default=None)
@@ -105,7 +105,7 @@ class GaussianRegeneration(AbstractRejuvenation):
                     " a Gaussian is; choose the leaves that are floating point"
                 )
         states = jnp.where(mixture.occupied[:, None], flatten_states(chosen), 0.0)
-        centre = origin(states, mixture)  # far from it, moments would drown in rounding
+        centre = origin(states, mixture)  # far from zero, rounding would hide the moments
         states = jnp.where(mixture.occupied[:, None], states - centre[None], 0.0)
         weights = mixture.component_weights.astype(states.dtype)
         moments = summarise(states, weights, mixture.component_indicators, mixture.num_components)

@@ -5,11 +5,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
+from mpfjax.checks import check_one_of
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling import Resample
-from mpfjax.moves.slots import require_all_slots
+from mpfjax.moves.resampling_schemes import SCHEMES
+from mpfjax.moves.slots import require_equal_rows
 from mpfjax.operations.generator import split
 
 
@@ -19,13 +21,13 @@ class PropagateIndependently(AbstractPropagation):
     For every object j: x_t^j ~ D, weights L(y_t | x_t^j), resampled by these weights alone.
     Objects that do not interact are independent given the observations, so the product of their
     N-particle clouds is the joint cloud, with Ẑ = Π_j Ẑ_j. Particle i holds the i-th particle
-    of every object: a row is one of the N^J combinations, each as good as another, and all of
-    equal weight. A row has no single ancestor, and is its own.
+    of every object: it is one of N^J combinations of equal weight. It has no single ancestor, so
+    every particle is named as its own ancestor.
 
-    The particles that it is given must have equal weights, as those of x_0 and its own have; it
-    needs no other resampling. An interaction of the model is left out, and `approximate` is then
-    true. Raises `ValueError` for a mixture of several components, a model of one object, and an
-    unknown scheme.
+    The move needs particles of equal weight, as x_0 has and as it returns them; the chain needs no
+    other resampling. It ignores an interaction of the model, and `approximate` is then true.
+    Raises `ValueError` for a mixture of several components, a model of one object, and an unknown
+    scheme.
     """
 
     model: MultiObjectModel
@@ -33,7 +35,7 @@ class PropagateIndependently(AbstractPropagation):
 
     def __check_init__(self) -> None:
         require_multi_object(self.model, "PropagateIndependently")
-        Resample(self.scheme)  # raises where there is no such scheme
+        check_one_of(SCHEMES, scheme=self.scheme)
 
     @property
     def approximate(self) -> bool:
@@ -44,9 +46,7 @@ class PropagateIndependently(AbstractPropagation):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
         """One step of every object's filter."""
-        if mixture.num_components != 1:
-            raise ValueError(f"mixture: {mixture.num_components} components, not one")
-        require_all_slots(mixture, "PropagateIndependently")
+        require_equal_rows(mixture, "PropagateIndependently")
         num_objects = self.model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = split(key, 2 * num_objects)

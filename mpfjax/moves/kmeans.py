@@ -18,11 +18,11 @@ from mpfjax.operations.segments import segment_counts, segment_sum
 class KMeans(AbstractRegrouping):
     """A fixed number of K-means iterations, from the components as they are.
 
-    Vermaak et al. (2003), section 4. Each particle counts the same whatever its weight: the
-    groups are to cover the places that hold particles, and on the quadratic model weighting
-    loses modes. A component without a particle is dead and stays so; a component keeps its label.
+    Vermaak et al. (2003), section 4. Every particle counts the same, whatever its weight: groups
+    should cover all places that hold particles. On the quadratic model, K-means by weight loses
+    modes. A component keeps its label. A component without a particle is dead and stays dead.
 
-    - `num_iterations`: assignments of all particles; the centroids move in between.
+    - `num_iterations`: how often all particles are assigned; the centroids move in between.
     - `reseed`: start from all M components instead, seeded by farthest-first traversal from the
       particle farthest from the mean. For the grouping of x_0.
     - `features`, `scale`: see `Features`.

@@ -25,9 +25,9 @@ class Merge(AbstractRegrouping):
       that joins them (Ashman's D; at 1 two equal Gaussians share 62% of their mass, at 2 32%);
     - their means are less than `max_distance` apart, in units of `scale`.
 
-    None leaves out a condition. `patience` is for how many steps in a row (frames) they must
-    overlap before they merge, so that two objects that pass each other are not made one. Chains
-    of overlapping components merge into one, which keeps the lowest label.
+    None leaves out a condition. `patience` is the number of steps (frames) in a row for which they
+    must overlap before they merge, so that two objects which pass each other do not become one.
+    A chain of overlapping components becomes one component, which keeps the lowest label.
 
     Raises `ValueError` where both conditions are None, for a threshold that is not positive, or
     for a patience below 1. Exact: a relabelling only.
@@ -65,7 +65,7 @@ class Merge(AbstractRegrouping):
     def regroup(
         self, key: Key[Array, ""], mixture: ParticleMixture
     ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
-        """Every particle to the lowest label that its component is chained to by overlap."""
+        """The lowest label of the chain of overlapping components that each particle is in."""
         del key
         overlap = self._overlap(mixture)
         memory = mixture.memory

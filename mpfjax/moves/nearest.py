@@ -9,7 +9,7 @@ from mpfjax.operations.matrices import row_sums
 def nearest(
     features: Float[Array, "n k"], centroids: Float[Array, "m k"], alive: Bool[Array, " m"]
 ) -> Int[Array, " n"]:
-    """The living centroid nearest to each particle, the lowest of equals.
+    """The living centroid nearest to each particle; of equally near ones, the first.
 
     A running minimum over the centroids: no (m, n) array is made.
     """

@@ -32,26 +32,26 @@ class Partitioned(AbstractPropagation):
     Smith and Gatica-Perez (2004), section 3: object j moves by its dynamics, the particles are
     resampled by importance weights ρ_i in proportion to a weight function g, and weights are
     divided by ρ_i. Here g is what the object adds to the target: its own likelihood, and its
-    potentials ψ with the objects that have moved before it. Each g stays in the joint weights,
-    so that resampling in proportion to the weights, every offspring with an equal share, is that
-    division; what remains after the last object is L(y_t | x_t) D / q of the whole joint state,
-    and Ẑ is unbiased in every order. Everything happens within components.
+    potentials ψ with the objects that have moved before it. Each g is multiplied into the joint
+    weights. Resampling in proportion to the weights, with equal shares for the offspring, then
+    does the division. After the last object the weights hold L(y_t | x_t) D / q of the whole
+    joint state, and Ẑ is unbiased in every order. Everything happens within components.
 
     - `orders`: which object moves when, counted from 0. One order for all components; one order
       for each component; "circular", where component c starts with object c, then c + 1, and so
       on round; or "random", a new order for each component at every step. None is 0, ..., J-1.
     - `scheme`, `ess_threshold`: of the resampling after each object, as in `Resample`.
-    - `reassembly`: how components come together (section 4 and eq. 5). "evidence" keeps what
-      each component's evidence made of its mass, eq. 4 of Vermaak et al. (2003). "prior" is the
-      paper's: each returns to the mass it had before, its particles' share of it unchanged, and
-      the total grows as before. The marginal likelihood is then biased (`approximate` is true),
-      but no component is lost to a step of bad luck. With one component they are the same.
+    - `reassembly`: what masses the components have afterwards (section 4 and eq. 5). "evidence"
+      multiplies each mass by the component's evidence, eq. 4 of Vermaak et al. (2003). "prior" is
+      the paper's: each component returns to the mass that it had before, and only the total grows
+      by the evidence. The marginal likelihood is then biased (`approximate` is true), but one
+      step of bad luck loses no component. With one component both are the same.
 
-    - `gradient`: of the resampling after each object, as in `Resample`; with "stop" the draws of
-      the objects are constants as well, and count through their densities, as in `Propagate`.
+    - `gradient`: of the resampling after each object, as in `Resample`. With "stop" the objects'
+      draws are constants too, and derivatives pass through their densities, as in `Propagate`.
 
-    A component that an object leaves without weight dies, and the others share its slots and,
-    with "prior", its mass. Where all weight is lost the particles move by their dynamics alone.
+    A component dies if an object leaves it without weight. The others share its slots and, with
+    "prior", its mass. If all weight is lost, the particles move by their dynamics alone.
 
     Raises `ValueError` for an order that is no permutation of the objects, a number of orders
     other than one or the number of components, an unknown scheme, reassembly or gradient, and
@@ -139,7 +139,7 @@ class Partitioned(AbstractPropagation):
     ) -> ParticleMixture:
         """The prediction without weights where every particle is lost, `moved` elsewhere.
 
-        A loop of one turn at most: under `vmap` a `cond` would draw the prediction at every step.
+        It is a loop of at most one turn: under `vmap`, a `cond` would always draw the prediction.
         """
         move, before, after = without_gradient((self, mixture, moved))
 
@@ -191,8 +191,8 @@ class Partitioned(AbstractPropagation):
         assert interaction is not None
         ranks = jnp.arange(self.model.num_objects - 1, dtype=jnp.int32)
         has_moved = ranks < rank
-        # A rank that is still to come stands in by the first, so that no object ever meets
-        # itself, where a potential may have no gradient.
+        # Ranks still to come are replaced by the first: an object must not meet itself, since
+        # a potential may have no gradient there.
         partners = orders[:, jnp.where(has_moved, ranks, 0)]
 
         def potential(partner: Int[Array, " m"]) -> Float[Array, " n"]:

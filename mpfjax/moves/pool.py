@@ -11,7 +11,7 @@ class Pool(AbstractRegrouping):
     """All particles into component 0, the mixture as one particle set.
 
     The left-hand side of eq. 3 of Smith and Gatica-Perez (2004), read from right to left. Use it
-    before a `Resample` in which the components are to compete. Exact: a relabelling only.
+    before a `Resample` in which the components should compete. Exact: a relabelling only.
     """
 
     def regroup(

@@ -26,16 +26,16 @@ from mpfjax.proposals import AbstractProposal
 class Propagate(AbstractPropagation):
     """Draw x_t and multiply the weights by L(y_t | x_t) D(x_t | x_{t-1}) / q(x_t | x_{t-1}, y_t).
 
-    The weight update of Vermaak et al. (2003), section 3. On joint weights it performs the update
-    of the mixture weights (eq. 4) as well: that is ordinary normalisation. Without a proposal q
-    is the dynamics D, and the factor is L alone; with one it is the guided filter, worth it
-    where the likelihood is much narrower than the dynamics.
+    This is the weight update of Vermaak et al. (2003), section 3. With joint weights, ordinary
+    normalisation then updates the mixture weights as well (eq. 4). Without a proposal, q is the
+    dynamics D, and the factor is L alone. With a proposal it is the guided filter. Use one where
+    the likelihood is much narrower than the dynamics.
 
-    - `gradient`: what a derivative sees; the values are the same. "none" differentiates the draw,
-      x_t = f(x_{t-1}, noise; θ), as it is written. "stop" takes what was drawn for a constant and
-      the weight's factor for L D / ⊥q, ⊥ being `stop_gradient`, so that parameters of D count
-      through its density (Ścibior and Wood 2021); parameters of q have no gradient then. Only
-      x_0 is still differentiated through its draw.
+    - `gradient`: what a derivative sees; the values are the same. "none" differentiates the draw
+      x_t = f(x_{t-1}, noise; θ). "stop" treats the draw as a constant and the factor as L D / ⊥q,
+      where ⊥ is `stop_gradient` (Ścibior and Wood 2021). Parameters of D then have a gradient
+      through its density, and parameters of q have none. The draw of x_0 is still
+      differentiated.
 
     Raises `ValueError` for another gradient, and for a proposal, or "stop", with a model that has
     no `log_transition`.
@@ -75,9 +75,9 @@ class Propagate(AbstractPropagation):
 class Predict(AbstractPropagation):
     """Draw x_t ~ D(. | x_{t-1}) and leave the weights: the first half of a bootstrap `Propagate`.
 
-    With `Weigh` as the second half, for chains that do something between the two, such as
-    redrawing the prediction from its Gaussian (Lin et al. 2012, section 4, step 3). `gradient` is
-    that of `Propagate`, and so are the errors.
+    `Weigh` is the second half. Use the two in a chain that does something in between, such as
+    redrawing the prediction from its Gaussian (Lin et al. 2012, section 4, step 3). `gradient` and
+    the errors are those of `Propagate`.
     """
 
     model: AbstractStateSpaceModel
@@ -102,7 +102,7 @@ class Predict(AbstractPropagation):
 class Weigh(AbstractPropagation):
     """Multiply the weights by L(y_t | x_t): the second half of a bootstrap `Propagate`.
 
-    After `Predict`, and whatever a chain does to the prediction.
+    Use it after `Predict` and what a chain does to the prediction.
     """
 
     model: AbstractStateSpaceModel

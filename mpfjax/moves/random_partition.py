@@ -16,14 +16,14 @@ from mpfjax.operations.prefix_sums import count_upto
 class RandomPartition(AbstractRegrouping):
     """The particles dealt at random into sets of equal size, without replacement.
 
-    Smith and Gatica-Perez (2004), section 4: C sets of N/C particles each, sizes differing by one
-    where C does not divide N; empty slots are dealt after the filled ones. A set's mass is that
-    of its particles (eq. 5), so that the distribution stays as it is.
+    Smith and Gatica-Perez (2004), section 4: C sets of N/C particles each; sizes differ by one if C
+    does not divide N. Empty slots are dealt after the filled ones. The mass of a set is that of
+    its particles (eq. 5), so the distribution does not change.
 
     - `num_sets`: C; None takes as many as the mixture has components.
 
-    Raises `ValueError` for C < 1, or more sets than components. Use it where components are to
-    stand for the same distribution, such as `Partitioned` in one order each.
+    Raises `ValueError` for C < 1, or more sets than components. Use it where all components
+    should stand for the same distribution, as when `Partitioned` gives each an order of its own.
     """
 
     num_sets: int | None = eqx.field(static=True, default=None)
@@ -41,8 +41,8 @@ class RandomPartition(AbstractRegrouping):
             raise ValueError(
                 f"num_sets: {num_sets} is more than num_components, {mixture.num_components}"
             )
-        # Sets dealt in turn, in an order drawn by sorting: the set stands in a word's lowest bits,
-        # random bits above it, and the sets for the empty slots come after all others.
+        # Sets are dealt in turn and then sorted into a random order. Each is a word: the set in the
+        # lowest bits, random bits above it. Words of empty slots come after all others.
         width = (num_sets - 1).bit_length()
         occupied, index = mixture.occupied, jnp.arange(n, dtype=jnp.int32)
         num_filled = jnp.sum(occupied, dtype=jnp.int32)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import (
     check_callable,
@@ -18,26 +18,16 @@ from mpfjax.checks import (
 )
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRejuvenation
-from mpfjax.moves.slots import (
-    Slots,
-    deal_slots,
-    place_slots,
-)
+from mpfjax.moves.lines import AsTheyStand, SideBySide, as_they_are, side_by_side
+from mpfjax.moves.resampling_schemes import SCHEMES
+from mpfjax.moves.slots import Slots, deal_slots, place_slots
 from mpfjax.moves.transport import require_ott, transport
-from mpfjax.operations.generator import uniform
 from mpfjax.operations.gradients import add_gradient
 from mpfjax.operations.indexing import take
 from mpfjax.operations.prefix_sums import count_starts, sum_before
-from mpfjax.operations.segments import (
-    order_by_segment,
-    segment_counts,
-    segment_log_sum_exp,
-    segment_sum,
-    spread,
-)
-from mpfjax.operations.stored import stored, to_int, whole_blocks
+from mpfjax.operations.segments import segment_log_sum_exp, spread
 
-# Up to so many components are resampled as they stand, each in a pass of its own.
+# Up to this number of components, each is resampled in a pass of its own over all particles.
 FEW_ROWS = 4
 GRADIENTS = ("none", "stop", "soft", "ot", "straight_through")
 
@@ -52,36 +42,38 @@ class Resample(AbstractRejuvenation):
 
     - `scheme`: "systematic" (the default: least noise, O(n)), "stratified", "multinomial" (the
       textbook's, most noise) or "residual".
-    - `ess_threshold`: a component is resampled where its effective sample size is below this
-      share of its particles; 1.0 resamples at every step. Under `vmap` an adaptive threshold
-      saves noise, not time.
-    - `particles_per_component`: None deals the slots equally to the living components that are
-      resampled; a number k gives each living component k particles and leaves the rest of the
-      slots empty, the paper's habit in section 5.2.
-    - `sort_by`: maps the particles to a number each, (n,), by which they stand in line within
-      their component. Systematic and stratified resampling of a sorted line change the
-      distribution least (Kitagawa 1996), and neighbours in line are neighbours in space when
-      `stratified_normal` spreads their noise, the array form of randomised quasi-Monte Carlo
-      (L'Ecuyer, Lécot and Tuffin 2008). Worth its sort where masses or likelihoods must be exact:
-      it cut the error of the modes' mass on the quadratic model by four or five.
+    - `ess_threshold`: a component is resampled if its effective sample size is below this share of
+      its particles. 1.0 resamples at every step. Under `vmap`, a lower threshold reduces the noise
+      but not the time.
+    - `particles_per_component`: None shares the slots equally among the living components that are
+      resampled. A number k gives each living component k particles and leaves the other slots
+      empty, as section 5.2 of the paper does.
+    - `sort_by`: a function that gives each particle a number, (n,). Within their component the
+      particles are resampled in the order of these numbers. Systematic and stratified resampling
+      in a good order change the distribution least (Kitagawa 1996). With `stratified_normal`
+      noise, it is the array form of randomised quasi-Monte Carlo (L'Ecuyer, Lécot and Tuffin
+      2008). Use it where masses or likelihoods must be accurate and a sort is worth its time: on
+      the quadratic model it made the error of the modes' masses four or five times smaller.
     - `gradient`: what a derivative of the filter sees of the resampling, one of
-        - "none": nothing. The indices that were drawn are taken for constants, and the derivative
-          of the log marginal likelihood is NOT an estimate of the score: its bias does not go
-          away with more particles, and may have the wrong sign.
-        - "stop": new weights w_a / ⊥w_a times the old share, ⊥ being `stop_gradient` (Ścibior and
-          Wood 2021, DPF-SGR). Values are the same to the bit; derivatives of Ẑ are unbiased.
-          `Propagate` and `Partitioned` have it as well, for parameters of the dynamics.
-        - "soft": draws from q = (1 - s) w + s / k and weighs by w / q, s the `softness` (Karkus,
-          Hsu and Lee 2018). Noisier weights, and still biased: what is left out grows as s falls.
-        - "ot": no draws: particles move to the barycentres of an entropy-regularised transport
-          plan from the weights to equal ones (Corenflos et al. 2021), by ott-jax, the extra `ot`.
-          Differentiable throughout, O(n²), and biased in value and gradient by the entropy.
-        - "straight_through": resampling in value; the derivative is that of particles moved by
-          Σ_j w_j ⊥x_j, as if every offspring were the component's mean (Bengio et al. 2013).
-          Biased, and it may grow exponentially with t, as on the quadratic model.
-      The masses of components carry their derivative in all of them. Component indicators are
-      whole numbers and have none: what a parameter does to the grouping is not seen, which is
-      no error, since regrouping does not change the distribution.
+        - "none": nothing. The drawn indices are constants, and the derivative of the log marginal
+          likelihood is NOT an estimate of the score: its bias stays however many particles there
+          are, and it may have the wrong sign.
+        - "stop": the new weights are w_a / ⊥w_a times the old share, where ⊥ is `stop_gradient`
+          (Ścibior and Wood 2021, DPF-SGR). Values are the same to the bit; derivatives of Ẑ are
+          unbiased. For parameters of the dynamics, `Propagate` and `Partitioned` have it too.
+        - "soft": particles are drawn from q = (1 - s) w + s / k and weighted by w / q, where s is
+          the `softness` (Karkus, Hsu and Lee 2018). The weights are noisier, and the derivative is
+          still biased, the more the smaller s is.
+        - "ot": nothing is drawn. Particles move to the barycentres of an entropy-regularised
+          transport plan from the weights to equal ones (Corenflos et al. 2021), computed by
+          ott-jax, the extra `ot`. It is differentiable throughout and O(n²); the entropy biases
+          the value and the gradient.
+        - "straight_through": the values are those of resampling. The derivative is that of
+          particles moved by Σ_j w_j ⊥x_j, as if every offspring were the component's mean (Bengio
+          et al. 2013). It is biased, and may grow exponentially with t, as on the quadratic model.
+      The masses of the components have their derivative in all of these. Component indicators are
+      whole numbers and have none. That is no error, since regrouping does not change the
+      distribution.
     - `softness`: s, in (0, 1]. `regularisation`: ε of the transport, positive, in units of the
       mean squared spread of a component's particles, as Corenflos et al. scale it.
 
@@ -119,8 +111,8 @@ class Resample(AbstractRejuvenation):
         if self.ess_threshold == 1.0:
             return mixture.active
         counts = mixture.component_counts
-        limit = self.ess_threshold * counts.astype(mixture.log_weights.dtype)
-        due = mixture.component_effective_sample_sizes < limit
+        least = self.ess_threshold * counts.astype(mixture.log_weights.dtype)
+        due = mixture.component_effective_sample_sizes < least
         if self.particles_per_component is not None:
             due = due | (counts != self.particles_per_component)
         return due & (counts > 0)
@@ -131,7 +123,7 @@ class Resample(AbstractRejuvenation):
         """Resample every component that is due."""
         due = self.is_due(mixture)
         drawn_from = self._drawn_from(mixture)
-        # Who is drawn is a whole number, through which no derivative passes.
+        # The drawn indices are whole numbers and have no derivative.
         drawn = self._draw(key, jax.lax.stop_gradient(drawn_from), due)
         slots = drawn.slots
         copies = _copies(mixture, drawn)
@@ -156,13 +148,14 @@ class Resample(AbstractRejuvenation):
     ) -> "_Drawn":
         """Each slot's parent: drawn by weight where its component is due, itself elsewhere."""
         num_particles, num_components = mixture.num_particles, mixture.num_components
-        # A component that keeps its particles needs them side by side, unless it has all slots.
+        # A component that keeps its particles needs them side by side, unless it is the only one.
         all_are_due = self.ess_threshold == 1.0
         as_they_stand = num_components == 1 or (num_components <= FEW_ROWS and all_are_due)
         as_they_stand &= self.sort_by is None
         as_they_stand &= self.gradient != "ot"  # which needs places without gaps
-        line = _as_they_stand(mixture) if as_they_stand else self._side_by_side(mixture, due)
-        # Where all that live are due, none keeps what it has.
+        stays = None if all_are_due else ~spread(due, mixture.component_indicators)
+        line = as_they_are(mixture) if as_they_stand else side_by_side(mixture, stays, self.sort_by)
+        # If all living components are due, none keeps its particles.
         counts = due.astype(jnp.int32) if all_are_due else line.counts
         targets = deal_slots(counts, due, mixture, self.particles_per_component)
         if as_they_stand and num_components == 1:
@@ -172,7 +165,7 @@ class Resample(AbstractRejuvenation):
         expected = line.weights * line.of_places(targets).astype(line.weights.dtype)
         before, total = jax.vmap(sum_before)(expected)
         starts = SCHEMES[self.scheme](key, expected, before, targets, slots, line)
-        # Rounding must not leave a slot to those that stand past all weight.
+        # Rounding must not give a slot to particles after the last weight.
         num_slots = line.num_slots(targets, num_particles)
         starts = jnp.minimum(starts, num_slots)
         starts = jnp.where(before < total[:, None], starts, num_slots) + line.first_slots(slots)
@@ -182,30 +175,6 @@ class Resample(AbstractRejuvenation):
             parents = jnp.where(spread(due, slots.components), parents, unmoved)
         parents = line.particles_at(jnp.clip(parents, 0, num_particles - 1))
         return _Drawn(parents, slots, targets, line)
-
-    def _side_by_side(self, mixture: ParticleMixture, due: Bool[Array, " m"]) -> "_SideBySide":
-        """One row of components, without particles that only a rounding error could draw.
-
-        A weight may underflow to zero where its logarithm does not. Such a particle is left out of
-        the row of a component that is resampled, and kept with one that is not.
-        """
-        m = mixture.num_components
-        weights = mixture.component_weights
-        stands = weights > 0
-        if self.ess_threshold < 1.0:
-            stands |= mixture.occupied & ~spread(due, mixture.component_indicators)
-        labels = jnp.where(stands, mixture.component_indicators, m)
-        if self.sort_by is None:
-            order, counts = order_by_segment(_padded(labels, m), m)
-        else:
-            order = jnp.lexsort((self.sort_by(mixture.particles), labels)).astype(jnp.int32)
-            order = _padded(order, mixture.num_particles - 1)
-            counts = segment_counts(stands, mixture.component_indicators, m)
-        num_standing = jnp.sum(counts, dtype=jnp.int32)
-        is_filled = jnp.arange(order.shape[0], dtype=jnp.int32) < num_standing
-        weights = jnp.where(is_filled, take(_padded(weights, 0.0), order), 0.0)
-        components = take(_padded(mixture.component_indicators, 0), order)
-        return _SideBySide(weights[None], counts, jnp.cumsum(counts) - counts, order, components)
 
     def _drawn_from(self, mixture: ParticleMixture) -> ParticleMixture:
         """The mixture whose weights the offspring are drawn in proportion to."""
@@ -247,7 +216,7 @@ class _Drawn(NamedTuple):
     parents: Int[Array, " n"]
     slots: Slots
     targets: Int[Array, " m"]  # how many slots each component has
-    line: "_AsTheyStand | _SideBySide"
+    line: AsTheyStand | SideBySide
 
 
 def _copies(mixture: ParticleMixture, drawn: _Drawn) -> ParticleMixture:
@@ -278,7 +247,7 @@ def _importance_weighted(
 
 
 def _following_the_mean(redrawn: ParticleMixture, mixture: ParticleMixture) -> ParticleMixture:
-    """The same particles, whose derivatives are also those of the component's mean by weight."""
+    """The same particles, with the derivative of their component's weighted mean added."""
 
     def follow(leaf: Array, drawn: Array) -> Array:
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -292,7 +261,7 @@ def _following_the_mean(redrawn: ParticleMixture, mixture: ParticleMixture) -> P
 def _where(
     is_redrawn: Bool[Array, " n"], redrawn: ParticleMixture, copies: ParticleMixture
 ) -> ParticleMixture:
-    """What was redrawn, and of the components that were not due the particles as they were."""
+    """The redrawn particles, or the old ones where a component was not due."""
 
     def pick(new: Array, old: Array) -> Array:
         return jnp.where(is_redrawn.reshape(-1, *[1] * (new.ndim - 1)), new, old)
@@ -303,170 +272,3 @@ def _where(
             ancestor_indices=pick(redrawn.ancestor_indices, copies.ancestor_indices),
         )
     return redrawn.replace(log_weights=pick(redrawn.log_weights, copies.log_weights))
-
-
-class _AsTheyStand(NamedTuple):
-    """The particles as they stand, in a row for each component, where only its own have a weight.
-
-    A row has p places, as many as make whole blocks for the prefix sums.
-    """
-
-    weights: Float[Array, "m p"]  # within the component, zero at another's place and an empty one
-    counts: Int[Array, " m"]
-
-    def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, "m 1"]:
-        """For each row the value of its component."""
-        return values[:, None]
-
-    def sums(self, values: Float[Array, "m p"]) -> Float[Array, " m"]:
-        """The sum over each component's places."""
-        return jnp.sum(values, axis=1)
-
-    def first_slots(self, slots: Slots) -> Int[Array, "m 1"]:
-        """Where the slots of each row begin."""
-        return slots.firsts[:, None]
-
-    def num_slots(self, targets: Int[Array, " m"], num_particles: int) -> Int[Array, "m 1"]:
-        """How many slots each row has."""
-        del num_particles
-        return targets[:, None]
-
-    def places_of(self, parents: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
-        """The place in its row of each slot's parent, counted over all rows."""
-        return parents - self.weights.shape[1] * slots.components
-
-    def places_by_rank(self, ranks: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
-        """The place of a rank in each slot's component, which is the only one."""
-        del slots
-        return ranks
-
-    def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
-        """Which particles stand at these places."""
-        return places
-
-
-class _SideBySide(NamedTuple):
-    """The particles in one row of p places, component by component, and empty places at the end."""
-
-    weights: Float[Array, "1 p"]  # within the component, zero at an empty place
-    counts: Int[Array, " m"]
-    firsts: Int[Array, " m"]  # the place of each component's first particle
-    order: Int[Array, " p"]  # which particle stands at each place
-    components: Int[Array, " p"]
-
-    def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, "1 p"]:
-        """At each place the value of its component."""
-        return spread(values, self.components)[None]
-
-    def sums(self, values: Float[Array, "1 p"]) -> Float[Array, " m"]:
-        """The sum over each component's places."""
-        return segment_sum(values[0], self.components, self.counts.shape[0])
-
-    def first_slots(self, slots: Slots) -> Int[Array, "1 1"]:
-        """Where the slots of the row begin."""
-        del slots
-        return jnp.zeros((1, 1), jnp.int32)
-
-    def num_slots(self, targets: Int[Array, " m"], num_particles: int) -> Int[Array, "1 1"]:
-        """How many slots the row has."""
-        del targets
-        return jnp.full((1, 1), num_particles, jnp.int32)
-
-    def places_of(self, parents: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
-        """The place of each slot's parent; rounding must not cross a border of components."""
-        firsts = spread(self.firsts, slots.components)
-        return jnp.clip(parents, firsts, firsts + spread(self.counts, slots.components) - 1)
-
-    def places_by_rank(self, ranks: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
-        """The place of a rank in each slot's component."""
-        return spread(self.firsts, slots.components) + ranks
-
-    def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
-        """Which particles stand at these places."""
-        return take(self.order, stored(places, self.order.shape[0]))
-
-
-def _as_they_stand(mixture: ParticleMixture) -> _AsTheyStand:
-    m = mixture.num_components
-    is_member = mixture.component_indicators[None] == jnp.arange(m, dtype=jnp.int32)[:, None]
-    weights = mixture.component_weights[None]
-    if m > 1:
-        weights = jnp.where(is_member, weights, 0.0)
-    padded = jax.vmap(lambda row: _padded(row, 0.0))(weights)
-    return _AsTheyStand(padded, mixture.component_counts)
-
-
-def _padded(values: Array, fill: float) -> Array:
-    n = values.shape[0]
-    return jnp.pad(values, (0, whole_blocks(n) - n), constant_values=fill)
-
-
-# A scheme gives the first slot of every particle's offspring, counted from the first slot of its
-# row. It sees the expected offspring k_m w_i laid end to end in each row, and where each particle's
-# stretch begins there, and places one point in each slot's share.
-
-
-def _systematic(key, expected, before, targets, slots, line):
-    shift = stored(uniform(key, targets.shape, expected.dtype))
-    return _points_before(before, line.of_places(shift))
-
-
-def _stratified(key, expected, before, targets, slots, line):
-    shift = uniform(key, slots.components.shape, expected.dtype)
-    slot = line.first_slots(slots) + before.astype(jnp.int32)
-    slot = jnp.clip(slot, 0, shift.shape[0] - 1)
-    return _points_before(before, take(shift, slot.reshape(-1)).reshape(slot.shape))
-
-
-def _points_before(
-    before: Float[Array, "rows p"], shift: Float[Array, "rows #p"]
-) -> Int[Array, "rows p"]:
-    """How many of the points s + shift, one in each slot s, come before a particle's stretch."""
-    whole = jnp.floor(before)
-    return to_int(whole, before.shape[-1]) + (shift < before - whole).astype(jnp.int32)
-
-
-def _multinomial(key, expected, before, targets, slots, line):
-    points = _sorted_points(key, slots, targets, expected.dtype)
-    return _sorted_points_before(before, points, line.first_slots(slots))
-
-
-def _residual(key, expected, before, targets, slots, line):
-    # A weight of 1 / k comes out as a hair less in floating point, and is meant to be certain.
-    whole = jnp.floor(expected * (1 + 16 * jnp.finfo(expected.dtype).eps))
-    certain, _ = jax.vmap(sum_before)(whole)
-    left = jnp.maximum(targets - line.sums(whole).astype(jnp.int32), 0)
-    rest = place_slots(left, slots.components.shape[0])
-    points = _sorted_points(key, rest, left, expected.dtype)
-    rests_before, _ = jax.vmap(sum_before)(jnp.maximum(expected - whole, 0.0))
-    drawn = _sorted_points_before(rests_before, points, line.first_slots(rest))
-    return certain.astype(jnp.int32) + drawn
-
-
-def _sorted_points_before(
-    before: Float[Array, "rows p"], points: Float[Array, " n"], first_slots: Int[Array, "rows 1"]
-) -> Int[Array, "rows p"]:
-    """How many of the points of its row come before a particle's stretch."""
-    found = jnp.searchsorted(points, before + first_slots.astype(before.dtype), side="left")
-    return found.astype(jnp.int32) - first_slots
-
-
-def _sorted_points(
-    key: Key[Array, ""], slots: Slots, targets: Int[Array, " m"], dtype: jnp.dtype
-) -> Float[Array, " n"]:
-    """Independent uniform points on each component's stretch of slots, in ascending order."""
-    shares = uniform(key, slots.components.shape, dtype)
-    firsts = spread(slots.firsts, slots.components).astype(dtype)
-    lengths = spread(targets, slots.components).astype(dtype)
-    # Rounding must not take the last of them for the first of the next component.
-    before_end = jnp.nextafter(firsts + lengths, jnp.zeros_like(firsts))
-    points = jnp.minimum(firsts + lengths * shares, before_end)
-    return jnp.sort(jnp.where(slots.filled, points, jnp.inf))
-
-
-SCHEMES: dict[str, Callable[..., Int[Array, " n"]]] = {
-    "systematic": _systematic,
-    "stratified": _stratified,
-    "multinomial": _multinomial,
-    "residual": _residual,
-}

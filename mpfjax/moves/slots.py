@@ -27,17 +27,17 @@ def deal_slots(
 ) -> Int[Array, " m"]:
     """How many slots each component gets.
 
-    Those that are not due keep what they have, `counts`; the others share the rest of the slots
-    that may be filled equally, or get `particles_per_component` each where that is a number.
+    Components that are not due keep their slots, `counts`. The others share the rest of the usable
+    slots equally, or get `particles_per_component` each if that is a number.
     """
-    room, num_slots = mixture.room, mixture.num_particles
+    usable, num_slots = mixture.num_usable_slots, mixture.num_particles
     if particles_per_component is not None:
         share = jnp.asarray(min(particles_per_component, num_slots), jnp.int32)
         return jnp.where(counts > 0, share, 0)
     kept = jnp.where(due, 0, counts)
     if counts.shape[0] == 1:
-        return jnp.where(due, room, kept)
-    pool = room - jnp.sum(kept, dtype=jnp.int32)
+        return jnp.where(due, usable, kept)
+    pool = usable - jnp.sum(kept, dtype=jnp.int32)
     sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
     rank = jnp.cumsum(due.astype(jnp.int32)) - 1
     share = pool // sharers + (rank < pool % sharers).astype(jnp.int32)
@@ -57,7 +57,9 @@ def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:
     )
 
 
-def require_all_slots(mixture: ParticleMixture, who: str) -> None:
-    """Raise a `ValueError` where some slots must stay empty."""
-    if mixture.limit is not None:
+def require_equal_rows(mixture: ParticleMixture, who: str) -> None:
+    """Raise a `ValueError` unless there is one component, which may fill every slot."""
+    if mixture.num_components != 1:
+        raise ValueError(f"mixture: {mixture.num_components} components, not one")
+    if mixture.usable_slots is not None:
         raise ValueError(f"slots: {who} fills every slot, and cannot leave some of them empty")

@@ -18,17 +18,16 @@ from mpfjax.operations.segments import segment_argmax, segment_sum, spread
 class Split(AbstractRegrouping):
     """Split a component in two where it has become too diffuse.
 
-    Vermaak et al. (2003), section 4, leaves the criterion open. Here each component is parted
-    by weighted 2-means, started from its two ends, and splits where all of these hold:
+    Vermaak et al. (2003), section 4, leaves the criterion open. Here weighted 2-means, started from
+    the two ends of the component, finds two halves. The component splits if all of these hold:
 
-    - the halves' means are more than `min_deviations` pooled standard deviations apart (a
-      Gaussian cut in the middle gives 2.6, a uniform cut in the middle 3.5, so that neither
-      splits below 4);
+    - the halves' means are more than `min_deviations` pooled standard deviations apart. The halves
+      of a Gaussian are 2.6 apart and those of a uniform distribution 3.5, so 4 splits neither;
     - they are more than `min_distance` apart, in units of `scale`;
     - the lighter half holds at least `min_share` of the component's mass.
 
-    The lighter half takes a free label, the clearest splits first; without a free label nothing
-    splits. Raises `ValueError` for a threshold that is negative or a share not in [0, 0.5].
+    The lighter half takes a free label. If there are too few free labels, the clearest splits come
+    first. Raises `ValueError` for a threshold that is negative or a share not in [0, 0.5].
     Exact: a relabelling only.
     """
 

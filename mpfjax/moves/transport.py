@@ -35,10 +35,11 @@ def transport(
 ) -> tuple[PyTree, Int[Array, " n"]]:
     """x̃_s = Σ_j P_sj x_j / Σ_j P_sj, and the j of the largest P_sj, for every slot s.
 
-    P is the plan between the weights w_j of each component's particles and equal weights on the
-    particles `targets_s`, one for each slot of the component, that minimises <P, C> - ε H(P),
-    C_sj the squared distance in units of the component's spread (Corenflos et al. 2021, eq. 9
-    and section 4.1). Leaves that are not floating point are those of the largest P_sj.
+    Within each component, P is a transport plan from the weights w_j of its particles to equal
+    weights on the particles `targets_s`, one for each slot. It minimises <P, C> - ε H(P), where
+    C_sj is the squared distance in units of the component's spread (Corenflos et al. 2021, eq. 9
+    and section 4.1). Leaves that are not floating point are copied from the particle j of the
+    largest P_sj.
     """
     states = _float_leaves(mixture)
     points = take(states, targets)
@@ -107,9 +108,9 @@ def _plan(
     from ott.geometry.geometry import Geometry
     from ott.solvers import linear
 
-    # The solver is written for JAX's default promotion, whatever its caller has set. Its iterations
-    # are differentiated as they were: the implicit derivative solves a linear system that weights
-    # near zero make singular, and that of a fixed number of iterations is wrong in ott-jax 0.6.
+    # The solver needs JAX's default promotion, whatever its caller has set. Its iterations are
+    # differentiated one by one: the implicit derivative solves a linear system that weights near
+    # zero make singular, and that of a fixed number of iterations is wrong in ott-jax 0.6.
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         geometry = Geometry(cost_matrix=cost, epsilon=regularisation, relative_epsilon=None)
         solution: Any = linear.solve(

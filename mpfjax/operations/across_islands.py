@@ -1,7 +1,7 @@
-"""What islands of particles tell each other; outside `run_islands` there is one island.
+"""What islands of particles exchange; outside `run_islands` there is one island.
 
-In numpy islands are a leading axis: `sums.sum(axis=0)`. Here they are two named axes, of devices
-and of islands on a device, and every function says what goes over them.
+In numpy, islands would be a leading axis: `sums.sum(axis=0)`. Here they are two named axes, one of
+devices and one of islands on a device. Every function says what the islands exchange.
 """
 
 import jax.extend.core
@@ -15,9 +15,9 @@ ISLAND_AXIS = "mpfjax_islands"
 
 
 def num_islands() -> int:
-    """Into how many islands the particles are dealt; 1 outside `run_islands`."""
+    """The number of islands; 1 outside `run_islands`."""
     try:
-        # Constants, known as the program is traced.
+        # Constants, known during tracing.
         return jax.lax.psum(1, ISLAND_AXIS) * jax.lax.psum(1, DEVICE_AXIS)
     except NameError:
         return 1
@@ -32,7 +32,7 @@ def island_index() -> Int[Array, ""]:
 def over_islands(value: Array) -> Array:
     """The values of all islands, in their order, on a new leading axis; the same for each.
 
-    The order does not depend on how many devices there are, so that neither does a sum.
+    The order does not depend on the number of devices, and so a sum does not either.
     """
     on_device = jax.lax.all_gather(value, ISLAND_AXIS)
     everywhere = jax.lax.all_gather(on_device, DEVICE_AXIS)
@@ -42,10 +42,10 @@ def over_islands(value: Array) -> Array:
 def deal_to_islands(values: Array) -> Array:
     """Row i of every island to island i mod G; the leading axis must be a multiple of G.
 
-    Dealing twice brings the rows of an island back to it, in another order.
+    A second call brings the rows of an island back to it, in another order.
     """
     num_devices, on_device = jax.lax.psum(1, DEVICE_AXIS), jax.lax.psum(1, ISLAND_AXIS)
-    # Under vmap JAX 0.10 gets the shape wrong of a value that is known to be the same everywhere.
+    # Under vmap, JAX 0.10 gives a wrong shape to a value that is the same on all devices.
     values = jnp.where(island_index() >= 0, values, values)
     dealt = values.reshape(-1, num_devices, on_device, *values.shape[1:])
     dealt = jax.lax.all_to_all(dealt, ISLAND_AXIS, split_axis=2, concat_axis=2)
@@ -56,17 +56,17 @@ def deal_to_islands(values: Array) -> Array:
 def excess_over_islands(
     log_scale: Float[Array, ""], log_largest: Float[Array, ""], log_sum: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """How far an island's own scale is above that of all, and log of all mass in two parts.
+    """The excess of an island's scale over that of all islands, and log of the mass of all.
 
-    The mass of an island is given in three parts, scale + largest + sum, and that of all islands
-    comes out as total + scale, so that none rounds another away. O(1) numbers from each island;
-    outside `run_islands` there is one, and nothing above it.
+    The log mass of an island is given in three parts, scale + largest + sum. That of all islands is
+    returned in two, total + scale. So rounding of a large part does not destroy a small one. Each
+    island sends O(1) numbers. Outside `run_islands` there is one island, and its excess is 0.
     """
     if num_islands() == 1:
         return jnp.zeros_like(log_sum), log_sum, log_scale + log_largest
     scales, largest, sums = over_islands(jnp.stack([log_scale, log_largest, log_sum])).T
     counts = sums > -jnp.inf
-    # Part by part, exactly: an island without mass has no say.
+    # Part by part, which is exact; an island without mass does not count.
     common = finite_max(jnp.where(counts, scales, -jnp.inf))
     shift = finite_max(jnp.where(counts, (scales - common) + largest, -jnp.inf))
     log_total = log_sum_exp(sums + (((scales - common) + largest) - shift))

@@ -18,26 +18,26 @@ _VECTOR_WIDTH = "xla_cpu_prefer_vector_width"
 
 
 def wide_vectors() -> dict[str, int]:
-    """The compiler's options for vectors of 512 bits on a CPU, where XLA keeps to 256 by default.
+    """The compiler's options for vectors of 512 bits on a CPU; XLA's default is 256.
 
-    A machine without such vectors takes its widest. Nothing on other platforms, and where
-    XLA_FLAGS sets the width.
+    A machine without such vectors uses its widest ones. There are no options on other platforms,
+    or if XLA_FLAGS sets the width.
     """
     is_set = _VECTOR_WIDTH in os.environ.get("XLA_FLAGS", "")
     return {} if is_set or jax.default_backend() != "cpu" else {_VECTOR_WIDTH: 512}
 
 
 def jit_on_wide_vectors(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """`equinox.filter_jit` with `wide_vectors`, on which the generator takes half the time.
+    """`equinox.filter_jit` with `wide_vectors`, with which random draws take half the time.
 
-    Such options are a whole program's: within a transformation of the caller's they are left to
-    its own `jax.jit(..., compiler_options=...)`, or XLA_FLAGS.
+    Such options are for a whole program. Within a transformation of the caller, they must be given
+    to its own `jax.jit(..., compiler_options=...)`, or in XLA_FLAGS.
     """
     plain = eqx.filter_jit(function)
 
     @functools.cache
     def wide() -> Callable[..., PyTree]:
-        # To ask for the platform before the first call would keep processes from joining.
+        # Asking JAX for the platform before the first call would keep processes from joining.
         with_options: Any = eqx.filter_jit
         return with_options(function, compiler_options=wide_vectors())
 
@@ -47,8 +47,8 @@ def jit_on_wide_vectors(function: Callable[..., PyTree]) -> Callable[..., PyTree
             try:
                 return wide()(*arguments, **named)
             except ValueError as error:
-                # Where all arguments are constants of the caller's program, or a function among
-                # them closes over a tracer.
+                # All arguments are constants of the caller's program, or a function among them
+                # closes over a tracer.
                 if "compiler_options" not in str(error):
                     raise
         return plain(*arguments, **named)
@@ -61,7 +61,7 @@ def is_traced(tree: PyTree) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-# What JAX says where Python asks for the value of a number that it traces.
+# The errors of JAX where Python asks for the value of a traced number.
 _NEEDS_VALUE = (
     jax.errors.ConcretizationTypeError,
     jax.errors.TracerArrayConversionError,
@@ -72,8 +72,8 @@ _NEEDS_VALUE = (
 def with_floats_traced(run: Callable[[PyTree], PyTree], filter: PyTree) -> PyTree:
     """`run(filter)`, compiled once for all values of the Python floats in it.
 
-    Such numbers would otherwise be constants of the program, and each value another program. They
-    stay constants where the model asks for their value in Python, as in `if self.phi > 0`.
+    Otherwise such a number would be a constant of the program, and every value would compile again.
+    It stays a constant if the model uses its value in Python, as in `if self.phi > 0`.
     """
     if not any(type(leaf) is float for leaf in jax.tree.leaves(filter)):
         return run(filter)

@@ -37,13 +37,13 @@ _FRACTION = 0x7FFFFF
 def fast_key(key: Key[Array, "*shape"]) -> Key[Array, "*shape"]:
     """The same key, from which `jax.random` draws the same numbers in less time on a CPU.
 
-    XLA compiles JAX's Threefry for a CPU as a loop over its rounds, which it cannot fuse with
+    For a CPU, XLA compiles JAX's Threefry as a loop over its rounds. It cannot fuse a loop with
     what uses the bits. Here the 20 rounds of Threefry-2x32 (Salmon et al. 2011, "Parallel random
-    numbers: as easy as 1, 2, 3") are written out, so that one pass turns counters into, say,
-    normal draws. The library wraps a key where it draws; moves and models are handed ordinary
-    keys, since not all of `jax.random` takes this one (`poisson` does not, nor does `jnp.where`
-    beside an ordinary key). A key of another generator is returned as it is, and so is every key
-    where JAX is set not to number its draws (`jax_threefry_partitionable`).
+    numbers: as easy as 1, 2, 3") are written out. So one pass over the counters gives, for
+    example, normal draws. The library wraps a key where it draws. Moves and models get ordinary
+    keys, since not all of `jax.random` takes a wrapped one (`poisson` does not, and `jnp.where`
+    does not take it beside an ordinary key). A key of another generator is returned as it is. So
+    is every key if JAX is set not to number its draws (`jax_threefry_partitionable`).
     """
     is_numbered = jax.config.jax_threefry_partitionable  # pyright: ignore[reportAttributeAccessIssue]
     if not is_numbered or jax.random.key_impl(key) != "threefry2x32":
@@ -76,10 +76,10 @@ def normal(
 ) -> Float[Array, "..."]:
     """Standard normal draws: those of `jax.random.normal`, up to rounding, in a third of its time.
 
-    √2 erf⁻¹(u) of the same uniform u on (-1, 1), by the same polynomials (Giles 2010), with a
-    logarithm that XLA for a CPU runs on vectors along with the generator's rounds. That is for
-    float32 on a CPU; otherwise it is `jax.random.normal` itself. Use it in the model of a filter
-    whose likelihood is so cheap that its noise is half of a step.
+    It is √2 erf⁻¹(u) of the same uniform u on (-1, 1), by the same polynomials (Giles 2010), with a
+    logarithm that XLA fuses with the generator's rounds and runs on vectors. That is for float32
+    on a CPU; elsewhere it is `jax.random.normal` itself. Use it in a model whose likelihood is so
+    cheap that its noise takes half of a step.
     """
     dtype = default_float() if dtype is None else jnp.dtype(dtype)
     stock = partial(jax.random.normal, shape=shape, dtype=dtype)
@@ -94,7 +94,7 @@ def _normal(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "..."]:
         fast_key(key), (math.prod(shape),), jnp.float32, minval=lowest, maxval=1.0
     )
     draws = normal_quantile(uniform)
-    # In short rows nothing that they are fused with would run on vectors.
+    # In short rows, nothing that is fused with them would run on vectors.
     is_short = len(shape) > 1 and shape[-1] < _SHORT_ROW
     return (stored(draws) if is_short else draws).reshape(shape)
 
@@ -125,14 +125,14 @@ def _log(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 def _polynomial(coefficients: Sequence[Any], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """The coefficient of the highest power comes first."""
+    """The polynomial; the coefficient of the highest power comes first."""
     return reduce(lambda value, coefficient: value * x + coefficient, coefficients)
 
 
 def _random_bits(key: UInt32[Array, " 2"], bit_width: int, shape: tuple[int, ...]) -> Array:
     stock = partial(threefry_prng_impl.random_bits, bit_width=bit_width, shape=shape)
     size = math.prod(shape)
-    # Fused with draws in short rows, the rounds would not run on vectors.
+    # If they were fused with draws in short rows, the rounds would not run on vectors.
     in_short_rows = len(shape) > 1 and shape[-1] < _SHORT_ROW and size > _FEW
     if bit_width != 32 or in_short_rows or not 0 < size < 2**32:
         return stock(key)

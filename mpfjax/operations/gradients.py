@@ -1,4 +1,4 @@
-"""Values with another gradient than their own, or with none."""
+"""Values with a gradient that is not their own, or without one."""
 
 import equinox as eqx
 import jax
@@ -9,9 +9,9 @@ from jaxtyping import Array, Float, PyTree
 def add_gradient(
     values: Float[Array, " *shape"], source: Float[Array, " *shape"]
 ) -> Float[Array, " *shape"]:
-    """`values`, to the bit, whose derivatives of every order are those of `values + source`.
+    """`values`, to the bit, with the derivatives of `values + source`, of every order.
 
-    Where nothing is differentiated the source is not even computed.
+    Without differentiation, the source is not even computed.
     """
     del source
     return values

@@ -1,8 +1,8 @@
 """Gathers and scatters: values at given indices, and how often each index is named.
 
 In numpy: `values[indices]`, `np.bincount(places)` and `np.argsort(places)`. Here indices are known
-to be in range, so that nothing is clipped, and under `vmap` all rows are one long line of places,
-which a CPU scatters in half the time of pairs of indices.
+to be in range, so nothing is clipped. Under `vmap` all rows become one long row, since a CPU
+scatters with single indices in half the time of pairs of indices.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ def take(values: Array, indices: Int[Array, " n"]) -> Array:
 
 
 def from_the_start(indices: Int[Array, "*shape"]) -> UInt32[Array, "*shape"]:
-    """Indices without a sign, of which JAX need not ask whether they count from the end."""
+    """Indices without a sign, so that JAX does not check whether they count from the end."""
     return indices.astype(jnp.uint32)
 
 
@@ -56,10 +56,10 @@ def _on_one_line(rows: Int[Array, "k n"], num_places: int) -> UInt32[Array, " k*
 
 
 def in_rows(scatter: Callable[..., Array]) -> Callable[..., Array]:
-    """A scatter over one row that under `vmap` scatters all rows at once, over one line of places.
+    """A scatter over one row. Under `vmap`, all rows become one long row.
 
-    On a CPU that takes about half the time of a scatter with pairs of indices. To a derivative it
-    is a constant: JAX would apply the rule below to itself without end.
+    On a CPU that takes about half the time of a scatter with pairs of indices. A derivative treats
+    it as a constant: JAX would apply the rule below to itself without end.
     """
     scatter_rows = jax.custom_batching.custom_vmap(scatter)
 

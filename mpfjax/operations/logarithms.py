@@ -1,8 +1,8 @@
 """Weights in logarithms: sums and shares that neither overflow nor lose their gradient.
 
-In numpy: `np.log(np.sum(np.exp(x)))` and `np.exp(x) / np.sum(np.exp(x))`. The largest is taken off
-first, -inf for all is a case of its own, and a weight too small to count becomes zero, since a CPU
-takes a hundred times as long over subnormal numbers.
+In numpy: `np.log(np.sum(np.exp(x)))` and `np.exp(x) / np.sum(np.exp(x))`. Here the largest value is
+subtracted first, and -inf everywhere is a case of its own. A weight that is too small to count
+becomes zero, since a CPU takes a hundred times as long for subnormal numbers.
 """
 
 import math
@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 
 
 def exp(log_values: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
-    """e to these powers, zero where it is too small to count beside 1, squares and sums included.
+    """e to these powers; zero where it is too small to count beside 1, even squared or summed.
 
-    Arithmetic on subnormal numbers, which weights a little above zero would lead to, takes a
+    Weights a little above zero would lead to subnormal numbers, and arithmetic on these takes a
     hundred times as long.
     """
     info = jnp.finfo(log_values.dtype)
@@ -24,18 +24,18 @@ def exp(log_values: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
 
 
 def scaled_exp(log_values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-    """exp of the values over the largest exp of them, and the logarithm of that one.
+    """exp of the values divided by the largest exp, and the logarithm of the largest.
 
-    All that is derived from weights starts from these, which XLA then computes once.
+    Everything that is derived from weights starts here, so XLA computes it once.
     """
     log_scale = finite_max(log_values)
     return exp(log_values - log_scale), log_scale
 
 
 def finite_max(log_values: Float[Array, " n"]) -> Float[Array, ""]:
-    """What logarithms may be reduced by: the largest, or 0 where that is infinite or NaN.
+    """What to subtract from logarithms: the largest, or 0 if that is infinite or NaN.
 
-    It is a constant to a derivative.
+    A derivative treats it as a constant.
     """
     return finite_or_zero(jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf))
 
@@ -49,9 +49,10 @@ def log_sum_exp(log_values: Float[Array, " n"]) -> Float[Array, ""]:
 def scaled_log_sum_exp(
     log_values: Float[Array, " n"],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """log Σ exp in two parts: that of the values over the largest, and the largest.
+    """log Σ exp in two parts: the largest, and log Σ exp of the values minus the largest.
 
-    Of logarithms beyond a million or so the sum of both would keep little of the first.
+    If the largest is beyond a million, the sum of both parts would lose the smaller one to
+    rounding.
     """
     values, log_scale = scaled_exp(log_values)
     return log_or_nothing(jnp.sum(values)), log_scale
@@ -66,12 +67,12 @@ def softmax(log_values: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def finite_or_zero(largest: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
-    """What may be taken off a logarithm: the largest, or nothing where that is infinite or NaN."""
+    """What to subtract from a logarithm: the value itself, or 0 if that is infinite or NaN."""
     return jnp.where(jnp.isfinite(largest), largest, 0.0)
 
 
 def masked_shares(log_values: Float[Array, " n"], shares: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The shares, with no gradient at -inf, where what uses them may have none that is finite."""
+    """The shares without a gradient at -inf, where that of later operations may not be finite."""
     return jnp.where(log_values == -jnp.inf, 0.0, shares)
 
 

@@ -2,7 +2,7 @@
 
 In numpy: `values.sum(axis=1)`, `rng.choice(n, p=weights[i])` for each row i, `np.linalg.cholesky`
 and `np.linalg.solve`. Calls of LAPACK for thousands of tiny matrices cost far more than their
-arithmetic, so that here all of them go through each of the d columns together.
+arithmetic. Here one operation does the same column of all matrices.
 """
 
 import math
@@ -14,7 +14,7 @@ _FEW_COLUMNS = 16
 
 
 def row_sums(values: Float[Array, "n d"]) -> Float[Array, " n"]:
-    """Σ_k v_ik. Over a few columns it is written out, which a CPU runs twenty times faster."""
+    """Σ_k v_ik. A sum over few columns is written out, which a CPU runs twenty times faster."""
     if not 0 < values.shape[1] <= _FEW_COLUMNS:
         return jnp.sum(values, axis=1)
     total = values[:, 0]
@@ -26,10 +26,11 @@ def row_sums(values: Float[Array, "n d"]) -> Float[Array, " n"]:
 def draw_columns(uniform: Float[Array, " k"], weights: Float[Array, "k n"]) -> Int[Array, " k"]:
     """The column of each row that holds the given quantile, in [0, 1), of the row's weights.
 
-    A column of weight zero is not drawn, unless the whole row is zero: its last column then is.
-    Two levels, blocks of columns and columns in a block, take one pass over the table.
+    A column of weight zero is not drawn, unless the whole row is zero: then the last column is.
+    The search has two levels, blocks of columns and columns in a block, and takes one pass over
+    the table.
     """
-    # In both, rounding may leave the target on either side of a border, or past the end.
+    # In both levels, rounding may put the target on either side of a border, or past the end.
     num_rows, num_columns = weights.shape
     size = max(math.isqrt(num_columns), 1)
     num_blocks = -(-num_columns // size)
@@ -51,7 +52,7 @@ def _first_above(
 ) -> Int[Array, " k"]:
     """In each row the first place of positive weight whose cumulative sum is above the target.
 
-    The last place of positive weight where none is, and the last of all where none has weight.
+    If there is none, it is the last place of positive weight; if no place has weight, the last one.
     """
     last = weights.shape[1] - 1
     place = jnp.arange(last + 1, dtype=jnp.int32)[None]
@@ -65,9 +66,9 @@ def _first_above(
 def cholesky(matrices: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
     """Lower triangular factors F with F Fᵀ = matrix, for positive semidefinite matrices.
 
-    A direction of no variance gets a column of zeros; each coordinate is held against its own
-    variance, so that units do not matter. Batched LAPACK calls on thousands of tiny matrices cost
-    far more than their arithmetic; here all of them go through each of the d columns at once.
+    A direction without variance gets a column of zeros. Whether a variance is zero is judged beside
+    the coordinate's own variance, so units do not matter. Batched LAPACK calls on thousands of
+    tiny matrices cost far more than their arithmetic; here all go through each column at once.
     """
     d = matrices.shape[-1]
     tiny = 8 * d * jnp.finfo(matrices.dtype).eps * jnp.diagonal(matrices, axis1=1, axis2=2)
@@ -86,8 +87,8 @@ def solve_lower(
 ) -> Float[Array, "n d"]:
     """F⁻¹ v of lower triangular F, by forward substitution; one F for all, or one for each.
 
-    Written out for the same reason as `cholesky`; LAPACK's own has also been seen to hang where
-    a program solves for several large batches at once.
+    It is written out for the same reason as `cholesky`. LAPACK's own has also been seen to hang
+    when a program solves several large batches at once.
     """
     solved = jnp.zeros_like(vectors)
     for i in range(vectors.shape[1]):

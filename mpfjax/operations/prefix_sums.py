@@ -1,8 +1,8 @@
-"""Sums of all that comes before, and what follows from them: which parent each slot has.
+"""Prefix sums, the sums of all values before each, and from them the parent of each slot.
 
-In numpy: `np.cumsum(values) - values` and `np.searchsorted(starts, slots, "right") - 1`. XLA's own
-cumulative sum goes over the line several times on a CPU; products of short blocks with a triangle
-of ones go over it once, and resampling is O(N) without a search.
+In numpy: `np.cumsum(values) - values` and `np.searchsorted(starts, slots, "right") - 1`. On a CPU,
+XLA's own cumulative sum makes several passes over the values. Here blocks of them are multiplied
+by a triangle of ones, in one pass. Resampling then needs no search and is O(N).
 """
 
 from functools import partial, reduce
@@ -21,10 +21,10 @@ _LANES_OF_ROWS = 4
 def sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """The exclusive prefix sums c_i = v_0 + ... + v_{i-1}, shape (n,), and the sum of all.
 
-    For values that are not negative the sums never fall, c_{i+1} is c_i to the bit where v_i is
-    zero, and the sum of all is what they are past the last value that is not: rounding gives no
-    stretch of the line to a value of zero. On a CPU they are products of blocks with a triangle
-    of ones, several times faster than XLA's own cumulative sum, which other platforms keep.
+    For values >= 0 the prefix sums never fall. Where v_i is zero, c_{i+1} is c_i to the bit, and
+    after the last value above zero they are the sum of all. So rounding never gives a value of
+    zero a share of the line. On a CPU, blocks are multiplied by a triangle of ones, which is
+    several times faster than XLA's own cumulative sum. Other platforms use XLA's.
     """
     return jax.lax.platform_dependent(values, cpu=_blocked_sum_before, default=_scanned_sum_before)
 
@@ -32,7 +32,7 @@ def sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Ar
 def _scanned_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     upto = jnp.cumsum(values)
     total = upto[-1]
-    # Each zero goes with the next that is not.
+    # Each zero takes the sum of the next value that is not zero.
     starts = jnp.where(values == 0, total, jnp.minimum(_shifted(upto), total))
     return jax.lax.cummin(starts, reverse=True), total
 
@@ -48,7 +48,7 @@ def _blocked_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"],
         return sums[:n], sums[n]
     blocks = _in_blocks(values)
     size = blocks.shape[1]
-    # Columns are summed in the same order, so that a zero adds nothing to the next one.
+    # Columns are summed in the same order, so the sum does not change where the value is zero.
     within = blocks @ _ones_before(size, size, values.dtype)
     totals = within[:, -1] + blocks[:, -1]
     # A zero after the last block has the sum of all before it.
@@ -56,7 +56,7 @@ def _blocked_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"],
     if before.shape[0] > _ONE_BLOCK:
         before = stored(before)
     upto = before[1:, None]
-    # Between blocks the order of summing changes: zeros at a block's end go with the next block.
+    # The order of summing changes between blocks: zeros at a block's end belong to the next.
     sums = jnp.where(within == totals[:, None], upto, jnp.minimum(before[:-1, None] + within, upto))
     return sums.reshape(-1)[:n], before[-1]
 
@@ -72,9 +72,9 @@ def _ones_before(num_rows: int, num_columns: int, dtype: jnp.dtype) -> Float[Arr
 
 
 def count_upto(values: Shaped[Array, " n"], bound: int) -> Int[Array, " n"]:
-    """The inclusive prefix sums of whole numbers of whatever type, or of members, exact.
+    """The exact inclusive prefix sums of whole numbers of any type, or of booleans.
 
-    `bound` is what their sum cannot exceed.
+    Their sum must not exceed `bound`.
     """
     scanned = partial(jnp.cumsum, dtype=jnp.int32)
     if bound >= EXACT_IN_FLOAT32:
@@ -87,7 +87,7 @@ def _blocked_count_upto(values: Shaped[Array, " n"]) -> Int[Array, " n"]:
     blocks = _in_blocks(values.astype(jnp.float32))
     before, _ = _blocked_sum_before(jnp.sum(blocks, axis=1))
     size = blocks.shape[1]
-    # No order of summing rounds: what is before a block may be summed along with its first entry.
+    # Whole numbers add up exactly in any order: a block's first entry takes the sum before it.
     is_first = jnp.arange(size) == 0
     blocks = blocks + jnp.where(is_first[None], before[:, None], 0.0)
     upto = blocks @ jnp.triu(jnp.ones((size, size), blocks.dtype))
@@ -99,21 +99,21 @@ def count_starts(starts: Int[Array, "*rows n"], num_slots: int) -> Int[Array, " 
 
     Rows are one line, the first row first.
 
-    With starts_i the first slot of parent i this is every slot's parent, in O(n) and without a
-    search: a one is scattered at each start, and the prefix sum counts them. Parents without
-    offspring start where the next one does and are passed over. Starts at or past `num_slots`
-    are dropped; a slot before the first start gets -1.
+    If starts_i is the first slot of parent i, this is the parent of every slot, in O(n) and without
+    a search: a one is added at each start, and the prefix sum counts them. A parent without
+    offspring has the same start as the next one and gets no slot. Starts at or past `num_slots`
+    are dropped. A slot before the first start gets -1.
     """
-    # Those that are dropped get a place of their own.
+    # Dropped starts get a place of their own.
     num_places = whole_blocks(num_slots + 1)
     dtype = jnp.float32 if starts.size < EXACT_IN_FLOAT32 else jnp.int32
     starts = stored(jnp.minimum(starts, num_slots), num_slots + 1)
     if starts.ndim == 1 or starts.shape[0] == 1:
         at_start = count_places(starts.reshape(-1), num_places, dtype)
-    else:  # a row has long runs without offspring, which are another row's
+    else:  # a row has long runs without offspring, where the other rows have theirs
         lane = jnp.arange(starts.shape[1], dtype=jnp.int32) % _LANES_OF_ROWS
         places = (starts + num_places * lane[None]).reshape(-1)
         lanes = count_places(places, _LANES_OF_ROWS * num_places, dtype)
-        # Written out: on several threads XLA takes ten times as long to sum over these few rows.
+        # Written out: on several threads, XLA's sum over these few rows takes ten times as long.
         at_start = reduce(jnp.add, lanes.reshape(_LANES_OF_ROWS, -1))
     return count_upto(at_start, starts.size)[:num_slots] - 1

@@ -1,9 +1,9 @@
 """Sums, maxima and orders by component.
 
 In numpy: `[values[labels == m].sum() for m in range(M)]`, `per_component[labels]` and
-`np.argsort(labels, kind="stable")`. Few components are M masks, which XLA fuses into its loops; for
-many there is one scatter, dealt to lanes, so that neighbours do not wait for each other and long
-sums do not drift.
+`np.argsort(labels, kind="stable")`. For few components there are M masks, which XLA fuses into its
+loops. For many there is one scatter, shared by lanes, so that neighbours need not wait for each
+other and rounding errors of long sums stay small.
 """
 
 from collections.abc import Callable
@@ -26,13 +26,13 @@ from mpfjax.operations.prefix_sums import count_starts, count_upto
 from mpfjax.operations.stored import EXACT_IN_FLOAT32, whole_blocks
 
 FEW_SEGMENTS = 4
-# Neighbours that are added to the same place go to different lanes, each with a place of its own: a
-# CPU would wait at every one of them for the last to be done.
+# Neighbours that are added to the same place go to different lanes, each with a place of its own.
+# In one place, a CPU would have to wait for each addition before the next.
 _LANES = 8
-# One after the other, a million equal numbers add up to a thousandth too much in float32.
+# In float32, a million equal numbers, added one after the other, give a thousandth too much.
 _LONGEST_SUM = 2**10
 _COUNTED_BLOCK = 32
-_MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # of which a block's counts are eight a particle
+_MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # eight counts for each particle
 
 
 def spread(
@@ -40,8 +40,8 @@ def spread(
 ) -> Shaped[Array, "n *rest"]:
     """values[segments], each entry its segment's value; a label out of range gets some value.
 
-    Few segments are chosen between, many are gathered: on a CPU a gather keeps all that is
-    computed along with it from running on vectors.
+    With few segments it is a choice between them, with many a gather: on a CPU, nothing that is
+    fused with a gather runs on vectors.
     """
     num_segments = values.shape[0]
     if num_segments > FEW_SEGMENTS:
@@ -94,7 +94,7 @@ def _scattered_sum(
 @_scattered_sum.defjvp
 def _scattered_sum_jvp(num_segments: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     values, segments = primals
-    # In JAX's own form, which can be transposed.
+    # The form of JAX itself, which can be transposed.
     tangent = jax.ops.segment_sum(tangents[0], segments, num_segments)
     return _scattered_sum(values, segments, num_segments), tangent
 
@@ -106,9 +106,9 @@ def _scattered(
     num_segments: int,
     initial: float,
 ) -> Shaped[Array, " num_segments"]:
-    """The values of each segment added up, or their "max" or "min", beginning at `initial`.
+    """The sum of each segment's values, or their "max" or "min", starting from `initial`.
 
-    Where there are many in a segment they are dealt to lanes.
+    Segments of many values are shared by lanes.
     """
     n = values.shape[0]
     num_lanes = _num_lanes(n) if n >= _LANES * num_segments else 1
@@ -118,12 +118,12 @@ def _scattered(
         rows: Shaped[Array, "k n"], labels: Int[Array, "k n"]
     ) -> Shaped[Array, "k num_segments"]:
         num_rows = rows.shape[0]
-        # One more, for what is in no segment.
+        # One more, for values that are in no segment.
         labels = jnp.where((labels >= 0) & (labels < num_segments), labels, num_segments)
         labels = jnp.pad(labels, padding, constant_values=num_segments)
         labels = labels.reshape(num_rows, -1, num_lanes)
-        # Row and lane are added as they are: XLA would take arithmetic on them out of a filter's
-        # loop, and then no longer see that two sums by the same labels have the same places.
+        # Row and lane are added without other arithmetic. XLA would move such arithmetic out of a
+        # filter's loop, and not see any more that two sums by the same labels use the same places.
         row, lane = (jax.lax.broadcasted_iota(jnp.int32, labels.shape, axis) for axis in (0, 2))
         places = (labels * num_lanes + lane) * num_rows + row
         line = jnp.full((num_segments + 1) * num_lanes * num_rows, initial, rows.dtype)
@@ -136,7 +136,7 @@ def _scattered(
 
 
 def _num_lanes(n: int) -> int:
-    """A power of two, of which no lane gets more than so many: a long sum would drift."""
+    """A power of two: enough lanes that the rounding error of each lane's sum stays small."""
     return max(_LANES, 1 << max(-(-n // _LONGEST_SUM) - 1, 0).bit_length())
 
 
@@ -178,9 +178,9 @@ def segment_argmax(
 
 
 def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, " num_places"]:
-    """Each place's segment, where segments lie side by side from ascending first places.
+    """The segment of each place, if segments lie side by side and `firsts` are their first places.
 
-    An empty segment has no place, and places past the last segment's are the last one's.
+    An empty segment has no place. Places after the last segment belong to the last one.
     """
     num_segments = firsts.shape[0]
     if num_segments > FEW_SEGMENTS:
@@ -197,10 +197,10 @@ def order_by_segment(
 ) -> tuple[Int[Array, " n"], Int[Array, " num_segments"]]:
     """The indices that make segments contiguous and ascending, and how many each segment has.
 
-    The original order is kept within each; a label equal to `num_segments` comes last. Up to a few
-    hundred segments it is counted which place an entry comes to, in O(n); for more, label and
-    index are packed into one integer where they fit, since sorting one array is several times
-    faster than sorting pairs.
+    Within a segment the original order stays; a label equal to `num_segments` comes last. For up to
+    a few hundred segments the place of each entry is counted, in O(n). For more, label and index
+    are packed into one integer if they fit: sorting one array is several times faster than
+    sorting pairs.
     """
     n = segments.shape[0]
     if num_segments <= _MOST_COUNTED_SEGMENTS and n < EXACT_IN_FLOAT32:
@@ -218,18 +218,19 @@ def _places_by_segment(
 ) -> tuple[Int[Array, " n"], Int[Array, " num_segments"]]:
     """Each entry's place in the order, which is how many come before it, and segments' counts.
 
-    A table holds how many of each segment every block of entries has, a row for each segment. In
-    one prefix sum over all of it, row after row, a cell's share of the order begins; an entry's
-    rank within its cell is how many of those before it in the block are of its segment.
+    A table has a row for each segment and a column for each block of entries; a cell counts the
+    block's entries of that segment. The prefix sum over the whole table, row after row, is the
+    first place of each cell. The rank of an entry in its cell is the number of entries before it
+    in the block that are of its segment.
     """
     n = segments.shape[0]
-    # Odd, since rows a power of two apart would share a few places of a cache.
+    # Odd: rows whose distance is a power of two would share few places of a cache.
     num_blocks = -(-n // _COUNTED_BLOCK) | 1
     cells = segments * num_blocks + jnp.arange(n, dtype=jnp.int32) // _COUNTED_BLOCK
     num_cells = whole_blocks((num_segments + 1) * num_blocks + 1)
-    # One place further on, so that what is summed up to a cell is what is before it.
+    # One place further, so that the sum up to a cell is the sum of all cells before it.
     before = count_upto(count_places(cells + 1, num_cells, jnp.float32), n)
-    # The start of the first block is filled up with what names no cell.
+    # The start of the first block is filled up with a label of no cell.
     line = jnp.pad(cells, (_COUNTED_BLOCK, 0), constant_values=-1)
     ranks = jnp.zeros(n, jnp.int32)
     for back in range(1, _COUNTED_BLOCK):
@@ -242,7 +243,7 @@ def _places_by_segment(
 def _members(
     segments: Int[Array, " n"], num_segments: int, trailing: int = 0
 ) -> Bool[Array, "num_segments n ..."]:
-    """Who belongs to which segment; XLA fuses the mask into its reduction and never stores it."""
+    """Which entry belongs to which segment; XLA fuses this mask into a sum and never stores it."""
     labels = jnp.arange(num_segments, dtype=segments.dtype)
     member = segments[None] == labels[:, None]
     return member.reshape(member.shape + (1,) * trailing)

@@ -1,8 +1,8 @@
 """Values that are computed once and kept.
 
-In numpy all of this is `values.copy()` and `values.astype(int)`. XLA fuses what is computed into
-whatever uses it, and then computes it again for every use; a product with the identity is a border
-that it does not fuse across.
+In numpy all of this is `values.copy()` and `values.astype(int)`. XLA fuses a computation into
+everything that uses its result, and then repeats it for every use. It does not fuse across a
+product with the identity matrix.
 """
 
 import jax
@@ -15,24 +15,24 @@ EXACT_IN_FLOAT32 = 2**23  # as exact as up to 2^24, and readable from the lowest
 
 
 def whole_blocks(n: int) -> int:
-    """The length, n or more, at which a prefix sum's blocks need no filling up."""
+    """The length, n or more, that the blocks of a prefix sum divide."""
     size = block_size(n)
     return -(-n // size) * size
 
 
 def block_size(n: int) -> int:
-    # Nothing that is fused with filling up runs on vectors, nor with dividing by an odd size.
+    # Nothing that is fused with a padding, or with a division by an odd size, runs on vectors.
     whole = (size for size in _BLOCKS if n % size == 0 and n > _BLOCKS[0])
     return next(whole, _BLOCKS[0])
 
 
 def stored(values: Shaped[Array, "*rest n"], bound: int | None = None) -> Shaped[Array, "*rest n"]:
-    """The same finite numbers, computed once and kept, where XLA for a CPU would not keep them.
+    """The same finite numbers, computed once and kept, where XLA on a CPU would not keep them.
 
-    It would compute them again within whatever uses them, once for every particle even where they
-    are one a component, and without vectors within a scatter or gather over flattened rows. A
-    product with the identity is what it computes on its own. `bound` is above all whole numbers
-    there may be; where it is above 2^23, more than is certain to come out exactly, nothing is done.
+    XLA would compute them again wherever they are used: once for every particle, even if there is
+    one for each component, and without vectors in a scatter or gather over flattened rows. A
+    product with the identity matrix is computed on its own. Whole numbers must be below `bound`;
+    if it is above 2^23, products might not be exact, and the values are returned as they are.
     """
     if bound is not None and bound > EXACT_IN_FLOAT32:
         return values
@@ -40,7 +40,7 @@ def stored(values: Shaped[Array, "*rest n"], bound: int | None = None) -> Shaped
 
 
 def _times_identity(values: Array) -> Array:
-    # The blocks are those of the prefix sums, so that nothing is divided within the loop.
+    # The blocks are those of the prefix sums, so there is no division within the loop.
     is_float = jnp.issubdtype(values.dtype, jnp.floating)
     *rest, n = values.shape
     size = block_size(n)
@@ -56,8 +56,8 @@ def to_int(
 ) -> Int[Array, "*shape"]:
     """Whole numbers from 0 to `bound` as integers.
 
-    Added to 2^23 they stand in the lowest bits, as long as they are smaller. XLA's own conversion
-    costs a CPU several times as much, since it looks for NaN and for what is out of range.
+    Added to 2^23 as floats, numbers below 2^23 are in the lowest bits. XLA's own conversion takes
+    several times as long on a CPU, since it checks for NaN and for numbers out of range.
     """
     if values.dtype != jnp.float32 or bound >= EXACT_IN_FLOAT32:
         return values.astype(jnp.int32)

@@ -1,1 +1,1 @@
-"""What runs a filter: over observations, seeds, devices, processes, islands, and whole studies."""
+"""Running a filter: over observations, seeds, devices, processes, islands, and whole studies."""

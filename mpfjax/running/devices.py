@@ -18,9 +18,9 @@ from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors
 
 
 def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
-    """The devices that are meant: all, the first few, or those given.
+    """The devices to use: all, the first few, or those given.
 
-    None is every device of every process; JAX's default device alone where one is set. Raises
+    None is every device of every process, or JAX's default device if one is set. Raises
     `ValueError` for more devices than there are, none at all, a device twice, and, under several
     processes, for devices that leave a process out.
     """
@@ -53,9 +53,9 @@ def over_devices(
     """`run(inputs, *arguments)` with the inputs dealt to the devices in blocks of equal size.
 
     Every leaf of the result has a leading axis k, like the inputs, and lies on the first device,
-    or on the first one of each process. The last input is repeated where the number of devices
-    does not divide k, and its results are dropped. Devices tell each other only what `run` has
-    them tell. `run_on_one`, compiled already, does all on one device; None leaves which to JAX.
+    or on the first one of each process. If the number of devices does not divide k, the last input
+    is repeated, and the extra results are dropped. Devices exchange only what `run` makes them
+    exchange. `run_on_one` is compiled and does all runs on one device. With None, JAX chooses it.
     """
     traced = is_traced((inputs, arguments))
     if devices is None or len(devices) == 1:
@@ -82,7 +82,7 @@ def length_of(inputs: PyTree) -> int:
 
 
 def _filled_up(inputs: PyTree, length: int) -> PyTree:
-    """As many inputs, of which the last is repeated."""
+    """The inputs, the last one repeated up to this number."""
     last = length_of(inputs) - 1
     if length == last + 1:
         return inputs
@@ -96,7 +96,7 @@ def _spread(run, inputs, arguments, mesh):
     def on_each(inputs: PyTree, arrays: PyTree) -> PyTree:
         return run(inputs, *eqx.combine(arrays, rest))
 
-    # The check of what varies over devices would ask every loop in a user's model to declare it.
+    # With this check, every loop in a user's model would have to declare what varies over devices.
     mapped = jax.shard_map(
         on_each,
         mesh=mesh,
@@ -129,7 +129,7 @@ def _placed(tree: PyTree, where: Any) -> PyTree:
 
 
 def _require_same_everywhere(arrays: PyTree) -> None:
-    """Raise where the processes do not hold the same numbers; a digest is all that they send."""
+    """Raise if the processes do not hold the same numbers; they exchange a digest only."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(arrays):
         if not _is_global(leaf):

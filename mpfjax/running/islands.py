@@ -1,4 +1,4 @@
-"""One filter over many devices: islands of particles that share nothing but their total mass."""
+"""One filter over many devices: islands of particles that share only their total mass."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -29,31 +29,30 @@ def run_islands(
 ) -> FilterRun:
     """Run one filter of G islands, each a copy of `filter`, over many devices.
 
-    The islands are the parts of ONE mixture of G N particles in G M components: every island
-    draws its own x_0 and moves its own components, and since the weights are joint that is
-    exact. Only the normalisation needs the others: a step's total mass is the sum of G masses,
-    O(1) numbers from each island, whatever N is (Vermaak et al. 2003, section 2: components
-    "interact only through the mixture weights"; Vergé et al. 2015 for islands). The estimate of
-    the marginal likelihood is as unbiased as the filter's.
+    The islands are parts of ONE mixture of G N particles in G M components. Every island draws its
+    own x_0 and moves its own components. That is exact, since the weights are joint. Only the
+    normalisation needs all islands: a step's total mass is the sum of G masses, O(1) numbers from
+    each island, whatever N is (Vermaak et al. 2003, section 2: components "interact only through
+    the mixture weights"; Vergé et al. 2015 for islands). If the filter's marginal likelihood is
+    unbiased, so is this one.
 
-    - `filter`: that of one island, so N and M are an island's. A plain particle filter makes
-      islands of particles; with an `Exchange` among the moves their masses stay even.
-    - `num_islands`: G. The numbers depend on the key and on G alone; devices only share the work.
-      Results on other numbers of devices differ by rounding, and where that decides a draw,
-      like another run.
-    - `devices`: None for as many as divide G, a number, or a sequence of `jax.devices()`, which
-      must divide G.
-    - `collect(mixture)` sees one island, whose weights sum to its mass, and is stacked over t and
-      islands, (t, G, ...). What is a sum over weighted particles, such as `mixture.mean()`, is
-      then the whole mixture's once it is summed over islands.
+    - `filter`: that of one island; N and M are those of one island. A plain particle filter makes
+      islands of particles. With an `Exchange` among the moves, their masses stay even.
+    - `num_islands`: G. The result depends on the key and on G, not on the devices. With another
+      number of devices it differs by rounding; where rounding changes a draw, it differs like
+      another run.
+    - `devices`: a number or a sequence of `jax.devices()`, whose number must divide G. None takes
+      the largest number of devices that divides G.
+    - `collect(mixture)` sees one island, whose weights sum to its mass. Its results are stacked
+      over t and islands, (t, G, ...). The sum over islands of a weighted sum, such as
+      `mixture.mean()`, is that of the whole mixture.
 
-    The result is that of `run_filter` on the whole mixture: slots and component labels of island
-    g come after those of island g - 1, ancestors may lie on other islands, and only `memory`
-    keeps a leading axis of islands. `observations`, `missing` and errors are those of
-    `run_filter`; also `ValueError` for G < 1, and devices that are not there or do not divide G.
-
-    Use it where one filter is too large or too slow for one device. For many runs of a filter
-    that fits use `monte_carlo`, whose runs share nothing at all.
+    The result is that of `run_filter` on the whole mixture. Slots and component labels of island g
+    come after those of island g - 1, ancestors may be on other islands, and only `memory` keeps a
+    leading axis of islands. `observations`, `missing` and errors are those of `run_filter`. Also
+    raises `ValueError` for G < 1, and for devices that do not exist or do not divide G. Use it if
+    one filter is too large or too slow for one device. For many runs of a filter that fits on one
+    device, use `monte_carlo`.
     """
     check_key(key)
     check_run(filter, collect)
@@ -108,6 +107,7 @@ def _joined(run: FilterRun, whole: bool) -> FilterRun:
         log_marginal_likelihood=run.log_marginal_likelihood[0],
         log_likelihood_increments=run.log_likelihood_increments[0],
         collected=collected,
+        initial=_whole_mixture(run.initial),
         final=_whole_mixture(run.final),
         resampled=resampled.reshape(resampled.shape[0], -1),
         degenerate=run.degenerate[0],

@@ -20,16 +20,16 @@ def join_processes(
     The same script runs in every process, and calls this before anything else of JAX. Then
     `monte_carlo` and `run_islands` spread over all devices of all processes: each process makes
     the same calls with the same arguments, and gets the whole result. It is
-    `jax.distributed.initialize` with a time limit that ends in words.
+    `jax.distributed.initialize` with a time limit and a clear message.
 
-    - Under SLURM, Open MPI or Kubernetes nothing is given: JAX asks the scheduler.
-    - Elsewhere `coordinator_address` is "host:port" of process 0, `num_processes` how many there
-      are, and `process_id` which one this is, from 0.
+    - Under SLURM, Open MPI or Kubernetes, give no argument: JAX asks the scheduler.
+    - Elsewhere `coordinator_address` is "host:port" of process 0, `num_processes` the number of
+      processes, and `process_id` the number of this process, from 0.
 
-    Raises `ValueError` where no cluster is found or an argument is out of range, and RuntimeError
-    where JAX is in use already. Where some process has not joined within `timeout_seconds` there
-    is no exception, since nothing interrupts JAX's own wait: this process says so on stderr and
-    ends with exit status 1.
+    Raises `ValueError` if no cluster is found or an argument is out of range, and RuntimeError if
+    JAX is in use already. If some process has not joined within `timeout_seconds`, there is no
+    exception, since nothing can interrupt JAX's own wait: this process prints a message on stderr
+    and ends with exit status 1.
     """
     if not timeout_seconds > 0:
         raise ValueError(f"timeout_seconds: {timeout_seconds} is not positive")
@@ -54,7 +54,7 @@ def join_processes(
 
     threading.Thread(target=end_when_late, daemon=True).start()
     try:
-        # JAX's own limit aborts the process with a stack trace: ours must come first.
+        # JAX's own time limit aborts the process with a stack trace, so ours must be shorter.
         jax.distributed.initialize(
             coordinator_address,
             num_processes,

@@ -18,10 +18,10 @@ from mpfjax.running.devices import choose_devices, over_devices
 from mpfjax.running.scan import FilterRun, check_run, checked, scan, scan_filter
 from mpfjax.running.threads import num_processors, over_threads
 
-# Particles, times the components where these are few and have a row of them each: what a CPU's
-# caches hold of all that a step makes of them.
+# How many particles, with all that a step makes of them, fit into a CPU's caches. Few components
+# have a row of particles each, which counts as so many times the particles.
 _IN_NEAR_CACHE, _IN_CACHE = 2**15, 2**16
-_WORTH_A_THREAD = 2**9  # particles, of all its runs
+_WORTH_A_THREAD = 2**9  # particles in all runs of the thread
 
 
 def run_filter(
@@ -35,19 +35,19 @@ def run_filter(
     """Run a filter over observations y_1..y_t in one scan.
 
     - `observations`: a pytree whose leaves have a leading axis t.
-    - `collect`: what to keep of the mixture after each step, stacked over t; None keeps all of
-      it. The same function object compiles once; a new lambda at every call compiles anew.
-      What is derived from a mixture is written for one: `jax.vmap(lambda m: m.mean())` maps it over
-      a collected stack.
+    - `collect`: a function of the mixture after each step; its results are stacked over t. None
+      keeps the whole mixture. The same function object compiles once; a new lambda in every call
+      compiles again. Methods of a mixture are for one mixture: `jax.vmap(lambda m: m.mean())`
+      maps them over a collected stack.
     - `missing`: "error" raises a `ValueError` that names the first step whose observation holds a
-      NaN or an infinity; "skip" takes such steps as missing, and only predicts. A model with
-      `handles_missing = True` is given the NaN, and with "skip" only a step of nothing else is
+      NaN or an infinity. "skip" treats such steps as missing and only predicts. A model with
+      `handles_missing = True` gets the NaN; with "skip", only a step of nothing but NaN is
       missing.
 
-    Raises `ValueError` for an argument of another kind, no observations, leaves of different
-    lengths, complex numbers or ones beyond what JAX's type holds, before anything compiles; for a
-    model whose draws or densities are of the wrong shape or type, as it is traced; and a
-    RuntimeError where its densities give NaN.
+    Raises `ValueError` before anything compiles: for an argument of another kind, no observations,
+    leaves of different lengths, complex numbers, or numbers that JAX's type cannot hold. Raises
+    `ValueError` during tracing for a model whose draws or densities have the wrong shape or type,
+    and RuntimeError if its densities give NaN.
     """
     check_key(key)
     check_run(filter, collect)
@@ -72,19 +72,20 @@ def monte_carlo(
     Every field of the result has a leading axis of seeds. Arguments and errors are those of
     `run_filter`; run k equals `run_filter(keys[k], ...)`.
 
-    - `devices`: what the runs are spread over. None is every device there is, of all processes
-      after `join_processes`; a number means the first few, a sequence those of `jax.devices()`.
-      Any number of keys will do. Devices tell each other nothing; the result is gathered on the
-      first one, and each process has all of it. Under the caller's own jit, grad or vmap None is
-      one device. One device that is a CPU is kept busy by a thread for each processor, if there
-      is enough to do.
-    - `slots`: keep the particles in so many slots, of which all but N stay empty. Filters that
-      differ in N alone then share one compiled program, at the cost of as many particles as there
-      are slots. The particles are those of a run without, up to rounding, and `collect` sees the
-      empty slots as well.
+    - `devices`: the devices that share the runs. None is every device, of all processes after
+      `join_processes`. A number means the first few, a sequence those of `jax.devices()`. The
+      number of keys need not be a multiple of theirs. Devices exchange nothing. The result is
+      gathered on the first one, and each process has all of it. Under the caller's own jit, grad
+      or vmap, None is one device. On one CPU device, the runs are shared by a thread for each
+      processor, if there is enough to do.
+    - `slots`: the length of the particle arrays, at least N; the slots after the first N stay
+      empty. None is N. Filters that differ in N alone compile once if they have the same `slots`:
+      1000, for example, for N = 50, 200 and 1000. Each then costs as much as 1000 particles. The
+      particles are those of a run without `slots`, up to rounding. `collect` sees the empty slots
+      as well, with `occupied` false.
 
-    Raises `ValueError` for more devices than there are, fewer slots than particles, and moves
-    that fill every slot, `PropagateIndependently` and `PropagateInClusters`.
+    Raises `ValueError` for more devices than there are, fewer slots than particles, and `slots`
+    with the moves that need every slot, `PropagateIndependently` and `PropagateInClusters`.
     """
     check_key(keys, "keys", batch=True)
     check_run(filter, collect)
@@ -110,11 +111,11 @@ def _run(key, filter, observations, present, collect):
 
 
 def _in_slots(keys: Key[Array, " seeds"], filter: Filter, slots: int) -> tuple[Start, Filter]:
-    """Where the runs start, and the filter, both of so many slots whatever N is."""
+    """The starts of the runs and the filter, both with this number of slots whatever N is."""
     num_particles = filter.num_particles
     if slots < num_particles:
         raise ValueError(f"slots: {slots} is no whole number of at least N, {num_particles}")
-    # How a model draws may depend on N: stratified draws do. So this is a program of its own.
+    # A model's draws may depend on N, as stratified draws do. So this is a separate program.
     particles = _sample_each(keys, filter.model, num_particles, int(slots))
     limits = jnp.full(keys.shape, num_particles, jnp.int32)
     initial_moves = untie(filter._initial_moves, filter.model)
@@ -147,7 +148,7 @@ def _run_each(starts, filter, observations, present, collect):
 
 
 def _group_size(num_runs: int, filter: Filter) -> int:
-    """How many runs go on together: on a CPU no more than leaves their particles in its cache."""
+    """How many runs go on together: on a CPU, no more than fit into its cache."""
     num_rows = filter.num_components if filter.num_components <= FEW_ROWS else 1
     one_run = filter.num_particles * num_rows
     if jax.default_backend() != "cpu" or num_runs * one_run <= _IN_CACHE:
@@ -160,11 +161,11 @@ _run_all = jit_on_wide_vectors(_run_each)
 
 
 def _run_on_threads(starts, filter, observations, present, collect):
-    """All runs on one device, which on a CPU is kept busy by several threads."""
+    """All runs on one device; on a CPU, several threads share them."""
     num_runs = starts.key.shape[0]
     num_worth_it = num_runs * filter.num_particles // _WORTH_A_THREAD
     num_threads = min(num_processors(), num_runs, num_worth_it)
-    keeps_all = collect is None  # of which there had better not be two copies for a while
+    keeps_all = collect is None  # threads would hold two copies of it for a while
     arguments = (filter, observations, present, collect)
     leave_to_caller = is_traced((starts, arguments)) or jax.default_backend() != "cpu"
     if num_threads < 2 or keeps_all or leave_to_caller:

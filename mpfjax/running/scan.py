@@ -25,6 +25,8 @@ class FilterRun(eqx.Module):
     log_likelihood_increments: Float[Array, " t"]
     collected: PyTree
     """what `collect` made of each step's mixture, stacked over t."""
+    initial: ParticleMixture
+    """the mixture of x_0, before any observation."""
     final: ParticleMixture
     resampled: Bool[Array, "t m"]
     """which components each step resampled."""
@@ -68,13 +70,14 @@ def scan(
         return mixture, (kept, info.log_likelihood_increment, info.resampled, info.degenerate)
 
     inputs = (jax.random.split(key_steps, length), observations, present)
-    initial = filter._init(start._replace(key=key_initial))
-    final, outputs = jax.lax.scan(advance, _share_of_islands(initial), inputs)
+    initial = _share_of_islands(filter._init(start._replace(key=key_initial)))
+    final, outputs = jax.lax.scan(advance, initial, inputs)
     collected, increments, resampled, degenerate = outputs
     return FilterRun(
         log_marginal_likelihood=jnp.sum(increments),
         log_likelihood_increments=increments,
         collected=collected,
+        initial=initial,
         final=final,
         resampled=resampled,
         degenerate=degenerate,
@@ -82,7 +85,7 @@ def scan(
 
 
 def _share_of_islands(mixture: ParticleMixture) -> ParticleMixture:
-    """The mixture's share of a whole that is made of as many as there are islands."""
+    """The mixture with its mass divided by the number of islands, as a part of the whole."""
     if num_islands() == 1:
         return mixture
     return mixture.replace(log_weights=mixture.log_weights - math.log(num_islands()))

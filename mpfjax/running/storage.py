@@ -24,15 +24,15 @@ _DESCRIPTION = "description"
 
 
 def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
-    """Write a mixture, or any pytree, from which an online filter goes on bit for bit.
+    """Write a mixture, or any pytree. An online filter can go on from it, bit for bit the same.
 
     - `state`: arrays, typed keys and numbers in any pytree, such as `{"mixture": mixture, "t": t}`
-      or a `Filter`. What else it holds, a network's activation say, is only written down by name.
-    - `path`: a .npz file without pickles. An interruption leaves the old one or the new one.
+      or a `Filter`. Of other things, such as a network's activation, only the name is written.
+    - `path`: a .npz file without pickles. After an interruption it is the old file or the new one.
 
-    Raises `ValueError` for a path that is none, and `OSError` where it cannot be written, a full
-    disk say: what was there is still there. Use it every so many steps of a filter that runs for
-    long:
+    Raises `ValueError` for something that is no path. Raises `OSError` if the file cannot be
+    written, for example on a full disk; the old file is then still there. Call it every thousand
+    steps, for example, of a filter that runs for a long time:
 
         state = {"mixture": filter.init(key), "t": 0}
         if path.exists():
@@ -56,12 +56,12 @@ def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
     """The state that `save_checkpoint` wrote, equal to it to the bit.
 
     - `like`: a state of the same structure, shapes, dtypes and static fields, whatever its
-      values: `filter.init(key)`, or `jax.eval_shape(filter.init, key)`. What is no array, key or
-      number is taken from it.
+      values: `filter.init(key)`, or `jax.eval_shape(filter.init, key)`. Everything that is not an
+      array, a key or a number is taken from it.
 
-    Arrays come back on the default device. Raises `FileNotFoundError`, and `ValueError` for a file
-    that is cut off, damaged, no checkpoint or does not hold what it says, or for one of another
-    state, naming what differs.
+    Arrays come back on the default device. Raises `FileNotFoundError`. Raises `ValueError` for a
+    file that is cut off, damaged, no checkpoint, or does not hold what it says, and for the
+    checkpoint of another state, naming what differs.
     """
     path = as_path(path)
     arrays = load_arrays(path)
@@ -107,7 +107,7 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
 
 
 def named(value: Any) -> str:
-    """A function, or another thing without a value, in words that are the same in every process."""
+    """A name for a function, or another thing without a value; the same in every process."""
     return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
 
 
@@ -131,7 +131,7 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
         with open(partial, "wb") as file:
             write(file)
             file.flush()
-            # Without it a power cut could leave the new name on a file that is not there yet.
+            # Without it, the file could be empty under its new name after a power cut.
             os.fsync(file.fileno())
         os.replace(partial, path)
     except BaseException as error:
@@ -152,7 +152,7 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
             raise ValueError(f"{name}: an array of {array.dtype} does not load without pickles")
 
     def write(file: BinaryIO) -> None:
-        # Not by np.savez, to which an array named "file" would be its own first argument.
+        # Not by np.savez, which takes an array named "file" for its first argument.
         with zipfile.ZipFile(file, "w") as archive:
             for name, array in arrays.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -161,7 +161,7 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
     write_whole(path, write)
 
 
-# What a flipped bit may lead to; where it names an unknown compression or an encryption, the last.
+# The errors that a flipped bit may lead to; the last is for an unknown compression or encryption.
 _DAMAGE = (
     zipfile.BadZipFile, zlib.error, EOFError, OSError, OverflowError, ValueError, RuntimeError,
 )  # fmt: skip
@@ -170,7 +170,7 @@ _DAMAGE = (
 def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """The arrays of a .npz file; `ValueError` for one that is cut off, damaged or no such file.
 
-    No more memory is taken than for what the file holds, whatever it claims.
+    It takes memory only for what the file really holds, whatever its headers claim.
     """
     arrays = {}
     with open(path, "rb") as file:
@@ -207,7 +207,7 @@ def _load_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray
         claimed, present = math.prod(shape) * dtype.itemsize, member.file_size - file.tell()
         if claimed != present:
             raise ValueError(f"{member.filename} claims {claimed} bytes and has {present}")
-        # In pieces, for the archive may claim too much as well.
+        # In pieces, since the archive may claim too much as well.
         content = bytearray()
         while piece := file.read(_PIECE):
             content += piece
@@ -245,7 +245,7 @@ def _found(path: Path, arrays: Mapping[str, np.ndarray], name: str, leaf: Any) -
     return array
 
 
-# What numpy makes of Python's numbers; of whole ones from 2⁶³ on, unsigned ones.
+# The types that numpy gives Python's numbers; whole numbers from 2⁶³ on are unsigned.
 _KINDS = {bool: "b", int: "iu", float: "f", complex: "c"}
 
 

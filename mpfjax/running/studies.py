@@ -1,4 +1,4 @@
-"""Monte Carlo studies over filters, numbers of particles and settings, which can be broken off."""
+"""Monte Carlo studies over filters, numbers of particles and settings; they can be interrupted."""
 
 import hashlib
 import itertools
@@ -39,27 +39,27 @@ Values = Sequence[Any] | np.ndarray | Array
 _MANIFEST = "study.json"
 _CELL = "cell"
 _TAKEN = ("filter", "num_particles", _CELL)
-# Names as `_cells` makes them, none of which leads out of a folder.
+# Names as `_cells` makes them; none of them leads out of the folder.
 _CELL_FILE = re.compile(r"\d+-[\w.+-]*\.npz")
 
 
 def log_evidence(run: FilterRun) -> dict[str, Array]:
-    """log Ẑ of each seed: what a `Study` measures where it is not told."""
+    """log Ẑ of each seed: what a `Study` measures by default."""
     return {"log_marginal_likelihood": run.log_marginal_likelihood}
 
 
 def nothing(mixture: ParticleMixture) -> None:
-    """What a `Study` collects where it is not told."""
+    """Collect nothing, the default of a `Study`."""
     del mixture
 
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """A grid of filters x N x settings, each cell the Monte Carlo runs of one filter.
+    """A grid of filters x N x settings. Each cell is the Monte Carlo runs of one filter.
 
-    Raises `ValueError` for an argument of another kind, an empty or repeated axis, numbers of
-    particles that are no whole numbers, a setting that is no number or string, a filter's function
-    that returns none, and what `monte_carlo` does.
+    Raises `ValueError` for an argument of another kind, an axis that is empty or has a value twice,
+    numbers of particles that are not whole, a setting that is not a number or a string, a function
+    that returns no filter, and what `monte_carlo` raises it for.
     """
 
     filters: Mapping[str, Callable[..., Filter]]
@@ -110,10 +110,10 @@ def run_study(
     cells_at_once: int = 1,
     slots: int | None = None,
 ) -> list[dict[str, Any]]:
-    """Run every cell of a study, and go on where an earlier call was broken off or killed.
+    """Run every cell of a study, and go on where an earlier call was interrupted or killed.
 
-    Each cell is written to a file of its own in `directory` as soon as it is finished, so that at
-    most the cells in flight are lost. Returns one dict a cell: its `filter`, `num_particles`,
+    Each cell is written to a file of its own in `directory` as soon as it is finished, so only
+    unfinished cells can be lost. Returns one dict for each cell: its `filter`, `num_particles`,
     settings and measured arrays. On a terminal a bar shows the time left.
 
         circle = lambda num_particles, noise: mpfjax.mixture_particle_filter(
@@ -122,19 +122,21 @@ def run_study(
                              observations, settings={"noise": [0.1, 0.3]})
         results = mpfjax.run_study(study, "results/circle")
 
-    - `seeds_at_once`: how many seeds share one `vmap`, where memory is short; None is all.
+    - `seeds_at_once`: how many seeds share one `vmap`; None is all. Set it if memory is short.
     - `cells_at_once`: with 2, one cell compiles while another runs; a kill may lose both. Several
-      processes, which must meet in the same cell, run one at a time.
-    - `slots`: filters of at most so many particles run within so many slots, as `monte_carlo` has
-      it, so that a filter compiles once for all these N. For small filters, of which the study
-      compiles for longer than it runs; with a filter that fills every slot it is an error.
+      processes must work on the same cell, and so run one cell at a time.
+    - `slots`: the length of the particle arrays, as for `monte_carlo`, in all cells with at most
+      so many particles. A filter then compiles once for all these N. Use it for small filters,
+      where the study spends more time on compiling than on running. A filter that fills every
+      slot, such as `independent_particle_filters`, raises an error.
 
-    Raises `ValueError`, before anything runs, for an argument of another kind, for a `directory` of
-    another study, naming what differs, and for files in it that are cut off: delete those, and only
-    their cells are run again. Raises `OSError` where a cell cannot be written, a full disk say;
-    finished cells stay. Filters are compared by their structure and numbers, `measure` and
-    `collect` only by their names: take a new directory after changing code. Several processes share
-    one directory, which the first writes. Use it where a loop over `monte_carlo` would take long.
+    Raises `ValueError` before anything runs: for an argument of another kind, for the `directory`
+    of another study, naming what differs, and for files in it that are cut off. Delete such files,
+    and only their cells run again. Raises `OSError` if a cell cannot be written, for example on a
+    full disk; finished cells stay. Filters are compared by their structure and numbers, `measure`
+    and `collect` only by their names: use a new directory after you change their code. Several
+    processes share one directory, which the first one writes. Use it where a loop over
+    `monte_carlo` would take long.
     """
     check_type(Study, "a Study", study=study)
     check_whole(**given(seeds_at_once=seeds_at_once, slots=slots))
@@ -165,10 +167,11 @@ def run_study(
 
 
 def read_study(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    """The finished cells of a study, as `run_study` returns them, without what it was made from.
+    """The finished cells of a study, as `run_study` returns them.
 
-    Also while it runs. Raises `FileNotFoundError` for a directory without a study, and
-    `ValueError` for files in it that are cut off, damaged or from another study.
+    It does not need the `Study`, and works while the study runs. Raises `FileNotFoundError` for a
+    directory without a study, and `ValueError` for files in it that are cut off, damaged or from
+    another study.
     """
     directory = _as_directory(directory)
     manifest = _read_manifest(directory / _MANIFEST)
@@ -189,7 +192,7 @@ class _Cell:
 def _cells(study: Study) -> list[_Cell]:
     """All cells, with their filters built: what cannot be built is an error before any runs."""
     axes = _axes(study)
-    # Settings are outermost: neighbours, which may compile at once, are different programs.
+    # Settings are outermost: neighbours, which may compile at once, are then different programs.
     outermost_first = [*study.settings, "num_particles", "filter"]
     cells = []
     for index, values in enumerate(itertools.product(*(axes[k] for k in outermost_first))):
@@ -327,7 +330,7 @@ def _mark(manifest: dict[str, Any], file: str) -> np.ndarray:
 
 def _finished(directory: Path, manifest: dict[str, Any]) -> dict[str, dict[str, np.ndarray]]:
     """The measured arrays of the cells that are there, by file."""
-    # No warning and a second run: who has a damaged file should know, for others may be as well.
+    # An error, not a warning and a second run: if one file is damaged, others may be as well.
     results, faults = {}, []
     for file in manifest["cells"]:
         path = directory / file
@@ -356,7 +359,7 @@ def _measure(
     size = num_seeds if seeds_at_once is None else min(seeds_at_once, num_seeds)
     parts = []
     for start in range(0, num_seeds, size):
-        # The last batch is filled up, so that it does not compile anew.
+        # The last batch is filled up, so that it does not compile again.
         batch = study.keys[np.clip(np.arange(start, start + size), 0, num_seeds - 1)]
         run = monte_carlo(
             batch,
@@ -377,7 +380,7 @@ def _measure(
 
 
 def _in_turn(finish: Callable[[_Cell], str], cells: list[_Cell], at_once: int) -> Iterator[str]:
-    """Finish the cells, so many at once; an error ends it once those in flight are finished."""
+    """Finish the cells, several at once; an error ends it after the cells that are running."""
     if at_once == 1:
         yield from map(finish, cells)
         return

@@ -25,10 +25,10 @@ def over_threads(
 ) -> PyTree:
     """`run(inputs, *arguments)`, compiled, with the inputs dealt to threads of this process.
 
-    For programs of many short operations, which a CPU device does mostly one after the other. The
-    blocks are of equal size; the last input fills up the last of them, and what comes of that is
-    dropped. This thread takes the first block, and all that are left by threads which would not
-    see what it sees: a setting of JAX that holds for it alone, or a transformation of the caller's.
+    It is for programs of many short operations, which a CPU device does mostly one after the other.
+    The blocks have equal size: the last input is repeated to fill the last block, and the extra
+    results are dropped. This thread takes the first block. It takes all of them if other threads
+    would not see its settings of JAX, or a transformation of the caller.
     """
     num_inputs = length_of(inputs)
     size = -(-num_inputs // num_threads)
@@ -67,7 +67,7 @@ def _threads() -> ThreadPoolExecutor:
 
 
 def _seen_by_thread() -> tuple[Any, ...]:
-    """JAX's settings, and which transformations go on. Of an old JAX it cannot be told."""
+    """JAX's settings and the active transformations. In an old JAX, every thread is different."""
     trace_state = getattr(jax.extend.core, "get_opaque_trace_state", None)
     if trace_state is None:
         return (threading.get_ident(),)

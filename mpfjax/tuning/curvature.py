@@ -47,21 +47,22 @@ def standard_errors(
 ) -> dict[str, np.ndarray] | None:
     """Standard errors of a filter's parameters where they maximise the likelihood.
 
-    The roots of the diagonal of J I⁻¹ Jᵀ: I is the observed information, by central differences
-    of the mean score over about one standard error to each side, with the same seeds on both, in
-    unconstrained numbers, and J their Jacobian (the delta method). How far that is, is found by
-    trying, from the size of the score: parameters may have any units. The scores must be
-    unbiased: build the filter with `gradient="stop"`, or be warned. Costs one gradient of
-    `num_seeds` runs, and two a number for each try, of which there are mostly two, at most ten.
+    They are the roots of the diagonal of J I⁻¹ Jᵀ (the delta method). I is the observed information
+    in unconstrained numbers, and J the Jacobian of the parameters. I is found by central
+    differences of the mean score, over about one standard error to each side, with the same seeds
+    on both sides. A few tries find that distance, starting from the size of the score, so the
+    parameters may have any units. The scores must be unbiased: build the filter with
+    `gradient="stop"`; otherwise there is a warning. The cost is one gradient of `num_seeds` runs,
+    and for each try two for each number; usually two tries, at most ten.
 
     Arguments are those of `fit`. Noise in I makes the errors too large rather than too small. A
-    warning says so where the seeds do not settle them: where the errors that one half of the seeds
-    gives and those of the other half differ by more than 25% (the root mean square of the
-    logarithm, over many ways to halve them), so that those of all are uncertain by half of that.
+    warning says if there are too few seeds: if the errors from one half of the seeds and those
+    from the other half differ by more than 25% (the root mean square of the logarithm, over many
+    ways to halve them). The errors from all seeds are then uncertain by about half of that.
 
-    None, with a warning, where I is not positive definite: away from a maximum, along a direction
-    that nothing tells, or with too few seeds. Raises `ValueError` for what `fit` does, fewer than
-    one seed, and more than fifty numbers.
+    Returns None, with a warning, if I is not positive definite: away from a maximum, along a
+    direction that the data do not determine, or with too few seeds. Raises `ValueError` for what
+    `fit` does, fewer than one seed, and more than fifty numbers.
     """
     check_key(key)
     check_whole(1, num_seeds=num_seeds)
@@ -107,8 +108,8 @@ def _informations(
     score: Callable[[np.ndarray], np.ndarray], centre: np.ndarray, longest: np.ndarray
 ) -> Float[np.ndarray, "seeds d d"]:
     """The observed information, as each seed has it; NaN where there is none."""
-    # A score is about as large as one over a standard error, in whatever units it is: by the
-    # noise of its seeds where nothing else.
+    # In any units, a score is about as large as one over a standard error, if only by the noise of
+    # its seeds.
     sizes = np.sqrt(np.mean(score(centre) ** 2, axis=0))
     shortest = _FEWEST_PLACES * np.asarray(np.spacing(np.abs(centre)), float)
     columns = []

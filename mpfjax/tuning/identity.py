@@ -1,4 +1,4 @@
-"""What makes two climbs the same one: every number and function of them, by name, as text."""
+"""Whether two climbs are the same: every number and function of a climb, by name, as text."""
 
 import functools
 import hashlib
@@ -12,7 +12,7 @@ import numpy as np
 
 from mpfjax.running.storage import differences, fingerprint, named
 
-# Functions of these are what their names say; of others the code counts as well.
+# Functions of these libraries are compared by name, others by their code as well.
 _LIBRARIES = ("chex", "equinox", "jax", "jaxlib", "mpfjax", "numpy", "optax")
 _MOST_SHOWN = 4
 
@@ -20,10 +20,10 @@ _MOST_SHOWN = 4
 def contents_of(name: str, value: Any) -> dict[str, str]:
     """All that a filter, an objective or an optimiser is made from, by `name` and its place.
 
-    Numbers by their values, arrays by their `fingerprint`, classes by their names; functions by
-    their names and what they hold: in their closures, as arguments bound to them, in what they are
-    methods of. Of functions that are of no library also the code, and the numbers and functions
-    of their modules that it names.
+    Numbers are described by their values, arrays by their `fingerprint`, classes by their names.
+    Functions are described by their names and by what they hold: closures, bound arguments, and
+    the object of a method. Functions outside the libraries are also described by their code, and
+    by the numbers and functions of their modules that it names.
     """
     found: dict[str, str] = {}
     _collect(name, value, found, {})
@@ -56,7 +56,7 @@ def _collect(name: str, value: Any, found: dict[str, str], seen: dict[int, Any])
     elif id(value) in seen:
         found[name] = "as above"
     else:
-        # Held, for what is gone leaves its id to others.
+        # Kept alive, since another object could get the id of one that is gone.
         seen[id(value)] = value
         found[name] = _title(value)
         for part, held in _parts(value).items():

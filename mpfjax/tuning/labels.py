@@ -1,4 +1,4 @@
-"""What labels say of a likelihood: the posterior of the label among candidate states."""
+"""A likelihood tuned on labels: the posterior of the label among candidate states."""
 
 from typing import Any
 
@@ -15,10 +15,10 @@ from mpfjax.models.base import AbstractStateSpaceModel, require
 class LabelLikelihood(eqx.Module):
     """The conditional log likelihood of labels given their observations, for `maximise`.
 
-    The mean over labels of `label_log_posteriors`, at each step over `num_frames` frames that its
-    seed draws, or over all of them. exp(-λ B²) and other likelihoods without their normaliser over
-    y have no maximum in λ by the marginal likelihood of a filter, which rises as λ falls; this has
-    one. Use it for such likelihoods, on frames whose true states are known.
+    It is the mean over labels of `label_log_posteriors`, in each step over `num_frames` frames that
+    its seed draws, or over all frames. Use it for a likelihood that is not normalised over y, such
+    as exp(-λ B²), on frames whose true states are known. The marginal likelihood of a filter only
+    rises as λ falls and has no maximum in λ; this objective has one.
 
     - `observations`: leading axis t.
     - `labels`: the true states: leaves (t, k, ...), k of them in each frame.
@@ -59,15 +59,15 @@ def label_log_posteriors(
 
         log L(y | x*) - log (1 / (n + 1)) Σ_{i=0..n} L(y | x_i),
 
-    the log posterior density of the label relative to q, normalised over the state, so that a
+    is the log posterior density of the label relative to q. It is normalised over the state, so a
     factor of L that does not depend on the state cancels: conditional maximum likelihood (for
     tracking, Taycher, Demirdjian, Darrell and Shakhnarovich 2006). With the label in the sum it is
-    at most log(n + 1), and its mean over labels a lower bound of the information that y has on x*
-    (van den Oord, Li and Vinyals 2018). Labels that are right to a pixel only ask for a likelihood
-    as wide as that: λ has a finite best value.
+    at most log(n + 1), and its mean over labels is a lower bound of the information that y has on
+    x* (van den Oord, Li and Vinyals 2018). If labels are right to a pixel only, the best
+    likelihood is about a pixel wide: λ has a finite best value.
 
-    Shapes as in `LabelLikelihood`; one frame after the other, whose terms are computed again for
-    the derivative, so that memory does not grow with t but for the data.
+    Shapes are as in `LabelLikelihood`. Frames are taken one after the other and computed again for
+    the derivative. So only the data grow with t in memory.
     """
     require(model, "log_likelihood", "label_log_posteriors")
     _check(observations, labels, candidates)

@@ -65,30 +65,31 @@ def metropolis_hastings(
     """Sample p(θ | y_1..y_t) with the filter's estimate Ẑ(θ) in place of the likelihood.
 
     Particle marginal Metropolis-Hastings (Andrieu, Doucet and Holenstein 2010, section 2.4.2), by
-    blackjax's Rosenbluth-Metropolis-Hastings on pairs (u, key): u are θ in unconstrained numbers,
-    proposed by a Gaussian random walk, with a fresh key. The log density of a pair,
+    blackjax's Rosenbluth-Metropolis-Hastings on pairs (u, key). u is θ in unconstrained numbers. A
+    Gaussian random walk proposes u, and the key is always new. The log density of a pair,
 
         log p(θ) + log |∂θ/∂u| + log Ẑ(θ; key),
 
-    is a function of the pair, and Ẑ unbiased, so that θ has exactly the posterior, whatever the
-    number of particles; too few make chains that stick. Aim at a deviation of log Ẑ of about one
-    (Doucet et al. 2015), and an acceptance of 10 to 40%. No derivative is taken: `gradient` does
-    not matter. Use it where a point and its standard errors are not enough: few observations,
-    skewed or several-humped posteriors.
+    is a function of the pair, and Ẑ is unbiased. So θ has exactly the posterior distribution,
+    whatever the number of particles. With too few particles, chains stay at one state for long.
+    Aim at a standard deviation of log Ẑ of about one (Doucet et al. 2015), and an acceptance of 10
+    to 40%. No derivative is taken, so `gradient` does not matter. Use it where a point and its
+    standard errors are not enough: with few observations, or posteriors that are skewed or have
+    several modes.
 
-    - `log_prior`: of the parameters by name, on their own scale, up to a constant; -inf where
-      there is none.
+    - `log_prior`: a function of the parameters by name, on their own scale, up to a constant; -inf
+      where the prior is zero.
     - `proposal_deviations`: of the random walk, in unconstrained numbers: one for all, or by name,
       each a number or of the parameter's unconstrained shape. 2.4 / sqrt(d) standard errors is a
       good start.
-    - `num_chains`: all start at the filter's own parameters, and run under one vmap; throw their
-      first steps away.
+    - `num_chains`: all start at the filter's own parameters, and run under one vmap. Drop their
+      first steps.
     - `observations`, `parameters`, `transforms`, `missing`: as for `fit`.
 
-    A NaN or +inf ends the chains with a warning, what they have, and the step in `stopped`. Raises
-    `ImportError` where blackjax is missing, `ValueError` for numbers below one, deviations that are
-    not positive or of unknown parameters, a filter that is `approximate`, a prior that is no
-    number, a start without one, and what `fit` does; `RuntimeError` where the start has no
+    At a NaN or +inf the chains end with a warning, the states so far, and the step in `stopped`.
+    Raises `ImportError` where blackjax is missing, `ValueError` for numbers below one, deviations
+    that are not positive or of unknown parameters, a filter that is `approximate`, a prior that is
+    no number, a start without one, and what `fit` does; `RuntimeError` where the start has no
     likelihood.
     """
     check_key(key)
@@ -163,7 +164,7 @@ class _Chain(eqx.Module):
         """Of a pair, up to a constant; an error where it is neither a number nor -inf."""
         reals, key = position["reals"], jax.random.wrap_key_data(position["key"])
         prior = self.log_prior_density(reals)
-        # A prior of zero rules out what the likelihood may not even be defined for.
+        # Where the prior is zero, the likelihood may not even be defined.
         evidence = jnp.where(prior == -jnp.inf, 0.0, self.problem.value(reals, key))
         density = prior + evidence
         return eqx.error_if(density, ~(density < jnp.inf), _BROKEN)

@@ -1,4 +1,4 @@
-"""What is tuned: some leaves of a filter or model, and the objective that they are to maximise."""
+"""What is tuned: some leaves of a filter or model, and the objective that they should maximise."""
 
 import warnings
 from collections.abc import Callable, Mapping
@@ -55,7 +55,7 @@ class Problem(eqx.Module):
                 raise ValueError(
                     f"parameters: {name} starts at {shown(value)}, outside {kind}'s domain"
                 )
-            # A strong type: a weak one would compile anew once an optimiser has made it strong.
+            # A strong type: an optimiser makes a weak one strong, and it would compile again.
             reals[name] = jax.lax.convert_element_type(transform.unconstrain(value), value.dtype)
         return reals
 
@@ -162,8 +162,8 @@ def pose_evidence(
 def warn_of_bias(caller: str, problem: Problem) -> None:
     """Warn where the derivatives of a filter are not the score of what is tuned.
 
-    Not for parameters of proposals, whose bound is to be climbed without the resampling, and not
-    for filters that never resample.
+    It does not warn for parameters of proposals, whose bound is maximised without the derivative of
+    the resampling, nor for filters that never resample.
     """
     filter = jax.tree.unflatten(problem.structure, map(_Place, range(len(problem.leaves))))
     of_proposals = {

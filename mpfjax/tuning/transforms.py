@@ -52,7 +52,7 @@ class Unconstrained(AbstractTransform):
 
 
 class Positive(AbstractTransform):
-    """exp: for scales, whose steps are then relative."""
+    """exp: for scales; a step of the optimiser is then a relative change."""
 
     def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
         """exp u."""

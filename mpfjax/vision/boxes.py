@@ -11,7 +11,7 @@ _COLUMNS = range(7, 11)
 
 
 def parse_box(text: str, argument: str = "box") -> Float[np.ndarray, "4"]:
-    """Read "x,y,w,h" in pixels. Raises `ValueError` naming `argument` where it is not that."""
+    """Read "x,y,w,h" in pixels. Raises `ValueError` naming `argument` for any other text."""
     check_type(str, "a text x,y,w,h", **{argument: text})
     try:
         box = np.array([float(part) for part in text.split(",")])
@@ -27,7 +27,7 @@ def check_boxes(
 ) -> None:
     """Raise `ValueError` for a box without area, or wholly outside a frame of this size.
 
-    Also for boxes that are not four finite numbers each, and a size that is no whole number.
+    Also for boxes that are not four finite numbers, and a size that is not a whole number.
     """
     check_whole(height=height, width=width)
     for x, y, w, h in to_rows(4, argument, boxes).tolist():
@@ -36,7 +36,7 @@ def check_boxes(
             raise ValueError(f"{named} is not finite")
         if not (w > 0 and h > 0):
             raise ValueError(f"{named} has no area")
-        # Less than a pixel inside may hold no pixel's centre, and so no colour to track.
+        # With less than a pixel inside, it may hold no pixel's centre, and so no colour to track.
         if not (x + w >= 1 and y + h >= 1 and x <= width - 1 and y <= height - 1):
             raise ValueError(f"{named} lies outside the first frame, {width} x {height}")
 
@@ -56,8 +56,8 @@ def top_left(boxes: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k 4"]:
 def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     """Read a MOTChallenge file into rows (frame, id, x, y, w, h), (x, y) the top-left corner.
 
-    Frames count from 1. Raises `ValueError` naming the file and the line where one does not
-    parse, and where the file holds no box at all.
+    Frames count from 1. Raises `ValueError` for a line that cannot be read, naming the file and the
+    line, and for a file without any box.
     """
     check_type((str, Path), "a path", path=path)
     lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
@@ -93,8 +93,8 @@ def read_detections(path: str | Path) -> Float[np.ndarray, "rows columns"]:
 def write_tracks(path: str | Path, rows: Float[np.ndarray, "rows 6"]) -> None:
     """Write rows (frame, id, x, y, w, h) in MOTChallenge form, in the order of the frames.
 
-    Raises `ValueError` for rows that could not be read again: not six finite numbers each, or a
-    frame or an id that is no whole number from 0 on.
+    Raises `ValueError` for rows that `read_tracks` could not read: rows that are not six finite
+    numbers, or with a frame or an id that is not a whole number from 0 on.
     """
     check_type((str, Path), "a path", path=path)
     rows = to_rows(6, "rows", rows)

@@ -40,11 +40,11 @@ _LARGEST_NARROW = 2**16 - 1
 
 
 class BoxState(eqx.Module):
-    """Where a box is, how large, and which of the reference boxes it is taken for.
+    """Where a box is, how large it is, and which reference box it is compared with.
 
     - `box`: (x, y, s_x, s_y), the centre in pixels and the size in units of the reference box.
     - `reference`: r, the reference box it is compared with, in [0, number of references).
-    - `previous`: the box one frame before, where the dynamics are of second order.
+    - `previous`: the box one frame before, if the dynamics are of second order.
     """
 
     box: Float[Array, "*n 4"]
@@ -53,10 +53,11 @@ class BoxState(eqx.Module):
 
 
 class AbstractBoxModel(AbstractStateSpaceModel):
-    """Boxes that move at random, without what is seen of them.
+    """The motion of boxes, without a likelihood.
 
-    x_0 is spread equally over the reference boxes and scatters about them; (x, y, s_x, s_y) follow
-    the dynamics, and r never changes, or is drawn anew with the switch probability in a frame.
+    x_0 scatters about the reference boxes, with equally many particles for each. (x, y, s_x, s_y)
+    follow the dynamics. In each frame, r is drawn again with the switch probability, which may be
+    zero.
     """
 
     reference_boxes: eqx.AbstractVar[Float[Array, "k 4"]]
@@ -78,7 +79,7 @@ class AbstractBoxModel(AbstractStateSpaceModel):
         return BoxState(box, reference, self._remembered(box))
 
     def sample_transition(self, key: Key[Array, ""], states: BoxState) -> BoxState:
-        """x_t from the dynamics, and r drawn anew with the switch probability."""
+        """x_t from the dynamics; with the switch probability, r is drawn again."""
         key_noise, key_switch, key_reference = jax.random.split(fast_key(key), 3)
         reference = states.reference
         if self.switch_probability > 0:
@@ -99,7 +100,7 @@ class AbstractBoxModel(AbstractStateSpaceModel):
         return log_density + self.log_switch(states, previous_states)
 
     def log_switch(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
-        """log P(r_t | r_{t-1}), the part of `log_transition` that is not of the box."""
+        """log P(r_t | r_{t-1}), the part of `log_transition` that is not about the box."""
         drawn = self.switch_probability / self.reference_boxes.shape[0]
         stays = states.reference == previous_states.reference
         return jnp.log(
@@ -124,7 +125,7 @@ class AbstractBoxModel(AbstractStateSpaceModel):
 
 
 class ColourModel(AbstractBoxModel):
-    """Boxes that move at random and are known by the colours that they hold.
+    """Boxes that move at random and are recognised by the colours in them.
 
     Vermaak et al. (2003), section 5.2: (x, y, s_x, s_y) follow independent Gaussian random walks,
     and L(y | x) ∝ exp(-Σ_c B²(h^c, h_ref^c) / 2σ²) with B the Bhattacharyya distance of the
@@ -132,17 +133,18 @@ class ColourModel(AbstractBoxModel):
     Lin et al. (2012), section 2, is the same with one `HSVColours` histogram (eqs. 1 to 3) and an
     `Autoregression` (eq. 4). Two extensions are in neither paper, and off unless asked for:
 
-    - several references: r, which one a particle is taken for, is part of the state, so that the
-      recursion stays exact; x_0 is spread equally over all of them, and r either never changes or
-      is drawn anew with a small probability in every frame, for objects whose looks do not last;
-    - boxes cut into bands from top to bottom, whose B² are averaged, so that a shirt is not taken
-      for trousers; and colours weighted by how much more of them a reference box holds than its
-      surround does, so that grass within a box counts for little.
+    - several references: r, the reference that a particle is compared with, is part of the state,
+      so the recursion stays exact. x_0 is spread equally over all references. r never changes, or
+      is drawn again with a small probability in every frame, for objects that change their looks;
+    - boxes cut into bands from top to bottom, whose B² are averaged, so that a shirt is not
+    confused
+      with trousers; and weights of colours: a colour counts by how much more of it is in a
+      reference box than around the box, so that grass in a box counts little.
 
     An observation is an RGB frame, uint8 of shape (h, w, 3), or its `IntegralHistogram`. A box
-    outside the frame holds no colour and lies at the largest distance, B = 1; so does a box of more
-    pixels than can be counted, see `wide_counts`. Make one with `from_frame`. Use it for objects
-    that keep their colours, among other colours.
+    outside the frame has no colour and the largest distance, B = 1. So has a box of more pixels
+    than can be counted, see `wide_counts`. Make a model with `from_frame`. Use it for objects that
+    keep their colours and are not surrounded by the same colours.
 
     - `reference_boxes`: (k, 4), centre and size in pixels; x_0 scatters about them.
     - `references`, `colour_weights`: h_ref and the weights of its colours, (k, parts, channels,
@@ -152,12 +154,13 @@ class ColourModel(AbstractBoxModel):
     - `initial_deviations`: of x_0, (k, 4), in the same units.
     - `sigma`: σ, the width of the likelihood.
     - `colours`: the bins of the histograms.
-    - `switch_probability`: with which r is drawn anew, from all references, in a frame.
-    - `contrast`: how much it speaks for a box that what lies to its sides, half a width each, does
-      not have the reference's colours; 0, as in the paper, looks at the box alone. Sides that
-      cannot be counted, of a box that is too large with them, do not speak for it.
-    - `wide_counts`: count pixels in 32 bits; see `integral_histogram`. Without it a box, or with
-      `contrast` a box and its sides, has at most 65 535 pixels.
+    - `switch_probability`: the probability, in each frame, that r is drawn again from all
+    references.
+    - `contrast`: how much a box gains if the areas at its sides, half a width each, do not have the
+      reference's colours. 0 looks at the box alone, as in the paper. If a box with its sides is too
+      large to be counted, it gains nothing.
+    - `wide_counts`: count pixels in 32 bits; see `integral_histogram`. Without it, a box, or with
+      `contrast` a box with its sides, may have at most 65 535 pixels.
     """
 
     reference_boxes: Float[Array, "k 4"]
@@ -192,18 +195,17 @@ class ColourModel(AbstractBoxModel):
         - `colours`: the bins of the histograms; None takes `RGBColours()`.
         - `deviations`: of x_0 and of the random walk, (4,) or one row a box; None takes the
           paper's, the roots of (2.5, 1.5, 0.05, 0.05).
-        - `dynamics`: in place of the random walk, one for all boxes or with a row for each.
+        - `dynamics`: instead of the random walk; one for all boxes, or with a row for each.
         - `num_parts`: bands from top to bottom.
-        - `weigh_colours`: weigh each colour by its share in the box against that in a surround
-          of twice the width and height.
-        - `share_reference`: all particles are taken for one reference, the mean of all boxes, as
-          in the paper, which has one B_ref for all players.
-        - `switch_probability`: with which a particle's reference is drawn anew in a frame.
-        - `contrast`: the weight of the unlikeness of a box's two sides.
+        - `weigh_colours`: weight each colour by its share in the box compared with its share in the
+          surround, which has twice the width and height.
+        - `share_reference`: all particles are compared with one reference, the mean of all boxes.
+          The paper too has one B_ref for all players.
+        - `switch_probability`, `contrast`: see the class.
 
         Raises `ValueError` naming the argument for one of another kind, for a frame that is not
-        (h, w, 3) of type uint8, for a box of no area or outside the frame, for a number that is not
-        positive, and for a probability outside [0, 1].
+        (h, w, 3) of type uint8, for a box without area or outside the frame, for a number that is
+        not positive, and for a probability outside [0, 1].
         """
         check_frame(frame)
         boxes = to_rows(4, "boxes", boxes)
@@ -263,7 +265,7 @@ class ColourModel(AbstractBoxModel):
     def prepare_observation(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"]
     ) -> IntegralHistogram:
-        """The frame's integral histogram, which a model of several objects builds but once."""
+        """The frame's integral histogram; a model of several objects builds it only once."""
         return self._counted(observation)
 
     def squared_distances(
@@ -284,8 +286,8 @@ class ColourModel(AbstractBoxModel):
         self, counts: Float[Array, "n parts channels bins"], states: BoxState
     ) -> Float[Array, " n"]:
         weights, references = self.colour_weights, self.references
-        # To gather the one reference there is costs more than the distance, but for particles
-        # that each come with a model of their own under vmap, where two gathers fuse.
+        # With one reference, a gather of it costs more than the distance. Only under vmap, where
+        # each particle has a model of its own, the two gathers fuse.
         if references.shape[0] > 1 or counts.shape[0] == 1:
             weights, references = weights[states.reference], references[states.reference]
         histograms = normalise(counts, weights)
@@ -332,6 +334,6 @@ def _references(
     ring = table.counts(around)[:, 0, None] - jnp.sum(counts, axis=1, keepdims=True)
     inside, outside = normalise(counts), normalise(ring)
     share = inside + outside
-    # A colour that neither holds tells nothing of the box, and nothing against it either.
+    # A colour that is neither in the box nor around it says nothing about the box.
     weights = jnp.where(share > 0, inside / jnp.where(share > 0, share, 1.0), 0.5)
     return normalise(counts, weights), weights

@@ -1,4 +1,4 @@
-"""What counts as one colour: the bins that a histogram sorts pixels into."""
+"""What counts as one colour: the bins into which a histogram sorts pixels."""
 
 import abc
 
@@ -12,8 +12,8 @@ from mpfjax.checks import check_share, check_whole
 class AbstractColours(eqx.Module):
     """A way to sort the pixels of an RGB frame into bins, in one or more channels.
 
-    A histogram is made, and normalised, in each channel on its own; the squared distances of the
-    channels add up.
+    Each channel has a normalised histogram of its own. The squared distances of the channels are
+    added.
     """
 
     @property
@@ -56,10 +56,10 @@ class HSVColours(AbstractColours):
     """Hue and saturation together, and the value of pixels that have hardly any colour.
 
     N = N_h N_s + N_v bins in one histogram, Lin et al. (2012), section 2.1, after Pérez, Hue,
-    Vermaak and Gangnet (2002): a pixel with a saturation of at least `least_saturation` and a
-    value of at least `least_value` (both in [0, 1]) counts in one of N_h N_s bins of hue and
-    saturation, and any other, whose hue means little, in one of N_v bins of value. Use it where
-    the light changes, or where one histogram is to be smaller than three.
+    Vermaak and Gangnet (2002). A pixel with a saturation of at least `least_saturation` and a value
+    of at least `least_value` (both in [0, 1]) counts in one of N_h N_s bins of hue and saturation.
+    The hue of any other pixel means little: it counts in one of N_v bins of value. Use it where the
+    light changes, or where one histogram should replace three.
 
     Raises `ValueError` for a number of bins outside 1 to 256 and thresholds outside [0, 1].
     """

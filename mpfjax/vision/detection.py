@@ -24,8 +24,6 @@ from mpfjax.vision.frames import check_frame
 _FOREGROUND = 255
 # How many blobs are remembered for their shape, and from how many on it counts.
 _REMEMBERED, _ENOUGH = 500, 20
-# A blob may be several where it is lower than this share of what is usual, in widths.
-_TOO_WIDE = 0.8
 # A part of a blob may be so much narrower than one is.
 _NARROWEST = 2.4
 
@@ -52,8 +50,8 @@ class BackgroundSubtraction:
     - `area`: least and most area of a box, as shares of the frame's.
     - `aspect`: least and most height of a box, in widths; None is any shape.
     - `largest_gap`: height of the gaps that are closed, as a share of the frame's height.
-    - `cut_aspect`: a blob lower than this many widths may be cut; None takes four fifths of the
-      median of the blobs so far, once there are a few, and 0 cuts none.
+    - `cut_aspect`: a blob lower than this many widths may be cut; None takes the median of the
+      blobs so far, once there are a few, and 0 cuts none.
     - `cut_depth`: how high the outline may reach between two heads, as a share of the lower one's
       height above the blob's foot, in (0, 1).
 
@@ -211,7 +209,7 @@ class BackgroundSubtraction:
         """The height of one, in widths, below which a blob may be several; 0 where unknown."""
         if self.cut_aspect is not None:
             return self.cut_aspect
-        return _TOO_WIDE * float(np.median(self._aspects)) if len(self._aspects) >= _ENOUGH else 0.0
+        return float(np.median(self._aspects)) if len(self._aspects) >= _ENOUGH else 0.0
 
     def _cut(self, blob: Bool[np.ndarray, "h w"], widest: float) -> list[tuple[int, int, int, int]]:
         """The boxes of those side by side in a blob that fills its array."""

@@ -1,22 +1,30 @@
 """The synthetic sequence of Smith and Gatica-Perez (2004), section 3.2: seven objects, one bait."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import check_key, check_whole
+from mpfjax.checks import (
+    check_key,
+    check_not_negative,
+    check_one_of,
+    check_positive,
+    check_whole,
+    shown,
+)
 
 _HEIGHT, _WIDTH = 288, 360
-_SIZE = np.array([32.0, 40.0])  # of every object, width and height
-_STEP_DEVIATION, _MOMENTUM = 3.0, 0.5
+_STEP_DEVIATION, _MOMENTUM = 3.0, 0.5  # of objects 2 to 7; all have the momentum
 _STARTS = np.array(
     [[180, 144], [60, 58], [180, 52], [300, 58], [60, 230], [180, 236], [300, 230]], float
 )
 _MARGIN = 8.0  # what objects keep free between each other and to the border
-# The distracter is over object 1 in its first frame, leads away at this speed, and is gone.
-_APPEARS, _VANISHES, _SPEED = 3, 9, 6.0
+_APPEARS, _VANISHES = 3, 9  # the frame in which the distracter comes, and the first without it
+# How far object 1 is clear of the distracter in its last frame, and at least at the end.
+_CLEAR, _CLEAR_AT_THE_END = (4.0, 12.0), 12.0
+_TRIES, _AT_A_TIME = 20_000, 500
 # Head, body and feet of each object; those of the distracter come last.
 _LOOKS = np.array(
     [
@@ -32,6 +40,7 @@ _LOOKS = np.array(
     float,
 )
 _GRAIN = 14.0
+_NOISES = {"grey": 1, "colour": 3}  # channels of the background that are drawn
 
 
 class DistracterScene(NamedTuple):
@@ -52,34 +61,60 @@ class DistracterScene(NamedTuple):
         return self.frames[_APPEARS - 1], self.distracter[_APPEARS - 1]
 
 
-def distracter_scene(key: Key[Array, ""], num_frames: int = 25) -> DistracterScene:
+def distracter_scene(
+    key: Key[Array, ""],
+    num_frames: int = 25,
+    *,
+    size: tuple[int, int] = (24, 24),
+    speed: float = 0.0,
+    deviation: float = 4.0,
+    noise: str = "grey",
+) -> DistracterScene:
     """Render seven objects on noise, and a distracter that lures the tracker of the first away.
 
-    Smith and Gatica-Perez (2004), section 3.2 and figures 2 and 3: 360 x 288 pixels; objects
-    move by x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + 3 ω_t in both directions, drawn again where
-    two would meet or one would leave the frame, and do not change in size. The distracter has
-    object 1's head and a body of warmer colours. It lies over object 1 in frame 3, moves from
-    there at 6 pixels a frame against the way that object 1 takes, and is last seen in frame 8,
-    where paths are drawn again unless it is clear of object 1; object 1's histogram is learned
-    from it (`template`). The paper prints none of the looks, places and speeds. Ours were chosen
-    by how the frames look, the speed so that the exact posterior of object 1 goes along with the
-    distracter. The same key gives the same scene.
+    Smith and Gatica-Perez (2004), section 3.2 and figures 2 and 3. The paper prints: 25 frames of
+    360 x 288 pixels; a noise-filled background; objects that move by
+    x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + 3 ω_t in both directions and do not change in size;
+    a distracter similar to object 1, from which object 1's histogram is learned (`template`),
+    which appears over object 1 in frame 3, leads the tracker astray, and is gone in frame 9; and
+    that object 1 is the quicker one. The rest is ours, chosen so that tables 1 and 2 come out:
+    looks, places and sizes; that the distracter stands still while object 1 walks away; and that
+    object 1 is clear of it by 4 to 12 pixels in frame 8 and by 12 in the last frame. Paths are
+    drawn again where two would meet or one would leave the frame. The same key gives the same
+    scene.
 
-    Raises `ValueError` for fewer frames than the three up to the distracter.
+    - `num_frames`: t, from 3 on.
+    - `size`: width and height of every object, in pixels.
+    - `speed`: of the distracter, in pixels a frame, against the way that object 1 takes.
+    - `deviation`: of ω_t of object 1, in pixels, where the others have 3.
+    - `noise`: of the background, "grey" or "colour".
+
+    `size=(32, 40), speed=6.0, deviation=3.0, noise="colour"` is a scene whose distracter runs
+    away. Raises `ValueError` for numbers out of their range and another noise, and, naming the
+    argument to change, where 20 000 tries find no path. Use it to see what a filter makes of an
+    object that looks like something else for a while.
     """
     check_key(key)
     check_whole(_APPEARS, num_frames=num_frames)
+    check_not_negative(speed=speed)
+    check_positive(deviation=deviation)
+    check_one_of(tuple(_NOISES), noise=noise)
+    sides = _sides(size)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
-    corners = np.round(_paths(rng, num_frames) - _SIZE / 2)
-    corners, bait = corners[:, :-1], corners[:, -1]
-    boxes = np.concatenate([corners, np.broadcast_to(_SIZE, corners.shape)], axis=-1)
-    distracter = np.concatenate([bait, np.broadcast_to(_SIZE, bait.shape)], axis=-1)
+    with np.errstate(over="ignore", invalid="ignore"):  # of steps beyond all bounds
+        others = _draw_others(rng, num_frames, sides)
+        first, bait = _draw_first(rng, others, sides, float(speed), float(deviation))
+    centres = np.concatenate([first[:, None], others, bait[:, None]], axis=1)
+    corners = np.round(centres - sides / 2)
+    boxes = np.concatenate([corners, np.broadcast_to(sides, corners.shape)], axis=-1)
+    boxes, distracter = boxes[:, :-1], boxes[:, -1]
     number = np.arange(1, num_frames + 1)
     distracter[(number < _APPEARS) | (number >= _VANISHES)] = np.nan
-    patches = [_patch(rng, looks) for looks in _LOOKS]
+    patches = [_patch(rng, looks, sides.astype(int)) for looks in _LOOKS]
     frames = []
     for t in range(num_frames):
-        frame = rng.integers(0, 256, (_HEIGHT, _WIDTH, 3), dtype=np.uint8)
+        grain = rng.integers(0, 256, (_HEIGHT, _WIDTH, _NOISES[noise]), dtype=np.uint8)
+        frame = np.broadcast_to(grain, (_HEIGHT, _WIDTH, 3)).copy()
         for box, patch in zip([*boxes[t], distracter[t]], patches, strict=True):
             if np.all(np.isfinite(box)):
                 x, y, w, h = box.astype(int)
@@ -88,43 +123,126 @@ def distracter_scene(key: Key[Array, ""], num_frames: int = 25) -> DistracterSce
     return DistracterScene(np.stack(frames), boxes, distracter)
 
 
-def _paths(rng: np.random.Generator, num_frames: int) -> np.ndarray:
-    """(t, objects and distracter, 2): centres that keep inside the frame and apart."""
-    while True:
-        paths = [_STARTS, _STARTS]
-        for _ in range(num_frames):
-            noise = _STEP_DEVIATION * rng.standard_normal(_STARTS.shape)
-            paths.append(paths[-1] + _MOMENTUM * (paths[-1] - paths[-2]) + noise)
-        centres = np.stack(paths[2:])
-        bait = _lure(centres[:, 0])
-        others = np.concatenate([centres[:, 1:], bait[:, None]], axis=1)
-        seen_last = slice(_VANISHES - 2, _VANISHES - 1)
-        parted = np.all(np.max(np.abs(bait - centres[:, 0])[seen_last] - _SIZE, axis=1) > 0)
-        if _is_free(centres) and _is_free(others) and parted:
-            return np.concatenate([centres, bait[:, None]], axis=1)
+def _sides(size: Any) -> np.ndarray:
+    """Width and height as numbers, or an error."""
+    if not isinstance(size, (tuple, list, np.ndarray)) or len(size) != 2:
+        raise ValueError(f"size: {shown(size)} is no (width, height)")
+    for side in size:
+        check_whole(size=side)
+    sides = np.array(size, float)
+    if not _is_free(_STARTS[None, None], sides)[0]:
+        raise ValueError(f"size: objects of {shown(size)} pixels have no room beside each other")
+    return sides
 
 
-def _lure(path: np.ndarray) -> np.ndarray:
-    """Where the distracter is: from an object's place straight away from where it goes."""
-    last = min(_VANISHES - 2, len(path) - 1)
-    ahead = path[last] - path[_APPEARS - 1]
-    away = -_SPEED * ahead / max(np.linalg.norm(ahead), 1e-9)
-    steps = np.clip(np.arange(1, len(path) + 1), _APPEARS, _VANISHES - 1) - _APPEARS
-    return path[_APPEARS - 1] + steps[:, None] * away
+def _draw_others(rng: np.random.Generator, num_frames: int, sides: np.ndarray) -> np.ndarray:
+    """(t, 6, 2): centres of objects 2 to 7, which keep inside the frame and apart."""
+    started = False
+    for _ in range(_TRIES // _AT_A_TIME):
+        paths = _walks(rng, _STARTS[1:], _STEP_DEVIATION, num_frames)
+        free = _is_free(paths, sides)
+        if free.any():
+            return paths[np.argmax(free)]
+        started |= bool(_is_free(paths[:, : _VANISHES - 1], sides).any())
+    name = f"num_frames: in {num_frames} frames" if started else "size: in few frames"
+    raise ValueError(
+        f"{name} objects of {_text(sides)} pixels met or left the image in each of {_TRIES} tries"
+    )
 
 
-def _is_free(centres: np.ndarray) -> bool:
-    room = _SIZE / 2 + _MARGIN
+def _draw_first(
+    rng: np.random.Generator, others: np.ndarray, sides: np.ndarray, speed: float, deviation: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(t, 2) each: the centres of object 1, and of the distracter that it leaves behind."""
+    num_frames, last = len(others), _VANISHES - 2
+    failed: dict[str, int] = dict.fromkeys(("too near", "too far", "bait", "early", "late"), 0)
+    for _ in range(_TRIES // _AT_A_TIME):
+        first = _walks(rng, _STARTS[:1], deviation, num_frames)
+        bait = _lure(first, speed)
+        gaps = np.max(np.abs(bait - first)[:, :, 0] - sides, axis=-1)
+        near, far = gaps[:, last:][:, :1] < _CLEAR[0], gaps[:, last:][:, :1] > _CLEAR[1]
+        near, far = near.any(axis=1), far.any(axis=1)  # of no frames where there is no such one
+        if num_frames > last + 1:
+            near |= gaps[:, -1] < _CLEAR_AT_THE_END
+        crowd = np.broadcast_to(others, (len(first), *others.shape))
+        walks = np.concatenate([crowd, first], axis=2)
+        walks, starts = _is_free(walks, sides), _is_free(walks[:, : last + 1], sides)
+        lures = _is_free(np.concatenate([crowd, bait], axis=2), sides)
+        parted = ~near & ~far
+        fits = parted & walks & lures
+        if fits.any():
+            chosen = np.argmax(fits)
+            return first[chosen, :, 0], bait[chosen, :, 0]
+        for name, found in {
+            "too near": near & ~far,
+            "too far": far,
+            "bait": parted & starts & ~lures,
+            "early": parted & ~starts,
+            "late": parted & starts & lures & ~walks,
+        }.items():
+            failed[name] += int(found.sum())
+    raise ValueError(_why_no_path(failed, num_frames, sides, speed, deviation))
+
+
+def _why_no_path(
+    failed: dict[str, int], num_frames: int, sides: np.ndarray, speed: float, deviation: float
+) -> str:
+    """Which argument to change, from how many paths failed for what reason."""
+    never = f"in none of {_TRIES} tries"
+    if failed["late"]:
+        return f"num_frames: {never} does object 1 keep inside and apart for {num_frames} frames"
+    if failed["bait"]:
+        return f"speed: {never} does a distracter with {speed:g} keep inside and apart"
+    clear = f"{_CLEAR[0]:g} to {_CLEAR[1]:g} pixels clear of the distracter in frame 8"
+    if speed > 0 and failed["too far"] > failed["too near"]:
+        return f"speed: {never} is object 1 {clear}, which leaves with {speed:g} pixels a frame"
+    return (
+        f"deviation: {never} is object 1, of {_text(sides)} pixels, with steps of {deviation:g}"
+        f" inside the frame and {clear}, and still clear of it at the end"
+    )
+
+
+def _walks(
+    rng: np.random.Generator, starts: np.ndarray, deviation: float, num_frames: int
+) -> np.ndarray:
+    """(tries, t, objects, 2): many second-order autoregressions from rest."""
+    position = previous = np.broadcast_to(starts, (_AT_A_TIME, *starts.shape))
+    path = []
+    for _ in range(num_frames):
+        noise = deviation * rng.standard_normal(position.shape)
+        moved = position + _MOMENTUM * (position - previous) + noise
+        position, previous = moved, position
+        path.append(position)
+    return np.stack(path, axis=1)
+
+
+def _lure(paths: np.ndarray, speed: float) -> np.ndarray:
+    """(tries, t, 1, 2): where distracters are, from object 1's place away from where it goes."""
+    num_frames = paths.shape[1]
+    last = min(_VANISHES - 2, num_frames - 1)
+    appears = paths[:, _APPEARS - 1]
+    ahead = paths[:, last] - appears
+    away = -speed * ahead / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), 1e-9)
+    steps = np.clip(np.arange(1, num_frames + 1), _APPEARS, _VANISHES - 1) - _APPEARS
+    return appears[:, None] + steps[None, :, None, None] * away[:, None]
+
+
+def _is_free(centres: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """(tries,): whether objects at (tries, t, objects, 2) keep inside the frame and apart."""
+    room = sides / 2 + _MARGIN
     inside = (centres > room) & (centres < np.array([_WIDTH, _HEIGHT]) - room)
-    gaps = np.abs(centres[:, :, None] - centres[:, None]) - _SIZE - _MARGIN
-    first, second = np.triu_indices(centres.shape[1], 1)
-    apart = np.max(gaps, axis=-1)[:, first, second] > 0
-    return bool(inside.all() and apart.all())
+    first, second = np.triu_indices(centres.shape[2], 1)
+    gaps = np.abs(centres[:, :, first] - centres[:, :, second]) - sides - _MARGIN
+    return inside.all(axis=(1, 2, 3)) & (gaps.max(axis=-1) > 0).all(axis=(1, 2))
 
 
-def _patch(rng: np.random.Generator, looks: np.ndarray) -> np.ndarray:
+def _text(sides: np.ndarray) -> str:
+    return " x ".join(f"{side:g}" for side in sides)
+
+
+def _patch(rng: np.random.Generator, looks: np.ndarray, sides: np.ndarray) -> np.ndarray:
     """A figure of one object: a third of head, a half of body, the rest feet, all with grain."""
-    width, height = _SIZE.astype(int)
+    width, height = sides
     part = np.searchsorted([1 / 3, 5 / 6], (np.arange(height) + 0.5) / height)
     patch = np.broadcast_to(looks[part][:, None], (height, width, 3))
     noise = _GRAIN * rng.standard_normal((height, width, 3))

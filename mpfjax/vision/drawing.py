@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, UInt8
 
-# Okabe and Ito's palette, told apart by people of any colour vision, in the order of use.
+# Okabe and Ito's palette, in the order of use; people with colour blindness can tell it apart.
 PALETTE = np.array(
     [
         [230, 159, 0], [86, 180, 233], [240, 228, 66], [204, 121, 167], [0, 114, 178],
@@ -81,7 +81,7 @@ def draw_points(
     colours: Float[np.ndarray, "n 3"],
     radius: float = 1.5,
 ) -> None:
-    """Draw a dot with a dark rim at each (x, y), so that it shows on any ground."""
+    """Draw a dot at each (x, y), with a dark rim so that it is visible on any background."""
     for (x, y), colour in zip(points.tolist(), colours, strict=True):
         draw_stroke(frame, (x, y), (x, y), radius + 0.7, np.zeros(3), opacity=0.5)
         draw_stroke(frame, (x, y), (x, y), radius, colour)

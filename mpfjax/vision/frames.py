@@ -26,9 +26,10 @@ def read_frames(
     """Read frames `first` to `last` in RGB, counted from 1 and both ends in, one at a time.
 
     `path` is a video file, a folder of images in the order of their names, or a folder with
-    such a folder `img` or `img1`. Raises `ImportError` where imageio is missing,
-    `FileNotFoundError` where `path` is, and `ValueError` naming `path` where it cannot be read,
-    holds no frames, or its frames differ in size; also for a range that is none.
+    such a folder `img` or `img1`. Raises `ImportError` if imageio is missing, and
+    `FileNotFoundError` if `path` is. Raises `ValueError` naming `path` if it cannot be read, has
+    no frames, or has frames of different sizes. Raises `ValueError` for `first` and `last` that are
+    no range.
     """
     check_type((str, Path), "a path", path=path)
     check_whole(first=first, **given(last=last))
@@ -42,9 +43,9 @@ def read_frames(
 
 
 def parse_range(text: str | None, argument: str = "frames") -> tuple[int, int | None]:
-    """A and B of "A:B", frames counted from 1; B is None where it is left out, for the last.
+    """A and B of "A:B", frames counted from 1; without B it is None, for the last frame.
 
-    Raises `ValueError` naming `argument` where it is not that.
+    Raises `ValueError` naming `argument` for any other text.
     """
     if text is None:
         return 1, None
@@ -107,7 +108,7 @@ def open_video(
     if suffix not in (".gif", ".mp4"):
         raise ValueError(f"path: {path} ends in neither .mp4 nor .gif")
     _imageio()
-    # The older interface is the one that takes frames as they come, without holding them all.
+    # Only the older interface takes one frame after the other, without keeping all of them.
     from imageio.v2 import get_writer
 
     if suffix == ".gif":
@@ -239,7 +240,7 @@ def _of_one_size(path: Path, frames: Iterator[np.ndarray]) -> Iterator[np.ndarra
 
 
 def _rgb(image: np.ndarray) -> np.ndarray:
-    """Three channels of eight bits, whatever the file had: grey, a palette, transparency."""
+    """Three channels of eight bits, also from grey, a palette, or with transparency."""
     image = np.asarray(image)
     if image.ndim == 2:
         image = image[:, :, None]

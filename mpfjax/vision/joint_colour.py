@@ -1,4 +1,4 @@
-"""Several objects, each known by its colours, as in Smith and Gatica-Perez (2004)."""
+"""Several objects, each recognised by its colours, as in Smith and Gatica-Perez (2004)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -31,23 +31,23 @@ def joint_colour_model(
     | None = None,
     interaction: Callable[[PyTree, PyTree], Float[Array, " n"]] | None = None,
 ) -> MultiObjectModel:
-    """J boxes with second-order dynamics, each known by the histograms of its own template.
+    """J boxes with second-order dynamics, each recognised by the histograms of its own template.
 
-    Smith and Gatica-Perez (2004), sections 2 and 3.2: L(y | x^j) ∝ exp(-λ d²), d² the squared
+    Smith and Gatica-Perez (2004), sections 2 and 3.2: L(y | x^j) ∝ exp(-λ d²). d² is the squared
     Bhattacharyya distance of HSV histograms, summed over the P bands into which a box is cut from
-    top to bottom, as in Pérez, Hue, Vermaak and Gangnet (2002), whose λ is 20 as well; and
-    x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + σ ω_t. It is a `ColourModel` for each object, which
-    takes the mean over bands, so that its σ² is 1 / (2 λ P); in place of the paper's one scale α,
-    width and height have a scale each. An observation is an RGB frame that all objects share;
-    its integral histogram is built once a step, and once for all runs under `monte_carlo`.
+    top to bottom, as in Pérez, Hue, Vermaak and Gangnet (2002), where λ is 20 as well. The
+    dynamics are x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + σ ω_t. Each object has a `ColourModel`,
+    which takes the mean over bands, so its σ² is 1 / (2 λ P). The paper has one scale α; here width
+    and height have a scale each. An observation is an RGB frame for all objects. Its integral
+    histogram is built once in each step, and under `monte_carlo` once for all runs.
 
-    - `boxes`: (x, y, w, h), top-left corner first, where the objects start; also where their
-      templates are, in `frame`.
+    - `boxes`: (x, y, w, h), top-left corner first, where the objects start, and where their
+      templates are in `frame`.
     - `lambda_`: λ.
     - `num_parts`: bands.
     - `colours`: the bins of the histograms; None takes `HSVColours()`.
-    - `deviations`: σ of x, y in pixels and of the scales of width and height; of x_0 as well.
-    - `templates`: the frame and box of an object, by its index, whose looks are learned elsewhere.
+    - `deviations`: σ of x and y in pixels and of the scales of width and height; also those of x_0.
+    - `templates`: for an object whose looks are taken from elsewhere, by its index: (frame, box).
     - `interaction`: that of `MultiObjectModel`, between `BoxState`s.
 
     Raises `ValueError` naming the argument for no boxes, a box of no area or outside its frame,
@@ -96,8 +96,8 @@ def joint_colour_model(
 def with_lambda(model: MultiObjectModel, lambda_: float) -> MultiObjectModel:
     """A `joint_colour_model` with another λ, whose filters compile to the same programs.
 
-    Raises `ValueError` for a λ that is not positive, and for another model. Use it to go through
-    several λ.
+    Raises `ValueError` for a λ that is not positive, and for another model. Use it to try several
+    λ.
     """
     _check_model(model, "with_lambda")
     colour_model: Any = model.object_model

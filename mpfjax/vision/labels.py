@@ -13,8 +13,8 @@ from mpfjax.vision.colour_model import AbstractBoxModel, BoxState
 def labelled_states(model: AbstractBoxModel, boxes: Float[np.ndarray, "t k 4"]) -> BoxState:
     """The states of k labelled objects in t consecutive frames: leaves (t, k, ...).
 
-    Boxes are (x, y, w, h), top-left corner first; object j is the model's reference j. Where the
-    dynamics are of second order the first frame's states have stood still. Raises `ValueError`
+    Boxes are (x, y, w, h), top-left corner first; object j is the model's reference j. With
+    dynamics of second order, the objects have no speed in the first frame. Raises `ValueError`
     for another number of boxes than of references, and for a box that is not finite or has no area.
     """
     check_type(AbstractBoxModel, "a model of boxes, such as a ColourModel", model=model)
@@ -46,10 +46,10 @@ def boxes_around(
     """Boxes spread evenly over the neighbourhood of each: leaves (..., n, ...).
 
     Centres are uniform within `reach` widths and heights to each side; width and height are
-    multiplied by up to `stretch`, or divided by it, uniformly in the logarithm. For the candidates
-    of a `LabelLikelihood` that a filter's dynamics reach in many steps, not in one: without boxes
-    of wrong sizes it says nothing of size. Raises `ValueError` for fewer than one box, a reach that
-    is not positive, and a stretch below one.
+    multiplied by up to `stretch`, or divided by it, uniformly in the logarithm. Use them as
+    candidates of a `LabelLikelihood` that the dynamics reach in many steps, not in one: without
+    boxes of wrong sizes it does not learn about size. Raises `ValueError` for fewer than one box,
+    a reach that is not positive, and a stretch below one.
     """
     check_key(key)
     check_type(AbstractBoxModel, "a model of boxes, such as a ColourModel", model=model)

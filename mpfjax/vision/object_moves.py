@@ -1,4 +1,4 @@
-"""Moves for mixtures whose components stand for objects, told apart by their references."""
+"""Moves for mixtures whose components stand for objects. The references tell objects apart."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,20 +7,21 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.checks import check_inner_share, check_positive, check_type
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.exclusion import AbstractExclusion
 
 
-class ObjectExclusion(AbstractPropagation):
+class ObjectExclusion(AbstractExclusion):
     """Lower the weights of particles near where the other objects probably are.
 
     log-weight_i -= strength · Σ_m s_m exp(-|x_i - μ_m|² / (2 radius²)) over the components m of
-    other objects, μ_m the mean of the propagated particles and s_m the component's share of its
+    other objects. μ_m is the mean of the propagated particles, and s_m the component's share of its
     object's mass. The object of a component is the reference that its particles carry
-    (`BoxState`); components of one object are rival hypotheses about it, and do not push each
-    other. Distances are in units of `scale`, the width and height of a box in pixels.
+    (`BoxState`). Components of one object are rival hypotheses and do not push each other.
+    Distances are in units of `scale`, the width and height of a box in pixels.
 
-    This is NOT part of the exact recursion: it makes objects interact through their means, as a
-    Markov random field would through their states, and biases the marginal likelihood
-    (`approximate` is true). Use it after `Propagate`, where look-alikes cross.
+    This is NOT part of the exact recursion. Objects interact as in a Markov random field, but
+    through their means instead of their states. The marginal likelihood is biased (`approximate` is
+    true). Use it after `Propagate`, where look-alikes cross.
 
     Raises `ValueError` for a strength, radius or scale that is not positive.
     """
@@ -37,11 +38,6 @@ class ObjectExclusion(AbstractPropagation):
         for unit in self.scale:
             check_positive(scale=unit)
 
-    @property
-    def approximate(self) -> bool:
-        """True: an interaction between objects, on top of the model."""
-        return True
-
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
@@ -54,7 +50,7 @@ class ObjectExclusion(AbstractPropagation):
         means = mixture.component_sums(filled * centres) / counts
         shares = jnp.exp(_log_shares(mixture, owners)).astype(centres.dtype)
         squares = jnp.sum((centres[:, None] - means[None]) ** 2, axis=-1)
-        nearness = shares[None] * jnp.exp(-squares / (2 * self.radius**2))
+        nearness = shares[None] * self.nearness(squares)
         others = states.reference[:, None] != owners[None]
         total = jnp.sum(jnp.where(others, nearness, 0.0), axis=1)
         penalty = self.strength * total.astype(mixture.log_weights.dtype)
@@ -64,11 +60,11 @@ class ObjectExclusion(AbstractPropagation):
 class PruneHypotheses(AbstractPropagation):
     """Empty the components that have become hopeless hypotheses about their object.
 
-    A component dies where its mass is less than `least_share` of the heaviest component's with
+    A component dies if its mass is less than `least_share` of that of the heaviest component with
     the same reference. Within one object the mixture weights are the posterior odds of its
-    hypotheses (Vermaak et al. 2003, eq. 4), so that what is thrown away is at most that share of
-    each object's mass, a component at a time: an approximation, with a bound that you choose.
-    Use it with `Split`, so that hypotheses that came to nothing do not linger.
+    hypotheses (Vermaak et al. 2003, eq. 4). So each component that dies takes away at most this
+    share of its object's mass: an approximation with a bound that you choose. Use it with `Split`,
+    to remove hypotheses that turned out wrong.
 
     Raises `ValueError` for a share outside (0, 1).
     """
@@ -106,7 +102,7 @@ def best_components(
 
 
 def _objects(mixture: ParticleMixture) -> Int[Array, " m"]:
-    """The reference that each component's particles carry, the nearest to their mean."""
+    """The reference of each component: the whole number nearest to its particles' mean."""
     reference = mixture.particles.reference.astype(mixture.log_weights.dtype)
     return jnp.round(mixture.component_averages(reference)).astype(jnp.int32)
 

@@ -1,8 +1,8 @@
 """Recipes for tracking boxes in video by their colours: a PF and an MPF, ready to run.
 
-Each recipe takes the first frame and a box for each object, and gives two filters with the same
+Each recipe takes the first frame and a box for each object. It returns two filters with the same
 model and the same particles at the start: a particle filter of 200 particles, and a mixture
-particle filter of at most 10 components of 20. `PRESETS` has them by name.
+particle filter of at most 10 components of 20. `PRESETS` has the recipes by name.
 """
 
 from typing import Any
@@ -49,11 +49,11 @@ def paper_filters(
 def default_filters(
     frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
 ) -> dict[str, Filter]:
-    """The recipe that covers most on real video: any component may come to stand for any object.
+    """The recipe that covers most on real video: any component may follow any object.
 
-    A particle is compared with one of the given boxes, and now and then with another, and takes a
-    long step now and then; components exclude each other, part where they straddle two places,
-    and merge only after ten frames on the same one.
+    A particle is compared with one of the given boxes, and sometimes changes to another. Sometimes
+    it takes a long step. Components exclude each other. They split if they cover two places, and
+    merge only after ten frames at the same place.
     """
     size = boxes[:, 2:].mean(axis=0)
     steps = _steps(boxes)
@@ -81,9 +81,9 @@ def objects_filters(
 ) -> dict[str, Filter]:
     """The recipe with the fewest strays and swaps: every component keeps to its object.
 
-    Every particle carries which box it was started from and is compared with that one alone, so
-    that the components of an object are rival hypotheses about it: only those merge, a component
-    splits where they part, and those that came to nothing are pruned. Objects exclude each other.
+    Every particle is compared only with the box that it started from. So the components of an
+    object are rival hypotheses about it. Only components of one object merge, a component splits
+    where hypotheses diverge, and hopeless ones are pruned. Objects exclude each other.
     """
     return _objects(frame, boxes, MAX_COMPONENTS)
 
@@ -113,7 +113,7 @@ def _own_references(frame: np.ndarray, boxes: np.ndarray, **options: Any) -> Col
 
 
 def _steps(boxes: np.ndarray) -> np.ndarray:
-    """Deviations of the random walk: 0.4 widths and 0.08 heights of each box, sizes hardly any."""
+    """Deviations of the random walk: 0.4 widths, 0.08 heights of each box; sizes hardly change."""
     still = np.full(len(boxes), 0.01)
     return np.stack([0.4 * boxes[:, 2], 0.08 * boxes[:, 3], still, still], axis=1)
 

@@ -1,4 +1,4 @@
-"""A rendered football scene with true boxes, for tracking without a video at hand."""
+"""A rendered football scene with true boxes, for tracking without a video."""
 
 from typing import NamedTuple
 
@@ -27,9 +27,9 @@ class Scene(NamedTuple):
 
     - `frames`: RGB, shape (t, h, w, 3).
     - `tracks`: rows (frame, id, x, y, w, h) of every player's true box, in MOTChallenge form:
-      frames count from 1, (x, y) is the top-left corner in pixels, and a box is given whether or
-      not another player hides it.
-    - `kits`: the kit of each player by id, 0 for the players to be tracked and 1 for the others.
+      frames count from 1, and (x, y) is the top-left corner in pixels. A player who is hidden by
+      another has a box too.
+    - `kits`: the kit of each player by id, 0 for the players to track and 1 for the others.
     """
 
     frames: UInt8[np.ndarray, "t h w 3"]
@@ -61,7 +61,7 @@ class _Camera(NamedTuple):
         u = np.arange(self.width, dtype=np.float32)[None, :, None] + 0.5 - self.width / 2
         v = self.height / 2 - np.arange(self.height, dtype=np.float32)[:, None, None] - 0.5
         rays = self.focal * forward + u * right + v * up
-        # Rays at or above the horizon meet nothing; what is drawn there covers them.
+        # Rays at or above the horizon meet no ground; other things are drawn there.
         reach = _CAMERA_HEIGHT / np.maximum(-rays[:, :, 2], np.float32(1e-3))
         return reach * rays[:, :, 0], reach * rays[:, :, 1], reach
 
@@ -86,10 +86,10 @@ def football_scene(
 ) -> Scene:
     """Render players of two teams on a pitch, seen by a camera that pans with the play.
 
-    Players of a team look alike but for skin and hair. Every couple of seconds, at 12 frames a
-    second, two of a team change places and cross on the way. The players to be tracked, of kit 0,
-    have the ids from 1 on; their opponents follow. The same key gives the same scene. With
-    `still_camera` the camera stays where it first looks, as detection of what moves needs it.
+    Players of a team differ only in skin and hair. About every two seconds, at 12 frames a second,
+    two players of a team change places and cross on the way. The players to track, of kit 0, have
+    the ids from 1 on; the ids of their opponents follow. The same key gives the same scene. With
+    `still_camera` the camera does not move, as detection of moving objects needs it.
 
     Raises `ValueError` for no frames, no pixels, fewer than one player or a negative number of
     opponents.

@@ -36,9 +36,9 @@ def follow(
     """Run a filter of boxes online, once for each key, and yield a snapshot for each frame.
 
     The filter's model has a method `boxes(states)`, as `ColourModel` does. A frame is read only
-    when the one before it is done, so that a camera will do. Raises `TypeError` for a filter that
-    is none and `ValueError` for keys that are no stack of keys. Use it with the `PRESETS`, and
-    `track_rows` to make tracks of what it yields.
+    when the one before it is done, so frames may come from a camera. Raises `TypeError` for
+    something that is no filter, and `ValueError` for keys that are not a stack of keys. Use it with
+    the `PRESETS`, and `track_rows` to make tracks of the snapshots.
     """
     check_type(Filter, "a Filter", filter=filter)
     check_key(keys, "keys", batch=True)
@@ -48,7 +48,7 @@ def follow(
 def _follow(filter: Filter, keys: Array, frames: Iterable[np.ndarray]) -> Iterator[Snapshot]:
     mixtures = jax.vmap(filter.init)(keys)
     for t, frame in enumerate(frames):
-        step = jnp.asarray(t)  # an array, since a new Python number would compile anew
+        step = jnp.asarray(t)  # an array: a new Python number would compile again
         mixtures, snapshot = _advance(filter, keys, step, mixtures, jnp.asarray(frame))
         yield jax.tree.map(np.asarray, snapshot)
 
@@ -62,7 +62,7 @@ def _advance(filter, keys, t, mixtures, frame):
         means = mixture.component_averages(places)
         return mixture, Snapshot(means, mixture.active, places[:, :2], labels)
 
-    # The frame is not mapped over, so that its histogram is built once for all runs.
+    # The frame is not mapped over, so its histogram is built once for all runs.
     return jax.vmap(step)(keys, mixtures)
 
 
@@ -86,7 +86,7 @@ def track_rows(
             if m not in alive:
                 alive[m], next_id = next_id, next_id + 1
             rows.append([frame, alive[m], *box_files.top_left(mean[None])[0]])
-    # Rounded as the file is, so that scores from the file are the scores.
+    # Rounded as in the file, so that scores from the file are the same.
     return np.round(np.array(rows, float).reshape(-1, 6), 3)
 
 

@@ -18,7 +18,7 @@ from mpfjax.vision.histograms import bhattacharyya, normalise
 
 
 class SoftColourModel(AbstractBoxModel):
-    """Boxes known by their colours, with a likelihood that is smooth in everything.
+    """Boxes recognised by their colours, with a likelihood that is smooth in all its arguments.
 
     L(y | x) ∝ exp(-λ Σ_c B²(h^c, h_ref^c)), as in `ColourModel` with λ = 1 / 2σ², where the
     histograms h are those of `soft_histograms`. h and h_ref are mixed with the uniform histogram,
@@ -27,7 +27,7 @@ class SoftColourModel(AbstractBoxModel):
 
     An observation is an RGB frame (h, w, 3), uint8 or floating point in [0, 256). Make one with
     `from_frame`. Use it to tune λ, the reference and the bandwidth (`maximise` with a
-    `LabelLikelihood`), or where the derivative in the box is wanted; `ColourModel` is faster.
+    `LabelLikelihood`), or where you need the derivative in the box. `ColourModel` is faster.
 
     - `reference_boxes`, `dynamics`, `initial_deviations`, `switch_probability`: see `ColourModel`.
     - `reference_logits`: (k, parts, 3, bins), whose softmax over the bins is h_ref.
@@ -136,14 +136,14 @@ def soft_histograms(
     num_points: int = 10,
     num_parts: int = 1,
 ) -> Float[Array, "n parts 3 bins"]:
-    """How many of K x K points in each box have each shade of red, green and blue, in shares.
+    """The shares of K x K points in each box that have each shade of red, green and blue.
 
-    The points are the centres of K x K cells of the box; the frame's colours there are
-    interpolated linearly from the four pixels around, as in a spatial transformer (Jaderberg et
-    al. 2015), and each shade counts in bin b with the share of it that a triangular kernel of
-    half-width `bandwidth` (in bins) puts there: bins sum to one a point, and the hard histogram is
-    the limit as the bandwidth goes to zero and a point falls on every pixel. Smooth in the boxes,
-    the frame and the bandwidth, but for kinks where a point crosses from pixel to pixel.
+    The points are the centres of K x K cells of the box. The frame's colours there are interpolated
+    linearly from the four pixels around, as in a spatial transformer (Jaderberg et al. 2015). Each
+    shade is spread over the bins by a triangular kernel of half-width `bandwidth` (in bins), with a
+    sum of one for each point. As the bandwidth goes to zero, with a point on every pixel, the
+    limit is the hard histogram. It is smooth in the boxes, the frame and the bandwidth, apart from
+    kinks where a point moves from one pixel to the next.
 
     Boxes are (x, y, w, h) about their centre, in pixels; points outside the frame do not count,
     those within half a pixel of its edge count in part. Bands run from top to bottom. A box that
@@ -215,15 +215,15 @@ def _soft_bins(
     values: Float[Array, "*batch"], num_bins: int, bandwidth: Float[Array, ""]
 ) -> Float[Array, "*batch bins"]:
     """The mass that a triangular kernel about each value, in [0, 256), has in each bin."""
-    # Whole values stay clear of the bins' edges, as far as they can: in the limit each counts
-    # where v num_bins // 256 puts it.
+    # Whole values are kept away from the edges of the bins, as far as possible. So in the limit
+    # each counts in bin v num_bins // 256.
     clear = math.gcd(num_bins, 256) / 2
     places = (values * num_bins + clear) / 256
     edges = jnp.arange(1, num_bins, dtype=values.dtype)
     edges = edges.reshape(*[1] * values.ndim, num_bins - 1)
     z = jnp.clip((edges - places[..., None]) / bandwidth, -1.0, 1.0)
     below = 0.5 + z - 0.5 * z * jnp.abs(z)
-    # What the kernel has beyond the first and last bin is theirs.
+    # The mass of the kernel outside all bins goes to the first and the last bin.
     ends = [(0, 0)] * values.ndim
     return jnp.diff(
         jnp.pad(jnp.pad(below, [*ends, (1, 0)]), [*ends, (0, 1)], constant_values=1.0), axis=-1

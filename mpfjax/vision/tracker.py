@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt8
 
-from mpfjax.checks import check_flag, check_positive, check_type, check_whole, given
+from mpfjax.checks import check_flag, check_positive, check_type, check_whole, given, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractRejuvenation
 from mpfjax.moves.gaussian import GaussianRegeneration
@@ -145,6 +145,8 @@ class ObjectTracker(eqx.Module):
             )
         check_type(Iterable, "a sequence of moves", moves=moves)
         self.moves = tuple(moves)
+        if not self.moves:
+            raise ValueError(f"moves: {shown(moves)} holds none, and a tracker needs some")
         for move in self.moves:
             check_type(AbstractMove, "a sequence of moves", moves=move)
             if isinstance(move, AbstractRejuvenation):

@@ -2,16 +2,13 @@
 
 import pytest
 
-from benchmarks import (
-    gm_mpf,
-    histograms,
-    interacting_objects,
-    likelihood_tuning,
-    partitioned_sampling,
-    peers,
-    scaling,
-    score_vs_particles,
-)
+from benchmarks import histograms, score_vs_particles
+from benchmarks.gm_mpf import __main__ as gm_mpf
+from benchmarks.interacting_objects import __main__ as interacting_objects
+from benchmarks.likelihood_tuning import __main__ as likelihood_tuning
+from benchmarks.partitioned_sampling import __main__ as partitioned_sampling
+from benchmarks.peers import __main__ as peers
+from benchmarks.scaling import __main__ as scaling
 from benchmarks.visual_tracking import __main__ as visual_tracking
 
 COUNTS = {
@@ -19,7 +16,7 @@ COUNTS = {
     histograms: ["boxes", "size", "repeats"],
     interacting_objects: ["runs"],
     likelihood_tuning: ["runs", "particles", "starts", "steps", "label-runs", "label-steps"],
-    partitioned_sampling: ["runs", "particles", "stretch"],
+    partitioned_sampling: ["runs", "particles", "scenes", "event"],
     peers: ["particles", "seeds", "repeats", "devices"],
     scaling: ["islands", "repeats", "devices", "processes"],
     score_vs_particles: ["seeds", "particles"],
@@ -73,13 +70,10 @@ def test_a_number_that_will_not_do_is_named(benchmark_, option, value, capsys):
         (likelihood_tuning, ["--parts", "b", "c", "--models", "quadratic"], "models"),
         (likelihood_tuning, ["--parts", "a", "--starts", 3], "starts"),
         (likelihood_tuning, ["--parts", "a", "b", "--label-steps", 3], "label-steps"),
-        (partitioned_sampling, ["--stretch", 2], "stretch"),
-        (partitioned_sampling, ["--sequence", "here", "--stretch", 1], "stretch"),
-        (
-            partitioned_sampling,
-            ["--sequence", "pets09_s2l1", "--ids", 1, "--stretch", 1],
-            "stretch",
-        ),
+        (partitioned_sampling, ["--event", 2], "event"),
+        (partitioned_sampling, ["--sequence", "here", "--ids", 1, "--event", 1], "event"),
+        (partitioned_sampling, ["--sensitivity", "--lambdas", 30], "lambdas"),
+        (partitioned_sampling, ["--keys", "3:5", "--scenes", 2], "scenes"),
         (partitioned_sampling, ["--sequence", "here", "--scene", 3], "scene"),
     ],
 )

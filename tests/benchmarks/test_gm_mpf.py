@@ -6,7 +6,10 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks import gm_mpf
+from benchmarks.gm_mpf import __main__ as gm_mpf
+from benchmarks.gm_mpf import sizes
+from benchmarks.gm_mpf.filters import make_model
+from benchmarks.gm_mpf.runs import Collect, Step, held, study
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision.colour_model import BoxState
 
@@ -19,7 +22,7 @@ def few(monkeypatch):
         ("TIMED_PARTICLES", 20), ("TIMED_FRAMES", 2), ("WARM_UP", 1),
         ("REFERENCE_PARTICLES", 40), ("REFERENCE_RUNS", 1),
     ):  # fmt: skip
-        monkeypatch.setattr(gm_mpf, name, value)
+        monkeypatch.setattr(sizes, name, value)
 
 
 @pytest.fixture(scope="module")
@@ -114,8 +117,8 @@ def test_a_target_is_held_by_its_own_particles_on_it():
     target = np.tile([0, 0, 1, 1], (3, 10, 1))
     centres[1, 9, 2:, 0] += 16.0
     target[2, :, 2:] = 0
-    step = gm_mpf.Step(np.zeros((3, 10, 2, 2)), np.zeros((3, 10)), centres, target)
-    np.testing.assert_array_equal(gm_mpf.held(step, truth), [True, False, False])
+    step = Step(np.zeros((3, 10, 2, 2)), np.zeros((3, 10)), centres, target)
+    np.testing.assert_array_equal(held(step, truth), [True, False, False])
 
 
 @pytest.mark.parametrize("labels", [[0, 0, 1, 1], [1, 1, 0, 0]])
@@ -133,7 +136,7 @@ def test_an_estimate_is_that_of_the_component_its_target_began(labels, blocks):
     )  # fmt: skip
     still = np.full((60, 80, 3), 90, np.uint8)
     boxes = np.array([[5.0, 5, 10, 20], [40.0, 5, 10, 20]])
-    found = gm_mpf.Collect(gm_mpf.make_model(still, boxes))(mixture)
+    found = Collect(make_model(still, boxes))(mixture)
     np.testing.assert_allclose(found.estimates, [[17.5, 10.0], [35.0, 10.0]], rtol=1e-6)
     sizes = 1 / (0.25**2 + 0.75**2) + 2
     np.testing.assert_allclose(found.effective_sample_size, sizes, rtol=1e-6)
@@ -148,6 +151,6 @@ def blocks():
 def test_the_mixtures_hold_both_pedestrians(data, monkeypatch):
     monkeypatch.setenv("MPFJAX_DATA", str(data))
     targets = gm_mpf.open_targets(gm_mpf.parse_arguments(["--frames", "129:165"]))
-    found = gm_mpf.study(targets, [100], 3, 0, lambda: None, ("pf", "gm_mpf"))
-    assert gm_mpf.held(found["gm_mpf"][100], targets.truth).all()
-    assert not gm_mpf.held(found["pf"][100], targets.truth).any()
+    found = study(targets, [100], 3, 0, lambda: None, ("pf", "gm_mpf"))
+    assert held(found["gm_mpf"][100], targets.truth).all()
+    assert not held(found["pf"][100], targets.truth).any()

@@ -9,33 +9,36 @@ import pytest
 from scipy.stats import binomtest
 
 import mpfjax
-from benchmarks import interacting_objects as benchmark
+from benchmarks.interacting_objects import __main__ as benchmark
+from benchmarks.interacting_objects import scenes
+from benchmarks.interacting_objects.methods import estimates
+from benchmarks.interacting_objects.results import wilson
 
 KEY = jax.random.key(0)
 
 
 def test_the_lost_object_comes_back_where_the_constants_say():
-    scene = benchmark.lost_object(KEY)
-    last, back = benchmark.LOST.start - 1, benchmark.LOST.stop
+    scene = scenes.lost_object(KEY)
+    last, back = scenes.LOST.start - 1, scenes.LOST.stop
     path = np.asarray(scene.places[:, 3])
-    assert np.linalg.norm(path[back] - path[last]) == pytest.approx(benchmark.JUMP, rel=1e-4)
+    assert np.linalg.norm(path[back] - path[last]) == pytest.approx(scenes.JUMP, rel=1e-4)
     own = np.asarray(scene.seen["heights"])[:, 3, 3]
-    assert (own[benchmark.LOST] == 0).all()
-    assert (own == 1).sum() == benchmark.NUM_FRAMES - (back - benchmark.LOST.start)
+    assert (own[scenes.LOST] == 0).all()
+    assert (own == 1).sum() == scenes.NUM_FRAMES - (back - scenes.LOST.start)
 
 
 def test_the_distracter_covers_its_object_and_leads_away():
-    scene = benchmark.distracted_object(KEY)
+    scene = scenes.distracted_object(KEY)
     places, heights = scene.seen["places"][:, 0], scene.seen["heights"][:, 0]
     there = np.flatnonzero(heights[:, -1])
     assert there.tolist() == list(range(3, 9))
     gaps = np.linalg.norm(places[:, -1] - scene.places[3, 0][None], axis=1)
-    np.testing.assert_allclose(gaps[there], benchmark.LEAD * np.arange(6), atol=1e-3)
-    assert float(heights[5, 0]) == pytest.approx(benchmark.LIKENESS)
+    np.testing.assert_allclose(gaps[there], scenes.LEAD * np.arange(6), atol=1e-3)
+    assert float(heights[5, 0]) == pytest.approx(scenes.LIKENESS)
 
 
 def test_a_pair_passes_without_sharing_a_place():
-    places = np.asarray(benchmark.crossing_pairs(KEY).places)
+    places = np.asarray(scenes.crossing_pairs(KEY).places)
     gaps = np.linalg.norm(places[:, 0] - places[:, 1], axis=1)
     assert gaps.min() > 12
     assert gaps[[0, -1]].min() > 70
@@ -51,7 +54,7 @@ def test_medians_count_weights():
         ancestor_indices=jnp.arange(3, dtype=jnp.int32),
         num_components=1,
     )
-    found = benchmark.estimates(mixture)
+    found = estimates(mixture)
     assert found["median"].tolist() == [[3.0, 0.0]]
     np.testing.assert_allclose(found["mean"], [[2.3, 2.2]], rtol=1e-5)
 
@@ -59,7 +62,7 @@ def test_medians_count_weights():
 @pytest.mark.parametrize(("hits", "runs"), [(0, 20), (13, 20), (200, 200)])
 def test_intervals_are_wilsons(hits, runs):
     expected = binomtest(hits, runs).proportion_ci(0.95, "wilson")
-    low, high = benchmark.wilson(hits / runs, runs)
+    low, high = wilson(hits / runs, runs)
     np.testing.assert_allclose([low, high], [expected.low, expected.high], atol=1e-4)
 
 

@@ -8,10 +8,11 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks import peers
-from benchmarks.peer_jobs import JOBS
-from benchmarks.peer_libraries import jax_functions, model_of, prepare
-from benchmarks.peer_worker import Worker
+from benchmarks.peers import __main__ as peers
+from benchmarks.peers.comparison import disagreement
+from benchmarks.peers.jobs import JOBS
+from benchmarks.peers.libraries import jax_functions, model_of, prepare
+from benchmarks.peers.worker import Worker
 from mpfjax.exact import kalman_filter
 
 # They are no part of the tests' own extra: particles 0.4 would take numpy and JAX back.
@@ -63,11 +64,11 @@ def test_plain_functions_are_those_of_the_model(job):
 @pytest.mark.parametrize("job", JOBS.values(), ids=list(JOBS))
 def test_particles_weighs_like_the_model(job):
     pytest.importorskip("particles", reason=NO_RIVAL)
-    from benchmarks import peer_particles
+    from benchmarks.peers import through_particles
 
     kinds = {
-        JOBS["quadratic"]: peer_particles.QuadraticFeynmanKac,
-        JOBS["constant_velocity"]: peer_particles.ConstantVelocityFeynmanKac,
+        JOBS["quadratic"]: through_particles.QuadraticFeynmanKac,
+        JOBS["constant_velocity"]: through_particles.ConstantVelocityFeynmanKac,
     }
     states = np.random.default_rng(0).standard_normal((50, *job.state_shape))
     observation = jax.numpy.asarray(job.observations[3])
@@ -103,7 +104,7 @@ def made_up(log_likelihood=-10.0, size=50.0, spread=0.3):
 
 
 def test_the_same_numbers_agree():
-    assert peers.disagreement(made_up(-10.1, 50.2), made_up(), exact=-10.0) is None
+    assert disagreement(made_up(-10.1, 50.2), made_up(), exact=-10.0) is None
 
 
 @pytest.mark.parametrize(
@@ -116,12 +117,12 @@ def test_the_same_numbers_agree():
     ],
 )
 def test_other_numbers_are_refused(found, reference, reason):
-    assert reason in peers.disagreement(found, reference, exact=-10.0)
+    assert reason in disagreement(found, reference, exact=-10.0)
 
 
 def test_estimates_that_spread_much_are_held_against_the_reference_only():
     wide = made_up(log_likelihood=-30, spread=4.0)
-    assert peers.disagreement(wide, wide, exact=-10.0) is None
+    assert disagreement(wide, wide, exact=-10.0) is None
 
 
 class Scripted:

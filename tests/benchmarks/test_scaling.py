@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import mpfjax
-from benchmarks import scaling
+from benchmarks.scaling import __main__ as scaling
+from benchmarks.scaling import cells, spread
 
 ONLY_AXES = ["--devices", "--processes"]
 
@@ -14,12 +15,12 @@ ONLY_AXES = ["--devices", "--processes"]
 @pytest.mark.parametrize("power", [0.0, 0.5, 1.0, 2.0])
 def test_the_slope_of_a_power_law_is_its_power(power):
     sizes = [10, 40, 90, 1000]
-    assert scaling.fit_slope(sizes, [3 * size**power for size in sizes]) == pytest.approx(power)
+    assert cells.fit_slope(sizes, [3 * size**power for size in sizes]) == pytest.approx(power)
 
 
 def test_one_size_has_no_slope():
-    assert scaling.fit_slope([10], [1.0]) is None
-    assert scaling.fit_slope([10, 10], [1.0, 2.0]) is None
+    assert cells.fit_slope([10], [1.0]) is None
+    assert cells.fit_slope([10, 10], [1.0, 2.0]) is None
 
 
 def test_slopes_are_found_for_each_filter_and_at_the_end():
@@ -29,7 +30,7 @@ def test_slopes_are_found_for_each_filter_and_at_the_end():
         for name, start in (("pf", 0.0), ("mpf", 100.0))
         for size in (10, 1000, 100_000)
     ]
-    pf, mpf = scaling.slopes_of("seeds", entries)
+    pf, mpf = cells.slopes_of("seeds", entries)
     assert (pf["filter"], mpf["filter"]) == ("pf", "mpf")
     assert pf["time"] == pytest.approx(1)
     assert mpf["time"] < 0.8
@@ -38,11 +39,11 @@ def test_slopes_are_found_for_each_filter_and_at_the_end():
 
 
 def test_one_axis_is_varied_at_a_time():
-    cells = scaling.cells_of("components", ["pf", "mpf_fixed"], scaling.FULL)
-    assert [cell.components for cell in cells] == [1, 2, 12, 64]
-    assert len({cell._replace(filter="", components=0) for cell in cells}) == 1
-    middle = scaling.Cell("mpf", **scaling.FULL.middle)
-    assert all(middle in scaling.cells_of(axis, ["mpf"], scaling.FULL) for axis in scaling.AXES)
+    found = cells.cells_of("components", ["pf", "mpf_fixed"], cells.FULL)
+    assert [cell.components for cell in found] == [1, 2, 12, 64]
+    assert len({cell._replace(filter="", components=0) for cell in found}) == 1
+    middle = cells.Cell("mpf", **cells.FULL.middle)
+    assert all(middle in cells.cells_of(axis, ["mpf"], cells.FULL) for axis in cells.AXES)
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +57,8 @@ def finished(tmp_path_factory):
 
 def test_every_cell_is_there(finished):
     out, content = finished
-    cells = {(entry["filter"], entry["steps"]) for entry in content["results"]}
-    assert cells == {("pf", 4), ("pf", 8)}
+    found = {(entry["filter"], entry["steps"]) for entry in content["results"]}
+    assert found == {("pf", 4), ("pf", 8)}
     assert all(len(entry["seconds"]) == 2 for entry in content["results"])
     assert [slope["filter"] for slope in content["slopes"]] == ["pf"]
     assert content["spread"] == []
@@ -75,14 +76,14 @@ def test_memory_does_not_depend_on_the_steps_where_nothing_is_collected(finished
 
 
 def test_memory_grows_with_the_steps_where_all_is_collected(monkeypatch):
-    monkeypatch.setattr(scaling, "nothing", lambda mixture: mixture.particles)
-    program = scaling.compile_cell(scaling.Cell("pf", 2000, 1, 2, steps=50))
-    assert scaling.bytes_of(program) >= 50 * 2000 * 2 * 4
+    monkeypatch.setattr(cells, "nothing", lambda mixture: mixture.particles)
+    program = cells.compile_cell(cells.Cell("pf", 2000, 1, 2, steps=50))
+    assert cells.bytes_of(program) >= 50 * 2000 * 2 * 4
 
 
-@pytest.mark.parametrize("name", scaling.FILTERS)
+@pytest.mark.parametrize("name", cells.FILTERS)
 def test_a_filter_has_the_size_that_its_cell_says(name):
-    filter, observations = scaling.build(scaling.Cell(name, 64, 4, 2, 5))
+    filter, observations = cells.build(cells.Cell(name, 64, 4, 2, 5))
     assert isinstance(filter, mpfjax.Filter)
     assert filter.num_particles == 64
     assert filter.num_components == (1 if name == "pf" else 4)
@@ -90,10 +91,10 @@ def test_a_filter_has_the_size_that_its_cell_says(name):
 
 
 def test_processes_share_the_seeds():
-    found = scaling.spread_over("processes", [2], {"particles": 16, "seeds": 3}, repeats=1)
+    found = spread.spread_over("processes", [2], {"particles": 16, "seeds": 3}, repeats=1)
     assert [(entry["kind"], entry["number"]) for entry in found] == [("processes", 2)]
     assert found[0]["median"] > 0
-    assert "processes (PF, N = 16, 3 seeds)" in scaling.spread_table(
+    assert "processes (PF, N = 16, 3 seeds)" in spread.spread_table(
         "processes", found, {"particles": 16, "seeds": 3}
     )
 

@@ -21,7 +21,7 @@ def test_uniqueness_counts_what_differs_in_any_part_of_an_objects_state():
     np.testing.assert_allclose(boxes, [5 / 6, 2 / 6, 1 / 6], rtol=1e-6)
     both = uniqueness(mixture.replace(particles=(mixture.particles, age)))
     np.testing.assert_allclose(both, boxes, rtol=1e-6)
-    five_slots = mixture.replace(limit=jnp.array(5, jnp.int32))
+    five_slots = mixture.replace(usable_slots=jnp.array(5, jnp.int32))
     np.testing.assert_allclose(uniqueness(five_slots), boxes * 6 / 5, rtol=1e-6)
     full = mixture.replace(particles=(mixture.particles, age), log_weights=jnp.zeros(6))
     np.testing.assert_allclose(uniqueness(full), [1.0, 3 / 6, 2 / 6], rtol=1e-6)

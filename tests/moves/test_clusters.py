@@ -12,7 +12,7 @@ import pytest
 import mpfjax
 from mpfjax import MultiObjectModel, PairwiseRepulsion, PropagateInClusters
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.clusters import _components
+from mpfjax.moves.contact import connected
 from tests.examples import stack, walker
 
 KEY = jax.random.key(0)
@@ -221,8 +221,8 @@ class TestClusters:
         links = np.zeros((6, 6), bool)
         for i, j in ((0, 3), (3, 5), (1, 4)):
             links[i, j] = links[j, i] = True
-        assert _components(jnp.asarray(links)).tolist() == [0, 1, 2, 0, 1, 0]
-        assert _components(jnp.zeros((1, 1), bool)).tolist() == [0]
+        assert connected(jnp.asarray(links)).tolist() == [0, 1, 2, 0, 1, 0]
+        assert connected(jnp.zeros((1, 1), bool)).tolist() == [0]
 
     def test_who_touches_merges_and_stays(self):
         """Object 2 touches 0 and 3, which do not touch each other."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mpfjax import Resample
-from mpfjax.moves.resampling import _sorted_points
+from mpfjax.moves.resampling_schemes import sorted_points
 from mpfjax.moves.slots import place_slots
 from tests.examples import make_mixture
 
@@ -100,7 +100,7 @@ class TestAtScale:
         """Not with random draws, nor with uniform draws at their ends."""
         for kind in KINDS:
             mixture = large_mixture(kind, 100_000, num_components)
-            for seed, uniform in enumerate((np.nan, np.nan, 0.0, 0.5, NEARLY_ONE)):
+            for seed, uniform in enumerate((np.nan, 0.0, NEARLY_ONE)):
                 key, value = jax.random.key(seed), jnp.asarray(uniform, jnp.float32)
                 assert_sound(mixture, redraw_with(Resample(scheme), key, value, mixture))
 
@@ -261,12 +261,13 @@ def test_soft_resampling_draws_from_the_softened_weights_and_weighs_by_the_ratio
 def test_points_stay_within_their_components_stretch_of_slots():
     """The largest uniform numbers round up onto the border, which is the next component's.
 
-    One resampling in 320 then gave a slot to another component's particle, multinomial or residual.
+    One resampling in 320 then gave a slot to another component's particle, multinomial or residual;
+    the numbers of these three seeds are such.
     """
     targets = jnp.full(4, 25_000, jnp.int32)
     slots = place_slots(targets, 100_000)
-    draw = jax.jit(lambda key: _sorted_points(key, slots, targets, jnp.dtype("float32")))
+    draw = jax.jit(lambda key: sorted_points(key, slots, targets, jnp.dtype("float32")))
     borders = np.asarray(slots.firsts) + 25_000
-    for seed in range(300):
+    for seed in (44, 118, 249):
         points = np.asarray(draw(jax.random.key(seed))).reshape(4, -1)
         assert (points < borders[:, None]).all(), seed

@@ -128,7 +128,7 @@ class TestResuming:
         assert resumed.log_marginal_likelihood == whole.log_marginal_likelihood
 
     def test_what_is_done_is_kept_where_it_is_interrupted(self, tmp_path, monkeypatch):
-        real, path = mpfjax.tuning.climb.scores, tmp_path / "fit.npz"
+        real, path = mpfjax.tuning.ascent.scores, tmp_path / "fit.npz"
         calls = []
 
         def interrupted(*arguments):
@@ -137,7 +137,7 @@ class TestResuming:
                 raise KeyboardInterrupt
             return real(*arguments)
 
-        monkeypatch.setattr(mpfjax.tuning.climb, "scores", interrupted)
+        monkeypatch.setattr(mpfjax.tuning.ascent, "scores", interrupted)
         with pytest.raises(KeyboardInterrupt):
             short_fit(checkpoint=path)
         with np.load(path, allow_pickle=False) as file:

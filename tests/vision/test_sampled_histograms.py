@@ -52,8 +52,15 @@ def test_rows_are_made_up_to_whole_bands():
 
 @pytest.mark.parametrize(
     "box",
-    [[-50, 10, 8, 8], [10, 200, 8, 8], [10, 10, 0, 8], [10, 10, 8, -3], [np.nan, 10, 8, 8]]
-    + [[10, 10, np.inf, 8], [3e9, 10, 8, 8]],
+    [
+        [-50, 10, 8, 8],
+        [10, 200, 8, 8],
+        [10, 10, 0, 8],
+        [10, 10, 8, -3],
+        [np.nan, 10, 8, 8],
+        [10, 10, np.inf, 8],
+        [3e9, 10, 8, 8],
+    ],
 )
 def test_what_is_no_box_in_the_frame_counts_nothing(box):
     table = SampledHistogram(jnp.asarray(FRAME), HSVColours(4, 2, 2))

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Key
+from jaxtyping import Array, Bool, Key, PyTree
 
 from mpfjax.checks import check_whole
 from mpfjax.mixture import ParticleMixture
@@ -25,7 +25,7 @@ class Bury(AbstractMove):
     frames that is not whole, or below 1.
     """
 
-    confirmation: int = eqx.field(static=True, default=2)
+    confirmation: int = eqx.field(static=True, default=3)
     patience: int = eqx.field(static=True, default=20)
 
     def __check_init__(self) -> None:
@@ -36,7 +36,7 @@ class Bury(AbstractMove):
         """True: a component's mass is thrown away."""
         return True
 
-    def initial_memory(self, num_components: int) -> dict[str, Lives]:
+    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
         """Nobody lives yet."""
         nothing = jnp.array([jnp.inf, jnp.inf, -jnp.inf, -jnp.inf])
         return {LIVES: Lives.none(num_components), EXTENT: nothing}

@@ -41,8 +41,8 @@ class RankScores(AbstractMove):
             raise ValueError(
                 f"weak_share: {self.weak_share} is above strong_share, {self.strong_share}"
             )
-        scores = (self.weak_score, self.strong_score)
-        if None not in scores and self.weak_score > self.strong_score:
+        weak = self.weak_score
+        if weak is not None and self.strong_score is not None and weak > self.strong_score:
             raise ValueError(
                 f"weak_score: {self.weak_score} is above strong_score, {self.strong_score}"
             )

@@ -1,0 +1,310 @@
+"""Part c: a colour likelihood tuned on labelled frames, and judged on other frames."""
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array
+from tqdm import tqdm
+
+import mpfjax
+from mpfjax import plotting
+from mpfjax.console import format_table, write_json
+from mpfjax.metrics.coverage import covers
+from mpfjax.metrics.tracking_quality import intersection_area
+from mpfjax.tuning import (
+    LabelLikelihood,
+    Maximisation,
+    Positive,
+    maximise,
+    transition_candidates,
+)
+from mpfjax.vision import (
+    BoxState,
+    SoftColourModel,
+    boxes_around,
+    football_scene,
+    labelled_states,
+    read_frames,
+    read_tracks,
+)
+
+SEQUENCES = ("rendered", "otb_jogging", "vot_basketball")
+LAST_FRAME = {"rendered": 120, "otb_jogging": 307, "vot_basketball": 300}
+FILTERS = ("pf", "mpf")
+NUM_PARTICLES, MAX_COMPONENTS = 100, 5
+NUM_BINS, NUM_POINTS, NUM_PARTS = 16, 8, 2
+# Of the random walk, in widths and heights of the box, and of its scales.
+STEPS = (0.25, 0.08, 0.01, 0.01)
+# From the dynamics, over the neighbourhood, and on the label in other sizes, so many of each.
+CANDIDATES, NEAR = 16, 0.2
+FRAMES_A_STEP = 8
+CLIMB_STEPS = 60
+RATE = 0.03
+KINDS = ("first", "last", "tuned")
+LEGENDS = ("reference of the first frame", "of the last labelled frame", "tuned")
+
+
+class Labelled(NamedTuple):
+    """Consecutive frames with the true boxes of k objects, (x, y, w, h) of (t, k, 4)."""
+
+    frames: np.ndarray
+    boxes: np.ndarray
+
+
+def read_labelled(name: str, seed: int) -> Labelled:
+    """The scene, or the first frames of a sequence; `FileNotFoundError` where it is absent."""
+    last = LAST_FRAME[name]
+    if name == "rendered":
+        scene = football_scene(jax.random.key(seed), last)
+        frames, rows = scene.frames, scene.tracks
+        ids = [id for id, kit in scene.kits.items() if kit == 0]
+    else:
+        folder = Path(os.environ.get("MPFJAX_DATA", "../shared/data")) / name
+        if not folder.is_dir():
+            raise FileNotFoundError(f"{folder}: no such sequence")
+        frames, rows = np.stack(list(read_frames(folder, 1, last))), read_tracks(folder / "gt.txt")
+        ids = sorted(set(rows[rows[:, 0] <= last, 1]))
+    boxes = [[rows[(rows[:, 0] == t) & (rows[:, 1] == id)][0, 2:] for id in ids]
+             for t in range(1, last + 1)]  # fmt: skip
+    return Labelled(frames, np.array(boxes))
+
+
+def untuned_model(labelled: Labelled, template: int) -> SoftColourModel:
+    """References from the frame `template`, σ = 0.15 as in the paper; x_0 in the last frame."""
+
+    def learn(frame: np.ndarray, boxes: np.ndarray) -> SoftColourModel:
+        size = np.concatenate([boxes[:, 2:], np.ones_like(boxes[:, 2:])], axis=1)
+        return SoftColourModel.from_frame(
+            frame,
+            boxes,
+            num_bins=NUM_BINS,
+            num_points=NUM_POINTS,
+            num_parts=NUM_PARTS,
+            deviations=size * np.array(STEPS),
+        )
+
+    looks = learn(labelled.frames[template], labelled.boxes[template]).reference_logits
+    model = learn(labelled.frames[-1], labelled.boxes[-1])
+    return eqx.tree_at(lambda m: m.reference_logits, model, looks)
+
+
+def tune(key: Array, model: SoftColourModel, labelled: Labelled, num_steps: int) -> Maximisation:
+    """λ, the bandwidth and the references, by the conditional likelihood of the labels."""
+    key_drawn, key_around, key_near, key_climb = jax.random.split(key, 4)
+    states = labelled_states(model, labelled.boxes)
+    present = jax.tree.map(lambda leaf: leaf[1:], states)
+    rivals = jax.tree.map(
+        lambda *leaves: jnp.concatenate(leaves, axis=2),
+        transition_candidates(key_drawn, model, states, CANDIDATES),
+        boxes_around(key_around, model, present, CANDIDATES),
+        boxes_around(key_near, model, present, CANDIDATES, reach=NEAR),
+    )
+    frames = jnp.asarray(labelled.frames[1:])
+    objective = LabelLikelihood(frames, present, rivals, min(FRAMES_A_STEP, len(frames)))
+    return maximise(
+        key_climb,
+        objective,
+        model,
+        optax.adam(optax.cosine_decay_schedule(RATE, num_steps)),
+        num_steps,
+        parameters={
+            "lambda": lambda m: m.lambda_,
+            "bandwidth": lambda m: m.bandwidth,
+            "references": lambda m: m.reference_logits,
+        },
+        transforms={"lambda": Positive(), "bandwidth": Positive()},
+        progress=False,
+    )
+
+
+def filters_of(size: np.ndarray) -> dict[str, Callable[[SoftColourModel], mpfjax.Filter]]:
+    """Both filters of one object, as functions of its model."""
+    where: dict[str, Any] = {"features": centre, "scale": tuple(size.tolist())}
+
+    def mixture(model: SoftColourModel) -> mpfjax.Filter:
+        return mpfjax.mixture_particle_filter(
+            model,
+            NUM_PARTICLES,
+            MAX_COMPONENTS,
+            merge=mpfjax.Merge(None, 0.5, **where),
+            split=mpfjax.Split(4.0, 0.5, min_share=0.15, **where),
+            kmeans=mpfjax.KMeans(5, **where),
+            initial_kmeans=mpfjax.KMeans(5, reseed=True, **where),
+        )
+
+    return {"pf": lambda model: mpfjax.particle_filter(model, NUM_PARTICLES), "mpf": mixture}
+
+
+def centre(states: BoxState) -> Array:
+    """What boxes are grouped by."""
+    return states.box[:, :2]
+
+
+@eqx.filter_jit
+def follow(
+    build: Callable[[SoftColourModel], mpfjax.Filter],
+    model: SoftColourModel,
+    keys: Array,
+    frames: Array,
+) -> Array:
+    """The heaviest component's mean box in every frame, (runs, t, k, 4), each object on its own."""
+
+    def of_one(model: SoftColourModel, key: Array) -> Array:
+        model = jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[None], model)
+
+        def place(mixture: mpfjax.ParticleMixture) -> Array:
+            means = mixture.component_averages(model.boxes(mixture.particles))
+            mean = means[jnp.argmax(mixture.log_mixture_weights)]
+            return jnp.concatenate([mean[:2] - 0.5 * mean[2:], mean[2:]])
+
+        return mpfjax.run_filter(key, build(model), frames, place).collected
+
+    per_object = jax.tree.map(lambda leaf: None if leaf.ndim == 0 else 0, model)
+    k = model.reference_boxes.shape[0]
+    of_all = eqx.filter_vmap(of_one, in_axes=(per_object, 0), out_axes=1)
+    return jax.lax.map(lambda key: of_all(model, jax.random.split(key, k)), keys)
+
+
+def overlaps(estimates: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Intersection over union of boxes, (runs, t, k)."""
+    common = np.asarray(intersection_area(jnp.asarray(estimates), jnp.asarray(truth[None])), float)
+    union = np.prod(estimates[..., 2:], axis=-1) + np.prod(truth[None, ..., 2:], axis=-1) - common
+    return common / union
+
+
+def covered(estimates: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Whether each box covers its object, (runs, t, k)."""
+    pairs = [
+        [covers(boxes, true).diagonal() for boxes, true in zip(run, truth, strict=True)]
+        for run in estimates
+    ]
+    return np.array(pairs, float)
+
+
+def run_labels(options: Any, out: Path) -> None:
+    """Tune and judge on every sequence that there is."""
+    results: list[dict[str, Any]] = []
+    panels: list[tuple[str, dict[str, np.ndarray], int]] = []
+    for name in tqdm(options.sequences, disable=not sys.stderr.isatty(), unit="sequence"):
+        try:
+            labelled = read_labelled(name, options.seed)
+        except FileNotFoundError as error:
+            print(f"{name} left out: {error}", file=sys.stderr)
+            continue
+        entries, curves, first = judge(name, labelled, options)
+        results += entries
+        named: dict[str, np.ndarray] = dict(
+            zip(LEGENDS, (curves[kind] for kind in KINDS), strict=True)
+        )
+        panels.append((f"{name}, {FILTERS[-1].upper()}", named, first))
+        write_json(out / "labels.json", {"settings": settings_of(options), "results": results})
+    if not results:
+        raise FileNotFoundError("--sequences: none of them is there")
+    print(as_label_table(results))
+    plotting.draw_overlaps(panels).savefig(out / "overlaps.png", dpi=150)
+
+
+def judge(
+    name: str, labelled: Labelled, options: Any
+) -> tuple[list[dict[str, Any]], dict[str, np.ndarray], int]:
+    """Entries of the results, the MPF's overlap over frames, and the first held-out frame."""
+    half = len(labelled.frames) // 2
+    seen = Labelled(labelled.frames[:half], labelled.boxes[:half])
+    key_tuning, key_runs = jax.random.split(jax.random.key(options.seed))
+    first, last = untuned_model(seen, 0), untuned_model(seen, -1)
+    run = tune(key_tuning, first, seen, options.label_steps)
+    models = dict(zip(KINDS, (first, last, run.model), strict=True))
+    frames, truth = jnp.asarray(labelled.frames[half:]), labelled.boxes[half:]
+    keys = jax.random.split(key_runs, options.label_runs)
+    builders = filters_of(seen.boxes[-1, :, 2:].mean(axis=0))
+    climb = {
+        "lambda": [float(first.lambda_), float(run.model.lambda_)],
+        "bandwidth": [float(first.bandwidth), float(run.model.bandwidth)],
+        "label_log_posterior": run.history["value"].round(4).tolist(),
+        "references": {
+            kind: np.asarray(model.references, float).round(4).tolist()
+            for kind, model in models.items()
+        },
+    }
+    entries: list[dict[str, Any]] = []
+    curves: dict[str, np.ndarray] = {}
+    for filter in FILTERS:
+        scores = {}
+        for kind, model in models.items():
+            estimates = np.asarray(follow(builders[filter], model, keys, frames), float)
+            overlap = overlaps(estimates, truth)
+            scores[kind] = {"coverage": covered(estimates, truth), "overlap": overlap}
+            curves[kind] = overlap.mean(axis=2)
+        entry = {"sequence": name, "filter": filter, "first_frame": half + 1}
+        entry |= compare_scores(scores)
+        entry["overlap_by_frame"] = {
+            kind: values.mean(axis=0).round(4).tolist() for kind, values in curves.items()
+        }
+        entries.append(entry | climb)
+    return entries, curves, half + 1
+
+
+def compare_scores(scores: dict[str, dict[str, np.ndarray]]) -> dict[str, Any]:
+    """Means over runs with their standard errors, and those of the gains, run by run."""
+    compared: dict[str, Any] = {}
+    for measure in ("coverage", "overlap"):
+        means = {kind: scores[kind][measure].mean(axis=(1, 2)) for kind in KINDS}
+        for kind in ("first", "last"):
+            means[f"gain_over_{kind}"] = means["tuned"] - means[kind]
+        compared[measure] = {
+            kind: [float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))]
+            for kind, values in means.items()
+        }
+    return compared
+
+
+def as_label_table(results: list[dict[str, Any]]) -> str:
+    """Coverage and overlap with every likelihood, and whether the tuned one is better."""
+    rows = []
+    for entry in results:
+        for measure in ("coverage", "overlap"):
+            numbers = entry[measure]
+            cells = ["{:.3f} ± {:.3f}".format(*numbers[kind]) for kind in KINDS]
+            verdicts = [verdict(*numbers[f"gain_over_{kind}"]) for kind in ("first", "last")]
+            rows.append([entry["sequence"], entry["filter"], measure, *cells, *verdicts])
+    header = ["sequence", "filter", "", "first frame's", "last frame's", "tuned"]
+    return (
+        f"{format_table([*header, 'than first', 'than last'], rows)}\n"
+        "References of the first and of the last labelled frame, and tuned from the first;\n"
+        "held-out frames, mean ± standard error over runs; better or worse by two of them."
+    )
+
+
+def verdict(gain: float, error: float) -> str:
+    """Whether a gain is more than twice its standard error."""
+    if abs(gain) <= 2 * error:
+        return "no difference"
+    return "better" if gain > 0 else "worse"
+
+
+def settings_of(options: Any) -> dict[str, Any]:
+    """Everything that a second run needs to be the same."""
+    return {
+        "sequences": list(options.sequences),
+        "last_frames": LAST_FRAME,
+        "runs": options.label_runs,
+        "steps": options.label_steps,
+        "seed": options.seed,
+        "num_particles": NUM_PARTICLES,
+        "max_components": MAX_COMPONENTS,
+        "bins_points_parts": [NUM_BINS, NUM_POINTS, NUM_PARTS],
+        "random_walk": STEPS,
+        "candidates": 3 * CANDIDATES,
+        "frames_a_step": FRAMES_A_STEP,
+        "rate": RATE,
+        "jax": jax.__version__,
+        "mpfjax": mpfjax.__version__,
+    }

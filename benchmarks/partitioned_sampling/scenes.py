@@ -1,0 +1,216 @@
+"""What the filters run on: synthetic scenes that a rule has chosen, and stretches of real ones."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import mpfjax
+from benchmarks.partitioned_sampling.events import Event
+from benchmarks.partitioned_sampling.maps import Window, distance_maps, mapped_model
+from benchmarks.partitioned_sampling.posterior import (
+    Verdict,
+    judge,
+    particle_means,
+    posterior_means,
+)
+from mpfjax import vision
+from mpfjax.metrics import effective_dynamics, uniqueness
+from mpfjax.vision import boxes as box_files
+from mpfjax.vision.joint_colour import PAPER_DEVIATIONS
+
+PAPER_WIDTH = 360  # the frames in which a step deviates by two pixels
+MOST_TRIED = 100  # keys, before there are too few scenes
+Collector = Callable[[mpfjax.ParticleMixture], "Kept"]
+
+
+class Kept(NamedTuple):
+    """What is kept of every step of a run; only the boxes where that is all there is to show."""
+
+    boxes: Any  # (objects, 4), of the mean state
+    uniqueness: Any = None  # (objects,)
+    dynamics: Any = None  # (objects, 2), variance of u and v over the particles
+    centres: Any = None  # (n, objects, 2)
+
+
+class Scene(NamedTuple):
+    """Frames, the objects in them, and what the filters know of both."""
+
+    key: int | str  # what the rows of the tables call it
+    name: str
+    stills: np.ndarray  # (t, h, w, 3)
+    first: int  # the number of the first frame
+    truth: np.ndarray  # (t, objects, 4), top-left corner first, NaN where there is none
+    hard: int  # which object is distracted or occluded, from 0 on
+    observations: Any
+    model_at: Callable[[float], mpfjax.MultiObjectModel]  # of λ
+    collector: Callable[[bool], Collector]  # of whether to keep everything, or the boxes
+    deviations: np.ndarray  # of a step in u and v
+    verdict: Verdict | None = None  # of 20 000 particles on the hard object alone
+    exact: Verdict | None = None
+
+    @property
+    def num_objects(self) -> int:
+        """J."""
+        return self.truth.shape[1]
+
+
+class Setting(NamedTuple):
+    """What `distracter_scene` leaves open, and the tracker's momentum, which the paper prints."""
+
+    size: tuple[int, int] = (24, 24)
+    speed: float = 0.0
+    deviation: float = 4.0
+    noise: str = "grey"
+    momentum: float = 0.5
+
+
+DEFAULT = Setting()
+
+# --- synthetic --------------------------------------------------------------------------------
+
+
+def synthetic_scenes(
+    keys: Sequence[int], most: int | None = None, setting: Setting = DEFAULT
+) -> Iterator[tuple[int, Scene | None]]:
+    """Each key with its scene, or None where the posterior of object 1 speaks against it.
+
+    No filter has run by then. Raises `ValueError` where the keys do not hold `most` scenes.
+    """
+    found = 0
+    for key in keys:
+        scene = synthetic_scene(key, setting, only_if_kept=True)
+        found += scene is not None
+        yield key, scene
+        if found == most:
+            return
+    if most is not None:
+        raise ValueError(
+            f"--scenes: {most}, but of the {len(keys)} keys from {keys[0]} on the posterior"
+            f" keeps {found}"
+        )
+
+
+def synthetic_scene(
+    key: int, setting: Setting = DEFAULT, *, only_if_kept: bool = False
+) -> Scene | None:
+    """The seven objects of section 3.2 and their distracter; None where not to be kept."""
+    drawn = vision.distracter_scene(
+        jax.random.key(key),
+        size=setting.size,
+        speed=setting.speed,
+        deviation=setting.deviation,
+        noise=setting.noise,
+    )
+    starts = drawn.boxes[0, :, :2] + drawn.boxes[0, :, 2:] / 2
+    learned = vision.joint_colour_model(
+        drawn.frames[0], drawn.boxes[0], templates={0: drawn.template}
+    )
+    # Of one reference and one channel each: (objects, parts, bins).
+    references = np.asarray(learned.object_model.references)[:, 0, :, 0]  # pyright: ignore
+    bins = np.asarray(_bins(jnp.asarray(drawn.frames)))
+    sides = setting.size
+    whole = Window.whole(bins[0], sides)
+
+    def maps_of(objects: slice) -> np.ndarray:
+        return np.stack([distance_maps(one, references[objects], sides, whole) for one in bins])
+
+    first, steps = maps_of(slice(0, 1)), PAPER_DEVIATIONS[:2]
+    means = particle_means(first[:, 0], starts[0], sides, steps)
+    verdict = judge(means, drawn.boxes[:, 0])
+    if only_if_kept and not verdict.keeps:
+        return None
+    exact = judge(posterior_means(bins, references[0], starts[0], sides), drawn.boxes[:, 0])
+    maps = np.concatenate([first, maps_of(slice(1, None))], axis=1)
+    return Scene(
+        key,
+        f"synthetic sequence of key {key}",
+        drawn.frames,
+        1,
+        drawn.boxes,
+        0,
+        jnp.asarray(maps),
+        lambda lambda_: mapped_model(starts, sides, lambda_, setting.momentum, steps),
+        lambda everything: _place_collector(sides, everything),
+        np.array(steps),
+        verdict,
+        exact,
+    )
+
+
+@jax.jit
+@jax.vmap
+def _bins(frame):
+    """The colour of every pixel."""
+    return vision.HSVColours().bins(frame)[:, :, 0]
+
+
+@lru_cache
+def _place_collector(sides: tuple[int, int], everything: bool) -> Collector:
+    """What to keep of places; the same function for all scenes, which then share a program."""
+
+    def collect(mixture: mpfjax.ParticleMixture) -> Kept:
+        mean = mixture.average(mixture.particles.place)
+        size = jnp.broadcast_to(jnp.asarray(sides, mean.dtype), mean.shape)
+        boxes = jnp.concatenate([mean - size / 2, size], axis=-1)
+        if not everything:
+            return Kept(boxes)
+        dynamics = effective_dynamics(mixture).place
+        return Kept(boxes, uniqueness(mixture), dynamics, mixture.particles.place)
+
+    return collect
+
+
+# --- real -------------------------------------------------------------------------------------
+
+
+def real_scene(folder: Path, event: Event) -> Scene:
+    """A stretch of a sequence with a gt.txt; steps deviate in proportion to the frame's width."""
+    first, last = event.frames
+    if not folder.is_dir():
+        raise ValueError(f"--sequence: {folder} is not a folder")
+    stills = np.stack(list(vision.read_frames(folder, first, last)))
+    rows = vision.read_tracks(folder / "gt.txt")
+    started = box_files.boxes_of_frame(rows, first)
+    ids = event.ids or tuple(sorted(started))
+    missing = [id for id in ids if id not in started]
+    if missing or not ids:
+        raise ValueError(f"--ids: gt.txt has no box of {missing or 'any object'} in frame {first}")
+    truth = np.full((len(stills), len(ids), 4), np.nan)
+    for t in range(len(stills)):
+        own = box_files.boxes_of_frame(rows, first + t)
+        for j, id in enumerate(ids):
+            truth[t, j] = own.get(id, np.nan)
+    deviations = np.array(PAPER_DEVIATIONS)
+    deviations[:2] *= stills.shape[2] / PAPER_WIDTH
+    model = vision.joint_colour_model(stills[0], truth[0], deviations=tuple(deviations.tolist()))
+    span = f"{first}-{first + len(stills) - 1}"
+    name = f"{folder.name}, objects {', '.join(map(str, ids))}, frames {span}"
+
+    def collect_boxes(mixture: mpfjax.ParticleMixture) -> Kept:
+        return Kept(mixture.average(vision.object_boxes(model, mixture.particles)))
+
+    def collect(mixture: mpfjax.ParticleMixture) -> Kept:
+        return Kept(
+            collect_boxes(mixture).boxes,
+            uniqueness(mixture),
+            effective_dynamics(mixture).box[:, :2],
+            mixture.particles.box[:, :, :2],
+        )
+
+    return Scene(
+        f"{folder.name} {ids[0]} {span}",
+        name,
+        stills,
+        first,
+        truth,
+        0,
+        jnp.asarray(stills),
+        lambda lambda_: vision.with_lambda(model, lambda_),
+        lambda everything: collect if everything else collect_boxes,
+        deviations[:2],
+    )

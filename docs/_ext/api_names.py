@@ -1,0 +1,49 @@
+"""The public names of mpfjax: what the API pages show, and what code in pages links to."""
+
+import importlib
+import importlib.util
+from functools import cache
+from typing import Any
+
+MODULES = (
+    "vision",
+    "tuning",
+    "metrics",
+    "exact",
+    "plotting",
+    "smoothing",
+    "mpfjax",
+)  # the top last
+
+
+@cache
+def public_names() -> dict[str, str]:
+    """The full name of everything public, by its name with and without the module's.
+
+    What the top has from one of the other modules is shown once, there.
+    """
+    found: dict[str, str] = {}
+    shown: dict[int, str] = {}
+    for name in MODULES:
+        full = name if name == "mpfjax" else f"mpfjax.{name}"
+        if importlib.util.find_spec(full) is None:
+            continue
+        module = importlib.import_module(full)
+        for each in _public_in(module, full):
+            target = shown.setdefault(id(getattr(module, each)), f"{full}.{each}")
+            found[f"{full}.{each}"] = found[f"{name}.{each}"] = target
+            found.setdefault(each, target)
+    return found
+
+
+def _public_in(module: Any, full: str) -> list[str]:
+    """The classes and functions that a module offers: what it defines, or hands on."""
+    is_package = hasattr(module, "__path__")
+    return [
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_")
+        and callable(value)
+        and getattr(value, "__module__", "").startswith("mpfjax.")
+        and (is_package or value.__module__ == full)
+    ]

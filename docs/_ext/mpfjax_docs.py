@@ -1,0 +1,135 @@
+"""The extension of Sphinx for this site: docstrings, links from code to the API, MathML."""
+
+import importlib
+import re
+from typing import Any
+
+import docstrings
+from api_names import public_names
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx import addnodes
+from sphinx.application import Sphinx
+from sphinx.transforms import SphinxTransform
+from sphinx.util import logging
+from sphinx.writers.html5 import HTML5Translator
+
+LOGGER = logging.getLogger(__name__)
+
+
+def target_of(code: str) -> str | None:
+    """The full name of what a piece of code names, `Merge` say, or `mpfjax.Merge(None, 0.5)`."""
+    found = re.fullmatch(r"([A-Za-z_][\w.]*)(\(.*\))?", code, re.DOTALL)
+    if found is None:
+        return None
+    name, names = found[1], public_names()
+    if name in names:
+        return names[name]
+    owner, _, member = name.rpartition(".")
+    if owner in names and member and not member.startswith("_"):
+        holder = names[owner]
+        module, _, attribute = holder.rpartition(".")
+        if member in vars(getattr(importlib.import_module(module), attribute)):
+            return f"{holder}.{member}"
+    return None
+
+
+class LinkCode(SphinxTransform):
+    """Code that names something public becomes a link to the API, which is checked."""
+
+    default_priority = 210
+
+    def apply(self, **options: Any) -> None:
+        """Wrap each such piece of code in a reference; a wrong name of ours is a warning."""
+        for literal in list(self.document.findall(nodes.literal)):
+            inside = (nodes.reference, addnodes.pending_xref, addnodes.desc_signature, nodes.title)
+            if any(isinstance(each, inside) for each in _ancestors(literal)):
+                continue
+            code = literal.astext()
+            target = target_of(code)
+            if target is None:
+                if re.fullmatch(r"mpfjax(\.\w+)*\.[A-Z]?\w*(\(.*\))?", code) and not _exists(code):
+                    LOGGER.warning("mpfjax has no %s", code, location=literal)
+                continue
+            reference = addnodes.pending_xref(
+                "", refdomain="py", reftype="obj", reftarget=target, refexplicit=True, refwarn=True,
+                refdoc=self.env.docname,
+            )  # fmt: skip
+            literal.replace_self(reference)
+            reference += literal
+
+
+def _ancestors(node: nodes.Node) -> list[nodes.Node]:
+    found = []
+    while (node := node.parent) is not None:
+        found.append(node)
+    return found
+
+
+def _exists(code: str) -> bool:
+    """Whether a dotted name is a module, or can be reached from one."""
+    name = re.sub(r"\(.*", "", code, flags=re.DOTALL)
+    try:
+        importlib.import_module(name)
+    except ImportError:
+        owner, _, last = name.rpartition(".")
+        try:
+            return hasattr(importlib.import_module(owner), last)
+        except ImportError:
+            return False
+    return True
+
+
+def process_docstring(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]
+) -> None:
+    """Every docstring as reStructuredText."""
+    lines[:] = docstrings.to_rst(lines)
+
+
+def process_signature(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, returns: str
+) -> tuple[str | None, str | None]:
+    """Signatures with `Array`, not with the private name that JAX gives it."""
+    short = [part and re.sub(r"\bjaxlib\._jax\.", "", part) for part in (signature, returns)]
+    return short[0], short[1]
+
+
+def shorten_types(app: Sphinx, doctree: nodes.document) -> None:
+    """The same in the types of properties, which are no signatures."""
+    for text in list(doctree.findall(nodes.Text)):
+        if "jaxlib._jax." in text:
+            text.parent.replace(text, nodes.Text(text.replace("jaxlib._jax.", "")))
+
+
+def _mathml(self: HTML5Translator, node: nodes.Element, as_block: bool) -> None:
+    try:
+        self.body.append(tex2mathml(node.astext(), as_block=as_block))
+    except Exception as error:
+        LOGGER.warning("no MathML of %r: %s", node.astext(), error, location=node)
+    raise nodes.SkipNode
+
+
+def visit_math(self: HTML5Translator, node: nodes.Element) -> None:
+    """A formula within a line."""
+    _mathml(self, node, as_block=False)
+
+
+def visit_math_block(self: HTML5Translator, node: nodes.Element) -> None:
+    """A formula on a line of its own, which scrolls where it is too wide."""
+    self.body.append(self.starttag(node, "div", CLASS="math"))
+    try:
+        _mathml(self, node, as_block=True)
+    except nodes.SkipNode:
+        self.body.append("</div>\n")
+        raise
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """What Sphinx calls."""
+    app.add_html_math_renderer("mathml", (visit_math, None), (visit_math_block, None))
+    app.add_transform(LinkCode)
+    app.connect("autodoc-process-docstring", process_docstring)
+    app.connect("autodoc-process-signature", process_signature)
+    app.connect("doctree-read", shorten_types)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,6 @@
+"""What is known of the past given all observations, and of the future given those so far."""
+
+from mpfjax.smoothing.ancestors import Genealogy as Genealogy
+from mpfjax.smoothing.ancestors import trace_ancestors as trace_ancestors
+from mpfjax.smoothing.forecasts import Forecast as Forecast
+from mpfjax.smoothing.trajectories import sample_trajectories as sample_trajectories

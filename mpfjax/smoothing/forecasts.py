@@ -1,0 +1,74 @@
+"""Forecasts: the mixture some steps ahead, with its components, and observations drawn from it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Key, PyTree
+
+from mpfjax.checks import check_callable, check_key, check_type, check_whole, given, saying
+from mpfjax.filter import Filter
+from mpfjax.mixture import ParticleMixture
+from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
+
+
+class Forecast(eqx.Module):
+    """What a filter expects of the next k steps.
+
+    - `mixtures`: the mixtures at t + 1, ..., t + k, stacked: components keep their labels as far
+      as the filter's regrouping lets them. `jax.vmap` maps what is derived from one over them.
+    - `observations`: one simulated observation for each particle, leaves (k, n, ...), with the
+      weights of the particles; None where none were asked for.
+    """
+
+    mixtures: ParticleMixture
+    observations: PyTree = None
+
+
+def forecast(
+    key: Key[Array, ""],
+    filter: Filter,
+    mixture: ParticleMixture,
+    num_steps: int,
+    *,
+    simulate_observation: Callable[[Key[Array, ""], PyTree], PyTree] | None = None,
+) -> Forecast:
+    """The distribution of x_{t+1}, ..., x_{t+k} given y_1..y_t, from the mixture at t.
+
+    Every step is the filter's `predict`: the particles propagate and regroup, and keep their
+    masses, so that a component's mixture weight is the probability of its mode.
+
+    - `simulate_observation(key, states)`: draws y given each of the n states, leaves (n, ...), as
+      the model's likelihood would have it; for intervals of what will be observed.
+
+    `key` is one that nothing else was given: `jax.random.fold_in(key, 1)` of the run's own key is
+    a key that the run has used.
+
+    Raises `ValueError` for arguments of another kind and for moves that do not say what they do
+    without an observation. Use it for forecasts with intervals, and for what a filter is scored by.
+    """
+    check_key(key)
+    check_type(Filter, "a Filter", filter=filter)
+    check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
+    check_whole(num_steps=num_steps)
+    check_callable(
+        "a function of a key and states", **given(simulate_observation=simulate_observation)
+    )
+    run = lambda filter: _forecast(key, filter, mixture, num_steps, simulate_observation)  # noqa: E731
+    return with_floats_traced(run, filter)
+
+
+@jit_on_wide_vectors
+def _forecast(key, filter, mixture, num_steps, simulate_observation):
+    def advance(mixture: ParticleMixture, key: Array) -> tuple[ParticleMixture, Any]:
+        key_step, key_observation = jax.random.split(key)
+        mixture, _ = filter._predict(key_step, mixture)
+        observations = None
+        if simulate_observation is not None:
+            with saying("in simulate_observation, which is called with a key and the particles"):
+                observations = simulate_observation(key_observation, mixture.particles)
+        return mixture, (mixture, observations)
+
+    _, (mixtures, observations) = jax.lax.scan(advance, mixture, jax.random.split(key, num_steps))
+    return Forecast(mixtures, observations)

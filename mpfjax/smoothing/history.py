@@ -1,0 +1,39 @@
+"""The mixtures of a run, from x_0 to x_t, as every smoother takes them."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mpfjax.checks import shown
+from mpfjax.mixture import ParticleMixture
+from mpfjax.running.scan import FilterRun
+
+_NEEDED = "a FilterRun of run_filter(..., collect=None), or the mixtures that it collected"
+
+
+def mixtures_of(run: Any) -> ParticleMixture:
+    """The stacked mixtures of a run; with those of a whole `FilterRun` x_0 comes first.
+
+    Raises `ValueError` for what holds no stack of mixtures, and for a stack of several runs.
+    """
+    initial, mixtures = None, run
+    if isinstance(run, FilterRun):
+        initial, mixtures = run.initial, run.collected
+    if not isinstance(mixtures, ParticleMixture):
+        raise ValueError(f"mixtures: {shown(mixtures)} is not {_NEEDED}")
+    if mixtures.log_weights.ndim != 2:
+        raise ValueError(
+            f"mixtures: weights of shape {mixtures.log_weights.shape} are not those of one run, "
+            "(t, n); jax.vmap over the leading axis of several runs"
+        )
+    # Moves' memory has no part in the past, and what it holds need not be stacked alike.
+    mixtures = jax.vmap(lambda mixture: mixture.replace(memory={}))(mixtures)
+    if initial is None:
+        return mixtures
+    initial = initial.replace(memory={})
+    return jax.tree.map(
+        lambda first, rest: jnp.concatenate([first[None].astype(rest.dtype), rest]),
+        initial,
+        mixtures,
+    )

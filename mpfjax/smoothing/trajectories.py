@@ -1,0 +1,189 @@
+"""Backward sampling: whole trajectories from their distribution given all observations."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int, Key, PyTree
+
+from mpfjax.checks import check_key, check_one_of, check_whole, given
+from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import AbstractStateSpaceModel, check_log_density, check_model, require
+from mpfjax.operations.compiling import jit_on_wide_vectors
+from mpfjax.operations.generator import split, uniform
+from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import exp, finite_or_zero
+from mpfjax.operations.matrices import draw_columns
+from mpfjax.running.scan import FilterRun
+from mpfjax.smoothing.history import mixtures_of
+
+# How many densities are held at once: rows of trajectories are taken together up to this.
+_MOST_DENSITIES = 2**22
+_NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the step before"
+
+
+def sample_trajectories(
+    key: Key[Array, ""],
+    model: AbstractStateSpaceModel,
+    mixtures: FilterRun | ParticleMixture,
+    num_trajectories: int,
+    *,
+    component: int | None = None,
+    method: str = "exact",
+    num_steps: int | None = None,
+) -> PyTree:
+    """Draw trajectories x_0, ..., x_t from their smoothing distribution p(x_0, ..., x_t | y).
+
+    Backward sampling (Godsill, Doucet and West 2004): x_t is drawn by the weights of the last
+    mixture, then each x_{s} by W_s^i D(x_{s+1} | x_s^i), W_s the joint weights of the mixture at s.
+    Component indicators have no part in it, since the weights are joint: a mixture filter is
+    smoothed like any other.
+
+    - `mixtures`: a run of `run_filter(..., collect=None)`, or the mixtures that it collected.
+    - `num_trajectories`: k. Leaves of the result are (k, t + 1, ...); (k, t, ...), without x_0, for
+      mixtures alone.
+    - `component`: draw x_t from this component of the last mixture alone: the past of one mode.
+    - `method`: "exact" weighs all N particles, O(N) for a trajectory and step. "mcmc" (Dau and
+      Chopin 2023) goes from the ancestor of x_{s+1} `num_steps` steps of independent
+      Metropolis-Hastings with proposals by W_s, O(1) for a trajectory and step, and is as exact
+      as N grows.
+    - `num_steps`: of "mcmc"; None is one.
+
+    Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
+    that is not there or dead, and for `num_steps` with "exact"; a RuntimeError where no particle
+    can have moved to the next. Use it where estimates of the past are wanted: the genealogy of the
+    particles (`trace_ancestors`) is exact as well, but has few distinct states of long ago.
+    """
+    check_key(key)
+    check_model(model, "sample_trajectories")
+    require(model, "log_transition", "sample_trajectories")
+    check_whole(num_trajectories=num_trajectories)
+    check_one_of(("exact", "mcmc"), method=method)
+    check_whole(**given(num_steps=num_steps))
+    if method == "exact" and num_steps is not None:
+        raise ValueError(f"num_steps: {num_steps} does nothing with method 'exact'")
+    stacked = mixtures_of(mixtures)
+    if component is not None:
+        check_whole(0, component=component)
+        _check_component(stacked, component)
+    if method == "exact":
+        num_steps = 0
+    elif num_steps is None:
+        num_steps = 1
+    return _sample(key, model, stacked, num_trajectories, component, num_steps)
+
+
+def _check_component(mixtures: ParticleMixture, component: int) -> None:
+    if component >= mixtures.num_components:
+        raise ValueError(f"component: {component} is not one of {mixtures.num_components}")
+    final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
+    active = final.active
+    if not isinstance(active, Tracer) and not np.asarray(active)[component]:
+        alive = np.flatnonzero(np.asarray(active)).tolist()
+        raise ValueError(f"component: {component} is dead at the end; alive are {alive}")
+
+
+@jit_on_wide_vectors
+def _sample(key, model, mixtures, num_trajectories, component, num_steps):
+    key_final, key_steps = split(key, 2)
+    final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
+    log_weights = final.log_weights
+    if component is not None:
+        log_weights = jnp.where(final.component_indicators == component, log_weights, -jnp.inf)
+    last = _draw(uniform(key_final, (num_trajectories,), log_weights.dtype), log_weights)
+    states = jax.tree.map(lambda leaf: take(leaf, last), final.particles)
+
+    def back(carry: tuple[PyTree, Array], inputs: Any) -> tuple[tuple[PyTree, Array], PyTree]:
+        next_states, next_indices = carry
+        step_key, earlier, ancestors = inputs
+        if num_steps == 0:
+            indices = _draw_exactly(step_key, model, next_states, earlier)
+        else:
+            start = take(ancestors, next_indices)
+            indices = _walk(step_key, model, next_states, earlier, start, num_steps)
+        states = jax.tree.map(lambda leaf: take(leaf, indices), earlier.particles)
+        return (states, indices), states
+
+    num_earlier = mixtures.log_weights.shape[0] - 1
+    earlier = jax.tree.map(lambda leaf: leaf[:-1], mixtures)
+    inputs = jax.random.split(key_steps, num_earlier), earlier, mixtures.ancestor_indices[1:]
+    _, past = jax.lax.scan(back, (states, last), inputs, reverse=True)
+    return jax.tree.map(
+        lambda before, end: jnp.concatenate([jnp.moveaxis(before, 0, 1), end[:, None]], axis=1),
+        past,
+        states,
+    )
+
+
+def _draw(uniforms: Float[Array, " k"], log_weights: Float[Array, " n"]) -> Int[Array, " k"]:
+    """Indices by their weights, by the inverse of the cumulative weights."""
+    weights = exp(log_weights - finite_or_zero(jnp.max(log_weights)))
+    upto = jnp.cumsum(weights)
+    # Rounding must not lead past the last particle of positive weight.
+    last = jnp.max(jnp.where(weights > 0, jnp.arange(weights.shape[0]), 0))
+    indices = jnp.searchsorted(upto, uniforms * upto[-1], side="right")
+    return jnp.minimum(indices, last).astype(jnp.int32)
+
+
+def _draw_exactly(
+    key: Key[Array, ""], model: Any, next_states: PyTree, mixture: ParticleMixture
+) -> Int[Array, " k"]:
+    """An index for each trajectory by W^i D(next | x^i)."""
+    n = mixture.num_particles
+
+    def log_weights_of(state: PyTree) -> Float[Array, " n"]:
+        copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), state)
+        log_density = model.log_transition(copies, mixture.particles)
+        check_log_density(log_density, model, "log_transition", n)
+        return jnp.where(mixture.occupied, mixture.log_weights + log_density, -jnp.inf)
+
+    def draw_one(inputs: tuple[Array, PyTree]) -> tuple[Array, Array]:
+        quantile, state = inputs
+        log_weights = log_weights_of(state)
+        largest = jnp.max(log_weights)
+        weights = exp(log_weights - finite_or_zero(largest))
+        return draw_columns(quantile[None], weights[None])[0], largest
+
+    num_trajectories = jax.tree.leaves(next_states)[0].shape[0]
+    quantiles = uniform(key, (num_trajectories,), mixture.log_weights.dtype)
+    together = max(1, min(num_trajectories, _MOST_DENSITIES // n))
+    inputs = (quantiles, next_states)
+    if together == num_trajectories:
+        indices, largest = jax.vmap(draw_one)(inputs)
+    else:
+        indices, largest = jax.lax.map(draw_one, inputs, batch_size=together)
+    return eqx.error_if(indices, ~jnp.all(largest > -jnp.inf), _NO_PAST)
+
+
+def _walk(
+    key: Key[Array, ""],
+    model: Any,
+    next_states: PyTree,
+    mixture: ParticleMixture,
+    start: Int[Array, " k"],
+    num_steps: int,
+) -> Int[Array, " k"]:
+    """Steps of independent Metropolis-Hastings on the index, whose target is W^i D(next | x^i)."""
+    num_trajectories = start.shape[0]
+    dtype = mixture.log_weights.dtype
+
+    def log_density(indices: Int[Array, " k"]) -> Float[Array, " k"]:
+        previous = jax.tree.map(lambda leaf: take(leaf, indices), mixture.particles)
+        values = model.log_transition(next_states, previous)
+        check_log_density(values, model, "log_transition", num_trajectories)
+        return values
+
+    # The proposal draws by the weights, which therefore cancel in the acceptance ratio.
+    indices, current = start, log_density(start)
+    for step_key in split(key, num_steps):
+        key_proposal, key_accept = split(step_key, 2)
+        proposed = _draw(uniform(key_proposal, (num_trajectories,), dtype), mixture.log_weights)
+        log_ratio = (new := log_density(proposed)) - current
+        accepted = jnp.log(uniform(key_accept, (num_trajectories,), dtype)) < log_ratio
+        accepted |= current == -jnp.inf
+        indices = jnp.where(accepted, proposed, indices)
+        current = jnp.where(accepted, new, current)
+    return eqx.error_if(indices, ~jnp.all(current > -jnp.inf), _NO_PAST)

@@ -1,0 +1,77 @@
+"""The documentation holds: its code runs, its commands exist, the API pages are complete."""
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+from sybil import Sybil
+from sybil.parsers.markdown import PythonCodeBlockParser, SkipParser
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+DOCS = REPOSITORY / "docs"
+PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"]
+PAGES += sorted(path for path in DOCS.rglob("*.md") if "notebooks" not in path.parts)
+NAMES = [str(page.relative_to(REPOSITORY)) for page in PAGES]
+COMMAND = re.compile(r"python -m (benchmarks\.[a-z_]+|mpfjax\b)((?: [^\n`|#]*)?)")
+WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
+
+sybil = Sybil(parsers=[PythonCodeBlockParser(), SkipParser()], path=str(REPOSITORY))
+
+
+@pytest.mark.usefixtures("as_installed")
+@pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: page.stem)
+def test_the_code_of_a_page_runs(page):
+    """All blocks of a page in their order, as a reader runs them: without the tests' strictness."""
+    document = sybil.parse(page)
+    examples = list(document.examples())
+    assert examples
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        for example in examples:
+            example.evaluate()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_the_commands_of_a_page_exist(page):
+    """Each module, and each option that a command gives it."""
+    for name, arguments in COMMAND.findall(page.read_text(encoding="utf-8")):
+        module = importlib.util.find_spec(name if name != "mpfjax" else "mpfjax.__main__")
+        assert module is not None, name
+        place = Path(module.origin)
+        is_folder = place.name in ("__init__.py", "__main__.py")
+        sources = place.parent.rglob("*.py") if is_folder else [place]
+        text = "".join(source.read_text(encoding="utf-8") for source in sources)
+        for option in re.findall(r"(?<=\s)--[a-z-]+", arguments):
+            assert f'"{option}"' in text, f"{name} {option}"
+
+
+def test_readme_is_short_and_keeps_its_two_commands():
+    lines = (REPOSITORY / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 150
+    assert "    python -m pip install -e . && python -m benchmarks.score_vs_particles" in lines
+    assert '    python -m pip install -e ".[test]" && python -m pytest' in lines
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_pictures_and_pages_that_a_page_links_to_exist(page):
+    """Links to files; Sphinx checks those between pages too, but not README's."""
+    text = page.read_text(encoding="utf-8")
+    for link in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", text):
+        target = (page.parent / link).resolve()
+        shown = REPOSITORY / "notebooks" / target.name  # copied into docs/ as the site is built
+        assert target.exists() or shown.exists(), link
+
+
+def test_every_public_name_is_on_an_api_page():
+    sys.path.insert(0, str(DOCS / "_ext"))
+    try:
+        api = importlib.import_module("api_names")
+    finally:
+        sys.path.remove(str(DOCS / "_ext"))
+    text = "".join(path.read_text(encoding="utf-8") for path in (DOCS / "api").glob("*.md"))
+    shown = re.findall(r"^\.\. auto(?:class|function|data):: (\S+)", text, re.MULTILINE)
+    assert len(shown) == len(set(shown)), "a name stands on two pages"
+    names = api.public_names()
+    assert set(names.values()) == {names.get(name, name) for name in shown}
