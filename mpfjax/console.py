@@ -4,12 +4,17 @@ A number out of range is an error of argparse, with exit status 2.
 """
 
 import argparse
+import contextlib
 import json
 import math
 import sys
-from collections.abc import Callable
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
+
+from tqdm import tqdm
 
 from mpfjax.running.storage import write_whole
 
@@ -43,6 +48,17 @@ def positive(text: str) -> float:
         number = math.nan
     if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive, finite number")
+    return number
+
+
+def finite(text: str) -> float:
+    """The type of an option that is a finite number."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
     return number
 
 
@@ -94,3 +110,47 @@ def exit_status(run: Callable[[], None]) -> int:
         print("interrupted; what was finished is written", file=sys.stderr)
         return 130
     return 0
+
+
+def say_warnings(category: type[Warning]) -> None:
+    """From here on show warnings of this kind as one line each, every time, clear of any bar.
+
+    Call it inside `warnings.catch_warnings()`, which ends it.
+    """
+    before = warnings.showwarning
+
+    def show(message: Any, kind: type[Warning], *rest: Any) -> None:
+        if issubclass(kind, category):
+            tqdm.write(f"warning: {message}", file=sys.stderr)
+        else:
+            before(message, kind, *rest)
+
+    warnings.filterwarnings("always", category=category)
+    warnings.showwarning = show
+
+
+class Clock:
+    """The seconds that went into each part of the work."""
+
+    def __init__(self, *parts: str) -> None:
+        self.seconds = dict.fromkeys(parts, 0.0)
+
+    @contextlib.contextmanager
+    def of(self, part: str) -> Iterator[None]:
+        """Count the time in the block for this part, and for no part around it."""
+        start, before = time.perf_counter(), sum(self.seconds.values())
+        try:
+            yield
+        finally:
+            within = sum(self.seconds.values()) - before
+            self.seconds[part] += time.perf_counter() - start - within
+
+    def over(self, part: str, items: Iterable[Any]) -> Iterator[Any]:
+        """The items, the time to get each counted for this part."""
+        iterator = iter(items)
+        while True:
+            with self.of(part):
+                item = next(iterator, None)
+            if item is None:
+                return
+            yield item

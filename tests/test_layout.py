@@ -27,6 +27,8 @@ ORDER = (
     "vision",
     "tuning",
     "plotting",
+    "command",
+    "__main__",
 )
 # Inside the two folders that hold several floors.
 FLOORS = {

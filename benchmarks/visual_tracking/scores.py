@@ -17,13 +17,13 @@ def score(
 ) -> dict[str, Any]:
     """One entry of the results: means over the runs' tracks, null where there is no truth."""
     result = {"filter": name, "all_covered": None, "per_object": None, "on_object": None}
-    result |= {"id_swaps": None, "ms_per_frame": _milliseconds(seconds)}
+    result |= {"on_other": None, "id_swaps": None, "ms_per_frame": _milliseconds(seconds)}
     truth = source.truth
     if truth is not None:
         truth = truth[truth[:, 0] < source.first + num_frames]
     if truth is None or len(truth) == 0:
         return result
-    scores = [coverage(rows, truth) for rows in tracks]
+    scores = [coverage(rows, truth, source.others) for rows in tracks]
     result["all_covered"] = _mean([s.all_covered for s in scores])
     result["per_object"] = {
         str(id): _mean([s.per_object[id] for s in scores]) for id in scores[0].per_object
@@ -31,6 +31,7 @@ def score(
     result["id_swaps"] = _mean([s.id_swaps for s in scores])
     if source.all_labelled:
         result["on_object"] = _mean([s.on_object for s in scores])
+        result["on_other"] = _mean([s.on_other for s in scores])
     return result
 
 
@@ -62,6 +63,7 @@ def table(results: list[dict[str, Any]]) -> str:
     columns = {
         "all_covered": "all covered",
         "on_object": "on object",
+        "on_other": "on another",
         "id_swaps": "id swaps",
         "ms_per_frame": "ms a frame",
     }

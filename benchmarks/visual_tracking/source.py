@@ -23,6 +23,7 @@ class Source(NamedTuple):
     boxes: np.ndarray  # (k, 4), where the objects start
     truth: np.ndarray | None  # rows of the objects to score against
     all_labelled: bool  # whether the truth knows every object that was started
+    others: np.ndarray | None = None  # rows of those that were not started
 
 
 def open_source(options: argparse.Namespace) -> Source:
@@ -79,8 +80,11 @@ def _with_objects(options, name, read, first, last, count, rows, still) -> Sourc
     if len(boxes) > MAX_COMPONENTS:
         raise ValueError(f"{argument}: {len(boxes)} objects are more than {MAX_COMPONENTS}")
     box_files.check_boxes(boxes, still.shape[0], still.shape[1], argument)
-    truth = rows[np.isin(rows[:, 1], ids)] if rows is not None and ids else None
-    return Source(name, read, first, count, boxes, truth, len(ids) == len(boxes))
+    truth = others = None
+    if rows is not None and ids:
+        is_started = np.isin(rows[:, 1], ids)
+        truth, others = rows[is_started], rows[~is_started]
+    return Source(name, read, first, count, boxes, truth, len(ids) == len(boxes), others)
 
 
 def _chosen_ids(options, started: dict, rows: np.ndarray | None, first: int) -> list[int]:

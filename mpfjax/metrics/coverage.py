@@ -22,27 +22,38 @@ class Coverage(NamedTuple):
     - `per_object`: the share of its frames in which each object is covered, by its id.
     - `on_object`: the share of all boxes of tracks that cover some object.
     - `id_swaps`: how often an object's identity passes from one track to another.
+    - `on_other`: the share of all boxes of tracks that cover none of the objects but one of the
+      others, where those are given. What is left to one lies on nothing.
     """
 
     all_covered: float
     per_object: dict[int, float]
     on_object: float
     id_swaps: int
+    on_other: float = 0.0
 
 
-def coverage(tracks: Float[np.ndarray, "r 6"], objects: Float[np.ndarray, "s 6"]) -> Coverage:
+def coverage(
+    tracks: Float[np.ndarray, "r 6"],
+    objects: Float[np.ndarray, "s 6"],
+    others: Float[np.ndarray, "o 6"] | None = None,
+) -> Coverage:
     """Score tracks against the true boxes, over the frames in which there is an object.
 
     In each frame only the objects with a box there count. Every object is assigned to a track, and
     keeps it while the track covers it. Otherwise it is assigned to the nearest covering track that
-    no other object keeps, and if it had another track before, a swap is counted. Raises
-    `ValueError` where there are no true boxes, and for what is no rows of six finite numbers.
+    no other object keeps, and if it had another track before, a swap is counted. `others` are true
+    boxes of what nobody asked to track: a box on one of them is a stray of another kind than one on
+    nothing. Raises `ValueError` where there are no true boxes, and for what is no rows of six
+    finite numbers.
     """
     tracks, objects = _checked(tracks, "tracks"), _checked(objects, "objects")
+    others = _checked(np.zeros((0, 6)) if others is None else others, "others")
     if len(objects) == 0:
         raise ValueError("objects: there are no true boxes to score against")
     complete: list[bool] = []
     on_object: list[bool] = []
+    on_other: list[bool] = []
     swaps = 0
     covered: dict[int, list[bool]] = {}
     identity: dict[int, int] = {}
@@ -51,6 +62,10 @@ def coverage(tracks: Float[np.ndarray, "r 6"], objects: Float[np.ndarray, "s 6"]
         hits = covers(boxes[:, 2:], truth[:, 2:])
         complete.append(bool(hits.any(axis=0).all()))
         on_object += [bool(row.any()) for row in hits]
+        strays = covers(boxes[:, 2:], others[others[:, 0] == frame, 2:])
+        on_other += [
+            bool(other.any() and not own.any()) for other, own in zip(strays, hits, strict=True)
+        ]
         for row, column in zip(truth, hits.T, strict=True):
             covered.setdefault(int(row[1]), []).append(bool(column.any()))
         swaps += _reassign(identity, boxes, truth, hits)
@@ -59,6 +74,7 @@ def coverage(tracks: Float[np.ndarray, "r 6"], objects: Float[np.ndarray, "s 6"]
         per_object={id: float(np.mean(hits)) for id, hits in sorted(covered.items())},
         on_object=float(np.mean(on_object)) if on_object else 0.0,
         id_swaps=swaps,
+        on_other=float(np.mean(on_other)) if on_other else 0.0,
     )
 
 

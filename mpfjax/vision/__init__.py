@@ -2,6 +2,7 @@
 
 from mpfjax.vision.boxes import check_boxes as check_boxes
 from mpfjax.vision.boxes import parse_box as parse_box
+from mpfjax.vision.boxes import read_detections as read_detections
 from mpfjax.vision.boxes import read_tracks as read_tracks
 from mpfjax.vision.boxes import write_tracks as write_tracks
 from mpfjax.vision.colour_model import BoxState as BoxState
@@ -13,6 +14,8 @@ from mpfjax.vision.detection import BackgroundSubtraction as BackgroundSubtracti
 from mpfjax.vision.detections import Detections as Detections
 from mpfjax.vision.distracter import DistracterScene as DistracterScene
 from mpfjax.vision.distracter import distracter_scene as distracter_scene
+from mpfjax.vision.drawn import follow_boxes as follow_boxes
+from mpfjax.vision.frames import frame_rate as frame_rate
 from mpfjax.vision.frames import read_frames as read_frames
 from mpfjax.vision.frames import write_video as write_video
 from mpfjax.vision.histograms import IntegralHistogram as IntegralHistogram
@@ -23,6 +26,10 @@ from mpfjax.vision.joint_colour import object_boxes as object_boxes
 from mpfjax.vision.joint_colour import with_lambda as with_lambda
 from mpfjax.vision.labels import boxes_around as boxes_around
 from mpfjax.vision.labels import labelled_states as labelled_states
+from mpfjax.vision.loop import make_tracker as make_tracker
+from mpfjax.vision.loop import offline_rows as offline_rows
+from mpfjax.vision.loop import online_rows as online_rows
+from mpfjax.vision.loop import track as track
 from mpfjax.vision.object_moves import ObjectExclusion as ObjectExclusion
 from mpfjax.vision.object_moves import PruneHypotheses as PruneHypotheses
 from mpfjax.vision.recipes import PRESETS as PRESETS

@@ -67,6 +67,29 @@ def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     return np.array(rows)
 
 
+def read_detections(path: str | Path) -> Float[np.ndarray, "rows columns"]:
+    """Read a MOTChallenge file of detections into rows (frame, id, x, y, w, h, score).
+
+    The id, -1 in such files, means nothing. Without scores, in files of six columns, there are six
+    columns here as well. Raises `ValueError` naming the file and the line where one does not parse,
+    holds a number that is not finite, or has a score where others have none, and where the file
+    holds no detection at all.
+    """
+    check_type((str, Path), "a path", path=path)
+    lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        row = _parse_detection(path, number, line)
+        if rows and len(row) != len(rows[0]):
+            raise ValueError(f"{path}, line {number}: has a score, or none, unlike those before it")
+        rows.append(row)
+    if not rows:
+        raise ValueError(f"{path}: holds no detections")
+    return np.array(rows)
+
+
 def write_tracks(path: str | Path, rows: Float[np.ndarray, "rows 6"]) -> None:
     """Write rows (frame, id, x, y, w, h) in MOTChallenge form, in the order of the frames.
 
@@ -79,16 +102,36 @@ def write_tracks(path: str | Path, rows: Float[np.ndarray, "rows 6"]) -> None:
         if not np.all(np.isfinite(row)) or np.any(row[:2] < 0) or np.any(row[:2] % 1):
             raise ValueError(f"rows: {shown(row)} is not frame,id,x,y,w,h")
     ordered = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+    Path(path).write_text(format_tracks(ordered), encoding="utf-8")
+
+
+def format_tracks(rows: Float[np.ndarray, "rows 6"]) -> str:
+    """The lines of rows (frame, id, x, y, w, h) in MOTChallenge form."""
     lines = [
         f"{int(frame)},{int(track)},{x:.3f},{y:.3f},{w:.3f},{h:.3f},1,-1,-1,-1\n"
-        for frame, track, x, y, w, h in ordered
+        for frame, track, x, y, w, h in rows
     ]
-    Path(path).write_text("".join(lines), encoding="utf-8")
+    return "".join(lines)
 
 
 def boxes_of_frame(rows: Float[np.ndarray, "rows 6"], frame: int) -> dict[int, np.ndarray]:
     """The boxes of one frame by their id."""
     return {int(row[1]): row[2:6] for row in rows if row[0] == frame}
+
+
+def _parse_detection(path: str | Path, number: int, line: str) -> list[float]:
+    fields = line.split(",")
+    try:
+        values = [float(field) for field in fields[:7]]
+        whole = values[0] == int(values[0])
+    except (ValueError, OverflowError):
+        values, whole = [], False
+    if not 6 <= len(fields) <= 10 or not whole or not np.all(np.isfinite(values)):
+        raise ValueError(
+            f"{path}, line {number}: {line.strip()!r} is not frame,id,x,y,w,h,score and up to three"
+            " more columns"
+        )
+    return values
 
 
 def _parse_row(path: str | Path, number: int, line: str) -> list[float]:

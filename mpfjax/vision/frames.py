@@ -1,6 +1,11 @@
 """Frames in and out: folders of images, video files, animated GIFs, all through imageio."""
 
-from collections.abc import Iterable, Iterator
+import contextlib
+import math
+import re
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -11,6 +16,8 @@ from jaxtyping import UInt8
 from mpfjax.checks import check_positive, check_shape, check_type, check_whole, given
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp")
+# Where sequences keep their images; MOTChallenge's have the second.
+_INNER = ("img", "img1")
 
 
 def read_frames(
@@ -19,9 +26,10 @@ def read_frames(
     """Read frames `first` to `last` in RGB, counted from 1 and both ends in, one at a time.
 
     `path` is a video file, a folder of images in the order of their names, or a folder with
-    such a folder `img`. Raises `ImportError` if imageio is missing, and `FileNotFoundError` if
-    `path` is. Raises `ValueError` naming `path` if it cannot be read, has no frames, or has frames
-    of different sizes. Raises `ValueError` for `first` and `last` that are no range.
+    such a folder `img` or `img1`. Raises `ImportError` if imageio is missing, and
+    `FileNotFoundError` if `path` is. Raises `ValueError` naming `path` if it cannot be read, has
+    no frames, or has frames of different sizes. Raises `ValueError` for `first` and `last` that are
+    no range.
     """
     check_type((str, Path), "a path", path=path)
     check_whole(first=first, **given(last=last))
@@ -56,6 +64,22 @@ def num_images(path: str | Path) -> int:
     return len(_image_paths(Path(path)))
 
 
+def frame_rate(path: str | Path) -> float | None:
+    """Frames per second of a video file, or of a folder whose `seqinfo.ini` names a `frameRate`.
+
+    None where nothing says it. Raises `ValueError` for a file that is no video.
+    """
+    check_type((str, Path), "a path", path=path)
+    path = Path(path)
+    if path.is_dir():
+        return _rate_of_folder(path)
+    try:
+        rate = _imageio().immeta(path, plugin=_plugin(path)).get("fps")
+    except (OSError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{path}: cannot be read as a video ({error})") from error
+    return float(rate) if rate and 0 < rate < math.inf else None
+
+
 def write_video(
     path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], frames_per_second: float = 10.0
 ) -> None:
@@ -64,8 +88,21 @@ def write_video(
     Raises `ValueError` for another ending, a frame that is no RGB image and a rate that is not
     positive, `ImportError` where imageio is missing.
     """
-    check_type((str, Path), "a path", path=path)
     check_type(Iterable, "frames one after the other", frames=frames)
+    with open_video(path, frames_per_second) as append:
+        for frame in frames:
+            append(frame)
+
+
+@contextlib.contextmanager
+def open_video(
+    path: str | Path, frames_per_second: float = 10.0
+) -> Iterator[Callable[[UInt8[np.ndarray, "h w 3"]], None]]:
+    """What appends RGB frames to a new MP4 or GIF, which is whole however the block is left.
+
+    Raises as `write_video` does. Use it where the frames come from somewhere else.
+    """
+    check_type((str, Path), "a path", path=path)
     check_positive(frames_per_second=frames_per_second)
     suffix = Path(path).suffix.lower()
     if suffix not in (".gif", ".mp4"):
@@ -78,10 +115,31 @@ def write_video(
         writer = get_writer(path, mode="I", duration=1000 / frames_per_second, loop=0)
     else:
         writer = get_writer(path, fps=frames_per_second, quality=6, macro_block_size=1)
-    with writer:
-        for frame in frames:
-            check_frame(frame, "frames")
+
+    def append(frame: np.ndarray) -> None:
+        check_frame(frame, "frames")
+        # imageio kills the encoder that is interrupted while it is fed, and the video with it.
+        with _uninterrupted():
             writer.append_data(_even(frame) if suffix == ".mp4" else frame)
+
+    with writer:
+        yield append
+
+
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Put off a Ctrl-C that comes within the block to its end."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # Python tells the main thread alone
+        return
+    pending: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: pending.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
+        if pending and before is not signal.SIG_IGN:
+            signal.raise_signal(signal.SIGINT)
 
 
 def check_frame(frame: Any, argument: str = "frame", *, eight_bits: bool = True) -> None:
@@ -91,6 +149,29 @@ def check_frame(frame: Any, argument: str = "frame", *, eight_bits: bool = True)
         raise ValueError(f"{argument}: {frame.shape} is not the shape (h, w, 3) of a colour image")
     if eight_bits and frame.dtype != np.uint8:
         raise ValueError(f"{argument}: {frame.dtype} is not uint8")
+
+
+def of_one_kind(
+    frames: Iterable[UInt8[np.ndarray, "..."]], first: int = 1
+) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """The frames in RGB, grey ones as well, numbered from `first` on in what goes wrong.
+
+    Raises `ValueError` at the first that is no image of eight bits, or of another size than those
+    before it.
+    """
+    shape = None
+    for number, frame in enumerate(frames, first):
+        frame = np.asarray(frame)
+        if frame.ndim == 2 or frame.shape[2:] == (1,):
+            frame = np.repeat(frame.reshape(*frame.shape[:2], 1), 3, axis=2)
+        check_frame(frame, "frames")
+        shape = shape or frame.shape
+        if frame.shape != shape:
+            raise ValueError(
+                f"frames: frame {number} is {frame.shape[1]} x {frame.shape[0]}, and those before"
+                f" it {shape[1]} x {shape[0]}"
+            )
+        yield frame
 
 
 def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
@@ -104,9 +185,21 @@ def _even(frame: np.ndarray) -> np.ndarray:
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
+def _plugin(path: Path) -> str:
+    return "pillow" if path.suffix.lower() == ".gif" else "FFMPEG"
+
+
+def _rate_of_folder(folder: Path) -> float | None:
+    for place in (folder, folder.parent):
+        if (place / "seqinfo.ini").is_file():
+            text = (place / "seqinfo.ini").read_text(encoding="utf-8", errors="replace")
+            found = re.search(r"^frameRate\s*=\s*(\d+(?:\.\d+)?)\s*$", text, re.MULTILINE)
+            return float(found[1]) or None if found else None
+    return None
+
+
 def _image_paths(folder: Path) -> list[Path]:
-    inner = folder / "img"
-    folder = inner if inner.is_dir() else folder
+    folder = next((folder / name for name in _INNER if (folder / name).is_dir()), folder)
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in _IMAGES)
 
 
@@ -123,9 +216,8 @@ def _read_images(folder: Path, first: int, last: int | None) -> Iterator[np.ndar
 
 def _read_video(path: Path, first: int, last: int | None) -> Iterator[np.ndarray]:
     imageio, number = _imageio(), 0
-    plugin = "pillow" if path.suffix.lower() == ".gif" else "FFMPEG"
     try:
-        for number, frame in enumerate(imageio.imiter(path, plugin=plugin), 1):
+        for number, frame in enumerate(imageio.imiter(path, plugin=_plugin(path)), 1):
             if last is not None and number > last:
                 return
             if number >= first:

@@ -92,6 +92,15 @@ class PruneHypotheses(AbstractPropagation):
         return mixture.replace(log_weights=jnp.where(dies, -jnp.inf, mixture.log_weights))
 
 
+def best_components(
+    mixture: ParticleMixture, num_objects: int
+) -> tuple[Int[Array, " k"], Bool[Array, " k"]]:
+    """The heaviest component of each object, and whether the object has one at all."""
+    own = _objects(mixture)[None] == jnp.arange(num_objects, dtype=jnp.int32)[:, None]
+    masses = jnp.where(own & mixture.active[None], mixture.log_mixture_weights[None], -jnp.inf)
+    return jnp.argmax(masses, axis=1), jnp.max(masses, axis=1) > -jnp.inf
+
+
 def _objects(mixture: ParticleMixture) -> Int[Array, " m"]:
     """The reference of each component: the whole number nearest to its particles' mean."""
     reference = mixture.particles.reference.astype(mixture.log_weights.dtype)

@@ -85,6 +85,15 @@ def objects_filters(
     object are rival hypotheses about it. Only components of one object merge, a component splits
     where hypotheses diverge, and hopeless ones are pruned. Objects exclude each other.
     """
+    return _objects(frame, boxes, MAX_COMPONENTS)
+
+
+def drawn_filter(frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]) -> Filter:
+    """The MPF of `objects_filters`, with room for two hypotheses about each of many boxes."""
+    return _objects(frame, boxes, max(MAX_COMPONENTS, 2 * len(boxes)))["mpf"]
+
+
+def _objects(frame: np.ndarray, boxes: np.ndarray, num_components: int) -> dict[str, Filter]:
     size = boxes[:, 2:].mean(axis=0)
     model = _own_references(frame, boxes, sigma=0.15, num_parts=5, contrast=0.25)
     apart = _apart(size)
@@ -94,7 +103,7 @@ def objects_filters(
         PruneHypotheses(least_share=1e-6),
         Split(4.0, 0.5, min_share=0.15, **apart),
     ]
-    return _started_at_the_boxes(model, moves, size)
+    return _started_at_the_boxes(model, moves, size, num_components)
 
 
 def _own_references(frame: np.ndarray, boxes: np.ndarray, **options: Any) -> ColourModel:
@@ -110,7 +119,10 @@ def _steps(boxes: np.ndarray) -> np.ndarray:
 
 
 def _started_at_the_boxes(
-    model: ColourModel, moves: list[AbstractMove], size: np.ndarray
+    model: ColourModel,
+    moves: list[AbstractMove],
+    size: np.ndarray,
+    num_components: int = MAX_COMPONENTS,
 ) -> dict[str, Filter]:
     """Both filters; the mixture starts with one component for each box."""
     mixture = Filter(
@@ -120,8 +132,8 @@ def _started_at_the_boxes(
             Propagate(model),
             *moves,
         ],
-        num_particles=NUM_PARTICLES,
-        num_components=MAX_COMPONENTS,
+        num_particles=PARTICLES_PER_COMPONENT * num_components,
+        num_components=num_components,
         initial_moves=[
             KMeans(10, reseed=True, **_apart(size)),
             Merge(None, 0.5, features=_reference),

@@ -15,7 +15,9 @@ from mpfjax.vision.scenes import football_scene
 pytest.importorskip("imageio", reason="reading and writing frames needs the extra 'video'")
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
 
-FIELDS = ["filter", "all_covered", "per_object", "on_object", "id_swaps", "ms_per_frame"]
+FIELDS = [
+    "filter", "all_covered", "per_object", "on_object", "on_other", "id_swaps", "ms_per_frame"
+]  # fmt: skip
 
 
 def run(*arguments):
@@ -58,9 +60,12 @@ def test_all_that_the_issue_names_is_written(finished):
 
 def test_the_scores_are_those_of_the_tracks(finished, sequence):
     truth = read_tracks(sequence / "gt.txt")
-    truth = truth[(truth[:, 0] >= 3) & np.isin(truth[:, 1], [1, 2, 3])]
+    truth = truth[truth[:, 0] >= 3]
+    is_started = np.isin(truth[:, 1], [1, 2, 3])
+    truth, others = truth[is_started], truth[~is_started]
     for result in results_in(finished)["results"]:
-        expected = coverage(read_tracks(finished / f"tracks_{result['filter']}.txt"), truth)
+        expected = coverage(read_tracks(finished / f"tracks_{result['filter']}.txt"), truth, others)
+        assert result["on_other"] == pytest.approx(expected.on_other)
         assert result["all_covered"] == pytest.approx(expected.all_covered)
         assert result["on_object"] == pytest.approx(expected.on_object)
         assert result["id_swaps"] == expected.id_swaps
@@ -87,7 +92,7 @@ def test_without_a_truth_the_scores_are_null_and_the_rest_is_written(sequence, t
     assert run("--video", video, "--box", f"{x},{y},{w},{h}", "--frames", "1:4", "--out", out,
                "--seeds", 2, "--gif") == 0  # fmt: skip
     for result in results_in(out)["results"]:
-        assert [result[field] for field in FIELDS[1:5]] == [None] * 4
+        assert [result[field] for field in FIELDS[1:6]] == [None] * 5
         assert result["ms_per_frame"] > 0
     assert {path.name for path in out.iterdir()} >= {"contact_sheet.png", "tracking.gif"}
     assert len(read_tracks(out / "tracks_pf.txt")) == 4

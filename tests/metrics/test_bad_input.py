@@ -44,7 +44,7 @@ TABLE = {
     "coverage": (
         coverage,
         {"tracks": ROWS, "objects": ROWS},
-        {"tracks": "rows", "objects": "rows"},
+        {"tracks": "rows", "objects": "rows", "others": "rows?"},
     ),
     "multi_object_scores": (
         metrics.multi_object_scores,

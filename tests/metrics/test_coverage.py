@@ -30,6 +30,17 @@ def test_shares_by_hand():
     assert result.id_swaps == 0
 
 
+def test_a_box_on_somebody_else_is_told_from_one_on_nothing():
+    objects = np.array([row(1, 1, 100), row(2, 1, 100)])
+    others = np.array([row(1, 2, 104), row(1, 3, 300), row(3, 3, 300)])
+    tracks = np.array(
+        [row(1, 7, 100), row(1, 8, 300), row(2, 8, 300), row(2, 9, 500), row(3, 9, 300)]
+    )
+    result = coverage(tracks, objects, others)
+    assert (result.on_object, result.on_other) == (1 / 4, 1 / 4)
+    assert coverage(tracks, objects) == result._replace(on_other=0.0)
+
+
 def test_an_object_without_a_box_does_not_count():
     objects = np.array([row(1, 1, 0), row(2, 1, 0), row(2, 2, 100)])
     result = coverage(np.array([row(1, 5, 0), row(2, 5, 0)]), objects)

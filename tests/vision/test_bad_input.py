@@ -118,6 +118,24 @@ TABLE = {
         {"path": "/nowhere/a.gif", "frames": [FRAME]},
         {"path": "path", "frames_per_second": "positive"},
     ),
+    "track": (
+        vision.track,
+        {"frames": None, "detections": np.zeros((0, 7))},
+        {"tracker": "kind?", "key": "key?", "first": "count", "min_score": "finite?",
+         "max_detections": "count?", "use_colours": "flag"},
+    ),
+    "follow_boxes": (
+        vision.follow_boxes,
+        {"frames": [FRAME], "boxes": BOXES},
+        {"boxes": "rows", "key": "key?"},
+    ),
+    "make_tracker": (
+        vision.make_tracker,
+        {},
+        {"filter": "kind", "max_objects": "count", "frames_per_second": "positive?"},
+    ),
+    "read_detections": (vision.read_detections, {}, {"path": "path"}),
+    "frame_rate": (vision.frame_rate, {}, {"path": "path"}),
     "integral_histogram": (
         vision.integral_histogram,
         {"frame": FRAME, "colours": vision.RGBColours(4)},

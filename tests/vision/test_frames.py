@@ -1,5 +1,6 @@
 """Folders of images, videos and GIFs in and out."""
 
+import signal
 import sys
 
 import numpy as np
@@ -113,3 +114,22 @@ def test_a_missing_imageio_says_how_to_install_it(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio.v3", None)
     with pytest.raises(ImportError, match=r'pip install "mpfjax\[video\]"'):
         next(read_frames(folder))
+
+
+def test_an_interrupt_while_a_frame_is_written_leaves_a_whole_video(tmp_path, monkeypatch):
+    from imageio.plugins.ffmpeg import FfmpegFormat
+
+    append_data = FfmpegFormat.Writer._append_data
+    written = []
+
+    def interrupted(writer, *rest):
+        written.append(1)
+        if len(written) == 3:
+            signal.raise_signal(signal.SIGINT)
+        append_data(writer, *rest)
+
+    monkeypatch.setattr(FfmpegFormat.Writer, "_append_data", interrupted)
+    stills = [np.full((32, 32, 3), 10 * i, np.uint8) for i in range(5)]
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / "video.mp4", stills)
+    assert len(list(read_frames(tmp_path / "video.mp4"))) == 3

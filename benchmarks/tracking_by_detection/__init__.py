@@ -1,0 +1,1 @@
+"""Our trackers beside those that people use, on the same detections."""

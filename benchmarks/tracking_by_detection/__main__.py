@@ -1,0 +1,259 @@
+"""Our trackers beside those that people use, on the same detections and scored alike.
+
+    python -m benchmarks.tracking_by_detection DIR [DIR ...]
+
+Each DIR is a sequence: img/ (or img1/), gt.txt (or gt/gt.txt) and one or more files of detections,
+det*.txt (or det/det.txt). On each file run the two filters of `mpfjax.vision.track`, means over
+seeds, and the peers that are installed: the SORT-like trackers of the packages `trackers` and
+`norfair`, with their defaults, with what their documentation advises, and then all of them, ours
+as well, with the same minimal score, that below which weaker detections are left out. It is the
+threshold that parts the file's scores best in two (Otsu's), unless --min-score gives one.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.tracking_by_detection.peers import Peer, peers
+from mpfjax.console import (
+    Clock,
+    exit_status,
+    finite,
+    format_table,
+    positive,
+    seed,
+    whole,
+    write_json,
+)
+from mpfjax.metrics import multi_object_scores
+from mpfjax.vision import boxes as box_files
+from mpfjax.vision import frames
+from mpfjax.vision.detectors import Rows
+from mpfjax.vision.loop import make_tracker, online_rows, track
+
+OURS = {"gm_mpf": "GM-MPF", "mpf": "MPF"}
+SCORES = ("HOTA", "MOTA", "IDF1", "id_switches")
+COLUMNS = ("tracker", "sequence", "detections", *SCORES, "frames_per_second")
+
+
+class Sequence(NamedTuple):
+    """A folder with one of its files of detections."""
+
+    folder: Path
+    detections: Path
+    rows: np.ndarray
+    truth: np.ndarray
+    first: int
+    last: int
+    frames_per_second: float | None
+
+    def stills(self) -> Iterator[np.ndarray]:
+        """The frames."""
+        return frames.read_frames(self.folder, self.first, self.last)
+
+
+class Run(NamedTuple):
+    """The tracks of one run, and how fast it was."""
+
+    rows: np.ndarray
+    frames_per_second: float
+
+
+def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
+    """The arguments, each checked as far as it can be without the sequences."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.tracking_by_detection",
+        description="Our trackers beside those that people use, on the same detections.",
+    )
+    parser.add_argument("sequences", type=Path, nargs="+", metavar="DIR", help="img/, gt.txt, det*")
+    parser.add_argument("--out", type=Path, default=Path("results/tracking_by_detection"))
+    parser.add_argument("--seed", type=seed, default=0)
+    parser.add_argument("--seeds", type=whole(), default=3, help="runs of ours; scores are means")
+    parser.add_argument("--frames", metavar="A:B", help="frames A to B, counted from 1, both in")
+    parser.add_argument("--fps", type=positive, help="frames a second, where nothing says it")
+    parser.add_argument(
+        "--min-score", type=finite, metavar="S", help="the same minimal score for all"
+    )
+    parser.add_argument("--no-peers", action="store_true", help="our own trackers alone")
+    parser.add_argument("--no-colour", action="store_true", help="ours on the detections alone")
+    return parser.parse_args(arguments)
+
+
+def open_sequences(options: argparse.Namespace) -> list[Sequence]:
+    """Every file of detections of every folder, or a `ValueError` that names what is missing."""
+    first, last = frames.parse_range(options.frames, "--frames")
+    found = []
+    for folder in options.sequences:
+        if not folder.is_dir():
+            raise ValueError(f"DIR: {folder} is not a folder")
+        held = frames.num_images(folder)
+        truth_path = _first_file(folder, "gt.txt", "gt/gt.txt")
+        files = sorted(folder.glob("det*.txt")) + sorted(folder.glob("det/det*.txt"))
+        if held < first or truth_path is None or not files:
+            raise ValueError(
+                f"DIR: {folder} holds {held} images, {len(files)} files det*.txt and"
+                f" {'a' if truth_path else 'no'} gt.txt; all three are needed"
+            )
+        end = min(last or held, held)
+        truth = _between(box_files.read_tracks(truth_path), first, end)
+        rate = options.fps or frames.frame_rate(folder)
+        for path in files:
+            rows = _between(box_files.read_detections(path), first, end)
+            found.append(Sequence(folder, path, rows, truth, first, end, rate))
+    return found
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run every tracker on every sequence, writing the table after each."""
+    sequences = open_sequences(options)
+    others = [] if options.no_peers else peers()
+    results: list[dict[str, Any]] = []
+    options.out.mkdir(parents=True, exist_ok=True)
+    for sequence in sequences:
+        for name, runs in _runs(options, sequence, others):
+            results.append(_result(name, sequence, list(runs)))
+            write_json(options.out / "tracking_by_detection.json", {"rows": results})
+    print(table(results))
+    print(f"written to {options.out}")
+
+
+def _runs(
+    options: argparse.Namespace, sequence: Sequence, others: list[Peer]
+) -> Iterator[tuple[str, Iterator[Run]]]:
+    """The name of each tracker with its setting, and its runs, made as they are asked for."""
+    least = options.min_score
+    if least is None and _scores(sequence.rows) is not None:
+        least = otsu(sequence.rows[:, 6])
+    for filter, name in OURS.items():
+        yield name, _ours(options, sequence, filter, None)
+    for peer in others:
+        yield f"{peer.name}, {peer.setting}", iter([_theirs(sequence, peer, None)])
+    if least is not None:
+        for filter, name in OURS.items():
+            yield f"{name}, score >= {least:.3g}", _ours(options, sequence, filter, least)
+        for peer in others:
+            if peer.setting == "defaults":
+                run = _theirs(sequence, peer, least)
+                yield f"{peer.name}, defaults, score >= {least:.3g}", iter([run])
+
+
+def _ours(
+    options: argparse.Namespace, sequence: Sequence, filter: str, least: float | None
+) -> Iterator[Run]:
+    """A run for each seed; compiling, in the first frame, is not timed."""
+    rows = Rows(sequence.rows, sequence.first)
+    tracker = make_tracker(filter, rows.most_objects(), sequence.frames_per_second)
+    for number in range(options.seed, options.seed + options.seeds):
+        clock = Clock("read", "track")
+        tracked = track(
+            clock.over("read", sequence.stills()), rows, tracker, key=jax.random.key(number),
+            first=sequence.first, min_score=least, use_colours=not options.no_colour,
+        )  # fmt: skip
+        kept, compiling = [], 0.0
+        bar = tqdm(total=sequence.last - sequence.first + 1, desc=OURS[filter], disable=None)
+        for frame, tracks in enumerate(clock.over("track", tracked), sequence.first):
+            kept.append(online_rows(frame, tracks))
+            compiling = compiling or clock.seconds["track"]
+            bar.update()
+        bar.close()
+        yield Run(np.concatenate(kept), _rate(len(kept) - 1, clock.seconds["track"] - compiling))
+
+
+def _theirs(sequence: Sequence, peer: Peer, least: float | None) -> Run:
+    """One run, which has no random numbers."""
+    rows, scores = sequence.rows, _scores(sequence.rows)
+    scores = np.ones(len(rows)) if scores is None else scores
+    if least is not None:
+        rows, scores = rows[scores >= least], scores[scores >= least]
+    # Thresholds that a documentation advises are for scores up to one.
+    if peer.setting == "advised" and scores.max(initial=0.0) > 1:
+        scores = scores / scores.max()
+    step = peer.make(sequence.frames_per_second if peer.setting == "advised" else None)
+    kept, seconds = [], 0.0
+    for frame in range(sequence.first, sequence.last + 1):
+        here = rows[:, 0] == frame
+        boxes, strengths = rows[here, 2:6], scores[here]
+        start = time.perf_counter()
+        tracked = step(boxes, strengths)
+        seconds += time.perf_counter() - start
+        kept.append(np.column_stack([np.full(len(tracked), frame), tracked]))
+    return Run(np.round(np.concatenate(kept), 3), _rate(len(kept), seconds))
+
+
+def otsu(scores: np.ndarray) -> float:
+    """The threshold that parts scores in two classes with the most variance between them.
+
+    Otsu (1979), over the scores themselves in place of a histogram's bins.
+    """
+    ordered = np.sort(scores)
+    n = len(ordered)
+    below = np.arange(1, n)
+    sums = np.cumsum(ordered)
+    means = sums[:-1] / below, (sums[-1] - sums[:-1]) / (n - below)
+    between = below * (n - below) * (means[1] - means[0]) ** 2
+    return float(ordered[1:][np.argmax(between)]) if n > 1 else float(ordered[0])
+
+
+def _result(name: str, sequence: Sequence, runs: list[Run]) -> dict[str, Any]:
+    span = (sequence.first, sequence.last)
+    scores = [multi_object_scores(run.rows, sequence.truth, span) for run in runs]
+    result: dict[str, Any] = {
+        "tracker": name,
+        "sequence": sequence.folder.name,
+        "detections": sequence.detections.name,
+    }
+    result |= {score: round(float(np.mean([s[score] for s in scores])), 4) for score in SCORES}
+    rate = float(np.median([run.frames_per_second for run in runs]))
+    return result | {"frames_per_second": round(rate, 1)}
+
+
+def table(results: list[dict[str, Any]]) -> str:
+    """The results as text, the best HOTA first in each cell."""
+    cells = list(dict.fromkeys((row["sequence"], row["detections"]) for row in results))
+    ordered = sorted(
+        results, key=lambda row: (cells.index((row["sequence"], row["detections"])), -row["HOTA"])
+    )
+    lines = [
+        [
+            *(row[column] for column in COLUMNS[:3]),
+            *(f"{row[column]:.3f}" for column in SCORES[:3]),
+            f"{row['id_switches']:.1f}",
+            f"{row['frames_per_second']:.0f}",
+        ]
+        for row in ordered
+    ]
+    header = ["tracker", "sequence", "detections", "HOTA", "MOTA", "IDF1", "switches", "frames/s"]
+    return format_table(header, lines)
+
+
+def _scores(rows: np.ndarray) -> np.ndarray | None:
+    """The scores, where there are any that differ."""
+    return rows[:, 6] if rows.shape[1] > 6 and np.ptp(rows[:, 6]) > 0 else None
+
+
+def _between(rows: np.ndarray, first: int, last: int) -> np.ndarray:
+    return rows[(rows[:, 0] >= first) & (rows[:, 0] <= last)]
+
+
+def _first_file(folder: Path, *names: str) -> Path | None:
+    return next((folder / name for name in names if (folder / name).is_file()), None)
+
+
+def _rate(count: int, seconds: float) -> float:
+    return count / seconds if seconds > 0 else 0.0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the benchmark; bad input is one line on the error stream and exit status 2."""
+    return exit_status(lambda: run(parse_arguments(arguments)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,159 @@
+"""Trackers of other libraries, each as a function from a frame's detections to its tracks.
+
+`trackers` (SORT, ByteTrack, OC-SORT, BoT-SORT, C-BIoU) and `norfair`, each with its defaults and
+with what its own documentation advises for pedestrians: the configurations that the comparison
+page of `trackers` gives for MOT17, and those of norfair's MOTChallenge demonstration. All see
+boxes and scores alone, without camera motion.
+"""
+
+import sys
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+# Boxes (x, y, w, h) and scores of one frame, to rows (id, x, y, w, h).
+Step = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+class Peer(NamedTuple):
+    """A tracker of another library with one of its settings."""
+
+    name: str
+    setting: str
+    make: Callable[[float | None], Step]  # given the frames per second, where they are known
+
+
+_BOT_SORT = {"enable_cmc": False}
+# By class: what the table calls it, what it always gets, and what its documentation advises.
+TRACKERS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+    "SORTTracker": (
+        "SORT",
+        {},
+        {"lost_track_buffer": 10, "track_activation_threshold": 0.75,
+         "minimum_consecutive_frames": 2, "minimum_iou_threshold": 0.3},
+    ),
+    "ByteTrackTracker": (
+        "ByteTrack",
+        {},
+        {"lost_track_buffer": 10, "track_activation_threshold": 0.7,
+         "minimum_consecutive_frames": 1, "minimum_iou_threshold": 0.3,
+         "high_conf_det_threshold": 0.5},
+    ),
+    "OCSORTTracker": (
+        "OC-SORT",
+        {},
+        {"lost_track_buffer": 30, "minimum_iou_threshold": 0.3, "minimum_consecutive_frames": 3,
+         "direction_consistency_weight": 0.2, "high_conf_det_threshold": 0.4, "delta_t": 1},
+    ),
+    "BoTSORTTracker": (
+        "BoT-SORT",
+        _BOT_SORT,
+        {"lost_track_buffer": 30, "minimum_consecutive_frames": 2,
+         "minimum_iou_threshold_first_assoc": 0.2, "minimum_iou_threshold_second_assoc": 0.5,
+         "minimum_iou_threshold_unconfirmed_assoc": 0.2, "high_conf_det_threshold": 0.5,
+         "track_activation_threshold": 0.6},
+    ),
+    "CBIoUTracker": (
+        "C-BIoU",
+        {},
+        {"lost_track_buffer": 30, "minimum_consecutive_frames": 2,
+         "minimum_iou_threshold_first_assoc": 0.2, "minimum_iou_threshold_second_assoc": 0.5,
+         "minimum_iou_threshold_unconfirmed_assoc": 0.3, "high_conf_det_threshold": 0.6,
+         "track_activation_threshold": 0.7, "buffer_ratio_first": 0.3, "buffer_ratio_second": 0.5},
+    ),
+}  # fmt: skip
+# norfair has no default distance; that of its demonstrations on boxes, and of MOTChallenge's.
+NORFAIR = {
+    "defaults": {"distance_function": "iou", "distance_threshold": 0.7},
+    "advised": {
+        "distance_function": "iou",
+        "distance_threshold": 0.9,
+        "detection_threshold": 0.5,
+        "pointwise_hit_counter_max": 3,
+        "hit_counter_max": 8,
+    },
+}
+
+
+def peers() -> list[Peer]:
+    """Those that are installed; what is missing is said on the error stream."""
+    found: list[Peer] = []
+    for bring, hint in (
+        (_of_trackers, 'pip install "mpfjax[peers]"'),
+        (_of_norfair, "pip install --no-deps norfair, and filterpy"),
+    ):
+        try:
+            found += bring()
+        except ImportError as error:
+            print(f"peers are missing ({error}): {hint}", file=sys.stderr)
+    return found
+
+
+def _of_trackers() -> list[Peer]:
+    import supervision
+    import trackers
+
+    found = []
+    for name, (title, always, advised) in TRACKERS.items():
+        # Older versions have the first two alone.
+        kind = getattr(trackers, name, None)
+        if kind is not None:
+            for setting, options in (("defaults", {}), ("advised", advised)):
+                found.append(Peer(title, setting, _maker(kind, always | options, supervision)))
+    return found
+
+
+def _maker(kind: Any, options: dict[str, Any], supervision: Any) -> Callable[[float | None], Step]:
+    def make(frames_per_second: float | None) -> Step:
+        rate = {} if frames_per_second is None else {"frame_rate": frames_per_second}
+        tracker = kind(**options | rate)
+
+        def step(boxes: np.ndarray, scores: np.ndarray) -> np.ndarray:
+            corners = np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
+            found = supervision.Detections(
+                xyxy=corners.reshape(-1, 4).astype(np.float32),
+                confidence=scores.astype(np.float32),
+                class_id=np.zeros(len(boxes), int),
+            )
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                tracked = tracker.update(found)
+            ids = np.asarray(tracked.tracker_id if tracked.tracker_id is not None else [], int)
+            kept = np.flatnonzero(ids >= 0)
+            sides = np.asarray(tracked.xyxy, float)[kept]
+            # Ids of files count from 1.
+            return np.column_stack([ids[kept] + 1, sides[:, :2], sides[:, 2:] - sides[:, :2]])
+
+        return step
+
+    return make
+
+
+def _of_norfair() -> list[Peer]:
+    import norfair
+
+    def maker(options: dict[str, Any]) -> Callable[[float | None], Step]:
+        def make(frames_per_second: float | None) -> Step:
+            del frames_per_second
+            tracker = norfair.Tracker(**options)
+
+            def step(boxes: np.ndarray, scores: np.ndarray) -> np.ndarray:
+                corners = np.stack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
+                found = [
+                    norfair.Detection(points, scores=np.full(2, score))
+                    for points, score in zip(corners, scores, strict=True)
+                ]
+                tracked = tracker.update(detections=found)
+                rows = [
+                    [one.id, *one.estimate[0], *(one.estimate[1] - one.estimate[0])]
+                    for one in tracked
+                ]
+                return np.array(rows, float).reshape(-1, 5)
+
+            return step
+
+        return make
+
+    return [Peer("norfair", setting, maker(options)) for setting, options in NORFAIR.items()]

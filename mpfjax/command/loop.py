@@ -1,0 +1,186 @@
+"""One run of the command: read, detect, track and write, frame by frame."""
+
+import argparse
+import contextlib
+import resource
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from mpfjax.command.arguments import Source, open_source, read_boxes, read_detections
+from mpfjax.console import Clock, format_table, write_json
+from mpfjax.metrics import multi_object_scores
+from mpfjax.vision import boxes as box_files
+from mpfjax.vision import drawing, frames
+from mpfjax.vision.detection import BackgroundSubtraction
+from mpfjax.vision.detectors import LEAST_ROOM, Rows
+from mpfjax.vision.drawn import follow_boxes
+from mpfjax.vision.loop import make_tracker, offline_rows, online_rows, track
+from mpfjax.vision.tracker import Tracks
+
+_SCORES = ("HOTA", "MOTA", "IDF1")
+
+
+class Results:
+    """What is written of a run: rows as they come, the video, and the summary at the end."""
+
+    def __init__(self, options: argparse.Namespace, source: Source) -> None:
+        self.options, self.source = options, source
+        self.clock = Clock("read", "detect", "track", "write")
+        self.compiling = 0.0  # seconds of detecting and tracking in the first frame
+        self.rows: list[np.ndarray] = []
+        self.kept: list[Tracks] = []  # for --offline alone
+        self.num_frames = 0
+
+    def add(self, tracks: Tracks) -> np.ndarray:
+        """Keep a frame's tracks, and return its rows."""
+        rows = online_rows(self.source.first + self.num_frames, tracks)
+        self.rows.append(rows)
+        if self.options.offline:
+            self.kept.append(tracks)
+        self.num_frames += 1
+        if self.num_frames == 1:
+            self.compiling = self._working()
+        return rows
+
+    def _working(self) -> float:
+        return self.clock.seconds["detect"] + self.clock.seconds["track"]
+
+    def all_rows(self) -> np.ndarray:
+        """The rows of tracks.txt."""
+        if self.options.offline:
+            return offline_rows(self.kept, self.source.first)
+        return np.concatenate([np.zeros((0, 6)), *self.rows])
+
+    def summary(self) -> dict[str, Any]:
+        """The content of summary.json."""
+        rows, clock, n = self.all_rows(), self.clock, self.num_frames
+        # The first frame compiles, and says nothing of the others.
+        rate = (n - 1) / (self._working() - self.compiling) if n > 1 else 1 / self.compiling
+        summary = {
+            "frames": n,
+            "objects": len(np.unique(rows[:, 1])),
+            "seconds": {part: round(seconds, 3) for part, seconds in clock.seconds.items()},
+            "frames_per_second": round(rate, 2),
+            "peak_memory_mb": round(_peak_memory(), 1),
+        }
+        return summary | _scores(rows, self.source, n)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Track, and leave behind what was done, also where it ends before the frames do."""
+    source = open_source(options)
+    results = Results(options, source)
+    still = next(frames.read_frames(source.path, source.first, source.first), None)
+    if still is None:
+        raise ValueError(f"SOURCE: {source.path} has no frame {source.first}")
+    start = _start(options, source, still)
+    options.out.mkdir(parents=True, exist_ok=True)
+    try:
+        _track(results, start)
+    finally:
+        # Also on the way out of an interrupted run, or of one whose frames cannot be read on.
+        if results.num_frames:
+            box_files.write_tracks(options.out / "tracks.txt", results.all_rows())
+            summary = results.summary()
+            write_json(options.out / "summary.json", summary)
+            print(_table(summary))
+            print(f"written to {options.out}")
+
+
+# What makes tracks of stills that are seen once, one after the other.
+Start = Callable[[Iterable[np.ndarray], Clock], Iterator[Tracks]]
+
+
+def _start(options: argparse.Namespace, source: Source, still: np.ndarray) -> Start:
+    """The tracker that was asked for; everything that can be wrong with it is found here."""
+    key = jax.random.key(options.seed)
+    if options.box is not None:
+        boxes = read_boxes(options, still)
+        return lambda stills, clock: follow_boxes(stills, boxes, key=key)
+    rows = None if options.detect else Rows(read_detections(options, source), source.first)
+    room = LEAST_ROOM if rows is None else rows.most_objects()
+    tracker = make_tracker(
+        options.filter or "gm_mpf", options.max_objects or room, source.frames_per_second
+    )
+    detector = BackgroundSubtraction() if options.detect else None
+
+    def tracks(stills: Iterable[np.ndarray], clock: Clock) -> Iterator[Tracks]:
+        return track(
+            stills,
+            rows if detector is None else _timed(detector.detect, clock),
+            tracker,
+            key=key,
+            first=source.first,
+            min_score=options.min_score,
+            use_colours=not options.no_colour,
+        )
+
+    return tracks
+
+
+def _timed(detect: Callable[[Any], Any], clock: Clock) -> Callable[[Any], Any]:
+    def timed(frame: Any) -> Any:
+        with clock.of("detect"):
+            return detect(frame)
+
+    return timed
+
+
+def _track(results: Results, start: Start) -> None:
+    """The loop over frames."""
+    options, source, clock = results.options, results.source, results.clock
+    shown: list[np.ndarray] = []  # the frame that is being tracked in, for the picture
+
+    def watched() -> Iterator[np.ndarray]:
+        stills = frames.read_frames(source.path, source.first, source.last)
+        for still in clock.over("read", stills):
+            shown[:] = [still]
+            yield still
+
+    video = contextlib.nullcontext(None)
+    if not options.no_video:
+        rate = source.frames_per_second or 10.0
+        video = frames.open_video(options.out / "tracking.mp4", rate)
+    bar = tqdm(total=source.num_frames, desc="Tracking", unit="frame", disable=None)
+    with open(options.out / "tracks.txt", "w", encoding="utf-8") as file, video as append, bar:
+        for tracks in clock.over("track", start(watched(), clock)):
+            rows = results.add(tracks)
+            with clock.of("write"):
+                # A line at once, so that a run that is killed leaves them too.
+                file.write(box_files.format_tracks(rows))
+                file.flush()
+                if append is not None:
+                    append(drawing.with_tracks(shown[0], rows))
+            bar.update()
+
+
+def _scores(rows: np.ndarray, source: Source, num_frames: int) -> dict[str, float]:
+    """HOTA, MOTA and IDF1 where there is a truth, and TrackEval to score with."""
+    span = (source.first, source.first + num_frames - 1)
+    if source.truth is None or not np.any(source.truth[:, 0] <= span[1]):
+        return {}
+    try:
+        scores = multi_object_scores(rows, source.truth, span)
+    except ImportError as error:
+        print(f"no HOTA, MOTA and IDF1: {error}", file=sys.stderr)
+        return {}
+    return {name: round(scores[name], 4) for name in _SCORES}
+
+
+def _table(summary: dict[str, Any]) -> str:
+    columns = ["frames", "objects", "frames_per_second", "peak_memory_mb"]
+    columns += [name for name in _SCORES if name in summary]
+    names = ["frames", "objects", "frames a second", "peak MB", *columns[4:]]
+    return format_table(names, [[f"{summary[column]:g}" for column in columns]])
+
+
+def _peak_memory() -> float:
+    """The most memory that this process has held, in MB of 2²⁰ bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # Bytes on a Mac, kilobytes elsewhere.
+    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10

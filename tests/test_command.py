@@ -1,0 +1,248 @@
+"""The command: what it writes, and what it says of bad input."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mpfjax import command
+from mpfjax.command import loop as command_loop
+from mpfjax.metrics import multi_object_scores
+from mpfjax.vision import frames as frame_files
+from mpfjax.vision.boxes import read_tracks, write_tracks
+from mpfjax.vision.frames import read_frames, write_image, write_video
+
+pytest.importorskip("imageio", reason="reading and writing frames needs the extra 'video'")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:os.fork"),
+    # Argparse's and other people's types are not what is tested here.
+    pytest.mark.usefixtures("as_installed"),
+]
+
+NUM_FRAMES = 7
+FIELDS = ["frames", "objects", "seconds", "frames_per_second", "peak_memory_mb"]
+SCORES = ["HOTA", "MOTA", "IDF1"]
+SMALL = ("--max-objects", 3)
+
+
+def run(*arguments):
+    try:
+        return command.main(["track", *map(str, arguments)])
+    except SystemExit as stopped:  # argparse's way out
+        return stopped.code
+
+
+def summary_in(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
+def truth_rows():
+    t = np.arange(NUM_FRAMES)
+    one = np.column_stack([t + 1, 0 * t + 1, 4 + 3 * t, 0 * t + 5, 0 * t + 8, 0 * t + 14])
+    two = np.column_stack([t + 1, 0 * t + 2, 50 - 3 * t, 0 * t + 28, 0 * t + 8, 0 * t + 14])
+    return np.concatenate([one, two]).astype(float)
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    """A folder of frames in which a red and a blue box walk, with gt.txt and det.txt."""
+    folder = tmp_path_factory.mktemp("sequence")
+    frames = np.random.default_rng(0).integers(90, 130, (NUM_FRAMES, 48, 64, 3), dtype=np.uint8)
+    rows = truth_rows()
+    for frame, id, x, y, w, h in rows.astype(int):
+        frames[frame - 1, y : y + h, x : x + w] = (220, 10, 10) if id == 1 else (10, 10, 220)
+    (folder / "img").mkdir()
+    for i, frame in enumerate(frames, 1):
+        write_image(folder / "img" / f"{i:06d}.png", frame)
+    write_tracks(folder / "gt.txt", rows)
+    lines = [f"{f:.0f},-1,{x},{y},{w},{h},0.9,-1,-1,-1\n" for f, _, x, y, w, h in rows]
+    (folder / "det.txt").write_text("".join(lines))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(sequence, tmp_path_factory):
+    out = tmp_path_factory.mktemp("finished")
+    assert run(sequence, "--detections", sequence / "det.txt", "--out", out, *SMALL) == 0
+    return out
+
+
+def test_all_that_is_promised_is_written(finished):
+    assert {path.name for path in finished.iterdir()} == {
+        "tracks.txt", "tracking.mp4", "summary.json"
+    }  # fmt: skip
+    assert len(list(read_frames(finished / "tracking.mp4"))) == NUM_FRAMES
+    summary = summary_in(finished)
+    assert list(summary) == FIELDS + SCORES
+    assert list(summary["seconds"]) == ["read", "detect", "track", "write"]
+    assert summary["seconds"]["track"] > summary["seconds"]["detect"] >= 0
+    assert summary["frames"] == NUM_FRAMES
+    assert summary["frames_per_second"] > 0
+    assert summary["peak_memory_mb"] > 50
+
+
+def test_the_summary_is_that_of_the_file(finished):
+    rows, summary = read_tracks(finished / "tracks.txt"), summary_in(finished)
+    scores = multi_object_scores(rows, truth_rows(), (1, NUM_FRAMES))
+    assert {name: summary[name] for name in SCORES} == pytest.approx(
+        {name: scores[name] for name in SCORES}, abs=1e-4
+    )
+    assert summary["objects"] == len(np.unique(rows[:, 1])) == 2
+
+
+def test_rows_are_of_what_was_known_when_the_frame_came(sequence, finished, tmp_path):
+    online = read_tracks(finished / "tracks.txt")
+    assert online[0, 0] > 1, "an object was believed in at first sight"
+    assert run(sequence, "--detections", sequence / "det.txt", "--out", tmp_path, *SMALL,
+               "--offline", "--no-video") == 0  # fmt: skip
+    offline = read_tracks(tmp_path / "tracks.txt")
+    assert offline[0, 0] == 1
+    later = offline[offline[:, 0] >= online[0, 0]]
+    np.testing.assert_array_equal(later, online)
+    assert not (tmp_path / "tracking.mp4").exists()
+
+
+def test_some_frames_of_a_video_without_colours_or_truth(sequence, tmp_path):
+    video = tmp_path / "video.mp4"
+    write_video(video, read_frames(sequence), 12.5)
+    assert frame_files.frame_rate(video) == 12.5
+    out = tmp_path / "out"
+    assert run(video, "--detections", sequence / "det.txt", "--out", out, *SMALL,
+               "--frames", "2:6", "--no-colour") == 0  # fmt: skip
+    summary = summary_in(out)
+    assert list(summary) == FIELDS
+    assert summary["frames"] == 5
+    assert set(read_tracks(out / "tracks.txt")[:, 0]) <= set(range(2, 7))
+    assert frame_files.frame_rate(out / "tracking.mp4") == 12.5
+
+
+def test_an_interrupt_leaves_what_was_done(sequence, tmp_path, monkeypatch, capsys):
+    read = frame_files.read_frames
+
+    def interrupted(path, first, last):
+        for number, frame in enumerate(read(path, first, last), first):
+            if number == 5:
+                raise KeyboardInterrupt
+            yield frame
+
+    monkeypatch.setattr(frame_files, "read_frames", interrupted)
+    assert run(sequence, "--detections", sequence / "det.txt", "--out", tmp_path, *SMALL) == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert summary_in(tmp_path)["frames"] == 4
+    assert read_tracks(tmp_path / "tracks.txt")[-1, 0] == 4
+    monkeypatch.undo()
+    assert len(list(read_frames(tmp_path / "tracking.mp4"))) == 4
+
+
+@pytest.mark.parametrize("spoil", ["cut short", "another size"])
+def test_frames_that_cannot_be_read_on_leave_what_was_done(sequence, tmp_path, capsys, spoil):
+    (tmp_path / "img").mkdir()
+    for path in sorted((sequence / "img").iterdir()):
+        (tmp_path / "img" / path.name).write_bytes(path.read_bytes())
+    fifth = tmp_path / "img" / "000005.png"
+    if spoil == "cut short":
+        fifth.write_bytes(fifth.read_bytes()[:2000])
+    else:
+        write_image(fifth, np.zeros((40, 64, 3), np.uint8))
+    out = tmp_path / "out"
+    assert run(tmp_path, "--detections", sequence / "det.txt", "--out", out, *SMALL) == 2
+    error = capsys.readouterr().err
+    assert ("000005.png" if spoil == "cut short" else "different sizes") in error
+    assert summary_in(out)["frames"] == 4
+    assert read_tracks(out / "tracks.txt")[-1, 0] == 4
+
+
+def test_what_moves_is_detected(sequence, tmp_path):
+    pytest.importorskip("cv2", reason="detecting needs the extra 'video'")
+    assert run(sequence, "--detect", "--out", tmp_path, *SMALL, "--no-video") == 0
+    assert summary_in(tmp_path)["seconds"]["detect"] > 0
+
+
+def test_warnings_are_a_line_each(sequence, tmp_path, capsys):
+    rows = (
+        sequence / "det.txt"
+    ).read_text() + "3,-1,500,5,5,5,0.9,-1,-1,-1\n99,-1,5,5,5,5,1,-1,-1,-1\n"
+    (tmp_path / "det.txt").write_text(rows)
+    out = tmp_path / "out"
+    assert run(sequence, "--detections", tmp_path / "det.txt", "--out", out, *SMALL) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    assert len(lines) == 2
+    assert "frame 3 has boxes outside the frame, 64 x 48" in lines[0]
+    assert "1 lie in frames after the last, 7" in lines[1]
+
+
+def nothing_tracked(*_, **__):
+    pytest.fail("it went on to track")
+
+
+DETECTIONS = ["--detections", "DET"]
+
+
+@pytest.mark.parametrize(
+    ("message", "arguments"),
+    [
+        ("not allowed with argument", ["--detections", "DET", "--detect"]),
+        ("one of the arguments --detections --detect --box is required", []),
+        ("--detections: nowhere.txt is not a file", ["--detections", "nowhere.txt"]),
+        ("--box: '1,2,3' is not four numbers", ["--box", "1,2,3"]),
+        ("--box: 1,2,0,4 has no area", ["--box", "1,2,0,4"]),
+        ("--box: 100,2,4,4 lies outside the first frame, 64 x 48", ["--box", "100,2,4,4"]),
+        ("--filter: not allowed with --box", ["--box", "1,2,4,4", "--filter", "mpf"]),
+        ("--min-score: not allowed with --detect", ["--detect", "--min-score", "1"]),
+        ("--frames: '7' is not A:B", [*DETECTIONS, "--frames", "7"]),
+        ("holds 7 images, and no frame 9", [*DETECTIONS, "--frames", "9:12"]),
+        ("invalid choice: 'pf'", [*DETECTIONS, "--filter", "pf"]),
+        ("'nan' is not a finite number", [*DETECTIONS, "--min-score", "nan"]),
+        ("'0' is not a whole number from 1 to 1024", [*DETECTIONS, "--max-objects", "0"]),
+        ("'0' is not a positive, finite number", [*DETECTIONS, "--fps", "0"]),
+        ("'-1' is not a whole number", [*DETECTIONS, "--seed", "-1"]),
+    ],
+)
+def test_bad_arguments_are_named_before_anything_is_written(
+    sequence, tmp_path, capsys, monkeypatch, message, arguments
+):
+    monkeypatch.setattr(command_loop, "_track", nothing_tracked)
+    arguments = [sequence / "det.txt" if argument == "DET" else argument for argument in arguments]
+    assert run(sequence, "--out", tmp_path / "out", *arguments) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("message", "text"),
+    [
+        ("line 2: '1,-1,nan,5,5,5,1'", "1,-1,5,5,5,5,1\n1,-1,nan,5,5,5,1\n"),
+        ("line 1: '1,-1,5,5,5'", "1,-1,5,5,5\n"),
+        ("line 1: '1.5,-1,5,5,5,5,1'", "1.5,-1,5,5,5,5,1\n"),
+        ("line 3: has a score, or none, unlike", "1,-1,5,5,5,5\n\n1,-1,5,5,5,5,1\n"),
+        ("det.txt: holds no detections", "\n"),
+        ("--min-score: ", "1,-1,5,5,5,5\n"),
+    ],
+)
+def test_bad_detections_are_named_with_their_line(
+    sequence, tmp_path, capsys, monkeypatch, message, text
+):
+    monkeypatch.setattr(command_loop, "_track", nothing_tracked)
+    (tmp_path / "det.txt").write_text(text)
+    least = ["--min-score", 1] if "--min-score" in message else []
+    out = tmp_path / "out"
+    assert run(sequence, "--detections", tmp_path / "det.txt", "--out", out, *least) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("source", ["gone.mp4", "empty", "broken.mp4"])
+def test_a_source_without_frames_is_named(sequence, tmp_path, capsys, source):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "broken.mp4").write_bytes(b"no video")
+    detections = ["--detections", sequence / "det.txt"]
+    assert run(tmp_path / source, *detections, "--out", tmp_path / "out") == 2
+    assert source in capsys.readouterr().err
+
+
+def test_frame_rates_are_read_where_they_stand(tmp_path):
+    (tmp_path / "img1").mkdir()
+    write_image(tmp_path / "img1" / "000001.jpg", np.zeros((4, 4, 3), np.uint8))
+    assert frame_files.frame_rate(tmp_path) is None
+    (tmp_path / "seqinfo.ini").write_text("[Sequence]\nname=one\nframeRate=14\n")
+    assert frame_files.frame_rate(tmp_path) == frame_files.frame_rate(tmp_path / "img1") == 14
+    assert frame_files.num_images(tmp_path) == 1
