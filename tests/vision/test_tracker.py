@@ -322,7 +322,8 @@ def test_who_is_in_contact_teaches_nobody():
         references.append(np.asarray(state.memory["references"]))
         both.append((np.asarray(tracks.unseen) == 0)[np.asarray(tracks.identities) > 0].sum())
     assert both == [2] * 8
-    assert not np.array_equal(references[6], references[5])
+    # They touch at t = 5, and overlap by a fifth at t = 6.
+    assert not np.array_equal(references[5], references[4])
     np.testing.assert_array_equal(references[7], references[6])
 
 
@@ -372,7 +373,7 @@ def test_without_pixels_detections_are_tracked_alone():
         which = corners(0).index(own)
         np.testing.assert_allclose(places[-1], centre_of(corners(7)[which]), atol=2.5)
     gone = run(
-        [corners(t) for t in range(9)],
+        [[(20 - 3 * t, 5), (50 - t, 30)] for t in range(10)],
         pixels=False,
         seen=lambda t, c: boxes_at(c if t < 6 else c[1:]),
     )
@@ -423,9 +424,9 @@ def test_a_bad_setting_is_named(as_installed, name, value):
 @pytest.mark.parametrize(
     ("rejuvenation", "said"),
     [
-        (mpfjax.Resample(), "particles_per_component, None, is not .* 50"),
-        (mpfjax.Resample(particles_per_component=20), "particles_per_component, 20, is not .* 50"),
-        (mpfjax.GaussianRegeneration(50), "where is None"),
+        (mpfjax.Resample(), "particles_per_component, None, is not .* 64"),
+        (mpfjax.Resample(particles_per_component=20), "particles_per_component, 20, is not .* 64"),
+        (mpfjax.GaussianRegeneration(64), "where is None"),
     ],
 )
 def test_a_rejuvenation_that_would_leave_no_room_is_named(rejuvenation, said):
