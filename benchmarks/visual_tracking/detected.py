@@ -79,11 +79,9 @@ def track_detected(
 def _advance(tracker, keys, t, states, frame, found):
     def step(key, state):
         state, tracks = tracker.step(jax.random.fold_in(key, t), state, frame, found)
-        mixture = state.mixture
-        labels = jnp.where(mixture.occupied, mixture.component_indicators, -1)
-        points = state.colour.boxes(mixture.particles)[:, :2]
-        believed = tracks.confirmed & (tracks.unseen <= LONGEST_GUESS)
-        return state, tracks, Snapshot(tracks.boxes, believed, points, labels)
+        labels = jnp.where(state.occupied, state.component_indicators, -1)
+        points = state.particles.boxes[:, :2]
+        return state, tracks, Snapshot(tracks.boxes, tracks.shown, points, labels)
 
     # The frame is not mapped over, so that its histogram is built once for all runs.
     return jax.vmap(step)(keys, states)
