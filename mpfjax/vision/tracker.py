@@ -225,14 +225,14 @@ def object_model(
 ) -> DetectedObjectModel:
     """The tracker's model of people and of what moves like them, at a frame rate.
 
-    Chosen at 7 and 25 frames a second together; above 25, noise shrinks as that of a path with
-    random accelerations does. Raises `ValueError` for a rate or σ that is not positive.
+    Chosen at 7 and 25 frames a second together, on pedestrians and on players who turn at will;
+    above 25, noise shrinks as that of a path with random accelerations does. Raises `ValueError` for a rate or σ that is not positive.
     """
     check_positive(frames_per_second=frames_per_second)
     step = min(25 / frames_per_second, 1.0)
     return DetectedObjectModel(
         position_noise=jnp.array([0.06, 0.03]) * step**0.5,
-        velocity_noise=jnp.array([0.02, 0.01]) * step**1.5,
+        velocity_noise=jnp.array([0.05, 0.025]) * step**1.5,
         size_noise=jnp.array([0.03, 0.015]) * step**0.5,
         detection_deviations=jnp.array([0.2, 0.1, 0.2, 0.12]),
         sigma=sigma,
