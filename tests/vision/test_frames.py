@@ -130,6 +130,11 @@ def test_an_interrupt_while_a_frame_is_written_leaves_a_whole_video(tmp_path, mo
 
     monkeypatch.setattr(FfmpegFormat.Writer, "_append_data", interrupted)
     stills = [np.full((32, 32, 3), 10 * i, np.uint8) for i in range(5)]
-    with pytest.raises(KeyboardInterrupt):
-        write_video(tmp_path / "video.mp4", stills)
+    # A process that a shell started in the background ignores Ctrl-C, and so would this test.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            write_video(tmp_path / "video.mp4", stills)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert len(list(read_frames(tmp_path / "video.mp4"))) == 3
