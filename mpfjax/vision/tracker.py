@@ -225,8 +225,9 @@ def object_model(
 ) -> DetectedObjectModel:
     """The tracker's model of people and of what moves like them, at a frame rate.
 
-    Chosen at 7 and 25 frames a second together, on pedestrians and on players who turn at will;
-    above 25, noise shrinks as that of a path with random accelerations does. Raises `ValueError` for a rate or σ that is not positive.
+    Chosen at 7 and 25 frames a second together, on pedestrians and on players who turn at will.
+    Above 25, noise shrinks as that of a path with random accelerations does. Raises `ValueError`
+    for a rate or σ that is not positive.
     """
     check_positive(frames_per_second=frames_per_second)
     step = min(25 / frames_per_second, 1.0)
