@@ -76,3 +76,11 @@ def walker(mean=0.0, noise=0.5):
 def stack(models):
     """One model with an axis of objects in front, from a model for each."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
+
+
+def two_walkers(num_frames: int) -> np.ndarray:
+    """Rows (frame, id, x, y, w, h) of two boxes that walk towards each other, one above."""
+    t = np.arange(num_frames)
+    one = np.column_stack([t + 1, 0 * t + 1, 4 + 3 * t, 0 * t + 5, 0 * t + 8, 0 * t + 14])
+    two = np.column_stack([t + 1, 0 * t + 2, 50 - 3 * t, 0 * t + 28, 0 * t + 8, 0 * t + 14])
+    return np.concatenate([one, two]).astype(float)

@@ -11,8 +11,11 @@ from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import frames as frame_files
 from mpfjax.vision.boxes import read_tracks, write_tracks
 from mpfjax.vision.frames import read_frames, write_image, write_video
+from tests.examples import two_walkers
 
-pytest.importorskip("imageio", reason="reading and writing frames needs the extra 'video'")
+pytest.importorskip(
+    "imageio", reason="reading and writing frames needs the extra 'video', which 'test' brings"
+)
 pytestmark = [
     pytest.mark.filterwarnings("ignore:os.fork"),
     # Argparse's and other people's types are not what is tested here.
@@ -36,19 +39,12 @@ def summary_in(folder):
     return json.loads((folder / "summary.json").read_text())
 
 
-def truth_rows():
-    t = np.arange(NUM_FRAMES)
-    one = np.column_stack([t + 1, 0 * t + 1, 4 + 3 * t, 0 * t + 5, 0 * t + 8, 0 * t + 14])
-    two = np.column_stack([t + 1, 0 * t + 2, 50 - 3 * t, 0 * t + 28, 0 * t + 8, 0 * t + 14])
-    return np.concatenate([one, two]).astype(float)
-
-
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory):
     """A folder of frames in which a red and a blue box walk, with gt.txt and det.txt."""
     folder = tmp_path_factory.mktemp("sequence")
     frames = np.random.default_rng(0).integers(90, 130, (NUM_FRAMES, 48, 64, 3), dtype=np.uint8)
-    rows = truth_rows()
+    rows = two_walkers(NUM_FRAMES)
     for frame, id, x, y, w, h in rows.astype(int):
         frames[frame - 1, y : y + h, x : x + w] = (220, 10, 10) if id == 1 else (10, 10, 220)
     (folder / "img").mkdir()
@@ -83,7 +79,7 @@ def test_all_that_is_promised_is_written(finished):
 
 def test_the_summary_is_that_of_the_file(finished):
     rows, summary = read_tracks(finished / "tracks.txt"), summary_in(finished)
-    scores = multi_object_scores(rows, truth_rows(), (1, NUM_FRAMES))
+    scores = multi_object_scores(rows, two_walkers(NUM_FRAMES), (1, NUM_FRAMES))
     assert {name: summary[name] for name in SCORES} == pytest.approx(
         {name: scores[name] for name in SCORES}, abs=1e-4
     )
@@ -153,7 +149,7 @@ def test_frames_that_cannot_be_read_on_leave_what_was_done(sequence, tmp_path, c
 
 
 def test_what_moves_is_detected(sequence, tmp_path):
-    pytest.importorskip("cv2", reason="detecting needs the extra 'video'")
+    pytest.importorskip("cv2", reason="detecting needs the extra 'video', which 'test' brings")
     assert run(sequence, "--detect", "--out", tmp_path, *SMALL, "--no-video") == 0
     assert summary_in(tmp_path)["seconds"]["detect"] > 0
 

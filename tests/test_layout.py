@@ -110,13 +110,7 @@ def test_every_file_of_a_folder_of_several_floors_has_one():
 
 @pytest.mark.parametrize("path", FILES, ids=name)
 def test_no_file_is_longer_than_a_visitor_reads(path):
-    """About four hundred lines; what is longer says here why."""
-    reasons = {
-        # The tracker of detected objects, which is to become a chain of moves.
-        "vision/tracker.py": 480,
-    }
-    most = reasons.get(str(path.relative_to(PACKAGE).as_posix()), 400)
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= most
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 400
 
 
 @pytest.mark.parametrize(

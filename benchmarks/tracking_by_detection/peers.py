@@ -92,8 +92,8 @@ def peers() -> list[Peer]:
 
 
 def _of_trackers() -> list[Peer]:
-    import supervision
-    import trackers
+    import supervision  # pyright: ignore[reportMissingImports]
+    import trackers  # pyright: ignore[reportMissingImports]
 
     found = []
     for name, (title, always, advised) in TRACKERS.items():
@@ -132,7 +132,7 @@ def _maker(kind: Any, options: dict[str, Any], supervision: Any) -> Callable[[fl
 
 
 def _of_norfair() -> list[Peer]:
-    import norfair
+    import norfair  # pyright: ignore[reportMissingImports]
 
     def maker(options: dict[str, Any]) -> Callable[[float | None], Step]:
         def make(frames_per_second: float | None) -> Step:

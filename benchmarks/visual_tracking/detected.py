@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,10 +13,14 @@ from tqdm import tqdm
 
 import mpfjax
 from benchmarks.visual_tracking.source import Source
-from mpfjax.vision import BackgroundSubtraction, Detections, ObjectTracker, Tracks
-from mpfjax.vision import boxes as box_files
+from mpfjax.vision import (
+    BackgroundSubtraction,
+    Detections,
+    ObjectTracker,
+    Tracks,
+    offline_rows,
+)
 from mpfjax.vision.snapshots import Snapshot
-from mpfjax.vision.tracker import LONGEST_GUESS
 
 MAX_DETECTIONS = 32
 
@@ -70,9 +74,17 @@ def track_detected(
             yield snapshot, time.perf_counter() - start + detected.seconds[t]
 
     def rows_of_run(snapshots: list[Snapshot]) -> list[np.ndarray]:
-        return [_rows(kept[: len(snapshots)], run, source.first) for run in range(len(keys))]
+        tracked = kept[: len(snapshots)]
+        return [
+            offline_rows((_of_run(tracks, run) for tracks in tracked), source.first)
+            for run in range(len(keys))
+        ]
 
     return frames_of_run, rows_of_run
+
+
+def _of_run(tracks: Tracks, run: int) -> Tracks:
+    return jax.tree.map(lambda leaf: leaf[run], tracks)
 
 
 @eqx.filter_jit
@@ -85,22 +97,3 @@ def _advance(tracker, keys, t, states, frame, found):
 
     # The frame is not mapped over, so that its histogram is built once for all runs.
     return jax.vmap(step)(keys, states)
-
-
-def _rows(kept: list[Tracks], run: int, first: int) -> np.ndarray:
-    """Rows (frame, id, x, y, w, h) of the objects that were believed in at some time.
-
-    Their first frames, before they were, are among them.
-    """
-    believed: set[int] = set()
-    rows: list[list[Any]] = []
-    for frame, tracks in enumerate(kept, first):
-        boxes = box_files.top_left(np.asarray(tracks.boxes[run]))
-        for m in np.flatnonzero(tracks.identities[run]):
-            identity = int(tracks.identities[run][m])
-            if tracks.confirmed[run][m]:
-                believed.add(identity)
-            if tracks.unseen[run][m] <= LONGEST_GUESS:
-                rows.append([frame, identity, *boxes[m]])
-    chosen = np.array([row for row in rows if row[1] in believed]).reshape(-1, 6)
-    return np.round(chosen, 3)

@@ -55,8 +55,9 @@ def forecast(
     check_callable(
         "a function of a key and states", **given(simulate_observation=simulate_observation)
     )
-    run = lambda filter: _forecast(key, filter, mixture, num_steps, simulate_observation)  # noqa: E731
-    return with_floats_traced(run, filter)
+    return with_floats_traced(
+        lambda filter: _forecast(key, filter, mixture, num_steps, simulate_observation), filter
+    )
 
 
 @jit_on_wide_vectors

@@ -176,14 +176,17 @@ def _walk(
         check_log_density(values, model, "log_transition", num_trajectories)
         return values
 
-    # The proposal draws by the weights, which therefore cancel in the acceptance ratio.
-    indices, current = start, log_density(start)
-    for step_key in split(key, num_steps):
+    def move(
+        place: tuple[Int[Array, " k"], Float[Array, " k"]], step_key: Key[Array, ""]
+    ) -> tuple[tuple[Int[Array, " k"], Float[Array, " k"]], None]:
+        indices, current = place
         key_proposal, key_accept = split(step_key, 2)
         proposed = _draw(uniform(key_proposal, (num_trajectories,), dtype), mixture.log_weights)
-        log_ratio = (new := log_density(proposed)) - current
-        accepted = jnp.log(uniform(key_accept, (num_trajectories,), dtype)) < log_ratio
+        new = log_density(proposed)
+        # The proposal draws by the weights, which therefore cancel in the acceptance ratio.
+        accepted = jnp.log(uniform(key_accept, (num_trajectories,), dtype)) < new - current
         accepted |= current == -jnp.inf
-        indices = jnp.where(accepted, proposed, indices)
-        current = jnp.where(accepted, new, current)
+        return (jnp.where(accepted, proposed, indices), jnp.where(accepted, new, current)), None
+
+    (indices, current), _ = jax.lax.scan(move, (start, log_density(start)), split(key, num_steps))
     return eqx.error_if(indices, ~jnp.all(current > -jnp.inf), _NO_PAST)

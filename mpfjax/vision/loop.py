@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Key, PyTree, UInt8
 
 from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole, given
 from mpfjax.moves.resampling import Resample
+from mpfjax.vision.boxes import top_left
 from mpfjax.vision.detections import Detections
 from mpfjax.vision.detectors import LEAST_ROOM, AbstractDetector, Found, Once, Sieve, as_detector
 from mpfjax.vision.frames import of_one_kind
@@ -166,7 +167,7 @@ def online_rows(number: int, tracks: Tracks) -> Float[np.ndarray, "k 6"]:
 
     Those that are confirmed and were detected in the last frames, `Tracks.shown`.
     """
-    return _rows(number, tracks, tracks.confirmed & (tracks.unseen <= LONGEST_GUESS))
+    return _rows(number, tracks, tracks.shown)
 
 
 def offline_rows(kept: Iterable[Tracks], first: int = 1) -> Float[np.ndarray, "r 6"]:
@@ -185,8 +186,7 @@ def offline_rows(kept: Iterable[Tracks], first: int = 1) -> Float[np.ndarray, "r
 
 def _rows(number: int, tracks: Tracks, written: Any) -> np.ndarray:
     written = np.flatnonzero(np.asarray(written) & (np.asarray(tracks.identities) > 0))
-    boxes = np.asarray(tracks.boxes, float)[written]
-    corners = np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, 2:]], axis=1)
+    corners = top_left(np.asarray(tracks.boxes)[written])
     ids = np.asarray(tracks.identities)[written]
     rows = np.column_stack([np.full(len(ids), number), ids, corners])
     # Rounded as files are, so that scores from a file are the scores.

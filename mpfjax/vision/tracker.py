@@ -6,6 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt8
 
 from mpfjax.checks import check_flag, check_positive, check_type, check_whole, given, shown
@@ -52,7 +53,7 @@ class Tracks(NamedTuple):
     full: Bool[Array, ""]
 
     @property
-    def shown(self) -> Bool[Array, " m"]:
+    def shown(self) -> Bool[Array | np.ndarray, " m"]:
         """Which are confirmed, and were seen in this frame or in one of the three before."""
         return self.confirmed & (self.unseen <= LONGEST_GUESS)
 

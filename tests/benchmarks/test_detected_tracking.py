@@ -10,7 +10,6 @@ from tqdm import tqdm
 
 from benchmarks.visual_tracking import __main__ as visual_tracking
 from benchmarks.visual_tracking.detected import (
-    LONGEST_GUESS,
     Detected,
     detect_all,
     make_trackers,
@@ -19,6 +18,7 @@ from benchmarks.visual_tracking.detected import (
 from benchmarks.visual_tracking.source import Source
 from mpfjax.vision.boxes import read_tracks, write_tracks
 from mpfjax.vision.frames import read_frames, write_image, write_video
+from mpfjax.vision.tracker import LONGEST_GUESS
 
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
 

@@ -224,9 +224,12 @@ class TestPosterior:
         whole = maps.Window.whole(bins[0], sides)
         found = np.stack([maps.distance_maps(f, reference[None], sides, whole) for f in bins])
         model = maps.mapped_model(start[None], sides, 3.0, 0.5, (2.0, 2.0))
-        collect = lambda mixture: mixture.average(mixture.particles.place)  # noqa: E731
+
+        def place(mixture):
+            return mixture.average(mixture.particles.place)
+
         filter = mpfjax.particle_filter(model, 50_000)
-        many = mpfjax.run_filter(jax.random.key(0), filter, jnp.asarray(found), collect)
+        many = mpfjax.run_filter(jax.random.key(0), filter, jnp.asarray(found), place)
         np.testing.assert_allclose(means, np.asarray(many.collected)[:, 0], atol=0.1)
         assert np.abs(means - corners - np.array([5, 4])).max() > 0.3
 

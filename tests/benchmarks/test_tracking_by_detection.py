@@ -10,21 +10,15 @@ from benchmarks.tracking_by_detection import __main__ as benchmark
 from benchmarks.tracking_by_detection.peers import Peer, peers
 from mpfjax.vision.boxes import write_tracks
 from mpfjax.vision.frames import write_image
+from tests.examples import two_walkers
 
-pytest.importorskip("imageio", reason="reading frames needs the extra 'video'")
-pytest.importorskip("trackeval", reason="scoring needs the extra 'trackeval'")
+pytest.importorskip("imageio", reason="reading frames needs the extra 'video', which 'test' brings")
+pytest.importorskip("trackeval", reason="scoring needs the extra 'trackeval', which 'test' brings")
 
 COLUMNS = [
     "tracker", "sequence", "detections", "HOTA", "MOTA", "IDF1", "id_switches", "frames_per_second"
 ]  # fmt: skip
 NUM_FRAMES = 6
-
-
-def truth_rows():
-    t = np.arange(NUM_FRAMES)
-    one = np.column_stack([t + 1, 0 * t + 1, 4 + 3 * t, 0 * t + 5, 0 * t + 8, 0 * t + 14])
-    two = np.column_stack([t + 1, 0 * t + 2, 50 - 3 * t, 0 * t + 28, 0 * t + 8, 0 * t + 14])
-    return np.concatenate([one, two]).astype(float)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +30,7 @@ def sequence(tmp_path_factory):
     frames = np.random.default_rng(0).integers(0, 255, (NUM_FRAMES, 48, 64, 3), dtype=np.uint8)
     for i, frame in enumerate(frames, 1):
         write_image(folder / "img1" / f"{i:06d}.png", frame)
-    rows = truth_rows()
+    rows = two_walkers(NUM_FRAMES)
     write_tracks(folder / "gt.txt", rows)
     lines = [f"{f:.0f},-1,{x},{y},{w},{h}" for f, _, x, y, w, h in rows]
     scored = [f"{line},{0.9 - 0.01 * i}\n" for i, line in enumerate(lines)]
@@ -92,8 +86,11 @@ def test_what_is_not_installed_is_said_with_how_to_get_it(monkeypatch, capsys):
 
 @pytest.mark.parametrize("package", ["trackers", "norfair"])
 def test_peers_follow_two_walkers(package):
-    pytest.importorskip(package, reason="peers need the extra 'peers'")
-    rows = truth_rows()
+    pytest.importorskip(
+        package,
+        reason="peers come with the extra 'peers', not with 'test': their version caps clash",
+    )
+    rows = two_walkers(NUM_FRAMES)
     tried = [peer for peer in peers() if (peer.name == "norfair") == (package == "norfair")]
     assert {peer.setting for peer in tried} == {"defaults", "advised"}
     for peer in tried:

@@ -8,7 +8,7 @@ import pytest
 from mpfjax import vision
 from tests.refused import INFINITY, NAN, NOTHING, assert_named, refused
 
-VIDEO = "reading, writing and detecting in frames needs the extra 'video'"
+VIDEO = "reading, writing and detecting in frames needs the extra 'video', which 'test' brings"
 KEY = jax.random.key(0)
 FRAME = np.random.default_rng(0).integers(0, 256, (40, 50, 3), dtype=np.uint8)
 BOXES = np.array([[5.0, 5, 10, 20], [20, 10, 10, 15]])

@@ -6,7 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from mpfjax.vision import ObjectTracker, Tracks, track
+from mpfjax.metrics import multi_object_scores
+from mpfjax.vision import ObjectTracker, Tracks, football_scene, track
 from mpfjax.vision.detectors import LEAST_ROOM, MOST_ROOM, Rows
 from mpfjax.vision.drawn import follow_boxes
 from mpfjax.vision.loop import make_tracker, offline_rows, online_rows
@@ -365,3 +366,22 @@ def test_drawn_boxes_that_will_not_do_are_named(message, boxes):
 
 def test_no_frames_are_no_tracks_of_drawn_boxes():
     assert list(follow_boxes([], np.ones((1, 4)))) == []
+
+
+def test_players_who_turn_at_will_keep_their_names():
+    """One detection in ten is missing, and a third of the frames have a false one.
+
+    With speeds that hardly change, as those of pedestrians, the default tracker lost them.
+    """
+    pytest.importorskip("trackeval", reason="scoring needs the extra 'trackeval', of 'test'")
+    truth = football_scene(jax.random.key(2), 60, num_opponents=4, still_camera=True).tracks
+    rng, found = np.random.default_rng(0), []
+    for t in range(1, 61):
+        boxes = truth[truth[:, 0] == t][:, 2:]
+        boxes = boxes[rng.random(len(boxes)) > 0.1]
+        boxes[:, :2] += 0.05 * boxes[:, 2:] * rng.normal(size=(len(boxes), 2))
+        if rng.random() < 0.3:
+            boxes = np.concatenate([boxes, [[rng.uniform(0, 480), rng.uniform(60, 200), 12, 30]]])
+        found.append(boxes)
+    rows = [online_rows(t, tracks) for t, tracks in enumerate(track(None, found), 1)]
+    assert multi_object_scores(np.concatenate(rows), truth)["IDF1"] > 0.85
