@@ -21,6 +21,7 @@ from benchmarks.partitioned_sampling.posterior import (
 from mpfjax import vision
 from mpfjax.metrics import effective_dynamics, uniqueness
 from mpfjax.vision import boxes as box_files
+from mpfjax.vision.distracter import NoPath
 from mpfjax.vision.joint_colour import PAPER_DEVIATIONS
 
 PAPER_WIDTH = 360  # the frames in which a step deviates by two pixels
@@ -77,13 +78,16 @@ DEFAULT = Setting()
 def synthetic_scenes(
     keys: Sequence[int], most: int | None = None, setting: Setting = DEFAULT
 ) -> Iterator[tuple[int, Scene | None]]:
-    """Each key with its scene, or None where the posterior of object 1 speaks against it.
+    """Each key with its scene, or None: no path, or the posterior of object 1 speaks against it.
 
     No filter has run by then. Raises `ValueError` where the keys do not hold `most` scenes.
     """
     found = 0
     for key in keys:
-        scene = synthetic_scene(key, setting, only_if_kept=True)
+        try:
+            scene = synthetic_scene(key, setting, only_if_kept=True)
+        except NoPath:
+            scene = None
         found += scene is not None
         yield key, scene
         if found == most:

@@ -61,6 +61,10 @@ class DistracterScene(NamedTuple):
         return self.frames[_APPEARS - 1], self.distracter[_APPEARS - 1]
 
 
+class NoPath(ValueError):
+    """No path was found with these arguments and this key; with another key there may be one."""
+
+
 def distracter_scene(
     key: Key[Array, ""],
     num_frames: int = 25,
@@ -145,7 +149,7 @@ def _draw_others(rng: np.random.Generator, num_frames: int, sides: np.ndarray) -
             return paths[np.argmax(free)]
         started |= bool(_is_free(paths[:, : _VANISHES - 1], sides).any())
     name = f"num_frames: in {num_frames} frames" if started else "size: in few frames"
-    raise ValueError(
+    raise NoPath(
         f"{name} objects of {_text(sides)} pixels met or left the image in each of {_TRIES} tries"
     )
 
@@ -181,7 +185,7 @@ def _draw_first(
             "late": parted & starts & lures & ~walks,
         }.items():
             failed[name] += int(found.sum())
-    raise ValueError(_why_no_path(failed, num_frames, sides, speed, deviation))
+    raise NoPath(_why_no_path(failed, num_frames, sides, speed, deviation))
 
 
 def _why_no_path(

@@ -509,3 +509,10 @@ def test_the_events_are_those_of_the_data(data):
             assert np.isfinite(boxes[last, own[0]]).all()
             assert first < event.hidden[0] <= event.hidden[1] - 5 < last
     assert found
+
+
+def test_a_key_without_a_path_is_passed_over():
+    """Among so many keys there is one: it ended the whole sensitivity study."""
+    assert list(scenes.synthetic_scenes([16], setting=sensitivity.CASES[-1].setting)) == [
+        (16, None)
+    ]
