@@ -1,6 +1,7 @@
 """Figures 4 and 8, recovery against λ, what runs look like, and the sensitivity's multiples."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -126,11 +127,15 @@ def annotate(scene: Scene, kept: Kept, t: int) -> np.ndarray:
     return np.clip(canvas, 0, 255).astype(np.uint8)
 
 
+TURNED = "the paper's order does not hold"
+
+
 def draw_sensitivity(entries: Sequence[dict[str, Any]], chosen: dict[str, Any]) -> Figure:
     """Small multiples: a column for each thing that changes, a row for each rate.
 
     `entries` hold `axis`, `value`, `filter` and the rates with intervals; `chosen` is the value
-    of each axis in the tables, at the dotted line.
+    of each axis in the tables, at the dotted line. Grey is where the first row does not rise from
+    filter to filter as the paper's does, joint below PS below DPS.
     """
     axes_names = [name for name in chosen if any(entry["axis"] == name for entry in entries)]
     panels = [("recovery", "recovery of object 1"), ("precision", "precision of objects 2-7")]
@@ -156,12 +161,37 @@ def draw_sensitivity(entries: Sequence[dict[str, Any]], chosen: dict[str, Any]) 
                     color=plotting.COLOURS[index], marker=plotting.MARKERS[index], ms=5, lw=1.3,
                     capsize=3,
                 )  # fmt: skip
+            for low, high in _turned(own, filters) if row == 0 else []:
+                axis.axvspan(low, high, color="0.9", lw=0, zorder=0, label=TURNED)
             axis.set_xticks(places)
             axis.grid(alpha=0.25)
             axis.set_ylim(*((-0.03, 1.03) if rate == "recovery" else (0.5, 1.0)))
             if column == 0:
                 axis.set_ylabel(ylabel)
         axes[-1, column].set_xlabel(axis_name)
-    handles, names = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=len(names), fontsize=9)
+    labelled = [axis.get_legend_handles_labels() for axis in axes[0]]
+    legend = {
+        name: handle
+        for handles, names in labelled
+        for handle, name in zip(handles, names, strict=True)
+    }
+    figure.legend(
+        list(legend.values()), list(legend), loc="outside upper center", ncols=len(legend),
+        fontsize=9,
+    )  # fmt: skip
     return figure
+
+
+def _turned(entries: Sequence[dict[str, Any]], filters: Sequence[str]) -> list[tuple[float, float]]:
+    """Around each value at which recovery does not rise from filter to filter: from, to."""
+    places = sorted({entry["value"] for entry in entries})
+    middles = [(a + b) / 2 for a, b in pairwise(places)]
+    ends = [places[0] - 0.04 * (places[-1] - places[0]), *middles,
+            places[-1] + 0.04 * (places[-1] - places[0])]  # fmt: skip
+    found = {(entry["value"], entry["filter"]): entry["recovery"] for entry in entries}
+    spans = []
+    for index, place in enumerate(places):
+        rates = [found[place, name] for name in filters if (place, name) in found]
+        if rates != sorted(rates):
+            spans.append((ends[index], ends[index + 1]))
+    return spans
