@@ -28,6 +28,7 @@ from mpfjax.moves import AbstractMove as AbstractMove
 from mpfjax.moves import AbstractPropagation as AbstractPropagation
 from mpfjax.moves import AbstractRegrouping as AbstractRegrouping
 from mpfjax.moves import AbstractRejuvenation as AbstractRejuvenation
+from mpfjax.moves import Every as Every
 from mpfjax.moves import Exchange as Exchange
 from mpfjax.moves import Exclusion as Exclusion
 from mpfjax.moves import GaussianRegeneration as GaussianRegeneration

@@ -1,6 +1,6 @@
 """A filter: a chain of moves on a particle mixture, one step at a time."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,6 +13,7 @@ from mpfjax.checks import check_callable, check_key, check_type, check_whole, sh
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, check_states
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
+from mpfjax.moves.every import Every
 from mpfjax.moves.exchange import Exchange
 from mpfjax.moves.resampling import Resample
 from mpfjax.observations import checked_observation, one_observation
@@ -93,14 +94,15 @@ class Filter(eqx.Module):
         _check_sizes(num_particles, num_components)
         if not moves:
             raise ValueError("moves: a filter needs at least one")
-        for move in moves:
+        for move in _with_inner(moves):
             per_component = getattr(move, "particles_per_component", None)
             if per_component is not None and per_component * num_components > num_particles:
                 raise ValueError(
                     f"particles_per_component: {per_component} for each of {num_components}"
                     f" components needs more than num_particles, {num_particles}"
                 )
-        names = [n for move in moves if isinstance(move, AbstractMove) for n in _memory_of(move)]
+        held = [move for move in _with_inner(moves) if isinstance(move, AbstractMove)]
+        names = [name for move in held for name in _own_memory(move)]
         if len(set(names)) < len(names):
             raise ValueError(f"moves: two of them would share one memory, of {sorted(names)}")
         self.model = model
@@ -185,8 +187,11 @@ class Filter(eqx.Module):
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
         for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
-            if isinstance(move, Resample):
+            if isinstance(move, Resample | Every):
                 resampled |= move.is_due(mixture)
+            if isinstance(move, Every):
+                mixture = move(move_key, mixture, observation, self._forgetting)
+                continue
             moved = move(move_key, mixture, observation)
             if not isinstance(move, _KEEP_MASS):
                 moved, log_growth = _normalise(moved, mixture.log_weights)
@@ -284,8 +289,16 @@ def split_keys(key: Key[Array, ""], num: int) -> list[Key[Array, ""]]:
     return list(split(key, num))
 
 
-def _memory_of(move: AbstractMove) -> list[str]:
-    return list(move.initial_memory(1))
+def _with_inner(moves: Iterable[Any]) -> Iterator[Any]:
+    """The moves, and after each those that it runs from time to time."""
+    for move in moves:
+        yield move
+        if isinstance(move, Every):
+            yield from _with_inner(move.moves)
+
+
+def _own_memory(move: AbstractMove) -> list[str]:
+    return [move.name] if isinstance(move, Every) else list(move.initial_memory(1))
 
 
 def _tie(moves: tuple[Any, ...], model: Any) -> tuple[Any, ...]:

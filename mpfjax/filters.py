@@ -11,6 +11,7 @@ from mpfjax.models.base import AbstractStateSpaceModel, mapped
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.clusters import PropagateInClusters
+from mpfjax.moves.every import Every
 from mpfjax.moves.features import Scale
 from mpfjax.moves.gaussian import GaussianRegeneration
 from mpfjax.moves.independent import PropagateIndependently
@@ -66,6 +67,7 @@ def mixture_particle_filter(
     split: Split | None = None,
     kmeans: KMeans | None = None,
     initial_kmeans: KMeans | None = None,
+    regroup_every: int = 1,
 ) -> Filter:
     """The mixture particle filter: resample within components, propagate, regroup.
 
@@ -75,15 +77,15 @@ def mixture_particle_filter(
     grouping. All of it is exact. `features` and `scale` are the coordinates and units in which
     these three moves see the particles (see `Features`; features of one particle, if the model
     is wrapped by `per_particle`). `merge`, `split` and `kmeans` replace those moves, for example
-    with other thresholds, and bring their own features and scale. `gradient` is that of
-    `particle_filter`. Use it where the filtering distribution has several modes and all of them
-    must be kept.
+    with other thresholds, and bring their own features and scale. `regroup_every` is k where they
+    are to run at every k-th step only (see `Every`). `gradient` is that of `particle_filter`. Use
+    it where the filtering distribution has several modes and all of them must be kept.
     """
     resample = Resample(scheme, ess_threshold, particles_per_component, sort_by, gradient)
     propagate = Propagate(model, proposal, _of_draws(gradient))
     return _mixture_filter(
         model, num_particles, max_components, [resample, propagate], features, scale,
-        merge, split, kmeans, initial_kmeans,
+        merge, split, kmeans, initial_kmeans, regroup_every,
     )  # fmt: skip
 
 
@@ -122,6 +124,7 @@ def gaussian_mixture_particle_filter(
     split: Split | None = None,
     kmeans: KMeans | None = None,
     initial_kmeans: KMeans | None = None,
+    regroup_every: int = 1,
 ) -> Filter:
     """GM-MPF: each component redrawn from the Gaussian of its moments, propagated, regrouped.
 
@@ -140,7 +143,7 @@ def gaussian_mixture_particle_filter(
     return _mixture_filter(
         model, num_particles, max_components,
         _gaussian_moves(model, proposal, regeneration, importance), features, scale,
-        merge, split, kmeans, initial_kmeans,
+        merge, split, kmeans, initial_kmeans, regroup_every,
     )  # fmt: skip
 
 
@@ -295,9 +298,10 @@ def _mixture_filter(
     split: Split | None,
     kmeans: KMeans | None,
     initial_kmeans: KMeans | None,
+    regroup_every: int,
 ) -> Filter:
     """The given moves, then regrouping; x_0 grouped by K-means from seeds."""
-    check_whole(max_components=max_components)
+    check_whole(max_components=max_components, regroup_every=regroup_every)
     check_type(Merge, "a Merge", **given(merge=merge))
     check_type(Split, "a Split", **given(split=split))
     check_type(KMeans, "a KMeans", **given(kmeans=kmeans, initial_kmeans=initial_kmeans))
@@ -306,14 +310,16 @@ def _mixture_filter(
     if initial_kmeans is None:
         function, units = kmeans.features.function, kmeans.features.scale
         initial_kmeans = KMeans(10, reseed=True, features=function, scale=units)
+    regroup: list[AbstractMove] = [
+        Merge(**seen) if merge is None else merge,
+        Split(**seen) if split is None else split,
+        kmeans,
+    ]
+    if regroup_every > 1:
+        regroup = [Every(regroup_every, regroup)]
     return Filter(
         model,
-        moves=[
-            *moves,
-            Merge(**seen) if merge is None else merge,
-            Split(**seen) if split is None else split,
-            kmeans,
-        ],
+        moves=[*moves, *regroup],
         num_particles=num_particles,
         num_components=max_components,
         initial_moves=[initial_kmeans],

@@ -36,6 +36,18 @@ NUM_PARTICLES = 48
 NUM_COMPONENTS, MANY_COMPONENTS = 3, 6
 
 
+# Every scheme of resampling, regrouping and regeneration that does it in another way for many.
+OTHERWISE_OF_MANY = (
+    "mpf",
+    "guided, sorted, stratified noise",
+    "split only, adaptive",
+    "random labels, multinomial",
+    "random labels, residual",
+    "predictive Gaussian",
+    "partitioned in clusters",
+)
+
+
 class RandomLabels(AbstractRegrouping):
     """A regrouping of our own: every particle to a component drawn at random."""
 
@@ -147,6 +159,7 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     **{
         f"{name}, M = {MANY_COMPONENTS}": chain
         for name, chain in _of_components(MANY_COMPONENTS).items()
+        if name in OTHERWISE_OF_MANY
     },
     "predict and weigh": lambda model: Filter(
         model, [Resample(), Predict(model), Weigh(model)], NUM_PARTICLES

@@ -125,6 +125,11 @@ class ScalarLinear(mpfjax.AbstractStateSpaceModel):
 BLINDED, BROKEN, EXPLODING = -99.0, -98.0, -97.0
 
 
+def _strongly_typed(value):
+    # A weakly typed one would be another program to JAX.
+    return jnp.asarray(value, dtype=float)
+
+
 class TrickyQuadraticModel(mpfjax.QuadraticModel):
     """The quadratic model, with a zero, a NaN and an infinite likelihood on demand.
 
@@ -133,8 +138,8 @@ class TrickyQuadraticModel(mpfjax.QuadraticModel):
     model is an error.
     """
 
-    constant: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)
-    taken_off: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)
+    constant: jax.Array = eqx.field(converter=_strongly_typed, default=0.0)
+    taken_off: jax.Array = eqx.field(converter=_strongly_typed, default=0.0)
 
     def log_likelihood(self, observation, states):
         honest = super().log_likelihood(observation, _watch(states))

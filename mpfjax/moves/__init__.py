@@ -5,6 +5,7 @@ from mpfjax.moves.base import AbstractPropagation as AbstractPropagation
 from mpfjax.moves.base import AbstractRegrouping as AbstractRegrouping
 from mpfjax.moves.base import AbstractRejuvenation as AbstractRejuvenation
 from mpfjax.moves.clusters import PropagateInClusters as PropagateInClusters
+from mpfjax.moves.every import Every as Every
 from mpfjax.moves.exchange import Exchange as Exchange
 from mpfjax.moves.exclusion import Exclusion as Exclusion
 from mpfjax.moves.features import Features as Features

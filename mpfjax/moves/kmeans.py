@@ -74,14 +74,24 @@ def farthest_first(
     """Seeds for K-means: the particle farthest from the mean, then each farthest from all."""
     weight = occupied.astype(features.dtype)[:, None]
     mean = jnp.sum(weight * features, axis=0) / jnp.maximum(jnp.sum(weight), 1.0)
-    distance = jnp.sum((features - mean[None]) ** 2, axis=1)
-    seeds = []
-    for m in range(num_seeds):
-        seed = features[jnp.argmax(jnp.where(occupied, distance, -1.0))]
-        to_seed = jnp.sum((features - seed[None]) ** 2, axis=1)
-        distance = to_seed if m == 0 else jnp.minimum(distance, to_seed)
-        seeds.append(seed)
-    return jnp.stack(seeds)
+
+    def farthest(distance: Float[Array, " n"]) -> Float[Array, " k"]:
+        return features[jnp.argmax(jnp.where(occupied, distance, -1.0))]
+
+    def squared_distance(point: Float[Array, " k"]) -> Float[Array, " n"]:
+        return jnp.sum((features - point[None]) ** 2, axis=1)
+
+    def add(
+        state: tuple[Float[Array, " n"], Float[Array, " k"]], _: None
+    ) -> tuple[tuple[Float[Array, " n"], Float[Array, " k"]], Float[Array, " k"]]:
+        distance, seed = state
+        distance = jnp.minimum(distance, squared_distance(seed))
+        return (distance, farthest(distance)), seed
+
+    first = farthest(squared_distance(mean))
+    nowhere_near = jnp.full(features.shape[0], jnp.inf, features.dtype)
+    _, seeds = jax.lax.scan(add, (nowhere_near, first), length=num_seeds)
+    return seeds
 
 
 def _centroids(

@@ -1,9 +1,13 @@
 """The nearest of a few points, for every particle."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.operations.matrices import row_sums
+
+# So many points in one pass over the particles. A program of all 64 takes seconds to compile.
+_AT_ONCE = 16
 
 
 def nearest(
@@ -13,12 +17,33 @@ def nearest(
 
     A running minimum over the centroids: no (m, n) array is made.
     """
+    n, m = features.shape[0], centroids.shape[0]
     centroids = jnp.where(alive[:, None], centroids, jnp.inf)
-    best = jnp.full(features.shape[0], jnp.inf, features.dtype)
-    labels = jnp.zeros(features.shape[0], jnp.int32)
+    found = jnp.full(n, jnp.inf, features.dtype), jnp.zeros(n, jnp.int32)
+    if m <= _AT_ONCE:
+        return _nearer(found, features, centroids, 0)[1]
+    padding = -m % _AT_ONCE
+    centroids = jnp.pad(centroids, ((0, padding), (0, 0)), constant_values=jnp.inf)
+    passes = centroids.reshape(-1, _AT_ONCE, centroids.shape[1])
+    return jax.lax.fori_loop(
+        0,
+        len(passes),
+        lambda i, found: _nearer(found, features, passes[i], i * _AT_ONCE),
+        found,
+    )[1]
+
+
+def _nearer(
+    found: tuple[Float[Array, " n"], Int[Array, " n"]],
+    features: Float[Array, "n k"],
+    centroids: Float[Array, "m k"],
+    first: int | Int[Array, ""],
+) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
+    """The least squared distance so far and whose it is, after these centroids as well."""
+    best, labels = found
     for m in range(centroids.shape[0]):
         distance = row_sums((features - centroids[m][None]) ** 2)
         closer = distance < best
-        labels = jnp.where(closer, m, labels)
+        labels = jnp.where(closer, first + m, labels)
         best = jnp.where(closer, distance, best)
-    return labels
+    return best, labels

@@ -1,0 +1,131 @@
+"""Every: other moves, at every k-th step only."""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, Key, PyTree
+
+from mpfjax.checks import check_whole, shown
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
+from mpfjax.moves.resampling import Resample
+from mpfjax.operations.generator import split
+
+
+class Every(AbstractMove):
+    """Other moves at the steps k, 2k, 3k, ..., and nothing at those between.
+
+    Vermaak et al. (2003), section 4, regroup "from time to time". What a move does not change, it
+    need not do at every step: regrouping is exact whenever it is done. The step's number is
+    kept in the mixture's memory, so that a run goes on from a checkpoint as if it had not been
+    broken off. It does not depend on the run: under `vmap` over seeds the steps between cost
+    nothing. A missing observation is no step, since nothing is regrouped or resampled there.
+
+    - `num_steps`: k, from 1 on.
+    - `moves`: regrouping and rejuvenating moves, in order.
+
+    Raises `ValueError` for k < 1, no moves, and a move of another kind: without a propagation at
+    every step the state would not move. Use it where regrouping is a large part of the time.
+    """
+
+    num_steps: int = eqx.field(static=True)
+    moves: tuple[Any, ...]
+
+    def __init__(self, num_steps: int, moves: Iterable[AbstractMove]) -> None:
+        check_whole(num_steps=num_steps)
+        self.num_steps = int(num_steps)
+        self.moves = _as_inner_moves(moves)
+
+    @property
+    def approximate(self) -> bool:
+        """Whether any of the moves departs from the exact recursion."""
+        return any(move.approximate for move in self.moves)
+
+    @property
+    def name(self) -> str:
+        """Under which the number of the step is kept."""
+        return f"every {self.num_steps}: {', '.join(type(move).__name__ for move in self.moves)}"
+
+    def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
+        """Which components of `mixture` a `Resample` among the moves would resample now."""
+        due = jnp.zeros(mixture.num_components, bool)
+        for move in self.moves:
+            if isinstance(move, Resample | Every):
+                due |= move.is_due(mixture)
+        return due & self._runs(mixture)
+
+    def __call__(
+        self,
+        key: Key[Array, ""],
+        mixture: ParticleMixture,
+        observation: PyTree = None,
+        after: Callable[[ParticleMixture], ParticleMixture] | None = None,
+    ) -> ParticleMixture:
+        """Run the moves if this is a k-th step.
+
+        `after` is what the filter does after each of its moves: whatever remembers components
+        forgets the dead, whose labels the next move may use again.
+        """
+        after = self._forgetting if after is None else after
+        runs, steps = self._runs(mixture), self._steps(mixture) + 1
+        counted = mixture.memory | {self.name: {"steps": steps % self.num_steps}}
+        mixture = mixture.replace(memory=counted)
+
+        def run() -> ParticleMixture:
+            moved = mixture
+            for move_key, move in zip(split(key, len(self.moves)), self.moves, strict=True):
+                moved = after(move(move_key, moved, observation))
+            return moved
+
+        if not all(isinstance(move, AbstractRegrouping) for move in self.moves):
+            return jax.lax.cond(runs, run, lambda: mixture)
+
+        # Only what they may change goes through the condition; the rest would be copied there.
+        def regroup() -> tuple[Array, dict[str, PyTree]]:
+            moved = run()
+            return moved.component_indicators, moved.memory
+
+        indicators, memory = jax.lax.cond(
+            runs, regroup, lambda: (mixture.component_indicators, mixture.memory)
+        )
+        return mixture.replace(component_indicators=indicators, memory=memory)
+
+    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
+        """How many steps it is since the moves ran, and what they remember themselves."""
+        memory: dict[str, PyTree] = {self.name: {"steps": jnp.zeros((), jnp.int32)}}
+        for move in self.moves:
+            memory |= move.initial_memory(num_components)
+        return memory
+
+    def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
+        """What the moves themselves forget of dead components."""
+        for move in self.moves:
+            memory = move.forget(memory, dead)
+        return memory
+
+    def _forgetting(self, mixture: ParticleMixture) -> ParticleMixture:
+        return mixture.replace(memory=self.forget(mixture.memory, ~mixture.active))
+
+    def _steps(self, mixture: ParticleMixture) -> Int[Array, ""]:
+        return mixture.memory[self.name]["steps"]
+
+    def _runs(self, mixture: ParticleMixture) -> Bool[Array, ""]:
+        return self._steps(mixture) == self.num_steps - 1
+
+
+def _as_inner_moves(moves: Any) -> tuple[AbstractMove, ...]:
+    if not isinstance(moves, Iterable):
+        raise ValueError(f"moves: {shown(moves)} is not a list of moves")
+    moves = tuple(moves)
+    if not moves:
+        raise ValueError("moves: there must be at least one to run at every k-th step")
+    for move in moves:
+        if not isinstance(move, AbstractRegrouping | AbstractRejuvenation | Every):
+            raise ValueError(
+                f"moves: {shown(move)} neither regroups nor rejuvenates; a propagation belongs"
+                " into the chain itself, since without it the state would not move"
+            )
+    return moves
