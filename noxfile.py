@@ -79,6 +79,13 @@ def start(session: nox.Session, needed: str) -> None:
     session.run("python", "--version")
 
 
+def whole_suite(session: nox.Session) -> None:
+    """What `python -m pytest` runs, and the thorough cases that it leaves out."""
+    session.run("python", "-m", "pytest", *session.posargs)
+    if not session.posargs:
+        session.run("python", "-m", "pytest", "-m", "thorough")
+
+
 def build(session: nox.Session) -> tuple[Path, Path]:
     """A wheel and an sdist of the checkout."""
     folder = Path(session.create_tmp()).resolve() / "dist"
@@ -103,7 +110,7 @@ def lower_bounds(project: dict) -> list[str]:
 def tests(session: nox.Session) -> None:
     """The whole suite, on the Python that runs nox."""
     session.install("-e", ".[test]")
-    session.run("python", "-m", "pytest", *session.posargs)
+    whole_suite(session)
 
 
 @nox.session(python=sys.executable)
@@ -152,7 +159,7 @@ def newest(session: nox.Session) -> None:
         "import jax, platform; print('Python', platform.python_version(), 'JAX', jax.__version__)"
     )
     session.run("python", "-c", tell)
-    session.run("python", "-m", "pytest", *session.posargs)
+    whole_suite(session)
 
 
 @nox.session(python=sys.executable)

@@ -14,6 +14,7 @@ import mpfjax
 from mpfjax import (
     AbstractRegrouping,
     AbstractRejuvenation,
+    Every,
     Exclusion,
     Filter,
     GaussianRegeneration,
@@ -150,6 +151,24 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
     }
 
 
+# One of each kind of filter and of each way to do its sums: the others are held to the same
+# contracts where the thorough tests run.
+QUICK_CHAINS = (
+    "pf",
+    "guided pf",
+    "mpf",
+    "mpf, M = 6",
+    "guided mpf",
+    "random labels, residual",
+    "split only, adaptive",
+    "gaussian mixture",
+    "joint pf",
+    "ps adaptive, random order",
+    "dps",
+    "dps prior",
+    "partitioned in clusters",
+    "clusters",
+)
 CHAINS: dict[str, Callable[..., Filter]] = {
     "pf": _pf(),
     "pf multinomial": _pf(scheme="multinomial"),
@@ -161,6 +180,8 @@ CHAINS: dict[str, Callable[..., Filter]] = {
         for name, chain in _of_components(MANY_COMPONENTS).items()
         if name in OTHERWISE_OF_MANY
     },
+    "regrouped every second step": _mpf(regroup_every=2),
+    "resampled every second step": _chain(Every(2, [Resample("stratified"), KMeans(2)])),
     "predict and weigh": lambda model: Filter(
         model, [Resample(), Predict(model), Weigh(model)], NUM_PARTICLES
     ),

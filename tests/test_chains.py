@@ -14,7 +14,8 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter
-from tests.registry import CHAINS, MANY_COMPONENTS, NUM_PARTICLES
+from tests.marking import quick_of
+from tests.registry import CHAINS, MANY_COMPONENTS, NUM_PARTICLES, QUICK_CHAINS
 from tests.user_models import (
     BLINDED,
     BROKEN,
@@ -30,7 +31,7 @@ OBSERVATIONS = jnp.array([1.5, 1.0, 0.4, 0.9])
 GRID = jnp.linspace(-5.0, 5.0, 1001)
 MODELS = {"quadratic": TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0), "drift": Drift()}
 
-over_chains = pytest.mark.parametrize("chain", CHAINS)
+over_chains = pytest.mark.parametrize("chain", quick_of(CHAINS, QUICK_CHAINS))
 
 
 def is_exact(chain):
@@ -88,6 +89,14 @@ EXACT = [
 ]
 
 
+QUICK = [
+    (chain, model)
+    for chain, model in EXACT
+    if chain in QUICK_CHAINS
+    if model == "quadratic" or chain in ("pf", "guided pf", "guided mpf", "dps")
+]
+
+
 @cache
 def runs(chain, model):
     keys = jax.random.split(jax.random.key(3), NUM_RUNS)
@@ -95,7 +104,7 @@ def runs(chain, model):
     return jax.tree.map(np.asarray, run)
 
 
-@pytest.mark.parametrize(("chain", "model"), EXACT)
+@pytest.mark.parametrize(("chain", "model"), quick_of(EXACT, QUICK))
 class TestExactness:
     def test_evidence_and_moments_are_unbiased(self, chain, model):
         """E[Ẑ/Z] = 1, and E[Ẑ/Z φ̂] = E[φ | y], at every step, within 4 standard errors.

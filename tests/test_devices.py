@@ -29,6 +29,7 @@ from mpfjax.running.devices import choose_devices
 from mpfjax.running.threads import over_threads
 from tests import on_devices
 from tests.examples import make_mixture
+from tests.marking import thorough
 from tests.precision import float64
 from tests.user_models import TrickyQuadraticModel
 
@@ -300,7 +301,7 @@ class TestExchange:
 
 
 class TestProcesses:
-    @pytest.mark.parametrize("which", ["first", "second"])
+    @pytest.mark.parametrize("which", ["first", *thorough(["second"])])
     def test_must_all_pass_the_same_and_take_part(self, started, which):
         told = started[which][1]
         assert "keys, filter, observations: not the same in every process" in told["other keys"]

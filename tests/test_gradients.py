@@ -14,6 +14,7 @@ import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.resampling import GRADIENTS
 from tests.examples import example_mixtures
+from tests.marking import quick_of, thorough
 from tests.user_models import BLINDED, ScalarLinear
 
 NUM_PARTICLES = 48
@@ -107,7 +108,7 @@ def standard_errors(values, expected):
     return float((values.mean() - expected) / (values.std() / np.sqrt(len(values))))
 
 
-@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("name", quick_of(FILTERS, ("mpf", "guided pf", "dps")))
 def test_stop_gradient_scores_are_unbiased(name):
     """∇Ẑ = Ẑ ∇log Ẑ is an unbiased estimate of ∇Z, for any number of particles."""
     found = deviations(name, "stop")
@@ -191,7 +192,7 @@ class Window(mpfjax.QuadraticModel):
         return jnp.where(jnp.abs(observation - states**2) < 0.4, honest, -jnp.inf)
 
 
-@pytest.mark.parametrize("gradient", GRADIENTS[1:])
+@pytest.mark.parametrize("gradient", quick_of(GRADIENTS[1:], ("stop", "soft")))
 def test_gradients_are_finite_where_weights_and_components_vanish(gradient):
     """In float32, with empty slots, dead components, and a step of zero likelihood throughout."""
     observations = jnp.array([1.5, 1.0, BLINDED, 0.4, 0.9])
@@ -293,8 +294,9 @@ def log_evidence_by_sigma(make, gradient, m):
 # label or a shift is a constant in every order of differentiating.
 @pytest.mark.parametrize(
     ("make", "gradient", "m"),
-    [("mpf", "none", 3), ("gm-mpf", "none", 3), ("gm-mpf", "none", 6), ("mpf", "soft", 6),
-     ("mpf", "straight_through", 6)],
+    [("mpf", "none", 3),
+     *thorough([("gm-mpf", "none", 3), ("gm-mpf", "none", 6), ("mpf", "soft", 6),
+                ("mpf", "straight_through", 6)])],
 )  # fmt: skip
 def test_derivatives_are_the_same_in_both_modes(make, gradient, m):
     log_evidence = log_evidence_by_sigma(make, gradient, m)
@@ -305,7 +307,7 @@ def test_derivatives_are_the_same_in_both_modes(make, gradient, m):
     assert float(reverse) == pytest.approx(float(forward), rel=1e-3)
 
 
-@pytest.mark.parametrize(("gradient", "m"), [("none", 6), ("stop", 3), ("stop", 6)])
+@pytest.mark.parametrize(("gradient", "m"), [("stop", 3), *thorough([("none", 6), ("stop", 6)])])
 def test_derivatives_of_second_order_are_the_same_in_both_modes(gradient, m):
     log_evidence = log_evidence_by_sigma("mpf", gradient, m)
 

@@ -11,6 +11,7 @@ from mpfjax.metrics.coverage import coverage
 from mpfjax.vision.boxes import read_tracks, write_tracks
 from mpfjax.vision.frames import read_frames, write_image, write_video
 from mpfjax.vision.scenes import football_scene
+from tests.marking import thorough
 
 pytest.importorskip("imageio", reason="reading and writing frames needs the extra 'video'")
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
@@ -40,7 +41,7 @@ def sequence(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module", params=["default", "objects", "paper"])
+@pytest.fixture(scope="module", params=["default", *thorough(["objects", "paper"])])
 def finished(request, sequence, tmp_path_factory):
     out = tmp_path_factory.mktemp(request.param)
     arguments = ["--sequence", sequence, "--ids", 1, 2, 3, "--frames", "3:8"]
@@ -157,6 +158,7 @@ def test_an_unreadable_video_is_named(tmp_path, capsys):
     assert "broken.mp4: cannot be read as a video" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_the_mixture_keeps_more_pedestrians_than_the_particle_filter(data, tmp_path):
     """Three pedestrians in PETS 2009, 40 frames without a crossing."""
     folder = data / "pets09_s2l1"

@@ -10,6 +10,7 @@ import pytest
 
 from mpfjax import Resample
 from tests.examples import example_mixtures, log_masses, make_mixture
+from tests.marking import thorough
 from tests.registry import REGROUPINGS, REJUVENATIONS
 
 # On either side of the number of components up to which they are worked on as rows.
@@ -190,7 +191,7 @@ def test_resampling_works_with_any_pytree_of_particles(name):
 
 
 @pytest.mark.parametrize("num_components", [3, 6])
-@pytest.mark.parametrize("n", [31, 32, 33, 127, 128, 129, 1023, 1025, 8193])
+@pytest.mark.parametrize("n", [31, 33, 129, *thorough([32, 127, 128, 1023, 1025, 8193])])
 def test_resampling_on_either_side_of_every_block_size(n, num_components):
     rng = np.random.default_rng(n)
     labels = rng.integers(0, num_components, n)

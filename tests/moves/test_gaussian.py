@@ -10,6 +10,7 @@ from mpfjax import GaussianRegeneration
 from mpfjax.exact import kalman_filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision import BoxState
+from tests.marking import thorough
 
 NUM_DRAWS = 2000
 
@@ -194,7 +195,7 @@ def test_misread_importance_is_named(options, named):
 
 
 @pytest.mark.parametrize("importance", ["propagated", "predictive_gaussian"])
-@pytest.mark.parametrize("max_components", [1, 3])
+@pytest.mark.parametrize("max_components", [3, *thorough([1])])
 def test_moments_are_the_kalman_filters(max_components, importance):
     """On a linear-Gaussian model one component is exact, and any number close to it."""
     model = mpfjax.LinearGaussianModel(

@@ -10,6 +10,7 @@ from mpfjax import Resample
 from mpfjax.moves.resampling_schemes import sorted_points
 from mpfjax.moves.slots import place_slots
 from tests.examples import make_mixture
+from tests.marking import thorough
 
 SCHEMES = ("systematic", "stratified", "multinomial", "residual")
 NEARLY_ONE = 1 - 2.0**-24
@@ -95,7 +96,7 @@ class TestAtScale:
     """float32 has no room for a hundred thousand exact cumulative weights: guards must hold."""
 
     @over_schemes
-    @pytest.mark.parametrize("num_components", [1, 9])
+    @pytest.mark.parametrize("num_components", [9, *thorough([1])])
     def test_no_particle_of_zero_weight_is_ever_fed(self, scheme, num_components):
         """Not with random draws, nor with uniform draws at their ends."""
         for kind in KINDS:
