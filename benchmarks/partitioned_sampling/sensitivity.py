@@ -29,7 +29,7 @@ class Case(NamedTuple):
 
 
 CASES = [
-    *[Case(SIZE, side, DEFAULT._replace(size=(side, side))) for side in (20, 24, 28, 32)],
+    *[Case(SIZE, side, DEFAULT._replace(size=(side, side))) for side in (20, 24, 26, 28, 32)],
     *[Case(SPEED, speed, DEFAULT._replace(speed=speed)) for speed in (0.0, 2.0, 4.0, 6.0)],
     *[Case(MOMENTUM, share, DEFAULT._replace(momentum=share)) for share in (0.0, 0.5, 0.75, 1.0)],
     Case(OLD, 0.0, Setting((32, 40), 6.0, 3.0, "colour")),
