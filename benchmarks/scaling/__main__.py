@@ -1,7 +1,8 @@
 """What time and memory grow with: N, M, seeds and T, and what devices and processes gain.
 
     python -m benchmarks.scaling
-    python -m benchmarks.scaling --axes --islands 10000000    # one filter, as islands
+    python -m benchmarks.scaling --axes --devices --processes             # a mixture's price alone
+    python -m benchmarks.scaling --axes --no-price --islands 10000000     # one filter, as islands
 
 The quadratic model, whose likelihood costs next to nothing, so that what is seen is the filter;
 DPS tracks J such objects. One axis is varied at a time, from a common middle. The cells of an
@@ -34,6 +35,7 @@ from benchmarks.scaling.cells import (
     slopes_of,
 )
 from benchmarks.scaling.islands import NUM_ISLANDS, island_table, run_as_islands
+from benchmarks.scaling.price import FULL_PRICE, QUICK_PRICE, first_calls, price, price_table
 from benchmarks.scaling.spread import spread_over, spread_table
 from benchmarks.scaling.tables import as_tables, draw
 from mpfjax.console import exit_status, whole, write_json
@@ -65,6 +67,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--processes", type=whole(), nargs="*", default=[1, 2], help="none: leave out"
     )
+    parser.add_argument(
+        "--price",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="of a mixture over a plain filter, by N and M, with first calls",
+    )
     parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
     parser.add_argument("--out", default="results/scaling", metavar="DIR")
     options = parser.parse_args(arguments)
@@ -80,7 +88,7 @@ def run(options: argparse.Namespace) -> None:
     sizes = QUICK if options.quick else FULL
     content: dict[str, Any] = {
         "settings": settings_of(options, sizes), "results": [], "slopes": [], "spread": [],
-        "islands": [],
+        "price": [], "first_calls": [], "islands": [],
     }  # fmt: skip
     programs: dict[Cell, Any] = {}
     for axis in options.axes:
@@ -97,6 +105,11 @@ def run(options: argparse.Namespace) -> None:
         content["spread"] += found
         if found:
             print(spread_table(kind, found, sizes.spread), end="\n\n")
+    if options.price:
+        priced = QUICK_PRICE if options.quick else FULL_PRICE
+        content["price"] = price(priced, options.repeats)
+        content["first_calls"] = first_calls(priced)
+        print(price_table(content["price"], content["first_calls"]), end="\n\n")
     content["islands"] = [run_as_islands(number, options.repeats) for number in options.islands]
     if options.islands:
         print(island_table(content["islands"]), end="\n\n")

@@ -7,9 +7,9 @@ import pytest
 
 import mpfjax
 from benchmarks.scaling import __main__ as scaling
-from benchmarks.scaling import cells, spread
+from benchmarks.scaling import cells, price, spread
 
-ONLY_AXES = ["--devices", "--processes"]
+ONLY_AXES = ["--devices", "--processes", "--no-price"]
 
 
 @pytest.mark.parametrize("power", [0.0, 0.5, 1.0, 2.0])
@@ -123,3 +123,19 @@ def test_islands_alone(tmp_path, capsys):
     with pytest.raises(SystemExit):
         scaling.main([*arguments, "--islands", "81"])
     assert "--islands: 81" in capsys.readouterr().err
+
+
+def test_the_price_is_in_units_of_the_plain_filter(tmp_path, capsys):
+    arguments = ["--quick", "--repeats", "2", "--axes", "--devices", "--processes"]
+    assert scaling.main([*arguments, "--out", str(tmp_path)]) == 0
+    content = json.loads((tmp_path / "scaling.json").read_text())
+    assert content["results"] == []
+    sizes = {(e["filter"], e["particles"], e["components"]) for e in content["price"]}
+    assert sizes == {(name, 64, m) for name in price.PRICED for m in (2, 4)}
+    assert all(entry["ratio"] > 0 for entry in content["price"])
+    calls = {(e["filter"], e["components"]): e["first_call"] for e in content["first_calls"]}
+    assert set(calls) == {("pf", 1), *((name, m) for name in price.PRICED for m in (2, 4))}
+    printed = capsys.readouterr().out
+    ratio = next(e["ratio"] for e in content["price"] if e["filter"] == "mpf")
+    assert f"{ratio:.2f}" in printed
+    assert f"(its first call: {calls['pf', 1]:.1f} s)" in printed
