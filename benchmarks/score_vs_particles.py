@@ -107,6 +107,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         "--particles", type=whole(2), nargs="+", default=[20, 50, 100, 200, 500, 1000], metavar="N"
     )
     parser.add_argument("--filters", nargs="+", choices=list(LABELS), default=OF_THE_PAPER)
+    parser.add_argument(
+        "--components", type=whole(), default=2, metavar="M", help="the most that a mixture has"
+    )
+    parser.add_argument(
+        "--regroup-every", type=whole(), default=1, metavar="K", help="steps, not at every one"
+    )
     parser.add_argument("--out", default="results/score_vs_particles", metavar="DIR")
     parser.add_argument("--seed", type=seed, default=0, help="of all the runs")
     parser.add_argument(
@@ -126,23 +132,28 @@ def simulate(seed: int) -> tuple[Float[Array, " t"], Float[Array, " t"]]:
     return truth, truth**2 + SIGMA * noise
 
 
-def build(name: str, model: mpfjax.QuadraticModel, num_particles: int) -> mpfjax.Filter:
-    """The filter of that name; all mixtures have at most two components."""
+def build(
+    name: str,
+    model: mpfjax.QuadraticModel,
+    mixture: dict[str, int],
+    num_particles: int,
+) -> mpfjax.Filter:
+    """The filter of that name; `mixture` are the options of those that are mixtures."""
     if name == "pf":
         return mpfjax.particle_filter(model, num_particles)
     if name == "mpf":
-        return mpfjax.mixture_particle_filter(model, num_particles, max_components=2)
+        return mpfjax.mixture_particle_filter(model, num_particles, **mixture)
     regeneration = mpfjax.GaussianRegeneration(noise="stratified")
     if name == "gpf":
         return mpfjax.gaussian_particle_filter(model, num_particles, regeneration=regeneration)
     if name == "gm_mpf":
         return mpfjax.gaussian_mixture_particle_filter(
-            model, num_particles, max_components=2, regeneration=regeneration
+            model, num_particles, regeneration=regeneration, **mixture
         )
     return mpfjax.mixture_particle_filter(
         model,
         num_particles,
-        max_components=2,
+        **mixture,
         proposal=mpfjax.GaussNewtonProposal(model, noise="stratified"),
         sort_by=position,
     )
@@ -182,8 +193,9 @@ def study_of(
             kept |= {k: values[..., :size] for k, values in particles.items()}
         return kept
 
+    mixture = {"max_components": options.components, "regroup_every": options.regroup_every}
     return mpfjax.Study(
-        filters={name: functools.partial(build, name, model) for name in options.filters},
+        filters={name: functools.partial(build, name, model, mixture) for name in options.filters},
         num_particles=list(dict.fromkeys(options.particles)),
         keys=jax.random.split(jax.random.fold_in(jax.random.key(options.seed), 1), options.seeds),
         observations=observations,
@@ -278,7 +290,8 @@ def settings_of(options: argparse.Namespace) -> dict[str, Any]:
         "sigma_y": SIGMA,
         "initial": [LOW, HIGH],
         "radius": RADIUS,
-        "max_components": 2,
+        "max_components": options.components,
+        "regroup_every": options.regroup_every,
         "seeds": options.seeds,
         "particles": options.particles,
         "filters": options.filters,

@@ -33,8 +33,8 @@ ORDER = (
 # Inside the two folders that hold several floors.
 FLOORS = {
     "operations": (
-        "floats", "gradients", "stored", "indexing", "prefix_sums", "logarithms", "segments",
-        "matrices", "across_islands", "generator", "compiling",
+        "floats", "gradients", "platforms", "stored", "indexing", "prefix_sums", "logarithms",
+        "segments", "matrices", "across_islands", "generator", "compiling",
     ),
     "running": (
         "storage", "processes", "devices", "threads", "scan", "run", "islands", "studies",

@@ -13,6 +13,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Key, UInt32
 
 from mpfjax.operations.floats import default_float
+from mpfjax.operations.platforms import on_platform
 from mpfjax.operations.stored import stored
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
@@ -85,7 +86,7 @@ def normal(
     stock = partial(jax.random.normal, shape=shape, dtype=dtype)
     if dtype != jnp.float32 or math.prod(shape) == 0:
         return stock(key)
-    return jax.lax.platform_dependent(key, cpu=partial(_normal, shape=shape), default=stock)
+    return on_platform(key, cpu=partial(_normal, shape=shape), default=stock)
 
 
 def _normal(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "..."]:
@@ -136,14 +137,14 @@ def _random_bits(key: UInt32[Array, " 2"], bit_width: int, shape: tuple[int, ...
     in_short_rows = len(shape) > 1 and shape[-1] < _SHORT_ROW and size > _FEW
     if bit_width != 32 or in_short_rows or not 0 < size < 2**32:
         return stock(key)
-    return jax.lax.platform_dependent(key, cpu=partial(_words, shape=shape), default=stock)
+    return on_platform(key, cpu=partial(_words, shape=shape), default=stock)
 
 
 def _split(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, "*shape 2"]:
     stock = partial(threefry_prng_impl.split, shape=shape)
     if not 0 < math.prod(shape) < 2**32:
         return stock(key)
-    return jax.lax.platform_dependent(key, cpu=partial(_keys, shape=shape), default=stock)
+    return on_platform(key, cpu=partial(_keys, shape=shape), default=stock)
 
 
 @partial(jax.jit, static_argnames="shape")

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Shaped
 
 from mpfjax.operations.indexing import count_places
+from mpfjax.operations.platforms import on_platform
 from mpfjax.operations.stored import EXACT_IN_FLOAT32, block_size, stored, to_int, whole_blocks
 
 _ONE_BLOCK = 128
@@ -26,7 +27,7 @@ def sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Ar
     zero a share of the line. On a CPU, blocks are multiplied by a triangle of ones, which is
     several times faster than XLA's own cumulative sum. Other platforms use XLA's.
     """
-    return jax.lax.platform_dependent(values, cpu=_blocked_sum_before, default=_scanned_sum_before)
+    return on_platform(values, cpu=_blocked_sum_before, default=_scanned_sum_before)
 
 
 def _scanned_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
@@ -79,7 +80,7 @@ def count_upto(values: Shaped[Array, " n"], bound: int) -> Int[Array, " n"]:
     scanned = partial(jnp.cumsum, dtype=jnp.int32)
     if bound >= EXACT_IN_FLOAT32:
         return scanned(values)
-    return jax.lax.platform_dependent(values, cpu=_blocked_count_upto, default=scanned)
+    return on_platform(values, cpu=_blocked_count_upto, default=scanned)
 
 
 def _blocked_count_upto(values: Shaped[Array, " n"]) -> Int[Array, " n"]:

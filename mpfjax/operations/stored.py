@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
+from mpfjax.operations.platforms import on_platform
+
 _BLOCKS = (32, 16, 8)
 EXACT_IN_FLOAT32 = 2**23  # as exact as up to 2^24, and readable from the lowest bits
 
@@ -36,7 +38,7 @@ def stored(values: Shaped[Array, "*rest n"], bound: int | None = None) -> Shaped
     """
     if bound is not None and bound > EXACT_IN_FLOAT32:
         return values
-    return jax.lax.platform_dependent(values, cpu=_times_identity, default=lambda values: values)
+    return on_platform(values, cpu=_times_identity, default=lambda values: values)
 
 
 def _times_identity(values: Array) -> Array:
