@@ -29,6 +29,9 @@ FEW_SEGMENTS = 4
 # Neighbours that are added to the same place go to different lanes, each with a place of its own.
 # In one place, a CPU would have to wait for each addition before the next.
 _LANES = 8
+# A sum over the entries runs on vectors where they lie side by side, column by column: up to ten
+# times as fast. To bring many columns into that order costs more than it gains.
+_FEW_COLUMNS = 9
 # In float32, a million equal numbers, added one after the other, give a thousandth too much.
 _LONGEST_SUM = 2**10
 _COUNTED_BLOCK = 32
@@ -57,12 +60,22 @@ def segment_sum(
     values: Float[Array, "n *rest"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, "num_segments *rest"]:
     """The sum of the values in each segment; a label outside [0, num_segments) is left out."""
-    if num_segments > FEW_SEGMENTS:
-        columns = values.reshape(values.shape[0], -1).T
-        sums = jax.vmap(lambda column: _scattered_sum(column, segments, num_segments))(columns)
-        return sums.T.reshape(num_segments, *values.shape[1:])
+    columns = values.reshape(values.shape[0], -1).T
+    if num_segments > FEW_SEGMENTS or len(columns) <= _FEW_COLUMNS:
+        sums = column_sums(columns, segments, num_segments)
+        return sums.reshape(num_segments, *values.shape[1:])
     member = _members(segments, num_segments, values.ndim - 1)
     return jnp.sum(jnp.where(member, values[None], jnp.zeros((), values.dtype)), axis=1)
+
+
+def column_sums(
+    columns: Float[Array, "c n"], segments: Int[Array, " n"], num_segments: int
+) -> Float[Array, "num_segments c"]:
+    """`segment_sum` of values that lie column by column, each entry beside the next."""
+    if num_segments > FEW_SEGMENTS:
+        return jax.vmap(lambda column: _scattered_sum(column, segments, num_segments))(columns).T
+    member = _members(segments, num_segments)[:, None]
+    return jnp.sum(jnp.where(member, columns[None], jnp.zeros((), columns.dtype)), axis=2)
 
 
 def segment_max(
