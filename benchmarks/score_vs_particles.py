@@ -135,7 +135,7 @@ def simulate(seed: int) -> tuple[Float[Array, " t"], Float[Array, " t"]]:
 def build(
     name: str,
     model: mpfjax.QuadraticModel,
-    mixture: dict[str, int],
+    mixture: dict[str, Any],
     num_particles: int,
 ) -> mpfjax.Filter:
     """The filter of that name; `mixture` are the options of those that are mixtures."""
@@ -193,7 +193,10 @@ def study_of(
             kept |= {k: values[..., :size] for k, values in particles.items()}
         return kept
 
-    mixture = {"max_components": options.components, "regroup_every": options.regroup_every}
+    mixture: dict[str, Any] = {
+        "max_components": options.components,
+        "regroup_every": options.regroup_every,
+    }
     return mpfjax.Study(
         filters={name: functools.partial(build, name, model, mixture) for name in options.filters},
         num_particles=list(dict.fromkeys(options.particles)),

@@ -98,6 +98,7 @@ BUILT = {
     "Exclusion": (
         mpfjax.Exclusion, {"strength": 1.0, "radius": 0.5, "features": None, "scale": 1.0}
     ),
+    "Every": (mpfjax.Every, {"num_steps": 2, "moves": [mpfjax.KMeans(1)]}),
     "Exchange": (mpfjax.Exchange, {"threshold": 0.5}),
     "Propagate": (mpfjax.Propagate, {"model": MODEL, "proposal": None, "gradient": "none"}),
     "Predict": (mpfjax.Predict, {"model": MODEL, "gradient": "none"}),
@@ -129,7 +130,7 @@ BUILT = {
         {"model": MODEL, "num_particles": 4, "max_components": 2, "proposal": None,
          "scheme": "systematic", "ess_threshold": 1.0, "particles_per_component": None,
          "sort_by": None, "gradient": "none", "features": None, "scale": 1.0, "merge": None,
-         "split": None, "kmeans": None, "initial_kmeans": None},
+         "split": None, "kmeans": None, "initial_kmeans": None, "regroup_every": 1},
     ),
     "gaussian_particle_filter": (
         mpfjax.gaussian_particle_filter,
@@ -140,7 +141,7 @@ BUILT = {
         mpfjax.gaussian_mixture_particle_filter,
         {"model": MODEL, "num_particles": 4, "max_components": 2, "proposal": None,
          "regeneration": None, "importance": "propagated", "features": None, "scale": 1.0,
-         "merge": None, "split": None, "kmeans": None, "initial_kmeans": None},
+         "merge": None, "split": None, "kmeans": None, "initial_kmeans": None, "regroup_every": 1},
     ),
     "partitioned_sampling": (
         mpfjax.partitioned_sampling,

@@ -14,6 +14,8 @@ from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvena
 from mpfjax.moves.resampling import Resample
 from mpfjax.operations.generator import split
 
+_MOST_STEPS = 2**31 - 1  # that int32 counts
+
 
 class Every(AbstractMove):
     """Other moves at the steps k, 2k, 3k, ..., and nothing at those between.
@@ -36,7 +38,7 @@ class Every(AbstractMove):
 
     def __init__(self, num_steps: int, moves: Iterable[AbstractMove]) -> None:
         check_whole(num_steps=num_steps)
-        self.num_steps = int(num_steps)
+        self.num_steps = min(int(num_steps), _MOST_STEPS)
         self.moves = _as_inner_moves(moves)
 
     @property
