@@ -13,6 +13,7 @@ from mpfjax.checks import check_callable, check_key, check_type, check_whole, sh
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, check_states
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
+from mpfjax.moves.conditional import ConditionalResample
 from mpfjax.moves.exchange import Exchange
 from mpfjax.moves.resampling import Resample
 from mpfjax.observations import checked_observation, one_observation
@@ -185,7 +186,7 @@ class Filter(eqx.Module):
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
         for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
-            if isinstance(move, Resample):
+            if isinstance(move, Resample | ConditionalResample):
                 resampled |= move.is_due(mixture)
             moved = move(move_key, mixture, observation)
             if not isinstance(move, _KEEP_MASS):

@@ -76,6 +76,11 @@ def sample_trajectories(
     return _sample(key, model, stacked, num_trajectories, component, num_steps)
 
 
+@jit_on_wide_vectors
+def _sample(key, model, mixtures, num_trajectories, component, num_steps):
+    return draw_trajectories(key, model, mixtures, num_trajectories, component, num_steps)
+
+
 def _check_component(mixtures: ParticleMixture, component: int) -> None:
     if component >= mixtures.num_components:
         raise ValueError(f"component: {component} is not one of {mixtures.num_components}")
@@ -86,14 +91,21 @@ def _check_component(mixtures: ParticleMixture, component: int) -> None:
         raise ValueError(f"component: {component} is dead at the end; alive are {alive}")
 
 
-@jit_on_wide_vectors
-def _sample(key, model, mixtures, num_trajectories, component, num_steps):
+def draw_trajectories(
+    key: Key[Array, ""],
+    model: Any,
+    mixtures: ParticleMixture,
+    num_trajectories: int,
+    component: int | None,
+    num_steps: int,
+) -> PyTree:
+    """`sample_trajectories` under the caller's jit, unchecked; no steps are method "exact"."""
     key_final, key_steps = split(key, 2)
     final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
     log_weights = final.log_weights
     if component is not None:
         log_weights = jnp.where(final.component_indicators == component, log_weights, -jnp.inf)
-    last = _draw(uniform(key_final, (num_trajectories,), log_weights.dtype), log_weights)
+    last = draw_indices(uniform(key_final, (num_trajectories,), log_weights.dtype), log_weights)
     states = jax.tree.map(lambda leaf: take(leaf, last), final.particles)
 
     def back(carry: tuple[PyTree, Array], inputs: Any) -> tuple[tuple[PyTree, Array], PyTree]:
@@ -118,7 +130,7 @@ def _sample(key, model, mixtures, num_trajectories, component, num_steps):
     )
 
 
-def _draw(uniforms: Float[Array, " k"], log_weights: Float[Array, " n"]) -> Int[Array, " k"]:
+def draw_indices(uniforms: Float[Array, " k"], log_weights: Float[Array, " n"]) -> Int[Array, " k"]:
     """Indices by their weights, by the inverse of the cumulative weights."""
     weights = exp(log_weights - finite_or_zero(jnp.max(log_weights)))
     upto = jnp.cumsum(weights)
@@ -181,7 +193,7 @@ def _walk(
     ) -> tuple[tuple[Int[Array, " k"], Float[Array, " k"]], None]:
         indices, current = place
         key_proposal, key_accept = split(step_key, 2)
-        proposed = _draw(uniform(key_proposal, (num_trajectories,), dtype), mixture.log_weights)
+        proposed = draw_indices(uniform(key_proposal, (num_trajectories,), dtype), mixture.log_weights)
         new = log_density(proposed)
         # The proposal draws by the weights, which therefore cancel in the acceptance ratio.
         accepted = jnp.log(uniform(key_accept, (num_trajectories,), dtype)) < new - current
