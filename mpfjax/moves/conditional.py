@@ -8,7 +8,6 @@ propagation puts x*_t into the slot, and the resampling gives the slot at least 
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree

@@ -32,7 +32,7 @@ from mpfjax.running.scan import FilterRun, checked, scan
 from mpfjax.smoothing.history import mixtures_of
 from mpfjax.smoothing.trajectories import draw_indices, draw_trajectories
 
-_IMPOSSIBLE = "trajectory: the model's density of it is zero or NaN"
+_IMPOSSIBLE = "trajectory: its density beside the observations is zero or NaN"
 
 
 class ConditionalRun(eqx.Module):
@@ -140,12 +140,7 @@ def renew(
     log_weights = jax.vmap(at)(run.collected.log_weights, reference)
     later = (log_weights > -jnp.inf) & ~run.degenerate
     slots = jnp.concatenate([first_slot[None], reference])
-    mixtures = mixtures_of(run)
-    if backward:
-        drawn = draw_trajectories(key_back, filter.model, mixtures, 1, None, 0)
-        drawn = jax.tree.map(lambda leaf: leaf[0], drawn)
-    else:
-        drawn = _of_the_genealogy(key_back, mixtures)
+    drawn = draw_trajectory(key_back, filter.model, run, backward)
     possible = _possible(filter.model, trajectory, later)
     return ConditionalRun(drawn, run, slots, possible)
 
@@ -174,6 +169,17 @@ def _independent_initial(key: Key[Array, ""], model: Any, num_particles: int) ->
         return jax.tree.map(lambda leaf: leaf[0], sample_initial(key, model, 1))
 
     return jax.vmap(draw)(split(key, num_particles))
+
+
+def draw_trajectory(
+    key: Key[Array, ""], model: AbstractStateSpaceModel, run: FilterRun, backward: bool
+) -> PyTree:
+    """One trajectory of a run, by backward sampling or the genealogy: leaves (t + 1, ...)."""
+    mixtures = mixtures_of(run)
+    if not backward:
+        return _of_the_genealogy(key, mixtures)
+    drawn = draw_trajectories(key, model, mixtures, 1, None, 0)
+    return jax.tree.map(lambda leaf: leaf[0], drawn)
 
 
 def _of_the_genealogy(key: Key[Array, ""], mixtures: ParticleMixture) -> PyTree:
@@ -261,8 +267,8 @@ def _as_states(trajectory: Any, model: AbstractStateSpaceModel, length: int) -> 
         shape = (length, *state.shape[1:])
         if jnp.shape(leaf) != shape:
             raise ValueError(
-                f"trajectory: shape {jnp.shape(leaf)} is not {shape}, x_0 and a state for each"
-                f" observation, {of_states}"
+                f"trajectory: shape {jnp.shape(leaf)} is not {shape}, x_0 and one state"
+                f" for each of the observations, {of_states}"
             )
         if not np.can_cast(jnp.result_type(leaf), state.dtype, "same_kind"):
             raise ValueError(

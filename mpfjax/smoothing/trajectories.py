@@ -193,7 +193,9 @@ def _walk(
     ) -> tuple[tuple[Int[Array, " k"], Float[Array, " k"]], None]:
         indices, current = place
         key_proposal, key_accept = split(step_key, 2)
-        proposed = draw_indices(uniform(key_proposal, (num_trajectories,), dtype), mixture.log_weights)
+        proposed = draw_indices(
+            uniform(key_proposal, (num_trajectories,), dtype), mixture.log_weights
+        )
         new = log_density(proposed)
         # The proposal draws by the weights, which therefore cancel in the acceptance ratio.
         accepted = jnp.log(uniform(key_accept, (num_trajectories,), dtype)) < new - current

@@ -5,6 +5,8 @@ from mpfjax.tuning.climb import TuningRun as TuningRun
 from mpfjax.tuning.climb import fit as fit
 from mpfjax.tuning.climb import maximise as maximise
 from mpfjax.tuning.curvature import standard_errors as standard_errors
+from mpfjax.tuning.gibbs import GibbsPosterior as GibbsPosterior
+from mpfjax.tuning.gibbs import particle_gibbs as particle_gibbs
 from mpfjax.tuning.labels import LabelLikelihood as LabelLikelihood
 from mpfjax.tuning.labels import label_log_posteriors as label_log_posteriors
 from mpfjax.tuning.labels import transition_candidates as transition_candidates
