@@ -22,7 +22,7 @@ from mpfjax.smoothing.history import mixtures_of
 
 # How many densities are held at once: rows of trajectories are taken together up to this.
 _MOST_DENSITIES = 2**22
-_NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the step before"
+NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the step before"
 
 
 def sample_trajectories(
@@ -167,7 +167,7 @@ def _draw_exactly(
         indices, largest = jax.vmap(draw_one)(inputs)
     else:
         indices, largest = jax.lax.map(draw_one, inputs, batch_size=together)
-    return eqx.error_if(indices, ~jnp.all(largest > -jnp.inf), _NO_PAST)
+    return eqx.error_if(indices, ~jnp.all(largest > -jnp.inf), NO_PAST)
 
 
 def _walk(
@@ -203,4 +203,4 @@ def _walk(
         return (jnp.where(accepted, proposed, indices), jnp.where(accepted, new, current)), None
 
     (indices, current), _ = jax.lax.scan(move, (start, log_density(start)), split(key, num_steps))
-    return eqx.error_if(indices, ~jnp.all(current > -jnp.inf), _NO_PAST)
+    return eqx.error_if(indices, ~jnp.all(current > -jnp.inf), NO_PAST)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from tqdm import tqdm
 
 from mpfjax.checks import check_callable, shown
+from mpfjax.smoothing.trajectories import NO_PAST
 from mpfjax.tuning.problem import Problem, Reals
 from mpfjax.tuning.transforms import AbstractTransform
 
@@ -93,6 +94,11 @@ def constrained(problem: Problem, reals: dict[str, np.ndarray]) -> dict[str, np.
     return {name: convert(name, u) for name, u in reals.items()}
 
 
+def is_broken(error: RuntimeError) -> bool:
+    """Whether a density was NaN or infinite; weights that are NaN leave no trajectory either."""
+    return BROKEN in str(error) or NO_PAST in str(error)
+
+
 def take_steps(
     caller: str,
     advance: Callable[[Key[Array, " chains"], Any], tuple[Any, PyTree]],
@@ -114,7 +120,7 @@ def take_steps(
             states, report = advance(keys, states)
             path.append(jax.tree.map(np.asarray, report))
         except RuntimeError as error:
-            if BROKEN not in str(error):
+            if not is_broken(error):
                 raise
             stopped = f"{BROKEN} at step {step}"
             warnings.warn(f"{caller}: {stopped}", stacklevel=3)

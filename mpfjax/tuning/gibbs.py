@@ -31,6 +31,7 @@ from mpfjax.tuning.chains import (
     checked_deviations,
     checked_prior,
     constrained,
+    is_broken,
     take_steps,
     walk,
 )
@@ -149,7 +150,12 @@ def particle_gibbs(
         prior = checked_prior(log_prior, problem, start, "at the start")
     sampler = _Sampler(problem, joint, prior, deviations, draw, num_metropolis_steps, backward)
     key_start, key_steps = jax.random.split(key)
-    states = _starts(sampler, jax.random.split(key_start, num_chains), start)
+    try:
+        states = _starts(sampler, jax.random.split(key_start, num_chains), start)
+    except RuntimeError as error:
+        if not is_broken(error):
+            raise
+        raise RuntimeError(f"particle_gibbs: {BROKEN} at the start") from error
     advance = eqx.Partial(_advance, sampler, collect)
     (reals, kept, accepted, renewed), stopped = take_steps(
         "particle_gibbs", advance, states, key_steps, num_steps, num_chains, progress
