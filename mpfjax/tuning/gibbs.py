@@ -127,6 +127,7 @@ def particle_gibbs(
     check_callable("a function of a trajectory", **given(collect=collect))
     what = "a function of a key, a trajectory, observations and a model"
     check_callable(what, **given(draw=draw))
+    check_callable("a function of the parameters by name", **given(log_prior=log_prior))
     if (draw is None) == (log_prior is None):
         raise ValueError(
             f"draw, log_prior: {shown(draw)} and {shown(log_prior)}; exactly one must be given"

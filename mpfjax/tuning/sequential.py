@@ -60,7 +60,7 @@ class SequentialPosterior:
 
     def mean(self, name: str) -> np.ndarray:
         """E[θ | y_1..y_t] of one parameter, estimated."""
-        return np.einsum("n,n...->...", self.weights, self.parameters[name])
+        return np.asarray(np.einsum("n,n...->...", self.weights, self.parameters[name]))
 
 
 def smc2(
