@@ -28,9 +28,11 @@ from mpfjax.moves.resampling import Resample
 from mpfjax.observations import as_arrays, present_steps
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.generator import split, uniform
+from mpfjax.operations.logarithms import softmax
+from mpfjax.operations.matrices import draw_columns
 from mpfjax.running.scan import FilterRun, checked, scan
 from mpfjax.smoothing.history import mixtures_of
-from mpfjax.smoothing.trajectories import draw_indices, draw_trajectories
+from mpfjax.smoothing.trajectories import sample_trajectories
 
 _IMPOSSIBLE = "trajectory: its density beside the observations is zero or NaN"
 
@@ -104,15 +106,29 @@ def conditional_filter(
     observations = as_arrays(observations)
     length = jax.tree.leaves(observations)[0].shape[0]
     trajectory = _as_states(trajectory, filter.model, length + 1)
+    # Before the run: backward sampling would not find where the trajectory has come from.
+    _require(_steps_are_possible(filter.model, trajectory))
     run = lambda filter: _run(key, filter, observations, present, trajectory, backward)  # noqa: E731
     found = with_floats_traced(run, filter)
     found = eqx.tree_at(lambda found: found.run, found, checked(found.run))
     if isinstance(found.possible, Tracer):
         return eqx.error_if(found, ~jnp.all(found.possible), _IMPOSSIBLE)
-    if not np.all(found.possible):
-        first = int(np.argmin(np.asarray(found.possible)))
-        raise ValueError(f"{_IMPOSSIBLE}, first at index {first} of its times")
+    _require(found.possible)
     return found
+
+
+def _require(possible: Bool[Array, " t"]) -> None:
+    """Raise a `ValueError` that names the first time at which the trajectory is impossible."""
+    if not isinstance(possible, Tracer) and not np.all(possible):
+        first = int(np.argmin(np.asarray(possible)))
+        raise ValueError(f"{_IMPOSSIBLE}, first at index {first} of its times")
+
+
+@eqx.filter_jit
+def _steps_are_possible(model: AbstractStateSpaceModel, trajectory: PyTree) -> Bool[Array, " t"]:
+    """At which times the trajectory is possible, without regard to what was observed."""
+    length = jax.tree.leaves(trajectory)[0].shape[0] - 1
+    return _possible(model, trajectory, jnp.ones(length, bool))
 
 
 @jit_on_wide_vectors
@@ -175,17 +191,16 @@ def draw_trajectory(
     key: Key[Array, ""], model: AbstractStateSpaceModel, run: FilterRun, backward: bool
 ) -> PyTree:
     """One trajectory of a run, by backward sampling or the genealogy: leaves (t + 1, ...)."""
-    mixtures = mixtures_of(run)
     if not backward:
-        return _of_the_genealogy(key, mixtures)
-    drawn = draw_trajectories(key, model, mixtures, 1, None, 0)
-    return jax.tree.map(lambda leaf: leaf[0], drawn)
+        return _of_the_genealogy(key, mixtures_of(run))
+    return jax.tree.map(lambda leaf: leaf[0], sample_trajectories(key, model, run, 1))
 
 
 def _of_the_genealogy(key: Key[Array, ""], mixtures: ParticleMixture) -> PyTree:
     """A particle of the last mixture by its weight, and its ancestors."""
     last = jax.tree.map(lambda leaf: leaf[-1], mixtures)
-    end = draw_indices(uniform(key, (1,), last.log_weights.dtype), last.log_weights)[0]
+    weights = softmax(last.log_weights)
+    end = draw_columns(uniform(key, (1,), weights.dtype), weights[None])[0]
 
     def back(index: Array, ancestors: Array) -> tuple[Array, Array]:
         return at(ancestors, index), index

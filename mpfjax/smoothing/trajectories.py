@@ -22,7 +22,7 @@ from mpfjax.smoothing.history import mixtures_of
 
 # How many densities are held at once: rows of trajectories are taken together up to this.
 _MOST_DENSITIES = 2**22
-NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the step before"
+_NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the step before"
 
 
 def sample_trajectories(
@@ -76,11 +76,6 @@ def sample_trajectories(
     return _sample(key, model, stacked, num_trajectories, component, num_steps)
 
 
-@jit_on_wide_vectors
-def _sample(key, model, mixtures, num_trajectories, component, num_steps):
-    return draw_trajectories(key, model, mixtures, num_trajectories, component, num_steps)
-
-
 def _check_component(mixtures: ParticleMixture, component: int) -> None:
     if component >= mixtures.num_components:
         raise ValueError(f"component: {component} is not one of {mixtures.num_components}")
@@ -91,21 +86,14 @@ def _check_component(mixtures: ParticleMixture, component: int) -> None:
         raise ValueError(f"component: {component} is dead at the end; alive are {alive}")
 
 
-def draw_trajectories(
-    key: Key[Array, ""],
-    model: Any,
-    mixtures: ParticleMixture,
-    num_trajectories: int,
-    component: int | None,
-    num_steps: int,
-) -> PyTree:
-    """`sample_trajectories` under the caller's jit, unchecked; no steps are method "exact"."""
+@jit_on_wide_vectors
+def _sample(key, model, mixtures, num_trajectories, component, num_steps):
     key_final, key_steps = split(key, 2)
     final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
     log_weights = final.log_weights
     if component is not None:
         log_weights = jnp.where(final.component_indicators == component, log_weights, -jnp.inf)
-    last = draw_indices(uniform(key_final, (num_trajectories,), log_weights.dtype), log_weights)
+    last = _draw(uniform(key_final, (num_trajectories,), log_weights.dtype), log_weights)
     states = jax.tree.map(lambda leaf: take(leaf, last), final.particles)
 
     def back(carry: tuple[PyTree, Array], inputs: Any) -> tuple[tuple[PyTree, Array], PyTree]:
@@ -130,7 +118,7 @@ def draw_trajectories(
     )
 
 
-def draw_indices(uniforms: Float[Array, " k"], log_weights: Float[Array, " n"]) -> Int[Array, " k"]:
+def _draw(uniforms: Float[Array, " k"], log_weights: Float[Array, " n"]) -> Int[Array, " k"]:
     """Indices by their weights, by the inverse of the cumulative weights."""
     weights = exp(log_weights - finite_or_zero(jnp.max(log_weights)))
     upto = jnp.cumsum(weights)
@@ -167,7 +155,7 @@ def _draw_exactly(
         indices, largest = jax.vmap(draw_one)(inputs)
     else:
         indices, largest = jax.lax.map(draw_one, inputs, batch_size=together)
-    return eqx.error_if(indices, ~jnp.all(largest > -jnp.inf), NO_PAST)
+    return eqx.error_if(indices, ~jnp.all(largest > -jnp.inf), _NO_PAST)
 
 
 def _walk(
@@ -193,9 +181,7 @@ def _walk(
     ) -> tuple[tuple[Int[Array, " k"], Float[Array, " k"]], None]:
         indices, current = place
         key_proposal, key_accept = split(step_key, 2)
-        proposed = draw_indices(
-            uniform(key_proposal, (num_trajectories,), dtype), mixture.log_weights
-        )
+        proposed = _draw(uniform(key_proposal, (num_trajectories,), dtype), mixture.log_weights)
         new = log_density(proposed)
         # The proposal draws by the weights, which therefore cancel in the acceptance ratio.
         accepted = jnp.log(uniform(key_accept, (num_trajectories,), dtype)) < new - current
@@ -203,4 +189,4 @@ def _walk(
         return (jnp.where(accepted, proposed, indices), jnp.where(accepted, new, current)), None
 
     (indices, current), _ = jax.lax.scan(move, (start, log_density(start)), split(key, num_steps))
-    return eqx.error_if(indices, ~jnp.all(current > -jnp.inf), NO_PAST)
+    return eqx.error_if(indices, ~jnp.all(current > -jnp.inf), _NO_PAST)

@@ -12,10 +12,10 @@ from jaxtyping import Array, Float, Key, PyTree
 from tqdm import tqdm
 
 from mpfjax.checks import check_callable, shown
-from mpfjax.smoothing.trajectories import NO_PAST
 from mpfjax.tuning.problem import Problem, Reals
 from mpfjax.tuning.transforms import AbstractTransform
 
+_NO_PAST = "log_transition is -inf, or NaN"  # of backward sampling, where all weights are NaN
 BROKEN = "the log prior or log marginal likelihood was NaN or inf"
 
 
@@ -95,8 +95,8 @@ def constrained(problem: Problem, reals: dict[str, np.ndarray]) -> dict[str, np.
 
 
 def is_broken(error: RuntimeError) -> bool:
-    """Whether a density was NaN or infinite; weights that are NaN leave no trajectory either."""
-    return BROKEN in str(error) or NO_PAST in str(error)
+    """Whether a density was NaN or infinite."""
+    return BROKEN in str(error) or _NO_PAST in str(error)
 
 
 def take_steps(

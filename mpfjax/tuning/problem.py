@@ -157,7 +157,7 @@ def pose_evidence(
 
 def pose_filter(
     filter: Filter,
-    objective: Objective,
+    objective: Callable[..., Any],
     parameters: Parameters,
     transforms: Mapping[str, AbstractTransform] | None,
 ) -> Problem:
