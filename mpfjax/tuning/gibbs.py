@@ -20,7 +20,7 @@ from mpfjax.checks import (
     saying,
     shown,
 )
-from mpfjax.filter import Filter
+from mpfjax.filter import Filter, sample_initial
 from mpfjax.models.base import require
 from mpfjax.observations import as_arrays, present_steps
 from mpfjax.running.scan import scan_filter
@@ -150,6 +150,8 @@ def particle_gibbs(
         deviations = checked_deviations(proposal_deviations, start)
         prior = checked_prior(log_prior, problem, start, "at the start")
     sampler = _Sampler(problem, joint, prior, deviations, draw, num_metropolis_steps, backward)
+    if draw is not None:
+        _check_draw(sampler, start)
     key_start, key_steps = jax.random.split(key)
     try:
         states = _starts(sampler, jax.random.split(key_start, num_chains), start)
@@ -217,7 +219,7 @@ class _Sampler(eqx.Module):
         if self.draw is None:
             reals, accepted = self._metropolis(key_parameters, reals, trajectory)
         else:
-            reals = self._drawn(key_parameters, reals, trajectory)
+            reals = self.drawn(key_parameters, reals, trajectory)
             accepted = jnp.ones(())
         filter = self.problem.at(reals)
         observations, present = self.joint.observations, self.joint.present
@@ -232,7 +234,7 @@ class _Sampler(eqx.Module):
         renewed = jnp.any(jnp.stack(changes), axis=0)
         return eqx.error_if((reals, found.trajectory, accepted, renewed), broken, BROKEN)
 
-    def _drawn(self, key: Key[Array, ""], reals: Reals, trajectory: PyTree) -> Reals:
+    def drawn(self, key: Key[Array, ""], reals: Reals, trajectory: PyTree) -> Reals:
         """The user's draw, in unconstrained numbers."""
         filter = self.problem.at(reals)
         with saying("in draw, which is called with a key, trajectory, observations and model"):
@@ -277,6 +279,17 @@ class _Sampler(eqx.Module):
         keys = jax.random.split(key, self.num_metropolis_steps)
         (reals, _), accepted = jax.lax.scan(move, (reals, log_density(reals)), keys)
         return reals, jnp.mean(accepted.astype(jnp.result_type(float)))
+
+
+def _check_draw(sampler: _Sampler, start: Reals) -> None:
+    """Raise a `ValueError` for a draw of other names or shapes, before anything compiles."""
+    length = jax.tree.leaves(sampler.joint.observations)[0].shape[0] + 1
+    key, model = jax.random.key(0), sampler.problem.at(start).model
+    states = jax.eval_shape(lambda key: sample_initial(key, model, 1), key)
+    trajectory = jax.tree.map(
+        lambda state: jax.ShapeDtypeStruct((length, *state.shape[1:]), state.dtype), states
+    )
+    jax.eval_shape(lambda *arguments: sampler.drawn(*arguments), key, start, trajectory)
 
 
 @eqx.filter_jit

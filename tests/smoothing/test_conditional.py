@@ -31,7 +31,6 @@ def chain(*moves, n, m, model=QUADRATIC):
 
 # A filter, and whether the new trajectory is from backward sampling.
 CASES = {
-    "systematic": (mpfjax.particle_filter(LINEAR, 4), False),
     "guided, stratified, adaptive": (
         mpfjax.particle_filter(
             LINEAR, 5, proposal=GUIDED, scheme="stratified", ess_threshold=0.7
@@ -39,9 +38,6 @@ CASES = {
         True,
     ),
     "eager mixture, systematic": (chain(Resample(), Propagate(QUADRATIC), *EAGER, n=8, m=3), True),
-    "eager mixture, multinomial, adaptive": (
-        chain(Resample("multinomial", 0.6), Propagate(QUADRATIC), *EAGER, n=8, m=3), False
-    ),
     "many components, sorted, of fixed number": (
         chain(
             Resample("stratified", particles_per_component=2, sort_by=lambda x: -x),

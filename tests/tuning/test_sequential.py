@@ -109,22 +109,19 @@ def nan_prior(parameters):
     return jnp.where(parameters["a"] < 9, jnp.nan, 0.0)
 
 
-class Impossible(ScalarLinear):
-    def log_likelihood(self, observation, states):
-        return jnp.full(states.shape[0], -jnp.inf)
+class Faulty(ScalarLinear):
+    """Every likelihood is the same: r."""
 
-
-class Broken(ScalarLinear):
     def log_likelihood(self, observation, states):
-        return jnp.full(states.shape[0], jnp.nan)
+        return jnp.broadcast_to(self.r, states.shape)
 
 
 @pytest.mark.parametrize(
-    ("model", "named"), [(Impossible(), "no sample has any likelihood"), (Broken(), "was NaN")]
+    ("value", "named"), [(-np.inf, "no sample has any likelihood"), (np.nan, "was NaN")]
 )
-def test_likelihoods_that_are_none_are_an_error(model, named):
+def test_likelihoods_that_are_none_are_an_error(value, named):
     with pytest.raises(RuntimeError, match=named):
-        sample(filter=mpfjax.particle_filter(model, 10))
+        sample(filter=mpfjax.particle_filter(Faulty(r=value), 10))
 
 
 @pytest.mark.usefixtures("as_installed")
