@@ -15,7 +15,6 @@ from mpfjax.models.base import AbstractStateSpaceModel, check_model, check_state
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
 from mpfjax.moves.every import Every
 from mpfjax.moves.exchange import Exchange
-from mpfjax.moves.resampling import Resample
 from mpfjax.observations import checked_observation, one_observation
 from mpfjax.operations.across_islands import excess_over_islands, island_index, num_islands
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
@@ -187,7 +186,7 @@ class Filter(eqx.Module):
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
         for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
-            if isinstance(move, Resample | Every):
+            if isinstance(move, AbstractMove):
                 resampled |= move.is_due(mixture)
             if isinstance(move, Every):
                 mixture = move(move_key, mixture, observation, self._forgetting)

@@ -32,7 +32,11 @@ class AbstractProposal(eqx.Module):
     def propose(
         self, key: Key[Array, ""], observation: PyTree, previous_states: PyTree
     ) -> tuple[PyTree, Float[Array, " n"]]:
-        """x_t ~ q(. | x_{t-1}, y_t) for every particle, and log q of each, shape (n,)."""
+        """x_t ~ q(. | x_{t-1}, y_t) for every particle, and log q of each, shape (n,).
+
+        A proposal may also have `log_density(observation, states, previous_states)`, log q of
+        states that were not drawn from it, (n,). `mpfjax.smoothing.conditional_filter` needs it.
+        """
 
 
 class NetworkProposal(AbstractProposal):
@@ -85,17 +89,32 @@ class NetworkProposal(AbstractProposal):
         self, key: Key[Array, ""], observation: PyTree, previous_states: Float[Array, "n ..."]
     ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
         """x_t from the network's Gaussian of every particle, and its log density."""
+        means, deviations = self._moments(observation, previous_states)
+        noise = normal(key, means.shape, means.dtype)
+        states = means + deviations * noise
+        return states.reshape(previous_states.shape), _log_standard(noise, deviations)
+
+    def log_density(
+        self,
+        observation: PyTree,
+        states: Float[Array, "n ..."],
+        previous_states: Float[Array, "n ..."],
+    ) -> Float[Array, " n"]:
+        """log q(x_t | x_{t-1}, y_t) of every particle."""
+        means, deviations = self._moments(observation, previous_states)
+        return _log_standard((states.reshape(means.shape) - means) / deviations, deviations)
+
+    def _moments(
+        self, observation: PyTree, previous_states: Float[Array, "n ..."]
+    ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
+        """The mean and deviations of every particle's Gaussian."""
         previous = previous_states.reshape(previous_states.shape[0], -1)
         seen = ravel_pytree(observation)[0].astype(previous.dtype)
         rows = jnp.broadcast_to(seen, (previous.shape[0], seen.shape[0]))
         outputs = jax.vmap(self.network)(jnp.concatenate([previous, rows], axis=1))
         shifts, log_widths = jnp.split(outputs, 2, axis=1)
         scale = jnp.broadcast_to(self.scale.astype(previous.dtype), previous.shape)
-        noise = normal(key, previous.shape, previous.dtype)
-        states = previous + scale * (shifts + jnp.exp(log_widths) * noise)
-        log_widths = log_widths + jnp.log(scale) + 0.5 * jnp.log(2 * jnp.pi)
-        log_density = -jnp.sum(0.5 * noise**2 + log_widths, axis=1)
-        return states.reshape(previous_states.shape), log_density
+        return previous + scale * shifts, scale * jnp.exp(log_widths)
 
 
 class GaussNewtonProposal(AbstractProposal):
@@ -143,14 +162,30 @@ class GaussNewtonProposal(AbstractProposal):
         means, factors = self._fit(observation, prior_means)
         noise = NOISES[self.noise](key, means.shape, means.dtype)
         states = means + self.inflation * _solve_transposed(factors, noise)
-        dimension = means.shape[1]
+        return states.reshape(prior_means.shape), self._log_density(noise, factors)
+
+    def log_density(
+        self,
+        observation: PyTree,
+        states: Float[Array, "n ..."],
+        previous_states: Float[Array, "n ..."],
+    ) -> Float[Array, " n"]:
+        """log q(x_t | x_{t-1}, y_t) of every particle."""
+        means, factors = self._fit(observation, self.model.transition_mean(previous_states))
+        residuals = (states.reshape(means.shape) - means) / self.inflation
+        return self._log_density(jnp.einsum("nij,ni->nj", factors, residuals), factors)
+
+    def _log_density(
+        self, noise: Float[Array, "n d"], factors: Float[Array, "n d d"]
+    ) -> Float[Array, " n"]:
+        """log q of draws that were made of this noise."""
         log_scale = jnp.sum(jnp.log(_diagonals(factors)), axis=1)
         log_density = (
             log_scale
-            - dimension * (jnp.log(self.inflation) + 0.5 * jnp.log(2 * jnp.pi))
+            - noise.shape[1] * (jnp.log(self.inflation) + 0.5 * jnp.log(2 * jnp.pi))
             - 0.5 * jnp.sum(noise**2, axis=1)
         )
-        return states.reshape(prior_means.shape), log_density.astype(means.dtype)
+        return log_density.astype(noise.dtype)
 
     def _fit(
         self, observation: Float[Array, "..."], prior_means: Float[Array, "n ..."]
@@ -177,6 +212,14 @@ class GaussNewtonProposal(AbstractProposal):
             factors = cholesky(precisions)
             means = _solve_transposed(factors, solve_lower(factors, information))
         return means, factors
+
+
+def _log_standard(
+    noise: Float[Array, "n d"], deviations: Float[Array, "n d"]
+) -> Float[Array, " n"]:
+    """The log density of mean + deviations * noise, for standard normal noise."""
+    log_widths = jnp.log(deviations) + 0.5 * jnp.log(2 * jnp.pi)
+    return -jnp.sum(0.5 * noise**2 + log_widths, axis=1)
 
 
 def _solve_transposed(

@@ -203,6 +203,11 @@ RUN = {
         {"key": KEY, "model": MODEL, "mixtures": HISTORY, "num_trajectories": 2,
          "component": None, "method": "exact", "num_steps": None},
     ),
+    "conditional_filter": (
+        mpfjax.smoothing.conditional_filter,
+        {"key": KEY, "filter": FILTER, "observations": np.ones(2, np.float32),
+         "trajectory": np.ones(3, np.float32), "backward": True, "missing": "error"},
+    ),
     "trace_ancestors": (mpfjax.smoothing.trace_ancestors, {"mixtures": HISTORY}),
 }  # fmt: skip
 # What an argument is called further down.

@@ -1,3 +1,5 @@
+from mpfjax.metrics.forecast_scores import crps as crps
+from mpfjax.metrics.forecast_scores import log_score as log_score
 from mpfjax.metrics.modes import mass_above as mass_above
 from mpfjax.metrics.modes import modes_represented as modes_represented
 from mpfjax.metrics.set_distances import GOSPA as GOSPA

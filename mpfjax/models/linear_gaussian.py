@@ -70,6 +70,10 @@ class LinearGaussianModel(AbstractStateSpaceModel):
         """log N(x_t; A x_{t-1}, Q)."""
         return _log_normal(states - self.transition_mean(previous_states), self.Q)
 
+    def log_initial(self, states: Float[Array, "n d"]) -> Float[Array, " n"]:
+        """log N(x_0; m0, P0)."""
+        return _log_normal(states - self.m0[None], self.P0)
+
     def transition_mean(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
         """A x_{t-1}."""
         return states @ self.A.T

@@ -3,6 +3,7 @@
 import abc
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
@@ -28,6 +29,10 @@ class AbstractMove(eqx.Module):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
         """Move the mixture, given y_t."""
+
+    def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
+        """Which components the move would resample, for the report of a step; mostly none."""
+        return jnp.zeros(mixture.num_components, bool)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """The move when y_t is missing. Only a propagation does anything then."""

@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 from mpfjax.checks import check_whole, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
-from mpfjax.moves.resampling import Resample
 from mpfjax.operations.generator import split
 
 _MOST_STEPS = 2**31 - 1  # that int32 counts
@@ -52,12 +51,9 @@ class Every(AbstractMove):
         return f"every {self.num_steps}: {', '.join(type(move).__name__ for move in self.moves)}"
 
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
-        """Which components of `mixture` a `Resample` among the moves would resample now."""
-        due = jnp.zeros(mixture.num_components, bool)
-        for move in self.moves:
-            if isinstance(move, Resample | Every):
-                due |= move.is_due(mixture)
-        return due & self._runs(mixture)
+        """Which components of `mixture` the moves would resample now."""
+        due = jnp.stack([move.is_due(mixture) for move in self.moves])
+        return jnp.any(due, axis=0) & self._runs(mixture)
 
     def __call__(
         self,

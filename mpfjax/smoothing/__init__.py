@@ -2,5 +2,7 @@
 
 from mpfjax.smoothing.ancestors import Genealogy as Genealogy
 from mpfjax.smoothing.ancestors import trace_ancestors as trace_ancestors
+from mpfjax.smoothing.conditional import ConditionalRun as ConditionalRun
+from mpfjax.smoothing.conditional import conditional_filter as conditional_filter
 from mpfjax.smoothing.forecasts import Forecast as Forecast
 from mpfjax.smoothing.trajectories import sample_trajectories as sample_trajectories

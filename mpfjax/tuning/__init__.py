@@ -5,11 +5,16 @@ from mpfjax.tuning.climb import TuningRun as TuningRun
 from mpfjax.tuning.climb import fit as fit
 from mpfjax.tuning.climb import maximise as maximise
 from mpfjax.tuning.curvature import standard_errors as standard_errors
+from mpfjax.tuning.gibbs import GibbsPosterior as GibbsPosterior
+from mpfjax.tuning.gibbs import particle_gibbs as particle_gibbs
+from mpfjax.tuning.inference_data import to_inference_data as to_inference_data
 from mpfjax.tuning.labels import LabelLikelihood as LabelLikelihood
 from mpfjax.tuning.labels import label_log_posteriors as label_log_posteriors
 from mpfjax.tuning.labels import transition_candidates as transition_candidates
 from mpfjax.tuning.metropolis import Posterior as Posterior
 from mpfjax.tuning.metropolis import metropolis_hastings as metropolis_hastings
+from mpfjax.tuning.sequential import SequentialPosterior as SequentialPosterior
+from mpfjax.tuning.sequential import smc2 as smc2
 from mpfjax.tuning.transforms import AbstractTransform as AbstractTransform
 from mpfjax.tuning.transforms import Interval as Interval
 from mpfjax.tuning.transforms import Positive as Positive

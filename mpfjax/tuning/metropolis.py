@@ -1,7 +1,6 @@
 """The posterior of a filter's parameters, by particle marginal Metropolis-Hastings."""
 
 import importlib
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import ModuleType
@@ -12,21 +11,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
-from tqdm import tqdm
 
-from mpfjax.checks import (
-    check_callable,
-    check_flag,
-    check_key,
-    check_type,
-    check_whole,
-    shown,
-)
+from mpfjax.checks import check_callable, check_flag, check_key, check_type, check_whole
 from mpfjax.filter import Filter
-from mpfjax.tuning.problem import Parameters, Problem, pose_evidence
+from mpfjax.tuning.chains import (
+    BROKEN,
+    Prior,
+    checked_deviations,
+    checked_prior,
+    constrained,
+    take_steps,
+    walk,
+)
+from mpfjax.tuning.problem import Parameters, Problem, Reals, pose_evidence
 from mpfjax.tuning.transforms import AbstractTransform
-
-_BROKEN = "the log prior or log marginal likelihood was NaN or inf"
 
 
 @dataclass(frozen=True)
@@ -104,10 +102,8 @@ def metropolis_hastings(
     blackjax = _blackjax()
     problem = pose_evidence(filter, observations, parameters, transforms, missing)
     start = problem.start()
-    chain = _Chain(problem, log_prior, _deviations(proposal_deviations, start))
-    prior = _checked_prior(chain, start)
-    if not np.isfinite(prior):
-        raise ValueError(f"log_prior: {prior} at the start")
+    deviations = checked_deviations(proposal_deviations, start)
+    chain = _Chain(problem, checked_prior(log_prior, problem, start, "at the start"), deviations)
     key_start, key_steps = jax.random.split(key)
     positions = {
         "reals": jax.tree.map(lambda u: jnp.broadcast_to(u, (num_chains, *u.shape)), start),
@@ -116,31 +112,15 @@ def metropolis_hastings(
     init, advance = _kernels(blackjax, chain)
     states = init(positions)
     if not np.isfinite(states.logdensity).all():
-        raise RuntimeError(f"metropolis_hastings: {_BROKEN} at the start")
-    path, accepted, stopped = [], [], None
-    for step in tqdm(range(num_steps), disable=not progress, unit="step"):
-        keys = jax.random.split(jax.random.fold_in(key_steps, step), num_chains)
-        try:
-            states, moved = advance(keys, states)
-            accepted.append(np.asarray(moved))
-        except RuntimeError as error:
-            if _BROKEN not in str(error):
-                raise
-            stopped = f"{_BROKEN} at step {step}"
-            warnings.warn(f"metropolis_hastings: {stopped}", stacklevel=2)
-            break
-        path.append(jax.tree.map(np.asarray, (states.position["reals"], states.logdensity)))
-    if not path:
-        raise RuntimeError(f"metropolis_hastings: {_BROKEN} in the first step")
-    reals, densities = jax.tree.map(lambda *rows: np.stack(rows, axis=1), *path)
-    priors = jax.vmap(jax.vmap(chain.log_prior_density))(jax.tree.map(jnp.asarray, reals))
+        raise RuntimeError(f"metropolis_hastings: {BROKEN} at the start")
+    (reals, densities, accepted), stopped = take_steps(
+        "metropolis_hastings", advance, states, key_steps, num_steps, num_chains, progress
+    )
+    priors = jax.vmap(jax.vmap(chain.prior))(jax.tree.map(jnp.asarray, reals))
     return Posterior(
-        parameters={
-            name: np.asarray(jax.vmap(jax.vmap(problem.transforms[name].constrain))(jnp.asarray(u)))
-            for name, u in reals.items()
-        },
+        parameters=constrained(problem, reals),
         log_marginal_likelihoods=densities - np.asarray(priors),
-        accepted=np.stack(accepted, axis=1),
+        accepted=accepted,
         stopped=stopped,
     )
 
@@ -149,45 +129,23 @@ class _Chain(eqx.Module):
     """The target on pairs of unconstrained numbers and a key, and its proposal."""
 
     problem: Problem
-    prior: Callable[[dict[str, Array]], Float[Array, ""]]
-    deviations: dict[str, Array]
-
-    def log_prior_density(self, reals: dict[str, Array]) -> Float[Array, ""]:
-        """log p(θ) + log |∂θ/∂u|."""
-        transforms = self.problem.transforms
-        density = self.prior({name: transforms[name].constrain(u) for name, u in reals.items()})
-        for name, u in reals.items():
-            density += transforms[name].log_jacobian(u)
-        return density
+    prior: Prior
+    deviations: Reals
 
     def log_density(self, position: dict[str, Any]) -> Float[Array, ""]:
         """Of a pair, up to a constant; an error where it is neither a number nor -inf."""
         reals, key = position["reals"], jax.random.wrap_key_data(position["key"])
-        prior = self.log_prior_density(reals)
+        prior = self.prior(reals)
         # Where the prior is zero, the likelihood may not even be defined.
         evidence = jnp.where(prior == -jnp.inf, 0.0, self.problem.value(reals, key))
         density = prior + evidence
-        return eqx.error_if(density, ~(density < jnp.inf), _BROKEN)
+        return eqx.error_if(density, ~(density < jnp.inf), BROKEN)
 
     def propose(self, key: Array, position: dict[str, Any]) -> dict[str, Any]:
         """A Gaussian step in u, and a fresh key."""
         key_walk, key_fresh = jax.random.split(key)
-        names = sorted(position["reals"])
-        reals = {}
-        for name, key_of in zip(names, jax.random.split(key_walk, len(names)), strict=True):
-            u = position["reals"][name]
-            reals[name] = u + self.deviations[name] * jax.random.normal(key_of, u.shape, u.dtype)
+        reals = walk(key_walk, position["reals"], self.deviations)
         return {"reals": reals, "key": jax.random.key_data(key_fresh)}
-
-
-def _checked_prior(chain: _Chain, start: dict[str, Array]) -> float:
-    """The log density at the start, of a prior that is a number."""
-    values = {name: chain.problem.transforms[name].constrain(u) for name, u in start.items()}
-    density = chain.prior(values)
-    is_number = eqx.is_array_like(density) and jnp.ndim(density) == 0
-    if not is_number or not jnp.issubdtype(jnp.result_type(density), jnp.floating):
-        raise ValueError(f"log_prior: {shown(density)} at the start is no floating point number")
-    return float(chain.log_prior_density(start))
 
 
 def _kernels(blackjax: ModuleType, chain: _Chain) -> tuple[Callable, Callable]:
@@ -201,33 +159,11 @@ def _kernels(blackjax: ModuleType, chain: _Chain) -> tuple[Callable, Callable]:
         return jax.vmap(sampler(chain).init)(positions)
 
     @eqx.filter_jit
-    def advance(chain: _Chain, keys: Array, states: Any) -> tuple[Any, Array]:
+    def advance(chain: _Chain, keys: Array, states: Any) -> tuple[Any, PyTree]:
         states, info = jax.vmap(sampler(chain).step)(keys, states)
-        return states, info.is_accepted
+        return states, (states.position["reals"], states.logdensity, info.is_accepted)
 
     return eqx.Partial(init, chain), eqx.Partial(advance, chain)
-
-
-def _deviations(given: float | Mapping[str, Any], start: dict[str, Array]) -> dict[str, Array]:
-    by_name = given if isinstance(given, Mapping) else dict.fromkeys(start, given)
-    if set(by_name) != set(start):
-        raise ValueError(f"proposal_deviations: those of {sorted(by_name)}, not of {sorted(start)}")
-    deviations = {}
-    for name, u in start.items():
-        try:
-            value = np.asarray(by_name[name], float)
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"proposal_deviations: {shown(by_name[name])} of {name} is no number"
-            ) from error
-        if not (np.isfinite(value).all() and (value > 0).all()):
-            raise ValueError(f"proposal_deviations: {value} of {name} is not positive")
-        if value.shape not in ((), u.shape):
-            raise ValueError(
-                f"proposal_deviations: shape {value.shape} of {name} is neither () nor {u.shape}"
-            )
-        deviations[name] = jnp.broadcast_to(jnp.asarray(value, u.dtype), u.shape)
-    return deviations
 
 
 def _blackjax() -> ModuleType:

@@ -152,11 +152,22 @@ def pose_evidence(
 ) -> Problem:
     """The problem of the log marginal likelihood; without `parameters`, in those of the model."""
     check_type(Filter, "a filter", filter=filter)
+    return pose_filter(filter, LogEvidence(_groups(observations, missing)), parameters, transforms)
+
+
+def pose_filter(
+    filter: Filter,
+    objective: Callable[..., Any],
+    parameters: Parameters,
+    transforms: Mapping[str, AbstractTransform] | None,
+) -> Problem:
+    """The problem of any objective of a filter; without `parameters`, in those of its model."""
+    check_type(Filter, "a filter", filter=filter)
     if parameters is None:
         fixed = jax.tree.map(lambda _: False, filter)
         of_model = jax.tree.map(eqx.is_inexact_array, filter.model)
         parameters = eqx.tree_at(lambda f: f.model, fixed, of_model)
-    return pose(filter, LogEvidence(_groups(observations, missing)), parameters, transforms)
+    return pose(filter, objective, parameters, transforms)
 
 
 def warn_of_bias(caller: str, problem: Problem) -> None:

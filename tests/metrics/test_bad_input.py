@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import mpfjax
 from mpfjax import metrics
 from mpfjax.metrics.coverage import coverage
 from tests.examples import make_mixture
@@ -33,6 +34,20 @@ TABLE = {
         metrics.mass_above,
         {"mixture": MIXTURE, "threshold": 0.5},
         {"mixture": "kind", "threshold": "finite"},
+    ),
+    "crps": (
+        metrics.crps,
+        {"values": jnp.ones(5), "weights": jnp.ones(5), "observations": jnp.ones(())},
+        {"values": "array", "weights": "array", "observations": "array"},
+    ),
+    "log_score": (
+        metrics.log_score,
+        {
+            "model": mpfjax.QuadraticModel(),
+            "mixture": MIXTURE.replace(particles=jnp.ones(2)),
+            "observation": 1.0,
+        },
+        {"model": "kind", "mixture": "kind"},
     ),
     "ospa": (metrics.ospa, SETS, OF_SETS),
     "gospa": (metrics.gospa, SETS, OF_SETS | {"alpha": "positive"}),

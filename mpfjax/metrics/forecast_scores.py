@@ -1,0 +1,63 @@
+"""Scores of forecasts against what was then observed; lower is better."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from mpfjax.checks import check_shape, check_type
+from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import AbstractStateSpaceModel, check_log_density, check_model
+from mpfjax.operations.logarithms import log_sum_exp
+
+
+def crps(
+    values: Float[Array, "*batch n"],
+    weights: Float[Array, "*batch n"],
+    observations: Float[Array, " *batch"],
+) -> Float[Array, " *batch"]:
+    """The continuous ranked probability score of weighted draws, in the unit of the values.
+
+    CRPS = ∫ (F(z) - 1{z >= y})² dz = E|Y - y| - E|Y - Y'| / 2 of the distribution F of the draws
+    (Gneiting and Raftery 2007, section 4.2), by a sum over the draws in order, O(n log n). It is
+    the absolute error where all weight is in one draw. A weight of zero leaves a draw out, and
+    weights need not sum to one.
+
+    Use it for what `mpfjax.forecast(..., simulate_observation=...)` draws, with the weights of the
+    forecast's mixtures. Raises `ValueError` for what is no array, or of shapes that do not fit.
+    """
+    check_shape("... n", values=values, weights=weights)
+    check_shape("...", observations=observations)
+    if weights.shape != values.shape:
+        raise ValueError(f"weights: shape {weights.shape} is not that of values, {values.shape}")
+    if observations.shape != values.shape[:-1]:
+        raise ValueError(
+            f"observations: shape {observations.shape} is not {values.shape[:-1]}, one for each row"
+            " of values"
+        )
+    errors = jnp.where(weights > 0, values - observations[..., None], 0.0)
+    order = jnp.argsort(errors, axis=-1)
+    errors = jnp.take_along_axis(errors, order, axis=-1)
+    shares = jnp.take_along_axis(weights, order, axis=-1)
+    shares = shares / jnp.sum(shares, axis=-1, keepdims=True)
+    middles = jnp.cumsum(shares, axis=-1) - 0.5 * shares
+    return 2 * jnp.sum(shares * errors * ((errors > 0).astype(errors.dtype) - middles), axis=-1)
+
+
+def log_score(
+    model: AbstractStateSpaceModel, mixture: ParticleMixture, observation: PyTree
+) -> Float[Array, ""]:
+    """-log p(y) under a forecast, -log Σ_i exp(ℓ_i) L(y | x_i), in nats.
+
+    The logarithmic score (Gneiting and Raftery 2007, section 4.1). `mixture` is one of a
+    `Forecast`; `jax.vmap` maps over several, beside their observations. One step ahead it is the
+    negative increment of log Ẑ that the bootstrap filter's next step would give. It is +inf where
+    no particle has any likelihood.
+
+    Use it to compare models that see the same observations, with likelihoods that are normalised.
+    Raises `ValueError` for what is no model or no mixture, and for a likelihood of another shape.
+    """
+    check_model(model, "log_score")
+    check_type(ParticleMixture, "a mixture, as in a Forecast", mixture=mixture)
+    values = model.log_likelihood(observation, mixture.particles)
+    values = check_log_density(values, model, "log_likelihood", mixture.num_particles)
+    joint = jnp.where(mixture.occupied, mixture.log_weights + values, -jnp.inf)
+    return -log_sum_exp(joint)

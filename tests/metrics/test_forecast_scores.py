@@ -1,0 +1,75 @@
+"""Scores of forecasts against their definitions, and against a Gaussian's own."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax.metrics import crps, log_score
+
+
+def by_definition(values, weights, y):
+    """E|Y - y| - E|Y - Y'| / 2, by all pairs."""
+    weights = weights / weights.sum()
+    pairs = np.abs(values[:, None] - values[None])
+    return weights @ np.abs(values - y) - 0.5 * weights @ pairs @ weights
+
+
+class TestCrps:
+    def test_is_that_of_all_pairs(self):
+        rng = np.random.default_rng(0)
+        values = rng.normal(size=(3, 4, 9)).round(1)  # with ties
+        weights = rng.random((3, 4, 9)) * (rng.random((3, 4, 9)) < 0.7) + 1e-3
+        weights[0, :, :3] = 0.0
+        values[0, :, 1] = np.nan  # an empty slot may hold anything
+        y = rng.normal(size=(3, 4)).round(1)
+        found = crps(*(jnp.asarray(array, jnp.float32) for array in (values, weights, y)))
+        for row in np.ndindex(3, 4):
+            seen = weights[row] > 0
+            expected = by_definition(values[row][seen], weights[row][seen], y[row])
+            assert float(found[row]) == pytest.approx(expected, abs=1e-5)
+
+    def test_of_many_normal_draws_is_the_normal_distributions(self):
+        """σ (z (2 Φ(z) - 1) + 2 φ(z) - 1 / √π), z = (y - μ) / σ."""
+        quantiles = jax.scipy.stats.norm.ppf((jnp.arange(4000.0) + 0.5) / 4000)
+        z = 0.7
+        phi = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
+        below = float(jax.scipy.stats.norm.cdf(z))
+        expected = 2.0 * (z * (2 * below - 1) + 2 * phi - 1 / np.sqrt(np.pi))
+        found = crps(1.0 + 2.0 * quantiles, jnp.full(4000, 1 / 4000), jnp.asarray(1.0 + 2.0 * z))
+        assert float(found) == pytest.approx(expected, rel=1e-3)
+
+    @pytest.mark.usefixtures("as_installed")
+    @pytest.mark.parametrize(
+        ("change", "named"),
+        [
+            ({"weights": jnp.ones((2, 4))}, r"weights: shape \(2, 4\)"),
+            ({"observations": jnp.ones(3)}, r"observations: shape \(3,\) is not \(2,\)"),
+        ],
+    )
+    def test_shapes_that_do_not_fit_are_named(self, change, named):
+        good = {
+            "values": jnp.ones((2, 3)),
+            "weights": jnp.ones((2, 3)),
+            "observations": jnp.ones(2),
+        }
+        with pytest.raises(ValueError, match=named):
+            crps(**good | change)
+
+
+class TestLogScore:
+    def test_one_step_ahead_is_the_next_increment(self):
+        """Up to the Monte Carlo error of two predictions."""
+        model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
+        filter = mpfjax.mixture_particle_filter(model, 2000, 2)
+        run = mpfjax.run_filter(jax.random.key(0), filter, jnp.array([1.2, 1.0]))
+        ahead = mpfjax.forecast(jax.random.key(1), filter, run.final, 1)
+        mixture = jax.tree.map(lambda leaf: leaf[0], ahead.mixtures)
+        _, info = filter.step(jax.random.key(2), run.final, jnp.asarray(0.8))
+        score = log_score(model, mixture, jnp.asarray(0.8))
+        assert float(score) == pytest.approx(-float(info.log_likelihood_increment), abs=0.1)
+        by_hand = np.exp(mixture.log_weights) @ np.exp(
+            np.asarray(model.log_likelihood(jnp.asarray(0.8), mixture.particles), float)
+        )
+        assert float(score) == pytest.approx(-np.log(by_hand), abs=1e-4)

@@ -1,0 +1,120 @@
+"""Posteriors as ArviZ reads them."""
+
+import sys
+import types
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpfjax.tuning import GibbsPosterior, Posterior, to_inference_data
+
+RNG = np.random.default_rng(0)
+CHAINS = Posterior(
+    parameters={"a": RNG.normal(size=(3, 50)), "b": RNG.normal(size=(3, 50, 2))},
+    log_marginal_likelihoods=RNG.normal(size=(3, 50)),
+    accepted=RNG.random((3, 50)) < 0.3,
+    stopped=None,
+)
+STATES = {"position": RNG.normal(size=(3, 50, 6, 2)), "speed": RNG.normal(size=(3, 50, 6))}
+GIBBS = GibbsPosterior(
+    parameters=CHAINS.parameters,
+    trajectories=STATES,
+    accepted=RNG.random((3, 50)),
+    renewed=RNG.random((3, 50, 6)) < 0.7,
+    stopped=None,
+)
+
+
+@pytest.fixture(scope="module")
+def arviz():
+    return pytest.importorskip("arviz")
+
+
+def test_of_metropolis_hastings(arviz):
+    data = to_inference_data(CHAINS)
+    np.testing.assert_array_equal(data["posterior"]["b"], CHAINS.parameters["b"])
+    assert data["posterior"]["a"].dims == ("chain", "draw")
+    stats = data["sample_stats"]
+    np.testing.assert_array_equal(stats["accepted"], CHAINS.accepted)
+    np.testing.assert_array_equal(stats["log_marginal_likelihood"], CHAINS.log_marginal_likelihoods)
+    ess = float(arviz.ess(data)["a"])
+    assert 50 < ess < 400  # independent draws
+
+
+def test_of_particle_gibbs(arviz):
+    data = to_inference_data(GIBBS)
+    posterior = data["posterior"]
+    assert posterior["state_position"].dims[:3] == ("chain", "draw", "time")
+    np.testing.assert_array_equal(posterior["state_position"], STATES["position"])
+    assert posterior["state_speed"].dims == ("chain", "draw", "time")
+    np.testing.assert_array_equal(posterior["time"], np.arange(6))
+    np.testing.assert_array_equal(data["sample_stats"]["renewed"], GIBBS.renewed)
+    np.testing.assert_array_equal(data["sample_stats"]["acceptance_rate"], GIBBS.accepted)
+
+
+@pytest.mark.usefixtures("arviz")
+def test_of_what_particle_gibbs_collected():
+    first = STATES["speed"][:, :, 0]
+    of_first = GibbsPosterior(CHAINS.parameters, first, GIBBS.accepted, GIBBS.renewed, None)
+    data = to_inference_data(of_first)
+    assert data["posterior"]["state"].dims == ("chain", "draw")
+
+
+@pytest.mark.usefixtures("arviz")
+def test_of_trajectories():
+    data = to_inference_data(jnp.asarray(STATES["speed"][0]))
+    assert data["posterior"]["state"].dims == ("chain", "draw", "time")
+    assert data["posterior"]["state"].shape == (1, 50, 6)
+
+
+def before_1(posterior=None, *, sample_stats=None, dims=None, coords=None):
+    """The parameters that `arviz.from_dict` had before 1."""
+    return {"posterior": posterior, "sample_stats": sample_stats}, dims, coords
+
+
+def from_1_on(data, *, dims=None, coords=None):
+    """Groups in one mapping."""
+    return data, dims, coords
+
+
+@pytest.mark.parametrize("from_dict", [before_1, from_1_on])
+def test_either_version_gets_the_same_groups(from_dict, monkeypatch):
+    arviz = types.ModuleType("arviz")
+    monkeypatch.setattr(arviz, "from_dict", from_dict, raising=False)
+    monkeypatch.setitem(sys.modules, "arviz", arviz)
+    groups, dims, coords = to_inference_data(GIBBS)
+    assert set(groups["posterior"]) == {"a", "b", "state_position", "state_speed"}
+    assert set(groups["sample_stats"]) == {"acceptance_rate", "renewed"}
+    assert dims["state_position"] == ["time", "state_position_dim_1"]
+    assert dims["renewed"] == ["time"]
+    np.testing.assert_array_equal(coords["time"], np.arange(6))
+
+
+@pytest.mark.usefixtures("arviz")
+@pytest.mark.parametrize(
+    ("result", "named"),
+    [
+        (None, "result: None is not"),
+        (3.0, r"result: 3\.0 is not"),
+        (jnp.ones(4), "result: .* is not"),
+        ({"a": jnp.ones((2, 3)), "b": jnp.ones((2, 4))}, r"result: leaves of shapes"),
+        (np.array([["a", "b"]]), "result: .* is not"),
+        (
+            GibbsPosterior(
+                {"state": CHAINS.parameters["a"]}, STATES["speed"], GIBBS.accepted, GIBBS.renewed,
+                None,
+            ),
+            "result: a parameter is called state",
+        ),
+    ],
+)  # fmt: skip
+def test_anything_else_is_named(result, named):
+    with pytest.raises(ValueError, match=named):
+        to_inference_data(result)
+
+
+def test_without_arviz_it_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "arviz", None)
+    with pytest.raises(ImportError, match=r"mpfjax\[arviz\]"):
+        to_inference_data(CHAINS)
