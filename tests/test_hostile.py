@@ -27,6 +27,7 @@ JOINT = mpfjax.MultiObjectModel(MODEL, 2, shared_observation=True)
 FILTER = mpfjax.particle_filter(MODEL, 4)
 MIXTURE = FILTER.init(KEY)
 HISTORY = mpfjax.run_filter(KEY, FILTER, np.ones(2, np.float32))
+TRACED = mpfjax.smoothing.with_first_ancestors(FILTER).init(KEY)
 EYE = np.eye(1)
 
 
@@ -203,6 +204,10 @@ RUN = {
          "component": None, "method": "exact", "num_steps": None},
     ),
     "trace_ancestors": (mpfjax.smoothing.trace_ancestors, {"mixtures": HISTORY}),
+    "with_first_ancestors": (mpfjax.smoothing.with_first_ancestors, {"filter": FILTER}),
+    "log_marginal_likelihood_variance": (
+        mpfjax.smoothing.log_marginal_likelihood_variance, {"run": TRACED}
+    ),
 }  # fmt: skip
 # What an argument is called further down.
 ALSO = {"max_components": "num_components", "order": "orders", "object_model": "model"}

@@ -18,6 +18,7 @@ from mpfjax.checks import (
 )
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRejuvenation
+from mpfjax.moves.lineages import with_offspring
 from mpfjax.moves.lines import AsTheyStand, SideBySide, as_they_are, side_by_side
 from mpfjax.moves.resampling_schemes import SCHEMES
 from mpfjax.moves.slots import Slots, deal_slots, place_slots
@@ -141,7 +142,9 @@ class Resample(AbstractRejuvenation):
             redrawn = self._transported(redrawn, mixture, drawn)
         if self.ess_threshold < 1.0:
             redrawn = _where(spread(due, slots.components), redrawn, copies)
-        return redrawn.replace(log_weights=jnp.where(slots.filled, redrawn.log_weights, -jnp.inf))
+        log_weights = jnp.where(slots.filled, redrawn.log_weights, -jnp.inf)
+        redrawn = redrawn.replace(log_weights=log_weights)
+        return with_offspring(redrawn, mixture, drawn.parents, drawn.targets, due)
 
     def _draw(
         self, key: Key[Array, ""], mixture: ParticleMixture, due: Bool[Array, " m"]
