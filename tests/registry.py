@@ -64,6 +64,8 @@ REJUVENATIONS: dict[str, AbstractRejuvenation] = {
     "stratified": Resample("stratified"),
     "multinomial": Resample("multinomial"),
     "residual": Resample("residual"),
+    "ssp": Resample("ssp"),
+    "ssp, adaptive": Resample("ssp", ess_threshold=0.5),
     "systematic, adaptive": Resample(ess_threshold=0.5),
     "multinomial, adaptive": Resample("multinomial", ess_threshold=0.5),
     "systematic, sorted": Resample(sort_by=lambda states: states[:, 0]),
@@ -142,6 +144,7 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "pf": _pf(),
     "pf multinomial": _pf(scheme="multinomial"),
     "pf adaptive": _pf(ess_threshold=0.5),
+    "pf ssp": _pf(scheme="ssp"),
     "guided pf": lambda model: _pf(proposal=GaussNewtonProposal(model))(model),
     **_of_components(NUM_COMPONENTS),
     **{

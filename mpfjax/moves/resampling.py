@@ -1,4 +1,4 @@
-"""Resampling within components: systematic, stratified, multinomial or residual."""
+"""Resampling within components: systematic, stratified, multinomial, residual or SSP."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -42,7 +42,8 @@ class Resample(AbstractRejuvenation):
     marginal likelihood stays unbiased.
 
     - `scheme`: "systematic" (the default: least noise, O(n)), "stratified", "multinomial" (the
-      textbook's, most noise) or "residual".
+      textbook's, most noise), "residual" or "ssp" (Gerber, Chopin and Whiteley 2019: as even as
+      systematic, and consistent in whatever order the particles stand; a few times slower).
     - `ess_threshold`: a component is resampled if its effective sample size is below this share of
       its particles. 1.0 resamples at every step. Under `vmap`, a lower threshold reduces the noise
       but not the time.
@@ -122,7 +123,12 @@ class Resample(AbstractRejuvenation):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
     ) -> ParticleMixture:
         """Resample every component that is due."""
-        due = self.is_due(mixture)
+        return self.redraw(key, mixture, self.is_due(mixture))
+
+    def redraw(
+        self, key: Key[Array, ""], mixture: ParticleMixture, due: Bool[Array, " m"]
+    ) -> ParticleMixture:
+        """Resample the components that are `due`; with `ess_threshold` 1 all living ones are."""
         drawn_from = self._drawn_from(mixture)
         # The drawn indices are whole numbers and have no derivative.
         drawn = self._draw(key, jax.lax.stop_gradient(drawn_from), due)
