@@ -14,6 +14,7 @@ from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, check_states
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
 from mpfjax.moves.exchange import Exchange
+from mpfjax.moves.lookahead import ResampleAhead
 from mpfjax.moves.resampling import Resample
 from mpfjax.observations import checked_observation, one_observation
 from mpfjax.operations.across_islands import excess_over_islands, island_index, num_islands
@@ -187,6 +188,8 @@ class Filter(eqx.Module):
         for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
             if isinstance(move, Resample):
                 resampled |= move.is_due(mixture)
+            elif isinstance(move, ResampleAhead):
+                resampled |= move.is_due(mixture, observation)
             moved = move(move_key, mixture, observation)
             if not isinstance(move, _KEEP_MASS):
                 moved, log_growth = _normalise(moved, mixture.log_weights)

@@ -98,6 +98,11 @@ def _chain(
     )
 
 
+def _halfway(model):
+    """The root of the likelihood of the mean: a look-ahead with tails that are not too thin."""
+    return lambda y, states: 0.5 * model.log_likelihood(y, model.transition_mean(states))
+
+
 def _joint(make: Callable[[MultiObjectModel], Filter]) -> Callable[..., Filter]:
     """A filter of two objects, independent copies that give rise to the same observations."""
     return lambda model: make(MultiObjectModel(model, 2, shared_observation=True))
@@ -145,6 +150,10 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "pf multinomial": _pf(scheme="multinomial"),
     "pf adaptive": _pf(ess_threshold=0.5),
     "pf ssp": _pf(scheme="ssp"),
+    "auxiliary pf, adaptive": lambda model: mpfjax.auxiliary_particle_filter(
+        model, NUM_PARTICLES, GaussNewtonProposal(model), ess_threshold=0.5
+    ),
+    "auxiliary mpf": lambda model: _mpf(lookahead=_halfway(model), scheme="ssp")(model),
     "guided pf": lambda model: _pf(proposal=GaussNewtonProposal(model))(model),
     **_of_components(NUM_COMPONENTS),
     **{

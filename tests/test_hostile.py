@@ -79,6 +79,10 @@ BUILT = {
         {"scheme": "systematic", "ess_threshold": 0.5, "particles_per_component": 2,
          "sort_by": None, "gradient": "none", "softness": 0.5, "regularisation": 0.5},
     ),
+    "ResampleAhead": (
+        mpfjax.ResampleAhead,
+        {"resample": mpfjax.Resample(), "lookahead": mpfjax.GaussNewtonProposal(MODEL)},
+    ),
     "GaussianRegeneration": (
         mpfjax.GaussianRegeneration,
         {"particles_per_component": 2, "where": None, "inflation": 1.0, "noise": "independent"},
@@ -125,9 +129,16 @@ BUILT = {
         {"model": MODEL, "num_particles": 4, "proposal": None, "scheme": "systematic",
          "ess_threshold": 1.0, "sort_by": None, "gradient": "none"},
     ),
+    "auxiliary_particle_filter": (
+        mpfjax.auxiliary_particle_filter,
+        {"model": MODEL, "num_particles": 4, "lookahead": mpfjax.GaussNewtonProposal(MODEL),
+         "proposal": None, "scheme": "ssp", "ess_threshold": 1.0, "sort_by": None,
+         "gradient": "none"},
+    ),
     "mixture_particle_filter": (
         mpfjax.mixture_particle_filter,
         {"model": MODEL, "num_particles": 4, "max_components": 2, "proposal": None,
+         "lookahead": None,
          "scheme": "systematic", "ess_threshold": 1.0, "particles_per_component": None,
          "sort_by": None, "gradient": "none", "features": None, "scale": 1.0, "merge": None,
          "split": None, "kmeans": None, "initial_kmeans": None},
