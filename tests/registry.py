@@ -6,7 +6,9 @@ move or filter is one new line below; the tests then find it.
 """
 
 from collections.abc import Callable
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -98,9 +100,14 @@ def _chain(
     )
 
 
-def _halfway(model):
+class Halfway(eqx.Module):
     """The root of the likelihood of the mean: a look-ahead with tails that are not too thin."""
-    return lambda y, states: 0.5 * model.log_likelihood(y, model.transition_mean(states))
+
+    model: Any
+
+    def __call__(self, observation, states):
+        mean = self.model.transition_mean(states)
+        return 0.5 * self.model.log_likelihood(observation, mean)
 
 
 def _joint(make: Callable[[MultiObjectModel], Filter]) -> Callable[..., Filter]:
@@ -153,7 +160,7 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "auxiliary pf, adaptive": lambda model: mpfjax.auxiliary_particle_filter(
         model, NUM_PARTICLES, GaussNewtonProposal(model), ess_threshold=0.5
     ),
-    "auxiliary mpf": lambda model: _mpf(lookahead=_halfway(model), scheme="ssp")(model),
+    "auxiliary mpf": lambda model: _mpf(lookahead=Halfway(model))(model),
     "guided pf": lambda model: _pf(proposal=GaussNewtonProposal(model))(model),
     **_of_components(NUM_COMPONENTS),
     **{

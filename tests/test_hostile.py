@@ -35,6 +35,10 @@ def nothing(mixture):
     return None
 
 
+def difference(previous_states, states):
+    return states - previous_states
+
+
 # By name: what is called, and the arguments of a good call.
 BUILT = {
     "QuadraticModel": (
@@ -213,6 +217,12 @@ RUN = {
         mpfjax.smoothing.sample_trajectories,
         {"key": KEY, "model": MODEL, "mixtures": HISTORY, "num_trajectories": 2,
          "component": None, "method": "exact", "num_steps": None},
+    ),
+    "smoothed_sums": (
+        mpfjax.smoothing.smoothed_sums,
+        {"key": KEY, "filter": FILTER, "observations": np.ones(2, np.float32),
+         "function": difference, "lag": None, "method": "exact", "num_draws": 2,
+         "missing": "error"},
     ),
     "trace_ancestors": (mpfjax.smoothing.trace_ancestors, {"mixtures": HISTORY}),
     "with_first_ancestors": (mpfjax.smoothing.with_first_ancestors, {"filter": FILTER}),
