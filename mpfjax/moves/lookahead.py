@@ -84,12 +84,10 @@ class ResampleAhead(AbstractMove):
 
     def _log_factors(self, mixture: ParticleMixture, observation: PyTree) -> Float[Array, " n"]:
         """log ν of each particle, zero in a component where ν is zero throughout."""
-        look = self.lookahead
+        look: Any = self.lookahead
         with saying("in lookahead, which is called with an observation and the particles"):
-            if isinstance(look, AbstractProposal):
-                values = look.log_normaliser(observation, mixture.particles)
-            else:
-                values = look(observation, mixture.particles)
+            look = getattr(look, "log_normaliser", look)
+            values = look(observation, mixture.particles)
         if not isinstance(values, jax.Array | np.ndarray) or jnp.iscomplexobj(values):
             raise ValueError(f"lookahead: it returned {shown(values)}, no real array")
         if values.shape != (mixture.num_particles,):
