@@ -28,6 +28,13 @@ def _first(states: np.ndarray) -> np.ndarray:
     return states.reshape(states.shape[0], -1)[:, 0]
 
 
+def _auxiliary(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:
+    proposal = mpfjax.GaussNewtonProposal(model, noise="stratified")
+    return mpfjax.mixture_particle_filter(
+        model, num_particles, 2, lookahead=proposal, sort_by=_first
+    )
+
+
 def _guided(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:
     proposal = mpfjax.GaussNewtonProposal(model, noise="stratified")
     return mpfjax.mixture_particle_filter(
@@ -39,4 +46,5 @@ FILTERS: dict[str, Callable[[mpfjax.AbstractStateSpaceModel, int], mpfjax.Filter
     "PF": mpfjax.particle_filter,
     "MPF": lambda model, num_particles: mpfjax.mixture_particle_filter(model, num_particles, 2),
     "guided MPF": _guided,
+    "auxiliary MPF": _auxiliary,
 }
