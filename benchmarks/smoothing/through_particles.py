@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 import particles
-from particles.collectors import Paris
+from particles.collectors import Online_smooth_ON2, Paris
 
 from benchmarks.smoothing.jobs import Job, Linear
 
 LOG_2_PI = np.log(2 * np.pi)
+ONLINE = {"online": Online_smooth_ON2, "paris": Paris}
 
 
 class FeynmanKac(particles.FeynmanKac):
@@ -69,13 +70,14 @@ def estimator(
 
     def once(seed: int) -> float:
         np.random.seed(seed)
-        online = {"collect": [Paris()]} if method == "paris" else {"store_history": True}
+        collected = ONLINE.get(method)
+        kept = {"store_history": True} if collected is None else {"collect": [collected()]}
         smc: Any = particles.SMC(
-            fk=FeynmanKac(job), N=num_particles, resampling="systematic", ESSrmin=1.0, **online
+            fk=FeynmanKac(job), N=num_particles, resampling="systematic", ESSrmin=1.0, **kept
         )
         smc.run()
-        if method == "paris":
-            return float(smc.summaries.paris[-1]) / job.num_steps
+        if collected is not None:
+            return float(getattr(smc.summaries, collected().summary_name)[-1]) / job.num_steps
         history = smc.hist
         if method == "exact":
             paths = np.array(history.backward_sampling_ON2(num_trajectories))

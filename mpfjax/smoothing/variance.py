@@ -94,10 +94,10 @@ def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[
 
     This holds for x_0 drawn independently and for scheme "multinomial", with any `ess_threshold`.
     The other schemes draw more evenly than the independent draws of the formula, and no consistent
-    estimate is known for them. For "systematic" V is far too small: a seventh of the variance, in
-    the mean, on a linear-Gaussian model with N = 1000 and t = 100. It needs several families: with
-    t not much less than N, few are left and V is near 1. A component of one particle, which has
-    no pair, is left out of the product.
+    estimate is known for them. For "systematic" V is far too small: with N = 1000 and t = 100 it
+    was a seventh of the variance for a PF on a linear-Gaussian model, and negative for an MPF on
+    the quadratic one. It needs several families: with t not much less than N, few are left and V
+    is near 1. A component of one particle, which has no pair, is left out of the product.
 
     - `run`: a `FilterRun`, or a mixture that `step` returned. Use `jax.vmap` for those of
       `monte_carlo`.
