@@ -44,8 +44,10 @@ class FeynmanKac(particles.FeynmanKac):
         """log L(y_t | x_t); zero for x_0."""
         if t == 0:
             return np.zeros(len(x))
-        linear = isinstance(self.job, Linear)
-        scale, seen = (self.job.r, x) if linear else (self.job.sigma_y, x**2)
+        if isinstance(self.job, Linear):
+            scale, seen = self.job.r, x
+        else:
+            scale, seen = self.job.sigma_y, x**2
         noise = (self.job.observations[t - 1] - seen) / scale
         return -0.5 * noise**2 - np.log(scale) - 0.5 * LOG_2_PI
 
