@@ -1,6 +1,7 @@
 """The jobs as models of mpfjax, and the filters that are smoothed."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ def observations_of(job: Job) -> np.ndarray:
     return seen[:, None] if isinstance(job, Linear) else seen
 
 
-def _first(states: np.ndarray) -> np.ndarray:
+def _first(states: Any) -> Any:
     return states.reshape(states.shape[0], -1)[:, 0]
 
 
