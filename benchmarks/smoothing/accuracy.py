@@ -160,7 +160,8 @@ def picture(found: dict[str, list[dict[str, Any]]]) -> Any:
         for job, entries in found.items():
             lines: dict[str, list[tuple[float, float]]] = {}
             for entry in entries:
-                lines.setdefault(entry["method"], []).append((entry["particles"], entry[what]))
+                name = entry["method"].replace("backward sampling", "backward")  # to fit
+                lines.setdefault(name, []).append((entry["particles"], entry[what]))
             panels.append(plotting.CostPanel(job, "particles N", label, lines))
         rows.append(panels)
     return plotting.draw_costs(rows)
