@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from mpfjax.filter import Filter as Filter
 from mpfjax.filter import StepInfo as StepInfo
+from mpfjax.filters import auxiliary_particle_filter as auxiliary_particle_filter
 from mpfjax.filters import clustered_particle_filter as clustered_particle_filter
 from mpfjax.filters import distributed_partitioned_sampling as distributed_partitioned_sampling
 from mpfjax.filters import gaussian_mixture_particle_filter as gaussian_mixture_particle_filter
@@ -42,6 +43,7 @@ from mpfjax.moves import PropagateInClusters as PropagateInClusters
 from mpfjax.moves import PropagateIndependently as PropagateIndependently
 from mpfjax.moves import RandomPartition as RandomPartition
 from mpfjax.moves import Resample as Resample
+from mpfjax.moves import ResampleAhead as ResampleAhead
 from mpfjax.moves import Split as Split
 from mpfjax.moves import Weigh as Weigh
 from mpfjax.operations.generator import normal as normal

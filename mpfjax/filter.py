@@ -187,7 +187,7 @@ class Filter(eqx.Module):
         increment = jnp.zeros((), mixture.log_weights.dtype)
         for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
             if isinstance(move, AbstractMove):
-                resampled |= move.is_due(mixture)
+                resampled |= move.would_resample(mixture, observation)
             if isinstance(move, Every):
                 mixture = move(move_key, mixture, observation, self._forgetting)
                 continue

@@ -16,6 +16,7 @@ from mpfjax.moves.features import Scale
 from mpfjax.moves.gaussian import GaussianRegeneration
 from mpfjax.moves.independent import PropagateIndependently
 from mpfjax.moves.kmeans import KMeans
+from mpfjax.moves.lookahead import ResampleAhead, propagating_proposal, resampling
 from mpfjax.moves.merge import Merge
 from mpfjax.moves.partitioned import Partitioned, check_orders
 from mpfjax.moves.pool import Pool
@@ -50,12 +51,45 @@ def particle_filter(
     )
 
 
+def auxiliary_particle_filter(
+    model: AbstractStateSpaceModel,
+    num_particles: int,
+    lookahead: AbstractProposal | Callable[[PyTree, PyTree], Array],
+    *,
+    proposal: AbstractProposal | None = None,
+    scheme: str = "systematic",
+    ess_threshold: float = 1.0,
+    sort_by: Callable[[PyTree], Array] | None = None,
+    gradient: str = "none",
+) -> Filter:
+    """The auxiliary particle filter: resample by w times a look-ahead to y_t, propagate.
+
+    Pitt and Shephard (1999). `lookahead` is a function (y_t, states) -> log ν of each particle, or
+    a proposal with `log_normaliser`, which then also draws x_t unless there is another `proposal`.
+    Ẑ is unbiased whatever it is; see `ResampleAhead`. With
+    `GaussNewtonProposal(model, 1, inflation=1.0)` for a `LinearGaussianModel` the filter is fully
+    adapted: ν is p(y_t | x_{t-1}), x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are
+    equal. Use it where the likelihood is narrow and tells early which particles will survive.
+    """
+    resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
+    proposal = propagating_proposal(proposal, lookahead)
+    return Filter(
+        model,
+        moves=[
+            ResampleAhead(resample, lookahead),
+            Propagate(model, proposal, _of_draws(gradient)),
+        ],
+        num_particles=num_particles,
+    )
+
+
 def mixture_particle_filter(
     model: AbstractStateSpaceModel,
     num_particles: int,
     max_components: int,
     *,
     proposal: AbstractProposal | None = None,
+    lookahead: AbstractProposal | Callable[[PyTree, PyTree], Array] | None = None,
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
     particles_per_component: int | None = None,
@@ -78,13 +112,16 @@ def mixture_particle_filter(
     these three moves see the particles (see `Features`; features of one particle, if the model
     is wrapped by `per_particle`). `merge`, `split` and `kmeans` replace those moves, for example
     with other thresholds, and bring their own features and scale. `regroup_every` is k where they
-    are to run at every k-th step only (see `Every`). `gradient` is that of `particle_filter`. Use
-    it where the filtering distribution has several modes and all of them must be kept.
+    are to run at every k-th step only (see `Every`). `gradient` is that of `particle_filter`, and
+    `lookahead` that of `auxiliary_particle_filter`. Use it where the filtering distribution has
+    several modes and all of them must be kept.
     """
     resample = Resample(scheme, ess_threshold, particles_per_component, sort_by, gradient)
+    proposal = propagating_proposal(proposal, lookahead)
     propagate = Propagate(model, proposal, _of_draws(gradient))
+    moves = [resampling(resample, lookahead), propagate]
     return _mixture_filter(
-        model, num_particles, max_components, [resample, propagate], features, scale,
+        model, num_particles, max_components, moves, features, scale,
         merge, split, kmeans, initial_kmeans, regroup_every,
     )  # fmt: skip
 

@@ -187,6 +187,35 @@ class GaussNewtonProposal(AbstractProposal):
         )
         return log_density.astype(noise.dtype)
 
+    def log_normaliser(
+        self, observation: PyTree, previous_states: Float[Array, "n ..."]
+    ) -> Float[Array, " n"]:
+        """log p(y_t | x_{t-1}) of every particle by the fitted Gaussian, shape (n,).
+
+        Laplace's approximation of log ∫ L D dx_t: log L + log D at the mean, and the volume
+        (2π)^(d/2) |Λ|^(-1/2) around it. It is exact where h is linear, as in a
+        `LinearGaussianModel`. It does not depend on the inflation. Use it as the look-ahead of
+        `ResampleAhead`.
+        """
+        prior_means = self.model.transition_mean(previous_states)
+        means, factors = self._fit(observation, prior_means)
+        seen = self.model.observation_mean(means.reshape(prior_means.shape))
+        covariance_y = _matrix(self.model.observation_covariance).astype(means.dtype)
+        covariance = _matrix(self.model.transition_covariance).astype(means.dtype)
+        missed = jnp.atleast_1d(observation).astype(means.dtype)[None] - seen.reshape(
+            means.shape[0], -1
+        )
+        moved = means - prior_means.reshape(means.shape)
+        squares = jnp.einsum("np,pq,nq->n", missed, _inverse(covariance_y), missed)
+        squares = squares + jnp.einsum("nd,de,ne->n", moved, _inverse(covariance), moved)
+        log_volume = -jnp.sum(jnp.log(_diagonals(factors)), axis=1)
+        log_scale = 0.5 * (
+            covariance_y.shape[0] * jnp.log(2 * jnp.pi)
+            + jnp.linalg.slogdet(covariance_y)[1]
+            + jnp.linalg.slogdet(covariance)[1]
+        )
+        return log_volume - 0.5 * squares - log_scale.astype(means.dtype)
+
     def _fit(
         self, observation: Float[Array, "..."], prior_means: Float[Array, "n ..."]
     ) -> tuple[Float[Array, "n d"], Float[Array, "n d d"]]:

@@ -6,7 +6,9 @@ move or filter is one new line below; the tests then find it.
 """
 
 from collections.abc import Callable
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -77,6 +79,8 @@ REJUVENATIONS: dict[str, AbstractRejuvenation] = {
     "stratified": Resample("stratified"),
     "multinomial": Resample("multinomial"),
     "residual": Resample("residual"),
+    "ssp": Resample("ssp"),
+    "ssp, adaptive": Resample("ssp", ess_threshold=0.5),
     "systematic, adaptive": Resample(ess_threshold=0.5),
     "multinomial, adaptive": Resample("multinomial", ess_threshold=0.5),
     "systematic, sorted": Resample(sort_by=lambda states: states[:, 0]),
@@ -107,6 +111,16 @@ def _chain(
         m,
         initial_moves=[KMeans(3, reseed=True)],
     )
+
+
+class Halfway(eqx.Module):
+    """The root of the likelihood of the mean: a look-ahead with tails that are not too thin."""
+
+    model: Any
+
+    def __call__(self, observation, states):
+        mean = self.model.transition_mean(states)
+        return 0.5 * self.model.log_likelihood(observation, mean)
 
 
 def _joint(make: Callable[[MultiObjectModel], Filter]) -> Callable[..., Filter]:
@@ -159,6 +173,7 @@ QUICK_CHAINS = (
     "mpf",
     "mpf, M = 6",
     "guided mpf",
+    "auxiliary mpf",
     "random labels, residual",
     "split only, adaptive",
     "gaussian mixture",
@@ -173,6 +188,11 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "pf": _pf(),
     "pf multinomial": _pf(scheme="multinomial"),
     "pf adaptive": _pf(ess_threshold=0.5),
+    "pf ssp": _pf(scheme="ssp"),
+    "auxiliary pf, adaptive": lambda model: mpfjax.auxiliary_particle_filter(
+        model, NUM_PARTICLES, GaussNewtonProposal(model), ess_threshold=0.5
+    ),
+    "auxiliary mpf": lambda model: _mpf(lookahead=Halfway(model))(model),
     "guided pf": lambda model: _pf(proposal=GaussNewtonProposal(model))(model),
     **_of_components(NUM_COMPONENTS),
     **{

@@ -27,11 +27,16 @@ JOINT = mpfjax.MultiObjectModel(MODEL, 2, shared_observation=True)
 FILTER = mpfjax.particle_filter(MODEL, 4)
 MIXTURE = FILTER.init(KEY)
 HISTORY = mpfjax.run_filter(KEY, FILTER, np.ones(2, np.float32))
+TRACED = mpfjax.smoothing.with_first_ancestors(FILTER).init(KEY)
 EYE = np.eye(1)
 
 
 def nothing(mixture):
     return None
+
+
+def difference(previous_states, states):
+    return states - previous_states
 
 
 # By name: what is called, and the arguments of a good call.
@@ -77,6 +82,10 @@ BUILT = {
         mpfjax.Resample,
         {"scheme": "systematic", "ess_threshold": 0.5, "particles_per_component": 2,
          "sort_by": None, "gradient": "none", "softness": 0.5, "regularisation": 0.5},
+    ),
+    "ResampleAhead": (
+        mpfjax.ResampleAhead,
+        {"resample": mpfjax.Resample(), "lookahead": mpfjax.GaussNewtonProposal(MODEL)},
     ),
     "GaussianRegeneration": (
         mpfjax.GaussianRegeneration,
@@ -125,9 +134,16 @@ BUILT = {
         {"model": MODEL, "num_particles": 4, "proposal": None, "scheme": "systematic",
          "ess_threshold": 1.0, "sort_by": None, "gradient": "none"},
     ),
+    "auxiliary_particle_filter": (
+        mpfjax.auxiliary_particle_filter,
+        {"model": MODEL, "num_particles": 4, "lookahead": mpfjax.GaussNewtonProposal(MODEL),
+         "proposal": None, "scheme": "ssp", "ess_threshold": 1.0, "sort_by": None,
+         "gradient": "none"},
+    ),
     "mixture_particle_filter": (
         mpfjax.mixture_particle_filter,
         {"model": MODEL, "num_particles": 4, "max_components": 2, "proposal": None,
+         "lookahead": None,
          "scheme": "systematic", "ess_threshold": 1.0, "particles_per_component": None,
          "sort_by": None, "gradient": "none", "features": None, "scale": 1.0, "merge": None,
          "split": None, "kmeans": None, "initial_kmeans": None, "regroup_every": 1},
@@ -208,7 +224,17 @@ RUN = {
         {"key": KEY, "filter": FILTER, "observations": np.ones(2, np.float32),
          "trajectory": np.ones(3, np.float32), "backward": True, "missing": "error"},
     ),
+    "smoothed_sums": (
+        mpfjax.smoothing.smoothed_sums,
+        {"key": KEY, "filter": FILTER, "observations": np.ones(2, np.float32),
+         "function": difference, "lag": None, "method": "exact", "num_draws": 2,
+         "missing": "error"},
+    ),
     "trace_ancestors": (mpfjax.smoothing.trace_ancestors, {"mixtures": HISTORY}),
+    "with_first_ancestors": (mpfjax.smoothing.with_first_ancestors, {"filter": FILTER}),
+    "log_marginal_likelihood_variance": (
+        mpfjax.smoothing.log_marginal_likelihood_variance, {"run": TRACED}
+    ),
 }  # fmt: skip
 # What an argument is called further down.
 ALSO = {"max_components": "num_components", "order": "orders", "object_model": "model"}

@@ -198,10 +198,10 @@ class _PerParticleModel(AbstractStateSpaceModel):
 class _OverParticles:
     """A function of one particle, mapped over all of them; equal where the functions are."""
 
-    function: Callable[[Any], Any]
+    function: Callable[..., Any]
 
-    def __call__(self, particles: PyTree) -> PyTree:
-        return jax.vmap(self.function)(particles)
+    def __call__(self, *particles: PyTree) -> PyTree:
+        return jax.vmap(self.function)(*particles)
 
 
 def mapped(model: Any, function: Any) -> Any:

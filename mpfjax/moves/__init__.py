@@ -12,6 +12,7 @@ from mpfjax.moves.features import Features as Features
 from mpfjax.moves.gaussian import GaussianRegeneration as GaussianRegeneration
 from mpfjax.moves.independent import PropagateIndependently as PropagateIndependently
 from mpfjax.moves.kmeans import KMeans as KMeans
+from mpfjax.moves.lookahead import ResampleAhead as ResampleAhead
 from mpfjax.moves.merge import Merge as Merge
 from mpfjax.moves.partitioned import Partitioned as Partitioned
 from mpfjax.moves.pool import Pool as Pool

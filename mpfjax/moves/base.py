@@ -30,8 +30,11 @@ class AbstractMove(eqx.Module):
     ) -> ParticleMixture:
         """Move the mixture, given y_t."""
 
-    def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
-        """Which components the move would resample, for the report of a step; mostly none."""
+    def would_resample(
+        self, mixture: ParticleMixture, observation: PyTree = None
+    ) -> Bool[Array, " m"]:
+        """Which components the move would resample, for the report of a step; most moves none."""
+        del observation
         return jnp.zeros(mixture.num_components, bool)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:

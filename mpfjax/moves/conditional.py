@@ -101,6 +101,13 @@ class ConditionalResample(AbstractRejuvenation):
         """Which components of `mixture` the move would resample."""
         return self.move.is_due(mixture)
 
+    def would_resample(
+        self, mixture: ParticleMixture, observation: PyTree = None
+    ) -> Bool[Array, " m"]:
+        """Those that are due."""
+        del observation
+        return self.is_due(mixture)
+
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
     ) -> ParticleMixture:

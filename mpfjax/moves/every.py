@@ -50,9 +50,11 @@ class Every(AbstractMove):
         """Under which the number of the step is kept."""
         return f"every {self.num_steps}: {', '.join(type(move).__name__ for move in self.moves)}"
 
-    def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
+    def would_resample(
+        self, mixture: ParticleMixture, observation: PyTree = None
+    ) -> Bool[Array, " m"]:
         """Which components of `mixture` the moves would resample now."""
-        due = jnp.stack([move.is_due(mixture) for move in self.moves])
+        due = jnp.stack([move.would_resample(mixture, observation) for move in self.moves])
         return jnp.any(due, axis=0) & self._runs(mixture)
 
     def __call__(

@@ -20,6 +20,14 @@ from mpfjax.operations.segments import order_by_segment, segment_counts, segment
 from mpfjax.operations.stored import stored, whole_blocks
 
 
+class Stretches(NamedTuple):
+    """For each place, where in its row the particles and the slots of its component are."""
+
+    firsts: Int[Array, "rows p"]
+    counts: Int[Array, "rows p"]  # how many places the component has
+    first_slots: Int[Array, "rows p"]  # counted from the first slot of the row
+
+
 class AsTheyStand(NamedTuple):
     """The particles as they stand, in a row for each component, where only its own have a weight.
 
@@ -49,6 +57,12 @@ class AsTheyStand(NamedTuple):
     def places_of(self, parents: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
         """The place in its row of each slot's parent, counted over all rows."""
         return parents - self.weights.shape[1] * slots.components
+
+    def stretches(self, slots: Slots) -> "Stretches":
+        """Each row is the stretch of its component."""
+        del slots
+        zeros = jnp.zeros(self.weights.shape, jnp.int32)
+        return Stretches(zeros, zeros + self.weights.shape[1], zeros)
 
     def places_by_rank(self, ranks: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
         """The place of a rank in each slot's component, which is the only one."""
@@ -91,6 +105,11 @@ class SideBySide(NamedTuple):
         """The place of each slot's parent; rounding must not cross a border of components."""
         firsts = spread(self.firsts, slots.components)
         return jnp.clip(parents, firsts, firsts + spread(self.counts, slots.components) - 1)
+
+    def stretches(self, slots: Slots) -> "Stretches":
+        """The components' particles and slots, side by side."""
+        of_places = lambda values: spread(values, self.components)[None]  # noqa: E731
+        return Stretches(of_places(self.firsts), of_places(self.counts), of_places(slots.firsts))
 
     def places_by_rank(self, ranks: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
         """The place of a rank in each slot's component."""

@@ -1,4 +1,4 @@
-"""The schemes of resampling: systematic, stratified, multinomial, residual.
+"""The schemes of resampling: systematic, stratified, multinomial, residual, SSP.
 
 A scheme returns the first slot of every particle's offspring, counted from the first slot of its
 row. Each particle has a stretch of its row, as long as its expected number of offspring k_m w_i.
@@ -10,8 +10,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
+from mpfjax.moves.lines import Stretches
 from mpfjax.moves.slots import Slots, place_slots
 from mpfjax.operations.generator import uniform
 from mpfjax.operations.indexing import take
@@ -57,6 +58,55 @@ def residual(key, expected, before, targets, slots, line):
     return certain.astype(jnp.int32) + drawn
 
 
+def ssp(key, expected, before, targets, slots, line):
+    """Srinivasan's process: fractions are paired until each is 0 or 1 (Gerber et al. 2019).
+
+    Of two fractions with the sum s, one becomes 0 and the other s; or, if s >= 1, one becomes 1
+    and the other s - 1. Which one is drawn so that each keeps its mean. Every particle thus has
+    the floor or the ceiling of its expected number of offspring. Pairs are those of a tree over
+    each component, so that all of a level are settled at once: O(log N) levels.
+    """
+    places = line.stretches(slots)
+    whole = jnp.floor(expected * (1 + 16 * jnp.finfo(expected.dtype).eps))
+    uniforms = uniform(key, expected.shape, expected.dtype)
+    is_up = jax.vmap(_settle)(jnp.maximum(expected - whole, 0.0), uniforms, places)
+    offspring = whole.astype(jnp.int32) + is_up.astype(jnp.int32)
+    # Counted from the first of its component: a rounding error does not pass to the next.
+    earlier = jnp.cumsum(offspring, axis=1) - offspring
+    return earlier - jax.vmap(take)(earlier, places.firsts) + places.first_slots
+
+
+def _settle(
+    fractions: Float[Array, " p"], uniforms: Float[Array, " p"], places: Stretches
+) -> Bool[Array, " p"]:
+    """Which of the fractions become 1, where those of each component sum to a whole number."""
+    p = fractions.shape[0]
+    ranks = jnp.arange(p, dtype=jnp.int32) - places.firsts
+
+    def at(values: Array, rank: Int[Array, " p"]) -> Array:
+        return take(values, jnp.clip(places.firsts + rank, 0, p - 1))
+
+    levels = []
+    left_over, length = fractions, 1
+    while length < p:
+        # The pair of the blocks 2r and 2r + 1 of a component stands at its rank r.
+        has_right = (2 * ranks + 1) * length < places.counts
+        left = at(left_over, 2 * ranks)
+        right = jnp.where(has_right, at(left_over, 2 * ranks + 1), 0.0)
+        total = left + right
+        one_is_up = total >= 1
+        # The middle of a pair's stretch is that of no other pair.
+        draw = at(uniforms, (2 * ranks + 1) * length) * jnp.where(one_is_up, 2.0 - total, total)
+        left_stays = draw < jnp.where(one_is_up, 1 - left, left)
+        levels.append((left_stays, one_is_up))
+        left_over, length = total - one_is_up.astype(total.dtype), 2 * length
+    is_up = left_over > 0.5
+    for left_stays, one_is_up in reversed(levels):
+        stays = at(left_stays, ranks // 2) == (ranks % 2 == 0)
+        is_up = jnp.where(stays, at(is_up, ranks // 2), at(one_is_up, ranks // 2))
+    return is_up & (ranks < places.counts)
+
+
 def _sorted_points_before(
     before: Float[Array, "rows p"], points: Float[Array, " n"], first_slots: Int[Array, "rows 1"]
 ) -> Int[Array, "rows p"]:
@@ -83,4 +133,5 @@ SCHEMES: dict[str, Callable[..., Int[Array, " n"]]] = {
     "stratified": stratified,
     "multinomial": multinomial,
     "residual": residual,
+    "ssp": ssp,
 }

@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import check_callable, check_type, given, saying
-from mpfjax.filter import BROKEN_DENSITY, Filter, Start, split_keys
+from mpfjax.filter import BROKEN_DENSITY, Filter, Start, StepInfo, split_keys
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.across_islands import num_islands
 
@@ -57,14 +57,7 @@ def scan(
 
     def advance(mixture: ParticleMixture, inputs: PyTree) -> tuple[ParticleMixture, PyTree]:
         step_key, observation, is_present = inputs
-        if is_present is None:
-            mixture, info = filter._step(step_key, mixture, observation)
-        else:
-            mixture, info = jax.lax.cond(
-                is_present,
-                lambda: filter._step(step_key, mixture, observation),
-                lambda: filter._predict(step_key, mixture),
-            )
+        mixture, info = step_or_predict(filter, step_key, mixture, observation, is_present)
         with saying("in collect, which is called with the mixture after each step"):
             kept = mixture if collect is None else collect(mixture)
         return mixture, (kept, info.log_likelihood_increment, info.resampled, info.degenerate)
@@ -81,6 +74,23 @@ def scan(
         final=final,
         resampled=resampled,
         degenerate=degenerate,
+    )
+
+
+def step_or_predict(
+    filter: Filter,
+    key: Key[Array, ""],
+    mixture: ParticleMixture,
+    observation: PyTree,
+    is_present: Bool[Array, ""] | None,
+) -> tuple[ParticleMixture, StepInfo]:
+    """A step of the filter, or a prediction where the observation is missing; None is present."""
+    if is_present is None:
+        return filter._step(key, mixture, observation)
+    return jax.lax.cond(
+        is_present,
+        lambda: filter._step(key, mixture, observation),
+        lambda: filter._predict(key, mixture),
     )
 
 

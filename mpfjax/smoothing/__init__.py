@@ -5,4 +5,10 @@ from mpfjax.smoothing.ancestors import trace_ancestors as trace_ancestors
 from mpfjax.smoothing.conditional import ConditionalRun as ConditionalRun
 from mpfjax.smoothing.conditional import conditional_filter as conditional_filter
 from mpfjax.smoothing.forecasts import Forecast as Forecast
+from mpfjax.smoothing.sums import SmoothedSums as SmoothedSums
+from mpfjax.smoothing.sums import smoothed_sums as smoothed_sums
 from mpfjax.smoothing.trajectories import sample_trajectories as sample_trajectories
+from mpfjax.smoothing.variance import (
+    log_marginal_likelihood_variance as log_marginal_likelihood_variance,
+)
+from mpfjax.smoothing.variance import with_first_ancestors as with_first_ancestors

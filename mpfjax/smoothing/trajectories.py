@@ -2,27 +2,21 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_key, check_one_of, check_whole, given
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, check_log_density, check_model, require
+from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.generator import split, uniform
 from mpfjax.operations.indexing import take
-from mpfjax.operations.logarithms import exp, finite_or_zero
-from mpfjax.operations.matrices import draw_columns
 from mpfjax.running.scan import FilterRun
+from mpfjax.smoothing.backward import draw, draw_exactly, walk
 from mpfjax.smoothing.history import mixtures_of
-
-# How many densities are held at once: rows of trajectories are taken together up to this.
-_MOST_DENSITIES = 2**22
-_NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the step before"
 
 
 def sample_trajectories(
@@ -93,17 +87,17 @@ def _sample(key, model, mixtures, num_trajectories, component, num_steps):
     log_weights = final.log_weights
     if component is not None:
         log_weights = jnp.where(final.component_indicators == component, log_weights, -jnp.inf)
-    last = _draw(uniform(key_final, (num_trajectories,), log_weights.dtype), log_weights)
+    last = draw(uniform(key_final, (num_trajectories,), log_weights.dtype), log_weights)
     states = jax.tree.map(lambda leaf: take(leaf, last), final.particles)
 
     def back(carry: tuple[PyTree, Array], inputs: Any) -> tuple[tuple[PyTree, Array], PyTree]:
         next_states, next_indices = carry
         step_key, earlier, ancestors = inputs
         if num_steps == 0:
-            indices = _draw_exactly(step_key, model, next_states, earlier)
+            indices = draw_exactly(step_key, model, next_states, earlier)[:, 0]
         else:
             start = take(ancestors, next_indices)
-            indices = _walk(step_key, model, next_states, earlier, start, num_steps)
+            indices = walk(step_key, model, next_states, earlier, start, num_steps)[-1]
         states = jax.tree.map(lambda leaf: take(leaf, indices), earlier.particles)
         return (states, indices), states
 
@@ -116,77 +110,3 @@ def _sample(key, model, mixtures, num_trajectories, component, num_steps):
         past,
         states,
     )
-
-
-def _draw(uniforms: Float[Array, " k"], log_weights: Float[Array, " n"]) -> Int[Array, " k"]:
-    """Indices by their weights, by the inverse of the cumulative weights."""
-    weights = exp(log_weights - finite_or_zero(jnp.max(log_weights)))
-    upto = jnp.cumsum(weights)
-    # Rounding must not lead past the last particle of positive weight.
-    last = jnp.max(jnp.where(weights > 0, jnp.arange(weights.shape[0]), 0))
-    indices = jnp.searchsorted(upto, uniforms * upto[-1], side="right")
-    return jnp.minimum(indices, last).astype(jnp.int32)
-
-
-def _draw_exactly(
-    key: Key[Array, ""], model: Any, next_states: PyTree, mixture: ParticleMixture
-) -> Int[Array, " k"]:
-    """An index for each trajectory by W^i D(next | x^i)."""
-    n = mixture.num_particles
-
-    def log_weights_of(state: PyTree) -> Float[Array, " n"]:
-        copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), state)
-        log_density = model.log_transition(copies, mixture.particles)
-        check_log_density(log_density, model, "log_transition", n)
-        return jnp.where(mixture.occupied, mixture.log_weights + log_density, -jnp.inf)
-
-    def draw_one(inputs: tuple[Array, PyTree]) -> tuple[Array, Array]:
-        quantile, state = inputs
-        log_weights = log_weights_of(state)
-        largest = jnp.max(log_weights)
-        weights = exp(log_weights - finite_or_zero(largest))
-        return draw_columns(quantile[None], weights[None])[0], largest
-
-    num_trajectories = jax.tree.leaves(next_states)[0].shape[0]
-    quantiles = uniform(key, (num_trajectories,), mixture.log_weights.dtype)
-    together = max(1, min(num_trajectories, _MOST_DENSITIES // n))
-    inputs = (quantiles, next_states)
-    if together == num_trajectories:
-        indices, largest = jax.vmap(draw_one)(inputs)
-    else:
-        indices, largest = jax.lax.map(draw_one, inputs, batch_size=together)
-    return eqx.error_if(indices, ~jnp.all(largest > -jnp.inf), _NO_PAST)
-
-
-def _walk(
-    key: Key[Array, ""],
-    model: Any,
-    next_states: PyTree,
-    mixture: ParticleMixture,
-    start: Int[Array, " k"],
-    num_steps: int,
-) -> Int[Array, " k"]:
-    """Steps of independent Metropolis-Hastings on the index, whose target is W^i D(next | x^i)."""
-    num_trajectories = start.shape[0]
-    dtype = mixture.log_weights.dtype
-
-    def log_density(indices: Int[Array, " k"]) -> Float[Array, " k"]:
-        previous = jax.tree.map(lambda leaf: take(leaf, indices), mixture.particles)
-        values = model.log_transition(next_states, previous)
-        check_log_density(values, model, "log_transition", num_trajectories)
-        return values
-
-    def move(
-        place: tuple[Int[Array, " k"], Float[Array, " k"]], step_key: Key[Array, ""]
-    ) -> tuple[tuple[Int[Array, " k"], Float[Array, " k"]], None]:
-        indices, current = place
-        key_proposal, key_accept = split(step_key, 2)
-        proposed = _draw(uniform(key_proposal, (num_trajectories,), dtype), mixture.log_weights)
-        new = log_density(proposed)
-        # The proposal draws by the weights, which therefore cancel in the acceptance ratio.
-        accepted = jnp.log(uniform(key_accept, (num_trajectories,), dtype)) < new - current
-        accepted |= current == -jnp.inf
-        return (jnp.where(accepted, proposed, indices), jnp.where(accepted, new, current)), None
-
-    (indices, current), _ = jax.lax.scan(move, (start, log_density(start)), split(key, num_steps))
-    return eqx.error_if(indices, ~jnp.all(current > -jnp.inf), _NO_PAST)

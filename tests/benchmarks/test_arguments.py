@@ -9,6 +9,7 @@ from benchmarks.likelihood_tuning import __main__ as likelihood_tuning
 from benchmarks.partitioned_sampling import __main__ as partitioned_sampling
 from benchmarks.peers import __main__ as peers
 from benchmarks.scaling import __main__ as scaling
+from benchmarks.smoothing import __main__ as smoothing
 from benchmarks.visual_tracking import __main__ as visual_tracking
 
 COUNTS = {
@@ -20,6 +21,15 @@ COUNTS = {
     peers: ["particles", "seeds", "repeats", "devices"],
     scaling: ["islands", "repeats", "devices", "processes"],
     score_vs_particles: ["seeds", "particles"],
+    smoothing: [
+        "steps",
+        "particles",
+        "runs",
+        "mode-particles",
+        "seeds",
+        "variance-particles",
+        "variance-runs",
+    ],
     visual_tracking: ["seeds"],
 }
 SEEDS = {
@@ -28,6 +38,7 @@ SEEDS = {
     likelihood_tuning: ["seed"],
     partitioned_sampling: ["seed", "scene", "ids"],
     score_vs_particles: ["seed", "data-seed"],
+    smoothing: ["seed"],
     visual_tracking: ["seed", "ids"],
 }
 NUMBERS = {partitioned_sampling: ["lambdas"], peers: ["time-limit"]}

@@ -12,7 +12,7 @@ from mpfjax.moves.slots import place_slots
 from tests.examples import make_mixture
 from tests.marking import thorough
 
-SCHEMES = ("systematic", "stratified", "multinomial", "residual")
+SCHEMES = ("systematic", "stratified", "multinomial", "residual", "ssp")
 NEARLY_ONE = 1 - 2.0**-24
 
 over_schemes = pytest.mark.parametrize("scheme", SCHEMES)
@@ -119,18 +119,51 @@ def expected_offspring(mixture, per_component):
     return per_component * np.exp(np.asarray(mixture.log_component_weights, float))
 
 
-class TestSystematic:
-    @pytest.mark.parametrize("num_components", [1, 3])
-    def test_offspring_are_the_floor_or_the_ceiling_of_what_is_expected(self, num_components):
-        rng = np.random.default_rng(8)
-        labels = rng.permutation(np.arange(60) % num_components)
-        mixture = make_mixture(rng.normal(size=60), rng.normal(size=60), labels, num_components)
-        expected = expected_offspring(mixture, 60 // num_components)
-        for seed in range(50):
-            counts = offspring(mixture, draw(Resample(), mixture, seed))
-            assert (counts >= np.floor(expected - 1e-4)).all()
-            assert (counts <= np.ceil(expected + 1e-4)).all()
+@pytest.mark.parametrize("scheme", ["systematic", "ssp"])
+@pytest.mark.parametrize("num_components", [1, 3, 6])
+def test_offspring_are_the_floor_or_the_ceiling_of_what_is_expected(scheme, num_components):
+    rng = np.random.default_rng(8)
+    labels = rng.permutation(np.arange(60) % num_components)
+    mixture = make_mixture(rng.normal(size=60), rng.normal(size=60), labels, num_components)
+    expected = expected_offspring(mixture, 60 // num_components)
+    for seed in range(50):
+        counts = offspring(mixture, draw(Resample(scheme), mixture, seed))
+        assert (counts >= np.floor(expected - 1e-4)).all()
+        assert (counts <= np.ceil(expected + 1e-4)).all()
 
+
+class TestSSP:
+    def test_two_neighbours_are_not_drawn_together_as_systematic_resampling_draws_them(self):
+        """Four particles expect 0.5 each: a systematic draw has but two outcomes."""
+        mixture = make_mixture(np.arange(8.0), np.log(np.tile([0.25, 0.75], 4)), np.zeros(8), 1)
+        keys = jax.random.split(jax.random.key(0), 2000)
+        outcomes = {}
+        for scheme in ("systematic", "ssp"):
+            moved = jax.jit(jax.vmap(lambda key: Resample(scheme)(key, mixture)))(keys)  # noqa: B023
+            drawn = np.asarray(moved.ancestor_indices)
+            counts = np.stack([(drawn == i).sum(axis=1) for i in range(8)], axis=1)
+            outcomes[scheme] = np.unique(counts, axis=0)
+            covariance = np.cov(counts.T)
+            # No two particles are drawn together more often than apart.
+            off_diagonal = covariance[~np.eye(8, dtype=bool)]
+            if scheme == "ssp":
+                assert off_diagonal.max() < 4 * 0.25 / np.sqrt(2000)
+        assert len(outcomes["systematic"]) == 2
+        assert len(outcomes["ssp"]) > 10
+
+    def test_the_sums_of_a_component_do_not_move_by_more_than_one_offspring(self):
+        """In any stretch that the tree pairs first, the number of offspring is settled there."""
+        rng = np.random.default_rng(3)
+        mixture = make_mixture(rng.normal(size=64), rng.normal(size=64), np.zeros(64), 1)
+        expected = expected_offspring(mixture, 64)
+        for seed in range(20):
+            counts = offspring(mixture, draw(Resample("ssp"), mixture, seed))
+            assert counts.sum() == 64
+            halves = counts.reshape(2, 32).sum(axis=1) - expected.reshape(2, 32).sum(axis=1)
+            assert np.abs(halves).max() < 1
+
+
+class TestSystematic:
     def test_components_draw_their_offsets_independently(self):
         labels = np.repeat([0, 1], 10)
         log_weights = np.tile(np.log([0.05, 0.95] * 5), 2)

@@ -174,7 +174,7 @@ def test_rows_that_do_not_fit_together_are_drawn_in_turn(monkeypatch):
     filter = mpfjax.particle_filter(QUADRATIC, 50)
     found = mpfjax.run_filter(jax.random.key(1), filter, jnp.asarray(SQUARES))
     together = sample_trajectories(jax.random.key(2), QUADRATIC, found, 9)
-    monkeypatch.setattr(mpfjax.smoothing.trajectories, "_MOST_DENSITIES", 100)
+    monkeypatch.setattr(mpfjax.smoothing.backward, "MOST_DENSITIES", 100)
     in_turn = sample_trajectories(jax.random.key(2), QUADRATIC, found, 9 + 0 * len(SQUARES))
     np.testing.assert_array_equal(together, in_turn)
 

@@ -1,0 +1,99 @@
+"""Lineages: which particle of x_0 each particle descends from, where a filter keeps that.
+
+A filter keeps them only if a `Lineage` was put into the mixture's memory of x_0. Then `Resample`
+brings it up to date, wherever it stands in a chain or within a move.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mpfjax.mixture import ParticleMixture
+from mpfjax.operations.indexing import take
+from mpfjax.operations.segments import segment_sum
+
+LINEAGE = "lineage"
+
+
+class Lineage(eqx.Module):
+    """What `log_marginal_likelihood_variance` needs of the past, O(N + M²) numbers.
+
+    - `first_ancestors`: (n,), the slot in x_0 that each particle descends from.
+    - `groups`: (n,), the component in which each particle was last resampled.
+    - `log_pair_factors`: (m, m), the logarithm of the factor by which a pair of particles without
+      a common first ancestor counts, by their groups. Of the pairs of k independent draws,
+      (k - 1) / k are different draws. So a pair's factor grows by k / (k - 1) whenever the
+      component that both are in is resampled.
+    """
+
+    first_ancestors: Int[Array, " n"]
+    groups: Int[Array, " n"]
+    log_pair_factors: Float[Array, "m m"]
+
+    def family_masses(
+        self, weights: Float[Array, " n"], labels: Int[Array, " n"], num_labels: int
+    ) -> Float[Array, "labels n"]:
+        """The weight of the descendants of each particle of x_0, by the particles' labels."""
+        n = weights.shape[0]
+        families = labels * n + self.first_ancestors
+        return segment_sum(weights, families, num_labels * n).reshape(num_labels, n)
+
+
+def with_new_lineage(mixture: ParticleMixture) -> ParticleMixture:
+    """The mixture of x_0, every particle its own first ancestor."""
+    n, m = mixture.num_particles, mixture.num_components
+    lineage = Lineage(
+        first_ancestors=jnp.arange(n, dtype=jnp.int32),
+        groups=jnp.zeros(n, jnp.int32),
+        log_pair_factors=jnp.zeros((m, m), mixture.log_weights.dtype),
+    )
+    return mixture.replace(memory=mixture.memory | {LINEAGE: lineage})
+
+
+def with_offspring(
+    resampled: ParticleMixture,
+    before: ParticleMixture,
+    parents: Int[Array, " n"],
+    num_drawn: Int[Array, " m"],
+    due: Bool[Array, " m"],
+) -> ParticleMixture:
+    """The resampled mixture with the lineage of its particles, if one is kept."""
+    if LINEAGE not in before.memory:
+        return resampled
+    lineage: Lineage = before.memory[LINEAGE]
+    log_factors, groups = lineage.log_pair_factors, lineage.groups
+    if before.num_components > 1:
+        # Where nothing is drawn, the groups stay as they are, and nothing is averaged.
+        any_due = jnp.any(due)
+        log_factors = jnp.where(any_due, _by_components(lineage, before), log_factors)
+        groups = jnp.where(any_due, resampled.component_indicators, take(groups, parents))
+    k = num_drawn.astype(log_factors.dtype)
+    # A component of one particle has no pair to count.
+    grown = jnp.where(due & (k > 1), -jnp.log1p(-1 / jnp.maximum(k, 2)), 0.0)
+    lineage = Lineage(take(lineage.first_ancestors, parents), groups, log_factors + jnp.diag(grown))
+    return resampled.replace(memory=resampled.memory | {LINEAGE: lineage})
+
+
+def _by_components(lineage: Lineage, mixture: ParticleMixture) -> Float[Array, "m m"]:
+    """The pair factors by component: the average over the pairs, by group, that are in two.
+
+    Only pairs without a common first ancestor count. The others would have been in the same
+    component more often, and the factors would come out too large.
+    """
+    m = mixture.num_components
+    pairs = mixture.component_indicators * m + lineage.groups
+    masses = lineage.family_masses(mixture.weights, pairs, m * m)
+    totals = jnp.sum(masses, axis=1).reshape(m, m)
+    masses = masses.reshape(m, m, -1)
+    largest = jnp.max(lineage.log_pair_factors)
+    factors = jnp.exp(lineage.log_pair_factors - largest)
+
+    def of_different(factors: Float[Array, "m m"]) -> Float[Array, "m m"]:
+        of_same = jnp.einsum("cge,gh,dhe->cd", masses, factors, masses, optimize=True)
+        return totals @ factors @ totals.T - of_same
+
+    mass = of_different(jnp.ones_like(factors))
+    # Where hardly a pair is left, rounding is all that there is.
+    found = mass > 1e-4 * jnp.sum(totals, axis=1)[:, None] * jnp.sum(totals, axis=1)[None]
+    averages = jnp.where(found, of_different(factors) / jnp.where(found, mass, 1.0), 1.0)
+    return jnp.log(jnp.clip(averages, jnp.min(factors), 1.0)) + largest

@@ -1,0 +1,224 @@
+"""Online smoothing of sums over a trajectory: PaRIS, and fixed-lag smoothing."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int, Key, PyTree
+
+from mpfjax.checks import (
+    check_callable,
+    check_key,
+    check_one_of,
+    check_type,
+    check_whole,
+    saying,
+    shown,
+)
+from mpfjax.filter import Filter, Start, split_keys
+from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import mapped, require
+from mpfjax.observations import as_arrays, present_steps
+from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
+from mpfjax.operations.floats import as_inexact
+from mpfjax.operations.indexing import take
+from mpfjax.running.scan import FilterRun, checked, step_or_predict
+from mpfjax.smoothing.backward import draw_exactly, walk
+
+
+class SmoothedSums(eqx.Module):
+    """Smoothed expectations of a sum over the trajectory, as of each step.
+
+    - `sums`: leaves (t, ...), at step s the estimate of E[Σ_{r <= s} h(x_{r-1}, x_r) | y_1..y_s].
+      With a lag, each term is that of `terms`, as far as s goes.
+    - `terms`: leaves (t, ...), the estimates of E[h(x_{r-1}, x_r) | y_1..y_{min(r + lag, t)}] for
+      every r; None without a lag.
+    - `run`: the `FilterRun`, with nothing collected.
+    """
+
+    sums: PyTree
+    terms: PyTree
+    run: FilterRun
+
+
+def smoothed_sums(
+    key: Key[Array, ""],
+    filter: Filter,
+    observations: PyTree,
+    function: Callable[[PyTree, PyTree], PyTree],
+    *,
+    lag: int | None = None,
+    method: str = "exact",
+    num_draws: int = 2,
+    missing: str = "error",
+) -> SmoothedSums:
+    """E[Σ_t h(x_{t-1}, x_t) | y], online: PaRIS, in memory that does not grow with t.
+
+    Olsson and Westerborn (2017): each particle i of step t carries τ_t^i, the expected sum over
+    the trajectories that end in it. Some particles J of step t - 1 are drawn by the backward
+    kernel, W_{t-1}^J D(x_t^i | x_{t-1}^J), and τ_t^i is the mean of τ_{t-1}^J + h(x_{t-1}^J, x_t^i)
+    over them. The estimate is Σ_i W_t^i τ_t^i. W are joint weights, so that it is as right for a
+    mixture: a particle may come from another component. Times Ẑ, it is unbiased if Ẑ is. The
+    filter's run is that of `run_filter` with the same key.
+
+    - `function`: h. It takes x_{t-1} and x_t of n particles, leaves (n, ...), and returns values of
+      each, leaves (n, ...); of one particle if the model is wrapped by `per_particle`.
+    - `lag`: L. None smooths every term by all observations so far. With a lag, term r is smoothed
+      by y_1..y_{r+L} and then kept. Memory is L + 1 times that of None. The bias does not vanish
+      with N, but the variance does not grow with t - r. A lag of t or more is one of t - 1.
+    - `method`: "exact" weighs all N particles, O(N²) a step. "mcmc" (Dau and Chopin 2023) takes
+      the ancestor and goes on by steps of independent Metropolis-Hastings, O(N), and is as exact.
+    - `num_draws`: how many particles J are drawn for each particle. With one, few different ones
+      of long ago are left, as in a genealogy; two are enough.
+    - `observations`, `missing`: as in `run_filter`.
+
+    Raises `ValueError` for a model without `log_transition`, values that are not one a particle,
+    and as `run_filter` does; a RuntimeError where no particle can have moved to the next. Use it
+    for the sums that scores and EM need, and for series too long to keep. `sample_trajectories`
+    needs the mixtures of all steps, and serves every function at once.
+    """
+    check_key(key)
+    check_type(Filter, "a Filter", filter=filter)
+    require(filter.model, "log_transition", "smoothed_sums")
+    check_callable("a function of two states", function=function)
+    if lag is not None:
+        check_whole(0, lag=lag)
+    check_one_of(("exact", "mcmc"), method=method)
+    check_whole(num_draws=num_draws)
+    present = present_steps(observations, missing, filter.model)
+    observations = as_arrays(observations)
+    length = jax.tree.leaves(observations)[0].shape[0]
+    if lag is not None:
+        lag = min(lag, length - 1)
+    options = (mapped(filter.model, function), lag, method, num_draws)
+    sums = with_floats_traced(
+        lambda filter: _smooth(key, filter, observations, present, options), filter
+    )
+    return SmoothedSums(sums.sums, sums.terms, checked(sums.run))
+
+
+@jit_on_wide_vectors
+def _smooth(key, filter, observations, present, options):
+    function, lag, method, num_draws = options
+    # The first two are those of `run_filter`.
+    key_initial, key_steps, key_backward = split_keys(key, 3)
+    length = jax.tree.leaves(observations)[0].shape[0]
+    initial = filter._init(Start(key_initial))
+    num_kept = 1 if lag is None else lag + 1
+    shapes = _shapes(function, initial.particles)
+    kept = jax.tree.map(lambda leaf: jnp.zeros((num_kept, *leaf.shape), leaf.dtype), shapes)
+    settled = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:], leaf.dtype), shapes)
+
+    def advance(carry: tuple[ParticleMixture, PyTree, PyTree], inputs: PyTree) -> Any:
+        mixture, kept, settled = carry
+        t, step_key, draw_key, observation, is_present = inputs
+        moved, info = step_or_predict(filter, step_key, mixture, observation, is_present)
+        indices = _draw_pasts(draw_key, filter.model, mixture, moved, method, num_draws)
+        values = _values(function, mixture.particles, moved.particles, indices)
+        kept = jax.tree.map(lambda leaf: _mean_of_pasts(leaf, indices), kept)
+        if lag is None:
+            kept = jax.tree.map(lambda old, new: old + new[None], kept, values)
+        else:
+            kept = jax.tree.map(lambda old, new: old.at[t % num_kept].set(new), kept, values)
+        averages = jax.tree.map(jax.vmap(moved.average), kept)
+        sums = jax.tree.map(lambda done, own: done + jnp.sum(own, axis=0), settled, averages)
+        # What the next step will write over: term t - lag, or zero while there is none yet.
+        oldest = jax.tree.map(lambda own: own[(t + 1) % num_kept], averages)
+        if lag is not None:
+            settled = jax.tree.map(jnp.add, settled, oldest)
+        outputs = (sums, oldest, info.log_likelihood_increment, info.resampled, info.degenerate)
+        return (moved, kept, settled), outputs
+
+    keys = jax.random.split(key_steps, length), jax.random.split(key_backward, length)
+    inputs = (jnp.arange(length, dtype=jnp.int32), *keys, observations, present)
+    carry, outputs = jax.lax.scan(advance, (initial, kept, settled), inputs)
+    final, kept, _ = carry
+    sums, oldest, increments, resampled, degenerate = outputs
+    terms = None
+    if lag is not None:
+        last = np.arange(length - lag, length) % num_kept
+        open_terms = jax.tree.map(lambda leaf: jax.vmap(final.average)(leaf[last]), kept)
+        terms = jax.tree.map(
+            lambda done, rest: jnp.concatenate([done[lag:], rest]), oldest, open_terms
+        )
+    run = FilterRun(
+        log_marginal_likelihood=jnp.sum(increments),
+        log_likelihood_increments=increments,
+        collected=None,
+        initial=initial,
+        final=final,
+        resampled=resampled,
+        degenerate=degenerate,
+    )
+    return SmoothedSums(sums, terms, run)
+
+
+def _draw_pasts(
+    key: Key[Array, ""],
+    model: Any,
+    before: ParticleMixture,
+    after: ParticleMixture,
+    method: str,
+    num_draws: int,
+) -> Int[Array, "n draws"]:
+    """For each particle some of the step before, by the backward kernel."""
+    needed = after.occupied
+    if method == "exact":
+        return draw_exactly(key, model, after.particles, before, num_draws, needed)
+    start = after.ancestor_indices
+    if num_draws == 1:
+        return walk(key, model, after.particles, before, start, 1, needed).T
+    later = walk(key, model, after.particles, before, start, num_draws - 1, needed)
+    return jnp.concatenate([start[:, None], later.T], axis=1)
+
+
+def _mean_of_pasts(values: Array, indices: Int[Array, "n draws"]) -> Array:
+    """For each kept term, (kept, n, ...), the mean over the particles that each may come from."""
+    n, num_draws = indices.shape
+    flat = indices.reshape(-1)
+
+    def mean(rows: Array) -> Array:
+        return jnp.mean(take(rows, flat).reshape(n, num_draws, *rows.shape[1:]), axis=1)
+
+    return jax.vmap(mean)(values)
+
+
+def _values(
+    function: Callable[[PyTree, PyTree], PyTree],
+    previous: PyTree,
+    states: PyTree,
+    indices: Int[Array, "n draws"],
+) -> PyTree:
+    """h, its mean over the particles that each may come from."""
+    n, num_draws = indices.shape
+    flat = indices.reshape(-1)
+    earlier = jax.tree.map(lambda leaf: take(leaf, flat), previous)
+    later = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_draws, axis=0), states)
+    with saying("in function, which is called with x_{t-1} and x_t of all particles"):
+        values = function(earlier, later)
+    return jax.tree.map(
+        lambda leaf: jnp.mean(as_inexact(leaf).reshape(n, num_draws, *leaf.shape[1:]), axis=1),
+        values,
+    )
+
+
+def _shapes(function: Callable[[PyTree, PyTree], PyTree], particles: PyTree) -> PyTree:
+    """Shapes and types of h of all particles; a `ValueError` unless it is one value a particle."""
+    n = jax.tree.leaves(particles)[0].shape[0]
+    with saying("in function, which is called with x_{t-1} and x_t of all particles"):
+        values = jax.eval_shape(function, particles, particles)
+    leaves = jax.tree.leaves(values)
+    if not leaves:
+        raise ValueError(f"function: it returned {shown(values)}, which holds no array")
+    for leaf in leaves:
+        if leaf.shape[:1] != (n,):
+            raise ValueError(
+                f"function: it returned an array of shape {leaf.shape}, whose leading axis is not"
+                f" that of the {n} particles"
+            )
+        if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
+            raise ValueError(f"function: it returned complex values ({leaf.dtype})")
+    return jax.tree.map(lambda leaf: jax.eval_shape(as_inexact, leaf), values)

@@ -1,0 +1,82 @@
+"""The smoothing benchmark: its exact answers, and a run with little of everything."""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks.smoothing import __main__ as smoothing
+from benchmarks.smoothing import accuracy, modes, variance
+from benchmarks.smoothing.jobs import Linear, Quadratic
+from tests.smoothing.exact_smoothers import gaussian_smoother, grid_smoother
+
+
+def test_the_linear_truth_is_that_of_one_large_gaussian():
+    job = Linear(6, 1)
+    model = type("Model", (), {
+        "A": [[job.a]], "Q": [[job.q**2]], "H": [[1.0]], "R": [[job.r**2]], "m0": [0.0],
+        "P0": [[job.p**2]],
+    })  # fmt: skip
+    means, covariance = gaussian_smoother(model, job.observations[:, None])
+    x = means[:, 0]
+    expected = np.mean(np.diagonal(covariance, 1) + x[:-1] * x[1:])
+    assert job.exact == pytest.approx(expected)
+
+
+def test_the_quadratic_truth_is_that_of_another_grid():
+    job, grid = Quadratic(6, 1), np.linspace(-4, 4, 701)
+    log_initial = np.where(np.abs(grid) <= job.width, 0.0, -np.inf)
+    log_transition = -0.5 * ((grid[None] - grid[:, None]) / job.sigma_x) ** 2
+    log_likelihoods = -0.5 * ((job.observations[:, None] - grid**2) / job.sigma_y) ** 2
+    _, pairs = grid_smoother(log_initial, log_transition, log_likelihoods)
+    expected = np.mean(np.einsum("sij,i,j->s", pairs, grid, grid))
+    assert job.exact == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(modes, "NUM_TRAJECTORIES", 50)
+        monkeypatch.setattr(variance, "SCHEMES", ("multinomial",))
+        for table, names in (
+            (modes.FILTERS, ["MPF", "guided MPF"]),
+            (accuracy.OURS, ["backward sampling", "PaRIS"]),
+            (smoothing.JOBS, ["quadratic"]),
+        ):
+            for name in names:
+                monkeypatch.delitem(table, name)
+        out = tmp_path_factory.mktemp("smoothing")
+        arguments = [
+            "--steps", "10", "--particles", "150", "--runs", "3", "--mode-particles", "60",
+            "--seeds", "4", "--variance-particles", "40", "--variance-runs", "100",
+            "--out", str(out),
+        ]  # fmt: skip
+        assert smoothing.main(arguments) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def content(folder):
+    return json.loads((folder / "smoothing.json").read_text())
+
+
+def test_every_method_comes_close_to_the_truth(content):
+    entries = content["accuracy"]["linear"]
+    assert len({entry["method"] for entry in entries}) >= 3
+    for entry in entries:
+        assert entry["seconds"] > 0
+        assert entry["rms_error"] < 0.2, entry
+
+
+def test_masses_and_variances(content, folder):
+    found = content["modes"]
+    assert "PF, genealogy" in found
+    best = found["auxiliary MPF, backward sampling"]
+    assert best["worst_rms_error"] < 0.2
+    assert best["lost_at_some_time"] == 0
+    assert {entry["filter"] for entry in content["variance"]} == {"PF", "MPF"}
+    for entry in content["variance"]:
+        assert entry["variance"] > 0
+        assert -1 < entry["mean_of_runs"] <= 1
+    for name in ("accuracy.png", "modes.png"):
+        assert (folder / name).stat().st_size > 10_000
