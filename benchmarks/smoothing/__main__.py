@@ -1,4 +1,4 @@
-"""Smoothing, for one filter and for mixtures: accuracy, both modes, and the variance of log Ẑ.
+"""Smoothing, for one filter and for mixtures: accuracy, modes, variance of log Ẑ, posteriors.
 
     python -m benchmarks.smoothing                     # all parts
     python -m benchmarks.smoothing --parts modes --seeds 50
@@ -8,7 +8,10 @@
 - modes: the smoothed mass of one of two modes of equal mass, by PF and MPF.
 - variance: the variance of log Ẑ that a single run estimates, against that of many.
 
-Into --out DIR go smoothing.json, accuracy.png and modes.png.
+- posteriors: σ_x and σ_y of the quadratic model by PMMH, particle Gibbs and SMC², beside the grid
+  filter's; effective samples a second.
+
+Into --out DIR go smoothing.json, accuracy.png, modes.png and posteriors.png.
 """
 
 import argparse
@@ -16,11 +19,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from benchmarks.smoothing import accuracy, modes, variance
+from benchmarks.smoothing import accuracy, modes, posteriors, variance
 from benchmarks.smoothing.jobs import JOBS, Quadratic
 from mpfjax.console import exit_status, seed, whole, write_json
 
-PARTS = ("accuracy", "modes", "variance")
+PARTS = ("accuracy", "modes", "variance", "posteriors")
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -40,6 +43,8 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seeds", type=whole(), default=200, help="of modes")
     parser.add_argument("--variance-particles", type=whole(2), default=1000, metavar="N")
     parser.add_argument("--variance-runs", type=whole(2), default=1000)
+    parser.add_argument("--posterior-particles", type=whole(2), default=100, metavar="N")
+    parser.add_argument("--posterior-steps", type=whole(20), default=2000, help="of each chain")
     parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--out", type=Path, default=Path("results/smoothing"))
     return parser.parse_args(arguments)
@@ -77,6 +82,15 @@ def run(options: argparse.Namespace) -> None:
         write_json(options.out / "smoothing.json", content)
         print(f"\nvariance of log Ẑ, N = {size}, {runs} runs")
         print(variance.table(content["variance"]))
+    if "posteriors" in options.parts:
+        job = Quadratic(options.steps, options.seed)
+        size, steps = options.posterior_particles, options.posterior_steps
+        truth, found = posteriors.exact(job), posteriors.measure(job, size, steps, options.seed)
+        content["posteriors"] = posteriors.summary(truth, found)
+        write_json(options.out / "smoothing.json", content)
+        print(f"\nposterior of two parameters, N = {size}, chains of {steps} steps")
+        print(posteriors.table(content["posteriors"]))
+        posteriors.picture(truth, found).savefig(options.out / "posteriors.png", dpi=130)
     print(f"written to {options.out}")
 
 

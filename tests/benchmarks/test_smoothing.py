@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.smoothing import __main__ as smoothing
-from benchmarks.smoothing import accuracy, modes, variance
+from benchmarks.smoothing import accuracy, modes, posteriors, variance
 from benchmarks.smoothing.jobs import Linear, Quadratic
 from tests.smoothing.exact_smoothers import gaussian_smoother, grid_smoother
 
@@ -49,7 +49,7 @@ def folder(tmp_path_factory):
         arguments = [
             "--steps", "10", "--particles", "150", "--runs", "3", "--mode-particles", "60",
             "--seeds", "4", "--variance-particles", "40", "--variance-runs", "100",
-            "--out", str(out),
+            "--parts", "accuracy", "modes", "variance", "--out", str(out),
         ]  # fmt: skip
         assert smoothing.main(arguments) == 0
     return out
@@ -80,3 +80,21 @@ def test_masses_and_variances(content, folder):
         assert -1 < entry["mean_of_runs"] <= 1
     for name in ("accuracy.png", "modes.png"):
         assert (folder / name).stat().st_size > 10_000
+
+
+@pytest.mark.thorough
+def test_every_sampler_comes_close_to_the_grid_filters_posterior(tmp_path, monkeypatch):
+    pytest.importorskip("blackjax", reason="PMMH needs the extra 'mcmc', which 'test' brings")
+    monkeypatch.setattr(posteriors, "AXIS", posteriors.AXIS[::3])
+    arguments = ["--steps", "12", "--posterior-particles", "30", "--posterior-steps", "300"]
+    assert smoothing.main([*arguments, "--parts", "posteriors", "--out", str(tmp_path)]) == 0
+    entries = json.loads((tmp_path / "smoothing.json").read_text())["posteriors"]
+    assert {entry["sampler"] for entry in entries} == {
+        "grid filter", "PMMH", "particle Gibbs", "SMC²"
+    }  # fmt: skip
+    for name in posteriors.NAMES:
+        own = [entry for entry in entries if entry["parameter"] == name]
+        truth = next(entry for entry in own if entry["sampler"] == "grid filter")
+        for entry in own:
+            assert abs(entry["mean"] - truth["mean"]) < 0.6 * truth["deviation"], entry
+    assert (tmp_path / "posteriors.png").stat().st_size > 10_000
