@@ -10,7 +10,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.indexing import take
 from mpfjax.vision.detections import Detections
-from mpfjax.vision.histograms import bhattacharyya, normalise
+from mpfjax.vision.histograms import bhattacharyya
 from mpfjax.vision.tracking.memory import ASSIGNED, LIVES, REFERENCES, SCORES, remember
 from mpfjax.vision.tracking.model import DetectedObjectModel
 from mpfjax.vision.tracking.observation import TrackedFrame
@@ -110,8 +110,8 @@ class Assign(AbstractMove):
         if observation.pixels is None or self.colour_cost == 0:
             return jnp.zeros((mixture.num_components, len(observation.detections.boxes)))
         references = mixture.memory[REFERENCES]
-        counts = observation.pixels.counts(observation.detections.boxes, references.shape[1])
-        distances = bhattacharyya(normalise(counts)[None], references[:, None])
+        seen = observation.detected_colours(references.shape[1])
+        distances = bhattacharyya(seen[None], references[:, None])
         known = jnp.any(references > 0, axis=(1, 2, 3))[:, None]
         return self.colour_cost * jnp.where(known, jnp.mean(jnp.sum(distances, 3), 2), 0.0)
 
