@@ -120,7 +120,7 @@ def test_the_simulated_detector_errs_as_it_says():
     truth = np.array(rows, float)
     found = football.detect(match, truth, 0)
     gaps = np.abs(found[:, None, 2:6] - np.concatenate([corners, np.tile([20, 50], (5, 1))], 1))
-    near = (gaps <= 6 * football.ERROR * np.array([20, 50, 20, 50])).all(axis=2)
+    near = np.all(gaps <= 6 * football.ERROR * np.array([20, 50, 20, 50]), axis=2)
     hits = near.sum(axis=0) / 1000
     assert hits[[0, 3, 4]] == pytest.approx(1 - football.MISSES, abs=0.04)
     true_ones = near[:, [0, 3, 4]].any(axis=1)
