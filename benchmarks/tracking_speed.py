@@ -26,13 +26,15 @@ import numpy as np
 import mpfjax
 from mpfjax.console import Clock, exit_status, format_table, peak_memory, whole, write_json
 from mpfjax.vision.detection import BackgroundSubtraction
-from mpfjax.vision.loop import track
+from mpfjax.vision.detectors import LEAST_ROOM
+from mpfjax.vision.loop import make_tracker, track
 
 ROWS, COLUMNS = 3, 8
 NUM_OBJECTS = ROWS * COLUMNS
 BOX = 100 / 1920, 250 / 1080  # as shares of the frame
 LARGE, SMALL = (1080, 1920), (288, 384)
 ERROR = 0.02  # of a detection, in boxes
+ROOM = 40  # for objects, as `mpfjax track --detections` has it for a file with so many a frame
 
 
 class Way(NamedTuple):
@@ -101,7 +103,8 @@ class Timed:
             detections: Any = self._detecting(BackgroundSubtraction())
         else:
             detections = self.clock.over("read", map(street.detected, _count()))
-        self.tracked = self.clock.over("track", track(frames, detections))
+        tracker = make_tracker("gm_mpf", LEAST_ROOM if way.detect else ROOM)
+        self.tracked = self.clock.over("track", track(frames, detections, tracker))
 
     def _detecting(self, background: BackgroundSubtraction) -> Callable[[np.ndarray], np.ndarray]:
         def detect(frame: np.ndarray) -> np.ndarray:

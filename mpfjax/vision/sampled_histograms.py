@@ -97,7 +97,11 @@ class SampledBoxes(eqx.Module):
         rows: int = ROWS,
         columns: int = COLUMNS,
     ) -> "SampledBoxes":
-        """Look at boxes (x, y, w, h) about their centre, in so many bands."""
+        """Look at boxes (x, y, w, h) about their centre, in so many bands.
+
+        Raises `ValueError` for a frame that is not (h, w, 3) of type uint8.
+        """
+        check_frame(frame)
         height, width = frame.shape[:2]
         rows = -(-rows // num_parts) * num_parts
         row, column, inside = _points(np, boxes, rows, columns, height, width)

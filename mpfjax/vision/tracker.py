@@ -214,7 +214,8 @@ class ObjectTracker(eqx.Module):
 
         Then the time of a step does not depend on the size of the frame, nor does it compile anew
         for another. It is the frame where particles are weighed by their colours, where colours are
-        exact, and for a chain that holds moves of other kinds than the default one's.
+        exact, and for a chain that holds moves of other kinds than the default one's. Raises
+        `ValueError` for a frame as `step` does.
         """
         learned = [move.num_parts for move in self.moves if isinstance(move, LearnColours)]
         if self.exact_colours or len(learned) != 1 or not all(map(_sees_detections, self.moves)):

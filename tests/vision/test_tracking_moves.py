@@ -257,6 +257,7 @@ def test_the_assignment_is_scipys():
     sizes = np.exp(place[:, 2:])
     noise = np.c_[sizes * np.hypot([0.06, 0.03], [0.02, 0.01]), np.tile([0.03, 0.015], (M * P, 1))]
     boxes = np.asarray(frame.detections.boxes, float)
+    assert isinstance(frame.pixels, SampledHistogram)
     seen = np.asarray(frame.pixels.counts(frame.detections.boxes, 2), float)
     seen /= np.maximum(seen.sum(axis=3, keepdims=True), 1)
     expected = np.full((M, D), np.inf)
