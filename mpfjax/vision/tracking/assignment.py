@@ -65,10 +65,15 @@ class Assign(AbstractMove):
         """Settle whose each detection is."""
         del key
         cost = self.costs(mixture, observation)
-        rows, columns = hungarian_algorithm(cost)
-        possible = cost[rows, columns] < _IMPOSSIBLE
+        # A column of its own for each component that gets none: without, the algorithm would try
+        # one impossible pair after the other.
+        none = jnp.where(jnp.eye(len(cost), dtype=bool), _IMPOSSIBLE, 2 * _IMPOSSIBLE)
+        pairs = jnp.where(cost < _IMPOSSIBLE, cost, 2 * _IMPOSSIBLE)
+        rows, columns = hungarian_algorithm(
+            jnp.concatenate([pairs, none.astype(cost.dtype)], axis=1)
+        )
         source = jnp.full(mixture.num_components, _NONE, jnp.int32)
-        chosen = jnp.where(possible, columns.astype(jnp.int32), _NONE)
+        chosen = jnp.where(columns < cost.shape[1], columns.astype(jnp.int32), _NONE)
         return remember(mixture, assigned=source.at[rows].set(chosen))
 
     def costs(self, mixture: ParticleMixture, observation: TrackedFrame) -> Float[Array, "m d"]:
