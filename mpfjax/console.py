@@ -154,3 +154,18 @@ class Clock:
             if item is None:
                 return
             yield item
+
+
+def peak_memory() -> float:
+    """The most memory that this process has held, in MB of 2²⁰ bytes.
+
+    Linux's `ru_maxrss` goes on from the parent's at a fork; VmHWM starts anew with the program.
+    """
+    try:
+        status = Path("/proc/self/status").read_text()
+        return int(status.split("VmHWM:")[1].split()[0]) / 2**10
+    except (OSError, IndexError):
+        import resource
+
+        unit = 2**20 if sys.platform == "darwin" else 2**10
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

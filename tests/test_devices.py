@@ -16,6 +16,7 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import grid_filter
+from mpfjax.operations import compiling
 from mpfjax.operations.across_islands import (
     DEVICE_AXIS,
     ISLAND_AXIS,
@@ -24,7 +25,7 @@ from mpfjax.operations.across_islands import (
     num_islands,
     over_islands,
 )
-from mpfjax.operations.compiling import wide_vectors
+from mpfjax.operations.compiling import in_little_memory, wide_vectors
 from mpfjax.running.devices import choose_devices
 from mpfjax.running.threads import over_threads
 from tests import on_devices
@@ -407,6 +408,19 @@ def test_the_width_of_vectors_is_left_to_a_flag_that_sets_it(monkeypatch):
     assert wide_vectors() == {"xla_cpu_prefer_vector_width": 512}
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=128")
     assert wide_vectors() == {}
+
+
+def test_little_memory_is_an_option_that_this_compiler_has_or_is_left_out(monkeypatch):
+    chosen = in_little_memory.__wrapped__
+    monkeypatch.setenv("XLA_FLAGS", "")
+    options = chosen()
+    assert set(options) <= {"xla_cpu_use_fusion_emitters"}
+    assert jax.jit(lambda x: 2 * x, compiler_options=options)(3.0) == 6
+    monkeypatch.setattr(compiling, "_FUSION_EMITTERS", "xla_cpu_has_no_such_option")
+    assert chosen() == {}
+    monkeypatch.undo()
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=true")
+    assert chosen() == {}
 
 
 class TestChoosingDevices:

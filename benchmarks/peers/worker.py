@@ -183,7 +183,7 @@ def answer(
 
 
 def peak_memory() -> int:
-    """The most bytes that this process has held.
+    """The most bytes that this process has held, without importing mpfjax for it.
 
     Linux's `ru_maxrss` goes on from the parent's at a fork; VmHWM starts anew with the program.
     """

@@ -1,13 +1,15 @@
 """Our trackers beside those that people use, on the same detections and scored alike.
 
     python -m benchmarks.tracking_by_detection DIR [DIR ...]
+    python -m benchmarks.tracking_by_detection --scene football
 
 Each DIR is a sequence: img/ (or img1/), gt.txt (or gt/gt.txt) and one or more files of detections,
 det*.txt (or det/det.txt). On each file run the two filters of `mpfjax.vision.track`, means over
 seeds, and the peers that are installed: the SORT-like trackers of the packages `trackers` and
 `norfair`, with their defaults, with what their documentation advises, and then all of them, ours
 as well, with the same minimal score, that below which weaker detections are left out. It is the
-threshold that parts the file's scores best in two (Otsu's), unless --min-score gives one.
+threshold that parts the file's scores best in two (Otsu's), unless --min-score gives one. With
+--scene football the sequences are rendered, and the detections simulated.
 """
 
 import argparse
@@ -21,6 +23,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.tracking_by_detection import football
 from benchmarks.tracking_by_detection.peers import Peer, peers
 from mpfjax.console import (
     Clock,
@@ -44,19 +47,22 @@ COLUMNS = ("tracker", "sequence", "detections", *SCORES, "frames_per_second")
 
 
 class Sequence(NamedTuple):
-    """A folder with one of its files of detections."""
+    """A folder with one of its files of detections, or a rendered scene."""
 
-    folder: Path
-    detections: Path
+    name: str
+    detections: str
     rows: np.ndarray
     truth: np.ndarray
     first: int
     last: int
     frames_per_second: float | None
+    source: Path | np.ndarray
 
     def stills(self) -> Iterator[np.ndarray]:
         """The frames."""
-        return frames.read_frames(self.folder, self.first, self.last)
+        if isinstance(self.source, np.ndarray):
+            return iter(self.source[self.first - 1 : self.last])
+        return frames.read_frames(self.source, self.first, self.last)
 
 
 class Run(NamedTuple):
@@ -72,7 +78,8 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         prog="python -m benchmarks.tracking_by_detection",
         description="Our trackers beside those that people use, on the same detections.",
     )
-    parser.add_argument("sequences", type=Path, nargs="+", metavar="DIR", help="img/, gt.txt, det*")
+    parser.add_argument("sequences", type=Path, nargs="*", metavar="DIR", help="img/, gt.txt, det*")
+    parser.add_argument("--scene", choices=("football",), help="rendered, in place of any DIR")
     parser.add_argument("--out", type=Path, default=Path("results/tracking_by_detection"))
     parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--seeds", type=whole(), default=3, help="runs of ours; scores are means")
@@ -83,12 +90,17 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--no-peers", action="store_true", help="our own trackers alone")
     parser.add_argument("--no-colour", action="store_true", help="ours on the detections alone")
-    return parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
+    if bool(options.sequences) == (options.scene is not None):
+        parser.error("one of DIR and --scene is needed, and not both")
+    return options
 
 
 def open_sequences(options: argparse.Namespace) -> list[Sequence]:
     """Every file of detections of every folder, or a `ValueError` that names what is missing."""
     first, last = frames.parse_range(options.frames, "--frames")
+    if options.scene is not None:
+        return [_rendered(match, options.seed, first, last) for match in football.MATCHES]
     found = []
     for folder in options.sequences:
         if not folder.is_dir():
@@ -106,8 +118,18 @@ def open_sequences(options: argparse.Namespace) -> list[Sequence]:
         rate = options.fps or frames.frame_rate(folder)
         for path in files:
             rows = _between(box_files.read_detections(path), first, end)
-            found.append(Sequence(folder, path, rows, truth, first, end, rate))
+            found.append(Sequence(folder.name, path.name, rows, truth, first, end, rate, folder))
     return found
+
+
+def _rendered(match: football.Match, seed: int, first: int, last: int | None) -> Sequence:
+    """A match with the simulated detections."""
+    last = football.NUM_FRAMES if last is None else last
+    scene = football.play(match, seed, last)
+    truth = _between(scene.tracks, first, last)
+    rows = football.detect(match, truth, seed)
+    rate = football.FRAMES_PER_SECOND
+    return Sequence(match.name, "simulated", rows, truth, first, last, rate, scene.frames)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -206,8 +228,8 @@ def _result(name: str, sequence: Sequence, runs: list[Run]) -> dict[str, Any]:
     scores = [multi_object_scores(run.rows, sequence.truth, span) for run in runs]
     result: dict[str, Any] = {
         "tracker": name,
-        "sequence": sequence.folder.name,
-        "detections": sequence.detections.name,
+        "sequence": sequence.name,
+        "detections": sequence.detections,
     }
     result |= {score: round(float(np.mean([s[score] for s in scores])), 4) for score in SCORES}
     rate = float(np.median([run.frames_per_second for run in runs]))

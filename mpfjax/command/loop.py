@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import resource
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mpfjax.command.arguments import Source, open_source, read_boxes, read_detections
-from mpfjax.console import Clock, format_table, write_json
+from mpfjax.console import Clock, format_table, peak_memory, write_json
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import drawing, frames
@@ -66,7 +65,7 @@ class Results:
             "objects": len(np.unique(rows[:, 1])),
             "seconds": {part: round(seconds, 3) for part, seconds in clock.seconds.items()},
             "frames_per_second": round(rate, 2),
-            "peak_memory_mb": round(_peak_memory(), 1),
+            "peak_memory_mb": round(peak_memory(), 1),
         }
         return summary | _scores(rows, self.source, n)
 
@@ -177,10 +176,3 @@ def _table(summary: dict[str, Any]) -> str:
     columns += [name for name in _SCORES if name in summary]
     names = ["frames", "objects", "frames a second", "peak MB", *columns[4:]]
     return format_table(names, [[f"{summary[column]:g}" for column in columns]])
-
-
-def _peak_memory() -> float:
-    """The most memory that this process has held, in MB of 2²⁰ bytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    # Bytes on a Mac, kilobytes elsewhere.
-    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10

@@ -26,6 +26,8 @@ _FOREGROUND = 255
 _REMEMBERED, _ENOUGH = 500, 20
 # A part of a blob may be so much narrower than one is.
 _NARROWEST = 2.4
+# The height of a blob before any was seen, as a share of the frame's.
+_UNKNOWN_HEIGHT = 0.125
 
 
 class BackgroundSubtraction:
@@ -49,7 +51,8 @@ class BackgroundSubtraction:
     - `warm_up`: first frames that only teach the background, at least 1, the first of all.
     - `area`: least and most area of a box, as shares of the frame's.
     - `aspect`: least and most height of a box, in widths; None is any shape.
-    - `largest_gap`: height of the gaps that are closed, as a share of the frame's height.
+    - `largest_gap`: height of the gaps that are closed, as a share of the median height of the
+      blobs so far; of an eighth of the frame's height until there are a few.
     - `cut_aspect`: a blob lower than this many widths may be cut; None takes the median of the
       blobs so far, once there are a few, and 0 cuts none.
     - `cut_depth`: how high the outline may reach between two heads, as a share of the lower one's
@@ -69,13 +72,13 @@ class BackgroundSubtraction:
         self,
         *,
         history: int = 500,
-        threshold: float = 6.0,
+        threshold: float = 8.0,
         background_share: float = 0.6,
         shadow_brightness: float | None = 0.6,
         warm_up: int = 1,
         area: tuple[float, float] = (0.0015, 0.3),
         aspect: tuple[float, float] | None = None,
-        largest_gap: float = 0.02,
+        largest_gap: float = 0.1,
         cut_aspect: float | None = None,
         cut_depth: float = 0.9,
         most_pixels: int = 640 * 480,
@@ -154,6 +157,7 @@ class BackgroundSubtraction:
             self._background.setShadowThreshold(self.shadow_brightness)
         self._frames_seen, self._shape = 0, None
         self._aspects: deque[float] = deque(maxlen=_REMEMBERED)
+        self._heights: deque[int] = deque(maxlen=_REMEMBERED)
 
     def _subtract(self, frame: np.ndarray, rate: float) -> np.ndarray:
         """1 where a pixel is foreground; the frame joins the background with weight `rate`."""
@@ -181,7 +185,7 @@ class BackgroundSubtraction:
         )
 
     def _blobs(self, foreground: np.ndarray) -> list[tuple[int, int, int, int]]:
-        gap = round(self.largest_gap * len(foreground))
+        gap = round(self.largest_gap * self._usual_height(len(foreground)))
         if gap > 0:
             # Only upward and downward: who walks side by side must not be joined.
             line = np.ones((gap + 1, 1), np.uint8)
@@ -196,9 +200,13 @@ class BackgroundSubtraction:
         ]
         # Who leaves the frame in part does not show its shape.
         bottom, right = foreground.shape
-        self._aspects.extend(
-            h / w for _, x, y, w, h in large if x > 0 and y > 0 and x + w < right and y + h < bottom
-        )
+        whole = [
+            (w, h)
+            for _, x, y, w, h in large
+            if x > 0 and y > 0 and x + w < right and y + h < bottom
+        ]
+        self._aspects.extend(h / w for w, h in whole)
+        self._heights.extend(h for _, h in whole)
         widest = self._cut_aspect()
         for label, x, y, w, h in large:
             blob = labels[y : y + h, x : x + w] == label
@@ -210,6 +218,11 @@ class BackgroundSubtraction:
         if self.cut_aspect is not None:
             return self.cut_aspect
         return float(np.median(self._aspects)) if len(self._aspects) >= _ENOUGH else 0.0
+
+    def _usual_height(self, rows: int) -> float:
+        """The median height of a blob, in pixels of the reduced frame."""
+        known = len(self._heights) >= _ENOUGH
+        return float(np.median(self._heights)) if known else _UNKNOWN_HEIGHT * rows
 
     def _cut(self, blob: Bool[np.ndarray, "h w"], widest: float) -> list[tuple[int, int, int, int]]:
         """The boxes of those side by side in a blob that fills its array."""

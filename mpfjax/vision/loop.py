@@ -1,6 +1,7 @@
 """The loop over frames: from video and detections, or detections alone, to tracks."""
 
-from collections.abc import Iterable, Iterator
+import functools
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +11,7 @@ from jaxtyping import Array, Float, Key, PyTree, UInt8
 
 from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole, given
 from mpfjax.moves.resampling import Resample
+from mpfjax.operations.compiling import in_little_memory
 from mpfjax.vision.boxes import top_left
 from mpfjax.vision.detections import Detections
 from mpfjax.vision.detectors import LEAST_ROOM, AbstractDetector, Found, Once, Sieve, as_detector
@@ -83,7 +85,7 @@ def _tracked(
     room: int,
     use_colours: bool,
 ) -> Iterator[Tracks]:
-    state, once = tracker.init(), Once()
+    state, once, advance = tracker.init(), Once(), _compiled()
     for number, still, found in _observed(stills, detector, first):
         found = sieve(found, number, still)
         if len(found.boxes) > room:
@@ -93,9 +95,9 @@ def _tracked(
                 " there is room for, max_detections; the strongest are kept",
             )
         observation = Detections.from_boxes(found.boxes, room, found.scores)
-        pixels = still if use_colours else None
+        pixels = tracker.look(still, observation) if use_colours and still is not None else None
         # An array, since a new Python number would compile anew.
-        state, tracks = _advance(tracker, key, np.asarray(number), state, pixels, observation)
+        state, tracks = advance(tracker, key, np.asarray(number), state, pixels, observation)
         tracks = jax.device_get(tracks)
         if tracks.full:
             once.warn(
@@ -106,7 +108,6 @@ def _tracked(
         yield tracks
 
 
-@eqx.filter_jit
 def _advance(
     tracker: ObjectTracker,
     key: Key[Array, ""],
@@ -117,6 +118,13 @@ def _advance(
 ) -> tuple[PyTree, Tracks]:
     """A step, with the key of the frame drawn in the same program: a call is half a millisecond."""
     return tracker.step(jax.random.fold_in(key, number), state, pixels, observation)
+
+
+@functools.cache
+def _compiled() -> Callable[..., tuple[PyTree, Tracks]]:
+    """`_advance`; asking for its options any earlier would keep processes from joining."""
+    with_options: Any = eqx.filter_jit
+    return with_options(_advance, compiler_options=in_little_memory())
 
 
 def _observed(

@@ -1,7 +1,7 @@
 """A tracker that starts and ends its components by itself, from detections: a chain of moves."""
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from mpfjax.operations.floats import default_float
 from mpfjax.vision.colours import AbstractColours, HSVColours
 from mpfjax.vision.detections import Detections
 from mpfjax.vision.histograms import integral_histogram
-from mpfjax.vision.sampled_histograms import SampledHistogram
+from mpfjax.vision.sampled_histograms import SampledBoxes, SampledHistogram
 from mpfjax.vision.tracking.assignment import Assign
 from mpfjax.vision.tracking.births import Found, ShareMass
 from mpfjax.vision.tracking.colours import LearnColours
@@ -182,10 +182,12 @@ class ObjectTracker(eqx.Module):
         self,
         key: Key[Array, ""],
         state: ParticleMixture,
-        frame: UInt8[Array, "h w 3"] | None,
+        frame: UInt8[Array, "h w 3"] | SampledBoxes | None,
         detections: Detections,
     ) -> tuple[ParticleMixture, Tracks]:
         """The state after a frame and its detections, and what is tracked in it.
+
+        In place of the frame, what `look` returns of it does as well.
 
         Where `frame` is None detections are tracked alone, without colours. Frames may have any
         size, which should not change: each new one compiles anew, and boxes stay where they are in
@@ -205,9 +207,24 @@ class ObjectTracker(eqx.Module):
             full=lives.full,
         )
 
-    def _pixels(self, frame: UInt8[Array, "h w 3"] | None) -> Pixels | None:
-        if frame is None:
-            return None
+    def look(
+        self, frame: UInt8[np.ndarray, "h w 3"], detections: Detections
+    ) -> SampledBoxes | UInt8[np.ndarray, "h w 3"]:
+        """What `step` has to be given of a frame: the detections' pixels, where those are enough.
+
+        Then the time of a step does not depend on the size of the frame, nor does it compile anew
+        for another. It is the frame where particles are weighed by their colours, where colours are
+        exact, and for a chain that holds moves of other kinds than the default one's. Raises
+        `ValueError` for a frame as `step` does.
+        """
+        learned = [move.num_parts for move in self.moves if isinstance(move, LearnColours)]
+        if self.exact_colours or len(learned) != 1 or not all(map(_sees_detections, self.moves)):
+            return frame
+        return SampledBoxes.of(frame, np.asarray(detections.boxes), self.colours, learned[0])
+
+    def _pixels(self, frame: Any) -> Pixels | None:
+        if frame is None or isinstance(frame, SampledBoxes):
+            return frame
         if self.exact_colours:
             wide = frame.shape[0] * frame.shape[1] >= _LARGEST_NARROW
             return integral_histogram(frame, self.colours, wide)
@@ -256,6 +273,14 @@ def _check_rejuvenation(
         raise ValueError(
             f"{argument}: where is None, but which object a particle is of is no Gaussian"
         )
+
+
+def _sees_detections(move: AbstractMove) -> bool:
+    """Whether it looks at the colours of detections alone, or at none."""
+    if isinstance(move, PropagateObjects):
+        return move.model.sigma is None
+    kinds = (RankScores, Assign, AbstractRejuvenation, Bury, Found, LearnColours, ShareMass)
+    return isinstance(move, kinds)
 
 
 def _motion(states: ObjectState) -> tuple[PyTree, PyTree]:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks import histograms, score_vs_particles
+from benchmarks import histograms, score_vs_particles, tracking_speed
 from benchmarks.gm_mpf import __main__ as gm_mpf
 from benchmarks.interacting_objects import __main__ as interacting_objects
 from benchmarks.likelihood_tuning import __main__ as likelihood_tuning
@@ -20,7 +20,7 @@ COUNTS = {
     partitioned_sampling: ["runs", "particles", "scenes", "event"],
     peers: ["particles", "seeds", "repeats", "devices"],
     scaling: ["islands", "repeats", "devices", "processes"],
-    score_vs_particles: ["seeds", "particles"],
+    score_vs_particles: ["seeds", "particles", "components", "regroup-every"],
     smoothing: [
         "steps",
         "particles",
@@ -29,7 +29,10 @@ COUNTS = {
         "seeds",
         "variance-particles",
         "variance-runs",
+        "posterior-particles",
+        "posterior-steps",
     ],
+    tracking_speed: ["frames", "rounds"],
     visual_tracking: ["seeds"],
 }
 SEEDS = {

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.tracking_by_detection import __main__ as benchmark
+from benchmarks.tracking_by_detection import football
 from benchmarks.tracking_by_detection.peers import Peer, peers
 from mpfjax.vision.boxes import write_tracks
 from mpfjax.vision.frames import write_image
@@ -109,6 +110,42 @@ def test_the_threshold_parts_two_groups_of_scores():
     threshold = benchmark.otsu(random.permutation(scores))
     assert np.mean((scores >= threshold) == (np.arange(400) >= 300)) > 0.99
     assert benchmark.otsu(np.array([0.5])) == 0.5
+
+
+def test_the_simulated_detector_errs_as_it_says():
+    match = football.MATCHES[0]
+    # So far apart that nobody hides another, but for the second of each frame.
+    corners = np.array([[10, 10], [102, 5], [100, 10], [200, 10], [300, 10]])
+    rows = [[t, i, *corner, 20, 50] for t in range(1, 1001) for i, corner in enumerate(corners, 1)]
+    truth = np.array(rows, float)
+    found = football.detect(match, truth, 0)
+    gaps = np.abs(found[:, None, 2:6] - np.concatenate([corners, np.tile([20, 50], (5, 1))], 1))
+    near = np.all(gaps <= 6 * football.ERROR * np.array([20, 50, 20, 50]), axis=2)
+    hits = near.sum(axis=0) / 1000
+    assert hits[[0, 3, 4]] == pytest.approx(1 - football.MISSES, abs=0.04)
+    true_ones = near[:, [0, 3, 4]].any(axis=1)
+    offsets = found[near[:, 0], 2] - 10
+    assert offsets.std() == pytest.approx(football.ERROR * 20, rel=0.1)
+    assert len(found) / 1000 == pytest.approx(4 * 0.9 + football.FALSE_ONES, abs=0.1)
+    assert found[true_ones, 6].mean() == pytest.approx(0.8, abs=0.02)
+    assert not (football._hidden(np.array([[0, 0, 9, 9], [50, 50, 9, 9.0]])) > 0).any()
+
+
+def test_a_scene_is_a_sequence(tmp_path, monkeypatch):
+    small = football.Match("small", 2, 96, 160)
+    monkeypatch.setattr(football, "MATCHES", (small,))
+    options = ["--scene", "football", "--frames", "2:4"]
+    (sequence,) = benchmark.open_sequences(benchmark.parse_arguments(options))
+    assert len(list(sequence.stills())) == 3
+    assert set(sequence.truth[:, 0]) == {2, 3, 4} >= set(sequence.rows[:, 0])
+    assert (sequence.name, sequence.detections) == ("small", "simulated")
+
+
+@pytest.mark.parametrize("arguments", [[], ["folder", "--scene", "football"]])
+def test_a_folder_or_a_scene_is_needed_and_not_both(arguments, capsys):
+    with pytest.raises(SystemExit):
+        benchmark.parse_arguments(arguments)
+    assert "one of DIR and --scene is needed" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from mpfjax.vision import (
     integral_histogram,
 )
 from mpfjax.vision.histograms import normalise
+from mpfjax.vision.sampled_histograms import SampledBoxes
 
 RNG = np.random.default_rng(0)
 FRAME = RNG.integers(0, 256, (30, 40, 3), dtype=np.uint8)
@@ -109,3 +110,17 @@ def test_it_is_the_same_under_jit_and_vmap():
 def test_a_bad_argument_is_named(as_installed, arguments, said):
     with pytest.raises(ValueError, match=f"^{said}: "):
         SampledHistogram(**{"frame": FRAME, "colours": HSVColours()} | arguments)
+
+
+@pytest.mark.parametrize("num_parts", [1, 3])
+def test_boxes_looked_up_before_count_the_same(num_parts):
+    boxes = np.concatenate([BOXES, [[-50, 10, 8, 8], [10, 10, 0, 8]]]).astype(np.float32)
+    colours = HSVColours(4, 2, 2)
+    table = SampledHistogram(jnp.asarray(FRAME), colours, rows=6, columns=4)
+    looked = SampledBoxes.of(FRAME, boxes, colours, num_parts, rows=6, columns=4)
+    np.testing.assert_array_equal(
+        looked.counts(num_parts), table.counts(jnp.asarray(boxes), num_parts)
+    )
+    assert (int(looked.height), int(looked.width)) == FRAME.shape[:2]
+    with pytest.raises(ValueError, match="num_parts: 4 does not divide the 6 rows"):
+        looked.counts(4)

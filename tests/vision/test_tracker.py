@@ -295,6 +295,26 @@ def test_a_frame_without_colours_is_named(as_installed, frame, said):
         TRACKER.step(KEYS[0], TRACKER.init(), jnp.asarray(frame), detections([]))
 
 
+def test_what_it_looks_at_beforehand_is_all_that_it_sees_of_a_frame():
+    whole, looked, corners = TRACKER.init(), TRACKER.init(), [(5, 5), (22, 30)]
+    for t in range(4):
+        frame = draw([(x + t, y) for x, y in corners])
+        found = detections(boxes_at([(x + t, y) for x, y in corners]))
+        seen = TRACKER.look(frame, found)
+        assert sum(leaf.size for leaf in jax.tree.leaves(seen)) < 4 * ROOM * 18 * 8 * 3
+        whole, _ = TRACKER.step(KEYS[t], whole, jnp.asarray(frame), found)
+        looked, tracks = TRACKER.step(KEYS[t], looked, seen, found)
+    np.testing.assert_array_equal(looked.memory["references"], whole.memory["references"])
+    np.testing.assert_allclose(looked.particles.place, whole.particles.place, rtol=1e-5)
+    assert tracks.shown.sum() == 2
+
+
+@pytest.mark.parametrize("options", [{"sigma": 0.2}, {"exact_colours": True}])
+def test_where_more_is_needed_than_detections_show_it_looks_at_the_frame(options):
+    chosen, frame = mpfjax.vision.ObjectTracker(M, P, **options), draw([])
+    assert chosen.look(frame, detections([])) is frame
+
+
 def test_references_are_learned_from_who_stands_alone():
     """Trousers that change their colour: 5% of what is new joins the reference in each frame."""
     state, learned = TRACKER.init(), []

@@ -181,6 +181,7 @@ def tracked(seed=0):
         jnp.array([3, 5, 6, 0], jnp.int32),
         jnp.asarray(6, jnp.int32),
         jnp.array([9, 5, 1, 0], jnp.int32),
+        jnp.array([9, 5, 1, 0], jnp.int32),
         jnp.array([0, 2, 0, 0], jnp.int32),
         jnp.array([True, True, False, False]),
         jnp.asarray(False),
@@ -256,6 +257,7 @@ def test_the_assignment_is_scipys():
     sizes = np.exp(place[:, 2:])
     noise = np.c_[sizes * np.hypot([0.06, 0.03], [0.02, 0.01]), np.tile([0.03, 0.015], (M * P, 1))]
     boxes = np.asarray(frame.detections.boxes, float)
+    assert isinstance(frame.pixels, SampledHistogram)
     seen = np.asarray(frame.pixels.counts(frame.detections.boxes, 2), float)
     seen /= np.maximum(seen.sum(axis=3, keepdims=True), 1)
     expected = np.full((M, D), np.inf)
@@ -362,6 +364,25 @@ def test_who_is_gone_is_emptied():
     np.testing.assert_array_equal(moved.memory["lives"].confirmed, [True, True, True, False])
     kept = Bury(2, 3)(KEY, mixture, frame)
     np.testing.assert_array_equal(kept.log_weights, mixture.log_weights)
+
+
+@pytest.mark.parametrize(("seen", "believed"), [(1, False), (6, False), (7, True)])
+def test_who_stands_behind_another_is_believed_in_later(seen, believed):
+    """The third component, before the first: seen alone once, it has to be seen eight times."""
+    mixture, frame = tracked()
+    third = np.arange(M * P) // P == 2
+    place = mixture.particles.place.at[third, :2].set(jnp.array([22.0, 20.0]))
+    lives = mixture.memory["lives"]._replace(seen=jnp.array([9, 5, seen, 0], jnp.int32))
+    mixture = mixture.replace(
+        particles=ObjectState(place, mixture.particles.velocity, mixture.particles.label),
+        memory=mixture.memory | {"lives": lives},
+    )
+    after = Bury(2, 20, 8, 0.4)(KEY, mixture, frame).memory["lives"]
+    np.testing.assert_array_equal(after.confirmed, [True, True, believed, False])
+    np.testing.assert_array_equal(after.alone[2], 1)
+    # To nobody it is a rival where others do not count as contact.
+    apart = Bury(2, 20, 8, 3.0)(KEY, mixture, frame).memory["lives"]
+    np.testing.assert_array_equal(apart.confirmed, [True, True, True, False])
 
 
 def test_masses_are_shared_and_weights_within_components_kept():

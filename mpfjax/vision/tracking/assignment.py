@@ -10,7 +10,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.indexing import take
 from mpfjax.vision.detections import Detections
-from mpfjax.vision.histograms import bhattacharyya, normalise
+from mpfjax.vision.histograms import bhattacharyya
 from mpfjax.vision.tracking.memory import ASSIGNED, LIVES, REFERENCES, SCORES, remember
 from mpfjax.vision.tracking.model import DetectedObjectModel
 from mpfjax.vision.tracking.observation import TrackedFrame
@@ -65,10 +65,15 @@ class Assign(AbstractMove):
         """Settle whose each detection is."""
         del key
         cost = self.costs(mixture, observation)
-        rows, columns = hungarian_algorithm(cost)
-        possible = cost[rows, columns] < _IMPOSSIBLE
+        # A column of its own for each component that gets none: without, the algorithm would try
+        # one impossible pair after the other.
+        none = jnp.where(jnp.eye(len(cost), dtype=bool), _IMPOSSIBLE, 2 * _IMPOSSIBLE)
+        pairs = jnp.where(cost < _IMPOSSIBLE, cost, 2 * _IMPOSSIBLE)
+        rows, columns = hungarian_algorithm(
+            jnp.concatenate([pairs, none.astype(cost.dtype)], axis=1)
+        )
         source = jnp.full(mixture.num_components, _NONE, jnp.int32)
-        chosen = jnp.where(possible, columns.astype(jnp.int32), _NONE)
+        chosen = jnp.where(columns < cost.shape[1], columns.astype(jnp.int32), _NONE)
         return remember(mixture, assigned=source.at[rows].set(chosen))
 
     def costs(self, mixture: ParticleMixture, observation: TrackedFrame) -> Float[Array, "m d"]:
@@ -110,8 +115,8 @@ class Assign(AbstractMove):
         if observation.pixels is None or self.colour_cost == 0:
             return jnp.zeros((mixture.num_components, len(observation.detections.boxes)))
         references = mixture.memory[REFERENCES]
-        counts = observation.pixels.counts(observation.detections.boxes, references.shape[1])
-        distances = bhattacharyya(normalise(counts)[None], references[:, None])
+        seen = observation.detected_colours(references.shape[1])
+        distances = bhattacharyya(seen[None], references[:, None])
         known = jnp.any(references > 0, axis=(1, 2, 3))[:, None]
         return self.colour_cost * jnp.where(known, jnp.mean(jnp.sum(distances, 3), 2), 0.0)
 

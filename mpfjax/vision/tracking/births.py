@@ -98,6 +98,7 @@ class Found(AbstractMove):
             identities=jnp.where(born, lives.last_identity + number, lives.identities),
             last_identity=lives.last_identity + number[-1],
             seen=jnp.where(born, 1, lives.seen),
+            alone=jnp.where(born, 1, lives.alone),
             unseen=jnp.where(born, 0, lives.unseen),
             full=jnp.sum(founding, dtype=jnp.int32) > number[-1],
         )

@@ -7,9 +7,8 @@ from jaxtyping import Array, Bool, Key
 from mpfjax.checks import check_share, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
+from mpfjax.operations.indexing import take
 from mpfjax.vision.colours import AbstractColours
-from mpfjax.vision.histograms import normalise
-from mpfjax.vision.tracking.assignment import own_detections
 from mpfjax.vision.tracking.memory import ASSIGNED, LIVES, REFERENCES, mean_boxes, remember
 from mpfjax.vision.tracking.observation import TrackedFrame, overlap
 
@@ -59,14 +58,14 @@ class LearnColours(AbstractMove):
         if observation.pixels is None:
             return mixture
         references = mixture.memory[REFERENCES]
-        own = own_detections(mixture.memory[ASSIGNED], observation.detections)
-        seen = normalise(observation.pixels.counts(own.boxes, self.num_parts))
+        source = mixture.memory[ASSIGNED]
+        seen = take(observation.detected_colours(self.num_parts), jnp.maximum(source, 0))
         boxes, alive = mean_boxes(mixture), mixture.memory[LIVES].alive
         others = alive[None] & ~jnp.eye(len(boxes), dtype=bool)
         alone = ~jnp.any((overlap(boxes, boxes) > self.contact) & others, axis=1)
         known = jnp.any(references > 0, axis=(1, 2, 3))
         # What holds no pixel teaches nothing.
-        teaches = own.valid & jnp.any(seen > 0, axis=(1, 2, 3)) & (alone | ~known)
+        teaches = (source >= 0) & jnp.any(seen > 0, axis=(1, 2, 3)) & (alone | ~known)
         rate = jnp.where(teaches, jnp.where(known, self.adaptation, 1.0), 0.0)
         rate = rate.astype(references.dtype)[:, None, None, None]
         return remember(mixture, references=(1 - rate) * references + rate * seen)

@@ -4,12 +4,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Key, PyTree
 
-from mpfjax.checks import check_whole
+from mpfjax.checks import check_positive, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.segments import spread
 from mpfjax.vision.tracking.memory import ASSIGNED, EXTENT, LIVES, Lives, mean_boxes, remember
-from mpfjax.vision.tracking.observation import TrackedFrame, within
+from mpfjax.vision.tracking.observation import TrackedFrame, covered, within
 
 
 class Bury(AbstractMove):
@@ -18,18 +18,28 @@ class Bury(AbstractMove):
     A component dies where no detection has been assigned to it for more than `patience` frames in a
     row, for more than none while it is not confirmed; where its centre has left the frame; and
     where all its particles have zero likelihood. It is confirmed once detections have borne it out
-    in `confirmation` frames. Where there are no pixels, the frame reaches as far as all
-    detections so far. Memory: `Lives`, with `Found`, and that extent.
+    in `confirmation` frames in which it stood alone, or in `confirmation_in_contact` of whatever
+    kind. It does not stand alone where older, confirmed components cover more than the share
+    `contact` of its box: what is found between or before two objects is often a second detection of
+    one of them. Where there are no pixels, the frame reaches as far as all detections so far.
+    Memory: `Lives`, with `Found`, and that extent.
 
     Deaths are decided and not sampled (`approximate` is true). Raises `ValueError` for a number of
-    frames that is not whole, or below 1.
+    frames that is not whole, or below 1, and a share that is not positive.
     """
 
     confirmation: int = eqx.field(static=True, default=2)
     patience: int = eqx.field(static=True, default=20)
+    confirmation_in_contact: int = eqx.field(static=True, default=4)
+    contact: float = eqx.field(static=True, default=0.4)
 
     def __check_init__(self) -> None:
-        check_whole(confirmation=self.confirmation, patience=self.patience)
+        check_whole(
+            confirmation=self.confirmation,
+            patience=self.patience,
+            confirmation_in_contact=self.confirmation_in_contact,
+        )
+        check_positive(contact=self.contact)
 
     @property
     def approximate(self) -> bool:
@@ -47,6 +57,7 @@ class Bury(AbstractMove):
         kept = lives._replace(
             identities=jnp.where(dead, 0, lives.identities),
             seen=jnp.where(dead, 0, lives.seen),
+            alone=jnp.where(dead, 0, lives.alone),
             unseen=jnp.where(dead, 0, lives.unseen),
             confirmed=lives.confirmed & ~dead,
         )
@@ -61,12 +72,23 @@ class Bury(AbstractMove):
         borne_out = mixture.memory[ASSIGNED] >= 0
         seen = lives.seen + borne_out.astype(jnp.int32)
         unseen = jnp.where(borne_out, 0, lives.unseen + 1)
-        confirmed = lives.alive & (seen >= self.confirmation)
+        alone = lives.alone + (borne_out & ~self._in_contact(mixture)).astype(jnp.int32)
+        confirmed = lives.alive & (
+            (alone >= self.confirmation) | (seen >= self.confirmation_in_contact)
+        )
         patience = jnp.where(confirmed, self.patience, 0)
         stays = lives.alive & mixture.active & (unseen <= patience)
         extent = observation.extent(mixture.memory[EXTENT])
         stays &= within(mean_boxes(mixture), extent)
         dies = ~spread(stays, mixture.component_indicators)
         log_weights = jnp.where(dies, -jnp.inf, mixture.log_weights)
-        lives = lives._replace(seen=seen, unseen=unseen, confirmed=confirmed)
+        lives = lives._replace(seen=seen, alone=alone, unseen=unseen, confirmed=confirmed)
         return remember(mixture.replace(log_weights=log_weights), lives=lives, extent=extent)
+
+    def _in_contact(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
+        """Whether older components that are believed in cover much of each component's box."""
+        lives: Lives = mixture.memory[LIVES]
+        boxes, names = mean_boxes(mixture), lives.identities
+        older = lives.confirmed[None] & (names[None] < names[:, None])
+        shares = jnp.where(older, covered(boxes, boxes), 0.0)
+        return jnp.sum(shares, axis=1) > self.contact

@@ -24,7 +24,8 @@ class Lives(NamedTuple):
     """Of `Bury` and `Found`: who each component is, and how well it is borne out.
 
     - `identities`: 0 for a dead component; `last_identity`: the highest ever given.
-    - `seen`, `unseen`: in how many frames a detection bore it out, and for how many none has.
+    - `seen`, `unseen`: in how many frames a detection bore it out, and for how many none has;
+      `alone`: in how many of the first it stood alone.
     - `confirmed`: whether it was borne out often enough to be believed.
     - `full`: whether there was no room for a component in the last frame.
     """
@@ -32,6 +33,7 @@ class Lives(NamedTuple):
     identities: Int[Array, " m"]
     last_identity: Int[Array, ""]
     seen: Int[Array, " m"]
+    alone: Int[Array, " m"]
     unseen: Int[Array, " m"]
     confirmed: Bool[Array, " m"]
     full: Bool[Array, ""]
@@ -41,7 +43,7 @@ class Lives(NamedTuple):
         """Nobody lives yet."""
         nobody = jnp.zeros(num_components, jnp.int32)
         zero = jnp.zeros((), jnp.int32)
-        return cls(nobody, zero, nobody, nobody, nobody > 0, zero > 0)
+        return cls(nobody, zero, nobody, nobody, nobody, nobody > 0, zero > 0)
 
     @property
     def alive(self) -> Bool[Array, " m"]:

@@ -13,9 +13,9 @@ from mpfjax.operations.indexing import take
 from mpfjax.operations.matrices import row_sums
 from mpfjax.vision.detections import Detections
 from mpfjax.vision.histograms import IntegralHistogram, bhattacharyya, normalise
-from mpfjax.vision.sampled_histograms import SampledHistogram
+from mpfjax.vision.sampled_histograms import SampledBoxes, SampledHistogram
 
-Pixels = IntegralHistogram | SampledHistogram
+Pixels = IntegralHistogram | SampledHistogram | SampledBoxes
 
 
 class ObjectState(eqx.Module):
@@ -176,6 +176,8 @@ def unlikeness(
     pixels: Pixels, boxes: Float[Array, "n 4"], references: Float[Array, "n parts channels bins"]
 ) -> Float[Array, " n"]:
     """The mean B² of each box's bands from a reference of its own; zero where that is empty."""
+    if isinstance(pixels, SampledBoxes):
+        raise ValueError("pixels: those of detections alone do not show what particles cover")
     histograms = normalise(pixels.counts(boxes, references.shape[1]))
     distances = jnp.mean(jnp.sum(bhattacharyya(histograms, references), axis=2), axis=1)
     return jnp.where(jnp.any(references > 0, axis=(1, 2, 3)), distances, 0.0)

@@ -6,6 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mpfjax.vision.detections import Detections
+from mpfjax.vision.histograms import normalise
+from mpfjax.vision.sampled_histograms import SampledBoxes
 from mpfjax.vision.tracking.model import Pixels
 
 
@@ -15,11 +17,18 @@ class TrackedFrame(NamedTuple):
     detections: Detections
     pixels: Pixels | None
 
+    def detected_colours(self, num_parts: int) -> Float[Array, "d parts channels bins"]:
+        """The histograms of each detection's bands; None has a colour where it holds no pixel."""
+        if isinstance(self.pixels, SampledBoxes):
+            return normalise(self.pixels.counts(num_parts))
+        assert self.pixels is not None
+        return normalise(self.pixels.counts(self.detections.boxes, num_parts))
+
     def extent(self, known: Float[Array, "4"]) -> Float[Array, "4"]:
         """Left, top, right and bottom of the frame, or else of `known` and the detections."""
         if self.pixels is not None:
             size = [0, 0, self.pixels.width, self.pixels.height]
-            return jnp.asarray(size, known.dtype)
+            return jnp.stack([jnp.asarray(side, known.dtype) for side in size])
         valid, boxes = self.detections.valid[:, None], self.detections.boxes
         low, high = boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2
         lowest = jnp.min(jnp.where(valid, low, jnp.inf), axis=0, initial=jnp.inf)
@@ -37,8 +46,18 @@ def within(boxes: Float[Array, "k 4"], extent: Float[Array, "4"]) -> Bool[Array,
 
 def overlap(a: Float[Array, "m 4"], b: Float[Array, "d 4"]) -> Float[Array, "m d"]:
     """Intersection over union of every box with every other, 0 where one has no area."""
-    low = jnp.maximum(a[:, None, :2] - a[:, None, 2:] / 2, b[None, :, :2] - b[None, :, 2:] / 2)
-    high = jnp.minimum(a[:, None, :2] + a[:, None, 2:] / 2, b[None, :, :2] + b[None, :, 2:] / 2)
-    common = jnp.prod(jnp.maximum(high - low, 0.0), axis=2)
+    common = _common(a, b)
     union = jnp.prod(a[:, 2:], axis=1)[:, None] + jnp.prod(b[:, 2:], axis=1)[None] - common
     return jnp.where(union > 0, common / jnp.where(union > 0, union, 1.0), 0.0)
+
+
+def covered(a: Float[Array, "m 4"], b: Float[Array, "d 4"]) -> Float[Array, "m d"]:
+    """The share of each box of `a` that every box of `b` covers, 0 where the first has no area."""
+    area = jnp.prod(a[:, 2:], axis=1)[:, None]
+    return jnp.where(area > 0, _common(a, b) / jnp.where(area > 0, area, 1.0), 0.0)
+
+
+def _common(a: Float[Array, "m 4"], b: Float[Array, "d 4"]) -> Float[Array, "m d"]:
+    low = jnp.maximum(a[:, None, :2] - a[:, None, 2:] / 2, b[None, :, :2] - b[None, :, 2:] / 2)
+    high = jnp.minimum(a[:, None, :2] + a[:, None, 2:] / 2, b[None, :, :2] + b[None, :, 2:] / 2)
+    return jnp.prod(jnp.maximum(high - low, 0.0), axis=2)

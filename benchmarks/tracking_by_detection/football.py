@@ -1,0 +1,72 @@
+"""Rendered football with simulated detections: a video that no tracker here was made for.
+
+Players of two teams that look alike, at 12 frames a second, before a camera that pans. A detector
+is simulated that errs as real ones do: it misses players, above all those behind others, its boxes
+are off by some hundredths of their sides, and it finds some that are none, less surely.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from mpfjax.vision.scenes import Scene, football_scene
+
+FRAMES_PER_SECOND = 12.0
+NUM_FRAMES = 120
+MISSES = 0.1  # of players that nobody hides
+HIDDEN = 0.6  # who is covered by more than this share is not found
+FALSE_ONES = 0.35  # in a frame, on average
+ERROR = 0.04  # of a box, in its widths and heights
+
+
+class Match(NamedTuple):
+    """How many play, and how large the picture is."""
+
+    name: str
+    players_of_a_team: int
+    height: int
+    width: int
+
+
+MATCHES = (Match("football", 4, 288, 512), Match("football_20", 10, 1080, 1920))
+
+
+def play(match: Match, seed: int, num_frames: int = NUM_FRAMES) -> Scene:
+    """The rendered video, with the true boxes of those whose centre is in the picture."""
+    scene = football_scene(
+        jax.random.key(seed),
+        num_frames,
+        num_players=match.players_of_a_team,
+        num_opponents=match.players_of_a_team,
+        height=match.height,
+        width=match.width,
+    )
+    centres = scene.tracks[:, 2:4] + scene.tracks[:, 4:] / 2
+    inside = ((centres >= 0) & (centres < [match.width, match.height])).all(axis=1)
+    return scene._replace(tracks=scene.tracks[inside])
+
+
+def detect(match: Match, truth: np.ndarray, seed: int) -> np.ndarray:
+    """Rows (frame, -1, x, y, w, h, score) of the simulated detector."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for frame in np.unique(truth[:, 0]):
+        boxes = truth[truth[:, 0] == frame, 2:]
+        found = boxes[(rng.random(len(boxes)) >= MISSES) & (_hidden(boxes) <= HIDDEN)]
+        found = found + rng.normal(0, ERROR, found.shape) * np.tile(found[:, 2:], 2)
+        number = rng.poisson(FALSE_ONES)
+        size = boxes[rng.integers(len(boxes), size=number), 2:]
+        corners = rng.uniform(0, 1, (number, 2)) * ([match.width, match.height] - size)
+        both = np.concatenate([found, np.column_stack([corners, size])])
+        scores = np.concatenate([rng.beta(8, 2, len(found)), rng.beta(4, 4, number)])
+        rows.append(np.column_stack([np.full(len(both), frame), -np.ones(len(both)), both, scores]))
+    return np.concatenate(rows)
+
+
+def _hidden(boxes: np.ndarray) -> np.ndarray:
+    """The largest share of each box that one who stands nearer, lower in the picture, covers."""
+    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
+    sides = np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
+    shares = np.prod(np.maximum(sides, 0), axis=2) / np.prod(boxes[:, 2:], axis=1)[:, None]
+    return np.where(high[None, :, 1] > high[:, None, 1], shares, 0).max(axis=1, initial=0)
