@@ -108,6 +108,7 @@ BUILT = {
         mpfjax.Exclusion, {"strength": 1.0, "radius": 0.5, "features": None, "scale": 1.0}
     ),
     "Every": (mpfjax.Every, {"num_steps": 2, "moves": [mpfjax.KMeans(1)]}),
+    "Prune": (mpfjax.Prune, {"least_share": 1e-3}),
     "Exchange": (mpfjax.Exchange, {"threshold": 0.5}),
     "Propagate": (mpfjax.Propagate, {"model": MODEL, "proposal": None, "gradient": "none"}),
     "Predict": (mpfjax.Predict, {"model": MODEL, "gradient": "none"}),

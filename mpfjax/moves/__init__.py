@@ -19,6 +19,7 @@ from mpfjax.moves.pool import Pool as Pool
 from mpfjax.moves.propagation import Predict as Predict
 from mpfjax.moves.propagation import Propagate as Propagate
 from mpfjax.moves.propagation import Weigh as Weigh
+from mpfjax.moves.prune import Prune as Prune
 from mpfjax.moves.random_partition import RandomPartition as RandomPartition
 from mpfjax.moves.resampling import Resample as Resample
 from mpfjax.moves.split import Split as Split

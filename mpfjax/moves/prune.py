@@ -1,0 +1,43 @@
+"""Prune: components that have become hopeless are emptied."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Key, PyTree
+
+from mpfjax.checks import check_inner_share
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractMove
+from mpfjax.operations.segments import spread
+
+
+class Prune(AbstractMove):
+    """Empty the components whose mass is below a share of the heaviest component's.
+
+    Mixture weights are posterior odds (Vermaak et al. 2003, eq. 4). Resampling deals all living
+    components the same number of slots, however small their odds; a pruned one leaves its slots to
+    the others. With M components, a step loses at most the share (M - 1) `least_share` of the mass,
+    and log Ẑ falls by as much: an approximation with a bound that you choose.
+
+    Raises `ValueError` for a share outside (0, 1). Use it after a propagation, before regrouping,
+    where hypotheses that turned out wrong hold particles that others need.
+    """
+
+    least_share: float = eqx.field(static=True, default=1e-6)
+
+    def __check_init__(self) -> None:
+        check_inner_share(least_share=self.least_share)
+
+    @property
+    def approximate(self) -> bool:
+        """True: a little mass is thrown away."""
+        return True
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+    ) -> ParticleMixture:
+        """Take all weight from the hopeless components."""
+        del key, observation
+        masses = mixture.log_mixture_weights
+        hopeless = masses < jnp.max(masses) + jnp.log(self.least_share)
+        dies = spread(hopeless, mixture.component_indicators)
+        return mixture.replace(log_weights=jnp.where(dies, -jnp.inf, mixture.log_weights))
