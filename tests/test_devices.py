@@ -302,7 +302,7 @@ class TestExchange:
 
 
 class TestProcesses:
-    @pytest.mark.parametrize("which", ["first", *thorough(["second"])])
+    @pytest.mark.parametrize("which", thorough(["first", "second"]))
     def test_must_all_pass_the_same_and_take_part(self, started, which):
         told = started[which][1]
         assert "keys, filter, observations: not the same in every process" in told["other keys"]

@@ -8,6 +8,7 @@ import scipy.stats
 
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter
+from tests.user_models import ScalarLinear
 
 OBSERVATIONS = np.array([[0.4, -0.2], [1.0, 0.3], [0.1, 0.8]])
 MODEL = {
@@ -124,5 +125,5 @@ def test_bad_input_is_named():
         kalman_filter(model, jnp.zeros((3, 1)))
     with pytest.raises(ValueError, match="grid: shape"):
         grid_filter(mpfjax.QuadraticModel(), jnp.zeros(2), jnp.zeros(1))
-    with pytest.raises(ValueError, match="model: LinearGaussianModel defines no log_initial"):
-        grid_filter(model, jnp.zeros(2), jnp.linspace(-1.0, 1.0, 9))
+    with pytest.raises(ValueError, match="model: ScalarLinear defines no log_initial"):
+        grid_filter(ScalarLinear(), jnp.zeros(2), jnp.linspace(-1.0, 1.0, 9))

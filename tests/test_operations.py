@@ -28,6 +28,7 @@ from mpfjax.operations.segments import (
     spread,
 )
 from mpfjax.operations.stored import to_int, whole_blocks
+from tests.marking import thorough
 from tests.precision import float64
 
 RNG = np.random.default_rng(0)
@@ -205,7 +206,8 @@ class TestSegments:
 
 
 @pytest.mark.parametrize(
-    ("n", "m"), [(1, 5), (31, 2), (32, 64), (33, 256), (64, 257), (1000, 64), (1024, 31)]
+    ("n", "m"),
+    [(1, 5), (33, 256), (64, 257), *thorough([(31, 2), (32, 64), (1000, 64), (1024, 31)])],
 )
 def test_order_by_segment_counts_and_sorts_alike(n, m):
     rng = np.random.default_rng(n + m)

@@ -125,6 +125,7 @@ def test_islands_alone(tmp_path, capsys):
     assert "--islands: 81" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_the_price_is_in_units_of_the_plain_filter(tmp_path, capsys):
     arguments = ["--quick", "--repeats", "2", "--axes", "--devices", "--processes"]
     assert scaling.main([*arguments, "--out", str(tmp_path)]) == 0

@@ -85,6 +85,7 @@ def test_tracks_hold_one_box_a_component_and_frame(finished):
     assert (counts[1] <= 10).all()
 
 
+@pytest.mark.thorough
 def test_without_a_truth_the_scores_are_null_and_the_rest_is_written(sequence, tmp_path):
     video = tmp_path / "video.mp4"
     write_video(video, read_frames(sequence))

@@ -10,6 +10,7 @@ import pytest
 
 import mpfjax
 from mpfjax.smoothing import sample_trajectories, trace_ancestors
+from tests.marking import quick_of
 from tests.smoothing.exact_smoothers import gaussian_smoother, grid_smoother
 
 NUM_PARTICLES, NUM_RUNS, NUM_TRAJECTORIES = 60, 1500, 4
@@ -86,7 +87,7 @@ def assert_near(ratios, estimates, expected):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("name", quick_of(FILTERS, ("two dimensions", "mpf", "dps")))
 def test_moments_and_pairs_are_the_exact_ones(name, method):
     log_evidence, drawn, _ = sampled(name)
     ratios = np.exp(log_evidence - log_evidence.max())

@@ -73,6 +73,7 @@ class TestMaximum:
         runs = [kalman_filter(model, sequence[:, None]) for sequence in sequences]
         return sum(run.log_marginal_likelihood for run in runs)
 
+    @pytest.mark.thorough
     def test_is_found_with_its_standard_errors(self, sequences):
         start = jnp.zeros(2)
         value = jax.jit(jax.value_and_grad(lambda reals: -self.log_evidence(reals, sequences)))

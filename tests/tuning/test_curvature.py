@@ -10,6 +10,7 @@ import pytest
 import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.tuning import standard_errors
+from tests.marking import thorough
 from tests.user_models import ScalarLinear
 
 TRUTH = {"a": 0.8, "q": 0.6, "h": 1.0, "r": 0.5, "m": 0.5, "p": 0.3}
@@ -61,7 +62,7 @@ def exact_errors(names):
     return dict(zip(names, np.sqrt(np.diag(np.linalg.inv(information))), strict=True))
 
 
-@pytest.mark.parametrize("unit", [1e-3, 100.0, 1e4])
+@pytest.mark.parametrize("unit", [1e-3, *thorough([100.0, 1e4])])
 def test_a_location_has_its_error_in_any_unit(unit):
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of seeds that would be too few
