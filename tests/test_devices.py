@@ -309,7 +309,7 @@ class TestProcesses:
         assert "leaves 1 of the processes without any" in told["left out"]
 
 
-@pytest.mark.parametrize("which", ["eight", "first", "second"])
+@pytest.mark.parametrize("which", ["eight", *thorough(["first", "second"])])
 class TestManyDevices:
     def test_they_take_part(self, started, which):
         assert started[which][1]["devices"] == (8 if which == "eight" else 2)

@@ -111,6 +111,7 @@ def bootstrap_by_hand(rng, n):
 
 
 class TestRunners:
+    @pytest.mark.thorough
     def test_without_jit_the_run_is_the_same(self):
         filter, key = CHAINS["kmeans only"](QUADRATIC), jax.random.key(4)
         compiled = mpfjax.run_filter(key, filter, OBSERVATIONS[:2])

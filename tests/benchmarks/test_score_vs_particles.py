@@ -12,7 +12,7 @@ from benchmarks import score_vs_particles as benchmark
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def study(tmp_path_factory):
     """One short study, all three filters."""
     out = tmp_path_factory.mktemp("score")
     status = benchmark.main(["--seeds", "3", "--particles", "20", "40", "--out", str(out)])
@@ -20,8 +20,8 @@ def finished(tmp_path_factory):
     return out, json.loads((out / "score_vs_particles.json").read_text())
 
 
-def test_writes_one_entry_for_each_filter_and_size_with_one_score_a_seed(finished):
-    _, written = finished
+def test_writes_one_entry_for_each_filter_and_size_with_one_score_a_seed(study):
+    _, written = study
     entries = {(entry["filter"], entry["particles"]) for entry in written["results"]}
     assert entries == {(f, n) for f in ("pf", "mpf", "guided_mpf") for n in (20, 40)}
     for entry in written["results"]:
@@ -31,9 +31,9 @@ def test_writes_one_entry_for_each_filter_and_size_with_one_score_a_seed(finishe
     assert written["settings"]["seeds"] == 3
 
 
-def test_scores_are_those_of_the_filters_own_particles(finished):
+def test_scores_are_those_of_the_filters_own_particles(study):
     """Run 1 of the mixture particle filter again, and score it here with numpy alone."""
-    _, written = finished
+    _, written = study
     model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
     truth, observations = benchmark.simulate(written["settings"]["data_seed"])
     keys = jax.random.split(jax.random.fold_in(jax.random.key(written["settings"]["seed"]), 1), 3)
@@ -47,14 +47,14 @@ def test_scores_are_those_of_the_filters_own_particles(finished):
     np.testing.assert_allclose(entry["scores"][1], expected, atol=0.02)
 
 
-def test_draws_both_figures(finished):
-    out, _ = finished
+def test_draws_both_figures(study):
+    out, _ = study
     for name in ("score_vs_particles.png", "typical_run.png"):
         assert (out / name).stat().st_size > 10_000
 
 
 def test_an_interruption_leaves_what_was_finished_and_the_next_run_goes_on(
-    finished, tmp_path, monkeypatch, capsys
+    study, tmp_path, monkeypatch, capsys
 ):
     real, built = mpfjax.running.studies.monte_carlo, []
 
@@ -82,10 +82,8 @@ def test_an_interruption_leaves_what_was_finished_and_the_next_run_goes_on(
     monkeypatch.setattr(mpfjax.running.studies, "monte_carlo", noted)
     assert benchmark.main(arguments) == 0
     assert built == [40, 40, 40]
-    assert json.loads((tmp_path / "score_vs_particles.json").read_text()) == finished[1]
-    assert {path.name for path in tmp_path.iterdir()} == {
-        path.name for path in finished[0].iterdir()
-    }
+    assert json.loads((tmp_path / "score_vs_particles.json").read_text()) == study[1]
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in study[0].iterdir()}
 
 
 @pytest.mark.parametrize(

@@ -74,6 +74,7 @@ def test_a_location_has_its_error_in_any_unit(unit):
     assert found["m"] / unit == pytest.approx(exact_errors("m")["m"], rel=0.05)
 
 
+@pytest.mark.thorough
 def test_numbers_of_very_different_units_are_told_together():
     """Standard errors from 1e-6 to 1e3, none of them by a transform."""
     units, names = (1e3, 1e-3), ("a", "h", "m", "r")

@@ -330,6 +330,7 @@ def test_trackers_are_made_by_the_name_of_their_filter():
         make_tracker("pf")
 
 
+@pytest.mark.thorough
 def test_drawn_boxes_give_one_track_each_in_the_order_given():
     first = walks()[walks()[:, 0] == 1][:, 2:6]
     run = list(follow_boxes(stills()[:4], first[::-1]))
@@ -340,6 +341,7 @@ def test_drawn_boxes_give_one_track_each_in_the_order_given():
         np.testing.assert_allclose(rows[:, 2:4], expected[:, :2], atol=9)
 
 
+@pytest.mark.thorough
 def test_more_boxes_than_the_recipes_have_components_have_one_each():
     corners = np.stack(np.meshgrid([2.0, 18, 34, 50], [1.0, 17, 33]), axis=-1).reshape(-1, 2)
     boxes = np.concatenate([corners, np.tile([10.0, 14.0], (12, 1))], axis=1)
