@@ -33,6 +33,7 @@ from mpfjax.vision.loop import track as track
 from mpfjax.vision.object_moves import ObjectExclusion as ObjectExclusion
 from mpfjax.vision.object_moves import PruneHypotheses as PruneHypotheses
 from mpfjax.vision.recipes import PRESETS as PRESETS
+from mpfjax.vision.sampled_histograms import SampledBoxes as SampledBoxes
 from mpfjax.vision.sampled_histograms import SampledHistogram as SampledHistogram
 from mpfjax.vision.scenes import Scene as Scene
 from mpfjax.vision.scenes import football_scene as football_scene
