@@ -12,7 +12,7 @@ OPENCV = importlib.util.find_spec("cv2") is not None
 SMALL = ["--size", "70", "50", "--repeats", "2"]
 
 
-@pytest.mark.skipif(not OPENCV, reason="OpenCV comes with the extra 'video'")
+@pytest.mark.skipif(not OPENCV, reason="OpenCV comes with the extra 'video', which 'test' brings")
 class TestBesideOpenCV:
     def test_both_are_timed(self, tmp_path, capsys):
         assert histograms.main([*SMALL, "--boxes", "3", "9", "--out", str(tmp_path)]) == 0

@@ -24,7 +24,7 @@ def test_objects_stay_in_the_frame_and_apart_and_move():
 
 
 def test_the_detector_finds_them():
-    pytest.importorskip("cv2", reason="OpenCV comes with the extra 'video'")
+    pytest.importorskip("cv2", reason="OpenCV comes with the extra 'video', which 'test' brings")
     street, detector = Street(*SMALL), BackgroundSubtraction()
     for t in range(12):
         found = detector.detect(street.frame(t))

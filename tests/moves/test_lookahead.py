@@ -48,7 +48,10 @@ def test_fully_adapted_weights_are_equal_and_the_evidence_varies_less():
         "bootstrap": mpfjax.particle_filter(TWO, 100),
     }
     keys = jax.random.split(jax.random.key(0), 300)
-    size = lambda mixture: mixture.effective_sample_size  # noqa: E731
+
+    def size(mixture):
+        return mixture.effective_sample_size
+
     runs = {name: mpfjax.monte_carlo(keys, filter, SEEN, size) for name, filter in filters.items()}
     np.testing.assert_allclose(runs["adapted"].collected, 100.0, rtol=1e-3)
     errors = {
@@ -69,7 +72,10 @@ def three_components():
 def test_what_is_expected_stays_the_same_in_every_component(ess_threshold):
     """E[Σ_{c_i = m} exp(ℓ_i) φ(x_i)] is what it was, whatever the look-ahead."""
     mixture = three_components()
-    look = lambda y, states: jnp.where(states > 1e3, -jnp.inf, y * states)  # noqa: E731
+
+    def look(y, states):
+        return jnp.where(states > 1e3, -jnp.inf, y * states)
+
     move = ResampleAhead(Resample("multinomial", ess_threshold), look)
 
     def sums(mixture):

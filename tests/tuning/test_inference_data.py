@@ -28,7 +28,9 @@ GIBBS = GibbsPosterior(
 
 @pytest.fixture(scope="module")
 def arviz():
-    return pytest.importorskip("arviz")
+    return pytest.importorskip(
+        "arviz", reason="the extra 'arviz' brings 125 MB, mostly pandas, and is not in 'test'"
+    )
 
 
 def test_of_metropolis_hastings(arviz):
