@@ -93,6 +93,7 @@ def mixture_particle_filter(
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
     particles_per_component: int | None = None,
+    allocation: str = "equal",
     sort_by: Callable[[PyTree], Array] | None = None,
     gradient: str = "none",
     features: Callable[[PyTree], Array] | None = None,
@@ -112,11 +113,13 @@ def mixture_particle_filter(
     these three moves see the particles (see `Features`; features of one particle, if the model
     is wrapped by `per_particle`). `merge`, `split` and `kmeans` replace those moves, for example
     with other thresholds, and bring their own features and scale. `regroup_every` is k where they
-    are to run at every k-th step only (see `Every`). `gradient` is that of `particle_filter`, and
-    `lookahead` that of `auxiliary_particle_filter`. Use it where the filtering distribution has
-    several modes and all of them must be kept.
+    are to run at every k-th step only (see `Every`). `gradient` is that of `particle_filter`,
+    `lookahead` that of `auxiliary_particle_filter`, and `allocation` that of `Resample`. Use it
+    where the filtering distribution has several modes and all of them must be kept.
     """
-    resample = Resample(scheme, ess_threshold, particles_per_component, sort_by, gradient)
+    resample = Resample(
+        scheme, ess_threshold, particles_per_component, sort_by, gradient, allocation=allocation
+    )
     proposal = propagating_proposal(proposal, lookahead)
     propagate = Propagate(model, proposal, _of_draws(gradient))
     moves = [resampling(resample, lookahead), propagate]

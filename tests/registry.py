@@ -86,6 +86,8 @@ REJUVENATIONS: dict[str, AbstractRejuvenation] = {
     "systematic, sorted": Resample(sort_by=lambda states: states[:, 0]),
     "systematic, fixed number": Resample(particles_per_component=5),
     "residual, fixed number, adaptive": Resample("residual", 0.5, 5),
+    "systematic, shared by variance": Resample(allocation="variance"),
+    "residual, shared by variance, adaptive": Resample("residual", 0.5, allocation="variance"),
     "soft": Resample(gradient="soft"),
     "soft, fixed number, adaptive": Resample("residual", 0.5, 5, gradient="soft", softness=0.3),
     "gaussian": GaussianRegeneration(),
@@ -200,6 +202,7 @@ CHAINS: dict[str, Callable[..., Filter]] = {
         for name, chain in _of_components(MANY_COMPONENTS).items()
         if name in OTHERWISE_OF_MANY
     },
+    "mpf shared by variance": _mpf(allocation="variance"),
     "regrouped every second step": _mpf(regroup_every=2),
     "resampled every second step": _chain(Every(2, [Resample("stratified"), KMeans(2)])),
     "predict and weigh": lambda model: Filter(

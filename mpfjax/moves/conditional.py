@@ -16,7 +16,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation, AbstractRejuvenation
 from mpfjax.moves.propagation import Predict, Propagate, Weigh, log_transition
 from mpfjax.moves.resampling import Resample
-from mpfjax.moves.slots import Slots, deal_slots, place_slots
+from mpfjax.moves.slots import Slots, place_slots
 from mpfjax.operations.generator import split, uniform
 from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import order_by_segment, spread
@@ -113,7 +113,7 @@ class ConditionalResample(AbstractRejuvenation):
     ) -> ParticleMixture:
         """Resample every component that is due around the reference."""
         due, counts = self.is_due(mixture), mixture.component_counts
-        targets = deal_slots(counts, due, mixture, self.move.particles_per_component)
+        targets = self.move.deal(mixture, due, counts)
         slots = place_slots(targets, mixture.num_particles)
         parents, slot = self._draw(key, mixture, due, targets, slots)
         num_slots = jnp.maximum(targets, 1).astype(mixture.log_weights.dtype)

@@ -25,11 +25,13 @@ from mpfjax.moves.slots import Slots, deal_slots, place_slots
 from mpfjax.moves.transport import require_ott, transport
 from mpfjax.operations.gradients import add_gradient
 from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import scaled_exp
 from mpfjax.operations.prefix_sums import count_starts, sum_before
 from mpfjax.operations.segments import segment_log_sum_exp, spread
 
 # Up to this number of components, each is resampled in a pass of its own over all particles.
 FEW_ROWS = 4
+ALLOCATIONS = ("equal", "variance")
 GRADIENTS = ("none", "stop", "soft", "ot", "straight_through")
 
 
@@ -51,6 +53,12 @@ class Resample(AbstractRejuvenation):
     - `particles_per_component`: None shares the slots equally among the living components that are
       resampled. A number k gives each living component k particles and leaves the other slots
       empty, as section 5.2 of the paper does.
+    - `allocation`: how the components share the slots, where `particles_per_component` is None.
+      "equal" is the paper's. "variance" deals component m a number in proportion to
+      (k_m Σ_{c_i = m} exp 2ℓ_i)^(1/2) = π_m (k_m / ESS_m)^(1/2), the standard deviation that k_m
+      independent particles give the mass of m, times k_m^(1/2): for a sum of such masses, these
+      numbers leave the least variance (Neyman 1934). Each living component has at least a tenth of
+      an equal share. Use it where components of little mass hold slots that others need.
     - `sort_by`: a function that gives each particle a number, (n,). Within their component the
       particles are resampled in the order of these numbers. Systematic and stratified resampling
       in a good order change the distribution least (Kitagawa 1996). With `stratified_normal`
@@ -81,8 +89,8 @@ class Resample(AbstractRejuvenation):
       mean squared spread of a component's particles, as Corenflos et al. scale it.
 
     "soft" and "ot" are approximate: Ẑ is biased. Raises `ValueError` for an unknown scheme or
-    gradient, a threshold outside [0, 1], k < 1, and s or ε out of range; `ImportError` for "ot"
-    without ott-jax.
+    gradient or allocation, a threshold outside [0, 1], k < 1, k together with an allocation by
+    variance, and s or ε out of range; `ImportError` for "ot" without ott-jax.
     """
 
     scheme: str = eqx.field(static=True, default="systematic")
@@ -92,6 +100,7 @@ class Resample(AbstractRejuvenation):
     gradient: str = eqx.field(static=True, default="none")
     softness: float = eqx.field(static=True, default=0.5)
     regularisation: float = eqx.field(static=True, default=0.5)
+    allocation: str = eqx.field(static=True, default="equal")
 
     def __check_init__(self) -> None:
         check_one_of(SCHEMES, scheme=self.scheme)
@@ -99,6 +108,12 @@ class Resample(AbstractRejuvenation):
         check_whole(**given(particles_per_component=self.particles_per_component))
         check_callable("a function of the particles", **given(sort_by=self.sort_by))
         check_one_of(GRADIENTS, gradient=self.gradient)
+        check_one_of(ALLOCATIONS, allocation=self.allocation)
+        if self.allocation != "equal" and self.particles_per_component is not None:
+            raise ValueError(
+                f"allocation: {self.allocation!r} has no say where particles_per_component is"
+                f" {self.particles_per_component}"
+            )
         check_positive(softness=self.softness, regularisation=self.regularisation)
         check_share(softness=self.softness)
         if self.gradient == "ot":
@@ -174,7 +189,7 @@ class Resample(AbstractRejuvenation):
         line = as_they_are(mixture) if as_they_stand else side_by_side(mixture, stays, self.sort_by)
         # If all living components are due, none keeps its particles.
         counts = due.astype(jnp.int32) if all_are_due else line.counts
-        targets = deal_slots(counts, due, mixture, self.particles_per_component)
+        targets = self.deal(mixture, due, counts)
         if as_they_stand and num_components == 1:
             # What is not redrawn keeps its place, and there may be empty slots before it.
             targets = jnp.where(due, targets, num_particles)
@@ -192,6 +207,17 @@ class Resample(AbstractRejuvenation):
             parents = jnp.where(spread(due, slots.components), parents, unmoved)
         parents = line.particles_at(jnp.clip(parents, 0, num_particles - 1))
         return _Drawn(parents, slots, targets, line)
+
+    def deal(
+        self, mixture: ParticleMixture, due: Bool[Array, " m"], counts: Int[Array, " m"]
+    ) -> Int[Array, " m"]:
+        """How many slots each component gets; those that are not `due` keep theirs, `counts`."""
+        demands = None
+        if self.allocation == "variance":
+            weights, _ = scaled_exp(mixture.log_weights)
+            sizes = mixture.component_counts.astype(weights.dtype)
+            demands = jnp.sqrt(sizes * mixture.component_sums(weights**2))
+        return deal_slots(counts, due, mixture, self.particles_per_component, demands)
 
     def _drawn_from(self, mixture: ParticleMixture) -> ParticleMixture:
         """The mixture whose weights the offspring are drawn in proportion to."""

@@ -1,0 +1,84 @@
+"""How the components share the slots: by what the variance of their masses asks for."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpfjax import QuadraticModel, Resample, mixture_particle_filter
+from mpfjax.moves.slots import LEAST_SHARE
+from tests.examples import make_mixture
+
+MOVE = Resample(allocation="variance")
+
+
+def dealt(mixture, move=MOVE):
+    """How many slots each component has after resampling."""
+    due = move.is_due(mixture)
+    targets = np.asarray(move.deal(mixture, due, mixture.component_counts))
+    moved = move(jax.random.key(0), mixture)
+    np.testing.assert_array_equal(moved.component_counts, targets)
+    return targets
+
+
+def three_components(masses, spreads, n=40):
+    """Components of these masses, whose log-weights have these standard deviations."""
+    labels = np.repeat(np.arange(3), n)
+    log_weights = np.random.default_rng(1).normal(size=3 * n) * np.repeat(spreads, n)
+    for label, mass in enumerate(masses):
+        own = labels == label
+        log_weights[own] += np.log(mass) - np.log(np.exp(log_weights[own]).sum())
+    return make_mixture(np.zeros((3 * n, 1)), log_weights, labels, 3)
+
+
+def test_no_other_numbers_leave_less_variance_of_the_sum_of_the_masses():
+    """Against every way to deal twelve slots to three components, by brute force."""
+    rng = np.random.default_rng(3)
+    labels, values = np.repeat([0, 1, 2], 4), rng.exponential(size=12) ** 2
+    mixture = make_mixture(np.zeros((12, 1)), np.log(values), labels, 3)
+    seconds = np.array([4 * np.sum(values[labels == m] ** 2) for m in range(3)])
+    ways = [way for way in itertools.product(range(1, 13), repeat=3) if sum(way) == 12]
+    variances = [float(np.sum(seconds / np.array(way))) for way in ways]
+    found = tuple(int(number) for number in dealt(mixture))
+    # The numbers in proportion are rounded, which costs a few in a hundred of so few slots.
+    assert variances[ways.index(found)] <= 1.05 * min(variances)
+    assert variances[ways.index((4, 4, 4))] > 1.1 * min(variances)
+
+
+def test_a_component_of_no_mass_keeps_its_least_share():
+    found = dealt(three_components((0.5, 0.5, 1e-12), (1.0, 1.0, 1.0)))
+    assert found.sum() == 120
+    assert found[2] == 120 // (3 * LEAST_SHARE)
+
+
+def test_equal_masses_share_by_the_spread_of_their_weights():
+    found = dealt(three_components((1.0, 1.0, 1.0), (0.0, 0.0, 1.5)))
+    assert abs(found[0] - found[1]) <= 1
+    assert found[2] > 1.3 * found[0]
+
+
+def test_dead_components_get_nothing_and_what_is_not_due_stays():
+    mixture = three_components((0.7, 0.3, 1.0), (0.0, 2.5, 2.5))
+    alive = mixture.replace(
+        log_weights=jnp.where(mixture.component_indicators == 2, -jnp.inf, mixture.log_weights)
+    )
+    found = dealt(alive, Resample(ess_threshold=0.5, allocation="variance"))
+    assert list(found) == [40, 80, 0]
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 29])
+def test_fewer_slots_than_components_fill_up_all_the_same(n):
+    rng = np.random.default_rng(n)
+    mixture = make_mixture(np.zeros((n, 1)), rng.normal(size=n), rng.integers(0, 8, n), 8)
+    found = dealt(mixture)
+    assert found.sum() == n
+    assert (found >= np.asarray(mixture.active)).all()
+
+
+def test_an_allocation_beside_a_fixed_number_or_of_an_unknown_name_is_refused():
+    with pytest.raises(ValueError, match=r"allocation: 'variance'.*particles_per_component is 5"):
+        Resample(particles_per_component=5, allocation="variance")
+    with pytest.raises(ValueError, match="allocation"):
+        mixture_particle_filter(QuadraticModel(0.3, 0.5, -2.0, 2.0), 10, 2, allocation="mass")
