@@ -24,6 +24,7 @@ from mpfjax.moves.propagation import Predict, Propagate, Weigh
 from mpfjax.moves.random_partition import RandomPartition
 from mpfjax.moves.resampling import Resample
 from mpfjax.moves.split import Split
+from mpfjax.moves.standing import HILBERT, SortBy
 from mpfjax.proposals import AbstractProposal
 
 
@@ -34,7 +35,8 @@ def particle_filter(
     proposal: AbstractProposal | None = None,
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
-    sort_by: Callable[[PyTree], Array] | None = None,
+    sort_by: SortBy | None = None,
+    noise: str = "independent",
     gradient: str = "none",
 ) -> Filter:
     """The standard particle filter: resample, propagate.
@@ -42,11 +44,15 @@ def particle_filter(
     Vermaak et al. (2003), section 3, with one component; bootstrap unless a proposal is given.
     Use it for a filtering distribution with one mode; of several modes it loses all but one.
     `gradient` is that of `Resample`. "stop" is also that of `Propagate`: take it for tuning.
+    `noise` is that of `Propagate`. With "rqmc", particles stand along a Hilbert curve of their
+    state unless `sort_by` says otherwise, and the filter is sequential quasi-Monte Carlo (Gerber
+    and Chopin 2015).
     """
+    sort_by = _standing(sort_by, noise)
     resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
     return Filter(
         model,
-        moves=[resample, Propagate(model, proposal, _of_draws(gradient))],
+        moves=[resample, Propagate(model, proposal, _of_draws(gradient), noise)],
         num_particles=num_particles,
     )
 
@@ -59,7 +65,8 @@ def auxiliary_particle_filter(
     proposal: AbstractProposal | None = None,
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
-    sort_by: Callable[[PyTree], Array] | None = None,
+    sort_by: SortBy | None = None,
+    noise: str = "independent",
     gradient: str = "none",
 ) -> Filter:
     """The auxiliary particle filter: resample by w times a look-ahead to y_t, propagate.
@@ -69,15 +76,17 @@ def auxiliary_particle_filter(
     Ẑ is unbiased whatever it is; see `ResampleAhead`. With
     `GaussNewtonProposal(model, 1, inflation=1.0)` for a `LinearGaussianModel` the filter is fully
     adapted: ν is p(y_t | x_{t-1}), x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are
-    equal. Use it where the likelihood is narrow and tells early which particles will survive.
+    equal. `noise` is that of `particle_filter`. Use it where the likelihood is narrow and tells
+    early which particles will survive.
     """
+    sort_by = _standing(sort_by, noise)
     resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
     proposal = propagating_proposal(proposal, lookahead)
     return Filter(
         model,
         moves=[
             ResampleAhead(resample, lookahead),
-            Propagate(model, proposal, _of_draws(gradient)),
+            Propagate(model, proposal, _of_draws(gradient), noise),
         ],
         num_particles=num_particles,
     )
@@ -94,7 +103,8 @@ def mixture_particle_filter(
     ess_threshold: float = 1.0,
     particles_per_component: int | None = None,
     allocation: str = "equal",
-    sort_by: Callable[[PyTree], Array] | None = None,
+    sort_by: SortBy | None = None,
+    noise: str = "independent",
     gradient: str = "none",
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
@@ -113,15 +123,18 @@ def mixture_particle_filter(
     these three moves see the particles (see `Features`; features of one particle, if the model
     is wrapped by `per_particle`). `merge`, `split` and `kmeans` replace those moves, for example
     with other thresholds, and bring their own features and scale. `regroup_every` is k where they
-    are to run at every k-th step only (see `Every`). `gradient` is that of `particle_filter`,
-    `lookahead` that of `auxiliary_particle_filter`, and `allocation` that of `Resample`. Use it
-    where the filtering distribution has several modes and all of them must be kept.
+    are to run at every k-th step only (see `Every`). `gradient` and `noise` are those of
+    `particle_filter`, `lookahead` that of `auxiliary_particle_filter`, and `allocation` that of
+    `Resample`. With `noise="rqmc"` each component has a point set of its own, and the masses of
+    modes are far more accurate. Use it where the filtering distribution has several modes and all
+    of them must be kept.
     """
+    sort_by = _standing(sort_by, noise)
     resample = Resample(
         scheme, ess_threshold, particles_per_component, sort_by, gradient, allocation=allocation
     )
     proposal = propagating_proposal(proposal, lookahead)
-    propagate = Propagate(model, proposal, _of_draws(gradient))
+    propagate = Propagate(model, proposal, _of_draws(gradient), noise)
     moves = [resampling(resample, lookahead), propagate]
     return _mixture_filter(
         model, num_particles, max_components, moves, features, scale,
@@ -136,16 +149,17 @@ def gaussian_particle_filter(
     proposal: AbstractProposal | None = None,
     regeneration: GaussianRegeneration | None = None,
     importance: str = "propagated",
+    noise: str = "independent",
 ) -> Filter:
     """The Gaussian particle filter: redraw from the Gaussian of the moments, propagate.
 
     Kotecha and Djuric (2003); Lin et al. (2012), section 3. It is an approximation for a filtering
-    distribution close to one Gaussian, and cannot keep two modes. `importance` is that of
-    `gaussian_mixture_particle_filter`.
+    distribution close to one Gaussian, and cannot keep two modes. `importance` and `noise` are
+    those of `gaussian_mixture_particle_filter`.
     """
     return Filter(
         model,
-        moves=_gaussian_moves(model, proposal, regeneration, importance),
+        moves=_gaussian_moves(model, proposal, regeneration, importance, noise),
         num_particles=num_particles,
     )
 
@@ -158,6 +172,7 @@ def gaussian_mixture_particle_filter(
     proposal: AbstractProposal | None = None,
     regeneration: GaussianRegeneration | None = None,
     importance: str = "propagated",
+    noise: str = "independent",
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
     merge: Merge | None = None,
@@ -175,14 +190,14 @@ def gaussian_mixture_particle_filter(
     weighted by L (or L D / q). "predictive_gaussian": these particles only give the moments of
     the prediction (eqs. 12 and 13). New particles are drawn from its Gaussian, N(μ̄, Σ̄), and
     weighted by L, since the Gaussian cancels in eq. 8. That is one more approximation and one
-    more draw.
+    more draw. `noise` is that of `Propagate`, and of the regeneration unless one is given.
 
     The filter is an approximation, good where each mode is close to a Gaussian. Raises
     `ValueError` for another `importance`, and for "predictive_gaussian" with a `proposal`.
     """
     return _mixture_filter(
         model, num_particles, max_components,
-        _gaussian_moves(model, proposal, regeneration, importance), features, scale,
+        _gaussian_moves(model, proposal, regeneration, importance, noise), features, scale,
         merge, split, kmeans, initial_kmeans, regroup_every,
     )  # fmt: skip
 
@@ -310,16 +325,22 @@ def _gaussian_moves(
     proposal: AbstractProposal | None,
     regeneration: GaussianRegeneration | None,
     importance: str,
+    noise: str,
 ) -> list[AbstractMove]:
     """Redraw, propagate and weigh; for some, redraw again before weighing."""
-    redraw = GaussianRegeneration() if regeneration is None else regeneration
+    redraw = GaussianRegeneration(noise=noise) if regeneration is None else regeneration
     check_type(GaussianRegeneration, "a GaussianRegeneration", regeneration=redraw)
     check_one_of(("propagated", "predictive_gaussian"), importance=importance)
     if importance == "propagated":
-        return [redraw, Propagate(model, proposal)]
+        return [redraw, Propagate(model, proposal, noise=noise)]
     if proposal is not None:
         raise ValueError(f"importance: {importance!r} draws from no proposal, but one was given")
-    return [redraw, Predict(model), redraw, Weigh(model)]
+    return [redraw, Predict(model, noise=noise), redraw, Weigh(model)]
+
+
+def _standing(sort_by: SortBy | None, noise: str) -> SortBy | None:
+    """What particles are sorted by: for point sets they must stand in some order of their state."""
+    return HILBERT if sort_by is None and noise == "rqmc" else sort_by
 
 
 def _of_draws(gradient: str) -> str:

@@ -1,6 +1,7 @@
 """Proposals q(x_t | x_{t-1}, y_t) with a density of their own."""
 
 import abc
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -20,8 +21,7 @@ from mpfjax.checks import (
     to_array,
 )
 from mpfjax.models.base import model_name, require
-from mpfjax.models.noise import NOISES
-from mpfjax.operations.generator import normal
+from mpfjax.models.noise import NOISES, draw_noise, independent_normal
 from mpfjax.operations.matrices import cholesky, solve_lower
 
 
@@ -36,6 +36,9 @@ class AbstractProposal(eqx.Module):
 
         A proposal may also have `log_density(observation, states, previous_states)`, log q of
         states that were not drawn from it, (n,). `mpfjax.smoothing.conditional_filter` needs it.
+        And it may make its draws of standard normal noise, (n, k), which `Propagate(noise="rqmc")`
+        needs: `propose_from_noise(noise, observation, previous_states)` returns what `propose`
+        does, and `noise_dimension(previous_states)` is k.
         """
 
 
@@ -89,8 +92,22 @@ class NetworkProposal(AbstractProposal):
         self, key: Key[Array, ""], observation: PyTree, previous_states: Float[Array, "n ..."]
     ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
         """x_t from the network's Gaussian of every particle, and its log density."""
+        shape = (previous_states.shape[0], self.noise_dimension(previous_states))
+        noise = independent_normal(key, shape, previous_states.dtype)
+        return self.propose_from_noise(noise, observation, previous_states)
+
+    def noise_dimension(self, previous_states: Float[Array, "n ..."]) -> int:
+        """d."""
+        return math.prod(previous_states.shape[1:])
+
+    def propose_from_noise(
+        self,
+        noise: Float[Array, "n d"],
+        observation: PyTree,
+        previous_states: Float[Array, "n ..."],
+    ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
+        """The same, made of this noise."""
         means, deviations = self._moments(observation, previous_states)
-        noise = normal(key, means.shape, means.dtype)
         states = means + deviations * noise
         return states.reshape(previous_states.shape), _log_standard(noise, deviations)
 
@@ -129,8 +146,9 @@ class GaussNewtonProposal(AbstractProposal):
 
     - `model`: has `transition_mean`, `observation_mean`, `transition_covariance`, (d, d), and
       `observation_covariance`, (p, p). States are one array, (n,) or (n, d); Q is invertible.
-    - `noise`: "independent", or "stratified", which spreads the draws of all particles evenly. The
-      distribution of each draw stays the same, so the filter stays unbiased.
+    - `noise`: "independent", or "stratified" or "rqmc", which spread the draws of all particles
+      evenly. The distribution of each draw stays the same, so the filter stays unbiased.
+      `Propagate(noise="rqmc")` spreads those of each component.
 
     Raises `ValueError` for a model without these, no iterations, or an inflation not above 0.
     Use it where bootstrap particles mostly miss the likelihood.
@@ -158,9 +176,23 @@ class GaussNewtonProposal(AbstractProposal):
         self, key: Key[Array, ""], observation: PyTree, previous_states: Float[Array, "n ..."]
     ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
         """x_t from the fitted Gaussian of every particle, and its log density."""
+        shape = (previous_states.shape[0], self.noise_dimension(previous_states))
+        noise = draw_noise(self.noise, key, shape, previous_states.dtype)
+        return self.propose_from_noise(noise, observation, previous_states)
+
+    def noise_dimension(self, previous_states: Float[Array, "n ..."]) -> int:
+        """d."""
+        return math.prod(previous_states.shape[1:])
+
+    def propose_from_noise(
+        self,
+        noise: Float[Array, "n d"],
+        observation: PyTree,
+        previous_states: Float[Array, "n ..."],
+    ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
+        """The same, made of this noise."""
         prior_means = self.model.transition_mean(previous_states)
         means, factors = self._fit(observation, prior_means)
-        noise = NOISES[self.noise](key, means.shape, means.dtype)
         states = means + self.inflation * _solve_transposed(factors, noise)
         return states.reshape(prior_means.shape), self._log_density(noise, factors)
 

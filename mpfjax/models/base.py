@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import shown
+from mpfjax.checks import check_whole, shown
+from mpfjax.models.noise import independent_normal, noise_dtype
 from mpfjax.operations.generator import split
+from mpfjax.operations.sobol import direction_numbers
 
 
 class AbstractStateSpaceModel(eqx.Module):
@@ -30,6 +32,12 @@ class AbstractStateSpaceModel(eqx.Module):
 
     A model may also define `log_transition(states, previous_states)`, log D of each particle,
     shape (n,). Guided proposals need it; the bootstrap proposal does not.
+
+    In place of `sample_transition`, a model may say how x_t is made of noise:
+    `transition_from_noise(noise, states)`, whose `noise` is standard normal, (n, k), and
+    `noise_dimension`, k. `sample_transition` then draws independent noise. A uniform number is
+    `jax.scipy.special.ndtr` of a normal one. `Propagate(noise="rqmc")` needs this form: its noise
+    is spread evenly over the particles.
     """
 
     handles_missing = False
@@ -38,9 +46,12 @@ class AbstractStateSpaceModel(eqx.Module):
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         """Draw x_0 for `num_particles` particles: every leaf has shape (n, ...)."""
 
-    @abc.abstractmethod
     def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
-        """Draw x_t ~ D(. | x_{t-1}) for every particle."""
+        """Draw x_t ~ D(. | x_{t-1}) for every particle: `transition_from_noise` of fresh noise."""
+        model: Any = self
+        shape = (jax.tree.leaves(states)[0].shape[0], model.noise_dimension)
+        noise = independent_normal(key, shape, noise_dtype(states))
+        return model.transition_from_noise(noise, states)
 
     @abc.abstractmethod
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
@@ -56,6 +67,33 @@ class HasTransitionDensity(Protocol):
         ...
 
 
+@runtime_checkable
+class HasTransitionNoise(Protocol):
+    """A model that can make x_t of noise from outside."""
+
+    @property
+    def noise_dimension(self) -> int:
+        """k, how many standard normal numbers x_t is made of."""
+        ...
+
+    def transition_from_noise(self, noise: Float[Array, "n k"], states: Any) -> Any:
+        """x_t of every particle, given x_{t-1} and its noise."""
+        ...
+
+
+def require_noise(model: Any, needed_by: str) -> None:
+    """Raise a `ValueError` unless the model can make x_t of noise from the Sobol table."""
+    require(model, "transition_from_noise", needed_by)
+    dimension = getattr(model, "noise_dimension", None)
+    if dimension is None:
+        raise ValueError(
+            f"model: {model_name(model)} has no noise_dimension, which {needed_by} needs beside"
+            " transition_from_noise"
+        )
+    check_whole(noise_dimension=dimension)
+    direction_numbers(dimension)
+
+
 def require(model: Any, method: str, needed_by: str, argument: str = "model") -> None:
     """Raise a `ValueError` where `model` lacks `method`, before anything compiles."""
     if not callable(getattr(model, method, None)):
@@ -63,6 +101,7 @@ def require(model: Any, method: str, needed_by: str, argument: str = "model") ->
         raise ValueError(f"{argument}: {who} defines no {method}, which {needed_by} needs")
 
 
+_FROM_NOISE = AbstractStateSpaceModel.sample_transition
 _NO_MODELS = (type(None), str, int, float, list, tuple, dict, jax.Array, np.ndarray)
 
 
@@ -77,6 +116,13 @@ def check_model(model: Any, needed_by: str, argument: str = "model") -> None:
         raise ValueError(f"{argument}: {shown(model)} is a class; write {model.__name__}(...)")
     for method in ("sample_initial", "sample_transition", "log_likelihood"):
         require(model, method, needed_by, argument)
+    if getattr(type(model), "sample_transition", None) is _FROM_NOISE:
+        for name in ("transition_from_noise", "noise_dimension"):
+            if not hasattr(model, name):
+                raise ValueError(
+                    f"{argument}: {model_name(model)} defines no sample_transition, nor {name},"
+                    f" one of which {needed_by} needs"
+                )
     try:
         signature = inspect.signature(model.sample_initial)
     except (TypeError, ValueError):  # of what is not written in Python nothing is known
@@ -160,8 +206,13 @@ def check_log_density(
 
 # What a model may define beside the three methods: functions of one particle, and what all
 # particles share.
-_BATCHED = ("log_transition", "log_initial", "with_history", "transition_mean", "observation_mean")
-_SHARED = ("transition_covariance", "observation_covariance", "prepare_observation")
+_BATCHED = (
+    "log_transition", "log_initial", "with_history", "transition_from_noise", "transition_mean",
+    "observation_mean",
+)  # fmt: skip
+_SHARED = (
+    "transition_covariance", "observation_covariance", "prepare_observation", "noise_dimension",
+)  # fmt: skip
 
 
 class _PerParticleModel(AbstractStateSpaceModel):
@@ -177,6 +228,8 @@ class _PerParticleModel(AbstractStateSpaceModel):
         return jax.vmap(self.model.sample_initial)(split(key, num_particles))
 
     def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
+        if not hasattr(self.model, "sample_transition"):
+            return super().sample_transition(key, states)
         num_particles = jax.tree.leaves(states)[0].shape[0]
         return jax.vmap(self.model.sample_transition)(split(key, num_particles), states)
 
@@ -217,8 +270,9 @@ def per_particle(model: Any) -> AbstractStateSpaceModel:
     `model` has `sample_initial(key)`, `sample_transition(key, state)` and
     `log_likelihood(observation, state)`, each for one particle. It may also have, for one particle,
     `log_transition(state, previous_state)`, `log_initial(state)`, `with_history(state,
-    previous_state)`, `transition_mean(state)` and `observation_mean(state)`, and, for all
-    particles, `transition_covariance`, `observation_covariance` and
+    previous_state)`, `transition_from_noise(noise, state)` with noise (k,) (also in place of
+    `sample_transition`), `transition_mean(state)` and `observation_mean(state)`, and, for all
+    particles, `noise_dimension`, `transition_covariance`, `observation_covariance` and
     `prepare_observation(observation)`. Use it for a first version of a model: with a key for each
     particle, draws take four to five times as long as those of a batched model.
 
@@ -226,6 +280,8 @@ def per_particle(model: Any) -> AbstractStateSpaceModel:
     """
     if isinstance(model, type):
         raise ValueError(f"model: {shown(model)} is a class; write {model.__name__}(...)")
+    from_noise = hasattr(model, "transition_from_noise") and hasattr(model, "noise_dimension")
     for method in ("sample_initial", "sample_transition", "log_likelihood"):
-        require(model, method, "per_particle")
+        if not (from_noise and method == "sample_transition"):
+            require(model, method, "per_particle")
     return _PerParticleModel(model)

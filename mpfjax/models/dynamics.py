@@ -13,7 +13,7 @@ from mpfjax.checks import (
     check_scalars,
     to_array,
 )
-from mpfjax.operations.generator import normal
+from mpfjax.models.noise import independent_normal
 from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
 
 
@@ -34,14 +34,29 @@ class AbstractDynamics(eqx.Module):
     def is_shared(self) -> bool:
         """Whether there is one set of parameters for all particles."""
 
+    @property
     @abc.abstractmethod
+    def noise_dimension(self) -> int:
+        """k, how many standard normal numbers x_t is made of."""
+
+    @abc.abstractmethod
+    def from_noise(
+        self,
+        noise: Float[Array, "n k"],
+        current: Float[Array, "n d"],
+        previous: Float[Array, "n d"] | None = None,
+    ) -> Float[Array, "n d"]:
+        """x_t given x_{t-1}, and x_{t-2} where the order is 2, made of standard normal noise."""
+
     def sample(
         self,
         key: Key[Array, ""],
         current: Float[Array, "n d"],
         previous: Float[Array, "n d"] | None = None,
     ) -> Float[Array, "n d"]:
-        """x_t given x_{t-1}, and x_{t-2} where the order is 2."""
+        """x_t given x_{t-1}, and x_{t-2} where the order is 2: `from_noise` of fresh noise."""
+        shape = (current.shape[0], self.noise_dimension)
+        return self.from_noise(independent_normal(key, shape, current.dtype), current, previous)
 
     @abc.abstractmethod
     def log_density(
@@ -89,15 +104,19 @@ class RandomWalk(AbstractRandomWalk):
         check_positive_array(deviations=self.deviations)
         check_rows(deviations=self.deviations)
 
-    def sample(
+    @property
+    def noise_dimension(self) -> int:
+        """d."""
+        return self.deviations.shape[-1]
+
+    def from_noise(
         self,
-        key: Key[Array, ""],
+        noise: Float[Array, "n d"],
         current: Float[Array, "n d"],
         previous: Float[Array, "n d"] | None = None,
     ) -> Float[Array, "n d"]:
         """x_{t-1} plus noise."""
         del previous
-        noise = normal(key, current.shape, current.dtype)
         return current + jnp.broadcast_to(self.deviations, current.shape) * noise
 
     def log_density(
@@ -178,14 +197,18 @@ class Autoregression(AbstractDynamics):
         """Whether there is one set of matrices for all."""
         return self.mean.ndim == 1
 
-    def sample(
+    @property
+    def noise_dimension(self) -> int:
+        """d."""
+        return self.mean.shape[-1]
+
+    def from_noise(
         self,
-        key: Key[Array, ""],
+        noise: Float[Array, "n d"],
         current: Float[Array, "n d"],
         previous: Float[Array, "n d"] | None = None,
     ) -> Float[Array, "n d"]:
         """The expected x_t plus B ω_t."""
-        noise = normal(key, current.shape, current.dtype)
         return self.moments(current, previous)[0] + _times(self.B, noise)
 
     def log_density(

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from mpfjax.checks import check_inner_share, check_positive_array, check_rows, to_array
 from mpfjax.models.dynamics import AbstractRandomWalk, RandomWalk
@@ -39,24 +39,45 @@ class RandomWalkWithJumps(AbstractRandomWalk):
             )
         check_inner_share(jump_probability=self.jump_probability)
 
+    @property
+    def noise_dimension(self) -> int:
+        """d, and one number that says who jumps."""
+        return self.deviations.shape[-1] + 1
+
+    def from_noise(
+        self,
+        noise: Float[Array, "n k"],
+        current: Float[Array, "n d"],
+        previous: Float[Array, "n d"] | None = None,
+    ) -> Float[Array, "n d"]:
+        """x_{t-1} plus a step, long for the particles that jump."""
+        del previous
+        jumps = jax.scipy.special.ndtr(noise[:, -1:]) < self.jump_probability
+        return self._moved(jumps, noise[:, :-1], current)
+
     def sample(
         self,
         key: Key[Array, ""],
         current: Float[Array, "n d"],
         previous: Float[Array, "n d"] | None = None,
     ) -> Float[Array, "n d"]:
-        """x_{t-1} plus a step, long for the particles that jump."""
+        """The same, from keys of their own for the jumps and the steps."""
         del previous
         key_noise, key_jump = split(key, 2)
         jumps = jax.random.bernoulli(
             fast_key(key_jump), self.jump_probability, (current.shape[0], 1)
         )
+        return self._moved(jumps, normal(key_noise, current.shape, current.dtype), current)
+
+    def _moved(
+        self, jumps: Bool[Array, "n 1"], noise: Float[Array, "n d"], current: Float[Array, "n d"]
+    ) -> Float[Array, "n d"]:
         steps = jnp.where(
             jumps,
             jnp.broadcast_to(self.jump_deviations, current.shape),
             jnp.broadcast_to(self.deviations, current.shape),
         )
-        return current + steps * normal(key_noise, current.shape, current.dtype)
+        return current + steps * noise
 
     def log_density(
         self,

@@ -46,11 +46,15 @@ class LinearGaussianModel(AbstractStateSpaceModel):
         noise = normal(key, (num_particles, self.m0.shape[0]), self.m0.dtype)
         return self.m0[None] + noise @ jnp.linalg.cholesky(self.P0).T
 
-    def sample_transition(
-        self, key: Key[Array, ""], states: Float[Array, "n d"]
+    @property
+    def noise_dimension(self) -> int:
+        """d."""
+        return self.m0.shape[0]
+
+    def transition_from_noise(
+        self, noise: Float[Array, "n d"], states: Float[Array, "n d"]
     ) -> Float[Array, "n d"]:
         """x_t ~ N(A x_{t-1}, Q)."""
-        noise = normal(key, states.shape, states.dtype)
         return self.transition_mean(states) + noise @ jnp.linalg.cholesky(self.Q).T
 
     def log_likelihood(

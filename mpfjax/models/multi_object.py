@@ -127,7 +127,27 @@ class MultiObjectModel(AbstractStateSpaceModel):
         # the objects' is.
         if name == "log_transition" and hasattr(self.object_model, name):
             return self._log_transition
+        if name == "transition_from_noise" and hasattr(self.object_model, name):
+            return self._transition_from_noise
+        if name == "noise_dimension" and hasattr(self.object_model, name):
+            return self.num_objects * self._object_noise_dimension
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+    @property
+    def _object_noise_dimension(self) -> int:
+        model: Any = self.object_at(0)
+        return model.noise_dimension
+
+    def _transition_from_noise(
+        self, noise: Float[Array, "n k"], states: PyTree
+    ) -> PyTree:
+        """x_t of every object, from its own columns of the noise."""
+        noise = noise.reshape(noise.shape[0], self.num_objects, -1)
+
+        def move(noise: Float[Array, "n k"], states: PyTree, j: Int[Array, ""]) -> PyTree:
+            return self.object_at(j).transition_from_noise(noise, states)  # pyright: ignore
+
+        return jax.vmap(move, in_axes=(1, 1, 0), out_axes=1)(noise, states, self._indices)
 
     def _log_transition(self, states: PyTree, previous_states: PyTree) -> Float[Array, " n"]:
         """Σ_j log D(x_t^j | x_{t-1}^j)."""

@@ -1,15 +1,40 @@
-"""Standard normal and uniform draws: independent, or spread evenly over all particles."""
+"""Standard normal and uniform draws: independent, or spread evenly over particles."""
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.operations.generator import bits, normal, normal_quantile, uniform
+from mpfjax.operations.floats import default_float
+from mpfjax.operations.generator import bits, normal, normal_quantile, split, uniform
+from mpfjax.operations.segments import first_places, spread
+from mpfjax.operations.sobol import scrambled_directions, sobol_points
+
+NOISES = ("independent", "rqmc", "stratified")
+
+
+def draw_noise(
+    kind: str,
+    key: Key[Array, ""],
+    shape: tuple[int, int],
+    dtype: jnp.dtype,
+    components: Int[Array, " n"] | None = None,
+    num_components: int = 1,
+) -> Float[Array, "n d"]:
+    """Standard normal noise of one of the kinds in `NOISES`, one row a particle.
+
+    Each row is exactly normal for every kind. "rqmc" draws a point set for each component.
+    """
+    if kind == "rqmc":
+        return rqmc_normal(key, shape, dtype, components, num_components)
+    return (stratified_normal if kind == "stratified" else independent_normal)(key, shape, dtype)
 
 
 def independent_normal(
     key: Key[Array, ""], shape: tuple[int, ...], dtype: jnp.dtype
 ) -> Float[Array, "n d"]:
     """Independent standard normal draws."""
+    if shape[1:] == (1,):  # a vector runs faster than a column
+        return normal(key, shape[:1], dtype)[:, None]
     return normal(key, shape, dtype)
 
 
@@ -30,6 +55,43 @@ def stratified_normal(
     multipliers = jnp.array([int(2**32 * alpha) | 1 for alpha in _lattice(d)], jnp.uint32)
     shift = bits(key, (d,))
     points = jnp.arange(n, dtype=jnp.uint32)[:, None] * multipliers[None] + shift[None]
+    return _normal_of(points, dtype)
+
+
+def rqmc_normal(
+    key: Key[Array, ""],
+    shape: tuple[int, int],
+    dtype: jnp.dtype,
+    components: Int[Array, " n"] | None = None,
+    num_components: int = 1,
+) -> Float[Array, "n d"]:
+    """Standard normal draws, one row a particle, from randomised Sobol points.
+
+    The r-th slot of a component gets point r, scrambled by a random matrix and a random shift of
+    its digits. Systematic resampling of k slots takes its points at (r + U) / k, so slot and noise
+    together are a Hammersley set of d + 1 dimensions: where particles stand in the order of
+    their states, the step is array randomised quasi-Monte Carlo (L'Ecuyer, Lécot and Tuffin
+    2008). Each component has a shift of its own, so the noise of any two particles of different
+    components is independent. Every single row is exactly normal and independent of the past, so
+    a sum over particles keeps its expectation.
+
+    Raises `ValueError` for more dimensions than the table of direction numbers holds.
+    """
+    n, d = shape
+    ranks = jnp.arange(n, dtype=jnp.int32)
+    key_matrix, key_shift = split(key, 2)
+    directions = scrambled_directions(key_matrix, d, max((n - 1).bit_length(), 1))
+    shifts = bits(key_shift, (num_components, d))
+    if components is None or num_components == 1:
+        points = sobol_points(ranks, directions) ^ shifts[0][:, None]
+        return _normal_of(points, dtype).T
+    ranks = ranks - spread(first_places(components, num_components), components)
+    own = jnp.stack([spread(shifts[:, k], components) for k in range(d)])
+    return _normal_of(sobol_points(ranks, directions) ^ own, dtype).T
+
+
+def _normal_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
+    """Quantiles of the standard normal at points in units of 2^-32."""
     # The top 23 bits, at the middle of their cells, keep clear of -1 and 1 in float32 as well.
     centred = ((points >> 9).astype(dtype) + 0.5) * jnp.array(2.0**-22, dtype) - 1
     return normal_quantile(centred)
@@ -45,11 +107,14 @@ def stratified_uniform(key: Key[Array, ""], num_points: int) -> Float[Array, " n
     return (cells + uniform(key, (num_points,))) / num_points
 
 
+def noise_dtype(states: PyTree) -> jnp.dtype:
+    """The type of the noise that moves these states: that of their floating point leaves."""
+    leaves = [leaf for leaf in jax.tree.leaves(states) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return jnp.result_type(*leaves) if leaves else default_float()
+
+
 def _lattice(dimension: int) -> list[float]:
     root = 2.0
     for _ in range(64):
         root = (1 + root) ** (1 / (dimension + 1))
     return [root ** -(j + 1) for j in range(dimension)]
-
-
-NOISES = {"independent": independent_normal, "stratified": stratified_normal}

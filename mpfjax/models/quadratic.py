@@ -13,7 +13,7 @@ from mpfjax.checks import (
 )
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.noise import stratified_uniform
-from mpfjax.operations.generator import normal, uniform
+from mpfjax.operations.generator import uniform
 
 
 class QuadraticModel(AbstractStateSpaceModel):
@@ -54,11 +54,16 @@ class QuadraticModel(AbstractStateSpaceModel):
             shares = uniform(key, (num_particles,))
         return self.low + (self.high - self.low) * shares
 
-    def sample_transition(
-        self, key: Key[Array, ""], states: Float[Array, " n"]
+    @property
+    def noise_dimension(self) -> int:
+        """1."""
+        return 1
+
+    def transition_from_noise(
+        self, noise: Float[Array, "n 1"], states: Float[Array, " n"]
     ) -> Float[Array, " n"]:
         """x_t ~ N(x_{t-1}, σ_x²)."""
-        return states + self.sigma_x * normal(key, states.shape, states.dtype)
+        return states + self.sigma_x * noise[:, 0]
 
     def log_likelihood(
         self, observation: Float[Array, ""], states: Float[Array, " n"]

@@ -17,6 +17,7 @@ from mpfjax.moves.base import AbstractPropagation, AbstractRejuvenation
 from mpfjax.moves.propagation import Predict, Propagate, Weigh, log_transition
 from mpfjax.moves.resampling import Resample
 from mpfjax.moves.slots import Slots, place_slots
+from mpfjax.moves.standing import standing_order
 from mpfjax.operations.generator import split, uniform
 from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import order_by_segment, spread
@@ -173,7 +174,7 @@ class ConditionalResample(AbstractRejuvenation):
         labels = jnp.where(mixture.occupied, mixture.component_indicators, m)
         if self.move.sort_by is None:
             return order_by_segment(labels, m)
-        order = jnp.lexsort((self.move.sort_by(mixture.particles), labels)).astype(jnp.int32)
+        order = standing_order(mixture, labels, self.move.sort_by)
         return order, mixture.component_counts
 
     def _points(

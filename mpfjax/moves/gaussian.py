@@ -10,7 +10,7 @@ from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_callable, check_one_of, check_positive, check_whole, given
 from mpfjax.mixture import ParticleMixture, flatten_states
-from mpfjax.models.noise import NOISES
+from mpfjax.models.noise import NOISES, draw_noise
 from mpfjax.moves.base import AbstractRejuvenation
 from mpfjax.moves.features import origin, summarise
 from mpfjax.moves.resampling import Resample
@@ -111,7 +111,14 @@ class GaussianRegeneration(AbstractRejuvenation):
         moments = summarise(states, weights, mixture.component_indicators, mixture.num_components)
         factors = self.inflation * cholesky(moments.covariances)
         factors = spread(factors, vacated.component_indicators)
-        noise = NOISES[self.noise](key, states.shape, states.dtype)
+        noise = draw_noise(
+            self.noise,
+            key,
+            (states.shape[0], states.shape[1]),
+            states.dtype,
+            vacated.component_indicators,
+            mixture.num_components,
+        )
         offsets = jnp.einsum("nij,nj->ni", factors, noise)
         means = spread(moments.means, vacated.component_indicators)
         unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], chosen))[1]

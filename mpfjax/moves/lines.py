@@ -6,15 +6,15 @@ components, each has a line of its own, over all particles, as they stand (`AsTh
 many, the particles are first put side by side, component by component, on one line (`SideBySide`).
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.slots import Slots
+from mpfjax.moves.standing import SortBy, standing_order
 from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import order_by_segment, segment_counts, segment_sum, spread
 from mpfjax.operations.stored import stored, whole_blocks
@@ -133,7 +133,7 @@ def as_they_are(mixture: ParticleMixture) -> AsTheyStand:
 def side_by_side(
     mixture: ParticleMixture,
     stays: Bool[Array, " n"] | None,
-    sort_by: Callable[[PyTree], Float[Array, " n"]] | None,
+    sort_by: SortBy | None,
 ) -> SideBySide:
     """One row of components, without particles that only a rounding error could draw.
 
@@ -149,8 +149,7 @@ def side_by_side(
     if sort_by is None:
         order, counts = order_by_segment(padded(labels, m), m)
     else:
-        order = jnp.lexsort((sort_by(mixture.particles), labels)).astype(jnp.int32)
-        order = padded(order, mixture.num_particles - 1)
+        order = padded(standing_order(mixture, labels, sort_by), mixture.num_particles - 1)
         counts = segment_counts(stands, mixture.component_indicators, m)
     num_standing = jnp.sum(counts, dtype=jnp.int32)
     is_filled = jnp.arange(order.shape[0], dtype=jnp.int32) < num_standing

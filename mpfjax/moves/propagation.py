@@ -1,6 +1,6 @@
 """Propagation from t-1 to t: the bootstrap proposal, and any proposal with its own density."""
 
-from typing import cast
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -12,12 +12,15 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     HasTransitionDensity,
+    HasTransitionNoise,
     check_log_density,
     check_model,
     check_moved,
     model_name,
     require,
+    require_noise,
 )
+from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.operations.gradients import add_gradient
 from mpfjax.proposals import AbstractProposal
@@ -36,18 +39,29 @@ class Propagate(AbstractPropagation):
       where ⊥ is `stop_gradient` (Ścibior and Wood 2021). Parameters of D then have a gradient
       through its density, and parameters of q have none. The draw of x_0 is still
       differentiated.
+    - `noise`: what x_t is made of. "independent": each particle has noise of its own, as the
+      model's `sample_transition` or the proposal draws it. "rqmc" and "stratified" spread the noise
+      evenly over neighbours: over the slots of each component, or of all. Every particle's own law
+      stays the same, so Ẑ stays unbiased. "rqmc" is a randomised Sobol point set over slot and
+      noise (L'Ecuyer, Lécot and Tuffin 2008; Gerber and Chopin 2015). It needs particles that
+      stand in order, as after `Resample(sort_by="hilbert")`. Take it where masses and likelihoods
+      must be accurate.
 
-    Raises `ValueError` for another gradient, and for a proposal, or "stop", with a model that has
-    no `log_transition`.
+    Raises `ValueError` for another gradient or noise; for a proposal, or "stop", with a model that
+    has no `log_transition`; for noise that is not independent, with a model that has no
+    `transition_from_noise`, or a proposal that has no `propose_from_noise`; and for more noise
+    dimensions than there are Sobol direction numbers, 64.
     """
 
     model: AbstractStateSpaceModel
     proposal: AbstractProposal | None = None
     gradient: str = eqx.field(static=True, default="none")
+    noise: str = eqx.field(static=True, default="independent")
 
     def __check_init__(self) -> None:
         check_model(self.model, type(self).__name__)
         check_propagated_gradient(self.gradient, self.model)
+        check_noise(self.noise, self.model, self.proposal)
         if self.proposal is not None:
             what = "a proposal, such as GaussNewtonProposal(model)"
             check_type(AbstractProposal, what, proposal=self.proposal)
@@ -60,7 +74,7 @@ class Propagate(AbstractPropagation):
         if self.proposal is None:
             return _weigh(self.model, self.predict(key, mixture), observation)
         previous = mixture.particles
-        states, log_density = self.proposal.propose(key, observation, previous)
+        states, log_density = self._propose(key, mixture, observation)
         check_moved(states, previous, self.proposal, "propose")
         if self.gradient == "stop":
             states, log_density = jax.lax.stop_gradient((states, log_density))
@@ -69,23 +83,40 @@ class Propagate(AbstractPropagation):
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
-        return predict(key, self.model, mixture, self.gradient)
+        # A proposal says nothing of the model's own noise.
+        spreads = self.proposal is None or isinstance(self.model, HasTransitionNoise)
+        noise = self.noise if spreads else "independent"
+        return predict(key, self.model, mixture, self.gradient, noise)
+
+    def _propose(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> tuple[PyTree, Float[Array, " n"]]:
+        """x_t from the proposal, and its log density."""
+        proposal: Any = self.proposal
+        previous = mixture.particles
+        if self.noise == "independent":
+            return proposal.propose(key, observation, previous)
+        dimension = proposal.noise_dimension(previous)
+        noise = _noise(self.noise, key, dimension, mixture)
+        return proposal.propose_from_noise(noise, observation, previous)
 
 
 class Predict(AbstractPropagation):
     """Draw x_t ~ D(. | x_{t-1}) and leave the weights: the first half of a bootstrap `Propagate`.
 
     `Weigh` is the second half. Use the two in a chain that does something in between, such as
-    redrawing the prediction from its Gaussian (Lin et al. 2012, section 4, step 3). `gradient` and
-    the errors are those of `Propagate`.
+    redrawing the prediction from its Gaussian (Lin et al. 2012, section 4, step 3). `gradient`,
+    `noise` and the errors are those of `Propagate`.
     """
 
     model: AbstractStateSpaceModel
     gradient: str = eqx.field(static=True, default="none")
+    noise: str = eqx.field(static=True, default="independent")
 
     def __check_init__(self) -> None:
         check_model(self.model, type(self).__name__)
         check_propagated_gradient(self.gradient, self.model)
+        check_noise(self.noise, self.model)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -96,7 +127,7 @@ class Predict(AbstractPropagation):
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """The same without an observation."""
-        return predict(key, self.model, mixture, self.gradient)
+        return predict(key, self.model, mixture, self.gradient, self.noise)
 
 
 class Weigh(AbstractPropagation):
@@ -130,11 +161,41 @@ def check_propagated_gradient(gradient: str, model: object) -> None:
         require(model, "log_transition", "gradient='stop'")
 
 
+def check_noise(noise: str, model: object, proposal: object = None) -> None:
+    """Raise a `ValueError` for unknown noise, or one that model or proposal cannot be made of."""
+    check_one_of(NOISES, noise=noise)
+    if noise == "independent":
+        return
+    if proposal is None:
+        require_noise(model, f"noise={noise!r}")
+        return
+    for method in ("propose_from_noise", "noise_dimension"):
+        require(proposal, method, f"noise={noise!r}", "proposal")
+
+
+def _noise(
+    kind: str, key: Key[Array, ""], dimension: int, mixture: ParticleMixture
+) -> Float[Array, "n k"]:
+    """Noise for every slot; its points are those of the slot's component."""
+    shape, dtype = (mixture.num_particles, dimension), noise_dtype(mixture.particles)
+    labels, num_components = mixture.component_indicators, mixture.num_components
+    return draw_noise(kind, key, shape, dtype, labels, num_components)
+
+
 def predict(
-    key: Key[Array, ""], model: AbstractStateSpaceModel, mixture: ParticleMixture, gradient: str
+    key: Key[Array, ""],
+    model: AbstractStateSpaceModel,
+    mixture: ParticleMixture,
+    gradient: str,
+    noise: str = "independent",
 ) -> ParticleMixture:
     """Draws of x_t, with the weights' derivatives times D / ⊥D where the draws have none."""
-    states = model.sample_transition(key, mixture.particles)
+    if noise == "independent":
+        states = model.sample_transition(key, mixture.particles)
+    else:
+        maker = cast(HasTransitionNoise, model)
+        drawn = _noise(noise, key, maker.noise_dimension, mixture)
+        states = maker.transition_from_noise(drawn, mixture.particles)
     check_moved(states, mixture.particles, model)
     if gradient == "none":
         return mixture.replace(particles=states)

@@ -190,6 +190,15 @@ def segment_argmax(
     return jnp.min(jnp.where(member, index[None], n - 1), axis=1)
 
 
+def first_places(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " num_segments"]:
+    """The first index at which each segment's label stands, n - 1 for a label that nobody has."""
+    n = segments.shape[0]
+    index = jnp.arange(n, dtype=jnp.int32)
+    if num_segments > FEW_SEGMENTS:
+        return _scattered("min", index, segments, num_segments, n - 1)
+    return jnp.min(jnp.where(_members(segments, num_segments), index[None], n - 1), axis=1)
+
+
 def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, " num_places"]:
     """The segment of each place, if segments lie side by side and `firsts` are their first places.
 
