@@ -201,7 +201,7 @@ def in_turns(
 def _answer(pipe: Connection, way: Way) -> dict[str, Any]:
     try:
         return pipe.recv()
-    except EOFError as error:
+    except (EOFError, ConnectionError) as error:
         raise ValueError(f"{way.name}: its process ended before its time") from error
 
 

@@ -41,6 +41,7 @@ from mpfjax.moves import Predict as Predict
 from mpfjax.moves import Propagate as Propagate
 from mpfjax.moves import PropagateInClusters as PropagateInClusters
 from mpfjax.moves import PropagateIndependently as PropagateIndependently
+from mpfjax.moves import PropagateInStages as PropagateInStages
 from mpfjax.moves import Prune as Prune
 from mpfjax.moves import RandomPartition as RandomPartition
 from mpfjax.moves import Resample as Resample

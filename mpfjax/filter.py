@@ -9,15 +9,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_callable, check_key, check_type, check_whole, shown
+from mpfjax.checks import (
+    check_callable,
+    check_key,
+    check_one_of,
+    check_type,
+    check_whole,
+    shown,
+)
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import AbstractStateSpaceModel, check_model, check_states
+from mpfjax.models.base import (
+    AbstractStateSpaceModel,
+    HasInitialNoise,
+    check_model,
+    check_states,
+)
+from mpfjax.models.noise import NOISES, draw_noise
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
 from mpfjax.moves.every import Every
 from mpfjax.moves.exchange import Exchange
 from mpfjax.observations import checked_observation, one_observation
 from mpfjax.operations.across_islands import excess_over_islands, island_index, num_islands
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
+from mpfjax.operations.floats import default_float
 from mpfjax.operations.generator import split
 from mpfjax.operations.logarithms import scaled_log_sum_exp
 
@@ -68,6 +82,8 @@ class Filter(eqx.Module):
     - `num_components`: M, the most components; the filters of the literature call it
       `max_components`.
     - `initial_moves`: regrouping of x_0, such as `KMeans(reseed=True)`.
+    - `initial_noise`: what x_0 is made of where the model has `initial_from_noise`: "independent",
+      as the model's own `sample_initial` draws it, "rqmc" or "stratified"; see `Propagate`.
 
     Raises `ValueError` for N < 1, M < 1, N < M, no moves, or fewer slots than
     `particles_per_component` asks for.
@@ -78,6 +94,7 @@ class Filter(eqx.Module):
     _initial_moves: tuple[Any, ...]
     num_particles: int = eqx.field(static=True)
     num_components: int = eqx.field(static=True)
+    initial_noise: str = eqx.field(static=True)
 
     def __init__(
         self,
@@ -86,6 +103,7 @@ class Filter(eqx.Module):
         num_particles: int,
         num_components: int = 1,
         initial_moves: Iterable[AbstractRegrouping] = (),
+        initial_noise: str = "independent",
     ) -> None:
         check_model(model, "Filter")
         moves = _as_moves(moves, "moves")
@@ -109,6 +127,8 @@ class Filter(eqx.Module):
         self._initial_moves = _tie(initial_moves, model)
         self.num_particles = int(num_particles)
         self.num_components = int(num_components)
+        check_one_of(NOISES, initial_noise=initial_noise)
+        self.initial_noise = initial_noise
 
     @property
     def max_components(self) -> int:
@@ -119,6 +139,11 @@ class Filter(eqx.Module):
     def moves(self) -> tuple[Any, ...]:
         """The moves of one step; those that share the filter's model hold it."""
         return untie(self._moves, self.model)
+
+    @property
+    def initial_moves(self) -> tuple[Any, ...]:
+        """The moves that group x_0."""
+        return untie(self._initial_moves, self.model)
 
     @property
     def approximate(self) -> bool:
@@ -134,14 +159,14 @@ class Filter(eqx.Module):
         keys = split_keys(start.key, 1 + len(self._initial_moves))
         particles = start.particles
         if particles is None:
-            particles = sample_initial(keys[0], self.model, self.num_particles)
+            particles = sample_initial(keys[0], self.model, self.num_particles, self.initial_noise)
         memory = {}
         for move in self.moves:
             if isinstance(move, AbstractMove):
                 memory |= move.initial_memory(self.num_components)
         mixture = single_component(particles, self.num_components, start.num_particles)
         mixture = mixture.replace(memory=memory)
-        for move_key, move in zip(keys[1:], untie(self._initial_moves, self.model), strict=True):
+        for move_key, move in zip(keys[1:], self.initial_moves, strict=True):
             mixture = move(move_key, mixture)
         return mixture
 
@@ -234,10 +259,17 @@ def _checked_predict(filter, key, mixture):
 
 
 def sample_initial(
-    key: Key[Array, ""], model: AbstractStateSpaceModel, num_particles: int
+    key: Key[Array, ""],
+    model: AbstractStateSpaceModel,
+    num_particles: int,
+    noise: str = "independent",
 ) -> PyTree:
-    """The model's x_0; raises for leaves of another length."""
-    particles = model.sample_initial(key, num_particles)
+    """The model's x_0, of this noise if it can be; raises for leaves of another length."""
+    if noise == "independent" or not isinstance(model, HasInitialNoise):
+        particles = model.sample_initial(key, num_particles)
+    else:
+        shape = (num_particles, model.initial_noise_dimension)
+        particles = model.initial_from_noise(draw_noise(noise, key, shape, default_float()))
     check_states(particles, model, "sample_initial", num_particles)
     return particles
 

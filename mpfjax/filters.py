@@ -54,6 +54,7 @@ def particle_filter(
         model,
         moves=[resample, Propagate(model, proposal, _of_draws(gradient), noise)],
         num_particles=num_particles,
+        initial_noise=noise,
     )
 
 
@@ -89,6 +90,7 @@ def auxiliary_particle_filter(
             Propagate(model, proposal, _of_draws(gradient), noise),
         ],
         num_particles=num_particles,
+        initial_noise=noise,
     )
 
 
@@ -138,7 +140,7 @@ def mixture_particle_filter(
     moves = [resampling(resample, lookahead), propagate]
     return _mixture_filter(
         model, num_particles, max_components, moves, features, scale,
-        merge, split, kmeans, initial_kmeans, regroup_every,
+        merge, split, kmeans, initial_kmeans, regroup_every, noise,
     )  # fmt: skip
 
 
@@ -161,6 +163,7 @@ def gaussian_particle_filter(
         model,
         moves=_gaussian_moves(model, proposal, regeneration, importance, noise),
         num_particles=num_particles,
+        initial_noise=noise,
     )
 
 
@@ -198,7 +201,7 @@ def gaussian_mixture_particle_filter(
     return _mixture_filter(
         model, num_particles, max_components,
         _gaussian_moves(model, proposal, regeneration, importance, noise), features, scale,
-        merge, split, kmeans, initial_kmeans, regroup_every,
+        merge, split, kmeans, initial_kmeans, regroup_every, noise,
     )  # fmt: skip
 
 
@@ -360,6 +363,7 @@ def _mixture_filter(
     kmeans: KMeans | None,
     initial_kmeans: KMeans | None,
     regroup_every: int,
+    noise: str,
 ) -> Filter:
     """The given moves, then regrouping; x_0 grouped by K-means from seeds."""
     check_whole(max_components=max_components, regroup_every=regroup_every)
@@ -384,4 +388,5 @@ def _mixture_filter(
         num_particles=num_particles,
         num_components=max_components,
         initial_moves=[initial_kmeans],
+        initial_noise=noise,
     )

@@ -37,7 +37,8 @@ class AbstractStateSpaceModel(eqx.Module):
     `transition_from_noise(noise, states)`, whose `noise` is standard normal, (n, k), and
     `noise_dimension`, k. `sample_transition` then draws independent noise. A uniform number is
     `jax.scipy.special.ndtr` of a normal one. `Propagate(noise="rqmc")` needs this form: its noise
-    is spread evenly over the particles.
+    is spread evenly over the particles. `initial_from_noise(noise)` and `initial_noise_dimension`
+    do the same for x_0.
     """
 
     handles_missing = False
@@ -78,6 +79,20 @@ class HasTransitionNoise(Protocol):
 
     def transition_from_noise(self, noise: Float[Array, "n k"], states: Any) -> Any:
         """x_t of every particle, given x_{t-1} and its noise."""
+        ...
+
+
+@runtime_checkable
+class HasInitialNoise(Protocol):
+    """A model that can make x_0 of noise from outside."""
+
+    @property
+    def initial_noise_dimension(self) -> int:
+        """k, how many standard normal numbers x_0 is made of."""
+        ...
+
+    def initial_from_noise(self, noise: Float[Array, "n k"]) -> Any:
+        """x_0 of every particle, given its noise."""
         ...
 
 
@@ -207,11 +222,12 @@ def check_log_density(
 # What a model may define beside the three methods: functions of one particle, and what all
 # particles share.
 _BATCHED = (
-    "log_transition", "log_initial", "with_history", "transition_from_noise", "transition_mean",
-    "observation_mean",
+    "log_transition", "log_initial", "with_history", "initial_from_noise", "transition_from_noise",
+    "transition_mean", "observation_mean",
 )  # fmt: skip
 _SHARED = (
     "transition_covariance", "observation_covariance", "prepare_observation", "noise_dimension",
+    "initial_noise_dimension",
 )  # fmt: skip
 
 

@@ -43,7 +43,17 @@ class LinearGaussianModel(AbstractStateSpaceModel):
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n d"]:
         """x_0 ~ N(m0, P0)."""
-        noise = normal(key, (num_particles, self.m0.shape[0]), self.m0.dtype)
+        return self.initial_from_noise(
+            normal(key, (num_particles, self.initial_noise_dimension), self.m0.dtype)
+        )
+
+    @property
+    def initial_noise_dimension(self) -> int:
+        """d."""
+        return self.m0.shape[0]
+
+    def initial_from_noise(self, noise: Float[Array, "n d"]) -> Float[Array, "n d"]:
+        """x_0 ~ N(m0, P0)."""
         return self.m0[None] + noise @ jnp.linalg.cholesky(self.P0).T
 
     @property

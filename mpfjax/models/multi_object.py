@@ -138,9 +138,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
         model: Any = self.object_at(0)
         return model.noise_dimension
 
-    def _transition_from_noise(
-        self, noise: Float[Array, "n k"], states: PyTree
-    ) -> PyTree:
+    def _transition_from_noise(self, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
         """x_t of every object, from its own columns of the noise."""
         noise = noise.reshape(noise.shape[0], self.num_objects, -1)
 

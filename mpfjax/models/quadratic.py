@@ -1,6 +1,7 @@
 """The scalar model with two symmetric modes, Vermaak et al. (2003), section 5.1."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
@@ -53,6 +54,15 @@ class QuadraticModel(AbstractStateSpaceModel):
         else:
             shares = uniform(key, (num_particles,))
         return self.low + (self.high - self.low) * shares
+
+    @property
+    def initial_noise_dimension(self) -> int:
+        """1."""
+        return 1
+
+    def initial_from_noise(self, noise: Float[Array, "n 1"]) -> Float[Array, " n"]:
+        """x_0, uniform on [low, high]."""
+        return self.low + (self.high - self.low) * jax.scipy.special.ndtr(noise[:, 0])
 
     @property
     def noise_dimension(self) -> int:

@@ -23,3 +23,4 @@ from mpfjax.moves.prune import Prune as Prune
 from mpfjax.moves.random_partition import RandomPartition as RandomPartition
 from mpfjax.moves.resampling import Resample as Resample
 from mpfjax.moves.split import Split as Split
+from mpfjax.moves.stages import PropagateInStages as PropagateInStages

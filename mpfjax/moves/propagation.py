@@ -216,6 +216,19 @@ def log_transition(
     return check_log_density(values, model, "log_transition", num_particles)
 
 
+def likelihoods(
+    model: AbstractStateSpaceModel, observation: PyTree, states: PyTree
+) -> Float[Array, " n"]:
+    """log L of each particle, checked."""
+    leaves = [f"{leaf.dtype}{list(leaf.shape)}" for leaf in jax.tree.leaves(observation)]
+    seen = f"{', '.join(leaves)} in {jax.tree.structure(observation)}"
+    who = f"model: {model_name(model)}.log_likelihood"
+    with saying(f"in {who}, of an observation (a step of the observations) that is {seen}"):
+        values = model.log_likelihood(observation, states)
+    num_particles = jax.tree.leaves(states)[0].shape[0]
+    return check_log_density(values, model, "log_likelihood", num_particles)
+
+
 def _weigh(
     model: AbstractStateSpaceModel,
     mixture: ParticleMixture,
@@ -223,10 +236,5 @@ def _weigh(
     log_ratio: Float[Array, " n"] | None = None,
 ) -> ParticleMixture:
     """The weights times L, and times D / q where the draw was not from D."""
-    leaves = [f"{leaf.dtype}{list(leaf.shape)}" for leaf in jax.tree.leaves(observation)]
-    seen = f"{', '.join(leaves)} in {jax.tree.structure(observation)}"
-    who = f"model: {model_name(model)}.log_likelihood"
-    with saying(f"in {who}, of an observation (a step of the observations) that is {seen}"):
-        log_factors = model.log_likelihood(observation, mixture.particles)
-    log_factors = check_log_density(log_factors, model, "log_likelihood", mixture.num_particles)
+    log_factors = likelihoods(model, observation, mixture.particles)
     return mixture.weighed(*[log_factors] if log_ratio is None else [log_factors, log_ratio])

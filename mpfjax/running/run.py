@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_key, check_whole, given
-from mpfjax.filter import Filter, Start, sample_initial, split_keys, untie
+from mpfjax.filter import Filter, Start, sample_initial, split_keys
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.resampling import FEW_ROWS
 from mpfjax.observations import as_arrays, present_steps
@@ -116,20 +116,22 @@ def _in_slots(keys: Key[Array, " seeds"], filter: Filter, slots: int) -> tuple[S
     if slots < num_particles:
         raise ValueError(f"slots: {slots} is no whole number of at least N, {num_particles}")
     # A model's draws may depend on N, as stratified draws do. So this is a separate program.
-    particles = _sample_each(keys, filter.model, num_particles, int(slots))
+    particles = _sample_each(keys, filter.model, num_particles, int(slots), filter.initial_noise)
     limits = jnp.full(keys.shape, num_particles, jnp.int32)
-    initial_moves = untie(filter._initial_moves, filter.model)
-    filter = Filter(filter.model, filter.moves, int(slots), filter.num_components, initial_moves)
+    filter = Filter(
+        filter.model, filter.moves, int(slots), filter.num_components, filter.initial_moves,
+        filter.initial_noise,
+    )  # fmt: skip
     return Start(keys, particles, limits), filter
 
 
 @jit_on_wide_vectors
-def _sample_each(keys, model, num_particles, slots):
+def _sample_each(keys, model, num_particles, slots, noise):
     """x_0 of each run; the slots that stay empty hold one of its states as well."""
 
     def sample(key: Key[Array, ""]) -> PyTree:
         key_initial = split_keys(split_keys(key, 2)[0], 1)[0]
-        particles = sample_initial(key_initial, model, num_particles)
+        particles = sample_initial(key_initial, model, num_particles, noise)
         index = np.minimum(np.arange(slots), num_particles - 1)
         return jax.tree.map(lambda leaf: leaf[index], particles)
 

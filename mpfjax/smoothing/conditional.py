@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import check_flag, check_key, check_type, shown
-from mpfjax.filter import Filter, Start, sample_initial, untie
+from mpfjax.filter import Filter, Start, sample_initial
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, model_name, require
 from mpfjax.moves.base import AbstractRegrouping
@@ -175,7 +175,7 @@ def _around(filter: Filter, trajectory: PyTree, first_slot: Int[Array, ""]) -> F
         [around(move) for move in filter.moves],
         filter.num_particles,
         filter.num_components,
-        untie(filter._initial_moves, filter.model),
+        filter.initial_moves,
     )
 
 

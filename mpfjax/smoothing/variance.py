@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import check_type, shown
-from mpfjax.filter import Filter, untie
+from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping, AbstractRejuvenation
 from mpfjax.moves.clusters import PropagateInClusters
@@ -55,15 +55,15 @@ def with_first_ancestors(filter: Filter) -> Filter:
                 f"filter: {type(move).__name__}, one of its moves, is approximate or leaves a"
                 " particle without one ancestor; the variance of log Ẑ is not known from one run"
             )
-    initial_moves = untie(filter._initial_moves, filter.model)
-    if any(isinstance(move, _KeepFirstAncestors) for move in initial_moves):
+    if any(isinstance(move, _KeepFirstAncestors) for move in filter.initial_moves):
         return filter
     return Filter(
         filter.model,
         filter.moves,
         filter.num_particles,
         filter.num_components,
-        [*initial_moves, _KeepFirstAncestors()],
+        [*filter.initial_moves, _KeepFirstAncestors()],
+        filter.initial_noise,
     )
 
 

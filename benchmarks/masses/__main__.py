@@ -1,0 +1,151 @@
+"""How far the masses of several modes, and log Ẑ, can be believed; and at what price.
+
+    python -m benchmarks.masses                       # all scenes
+    python -m benchmarks.masses --scenes corridor --particles 400 4000 --seeds 100
+
+Every filter runs on the same observations with the same keys. `mass_rmse` is the root of the mean
+squared error of the regions' masses at the last step, `log_z_sd` the standard deviation of log Ẑ
+over the runs, `ms` the milliseconds of a step of one run alone. Masses are judged by symmetry
+(corridor), a grid (quadratic), or a plain filter of a million particles (bearings, look-alikes).
+
+Into --out DIR go masses.json and masses.png.
+"""
+
+import argparse
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.masses import measure
+from benchmarks.masses.filters import FILTERS
+from benchmarks.masses.scenes import SCENES, Scene
+from mpfjax import plotting
+from mpfjax.console import exit_status, format_table, seed, whole, write_json
+from mpfjax.models.base import HasInitialNoise
+
+# A reference of so many particles where the likelihood of a particle is that of its pixels.
+_FEWER = {"look-alikes": 10}
+
+
+def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
+    """The arguments, each checked."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.masses",
+        description="Errors of modes' masses and of log Ẑ, by filter and number of particles.",
+    )
+    parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
+    parser.add_argument("--filters", nargs="+", choices=list(FILTERS), default=list(FILTERS))
+    parser.add_argument(
+        "--particles", type=whole(2), nargs="+", default=[400, 1000, 4000], metavar="N"
+    )
+    parser.add_argument("--seeds", type=whole(2), default=100)
+    parser.add_argument("--steps", type=whole(2), help="of every scene; each has its own")
+    parser.add_argument(
+        "--reference", type=whole(2), default=1_000_000, metavar="N",
+        help="particles of the filter that says what is true, a tenth of it for look-alikes",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=seed, default=0)
+    parser.add_argument("--out", type=Path, default=Path("results/masses"))
+    return parser.parse_args(arguments)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Scene by scene; what is finished is written."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    settings = {name: value for name, value in vars(options).items() if name != "out"}
+    rows: list[dict[str, Any]] = []
+    truths: dict[str, Any] = {}
+    with_particles = importlib.util.find_spec("particles") is not None
+    if not with_particles:
+        print("particles is not installed: pip install particles")
+    for name in options.scenes:
+        make, num_steps = SCENES[name]
+        scene = make(options.steps or num_steps, options.seed)
+        reference = max(options.reference // _FEWER.get(name, 1), 2)
+        known, uncertain = measure.truth(scene, reference, options.seed + 1)
+        truths[name] = {"masses": known.tolist(), "standard_errors": uncertain.tolist()}
+        for num_particles in options.particles:
+            rows += _rows(name, scene, known, num_particles, options, with_particles)
+            write_json(
+                options.out / "masses.json", {"settings": settings, "truth": truths, "rows": rows}
+            )
+        print(f"\n{name}: masses {_numbers(known)}, known to within {uncertain.max():.4f}")
+        print(table([row for row in rows if row["scene"] == name]))
+    picture(rows).savefig(options.out / "masses.png", dpi=130)
+    print(f"written to {options.out}")
+
+
+def _rows(
+    name: str,
+    scene: Scene,
+    known: np.ndarray,
+    num_particles: int,
+    options: argparse.Namespace,
+    with_particles: bool,
+) -> list[dict[str, Any]]:
+    filters = {each: FILTERS[each](scene, num_particles) for each in options.filters}
+    times = measure.milliseconds(scene, filters, options.seed)
+    rows = []
+    for each, filter in filters.items():
+        found = measure.errors(scene, filter, known, options.seeds, options.seed)
+        rows.append({"scene": name, "filter": each, "N": num_particles, **found, "ms": times[each]})
+    if with_particles and isinstance(scene.model, HasInitialNoise):
+        from benchmarks.masses import through_particles
+
+        found, time = through_particles.errors_and_time(
+            scene, num_particles, known, options.seeds, options.seed
+        )
+        rows.append({
+            "scene": name, "filter": through_particles.SQMC, "N": num_particles, **found, "ms": time
+        })  # fmt: skip
+    return rows
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """A line for each filter and N."""
+    return format_table(
+        ["filter", "N", "error of masses", "sd of log Ẑ", "largest mass", "ms a step"],
+        [
+            [
+                row["filter"],
+                str(row["N"]),
+                f"{row['mass_rmse']:.3f} ± {row['mass_rmse_error']:.3f}",
+                f"{row['log_z_sd']:.3f} ± {row['log_z_sd_error']:.3f}",
+                f"{row['largest_mass']:.2f}",
+                f"{row['ms']:.3f}",
+            ]
+            for row in sorted(rows, key=lambda row: row["N"])
+        ],
+    )
+
+
+def picture(rows: list[dict[str, Any]]) -> Any:
+    """For each scene the errors of masses above and of log Ẑ below, against the time of a step."""
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    panels = []
+    for what, label in (("mass_rmse", "RMS error of masses"), ("log_z_sd", "sd of log Ẑ")):
+        line = []
+        for scene in scenes:
+            lines: dict[str, list[tuple[float, float]]] = {}
+            for row in rows:
+                if row["scene"] == scene:
+                    lines.setdefault(row["filter"], []).append((row["ms"], row[what]))
+            line.append(plotting.CostPanel(scene, "milliseconds a step", label, lines))
+        panels.append(line)
+    return plotting.draw_costs(panels)
+
+
+def _numbers(values: np.ndarray) -> str:
+    return ", ".join(f"{value:.3f}" for value in values)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the benchmark; bad input is one line on the error stream and exit status 2."""
+    return exit_status(lambda: run(parse_arguments(arguments)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

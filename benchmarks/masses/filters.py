@@ -1,0 +1,51 @@
+"""What is compared: the plain filter, the mixture filter, and each option on top of it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import mpfjax
+from benchmarks.masses.scenes import Scene
+
+Make = Callable[[Scene, int], mpfjax.Filter]
+
+
+def _plain(**options: Any) -> Make:
+    return lambda scene, num_particles: mpfjax.particle_filter(
+        scene.model, num_particles, **options
+    )
+
+
+def _mixture(ahead: bool = False, **options: Any) -> Make:
+    def make(scene: Scene, num_particles: int) -> mpfjax.Filter:
+        lookahead = {"lookahead": scene.lookahead} if ahead else {}
+        return mpfjax.mixture_particle_filter(
+            scene.model, num_particles, scene.max_components,
+            **scene.grouping, **lookahead, **options,
+        )  # fmt: skip
+
+    return make
+
+
+def _in_stages(scene: Scene, num_particles: int) -> mpfjax.Filter:
+    """The mixture filter with a propagation in stages in place of its own."""
+    plain = _mixture()(scene, num_particles)
+    moves = [
+        mpfjax.PropagateInStages(scene.model) if isinstance(move, mpfjax.Propagate) else move
+        for move in plain.moves
+    ]
+    return mpfjax.Filter(
+        scene.model, moves, num_particles, scene.max_components, initial_moves=plain.initial_moves
+    )
+
+
+FILTERS: dict[str, Make] = {
+    "PF": _plain(),
+    "PF, rqmc": _plain(noise="rqmc"),
+    "MPF": _mixture(),
+    "MPF, rqmc": _mixture(noise="rqmc"),
+    "MPF, by variance": _mixture(allocation="variance"),
+    "MPF, every 4th": _mixture(regroup_every=4),
+    "MPF, look-ahead": _mixture(ahead=True),
+    "MPF, in stages": _in_stages,
+    "MPF, all": _mixture(ahead=True, noise="rqmc", allocation="variance", regroup_every=4),
+}

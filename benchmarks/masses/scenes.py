@@ -1,0 +1,113 @@
+"""The scenes: a model, what is observed, and the regions whose masses a filter is asked for."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+import mpfjax
+from benchmarks.masses import bearings, corridor, look_alikes
+from mpfjax.exact import grid_filter
+
+GRID = jnp.linspace(-5.0, 5.0, 4001)
+
+
+class Scene(NamedTuple):
+    """A posterior with several modes.
+
+    - `region`: which region each particle is in, (n,), at the end; there are `num_regions`.
+    - `grouping`: the coordinates and units in which components are grouped.
+    - `lookahead`: (y_t, states) -> log ν of each particle, for resampling ahead.
+    - `exact`: the masses and log Z, where a grid or symmetry tells them; else None.
+    """
+
+    model: mpfjax.AbstractStateSpaceModel
+    observations: np.ndarray
+    region: Callable[[PyTree], Array]
+    num_regions: int
+    max_components: int
+    grouping: dict[str, Any]
+    lookahead: Callable[[PyTree, PyTree], Array]
+    exact: tuple[np.ndarray, float | None] | None = None
+
+
+def flattened(model: Any, moved: Callable[[PyTree], PyTree]) -> Callable[[PyTree, PyTree], Array]:
+    """The root of the likelihood of where a particle is expected: a look-ahead with long tails."""
+    return lambda observation, states: 0.5 * model.log_likelihood(observation, moved(states))
+
+
+def make_corridor(num_steps: int, seed: int) -> Scene:
+    """Four doors that look alike: four masses of a quarter."""
+    model = corridor.Corridor()
+    path, observations = corridor.simulate(model, num_steps, seed)
+    return Scene(
+        model, observations,
+        region=lambda states: corridor.section(model, states, path[-1]),
+        num_regions=corridor.NUM_DOORS,
+        max_components=8,
+        grouping={"scale": 1.0},
+        lookahead=flattened(model, lambda states: states + model.speed),
+        exact=(np.full(corridor.NUM_DOORS, 1 / corridor.NUM_DOORS), None),
+    )  # fmt: skip
+
+
+def make_quadratic(num_steps: int, seed: int) -> Scene:
+    """Section 5.1 of Vermaak et al. (2003), with independent draws of x_0; two masses of a half."""
+    rng = np.random.default_rng(seed)
+    model = mpfjax.QuadraticModel(initial_draw="independent")
+    path = 2 * np.sin(2 * np.pi * np.arange(1, num_steps + 1) / 100)
+    observations = (path**2 + 0.1 * rng.normal(size=num_steps)).astype(np.float32)
+    grid = grid_filter(model, jnp.asarray(observations), GRID)
+    above = float(grid.mass_above(0.0)[-1])
+    return Scene(
+        model, observations,
+        region=lambda states: (states > 0).astype(jnp.int32),
+        num_regions=2,
+        max_components=2,
+        grouping={},
+        lookahead=flattened(model, lambda states: states),
+        exact=(np.array([1 - above, above]), float(grid.log_marginal_likelihood)),
+    )  # fmt: skip
+
+
+def make_bearings(num_steps: int, seed: int) -> Scene:
+    """A target on either side of two lines of hydrophones."""
+    model = bearings.BearingsModel()
+    return Scene(
+        model, bearings.observations(num_steps, seed),
+        region=bearings.is_above,
+        num_regions=2,
+        max_components=4,
+        grouping={"features": bearings.position, "scale": 4.0},
+        lookahead=flattened(model, model.transition_mean),
+    )  # fmt: skip
+
+
+def make_look_alikes(num_steps: int, seed: int) -> Scene:
+    """Two players in the same kit."""
+    scene = look_alikes.LookAlikes(num_steps, seed + 1)
+    return Scene(
+        scene.model, scene.observations,
+        region=scene.nearest,
+        num_regions=2,
+        max_components=4,
+        grouping={"features": look_alikes.place, "scale": 20.0},
+        lookahead=flattened(scene.model, lambda states: states),
+    )  # fmt: skip
+
+
+# The scene, and its number of steps.
+SCENES: dict[str, tuple[Callable[[int, int], Scene], int]] = {
+    "corridor": (make_corridor, 80),
+    "quadratic": (make_quadratic, 100),
+    "bearings": (make_bearings, 40),
+    "look-alikes": (make_look_alikes, 30),
+}
+
+
+def masses(scene: Scene, mixture: mpfjax.ParticleMixture) -> Array:
+    """The mass of each region."""
+    return mixture.average(jax.nn.one_hot(scene.region(mixture.particles), scene.num_regions))

@@ -1,0 +1,120 @@
+"""The scenes through SQMC of particles (Chopin and Papaspiliopoulos), with our model's functions.
+
+particles has no x_0 before the first observation, so its time 0 is given a potential of one, and
+its time t is ours. It takes a state for a row of numbers, along whose Hilbert curve it sorts.
+"""
+# The rival is installed for this benchmark only.
+# pyright: reportMissingImports=false
+# ruff: noqa: NPY002
+
+import math
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import particles
+from jaxtyping import Array, PyTree
+
+from benchmarks.masses.measure import summary
+from benchmarks.masses.scenes import Scene
+
+SQMC = "SQMC of particles"
+
+
+class Rows:
+    """States as rows of numbers, and back."""
+
+    def __init__(self, model: Any) -> None:
+        one = jax.eval_shape(lambda key: model.sample_initial(key, 2), jax.random.key(0))
+        self.leaves, self.structure = jax.tree.flatten(one)
+
+    def of(self, states: PyTree) -> Array:
+        """A row for each particle."""
+        leaves = jax.tree.leaves(states)
+        return jnp.concatenate(
+            [leaf.reshape(len(leaf), -1).astype(jnp.float32) for leaf in leaves], axis=1
+        )
+
+    def states(self, rows: Array) -> PyTree:
+        """The states that the rows are of."""
+        found, place = [], 0
+        for leaf in self.leaves:
+            width = math.prod(leaf.shape[1:])
+            part = rows[:, place : place + width]
+            found.append(part.reshape(len(rows), *leaf.shape[1:]).astype(leaf.dtype))
+            place += width
+        return jax.tree.unflatten(self.structure, found)
+
+
+class FeynmanKac(particles.FeynmanKac):
+    """The bootstrap filter of a scene, made of uniform numbers."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(len(scene.observations) + 1)
+        model: Any = scene.model
+        rows = Rows(model)
+        dimension, start = model.noise_dimension, model.initial_noise_dimension
+        self.du = max(start, dimension)
+        self.observations = jnp.asarray(scene.observations)
+
+        def first(shares: Array) -> Array:
+            return rows.of(model.initial_from_noise(_normal(shares[:, :start])))
+
+        def following(states: Array, shares: Array) -> Array:
+            noise = _normal(shares[:, :dimension])
+            return rows.of(model.transition_from_noise(noise, rows.states(states)))
+
+        self.first, self.following = jax.jit(first), jax.jit(following)
+        self.weigh = jax.jit(lambda seen, x: model.log_likelihood(seen, rows.states(x)))
+        self.regions = jax.jit(lambda x: scene.region(rows.states(x)))
+
+    def Gamma0(self, u: np.ndarray) -> np.ndarray:
+        """x_0."""
+        return _squeezed(self.first(_columns(u)))
+
+    def Gamma(self, t: int, xp: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """A step of the dynamics."""
+        return _squeezed(self.following(_columns(xp), _columns(u)))
+
+    def logG(self, t: int, xp: np.ndarray | None, x: np.ndarray) -> np.ndarray:
+        """log L(y_t | x_t); zero for x_0."""
+        if t == 0:
+            return np.zeros(len(x))
+        return np.asarray(self.weigh(self.observations[t - 1], _columns(x)), float)
+
+
+def errors_and_time(
+    scene: Scene, num_particles: int, known: np.ndarray, seeds: int, seed: int
+) -> tuple[dict[str, float], float]:
+    """The errors over runs, and the median milliseconds of a step."""
+    model = FeynmanKac(scene)
+    found, logs, seconds = [], [], []
+    for k in range(-1, seeds):
+        np.random.seed(seed + k + 1)
+        start = time.perf_counter()
+        smc: Any = particles.SMC(fk=model, N=num_particles, qmc=True)
+        smc.run()
+        if k < 0:  # the first one compiles
+            continue
+        seconds.append(time.perf_counter() - start)
+        regions = np.asarray(model.regions(_columns(smc.X)))
+        found.append(np.bincount(regions, weights=smc.W, minlength=len(known)))
+        logs.append(smc.logLt)
+    steps = len(scene.observations)
+    milliseconds = 1e3 * float(np.median(seconds)) / steps
+    return summary(np.array(found), np.array(logs), known), milliseconds
+
+
+def _normal(shares: Array) -> Array:
+    return jax.scipy.special.ndtri(jnp.clip(shares, 1e-7, 1 - 1e-7))
+
+
+def _columns(values: np.ndarray) -> np.ndarray:
+    return np.asarray(values, np.float32).reshape(len(values), -1)
+
+
+def _squeezed(values: Any) -> np.ndarray:
+    rows = np.asarray(values, float)
+    return rows[:, 0] if rows.shape[1] == 1 else rows
