@@ -161,7 +161,8 @@ BUILT = {
         mpfjax.gaussian_mixture_particle_filter,
         {"model": MODEL, "num_particles": 4, "max_components": 2, "proposal": None,
          "regeneration": None, "importance": "propagated", "noise": "independent",
-         "features": None, "scale": 1.0, "merge": None, "split": None, "kmeans": None, "initial_kmeans": None, "regroup_every": 1},
+         "features": None, "scale": 1.0, "merge": None, "split": None, "kmeans": None,
+         "initial_kmeans": None, "regroup_every": 1},
     ),
     "partitioned_sampling": (
         mpfjax.partitioned_sampling,

@@ -93,7 +93,7 @@ def cell_counts(points, digits):
 
 
 def test_more_dimensions_than_the_table_holds():
-    with pytest.raises(ValueError, match="noise_dimension: 65 is not in 1, .* 64"):
+    with pytest.raises(ValueError, match=r"noise_dimension: 65 is not in 1, .* 64"):
         direction_numbers(65)
     with pytest.raises(ValueError, match="sort_by: 9 coordinates"):
         bits_per_dimension(9)

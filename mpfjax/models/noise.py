@@ -8,6 +8,7 @@ from mpfjax.operations.floats import default_float
 from mpfjax.operations.generator import bits, normal, normal_quantile, split, uniform
 from mpfjax.operations.segments import first_places, spread
 from mpfjax.operations.sobol import scrambled_directions, sobol_points
+from mpfjax.operations.stored import stored
 
 NOISES = ("independent", "rqmc", "stratified")
 
@@ -91,7 +92,8 @@ def rqmc_normal(
     else:
         directions = scrambled_directions(key_matrix, d, max((n - 1).bit_length(), 1))
         points = sobol_points(ranks, directions) ^ own
-    return _normal_of(points, dtype).T
+    # Row by row, and only then in columns: in short rows nothing runs on vectors.
+    return stored(_normal_of(points, dtype)).T
 
 
 def _normal_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, Shaped, UInt32
 
 from mpfjax.operations.indexing import take
+from mpfjax.operations.stored import stored
 
 _BITS = 32
 
@@ -32,7 +33,8 @@ def order_by_key(
         if 0 < low < _BITS:
             word = word | (segments << (_BITS - low))
         if low > 0:
-            word = take(word, order)
+            # Otherwise the gather would compute the keys again, without vectors.
+            word = take(stored(word & ((1 << digit) - 1), 1 << digit), order)
         ranked = jax.lax.sort((word << index_bits) | index) & ((1 << index_bits) - 1)
         ranked = ranked.astype(jnp.int32)
         order = ranked if low == 0 else take(order, ranked)
