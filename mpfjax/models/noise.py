@@ -8,9 +8,10 @@ from mpfjax.operations.floats import default_float
 from mpfjax.operations.generator import bits, normal, normal_quantile, split, uniform
 from mpfjax.operations.segments import first_places, spread
 from mpfjax.operations.sobol import scrambled_directions, sobol_points
-from mpfjax.operations.stored import stored
+from mpfjax.operations.stored import EXACT_IN_FLOAT32, stored
 
 NOISES = ("independent", "rqmc", "stratified")
+_UNUSED = 9  # bits of 32 that no draw of 23 bits shows
 
 
 def draw_noise(
@@ -81,12 +82,14 @@ def rqmc_normal(
     n, d = shape
     ranks = jnp.arange(n, dtype=jnp.int32)
     key_matrix, key_shift = split(key, 2)
-    shifts = bits(key_shift, (num_components, d))
+    shifts = bits(key_shift, (num_components, d)) >> _UNUSED
     if components is None or num_components == 1:
         own = shifts[0][:, None]
     else:
-        ranks = ranks - spread(first_places(components, num_components), components)
-        own = jnp.stack([spread(shifts[:, k], components) for k in range(d)])
+        ranks = stored(ranks - spread(first_places(components, num_components), components), n)
+        own = [spread(shifts[:, k], components) for k in range(d)]
+        own = stored(jnp.stack(own), EXACT_IN_FLOAT32)
+    own = own << _UNUSED
     if d == 1:
         points = (ranks.astype(jnp.uint32) * _multipliers(1))[None] + own
     else:
@@ -99,7 +102,7 @@ def rqmc_normal(
 def _normal_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
     """Quantiles of the standard normal at points in units of 2^-32."""
     # The top 23 bits, at the middle of their cells, keep clear of -1 and 1 in float32 as well.
-    centred = ((points >> 9).astype(dtype) + 0.5) * jnp.array(2.0**-22, dtype) - 1
+    centred = ((points >> _UNUSED).astype(dtype) + 0.5) * jnp.array(2.0**-22, dtype) - 1
     return normal_quantile(centred)
 
 
