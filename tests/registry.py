@@ -42,6 +42,7 @@ NUM_COMPONENTS, MANY_COMPONENTS = 3, 6
 # Every scheme of resampling, regrouping and regeneration that does it in another way for many.
 OTHERWISE_OF_MANY = (
     "mpf",
+    "mpf rqmc",
     "guided, sorted, stratified noise",
     "split only, adaptive",
     "random labels, multinomial",
@@ -84,6 +85,7 @@ REJUVENATIONS: dict[str, AbstractRejuvenation] = {
     "systematic, adaptive": Resample(ess_threshold=0.5),
     "multinomial, adaptive": Resample("multinomial", ess_threshold=0.5),
     "systematic, sorted": Resample(sort_by=lambda states: states[:, 0]),
+    "systematic, along a Hilbert curve": Resample(sort_by="hilbert"),
     "systematic, fixed number": Resample(particles_per_component=5),
     "residual, fixed number, adaptive": Resample("residual", 0.5, 5),
     "systematic, shared by variance": Resample(allocation="variance"),
@@ -92,6 +94,7 @@ REJUVENATIONS: dict[str, AbstractRejuvenation] = {
     "soft, fixed number, adaptive": Resample("residual", 0.5, 5, gradient="soft", softness=0.3),
     "gaussian": GaussianRegeneration(),
     "gaussian, fixed number, stratified": GaussianRegeneration(5, noise="stratified"),
+    "gaussian, point sets": GaussianRegeneration(noise="rqmc"),
 }
 
 
@@ -134,6 +137,13 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
     """The chains that regroup, with M components."""
     return {
         "mpf": _mpf(m),
+        "mpf rqmc": _mpf(m, noise="rqmc"),
+        "guided mpf rqmc, adaptive": lambda model: _mpf(
+            m, proposal=GaussNewtonProposal(model), noise="rqmc", ess_threshold=0.5
+        )(model),
+        "gaussian mixture rqmc": lambda model: mpfjax.gaussian_mixture_particle_filter(
+            model, NUM_PARTICLES, m, noise="rqmc"
+        ),
         "mpf fixed number": _mpf(m, particles_per_component=36 // m),
         "guided mpf": lambda model: _mpf(m, proposal=GaussNewtonProposal(model))(model),
         "guided, sorted, stratified noise": _chain(
@@ -171,9 +181,11 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
 # contracts where the thorough tests run.
 QUICK_CHAINS = (
     "pf",
+    "pf rqmc",
     "guided pf",
     "mpf",
     "mpf, M = 6",
+    "mpf rqmc, M = 6",
     "guided mpf",
     "auxiliary mpf",
     "random labels, residual",
@@ -191,6 +203,7 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "pf multinomial": _pf(scheme="multinomial"),
     "pf adaptive": _pf(ess_threshold=0.5),
     "pf ssp": _pf(scheme="ssp"),
+    "pf rqmc": _pf(noise="rqmc"),
     "auxiliary pf, adaptive": lambda model: mpfjax.auxiliary_particle_filter(
         model, NUM_PARTICLES, GaussNewtonProposal(model), ess_threshold=0.5
     ),

@@ -77,7 +77,7 @@ def chain_filter(chain, model):
 
 # Regrouping is exact whatever the labels are, so that what the state is makes no difference to it:
 # a second model for the chains without, and for one of each kind with it.
-ON_BOTH_MODELS = ("mpf", "guided mpf", "partitioned in clusters")
+ON_BOTH_MODELS = ("mpf", "mpf rqmc", "guided mpf", "partitioned in clusters")
 EXACT = [
     (chain, model)
     for chain in CHAINS
@@ -93,7 +93,7 @@ QUICK = [
     (chain, model)
     for chain, model in EXACT
     if chain in QUICK_CHAINS
-    if model == "quadratic" or chain in ("pf", "guided pf", "guided mpf", "dps")
+    if model == "quadratic" or chain in ("pf", "pf rqmc", "guided pf", "guided mpf", "dps")
 ]
 
 
@@ -145,7 +145,9 @@ def assert_unbiased(estimates, expected):
 
 def test_what_is_approximate_is_declared():
     declared = {chain for chain in CHAINS if not is_exact(chain)}
-    of_components = {"exclusion", "gaussian mixture", "predictive Gaussian"}
+    of_components = {
+        "exclusion", "gaussian mixture", "gaussian mixture rqmc", "predictive Gaussian"
+    }  # fmt: skip
     of_many = f"predictive Gaussian, M = {MANY_COMPONENTS}"
     assert declared == {"dps prior", of_many} | of_components
 

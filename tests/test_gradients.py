@@ -49,6 +49,7 @@ def pathwise(model, gradient):
 FILTERS = {
     "pf": single(mpfjax.particle_filter, NUM_PARTICLES),
     "mpf": single(mpfjax.mixture_particle_filter, NUM_PARTICLES, 2, ess_threshold=0.7),
+    "mpf rqmc": single(mpfjax.mixture_particle_filter, NUM_PARTICLES, 2, noise="rqmc"),
     "guided pf": guided,
     "pathwise": pathwise,
     "ps": joint(mpfjax.partitioned_sampling, order=(1, 0)),
@@ -108,7 +109,7 @@ def standard_errors(values, expected):
     return float((values.mean() - expected) / (values.std() / np.sqrt(len(values))))
 
 
-@pytest.mark.parametrize("name", quick_of(FILTERS, ("mpf", "guided pf", "dps")))
+@pytest.mark.parametrize("name", quick_of(FILTERS, ("mpf", "mpf rqmc", "guided pf", "dps")))
 def test_stop_gradient_scores_are_unbiased(name):
     """∇Ẑ = Ẑ ∇log Ẑ is an unbiased estimate of ∇Z, for any number of particles."""
     found = deviations(name, "stop")

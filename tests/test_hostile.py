@@ -110,8 +110,10 @@ BUILT = {
     "Every": (mpfjax.Every, {"num_steps": 2, "moves": [mpfjax.KMeans(1)]}),
     "Prune": (mpfjax.Prune, {"least_share": 1e-3}),
     "Exchange": (mpfjax.Exchange, {"threshold": 0.5}),
-    "Propagate": (mpfjax.Propagate, {"model": MODEL, "proposal": None, "gradient": "none"}),
-    "Predict": (mpfjax.Predict, {"model": MODEL, "gradient": "none"}),
+    "Propagate": (
+        mpfjax.Propagate, {"model": MODEL, "proposal": None, "gradient": "none", "noise": "rqmc"}
+    ),
+    "Predict": (mpfjax.Predict, {"model": MODEL, "gradient": "none", "noise": "stratified"}),
     "Weigh": (mpfjax.Weigh, {"model": MODEL}),
     "Partitioned": (
         mpfjax.Partitioned,
@@ -133,32 +135,34 @@ BUILT = {
     "particle_filter": (
         mpfjax.particle_filter,
         {"model": MODEL, "num_particles": 4, "proposal": None, "scheme": "systematic",
-         "ess_threshold": 1.0, "sort_by": None, "gradient": "none"},
+         "ess_threshold": 1.0, "sort_by": None, "noise": "rqmc", "gradient": "none"},
     ),
     "auxiliary_particle_filter": (
         mpfjax.auxiliary_particle_filter,
         {"model": MODEL, "num_particles": 4, "lookahead": mpfjax.GaussNewtonProposal(MODEL),
          "proposal": None, "scheme": "ssp", "ess_threshold": 1.0, "sort_by": None,
-         "gradient": "none"},
+         "noise": "independent", "gradient": "none"},
     ),
     "mixture_particle_filter": (
         mpfjax.mixture_particle_filter,
         {"model": MODEL, "num_particles": 4, "max_components": 2, "proposal": None,
          "lookahead": None,
          "scheme": "systematic", "ess_threshold": 1.0, "particles_per_component": None,
-         "sort_by": None, "gradient": "none", "features": None, "scale": 1.0, "merge": None,
-         "split": None, "kmeans": None, "initial_kmeans": None, "regroup_every": 1},
+         "sort_by": "hilbert", "noise": "rqmc", "gradient": "none", "features": None,
+         "scale": 1.0, "merge": None, "split": None, "kmeans": None, "initial_kmeans": None,
+         "regroup_every": 1},
     ),
     "gaussian_particle_filter": (
         mpfjax.gaussian_particle_filter,
         {"model": MODEL, "num_particles": 4, "proposal": None, "regeneration": None,
-         "importance": "propagated"},
+         "importance": "propagated", "noise": "rqmc"},
     ),
     "gaussian_mixture_particle_filter": (
         mpfjax.gaussian_mixture_particle_filter,
         {"model": MODEL, "num_particles": 4, "max_components": 2, "proposal": None,
-         "regeneration": None, "importance": "propagated", "features": None, "scale": 1.0,
-         "merge": None, "split": None, "kmeans": None, "initial_kmeans": None, "regroup_every": 1},
+         "regeneration": None, "importance": "propagated", "noise": "independent",
+         "features": None, "scale": 1.0, "merge": None, "split": None, "kmeans": None,
+         "initial_kmeans": None, "regroup_every": 1},
     ),
     "partitioned_sampling": (
         mpfjax.partitioned_sampling,

@@ -32,7 +32,12 @@ class Drift(mpfjax.AbstractStateSpaceModel):
         return jax.random.normal(key, (num_particles, 2))
 
     def sample_transition(self, key, states):
-        return self.transition_mean(states) + 0.5 * jax.random.normal(key, states.shape)
+        return self.transition_from_noise(jax.random.normal(key, states.shape), states)
+
+    noise_dimension = 2
+
+    def transition_from_noise(self, noise, states):
+        return self.transition_mean(states) + 0.5 * noise
 
     def log_likelihood(self, observation, states):
         return norm.logpdf(observation - states[:, 0], scale=0.7)
@@ -94,7 +99,12 @@ class ScalarLinear(mpfjax.AbstractStateSpaceModel):
         return self.m + self.p * jax.random.normal(key, (num_particles,))
 
     def sample_transition(self, key, states):
-        return self.a * states + self.q * jax.random.normal(key, states.shape)
+        return self.transition_from_noise(jax.random.normal(key, (len(states), 1)), states)
+
+    noise_dimension = 1
+
+    def transition_from_noise(self, noise, states):
+        return self.a * states + self.q * noise[:, 0]
 
     def log_likelihood(self, observation, states):
         return norm.logpdf(observation, self.h * states, self.r)

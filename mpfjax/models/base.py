@@ -96,17 +96,38 @@ class HasInitialNoise(Protocol):
         ...
 
 
+def is_made_of_noise(model: Any) -> bool:
+    """Whether the model makes x_t of noise, and draws no x_t of another law."""
+    has_noise = hasattr(model, "transition_from_noise") and hasattr(model, "noise_dimension")
+    return has_noise and not _draws_otherwise(model)
+
+
+def _draws_otherwise(model: Any) -> bool:
+    """Whether a class draws x_t itself, and inherits how it is made of noise."""
+    own = model.model if isinstance(model, _PerParticleModel) else model
+    for owner in type(own).__mro__:
+        if "transition_from_noise" in vars(owner):
+            return False
+        if "sample_transition" in vars(owner):
+            return callable(getattr(type(own), "transition_from_noise", None))
+    return False
+
+
 def require_noise(model: Any, needed_by: str) -> None:
     """Raise a `ValueError` unless the model can make x_t of noise from the Sobol table."""
     require(model, "transition_from_noise", needed_by)
-    dimension = getattr(model, "noise_dimension", None)
-    if dimension is None:
+    if not hasattr(model, "noise_dimension"):
         raise ValueError(
             f"model: {model_name(model)} has no noise_dimension, which {needed_by} needs beside"
             " transition_from_noise"
         )
-    check_whole(noise_dimension=dimension)
-    direction_numbers(dimension)
+    if not is_made_of_noise(model):
+        raise ValueError(
+            f"model: {model_name(model)} defines a sample_transition, but inherits its"
+            f" transition_from_noise, which {needed_by} needs; it must define both"
+        )
+    check_whole(noise_dimension=model.noise_dimension)
+    direction_numbers(model.noise_dimension)
 
 
 def require(model: Any, method: str, needed_by: str, argument: str = "model") -> None:

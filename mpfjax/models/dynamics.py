@@ -11,6 +11,7 @@ from mpfjax.checks import (
     check_positive_array,
     check_rows,
     check_scalars,
+    check_shape,
     to_array,
 )
 from mpfjax.models.noise import independent_normal
@@ -117,6 +118,7 @@ class RandomWalk(AbstractRandomWalk):
     ) -> Float[Array, "n d"]:
         """x_{t-1} plus noise."""
         del previous
+        check_shape(f"n {current.shape[1]}", noise=noise)
         return current + jnp.broadcast_to(self.deviations, current.shape) * noise
 
     def log_density(
@@ -209,6 +211,7 @@ class Autoregression(AbstractDynamics):
         previous: Float[Array, "n d"] | None = None,
     ) -> Float[Array, "n d"]:
         """The expected x_t plus B ω_t."""
+        check_shape(f"n {current.shape[1]}", noise=noise)
         return self.moments(current, previous)[0] + _times(self.B, noise)
 
     def log_density(

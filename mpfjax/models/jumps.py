@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from mpfjax.checks import check_inner_share, check_positive_array, check_rows, to_array
+from mpfjax.checks import check_inner_share, check_positive_array, check_rows, check_shape, to_array
 from mpfjax.models.dynamics import AbstractRandomWalk, RandomWalk
 from mpfjax.operations.generator import fast_key, normal, split
 
@@ -52,6 +52,7 @@ class RandomWalkWithJumps(AbstractRandomWalk):
     ) -> Float[Array, "n d"]:
         """x_{t-1} plus a step, long for the particles that jump."""
         del previous
+        check_shape(f"n {current.shape[1] + 1}", noise=noise)
         jumps = jax.scipy.special.ndtr(noise[:, -1:]) < self.jump_probability
         return self._moved(jumps, noise[:, :-1], current)
 

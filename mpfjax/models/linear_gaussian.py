@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from mpfjax.checks import check_finite_array, to_array
+from mpfjax.checks import check_finite_array, check_shape, to_array
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.operations.generator import normal
 from mpfjax.operations.matrices import row_sums, solve_lower
@@ -65,6 +65,7 @@ class LinearGaussianModel(AbstractStateSpaceModel):
         self, noise: Float[Array, "n d"], states: Float[Array, "n d"]
     ) -> Float[Array, "n d"]:
         """x_t ~ N(A x_{t-1}, Q)."""
+        check_shape(f"n {self.noise_dimension}", noise=noise)
         return self.transition_mean(states) + noise @ jnp.linalg.cholesky(self.Q).T
 
     def log_likelihood(

@@ -14,6 +14,7 @@ from mpfjax.models.base import (
     AbstractStateSpaceModel,
     check_log_density,
     check_model,
+    is_made_of_noise,
     model_name,
 )
 from mpfjax.operations.generator import split
@@ -127,9 +128,9 @@ class MultiObjectModel(AbstractStateSpaceModel):
         # the objects' is.
         if name == "log_transition" and hasattr(self.object_model, name):
             return self._log_transition
-        if name == "transition_from_noise" and hasattr(self.object_model, name):
+        if name == "transition_from_noise" and is_made_of_noise(self.object_model):
             return self._transition_from_noise
-        if name == "noise_dimension" and hasattr(self.object_model, name):
+        if name == "noise_dimension" and is_made_of_noise(self.object_model):
             return self.num_objects * self._object_noise_dimension
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 

@@ -2,14 +2,16 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
 from mpfjax.operations.floats import default_float
 from mpfjax.operations.generator import bits, normal, normal_quantile, split, uniform
 from mpfjax.operations.segments import first_places, spread
 from mpfjax.operations.sobol import scrambled_directions, sobol_points
+from mpfjax.operations.stored import EXACT_IN_FLOAT32, stored
 
 NOISES = ("independent", "rqmc", "stratified")
+_UNUSED = 9  # bits of 32 that no draw of 23 bits shows
 
 
 def draw_noise(
@@ -51,10 +53,8 @@ def stratified_normal(
     resampling.
     """
     n, d = shape
-    # Fractions of 2^32 in integers: floating point would lose the fraction of i α for large i.
-    multipliers = jnp.array([int(2**32 * alpha) | 1 for alpha in _lattice(d)], jnp.uint32)
     shift = bits(key, (d,))
-    points = jnp.arange(n, dtype=jnp.uint32)[:, None] * multipliers[None] + shift[None]
+    points = jnp.arange(n, dtype=jnp.uint32)[:, None] * _multipliers(d)[None] + shift[None]
     return _normal_of(points, dtype)
 
 
@@ -65,13 +65,15 @@ def rqmc_normal(
     components: Int[Array, " n"] | None = None,
     num_components: int = 1,
 ) -> Float[Array, "n d"]:
-    """Standard normal draws, one row a particle, from randomised Sobol points.
+    """Standard normal draws, one row a particle, from a randomised point set for each component.
 
-    The r-th slot of a component gets point r, scrambled by a random matrix and a random shift of
-    its digits. Systematic resampling of k slots takes its points at (r + U) / k, so slot and noise
-    together are a Hammersley set of d + 1 dimensions: where particles stand in the order of
-    their states, the step is array randomised quasi-Monte Carlo (L'Ecuyer, Lécot and Tuffin
-    2008). Each component has a shift of its own, so the noise of any two particles of different
+    The r-th slot of a component gets point r. Systematic resampling of k slots takes its points
+    at (r + U) / k, so slot and noise together are a point set of d + 1 dimensions: where particles
+    stand in the order of their states, the step is array randomised quasi-Monte Carlo (L'Ecuyer,
+    Lécot and Tuffin 2008). In two dimensions or more, point r is that of Sobol, its digits
+    scrambled by a random matrix and shifted. In one it is the fractional part of r times the golden
+    ratio plus a random shift: any run of neighbours is then spread evenly, as narrow likelihoods
+    ask for. Each component has a shift of its own, so the noise of any two particles of different
     components is independent. Every single row is exactly normal and independent of the past, so
     a sum over particles keeps its expectation.
 
@@ -80,20 +82,27 @@ def rqmc_normal(
     n, d = shape
     ranks = jnp.arange(n, dtype=jnp.int32)
     key_matrix, key_shift = split(key, 2)
-    directions = scrambled_directions(key_matrix, d, max((n - 1).bit_length(), 1))
-    shifts = bits(key_shift, (num_components, d))
+    shifts = bits(key_shift, (num_components, d)) >> _UNUSED
     if components is None or num_components == 1:
-        points = sobol_points(ranks, directions) ^ shifts[0][:, None]
-        return _normal_of(points, dtype).T
-    ranks = ranks - spread(first_places(components, num_components), components)
-    own = jnp.stack([spread(shifts[:, k], components) for k in range(d)])
-    return _normal_of(sobol_points(ranks, directions) ^ own, dtype).T
+        own = shifts[0][:, None]
+    else:
+        ranks = stored(ranks - spread(first_places(components, num_components), components), n)
+        own = [spread(shifts[:, k], components) for k in range(d)]
+        own = stored(jnp.stack(own), EXACT_IN_FLOAT32)
+    own = own << _UNUSED
+    if d == 1:
+        points = (ranks.astype(jnp.uint32) * _multipliers(1))[None] + own
+    else:
+        directions = scrambled_directions(key_matrix, d, max((n - 1).bit_length(), 1))
+        points = sobol_points(ranks, directions) ^ own
+    # Row by row, and only then in columns: in short rows nothing runs on vectors.
+    return stored(_normal_of(points, dtype)).T
 
 
 def _normal_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
     """Quantiles of the standard normal at points in units of 2^-32."""
     # The top 23 bits, at the middle of their cells, keep clear of -1 and 1 in float32 as well.
-    centred = ((points >> 9).astype(dtype) + 0.5) * jnp.array(2.0**-22, dtype) - 1
+    centred = ((points >> _UNUSED).astype(dtype) + 0.5) * jnp.array(2.0**-22, dtype) - 1
     return normal_quantile(centred)
 
 
@@ -111,6 +120,11 @@ def noise_dtype(states: PyTree) -> jnp.dtype:
     """The type of the noise that moves these states: that of their floating point leaves."""
     leaves = [leaf for leaf in jax.tree.leaves(states) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return jnp.result_type(*leaves) if leaves else default_float()
+
+
+def _multipliers(dimension: int) -> UInt32[Array, " d"]:
+    """α in units of 2^-32: floating point would lose the fraction of i α for large i."""
+    return jnp.array([int(2**32 * alpha) | 1 for alpha in _lattice(dimension)], jnp.uint32)
 
 
 def _lattice(dimension: int) -> list[float]:

@@ -10,6 +10,7 @@ from mpfjax.checks import (
     check_one_of,
     check_positive_array,
     check_scalars,
+    check_shape,
     to_array,
 )
 from mpfjax.models.base import AbstractStateSpaceModel
@@ -73,6 +74,7 @@ class QuadraticModel(AbstractStateSpaceModel):
         self, noise: Float[Array, "n 1"], states: Float[Array, " n"]
     ) -> Float[Array, " n"]:
         """x_t ~ N(x_{t-1}, σ_x²)."""
+        check_shape("n 1", noise=noise)
         return states + self.sigma_x * noise[:, 0]
 
     def log_likelihood(

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_callable, check_one_of, check_positive, check_whole, given
 from mpfjax.mixture import ParticleMixture, flatten_states
@@ -15,6 +15,7 @@ from mpfjax.moves.base import AbstractRejuvenation
 from mpfjax.moves.features import origin, summarise
 from mpfjax.moves.resampling import Resample
 from mpfjax.moves.slots import deal_slots, place_slots
+from mpfjax.moves.standing import standing_order
 from mpfjax.operations.generator import split
 from mpfjax.operations.indexing import take
 from mpfjax.operations.matrices import cholesky
@@ -35,7 +36,9 @@ class GaussianRegeneration(AbstractRejuvenation):
       The rest (angles, bounded or whole numbers) is copied from resampled particles. None redraws
       the whole state.
     - `inflation`: of the standard deviations; above 1 it counters the loss of spread.
-    - `noise`: "independent" or "stratified", see `stratified_normal`.
+    - `noise`: "independent"; or "stratified" or "rqmc", which spread the draws of all slots, or of
+      each component, evenly. With "rqmc", each component's draws then stand along a Hilbert curve,
+      as `Propagate(noise="rqmc")` needs them.
 
     With a singular Σ_m, draws stay in its plane; a component of one particle, or of copies of one,
     gives that particle again. With `where`, ancestors are the resampled particles; without it,
@@ -68,11 +71,30 @@ class GaussianRegeneration(AbstractRejuvenation):
         if self.where is None:
             vacated = self._vacated(mixture)
             drawn = self._draw(key_noise, mixture.particles, mixture, vacated)
-            return vacated.replace(particles=drawn)
+            return self._in_line(vacated.replace(particles=drawn))
         resample = Resample(particles_per_component=self.particles_per_component)
         vacated = resample(key_rest, mixture)
         drawn = self._draw(key_noise, self.where(mixture.particles), mixture, vacated)
-        return vacated.replace(particles=eqx.tree_at(self.where, vacated.particles, drawn))
+        drawn = eqx.tree_at(self.where, vacated.particles, drawn)
+        return self._in_line(vacated.replace(particles=drawn))
+
+    def _in_line(self, mixture: ParticleMixture) -> ParticleMixture:
+        """The same mixture, its slots in order if the next noise is a point set over them."""
+        if self.noise != "rqmc":
+            return mixture
+        labels = mixture.component_indicators
+        labels = jnp.where(mixture.occupied, labels, mixture.num_components)
+        order = standing_order(mixture, labels, self._redrawn)
+        return mixture.replace(
+            particles=jax.tree.map(lambda leaf: take(leaf, order), mixture.particles),
+            log_weights=take(mixture.log_weights, order),
+            component_indicators=take(mixture.component_indicators, order),
+            ancestor_indices=take(mixture.ancestor_indices, order),
+        )
+
+    def _redrawn(self, particles: PyTree) -> Float[Array, "n d"]:
+        """The part of the state that is redrawn, flattened."""
+        return flatten_states(particles if self.where is None else self.where(particles))
 
     def _vacated(self, mixture: ParticleMixture) -> ParticleMixture:
         """The slots dealt anew, each holding its component's heaviest particle."""

@@ -16,6 +16,7 @@ from mpfjax.models.base import (
     check_log_density,
     check_model,
     check_moved,
+    is_made_of_noise,
     model_name,
     require,
     require_noise,
@@ -42,10 +43,10 @@ class Propagate(AbstractPropagation):
     - `noise`: what x_t is made of. "independent": each particle has noise of its own, as the
       model's `sample_transition` or the proposal draws it. "rqmc" and "stratified" spread the noise
       evenly over neighbours: over the slots of each component, or of all. Every particle's own law
-      stays the same, so Ẑ stays unbiased. "rqmc" is a randomised Sobol point set over slot and
-      noise (L'Ecuyer, Lécot and Tuffin 2008; Gerber and Chopin 2015). It needs particles that
-      stand in order, as after `Resample(sort_by="hilbert")`. Take it where masses and likelihoods
-      must be accurate.
+      stays the same, so Ẑ stays unbiased. "rqmc" is a randomised point set over slot and noise,
+      of Sobol for noise of two dimensions or more (L'Ecuyer, Lécot and Tuffin 2008; Gerber and
+      Chopin 2015). It needs particles that stand in order, as after `Resample(sort_by="hilbert")`.
+      Take it where masses and likelihoods must be accurate.
 
     Raises `ValueError` for another gradient or noise; for a proposal, or "stop", with a model that
     has no `log_transition`; for noise that is not independent, with a model that has no
@@ -84,7 +85,7 @@ class Propagate(AbstractPropagation):
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
         # A proposal says nothing of the model's own noise.
-        spreads = self.proposal is None or isinstance(self.model, HasTransitionNoise)
+        spreads = self.proposal is None or is_made_of_noise(self.model)
         noise = self.noise if spreads else "independent"
         return predict(key, self.model, mixture, self.gradient, noise)
 
@@ -192,11 +193,14 @@ def predict(
     """Draws of x_t, with the weights' derivatives times D / ⊥D where the draws have none."""
     if noise == "independent":
         states = model.sample_transition(key, mixture.particles)
+        check_moved(states, mixture.particles, model)
     else:
         maker = cast(HasTransitionNoise, model)
         drawn = _noise(noise, key, maker.noise_dimension, mixture)
-        states = maker.transition_from_noise(drawn, mixture.particles)
-    check_moved(states, mixture.particles, model)
+        who = f"model: {model_name(model)}.transition_from_noise"
+        with saying(f"in {who}, of noise of shape {drawn.shape}, as noise_dimension says"):
+            states = maker.transition_from_noise(drawn, mixture.particles)
+        check_moved(states, mixture.particles, model, "transition_from_noise")
     if gradient == "none":
         return mixture.replace(particles=states)
     states = jax.lax.stop_gradient(states)

@@ -14,6 +14,7 @@ from mpfjax.operations.floats import as_inexact
 from mpfjax.operations.hilbert import bits_per_dimension, hilbert_index
 from mpfjax.operations.segments import column_sums, spread
 from mpfjax.operations.sorting import order_by_key, sortable_bits
+from mpfjax.operations.stored import stored
 
 HILBERT = "hilbert"
 SortBy = Callable[[PyTree], Array] | str
@@ -81,13 +82,15 @@ def _cells(
     rows = jnp.where(mixture.occupied[None], rows, 0.0)
     weights = mixture.component_weights.astype(rows.dtype)
     averages = lambda rows: column_sums(weights[None] * rows, labels, m)  # noqa: E731
-    means = averages(rows)
-    centred = jnp.stack([row - spread(means[:, k], labels) for k, row in enumerate(rows)])
+    # A gather is stored, since nothing that is fused with it would run on vectors.
+    own = lambda values: stored(  # noqa: E731
+        jnp.stack([spread(column, labels) for column in jnp.nan_to_num(values).T])
+    )
+    centred = rows - own(averages(rows))
     variances = averages(centred**2)
     # At one point, all are in the same cell.
     is_spread = (variances > 0) & (variances < jnp.inf)
-    scales = jnp.where(is_spread, _STEEPNESS / jnp.sqrt(variances), 1.0)
-    steps = [row * spread(scales[:, k], labels) for k, row in enumerate(centred)]
-    shares = jax.nn.sigmoid(jnp.stack(steps))
+    scales = own(jnp.where(is_spread, _STEEPNESS / jnp.sqrt(variances), 1.0))
+    shares = jax.nn.sigmoid(centred * scales)
     size = float(1 << num_bits)
     return jnp.clip(jnp.nan_to_num(shares) * size, 0.0, size - 1).astype(jnp.uint32)

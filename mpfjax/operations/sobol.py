@@ -80,15 +80,12 @@ def sobol_points(
     `directions` need as many digits as the largest index has.
     """
     indices = indices.astype(jnp.uint32)
-    rows = []
-    for row in directions:
-        points = jnp.zeros_like(indices)
-        for b in range(directions.shape[1]):
-            # All ones where the digit is one: a choice would not run on vectors everywhere.
-            mask = jnp.uint32(0) - ((indices >> b) & 1)
-            points = points ^ (mask & row[b])
-        rows.append(points)
-    return jnp.stack(rows)
+    points = jnp.zeros((directions.shape[0], indices.shape[0]), jnp.uint32)
+    for b in range(directions.shape[1]):
+        # All ones where the digit is one.
+        mask = jnp.uint32(0) - ((indices >> b) & 1)
+        points = points ^ (mask[None] & directions[:, b][:, None])
+    return points
 
 
 def scrambled_directions(

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, Shaped, UInt32
 
 from mpfjax.operations.indexing import take
+from mpfjax.operations.stored import stored
 
 _BITS = 32
 
@@ -25,17 +26,19 @@ def order_by_key(
     digit = _BITS - index_bits
     segments = segments.astype(jnp.uint32)
     index = jnp.arange(n, dtype=jnp.uint32)
-    order = index
+    order = index.astype(jnp.int32)
     for low in range(0, _BITS + (num_segments - 1).bit_length(), digit):
         # The bits from `low` on of the segment and the key, side by side.
         word = keys >> low if low < _BITS else segments >> (low - _BITS)
         if 0 < low < _BITS:
             word = word | (segments << (_BITS - low))
         if low > 0:
-            word = take(word, order)
+            # Otherwise the gather would compute the keys again, without vectors.
+            word = take(stored(word & ((1 << digit) - 1), 1 << digit), order)
         ranked = jax.lax.sort((word << index_bits) | index) & ((1 << index_bits) - 1)
+        ranked = ranked.astype(jnp.int32)
         order = ranked if low == 0 else take(order, ranked)
-    return order.astype(jnp.int32)
+    return order
 
 
 def sortable_bits(values: Shaped[Array, " n"]) -> UInt32[Array, " n"]:

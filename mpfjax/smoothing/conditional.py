@@ -94,10 +94,10 @@ def conditional_filter(
 
     Raises `ValueError` for a filter that is no chain of regrouping moves, `Resample` (systematic,
     stratified or multinomial), `Propagate`, `Predict` and `Weigh`; a proposal without
-    `log_density`, or with stratified noise; a model without `log_transition`, unless `backward` is
-    false; a trajectory of other shapes or types than the model's states, or of density zero
-    (RuntimeError within jit). Use it in a Gibbs sampler of your own; `mpfjax.tuning.particle_gibbs`
-    is one for parameters.
+    `log_density`; noise that is not independent; a model without `log_transition`, unless
+    `backward` is false; a trajectory of other shapes or types than the model's states, or of
+    density zero (RuntimeError within jit). Use it in a Gibbs sampler of your own;
+    `mpfjax.tuning.particle_gibbs` is one for parameters.
     """
     check_key(key)
     check_type(Filter, "a Filter", filter=filter)
@@ -249,10 +249,11 @@ def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
     proposal = getattr(advances[0], "proposal", None)
     if proposal is not None:
         require(proposal, "log_density", needed_by, "proposal")
-        if getattr(proposal, "noise", "independent") != "independent":
+    for name, draws in (("filter", advances[0]), ("proposal", proposal)):
+        if getattr(draws, "noise", "independent") != "independent":
             raise ValueError(
-                f"proposal: {needed_by} needs draws that are independent of each other, and not"
-                f" noise={proposal.noise!r}; take noise='independent'"
+                f"{name}: {needed_by} needs draws that are independent of each other, and not"
+                f" noise={draws.noise!r}; take noise='independent'"
             )
 
 

@@ -12,6 +12,7 @@ from mpfjax.checks import (
     check_flag,
     check_not_negative,
     check_positive,
+    check_shape,
     check_share,
     check_type,
     check_whole,
@@ -89,6 +90,26 @@ class AbstractBoxModel(AbstractStateSpaceModel):
             reference = jnp.where(switches, drawn, reference)
         dynamics = self.dynamics_of(states)
         box = dynamics.sample(key_noise, states.box, states.previous)
+        return BoxState(box, reference, self._remembered(states.box))
+
+    @property
+    def noise_dimension(self) -> int:
+        """That of the dynamics, and one for r where it may be drawn again."""
+        return self.dynamics.noise_dimension + (self.switch_probability > 0)
+
+    def transition_from_noise(self, noise: Float[Array, "n k"], states: BoxState) -> BoxState:
+        """The same, made of standard normal noise."""
+        check_shape(f"n {self.noise_dimension}", noise=noise)
+        reference = states.reference
+        if self.switch_probability > 0:
+            # Below the probability, where a share lies says which r is drawn.
+            shares = jax.scipy.special.ndtr(noise[:, -1]) / self.switch_probability
+            k = self.reference_boxes.shape[0]
+            drawn = jnp.clip(jnp.floor(k * shares), 0, k - 1).astype(reference.dtype)
+            reference = jnp.where(shares < 1, drawn, reference)
+        dynamics = self.dynamics_of(states)
+        noise = noise[:, : self.dynamics.noise_dimension]
+        box = dynamics.from_noise(noise, states.box, states.previous)
         return BoxState(box, reference, self._remembered(states.box))
 
     def log_transition(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:

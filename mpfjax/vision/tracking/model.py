@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mpfjax.checks import check_positive, check_positive_array, given, to_array
+from mpfjax.checks import check_positive, check_positive_array, check_shape, given, to_array
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.operations.indexing import take
 from mpfjax.operations.matrices import row_sums
@@ -102,9 +102,21 @@ class DetectedObjectModel(AbstractStateSpaceModel):
     def sample_transition(self, key: Key[Array, ""], states: ObjectState) -> ObjectState:
         """x_t: the place first, then the velocity that goes with it."""
         key_place, key_velocity = jax.random.split(key)
+        n, dtype = states.place.shape[0], states.place.dtype
+        place = jax.random.normal(key_place, (n, 4), dtype)
+        velocity = jax.random.normal(key_velocity, (n, 2), dtype)
+        return self.transition_from_noise(jnp.concatenate([place, velocity], axis=1), states)
+
+    @property
+    def noise_dimension(self) -> int:
+        """Four numbers for the place, and two for the velocity."""
+        return 6
+
+    def transition_from_noise(self, noise: Float[Array, "n 6"], states: ObjectState) -> ObjectState:
+        """The same, made of standard normal noise."""
+        check_shape("n 6", noise=noise)
         mean, deviations = self.predicted(states)
-        noise = jax.random.normal(key_place, mean.shape, mean.dtype)
-        return self.with_velocity(key_velocity, states, mean + deviations * noise)
+        return self.with_velocity(noise[:, 4:], states, mean + deviations * noise[:, :4])
 
     def log_transition(
         self, states: ObjectState, previous_states: ObjectState
@@ -123,11 +135,10 @@ class DetectedObjectModel(AbstractStateSpaceModel):
         return moved, jnp.concatenate([centre, size], axis=1)
 
     def with_velocity(
-        self, key: Key[Array, ""], previous: ObjectState, place: Float[Array, "n 4"]
+        self, noise: Float[Array, "n 2"], previous: ObjectState, place: Float[Array, "n 4"]
     ) -> ObjectState:
-        """The state in a new place, its velocity drawn given the place."""
+        """The state in a new place, its velocity made of noise, given the place."""
         mean, deviations = self._velocity_given(previous, place)
-        noise = jax.random.normal(key, mean.shape, mean.dtype)
         return ObjectState(place, mean + deviations * noise, previous.label)
 
     def log_velocity(self, states: ObjectState, previous: ObjectState) -> Float[Array, " n"]:

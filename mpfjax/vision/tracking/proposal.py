@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from mpfjax.checks import check_type
+from mpfjax.checks import check_shape, check_type
 from mpfjax.operations.generator import fast_key
 from mpfjax.operations.matrices import row_sums
 from mpfjax.proposals import AbstractProposal
@@ -37,20 +37,47 @@ class DetectionProposal(AbstractProposal):
     ) -> tuple[ObjectState, Float[Array, " n"]]:
         """x_t from the mixture, and its log density."""
         key_noise, key_which, key_velocity = jax.random.split(fast_key(key), 3)
+        n, dtype = previous_states.place.shape[0], previous_states.place.dtype
+        noise = jax.random.normal(key_noise, (n, 4), dtype)
+        which = jax.random.uniform(key_which, (n,), dtype)
+        velocity = jax.random.normal(key_velocity, (n, 2), dtype)
+        return self._drawn(noise, which, velocity, observation, previous_states)
+
+    def noise_dimension(self, previous_states: ObjectState) -> int:
+        """Four numbers for the place, one for its part of the mixture, two for the velocity."""
+        del previous_states
+        return 7
+
+    def propose_from_noise(
+        self, noise: Float[Array, "n 7"], observation: AssignedFrame, previous_states: ObjectState
+    ) -> tuple[ObjectState, Float[Array, " n"]]:
+        """The same, made of standard normal noise."""
+        check_shape("n 7", noise=noise)
+        which = jax.scipy.special.ndtr(noise[:, 4])
+        return self._drawn(noise[:, :4], which, noise[:, 5:], observation, previous_states)
+
+    def _drawn(
+        self,
+        noise: Float[Array, "n 4"],
+        which: Float[Array, " n"],
+        velocity: Float[Array, "n 2"],
+        observation: AssignedFrame,
+        previous_states: ObjectState,
+    ) -> tuple[ObjectState, Float[Array, " n"]]:
+        """x_t and its log density; `which` is uniform."""
         mean, deviations = self.model.predicted(previous_states)
         places, errors = self.model.detection_of(observation, previous_states)
         share = self._share(places - mean, deviations, errors)
         gain = deviations**2 / (deviations**2 + errors**2)
         posterior_mean = mean + gain * (places - mean)
         posterior_deviations = deviations * jnp.sqrt(1 - gain)
-        from_posterior = jax.random.uniform(key_which, share.shape, share.dtype) < share
-        noise = jax.random.normal(key_noise, mean.shape, mean.dtype)
+        from_posterior = which < share
         place = jnp.where(
             from_posterior[:, None],
             posterior_mean + posterior_deviations * noise,
             mean + deviations * noise,
         )
-        states = self.model.with_velocity(key_velocity, previous_states, place)
+        states = self.model.with_velocity(velocity, previous_states, place)
         log_place = jnp.logaddexp(
             jnp.log(share) + log_normal(place, posterior_mean, posterior_deviations),
             jnp.log1p(-share) + log_normal(place, mean, deviations),
