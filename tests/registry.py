@@ -28,6 +28,7 @@ from mpfjax import (
     Pool,
     Predict,
     Propagate,
+    PropagateInStages,
     RandomPartition,
     Resample,
     Split,
@@ -118,6 +119,17 @@ def _chain(
     )
 
 
+def _in_stages(m: int) -> Callable[..., Filter]:
+    return lambda model: Filter(
+        model,
+        [Resample(), PropagateInStages(model, exponents=(0.1, 0.4, 1.0)), KMeans()],
+        NUM_PARTICLES,
+        m,
+        initial_moves=[KMeans(3, reseed=True)],
+        initial_noise="stratified",
+    )
+
+
 class Halfway(eqx.Module):
     """The root of the likelihood of the mean: a look-ahead with tails that are not too thin."""
 
@@ -182,6 +194,7 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
 QUICK_CHAINS = (
     "pf",
     "pf rqmc",
+    "mixture in stages",
     "guided pf",
     "mpf",
     "mpf, M = 6",
@@ -218,6 +231,8 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "mpf shared by variance": _mpf(allocation="variance"),
     "regrouped every second step": _mpf(regroup_every=2),
     "resampled every second step": _chain(Every(2, [Resample("stratified"), KMeans(2)])),
+    "in stages": _in_stages(1),
+    "mixture in stages": _in_stages(NUM_COMPONENTS),
     "predict and weigh": lambda model: Filter(
         model, [Resample(), Predict(model), Weigh(model)], NUM_PARTICLES
     ),

@@ -115,6 +115,11 @@ BUILT = {
     ),
     "Predict": (mpfjax.Predict, {"model": MODEL, "gradient": "none", "noise": "stratified"}),
     "Weigh": (mpfjax.Weigh, {"model": MODEL}),
+    "PropagateInStages": (
+        mpfjax.PropagateInStages,
+        {"model": MODEL, "resample": None, "exponents": (0.1, 1.0), "num_moves": 1,
+         "least_step": 0.05},
+    ),
     "Partitioned": (
         mpfjax.Partitioned,
         {"model": JOINT, "orders": None, "scheme": "systematic", "ess_threshold": 1.0,
@@ -130,7 +135,7 @@ BUILT = {
     "Filter": (
         mpfjax.Filter,
         {"model": MODEL, "moves": [mpfjax.Propagate(MODEL)], "num_particles": 4,
-         "num_components": 1, "initial_moves": ()},
+         "num_components": 1, "initial_moves": (), "initial_noise": "rqmc"},
     ),
     "particle_filter": (
         mpfjax.particle_filter,
