@@ -18,6 +18,9 @@ class Corridor(mpfjax.AbstractStateSpaceModel):
     is: further in front of a door, by the profile of a niche. It starts anywhere. All doors look
     alike, so the filtering distribution has four modes of exactly the same mass and shape.
 
+    - `spacing`: of the doors, in metres. `speed`, `slip`: mean and deviation of a step.
+    - `niche_depth`, `niche_width`: of a door's Gaussian profile. `sensor_error`: a deviation.
+
     States are positions in metres along the way, not taken modulo the corridor's length, (n,);
     observations are distances in metres, scalars.
     """
@@ -27,7 +30,7 @@ class Corridor(mpfjax.AbstractStateSpaceModel):
     slip: float = eqx.field(static=True, default=0.5)
     niche_depth: float = eqx.field(static=True, default=1.0)
     niche_width: float = eqx.field(static=True, default=1.0)
-    sensor_error: float = eqx.field(static=True, default=0.1)
+    sensor_error: float = eqx.field(static=True, default=0.05)
 
     @property
     def noise_dimension(self) -> int:

@@ -82,7 +82,7 @@ def rqmc_normal(
     n, d = shape
     ranks = jnp.arange(n, dtype=jnp.int32)
     key_matrix, key_shift = split(key, 2)
-    shifts = bits(key_shift, (num_components, d)) >> _UNUSED
+    shifts = stored(bits(key_shift, (num_components, d)) >> _UNUSED, EXACT_IN_FLOAT32)
     if components is None or num_components == 1:
         own = shifts[0][:, None]
     else:

@@ -250,10 +250,11 @@ def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
     if proposal is not None:
         require(proposal, "log_density", needed_by, "proposal")
     for name, draws in (("filter", advances[0]), ("proposal", proposal)):
-        if getattr(draws, "noise", "independent") != "independent":
+        noise = getattr(draws, "noise", "independent")
+        if noise != "independent":
             raise ValueError(
                 f"{name}: {needed_by} needs draws that are independent of each other, and not"
-                f" noise={draws.noise!r}; take noise='independent'"
+                f" noise={noise!r}; take noise='independent'"
             )
 
 

@@ -50,13 +50,13 @@ def test_the_marginal_likelihood_is_unbiased():
 
 def test_particles_between_the_stages_follow_the_tempered_target():
     """One step of many particles, with moves enough to forget where they were drawn."""
-    filter = in_stages(NARROW, 20_000, exponents=(0.01, 1.0), num_moves=20)
+    model = mpfjax.QuadraticModel(1.0, 4.0, -1.0, 1.0)  # which the prior tells as much as y_1
+    filter = in_stages(model, 20_000, exponents=(0.9, 1.0), num_moves=20)
     mixture, _ = filter.step(jax.random.key(2), filter.init(jax.random.key(1)), SEEN[0])
-    exact = grid_filter(NARROW, SEEN[:1], GRID)
-    probabilities = np.asarray(exact.probabilities[0], float)
+    probabilities = np.asarray(grid_filter(model, SEEN[:1], 2 * GRID).probabilities[0], float)
     values, weights = np.asarray(mixture.particles, float), np.asarray(mixture.weights, float)
     for power in (1, 2, 4):
-        truth = probabilities @ np.asarray(GRID, float) ** power
+        truth = probabilities @ (2 * np.asarray(GRID, float)) ** power
         moments = values**power
         error = np.sqrt(np.sum(weights**2 * (moments - truth) ** 2))
         assert abs(weights @ moments - truth) <= 4 * error
