@@ -1,9 +1,12 @@
 """What every test runs under: checked shapes and types, strict promotion, no display."""
 
+import atexit
 import gc
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import jaxtyping
@@ -35,6 +38,15 @@ if quick and "XLA_FLAGS" not in os.environ:
     if not known_to_xla(*flags):
         flags = [flag for flag in flags if known_to_xla(flag)]
     os.environ["XLA_FLAGS"] = " ".join(flags)
+
+# Workers and the processes that tests start take each other's programs, as modules do whose own
+# are dropped when they end (below). The folder is the session's, gone when it ends.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    programs = tempfile.mkdtemp(prefix="programs-of-tests-")
+    atexit.register(shutil.rmtree, programs, ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = programs
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 import jax  # noqa: E402
 

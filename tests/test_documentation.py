@@ -10,6 +10,8 @@ import pytest
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser, SkipParser
 
+from tests.marking import quick_of
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
 PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"]
@@ -17,12 +19,19 @@ PAGES += sorted(path for path in DOCS.rglob("*.md") if "notebooks" not in path.p
 NAMES = [str(page.relative_to(REPOSITORY)) for page in PAGES]
 COMMAND = re.compile(r"python -m (benchmarks\.[a-z_]+|mpfjax\b)((?: [^\n`|#]*)?)")
 WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
+# The others are run where the thorough tests are.
+QUICK_PAGES = [page for page in WITH_CODE if page.stem in ("README", "start", "filters", "model")]
 
 sybil = Sybil(parsers=[PythonCodeBlockParser(), SkipParser()], path=str(REPOSITORY))
 
 
+def stem(page: Path) -> str:
+    """The name of a page without its ending."""
+    return page.stem
+
+
 @pytest.mark.usefixtures("as_installed")
-@pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", quick_of(WITH_CODE, QUICK_PAGES), ids=stem)
 def test_the_code_of_a_page_runs(page):
     """All blocks of a page in their order, as a reader runs them: without the tests' strictness."""
     document = sybil.parse(page)

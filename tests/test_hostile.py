@@ -362,7 +362,7 @@ def test_the_good_calls_work(table):
         assert function(**arguments) is not None, name
 
 
-@unhurried(max_examples=3000)
+@unhurried(max_examples=2000)
 @given(calls(BUILT))
 def test_constructors_work_or_name_the_argument(call):
     check_built(call)

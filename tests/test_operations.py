@@ -28,7 +28,7 @@ from mpfjax.operations.segments import (
     spread,
 )
 from mpfjax.operations.stored import to_int, whole_blocks
-from tests.marking import thorough
+from tests.marking import quick_of, thorough
 from tests.precision import float64
 
 RNG = np.random.default_rng(0)
@@ -57,7 +57,7 @@ def test_sums_before_in_float64_and_under_vmap():
 
 
 @pytest.mark.parametrize("how", ["blocked", "scanned"])
-@pytest.mark.parametrize("n", [*SIZES, 10_000])
+@pytest.mark.parametrize("n", quick_of((*SIZES, 10_000), (1, 33, 1025, 33_000)))
 def test_sums_never_fall_and_zeros_add_nothing(n, how):
     # Zeros in runs, some over whole blocks, at the front and at the end; sizes far apart.
     rows = np.exp(RNG.normal(scale=5, size=(20, n)))

@@ -147,6 +147,7 @@ def blocks():
     return [[10.0, 10, 1, 1], [20.0, 10, 1, 1], [30.0, 10, 1, 1], [40.0, 10, 1, 1]]
 
 
+@pytest.mark.thorough
 @pytest.mark.real_data
 def test_the_mixtures_hold_both_pedestrians(data, monkeypatch):
     monkeypatch.setenv("MPFJAX_DATA", str(data))

@@ -66,6 +66,7 @@ def test_intervals_are_wilsons(hits, runs):
     np.testing.assert_allclose([low, high], [expected.low, expected.high], atol=1e-4)
 
 
+@pytest.mark.thorough
 def test_a_short_study(tmp_path, capsys):
     options = ["--runs", "2", "--scenes", "e", "--methods", "ps", "independent", "--seed", "1"]
     assert benchmark.main([*options, "--out", str(tmp_path)]) == 0

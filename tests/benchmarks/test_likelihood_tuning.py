@@ -52,6 +52,7 @@ def test_ends_are_compared_with_the_exact_maximum():
     assert "1 of 2 end within 3%" in table
 
 
+@pytest.mark.thorough
 def test_tuned_labels_are_judged_on_other_frames(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(labels.LAST_FRAME, "rendered", 8)
     monkeypatch.setattr(labels, "NUM_PARTICLES", 10)

@@ -154,6 +154,7 @@ def test_pictures_are_written(finished):
     assert pictures[0].shape == (288, 2 * 360 + 4, 3)
 
 
+@pytest.mark.thorough
 def test_sensitivity_has_every_filter_in_every_case(tmp_path, monkeypatch):
     monkeypatch.setattr(scenes, "synthetic_scene", few_objects)
     monkeypatch.setattr(sensitivity, "FILTERS", {"ps": "PS", "dps": "DPS"})
@@ -303,6 +304,7 @@ def sequence(tmp_path_factory):
     return folder
 
 
+@pytest.mark.thorough
 def test_a_sequence_makes_table_3_for_the_first_id(sequence, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("mpfjax.vision.joint_colour.HSVColours", lambda: HSVColours(4, 2, 2))
     assert run("--sequence", sequence, "--ids", 2, 1, "--frames", "2:6", "--runs", NUM_RUNS,

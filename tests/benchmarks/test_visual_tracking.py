@@ -100,6 +100,7 @@ def test_without_a_truth_the_scores_are_null_and_the_rest_is_written(sequence, t
     assert len(read_tracks(out / "tracks_pf.txt")) == 4
 
 
+@pytest.mark.thorough
 def test_an_interrupted_run_leaves_what_it_finished(sequence, tmp_path, monkeypatch):
     track = visual_tracking.track
 

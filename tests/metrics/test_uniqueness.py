@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import mpfjax
 from mpfjax.metrics import effective_dynamics, uniqueness
@@ -91,6 +92,7 @@ class TestFigure4:
         assert spreads[list(order)][0] < 0.2
         assert spreads[list(order)][-1] > 0.9
 
+    @pytest.mark.thorough
     def test_dps_shares_it_out_equally(self):
         filter = mpfjax.distributed_partitioned_sampling(self.MODEL, NUM_PARTICLES)
         shares, spreads = self.over_runs(filter)

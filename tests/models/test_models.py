@@ -191,6 +191,7 @@ class TestModelsThatDrawWithAllOfJaxRandom:
         def log_likelihood(self, observation, states):
             return -0.5 * (observation - states) ** 2
 
+    @pytest.mark.thorough
     def test_in_every_kind_of_move(self):
         model = self.Counting()
         joint = mpfjax.MultiObjectModel(model, 2, shared_observation=True)

@@ -95,6 +95,7 @@ class TestAgainstExactAnswers:
         assert 0.05 < is_merged[:, 0].mean() < 0.99
         assert (is_merged[:, 1:] >= is_merged[:, :-1]).all()
 
+    @pytest.mark.thorough
     def test_three_that_meet_in_one_step_are_unbiased(self):
         """Against quadrature over all three, y_1 only."""
         close = (0.0, 1.0, -1.0)
@@ -118,6 +119,7 @@ class TestAgainstExactAnswers:
         assert_unbiased(log_estimates, means, np.log(mass), exact)
         assert (np.asarray(labels) == 0).all(axis=(1, 2)).mean() > 0.9
 
+    @pytest.mark.thorough
     def test_crossing_keeps_a_state_that_holds_the_past(self):
         """Two AR2 objects in one cluster, against Kalman filters of (x_t, x_{t-1})."""
         transition = jnp.array([[1.5, -0.5], [1.0, 0.0]])

@@ -76,6 +76,7 @@ class TestAgainstKalmanFilters:
         log_estimates, means = in_order(ORDERS)
         assert_unbiased(log_estimates, means, *self.truth())
 
+    @pytest.mark.thorough
     def test_dps_that_keeps_the_evidence_is_unbiased_with_adaptive_resampling(self):
         filter = mpfjax.distributed_partitioned_sampling(
             APART, 60, ORDERS[:4], "evidence", ess_threshold=0.5
@@ -358,6 +359,7 @@ class TestGradient:
             down, _ = evaluate(*[p - s for p, s in zip(point, step, strict=True)])
             np.testing.assert_allclose(gradient[i], (up - down) / 0.04, rtol=0.02)
 
+    @pytest.mark.thorough
     def test_is_finite_through_dps(self):
         filter = mpfjax.distributed_partitioned_sampling(REPELLING, 30)
 

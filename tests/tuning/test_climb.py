@@ -336,6 +336,7 @@ class TestOptimisers:
         monkeypatch.setitem(globals(), "RATE", 0.7)
         assert contents_of("optimizer", optax.sgd(schedule)) != before
 
+    @pytest.mark.thorough
     def test_they_are_the_same_in_another_process(self):
         """Where addresses and the order of sets are others."""
         code = """

@@ -86,6 +86,7 @@ class TestPosterior:
         assert 0.1 < rates[moved].mean() < 0.8
         assert runs[0].parameters["sigma_y"].shape == (240,)
 
+    @pytest.mark.thorough
     def test_ends_of_chains_are_the_exact_one_too(self):
         runs = [
             sample(200, key=key, waste_free=False, num_moves=3, ess_threshold=0.7)

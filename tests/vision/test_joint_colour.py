@@ -65,6 +65,7 @@ def test_the_likelihood_is_the_papers_formula(frame):
     np.testing.assert_allclose(other, 3 * value, rtol=1e-5)
 
 
+@pytest.mark.thorough
 def test_lambda_and_sigma_are_one_parameter(frame, model):
     """With one band λ = 1 / 2σ²: the object's model is the plain colour model."""
     sigma = 0.2

@@ -370,6 +370,7 @@ def test_no_frames_are_no_tracks_of_drawn_boxes():
     assert list(follow_boxes([], np.ones((1, 4)))) == []
 
 
+@pytest.mark.thorough
 def test_players_who_turn_at_will_keep_their_names():
     """One detection in ten is missing, and a third of the frames have a false one.
 

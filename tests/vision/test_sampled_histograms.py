@@ -85,6 +85,7 @@ def test_distances_are_nearly_those_of_all_pixels():
     assert np.asarray(bhattacharyya(sampled, exact)).mean() < 0.02
 
 
+@pytest.mark.thorough
 def test_it_is_the_same_under_jit_and_vmap():
     boxes = jnp.asarray(BOXES, jnp.float32)
     colours = HSVColours(4, 2, 2)
