@@ -16,6 +16,7 @@ COLOURS = (
     "#56B4E9", "#F0E442", "#8B4513", "#5E3C99", "#666666",
 )  # fmt: skip
 MARKERS = "osD^vP*X<>"
+_MOST_TICKS = 6
 
 
 @dataclass(frozen=True)
@@ -372,7 +373,12 @@ def _draw_cost_panel(axis: Axes, panel: CostPanel, names: Sequence[str]) -> None
     axis.set(xscale="log", yscale="log", xlabel=panel.xlabel, ylabel=panel.ylabel)
     axis.set_title(panel.title, fontsize=10)
     ticks = sorted(sizes)
-    axis.set_xticks(ticks, [f"{tick:,.0f}".replace(",", "\u2009") for tick in ticks], fontsize=8)
+    if len(ticks) <= _MOST_TICKS:
+        labels = [f"{tick:,.0f}".replace(",", "\u2009") for tick in ticks]
+        axis.set_xticks(ticks, labels, fontsize=8)
+    else:  # times, of which every point has its own
+        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+        axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_locator(NullLocator())
     axis.grid(alpha=0.25)
 

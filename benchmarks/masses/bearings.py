@@ -48,7 +48,7 @@ class BearingsModel(mpfjax.AbstractStateSpaceModel):
     def initial_from_noise(self, noise: Float[Array, "n 4"]) -> PyTree:
         """The same from standard normal numbers."""
         return {
-            "motion": _START + _SPREAD * noise,
+            "motion": _START[None] + _SPREAD[None] * noise,
             "mode": jnp.zeros(len(noise), jnp.int32),
         }
 
@@ -69,14 +69,14 @@ class BearingsModel(mpfjax.AbstractStateSpaceModel):
 
     def log_likelihood(self, observation: Float[Array, "2"], states: PyTree) -> Float[Array, " n"]:
         """Independent Gaussian errors of the two angles."""
-        errors = (observation - heard(states["motion"])) / _NOISE
+        errors = (observation[None] - heard(states["motion"])) / _NOISE
         return -0.5 * jnp.sum(errors**2, axis=1) - 2 * jnp.log(_NOISE * jnp.sqrt(2 * jnp.pi))
 
 
 def heard(motion: Float[Array, "n 4"]) -> Float[Array, "n 2"]:
     """The angles between each axis and the direction to the target, from 0 to pi."""
-    offsets = motion[:, None, :2] - SENSORS
-    angles = jnp.arctan2(offsets[:, :, 1], offsets[:, :, 0]) - AXES
+    offsets = motion[:, None, :2] - SENSORS[None]
+    angles = jnp.arctan2(offsets[:, :, 1], offsets[:, :, 0]) - AXES[None]
     return jnp.abs(jnp.mod(angles + jnp.pi, 2 * jnp.pi) - jnp.pi)
 
 

@@ -42,7 +42,7 @@ class LookAlikes:
 
     def nearest(self, states: PyTree) -> Array:
         """Which of the two is nearer in the last frame."""
-        offsets = states.box[:, None, :2] - self.centres
+        offsets = states.box[:, None, :2] - self.centres[None]
         return jnp.argmin(jnp.sum(offsets**2, axis=2), axis=1).astype(jnp.int32)
 
 
