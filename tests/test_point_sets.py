@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 from scipy.stats import qmc
 
-from mpfjax.models.noise import draw_noise, independent_normal, rqmc_normal
+from mpfjax.models.noise import draw_noise, rqmc_normal
 from mpfjax.operations.hilbert import bits_per_dimension, hilbert_index
 from mpfjax.operations.sobol import (
     MOST_DIMENSIONS,
@@ -151,9 +151,3 @@ class TestRqmcNormal:
 
     def test_one_row(self):
         assert rqmc_normal(jax.random.key(8), (1, 2), FLOAT).shape == (1, 2)
-
-
-def test_independent_noise_of_one_dimension_is_the_vector_in_a_column():
-    key = jax.random.key(3)
-    one, many = independent_normal(key, (20, 1), FLOAT), independent_normal(key, (4, 5), FLOAT)
-    np.testing.assert_allclose(one.ravel(), many.ravel(), rtol=1e-6)

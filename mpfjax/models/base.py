@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_whole, shown
-from mpfjax.models.noise import independent_normal, noise_dtype
-from mpfjax.operations.generator import split
+from mpfjax.models.noise import noise_dtype
+from mpfjax.operations.generator import normal, split
 from mpfjax.operations.sobol import direction_numbers
 
 
@@ -50,8 +50,11 @@ class AbstractStateSpaceModel(eqx.Module):
     def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """Draw x_t ~ D(. | x_{t-1}) for every particle: `transition_from_noise` of fresh noise."""
         model: Any = self
-        shape = (jax.tree.leaves(states)[0].shape[0], model.noise_dimension)
-        noise = independent_normal(key, shape, noise_dtype(states))
+        num_particles, dtype = jax.tree.leaves(states)[0].shape[0], noise_dtype(states)
+        if model.noise_dimension == 1:  # drawn as a vector, it is fused with what uses it
+            noise = normal(key, (num_particles,), dtype)[:, None]
+        else:
+            noise = normal(key, (num_particles, model.noise_dimension), dtype)
         return model.transition_from_noise(noise, states)
 
     @abc.abstractmethod

@@ -35,8 +35,6 @@ def independent_normal(
     key: Key[Array, ""], shape: tuple[int, ...], dtype: jnp.dtype
 ) -> Float[Array, "n d"]:
     """Independent standard normal draws."""
-    if shape[1:] == (1,):  # a vector runs faster than a column
-        return normal(key, shape[:1], dtype)[:, None]
     return normal(key, shape, dtype)
 
 
