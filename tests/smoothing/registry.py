@@ -1,0 +1,142 @@
+"""Every smoother by name: what is listed here inherits the contracts of `test_contracts.py`.
+
+A smoother is tried on chains of `tests/registry.py` and on models whose smoothing distribution is
+known. A new smoother is one new entry below; the tests then find it.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import mpfjax
+from mpfjax.smoothing import (
+    conditional_filter,
+    sample_trajectories,
+    smoothed_sums,
+    trace_ancestors,
+)
+from tests.registry import CHAINS
+
+NUM_TRAJECTORIES, LAG = 4, 2
+
+
+def flat(states):
+    """The states of the first object, (n, d)."""
+    objects = getattr(states, "ndim", 1) > 2
+    return states[:, 0] if objects else states.reshape(states.shape[0], -1)
+
+
+def statistics(previous_states, states):
+    """Means, second moments and pairs: x_{t-1}, x_t, x_t x_tᵀ, x_{t-1} x_tᵀ, side by side."""
+    earlier, later = flat(previous_states), flat(states)
+    products = [left[:, :, None] * later[:, None, :] for left in (later, earlier)]
+    rows = [product.reshape(len(later), -1) for product in products]
+    return jnp.concatenate([earlier, later, *rows], axis=1)
+
+
+def _of_paths(paths, weights):
+    """The statistics of each step, (t, s), from trajectories (k, t + 1, ...)."""
+    each = jax.vmap(statistics)(paths[:, :-1], paths[:, 1:])
+    return jnp.sum(weights[:, None, None] * each, axis=0)
+
+
+def _genealogy(key, model, run):
+    return _of_paths(trace_ancestors(run).trajectories, run.final.weights)
+
+
+def _backward(**options):
+    def smooth(key, model, run):
+        paths = sample_trajectories(key, model, run, NUM_TRAJECTORIES, **options)
+        return _of_paths(paths, jnp.full(NUM_TRAJECTORIES, 1 / NUM_TRAJECTORIES))
+
+    return smooth
+
+
+def _online(**options):
+    def smooth(key, filter, observations):
+        found = smoothed_sums(key, filter, observations, statistics, missing="skip", **options)
+        rows = found.sums if found.terms is None else found.terms
+        return found.run.log_likelihood_increments, rows
+
+    return smooth
+
+
+def _conditional(key, filter, observations, trajectory):
+    found = conditional_filter(key, filter, observations, trajectory, missing="skip")
+    return _of_paths(found.trajectory[None], jnp.ones(1))
+
+
+class Smoother(NamedTuple):
+    """A smoother in one of three forms, and what its rows are estimates of.
+
+    - `of_run`: (key, model, run) -> (t, s).
+    - `online`: (key, filter, observations) -> the increments of log Ẑ, and (t, s).
+    - `kernel`: (key, filter, observations, trajectory) -> (t, s), of another trajectory with the
+      law of the given one.
+
+    Row r is the term r given all observations; with a `lag`, given those up to r + lag; with
+    `summed`, the sum of the terms up to r given the observations up to r.
+    """
+
+    of_run: Callable | None = None
+    online: Callable | None = None
+    kernel: Callable | None = None
+    lag: int | None = None
+    summed: bool = False
+
+
+SMOOTHERS = {
+    "genealogy": Smoother(of_run=_genealogy),
+    "backward sampling": Smoother(of_run=_backward()),
+    "backward sampling, MCMC": Smoother(of_run=_backward(method="mcmc", num_steps=8)),
+    "PaRIS": Smoother(online=_online(), summed=True),
+    "PaRIS, MCMC": Smoother(online=_online(method="mcmc", num_draws=3), summed=True),
+    "fixed lag": Smoother(online=_online(lag=LAG), lag=LAG),
+    "fixed lag, MCMC": Smoother(online=_online(lag=LAG, method="mcmc", num_draws=3), lag=LAG),
+    "conditional filter": Smoother(kernel=_conditional),
+}
+
+ONE = mpfjax.LinearGaussianModel(A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.4]], m0=[0.5], P0=[[1.0]])
+FOUR = mpfjax.LinearGaussianModel(
+    A=0.9 * np.eye(4) + 0.1 * np.eye(4, k=1), Q=0.2 * np.eye(4) + 0.1,
+    H=np.eye(2, 4), R=0.5 * np.eye(2), m0=np.full(4, 0.3), P0=np.eye(4),
+)  # fmt: skip
+QUADRATIC = mpfjax.QuadraticModel(0.3, 0.4, -2.0, 2.0)
+NAN = np.nan
+MODELS = {
+    "one dimension": (ONE, np.array([[0.8], [NAN], [0.1], [-0.4], [0.9]], np.float32)),
+    "four dimensions": (
+        FOUR, np.array([[0.8, 0.1], [NAN, NAN], [0.5, -1.0], [1.2, 0.3]], np.float32)
+    ),
+    "two modes": (QUADRATIC, np.array([1.2, 0.8, NAN, 1.5, 1.0], np.float32)),
+}  # fmt: skip
+
+# One of each kind of filter that knows its own evidence.
+SMOOTHED_CHAINS = (
+    "pf", "pf adaptive", "guided pf", "mpf", "auxiliary mpf", "ps adaptive, random order", "dps",
+)  # fmt: skip
+# Those that can keep a trajectory: see `check_conditional`.
+CONDITIONAL_CHAINS = ("pf", "pf adaptive", "guided pf", "mpf")
+assert set(SMOOTHED_CHAINS) <= set(CHAINS)
+
+CASES = [
+    (smoother, chain, model)
+    for smoother in SMOOTHERS
+    for chain in SMOOTHED_CHAINS
+    for model in MODELS
+    if SMOOTHERS[smoother].kernel is None or chain in CONDITIONAL_CHAINS
+]
+# What takes a way of its own; the smoothers of a run share one program.
+QUICK_CASES = [
+    *((smoother, chain, model)
+      for smoother in SMOOTHERS if SMOOTHERS[smoother].of_run
+      for chain, model in (("mpf", "one dimension"), ("pf", "four dimensions"),
+                           ("dps", "one dimension"), ("mpf", "two modes"))),
+    ("PaRIS", "pf", "four dimensions"),
+    ("PaRIS, MCMC", "mpf", "two modes"),
+    ("fixed lag", "pf", "one dimension"),
+    ("fixed lag, MCMC", "mpf", "one dimension"),
+]  # fmt: skip
