@@ -74,6 +74,7 @@ def run(options: argparse.Namespace) -> None:
         content["modes"] = modes.summary(masses)
         write_json(options.out / "smoothing.json", content)
         print(f"\nmass of one of two modes, N = {options.mode_particles}, {options.seeds} seeds")
+        print(f"lost by a seed: a mode whose smoothed mass is below {modes.LOST:.0%} at some time")
         print(modes.table(content["modes"]))
         modes.picture(masses).savefig(options.out / "modes.png", dpi=130)
     if "variance" in options.parts:
