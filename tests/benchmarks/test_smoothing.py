@@ -39,7 +39,7 @@ def folder(tmp_path_factory):
         monkeypatch.setattr(modes, "NUM_TRAJECTORIES", 50)
         monkeypatch.setattr(variance, "SCHEMES", ("multinomial",))
         for table, names in (
-            (modes.FILTERS, ["MPF", "guided MPF"]),
+            (modes.FILTERS, ["multinomial PF", "MPF", "guided MPF"]),
             (accuracy.OURS, ["backward sampling", "PaRIS"]),
             (smoothing.JOBS, ["quadratic"]),
         ):
