@@ -114,20 +114,29 @@ MODELS = {
     "two modes": (QUADRATIC, np.array([1.2, 0.8, NAN, 1.5, 1.0], np.float32)),
 }  # fmt: skip
 
-# One of each kind of filter that knows its own evidence.
+# One of each kind of filter that knows its own evidence, for the smoothers of a run.
 SMOOTHED_CHAINS = (
     "pf", "pf adaptive", "guided pf", "mpf", "auxiliary mpf", "ps adaptive, random order", "dps",
 )  # fmt: skip
+# The others run a filter of their own, and are compiled one by one.
+ONLINE_CHAINS = ("pf", "mpf", "dps")
 # Those that can keep a trajectory: see `check_conditional`.
-CONDITIONAL_CHAINS = ("pf", "pf adaptive", "guided pf", "mpf")
+KERNEL_CHAINS = ("pf", "guided pf", "mpf")
 assert set(SMOOTHED_CHAINS) <= set(CHAINS)
 
+
+def chains_of(smoother):
+    """The chains that a smoother is tried on."""
+    if smoother.of_run:
+        return SMOOTHED_CHAINS
+    return ONLINE_CHAINS if smoother.online else KERNEL_CHAINS
+
+
 CASES = [
-    (smoother, chain, model)
-    for smoother in SMOOTHERS
-    for chain in SMOOTHED_CHAINS
+    (name, chain, model)
+    for name, smoother in SMOOTHERS.items()
+    for chain in chains_of(smoother)
     for model in MODELS
-    if SMOOTHERS[smoother].kernel is None or chain in CONDITIONAL_CHAINS
 ]
 # What takes a way of its own; the smoothers of a run share one program.
 QUICK_CASES = [
