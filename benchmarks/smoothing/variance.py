@@ -1,5 +1,6 @@
 """(c) The errors of log Ẑ and of a mode's mass by one run, against those of many runs."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -24,12 +25,14 @@ def _nothing(mixture: mpfjax.ParticleMixture) -> None:
     del mixture
 
 
-def measure(jobs: dict[str, Job], num_particles: int, runs: int, seed: int) -> list[dict[str, Any]]:
+def measure(
+    jobs: dict[str, Job], schemes: Sequence[str], num_particles: int, runs: int, seed: int
+) -> list[dict[str, Any]]:
     """For each job, filter and scheme the variance over runs and what each run says of it."""
     entries = []
     for job_name, job in jobs.items():
         model, observations = make_model(job, independent=True), observations_of(job)
-        for scheme in SCHEMES:
+        for scheme in schemes:
             filters = {
                 "PF": mpfjax.particle_filter(model, num_particles, scheme=scheme),
                 "MPF": mpfjax.mixture_particle_filter(model, num_particles, 2, scheme=scheme),
