@@ -43,13 +43,10 @@ def measure(
                 found = mpfjax.monte_carlo(keys, remembering, observations, _nothing)
                 by_run = np.asarray(jax.vmap(log_marginal_likelihood_variance)(found))
                 truth = float(np.var(np.asarray(found.log_marginal_likelihood), ddof=1))
-                # A run in which one family is left says that nothing is known.
-                known = by_run[np.isfinite(by_run)]
                 entries.append({
                     "job": job_name, "filter": name, "scheme": scheme, "variance": truth,
                     "relative_error": float(np.sqrt(2 / (runs - 1))),
-                    "mean_of_runs": float(known.mean()), "std_of_runs": float(known.std()),
-                    "unknown": 1 - len(known) / runs,
+                    "mean_of_runs": float(by_run.mean()), "std_of_runs": float(by_run.std()),
                 })  # fmt: skip
                 # The linear model has one mode, which regrouping divides now here, now there.
                 if filter.num_components > 1 and job_name == "quadratic":
@@ -72,7 +69,7 @@ def _of_masses(runs: FilterRun) -> dict[str, float]:
 def table(entries: list[dict[str, Any]]) -> str:
     """A row for each job, filter and scheme."""
     return format_table(
-        ["log Ẑ of", "filter", "scheme", "variance of runs", "by one run", "ratio", "unknown",
+        ["log Ẑ of", "filter", "scheme", "variance of runs", "by one run", "ratio",
          "mass: deviation of runs", "by one run"],
         [
             [
@@ -82,7 +79,6 @@ def table(entries: list[dict[str, Any]]) -> str:
                 f"{entry['variance']:.4f} ± {entry['variance'] * entry['relative_error']:.4f}",
                 f"{entry['mean_of_runs']:.4f} ± {entry['std_of_runs']:.4f}",
                 f"{entry['mean_of_runs'] / entry['variance']:.2f}",
-                f"{entry['unknown']:.1%}",
                 *(f"{entry[name]:.3f}" if name in entry else ""
                   for name in ("mass_deviation", "mass_error_of_runs")),
             ]

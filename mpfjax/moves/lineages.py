@@ -77,11 +77,11 @@ def with_offspring(
 
 
 def evidence_variance(mixture: ParticleMixture) -> Float[Array, ""]:
-    """The variance of log Ẑ, from the weight of each family; inf where one family is left."""
+    """The variance of log Ẑ, from the weight of each family. It may be negative."""
     lineage: Lineage = mixture.memory[LINEAGE]
     families = lineage.family_masses(mixture.weights, lineage.groups, mixture.num_components)
-    # Of a log-normal Ẑ whose relative variance V is: E[Ẑ² (1 - V)] = Z².
-    return -jnp.log1p(-jnp.minimum(_variance(families, mixture), 1.0))
+    relative = _variance(families, mixture)
+    return relative + relative**2 / 2
 
 
 def mass_variances(mixture: ParticleMixture) -> Float[Array, " m"]:
