@@ -23,41 +23,46 @@ from tests.registry import CHAINS
 NUM_TRAJECTORIES, LAG = 4, 2
 
 
-def flat(states):
-    """The states of the first object, (n, d)."""
-    objects = getattr(states, "ndim", 1) > 2
-    return states[:, 0] if objects else states.reshape(states.shape[0], -1)
+def statistics_for(model):
+    """Means, second moments and pairs of one object, or the first one of several.
+
+    x_{t-1}, x_t, x_t x_tᵀ and x_{t-1} x_tᵀ, side by side: a function of n states and n more.
+    """
+    one = model.object_at(0) if isinstance(model, mpfjax.MultiObjectModel) else model
+    d = jax.eval_shape(lambda key: one.sample_initial(key, 1), jax.random.key(0)).size
+
+    def statistics(previous_states, states):
+        n = states.shape[0]
+        earlier, later = (leaf.reshape(n, -1)[:, :d] for leaf in (previous_states, states))
+        products = [left[:, :, None] * later[:, None, :] for left in (later, earlier)]
+        rows = [product.reshape(n, -1) for product in products]
+        return jnp.concatenate([earlier, later, *rows], axis=1)
+
+    return statistics
 
 
-def statistics(previous_states, states):
-    """Means, second moments and pairs: x_{t-1}, x_t, x_t x_tᵀ, x_{t-1} x_tᵀ, side by side."""
-    earlier, later = flat(previous_states), flat(states)
-    products = [left[:, :, None] * later[:, None, :] for left in (later, earlier)]
-    rows = [product.reshape(len(later), -1) for product in products]
-    return jnp.concatenate([earlier, later, *rows], axis=1)
-
-
-def _of_paths(paths, weights):
+def _of_paths(model, paths, weights):
     """The statistics of each step, (t, s), from trajectories (k, t + 1, ...)."""
-    each = jax.vmap(statistics)(paths[:, :-1], paths[:, 1:])
+    each = jax.vmap(statistics_for(model))(paths[:, :-1], paths[:, 1:])
     return jnp.sum(weights[:, None, None] * each, axis=0)
 
 
 def _genealogy(key, model, run):
-    return _of_paths(trace_ancestors(run).trajectories, run.final.weights)
+    return _of_paths(model, trace_ancestors(run).trajectories, run.final.weights)
 
 
 def _backward(**options):
     def smooth(key, model, run):
         paths = sample_trajectories(key, model, run, NUM_TRAJECTORIES, **options)
-        return _of_paths(paths, jnp.full(NUM_TRAJECTORIES, 1 / NUM_TRAJECTORIES))
+        return _of_paths(model, paths, jnp.full(NUM_TRAJECTORIES, 1 / NUM_TRAJECTORIES))
 
     return smooth
 
 
 def _online(**options):
     def smooth(key, filter, observations):
-        found = smoothed_sums(key, filter, observations, statistics, missing="skip", **options)
+        function = statistics_for(filter.model)
+        found = smoothed_sums(key, filter, observations, function, missing="skip", **options)
         rows = found.sums if found.terms is None else found.terms
         return found.run.log_likelihood_increments, rows
 
@@ -66,7 +71,7 @@ def _online(**options):
 
 def _conditional(key, filter, observations, trajectory):
     found = conditional_filter(key, filter, observations, trajectory, missing="skip")
-    return _of_paths(found.trajectory[None], jnp.ones(1))
+    return _of_paths(filter.model, found.trajectory[None], jnp.ones(1))
 
 
 class Smoother(NamedTuple):

@@ -11,7 +11,7 @@ import mpfjax
 from tests.marking import quick_of
 from tests.registry import CHAINS
 from tests.smoothing.exact_smoothers import gaussian_smoother, grid_smoother, grid_trajectories
-from tests.smoothing.registry import CASES, MODELS, QUICK_CASES, SMOOTHERS, statistics
+from tests.smoothing.registry import CASES, MODELS, QUICK_CASES, SMOOTHERS, statistics_for
 
 NUM_RUNS = 1000
 GRID = np.linspace(-4.0, 4.0, 401)
@@ -147,8 +147,8 @@ def test_rows_are_finite(name, observations):
 
 def test_statistics_are_those_that_are_expected():
     """Of trajectories drawn from the exact distribution, so that the truth is not of one kind."""
-    for name, (_, observations) in MODELS.items():
-        drawn = exact_trajectories(name)
+    for name, (model, observations) in MODELS.items():
+        drawn, statistics = exact_trajectories(name), statistics_for(model)
         rows = np.stack(
             [statistics(drawn[:, t], drawn[:, t + 1]) for t in range(len(observations))], axis=1
         )
