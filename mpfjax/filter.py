@@ -28,6 +28,7 @@ from mpfjax.models.noise import NOISES, draw_noise
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
 from mpfjax.moves.every import Every
 from mpfjax.moves.exchange import Exchange
+from mpfjax.moves.lineages import LINEAGE, evidence_variance, mass_variances
 from mpfjax.observations import checked_observation, one_observation
 from mpfjax.operations.across_islands import excess_over_islands, island_index, num_islands
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
@@ -49,6 +50,11 @@ class StepInfo(eqx.Module):
     """which components of the mixture that the step was given were resampled."""
     degenerate: Bool[Array, ""]
     """whether every particle had zero likelihood: the weights are then those of the prediction."""
+    log_marginal_likelihood_error: Float[Array, ""] | None = None
+    """the standard error of log Ẑ of all steps so far, from this one run; None unless the filter
+    is one of `mpfjax.smoothing.with_first_ancestors`."""
+    mixture_weight_errors: Float[Array, " m"] | None = None
+    """the standard error of each mixture weight; None likewise."""
 
 
 # Moves that do not change the total mass; there is nothing to normalise after them.
@@ -297,12 +303,21 @@ def _normalise(
 def _report(
     mixture: ParticleMixture, increment: Float[Array, ""], resampled: Bool[Array, " m"]
 ) -> StepInfo:
+    degenerate = increment == -jnp.inf
+    of_evidence = of_masses = None
+    # Families on several islands would have to be brought together.
+    if LINEAGE in mixture.memory and num_islands() == 1:
+        variance = jnp.where(degenerate, jnp.inf, evidence_variance(mixture))
+        of_evidence = jnp.sqrt(jnp.maximum(variance, 0.0))
+        of_masses = jnp.sqrt(jnp.maximum(mass_variances(mixture), 0.0))
     return StepInfo(
         log_likelihood_increment=increment,
         effective_sample_sizes=mixture.component_effective_sample_sizes,
         mixture_weights=mixture.mixture_weights,
         resampled=resampled,
-        degenerate=increment == -jnp.inf,
+        degenerate=degenerate,
+        log_marginal_likelihood_error=of_evidence,
+        mixture_weight_errors=of_masses,
     )
 
 

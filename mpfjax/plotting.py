@@ -353,9 +353,11 @@ def draw_costs(rows: Sequence[Sequence[CostPanel]]) -> Figure:
         for axis in axes.ravel()
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
     }
+    # In inches, of a name and its marker at this size of letters: a wider legend would be cut off.
+    column = 0.55 + 0.07 * max(map(len, names))
     figure.legend(
         [handles[name] for name in names], names, loc="outside upper center", fontsize=8,
-        ncols=min(len(names), 2 * num_columns),
+        ncols=max(1, min(len(names), 2 * num_columns, int(figure.get_figwidth() / column))),
     )  # fmt: skip
     return figure
 

@@ -242,6 +242,7 @@ RUN = {
     ),
     "trace_ancestors": (mpfjax.smoothing.trace_ancestors, {"mixtures": HISTORY}),
     "with_first_ancestors": (mpfjax.smoothing.with_first_ancestors, {"filter": FILTER}),
+    "mixture_weight_errors": (mpfjax.smoothing.mixture_weight_errors, {"run": TRACED}),
     "log_marginal_likelihood_variance": (
         mpfjax.smoothing.log_marginal_likelihood_variance, {"run": TRACED}
     ),

@@ -43,6 +43,10 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seeds", type=whole(), default=200, help="of modes")
     parser.add_argument("--variance-particles", type=whole(2), default=1000, metavar="N")
     parser.add_argument("--variance-runs", type=whole(2), default=1000)
+    parser.add_argument(
+        "--schemes", nargs="+", choices=variance.SCHEMES, default=list(variance.SCHEMES),
+        help="of resampling, of variance",
+    )  # fmt: skip
     parser.add_argument("--posterior-particles", type=whole(2), default=100, metavar="N")
     parser.add_argument("--posterior-steps", type=whole(20), default=2000, help="of each chain")
     parser.add_argument("--seed", type=seed, default=0)
@@ -74,11 +78,12 @@ def run(options: argparse.Namespace) -> None:
         content["modes"] = modes.summary(masses)
         write_json(options.out / "smoothing.json", content)
         print(f"\nmass of one of two modes, N = {options.mode_particles}, {options.seeds} seeds")
+        print(f"lost by a seed: a mode whose smoothed mass is below {modes.LOST:.0%} at some time")
         print(modes.table(content["modes"]))
         modes.picture(masses).savefig(options.out / "modes.png", dpi=130)
     if "variance" in options.parts:
         size, runs = options.variance_particles, options.variance_runs
-        content["variance"] = variance.measure(jobs, size, runs, options.seed)
+        content["variance"] = variance.measure(jobs, options.schemes, size, runs, options.seed)
         write_json(options.out / "smoothing.json", content)
         print(f"\nvariance of log Ẑ, N = {size}, {runs} runs")
         print(variance.table(content["variance"]))

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from benchmarks.smoothing.filters import make_model, observations_of
 from benchmarks.smoothing.jobs import Job
 from mpfjax import plotting
 from mpfjax.console import format_table
+from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.smoothing import sample_trajectories, smoothed_sums, trace_ancestors
 
 NUM_TRAJECTORIES = 100
@@ -102,7 +102,7 @@ def measure(job: Job, sizes: Sequence[int], runs: int, seed: int) -> list[dict[s
 def _ours(estimate: Callable[..., Any], job: Job, num_particles: int) -> Callable[[int], float]:
     filter = mpfjax.particle_filter(make_model(job), num_particles)
     observations = jnp.asarray(observations_of(job))
-    compiled = eqx.filter_jit(estimate)
+    compiled = jit_on_wide_vectors(estimate)
     return lambda seed: float(compiled(jax.random.key(seed), filter, observations))
 
 

@@ -45,6 +45,9 @@ def _guided(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax
 
 FILTERS: dict[str, Callable[[mpfjax.AbstractStateSpaceModel, int], mpfjax.Filter]] = {
     "PF": mpfjax.particle_filter,
+    "multinomial PF": lambda model, num_particles: mpfjax.particle_filter(
+        model, num_particles, scheme="multinomial"
+    ),
     "MPF": lambda model, num_particles: mpfjax.mixture_particle_filter(model, num_particles, 2),
     "guided MPF": _guided,
     "auxiliary MPF": _auxiliary,

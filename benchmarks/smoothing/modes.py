@@ -21,7 +21,7 @@ from mpfjax.smoothing import sample_trajectories, trace_ancestors
 NUM_TRAJECTORIES = 1000
 # Drawn in the picture, where there is room for four names.
 _DRAWN = ("PF", "auxiliary MPF")
-# Below this share of the mass a mode counts as lost.
+# A mode counts as lost by a seed if its smoothed mass is below this at any time 0, ..., T.
 LOST = 0.01
 _TOGETHER = 10  # seeds at once
 

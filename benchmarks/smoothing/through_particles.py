@@ -73,7 +73,7 @@ def estimator(
     def once(seed: int) -> float:
         np.random.seed(seed)
         collected = ONLINE.get(method)
-        kept = {"store_history": True} if collected is None else {"collect": [collected()]}
+        kept: Any = {"store_history": True} if collected is None else {"collect": [collected()]}
         smc: Any = particles.SMC(
             fk=FeynmanKac(job), N=num_particles, resampling="systematic", ESSrmin=1.0, **kept
         )

@@ -84,5 +84,20 @@ class AbstractRejuvenation(AbstractMove):
     """A move that redraws the particles within each component and keeps the component's mass."""
 
 
+class AbstractResampling(AbstractRejuvenation):
+    """A rejuvenation that draws the particles of some components, those that are due."""
+
+    @abc.abstractmethod
+    def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
+        """Which components of `mixture` the move would resample."""
+
+    def would_resample(
+        self, mixture: ParticleMixture, observation: PyTree = None
+    ) -> Bool[Array, " m"]:
+        """Those that are due."""
+        del observation
+        return self.is_due(mixture)
+
+
 class AbstractPropagation(AbstractMove):
     """A move that draws x_t and multiplies the weights by L D / q, so that the mass changes."""

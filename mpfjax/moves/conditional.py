@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractPropagation, AbstractRejuvenation
+from mpfjax.moves.base import AbstractPropagation, AbstractResampling
 from mpfjax.moves.propagation import Predict, Propagate, Weigh, log_transition
 from mpfjax.moves.resampling import Resample
 from mpfjax.moves.slots import Slots, place_slots
@@ -79,7 +79,7 @@ class ConditionalPropagation(AbstractPropagation):
         return mixture.replace(particles=particles, memory=memory)
 
 
-class ConditionalResample(AbstractRejuvenation):
+class ConditionalResample(AbstractResampling):
     """Resample within components, given that the reference has an offspring.
 
     It is the law of `Resample`'s ancestor indices, given that a slot of the reference's component,
@@ -101,13 +101,6 @@ class ConditionalResample(AbstractRejuvenation):
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
         return self.move.is_due(mixture)
-
-    def would_resample(
-        self, mixture: ParticleMixture, observation: PyTree = None
-    ) -> Bool[Array, " m"]:
-        """Those that are due."""
-        del observation
-        return self.is_due(mixture)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None

@@ -1,10 +1,12 @@
-"""Lineages: which particle of x_0 each particle descends from, where a filter keeps that.
+"""Lineages: which particle of x_0 each particle descends from, and what that says of errors.
 
 A filter keeps them only if a `Lineage` was put into the mixture's memory of x_0. Then `Resample`
 brings it up to date, wherever it stands in a chain or within a move.
+`mpfjax.smoothing.log_marginal_likelihood_variance` has the equations.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -16,7 +18,7 @@ LINEAGE = "lineage"
 
 
 class Lineage(eqx.Module):
-    """What `log_marginal_likelihood_variance` needs of the past, O(N + M²) numbers.
+    """What the errors of log Ẑ and of the masses need of the past, O(N + M²) numbers.
 
     - `first_ancestors`: (n,), the slot in x_0 that each particle descends from.
     - `groups`: (n,), the component in which each particle was last resampled.
@@ -72,6 +74,37 @@ def with_offspring(
     grown = jnp.where(due & (k > 1), -jnp.log1p(-1 / jnp.maximum(k, 2)), 0.0)
     lineage = Lineage(take(lineage.first_ancestors, parents), groups, log_factors + jnp.diag(grown))
     return resampled.replace(memory=resampled.memory | {LINEAGE: lineage})
+
+
+def evidence_variance(mixture: ParticleMixture) -> Float[Array, ""]:
+    """The variance of log Ẑ, from the weight of each family. It may be negative."""
+    lineage: Lineage = mixture.memory[LINEAGE]
+    families = lineage.family_masses(mixture.weights, lineage.groups, mixture.num_components)
+    relative = _variance(families, mixture)
+    return relative + relative**2 / 2
+
+
+def mass_variances(mixture: ParticleMixture) -> Float[Array, " m"]:
+    """The variance of each mixture weight, from the share of each family that is in it."""
+    lineage: Lineage = mixture.memory[LINEAGE]
+    m, masses = mixture.num_components, mixture.mixture_weights
+    pairs = mixture.component_indicators * m + lineage.groups
+    families = lineage.family_masses(mixture.weights, pairs, m * m).reshape(m, m, -1)
+    # The families' part in a component, less what it would be were all families alike.
+    excess = families - masses[:, None, None] * jnp.sum(families, axis=0)[None]
+    return jax.vmap(_variance, (0, None))(excess, mixture)
+
+
+def _variance(families: Float[Array, "m n"], mixture: ParticleMixture) -> Float[Array, ""]:
+    """(Σ s)² - N / (N - 1) Σ s_i s_j Π k_m / (k_m - 1), over the pairs of different families."""
+    lineage: Lineage = mixture.memory[LINEAGE]
+    totals = jnp.sum(families, axis=1)
+    of_different = totals[:, None] * totals[None] - families @ families.T
+    num_drawn = jnp.asarray(mixture.num_usable_slots, families.dtype)
+    log_factors = lineage.log_pair_factors - jnp.log1p(-1 / jnp.maximum(num_drawn, 2))
+    # The sums with factors of one, and what the factors add, which are close to one.
+    of_same = jnp.sum(jnp.sum(families, axis=0) ** 2)
+    return of_same - jnp.sum(of_different * jnp.expm1(log_factors))
 
 
 def _by_components(lineage: Lineage, mixture: ParticleMixture) -> Float[Array, "m m"]:

@@ -15,7 +15,7 @@ from mpfjax.checks import (
     given,
 )
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractRejuvenation
+from mpfjax.moves.base import AbstractResampling
 from mpfjax.moves.lineages import with_offspring
 from mpfjax.moves.lines import AsTheyStand, SideBySide, as_they_are, side_by_side
 from mpfjax.moves.resampling_schemes import SCHEMES
@@ -34,7 +34,7 @@ ALLOCATIONS = ("equal", "variance")
 GRADIENTS = ("none", "stop", "soft", "ot", "straight_through")
 
 
-class Resample(AbstractRejuvenation):
+class Resample(AbstractResampling):
     """Draw each component's particles anew in proportion to their weights w_i.
 
     Components are resampled independently of each other, which keeps the support of every mode
@@ -136,13 +136,6 @@ class Resample(AbstractRejuvenation):
         if self.particles_per_component is not None:
             due = due | (counts != self.particles_per_component)
         return due & (counts > 0)
-
-    def would_resample(
-        self, mixture: ParticleMixture, observation: PyTree = None
-    ) -> Bool[Array, " m"]:
-        """Those that are due."""
-        del observation
-        return self.is_due(mixture)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None

@@ -32,7 +32,7 @@ def draw_columns(uniform: Float[Array, " k"], weights: Float[Array, "k n"]) -> I
     """
     # In both levels, rounding may put the target on either side of a border, or past the end.
     num_rows, num_columns = weights.shape
-    size = max(math.isqrt(num_columns), 1)
+    size = _block_size(num_columns)
     num_blocks = -(-num_columns // size)
     padded = jnp.pad(weights, ((0, 0), (0, num_blocks * size - num_columns)))
     blocks = padded.reshape(num_rows, num_blocks, size)
@@ -45,6 +45,14 @@ def draw_columns(uniform: Float[Array, " k"], weights: Float[Array, "k n"]) -> I
     rest = target - (upto[rows, block] - sums[rows, block])
     column = _first_above(rest, jnp.cumsum(chosen, axis=1), chosen)
     return jnp.minimum(block * size + column, num_columns - 1)
+
+
+def _block_size(num_columns: int) -> int:
+    """About √n; a divisor of n if there is one, since what is fused with a padding is slow."""
+    root = max(math.isqrt(num_columns), 1)
+    near = range(max(root // 2, 1), 2 * root + 1)
+    divisors = [size for size in near if num_columns % size == 0]
+    return min(divisors, key=lambda size: abs(size - root), default=root)
 
 
 def _first_above(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -60,20 +60,39 @@ def scan(
         mixture, info = step_or_predict(filter, step_key, mixture, observation, is_present)
         with saying("in collect, which is called with the mixture after each step"):
             kept = mixture if collect is None else collect(mixture)
-        return mixture, (kept, info.log_likelihood_increment, info.resampled, info.degenerate)
+        return mixture, (kept, report_of(info))
 
     inputs = (jax.random.split(key_steps, length), observations, present)
     initial = _share_of_islands(filter._init(start._replace(key=key_initial)))
     final, outputs = jax.lax.scan(advance, initial, inputs)
-    collected, increments, resampled, degenerate = outputs
+    return run_of(initial, final, *outputs)
+
+
+class StepReport(NamedTuple):
+    """The part of a `StepInfo` that a run keeps of each step."""
+
+    log_likelihood_increment: Float[Array, "*t"]
+    resampled: Bool[Array, "*t m"]
+    degenerate: Bool[Array, "*t"]
+
+
+def report_of(info: StepInfo) -> StepReport:
+    """What a run keeps of a step."""
+    return StepReport(info.log_likelihood_increment, info.resampled, info.degenerate)
+
+
+def run_of(
+    initial: ParticleMixture, final: ParticleMixture, collected: PyTree, reports: StepReport
+) -> FilterRun:
+    """The run of these steps, whose reports are stacked."""
     return FilterRun(
-        log_marginal_likelihood=jnp.sum(increments),
-        log_likelihood_increments=increments,
+        log_marginal_likelihood=jnp.sum(reports.log_likelihood_increment),
+        log_likelihood_increments=reports.log_likelihood_increment,
         collected=collected,
         initial=initial,
         final=final,
-        resampled=resampled,
-        degenerate=degenerate,
+        resampled=reports.resampled,
+        degenerate=reports.degenerate,
     )
 
 

@@ -13,24 +13,24 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import check_log_density
-from mpfjax.operations.generator import split, uniform
+from mpfjax.operations.generator import uniform
 from mpfjax.operations.indexing import take
 from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.matrices import draw_columns
+from mpfjax.operations.prefix_sums import sum_before
 
 # How many densities are held at once: rows of states are taken together up to this.
 MOST_DENSITIES = 2**22
 _NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the step before"
 
 
-def draw(uniforms: Float[Array, " k"], log_weights: Float[Array, " n"]) -> Int[Array, " k"]:
+def draw(uniforms: Float[Array, "*shape"], log_weights: Float[Array, " n"]) -> Int[Array, "*shape"]:
     """Indices by their weights, by the inverse of the cumulative weights."""
     weights = exp(log_weights - finite_or_zero(jnp.max(log_weights)))
-    upto = jnp.cumsum(weights)
+    before, total = sum_before(weights)
+    indices = jnp.searchsorted(before, uniforms * total, side="right").astype(jnp.int32) - 1
     # Rounding must not lead past the last particle of positive weight.
-    last = jnp.max(jnp.where(weights > 0, jnp.arange(weights.shape[0]), 0))
-    indices = jnp.searchsorted(upto, uniforms * upto[-1], side="right")
-    return jnp.minimum(indices, last).astype(jnp.int32)
+    return jnp.minimum(indices, jnp.max(jnp.where(weights > 0, jnp.arange(len(weights)), 0)))
 
 
 def draw_exactly(
@@ -72,21 +72,28 @@ def draw_exactly(
     return _with_a_past(indices, largest, needed)
 
 
+def propose(
+    key: Key[Array, ""], mixture: ParticleMixture, num_steps: int, num_states: int
+) -> Int[Array, "steps k"]:
+    """What `walk` proposes: indices by the weights alone, so that all can be drawn beforehand."""
+    dtype = mixture.log_weights.dtype
+    return draw(uniform(key, (num_steps, num_states), dtype), mixture.log_weights)
+
+
 def walk(
     key: Key[Array, ""],
     model: Any,
     next_states: PyTree,
     mixture: ParticleMixture,
     start: Int[Array, " k"],
-    num_steps: int,
+    proposed: Int[Array, "steps k"],
     needed: Bool[Array, " k"] | None = None,
 ) -> Int[Array, "steps k"]:
     """Steps of independent Metropolis-Hastings on the index, whose target is W^i D(next | x^i).
 
-    O(1) for a state and step; the index after each of the steps.
+    O(1) for a state and step; the index after each of the steps. `proposed` is that of `propose`.
     """
     num_states = start.shape[0]
-    dtype = mixture.log_weights.dtype
 
     def log_density(indices: Int[Array, " k"]) -> Float[Array, " k"]:
         previous = jax.tree.map(lambda leaf: take(leaf, indices), mixture.particles)
@@ -95,20 +102,19 @@ def walk(
         return values
 
     def move(
-        place: tuple[Int[Array, " k"], Float[Array, " k"]], step_key: Key[Array, ""]
+        place: tuple[Int[Array, " k"], Float[Array, " k"]],
+        inputs: tuple[Int[Array, " k"], Float[Array, " k"]],
     ) -> tuple[tuple[Int[Array, " k"], Float[Array, " k"]], Int[Array, " k"]]:
-        indices, current = place
-        key_proposal, key_accept = split(step_key, 2)
-        proposed = draw(uniform(key_proposal, (num_states,), dtype), mixture.log_weights)
-        new = log_density(proposed)
+        (indices, current), (candidates, log_uniform) = place, inputs
+        new = log_density(candidates)
         # The proposal draws by the weights, which therefore cancel in the acceptance ratio.
-        accepted = jnp.log(uniform(key_accept, (num_states,), dtype)) < new - current
-        accepted |= current == -jnp.inf
-        indices = jnp.where(accepted, proposed, indices)
+        accepted = (log_uniform < new - current) | (current == -jnp.inf)
+        indices = jnp.where(accepted, candidates, indices)
         return (indices, jnp.where(accepted, new, current)), indices
 
     first = (start, log_density(start))
-    (_, current), indices = jax.lax.scan(move, first, split(key, num_steps))
+    log_uniforms = jnp.log(uniform(key, proposed.shape, mixture.log_weights.dtype))
+    (_, current), indices = jax.lax.scan(move, first, (proposed, log_uniforms))
     return _with_a_past(indices, current, needed)
 
 

@@ -24,9 +24,10 @@ from mpfjax.models.base import mapped, require
 from mpfjax.observations import as_arrays, present_steps
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.floats import as_inexact
+from mpfjax.operations.generator import split
 from mpfjax.operations.indexing import take
-from mpfjax.running.scan import FilterRun, checked, step_or_predict
-from mpfjax.smoothing.backward import draw_exactly, walk
+from mpfjax.running.scan import FilterRun, checked, report_of, run_of, step_or_predict
+from mpfjax.smoothing.backward import draw_exactly, propose, walk
 
 
 class SmoothedSums(eqx.Module):
@@ -129,14 +130,13 @@ def _smooth(key, filter, observations, present, options):
         oldest = jax.tree.map(lambda own: own[(t + 1) % num_kept], averages)
         if lag is not None:
             settled = jax.tree.map(jnp.add, settled, oldest)
-        outputs = (sums, oldest, info.log_likelihood_increment, info.resampled, info.degenerate)
-        return (moved, kept, settled), outputs
+        return (moved, kept, settled), (sums, oldest, report_of(info))
 
     keys = jax.random.split(key_steps, length), jax.random.split(key_backward, length)
     inputs = (jnp.arange(length, dtype=jnp.int32), *keys, observations, present)
     carry, outputs = jax.lax.scan(advance, (initial, kept, settled), inputs)
     final, kept, _ = carry
-    sums, oldest, increments, resampled, degenerate = outputs
+    sums, oldest, reports = outputs
     terms = None
     if lag is not None:
         last = np.arange(length - lag, length) % num_kept
@@ -144,16 +144,7 @@ def _smooth(key, filter, observations, present, options):
         terms = jax.tree.map(
             lambda done, rest: jnp.concatenate([done[lag:], rest]), oldest, open_terms
         )
-    run = FilterRun(
-        log_marginal_likelihood=jnp.sum(increments),
-        log_likelihood_increments=increments,
-        collected=None,
-        initial=initial,
-        final=final,
-        resampled=resampled,
-        degenerate=degenerate,
-    )
-    return SmoothedSums(sums, terms, run)
+    return SmoothedSums(sums, terms, run_of(initial, final, None, reports))
 
 
 def _draw_pasts(
@@ -168,11 +159,12 @@ def _draw_pasts(
     needed = after.occupied
     if method == "exact":
         return draw_exactly(key, model, after.particles, before, num_draws, needed)
-    start = after.ancestor_indices
-    if num_draws == 1:
-        return walk(key, model, after.particles, before, start, 1, needed).T
-    later = walk(key, model, after.particles, before, start, num_draws - 1, needed)
-    return jnp.concatenate([start[:, None], later.T], axis=1)
+    key_proposed, key_walk = split(key, 2)
+    # The start counts as a draw, unless it would be the only one.
+    num_steps, start = max(num_draws - 1, 1), after.ancestor_indices
+    proposed = propose(key_proposed, before, num_steps, start.shape[0])
+    later = walk(key_walk, model, after.particles, before, start, proposed, needed).T
+    return later if num_draws == 1 else jnp.concatenate([start[:, None], later], axis=1)
 
 
 def _mean_of_pasts(values: Array, indices: Int[Array, "n draws"]) -> Array:

@@ -9,13 +9,14 @@ from jax.core import Tracer
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_key, check_one_of, check_whole, given
+from mpfjax.filter import split_keys
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
 from mpfjax.operations.compiling import jit_on_wide_vectors
-from mpfjax.operations.generator import split, uniform
+from mpfjax.operations.generator import uniform
 from mpfjax.operations.indexing import take
 from mpfjax.running.scan import FilterRun
-from mpfjax.smoothing.backward import draw, draw_exactly, walk
+from mpfjax.smoothing.backward import draw, draw_exactly, propose, walk
 from mpfjax.smoothing.history import mixtures_of
 
 
@@ -82,7 +83,7 @@ def _check_component(mixtures: ParticleMixture, component: int) -> None:
 
 @jit_on_wide_vectors
 def _sample(key, model, mixtures, num_trajectories, component, num_steps):
-    key_final, key_steps = split(key, 2)
+    key_final, key_steps, key_proposed = split_keys(key, 3)
     final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
     log_weights = final.log_weights
     if component is not None:
@@ -92,18 +93,23 @@ def _sample(key, model, mixtures, num_trajectories, component, num_steps):
 
     def back(carry: tuple[PyTree, Array], inputs: Any) -> tuple[tuple[PyTree, Array], PyTree]:
         next_states, next_indices = carry
-        step_key, earlier, ancestors = inputs
-        if num_steps == 0:
+        step_key, earlier, ancestors, proposed = inputs
+        if proposed is None:
             indices = draw_exactly(step_key, model, next_states, earlier)[:, 0]
         else:
             start = take(ancestors, next_indices)
-            indices = walk(step_key, model, next_states, earlier, start, num_steps)[-1]
+            indices = walk(step_key, model, next_states, earlier, start, proposed)[-1]
         states = jax.tree.map(lambda leaf: take(leaf, indices), earlier.particles)
         return (states, indices), states
 
     num_earlier = mixtures.log_weights.shape[0] - 1
     earlier = jax.tree.map(lambda leaf: leaf[:-1], mixtures)
-    inputs = jax.random.split(key_steps, num_earlier), earlier, mixtures.ancestor_indices[1:]
+    ancestors, proposed = mixtures.ancestor_indices[1:], None
+    if num_steps > 0:
+        # All times in one go, since proposals do not depend on the states after them.
+        keys = jax.random.split(key_proposed, num_earlier)
+        proposed = jax.vmap(propose, (0, 0, None, None))(keys, earlier, num_steps, num_trajectories)
+    inputs = jax.random.split(key_steps, num_earlier), earlier, ancestors, proposed
     _, past = jax.lax.scan(back, (states, last), inputs, reverse=True)
     return jax.tree.map(
         lambda before, end: jnp.concatenate([jnp.moveaxis(before, 0, 1), end[:, None]], axis=1),

@@ -58,3 +58,13 @@ def grid_smoother(log_initial, log_transition, log_likelihoods):
         joint = forward[s][:, None] * kernel * (likelihood * backward[s + 1])[None]
         pairs.append(joint / joint.sum())
     return np.array(smoothed), np.array(pairs)
+
+
+def grid_trajectories(rng, num, points, smoothed, pairs):
+    """Trajectories (num, t + 1) drawn from what `grid_smoother` found."""
+    indices = [rng.choice(len(points), num, p=smoothed[0])]
+    for pair in pairs:
+        upto = np.cumsum(pair[indices[-1]], axis=1)
+        quantiles = rng.random(num) * upto[:, -1]
+        indices.append((upto <= quantiles[:, None]).sum(axis=1))
+    return points[np.stack(indices, axis=1)].astype(np.float32)

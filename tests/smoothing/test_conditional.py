@@ -11,7 +11,7 @@ import pytest
 import mpfjax
 from mpfjax import Filter, KMeans, Merge, Propagate, RandomPartition, Resample, Split
 from mpfjax.smoothing import conditional_filter
-from tests.smoothing.exact_smoothers import grid_smoother
+from tests.smoothing.exact_smoothers import grid_smoother, grid_trajectories
 
 NUM_CHAINS = 4000
 LINEAR = mpfjax.LinearGaussianModel(
@@ -58,12 +58,7 @@ def exact_draws():
         [np.asarray(QUADRATIC.log_likelihood(jnp.asarray(y), points), float) for y in SQUARES]
     )
     smoothed, pairs = grid_smoother(log_initial, log_transition, log_likelihoods)
-    indices = [rng.choice(len(GRID), NUM_CHAINS, p=smoothed[0])]
-    for pair in pairs:
-        upto = np.cumsum(pair[indices[-1]], axis=1)
-        quantiles = rng.random(NUM_CHAINS) * upto[:, -1]
-        indices.append((upto <= quantiles[:, None]).sum(axis=1))
-    return GRID[np.stack(indices, axis=1)].astype(np.float32)
+    return grid_trajectories(rng, NUM_CHAINS, GRID, smoothed, pairs)
 
 
 @functools.cache
