@@ -21,6 +21,7 @@ from mpfjax.vision.sampled_histograms import SampledBoxes, SampledHistogram
 from mpfjax.vision.tracking.assignment import Assign
 from mpfjax.vision.tracking.births import Found, ShareMass
 from mpfjax.vision.tracking.colours import LearnColours
+from mpfjax.vision.tracking.contact import ShareDetections
 from mpfjax.vision.tracking.deaths import Bury
 from mpfjax.vision.tracking.memory import LIVES, Lives, mean_boxes
 from mpfjax.vision.tracking.model import DetectedObjectModel, ObjectState, Pixels
@@ -70,6 +71,7 @@ class ObjectTracker(eqx.Module):
 
     - `RankScores`: which detections are strong, by the scores seen so far;
     - `Assign`: at most one detection for each component, at the least total cost;
+    - `ShareDetections`: one for two, where a component hides another;
     - a rejuvenation, of the GM-MPF (Lin et al. 2012) or of the MPF (Vermaak et al. 2003);
     - `PropagateObjects`: draw x_t and weigh it by the component's detection, exactly;
     - `Bury`: end what no detection bears out, or has left the frame;
@@ -137,6 +139,7 @@ class ObjectTracker(eqx.Module):
             moves = (
                 RankScores(strong_score=strong_score, weak_score=weak_score),
                 Assign(model),
+                ShareDetections(model, longest=round(10 * max(frames_per_second / 25, 1.0))),
                 rejuvenation,
                 PropagateObjects(model),
                 Bury(patience=patience),
@@ -279,8 +282,8 @@ def _sees_detections(move: AbstractMove) -> bool:
     """Whether it looks at the colours of detections alone, or at none."""
     if isinstance(move, PropagateObjects):
         return move.model.sigma is None
-    kinds = (RankScores, Assign, AbstractRejuvenation, Bury, Found, LearnColours, ShareMass)
-    return isinstance(move, kinds)
+    kinds = (RankScores, Assign, ShareDetections, AbstractRejuvenation, Bury, Found, LearnColours)
+    return isinstance(move, (*kinds, ShareMass))
 
 
 def _motion(states: ObjectState) -> tuple[PyTree, PyTree]:

@@ -119,7 +119,8 @@ def frame_of_two():
     found = Detections(
         jnp.asarray([[1.0, 2.0, 7.0, 8.0]] * 2, jnp.float32), jnp.array([True, False]), jnp.ones(2)
     )
-    return AssignedFrame(found, jnp.array([True, False]), None, jnp.zeros((2, 1, 1, 2)))
+    first, nobody = jnp.array([True, False]), jnp.array([False, False])
+    return AssignedFrame(found, first, nobody, nobody, None, jnp.zeros((2, 1, 1, 2)))
 
 
 def test_the_proposal_is_optimal():
