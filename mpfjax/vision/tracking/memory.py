@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mpfjax.mixture import ParticleMixture
 
 SCORES, ASSIGNED, LIVES, REFERENCES = "scores", "assigned", "lives", "references"
-EXTENT, SHARED, HIDDEN = "extent", "shared", "hidden"
+EXTENT, SHARED, HIDDEN, DOUBTS = "extent", "shared", "hidden", "doubts"
 
 
 class Scores(NamedTuple):

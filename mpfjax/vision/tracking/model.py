@@ -45,6 +45,8 @@ class AssignedFrame(NamedTuple):
     - `detections`: a row for each object, its own detection, valid where it has one.
     - `weak`: (m,), which of them are weak ones; `merged`: which stand for others as well, whom the
       object hides; `borrowed`: which are those of another object, which hides this one.
+    - `doubts`: (m,), the floor of each object's likelihood beside the model's own: what speaks for
+      its detection being another's.
     - `pixels`: the colours of the frame; None where nobody looks at them.
     - `references`: (m, parts, channels, bins), the histograms that each object is known by, all
       zero where it has none.
@@ -54,6 +56,7 @@ class AssignedFrame(NamedTuple):
     weak: Bool[Array, " m"]
     merged: Bool[Array, " m"]
     borrowed: Bool[Array, " m"]
+    doubts: Float[Array, " m"]
     pixels: Pixels | None
     references: Float[Array, "m parts channels bins"]
 
@@ -75,7 +78,7 @@ class DetectedObjectModel(AbstractStateSpaceModel):
     - `detection_deviations`: of (x, y, log w, log h); `weak_error` times as much for a weak one,
       `merged_error` times in the size for one that stands for two, and `borrowed_error` times in
       the place for one of another object, which says nothing of the size.
-    - `miss`: against 1 where detection and box agree.
+    - `miss`: against 1 where detection and box agree; a frame's doubts come on top of it.
     - `sigma`: σ, None where the particles are not weighed by colours.
 
     Raises `ValueError` for a number that is not positive. Use it in an `ObjectTracker`.
@@ -87,7 +90,7 @@ class DetectedObjectModel(AbstractStateSpaceModel):
     detection_deviations: Float[Array, "4"] = eqx.field(converter=to_array("detection_deviations"))
     weak_error: float = eqx.field(static=True, default=1.35)
     merged_error: float = eqx.field(static=True, default=2.0)
-    borrowed_error: float = eqx.field(static=True, default=2.0)
+    borrowed_error: float = eqx.field(static=True, default=3.0)
     miss: float = eqx.field(static=True, default=1e-4)
     sigma: float | None = eqx.field(static=True, default=None)
 
@@ -186,7 +189,8 @@ class DetectedObjectModel(AbstractStateSpaceModel):
         """log (miss + exp(-½ ...)) where there is a detection, and -B² / 2σ²."""
         places, deviations = self.detection_of(observation, states)
         gaps = (places - states.place) / deviations
-        log_detected = jnp.log(self.miss + jnp.exp(-0.5 * jnp.sum(gaps**2, axis=1)))
+        floor = self.miss + take(observation.doubts, states.label)
+        log_detected = jnp.log(floor + jnp.exp(-0.5 * jnp.sum(gaps**2, axis=1)))
         detected = take(observation.detections.valid, states.label)
         log_detected = jnp.where(detected, log_detected, 0.0)
         if observation.pixels is None or self.sigma is None:

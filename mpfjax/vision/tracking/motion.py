@@ -8,7 +8,7 @@ from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation import Propagate
 from mpfjax.vision.tracking.assignment import own_detections
 from mpfjax.vision.tracking.contact import in_front
-from mpfjax.vision.tracking.memory import ASSIGNED, REFERENCES, SCORES, shared_detections
+from mpfjax.vision.tracking.memory import ASSIGNED, DOUBTS, REFERENCES, SCORES, shared_detections
 from mpfjax.vision.tracking.model import AssignedFrame, DetectedObjectModel
 from mpfjax.vision.tracking.observation import TrackedFrame
 from mpfjax.vision.tracking.proposal import DetectionProposal
@@ -36,6 +36,7 @@ class PropagateObjects(AbstractPropagation):
             weak=own.scores < mixture.memory[SCORES].strong,
             merged=in_front(mixture),
             borrowed=borrowed,
+            doubts=jnp.where(borrowed, 0.0, mixture.memory[DOUBTS]),
             pixels=observation.pixels,
             references=mixture.memory[REFERENCES],
         )
