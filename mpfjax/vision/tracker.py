@@ -23,7 +23,7 @@ from mpfjax.vision.tracking.births import Found, ShareMass
 from mpfjax.vision.tracking.colours import LearnColours
 from mpfjax.vision.tracking.contact import ShareDetections
 from mpfjax.vision.tracking.deaths import Bury
-from mpfjax.vision.tracking.memory import LIVES, Lives, mean_boxes
+from mpfjax.vision.tracking.memory import LIVES, Lives, frames_unseen, mean_boxes
 from mpfjax.vision.tracking.model import DetectedObjectModel, ObjectState, Pixels
 from mpfjax.vision.tracking.motion import PropagateObjects
 from mpfjax.vision.tracking.observation import TrackedFrame
@@ -41,7 +41,7 @@ class Tracks(NamedTuple):
     - `boxes`: (m, 4), the mean box of each, centre and size in pixels.
     - `identities`: (m,), a number that an object keeps for life, 0 for a dead component.
     - `confirmed`: (m,), whether detections have borne it out often enough to be believed.
-    - `unseen`: (m,), for how many frames none has.
+    - `unseen`: (m,), for how many frames none has; 0 while it is hidden by another one.
     - `full`: whether a detection that would have founded a component found no room.
 
     A box that is confirmed and was seen within the last three frames is worth showing: `shown`.
@@ -139,7 +139,7 @@ class ObjectTracker(eqx.Module):
             moves = (
                 RankScores(strong_score=strong_score, weak_score=weak_score),
                 Assign(model),
-                ShareDetections(model, longest=round(5 * max(frames_per_second / 25, 1.0))),
+                ShareDetections(model, longest=round(10 * max(frames_per_second / 25, 1.0))),
                 rejuvenation,
                 PropagateObjects(model),
                 Bury(patience=patience),
@@ -206,7 +206,7 @@ class ObjectTracker(eqx.Module):
             boxes=mean_boxes(state),
             identities=lives.identities,
             confirmed=lives.confirmed,
-            unseen=lives.unseen,
+            unseen=frames_unseen(state),
             full=lives.full,
         )
 

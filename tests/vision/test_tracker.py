@@ -352,24 +352,24 @@ def test_who_is_in_contact_teaches_nobody():
     np.testing.assert_array_equal(references[7], references[6])
 
 
-CROSSING = range(24)
+CROSSING = range(26)
 WIDE = np.array([14.0, 22.0])
 
 
 def crossing(pixels, alike):
-    """Two who walk through each other, found as one box about both for ten frames.
+    """Two who walk through each other, found as one box about both for nine frames.
 
     The tracks, and where the two are: the first goes to the right, and the second to the left.
     """
     state, tracks, places = TRACKER.init(), [], []
     for t in CROSSING:
-        x = np.array([3 + 1.5 * t, 47 - 1.5 * t])
+        x = np.array([10 + t, 36 - t])
         boxes = np.column_stack([x, [14, 15], [WIDE[0]] * 2, [WIDE[1]] * 2])
         picture = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
         for (left, top, w, h), shirt in reversed(list(zip(boxes, SHIRTS, strict=False))):
             rows, columns = slice(int(top), int(top + h)), slice(round(left), round(left + w))
             picture[rows, columns] = SHIRTS[0] if alike else shirt
-        merged = 10 <= t < 20
+        merged = abs(x[1] - x[0]) < 10
         low, high = boxes[:, :2].min(0), (boxes[:, :2] + boxes[:, 2:]).max(0)
         found = np.r_[low, high - low][None] if merged else boxes
         frame = jnp.asarray(picture) if pixels else None

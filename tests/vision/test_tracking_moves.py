@@ -394,9 +394,8 @@ BOTH, FIRST, FAR = [22, 20, 14, 14], [20, 20, 7, 12], [60, 40, 8, 13]
         # Nor is anybody hidden who has been lost for long, or whom nobody believes in.
         ((0, -1, -1), [BOTH], {"unseen": (0, 9, 0)}, [-1] * 4),
         ((0, -1, -1), [BOTH], {"confirmed": (True, False, True)}, [-1] * 4),
-        # One that is nobody's stands for both, or else for nobody.
-        ((-1, -1, -1), [BOTH], {}, [0, 0, -1, -1]),
-        ((-1, -1, -1), [FAR], {}, [-1] * 4),
+        # One that is nobody's hides nobody.
+        ((-1, -1, -1), [BOTH], {}, [-1] * 4),
     ],
 )  # fmt: skip
 def test_who_is_hidden_shares_the_detection_of_who_hides_it(source, boxes, options, expected):

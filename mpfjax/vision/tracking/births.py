@@ -18,7 +18,6 @@ from mpfjax.vision.tracking.memory import (
     Lives,
     mean_boxes,
     remember,
-    shared_detections,
 )
 from mpfjax.vision.tracking.model import DetectedObjectModel, ObjectState
 from mpfjax.vision.tracking.observation import TrackedFrame, overlap, within
@@ -67,9 +66,6 @@ class Found(AbstractMove):
         lives: Lives = mixture.memory[LIVES]
         rows = jnp.where(source >= 0, source, len(found.valid))
         free = jnp.ones(len(found.valid), bool).at[rows].set(False, mode="drop")
-        shared = shared_detections(mixture)
-        shared = jnp.where(shared >= 0, shared, len(found.valid))
-        free = free.at[shared].set(False, mode="drop")
         strong = found.valid & (found.scores >= mixture.memory[SCORES].strong)
         covered = overlap(mean_boxes(mixture), found.boxes) > self.birth_overlap
         wanted = free & strong & within(found.boxes, mixture.memory[EXTENT])

@@ -7,11 +7,11 @@ from jaxtyping import Array, Bool, Int, Key
 from mpfjax.checks import check_share, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
+from mpfjax.operations.indexing import take
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
     HIDDEN,
     LIVES,
-    SCORES,
     SHARED,
     Lives,
     boxes_of,
@@ -28,11 +28,10 @@ class ShareDetections(AbstractMove):
     Of two objects in contact a detector often finds one, or both as one: it keeps one of the boxes
     that overlap. A confirmed component without a detection is therefore taken for hidden, not for
     gone, where the detection of another confirmed one covers more than the share `cover` of its
-    predicted box, or where one that is nobody's covers so much of several. Until they part both
-    live and both are shown; whoever is hidden learns roughly where it is and nothing of its size or
-    colours, and the other learns its size less surely (`PropagateObjects`, `LearnColours`). So
-    neither takes the other's place, and when two detections are found again, motion and colours say
-    whose each is (`Assign`).
+    predicted box. Until they part both live and both are shown; whoever is hidden learns roughly
+    where it is and nothing of its size or colours, and the other learns its size less surely
+    (`PropagateObjects`, `LearnColours`). So neither takes the other's place, and when two
+    detections are found again, motion and colours say whose each is (`Assign`).
 
     - `longest`: after so many hidden frames in a row one counts as unseen again.
     - `recent`: who has been unseen for more frames before is not hidden but lost.
@@ -80,28 +79,14 @@ class ShareDetections(AbstractMove):
         source, lives = mixture.memory[ASSIGNED], mixture.memory[LIVES]
         detected = source >= 0
         predicted = boxes_of(mixture.component_averages(self.model.predicted(mixture.particles)[0]))
-        missed = self._missed(lives, detected)
-        shares = covered(predicted, observation.detections.boxes)
-        covers = missed[:, None] & (shares > self.cover)
-        shares = jnp.where(covers & self._shared(mixture, observation, covers)[None], shares, 0.0)
-        hidden = jnp.any(shares > 0, axis=1)
+        own = take(observation.detections.boxes, jnp.maximum(source, 0))
+        hides = (lives.confirmed & detected)[None] & ~jnp.eye(len(source), dtype=bool)
+        shares = jnp.where(hides, covered(predicted, own), 0.0)
+        hidden = self._missed(lives, detected) & (jnp.max(shares, axis=1) > self.cover)
         frames = jnp.where(detected, 0, mixture.memory[HIDDEN] + hidden.astype(jnp.int32))
         hidden &= frames <= self.longest
-        row = jnp.argmax(shares, axis=1).astype(jnp.int32)
-        return remember(mixture, shared=jnp.where(hidden, row, -1), hidden=frames)
-
-    def _shared(
-        self, mixture: ParticleMixture, observation: TrackedFrame, covers: Bool[Array, "m d"]
-    ) -> Bool[Array, " d"]:
-        """Which detections may stand for more than one."""
-        found, source = observation.detections, mixture.memory[ASSIGNED]
-        count = len(found.valid)
-        believed = jnp.where(mixture.memory[LIVES].confirmed & (source >= 0), source, count)
-        anybodys = jnp.where(source >= 0, source, count)
-        taken = jnp.zeros(count, bool).at[believed].set(True, mode="drop")
-        free = jnp.ones(count, bool).at[anybodys].set(False, mode="drop")
-        free &= found.valid & (found.scores >= mixture.memory[SCORES].weak)
-        return taken | (free & (jnp.sum(covers, axis=0, dtype=jnp.int32) > 1))
+        front = take(source, jnp.argmax(shares, axis=1).astype(jnp.int32))
+        return remember(mixture, shared=jnp.where(hidden, front, -1), hidden=frames)
 
     def _missed(self, lives: Lives, detected: Bool[Array, " m"]) -> Bool[Array, " m"]:
         """Who has no detection now and had one lately."""

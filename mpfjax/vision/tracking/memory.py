@@ -61,6 +61,13 @@ def boxes_of(places: Float[Array, "m 4"]) -> Float[Array, "m 4"]:
     return jnp.concatenate([places[:, :2], jnp.exp(places[:, 2:])], axis=1)
 
 
+def frames_unseen(mixture: ParticleMixture) -> Int[Array, " m"]:
+    """For how many frames no detection has borne each out, or stood for it while it was hidden."""
+    lives: Lives = mixture.memory[LIVES]
+    hidden = mixture.memory.get(HIDDEN, jnp.zeros_like(lives.unseen))
+    return lives.unseen + jnp.where(shared_detections(mixture) < 0, hidden, 0)
+
+
 def shared_detections(mixture: ParticleMixture) -> Int[Array, " m"]:
     """The row of the detection that each component shares; -1 for all where no move shares any."""
     nobody = jnp.full(mixture.num_components, -1, jnp.int32)
