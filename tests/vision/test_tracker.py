@@ -356,14 +356,14 @@ CROSSING = range(26)
 WIDE = np.array([14.0, 22.0])
 
 
-def crossing(pixels, alike):
-    """Two who walk through each other, found as one box about both for nine frames.
+def crossing(pixels, alike, pace):
+    """Two who walk through each other, found as one box about both while they overlap by a third.
 
     The tracks, and where the two are: the first goes to the right, and the second to the left.
     """
     state, tracks, places = TRACKER.init(), [], []
     for t in CROSSING:
-        x = np.array([10 + t, 36 - t])
+        x = np.array([23 + pace * (t - 13), 23 + pace * (13 - t)])
         boxes = np.column_stack([x, [14, 15], [WIDE[0]] * 2, [WIDE[1]] * 2])
         picture = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
         for (left, top, w, h), shirt in reversed(list(zip(boxes, SHIRTS, strict=False))):
@@ -379,10 +379,12 @@ def crossing(pixels, alike):
     return tracks, places
 
 
-@pytest.mark.parametrize(("pixels", "alike"), [(False, True), (True, True), (True, False)])
-def test_two_who_cross_and_are_found_as_one_keep_their_names(pixels, alike):
+@pytest.mark.parametrize(
+    ("pixels", "alike", "pace"), [(False, True, 1.5), (True, True, 1.5), (True, False, 1.0)]
+)
+def test_two_who_cross_and_are_found_as_one_keep_their_names(pixels, alike, pace):
     """By motion alone where they look alike; and both are shown all the time."""
-    tracks, places = crossing(pixels, alike)
+    tracks, places = crossing(pixels, alike, pace)
     assert [living(each) for each in tracks] == [[1, 2]] * len(tracks)
     assert all(each.shown.sum() == 2 for each in tracks)
     first = [box_of(tracks[0], 1)[0], box_of(tracks[0], 2)[0]]

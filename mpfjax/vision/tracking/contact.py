@@ -29,7 +29,7 @@ class ShareDetections(AbstractMove):
     that overlap. A confirmed component without a detection is therefore taken for hidden, not for
     gone, where the detection of another confirmed one covers more than the share `cover` of its
     predicted box. Until they part both live and both are shown; whoever is hidden learns roughly
-    where it is and nothing of its size or colours, and the other learns its size less surely
+    where it is and nothing of its size or colours, and the other follows it less surely
     (`PropagateObjects`, `LearnColours`). So neither takes the other's place, and when two
     detections are found again, motion and colours say whose each is (`Assign`).
 

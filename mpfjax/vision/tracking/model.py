@@ -76,8 +76,8 @@ class DetectedObjectModel(AbstractStateSpaceModel):
     - `position_noise`, `velocity_noise`: σ_x and σ_v of x and y, in boxes a frame.
     - `size_noise`: of log w and log h in a frame.
     - `detection_deviations`: of (x, y, log w, log h); `weak_error` times as much for a weak one,
-      `merged_error` times in the size for one that stands for two, and `borrowed_error` times in
-      the place for one of another object, which says nothing of the size.
+      `merged_error` times for one that stands for two, and `borrowed_error` times in the place for
+      one of another object, which says nothing of the size.
     - `miss`: against 1 where detection and box agree; a frame's doubts come on top of it.
     - `sigma`: σ, None where the particles are not weighed by colours.
 
@@ -179,10 +179,9 @@ class DetectedObjectModel(AbstractStateSpaceModel):
 
     def _errors(self, observation: AssignedFrame) -> Float[Array, "m 4"]:
         """How many times the deviations of a sure detection each object's own has."""
-        merged = jnp.array([1.0, 1.0, self.merged_error, self.merged_error])
         borrowed = jnp.array([self.borrowed_error, self.borrowed_error, _NOTHING, _NOTHING])
         errors = jnp.where(observation.weak, self.weak_error, 1.0)[:, None]
-        errors = errors * jnp.where(observation.merged[:, None], merged[None], 1.0)
+        errors = errors * jnp.where(observation.merged[:, None], self.merged_error, 1.0)
         return errors * jnp.where(observation.borrowed[:, None], borrowed[None], 1.0)
 
     def log_likelihood(self, observation: AssignedFrame, states: ObjectState) -> Float[Array, " n"]:
