@@ -21,8 +21,9 @@ from mpfjax.vision.sampled_histograms import SampledBoxes, SampledHistogram
 from mpfjax.vision.tracking.assignment import Assign
 from mpfjax.vision.tracking.births import Found, ShareMass
 from mpfjax.vision.tracking.colours import LearnColours
+from mpfjax.vision.tracking.contact import ShareDetections
 from mpfjax.vision.tracking.deaths import Bury
-from mpfjax.vision.tracking.memory import LIVES, Lives, mean_boxes
+from mpfjax.vision.tracking.memory import LIVES, Lives, frames_unseen, mean_boxes
 from mpfjax.vision.tracking.model import DetectedObjectModel, ObjectState, Pixels
 from mpfjax.vision.tracking.motion import PropagateObjects
 from mpfjax.vision.tracking.observation import TrackedFrame
@@ -40,7 +41,7 @@ class Tracks(NamedTuple):
     - `boxes`: (m, 4), the mean box of each, centre and size in pixels.
     - `identities`: (m,), a number that an object keeps for life, 0 for a dead component.
     - `confirmed`: (m,), whether detections have borne it out often enough to be believed.
-    - `unseen`: (m,), for how many frames none has.
+    - `unseen`: (m,), for how many frames none has; 0 while it is hidden by another one.
     - `full`: whether a detection that would have founded a component found no room.
 
     A box that is confirmed and was seen within the last three frames is worth showing: `shown`.
@@ -70,6 +71,7 @@ class ObjectTracker(eqx.Module):
 
     - `RankScores`: which detections are strong, by the scores seen so far;
     - `Assign`: at most one detection for each component, at the least total cost;
+    - `ShareDetections`: one for two, where a component hides another;
     - a rejuvenation, of the GM-MPF (Lin et al. 2012) or of the MPF (Vermaak et al. 2003);
     - `PropagateObjects`: draw x_t and weigh it by the component's detection, exactly;
     - `Bury`: end what no detection bears out, or has left the frame;
@@ -137,6 +139,7 @@ class ObjectTracker(eqx.Module):
             moves = (
                 RankScores(strong_score=strong_score, weak_score=weak_score),
                 Assign(model),
+                ShareDetections(model, longest=round(10 * max(frames_per_second / 25, 1.0))),
                 rejuvenation,
                 PropagateObjects(model),
                 Bury(patience=patience),
@@ -203,7 +206,7 @@ class ObjectTracker(eqx.Module):
             boxes=mean_boxes(state),
             identities=lives.identities,
             confirmed=lives.confirmed,
-            unseen=lives.unseen,
+            unseen=frames_unseen(state),
             full=lives.full,
         )
 
@@ -279,8 +282,8 @@ def _sees_detections(move: AbstractMove) -> bool:
     """Whether it looks at the colours of detections alone, or at none."""
     if isinstance(move, PropagateObjects):
         return move.model.sigma is None
-    kinds = (RankScores, Assign, AbstractRejuvenation, Bury, Found, LearnColours, ShareMass)
-    return isinstance(move, kinds)
+    kinds = (RankScores, Assign, ShareDetections, AbstractRejuvenation, Bury, Found, LearnColours)
+    return isinstance(move, (*kinds, ShareMass))
 
 
 def _motion(states: ObjectState) -> tuple[PyTree, PyTree]:

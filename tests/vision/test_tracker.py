@@ -11,6 +11,7 @@ from mpfjax.vision.tracker import object_model
 from mpfjax.vision.tracking.assignment import Assign
 from mpfjax.vision.tracking.births import Found, ShareMass
 from mpfjax.vision.tracking.colours import LearnColours
+from mpfjax.vision.tracking.contact import ShareDetections
 from mpfjax.vision.tracking.deaths import Bury
 from mpfjax.vision.tracking.motion import PropagateObjects
 from mpfjax.vision.tracking.scores import RankScores
@@ -33,6 +34,7 @@ def tracker_of(rejuvenation, patience=3):
     moves = [
         RankScores(),
         Assign(model),
+        ShareDetections(model, longest=12),
         rejuvenation,
         PropagateObjects(model),
         Bury(2, patience),
@@ -143,7 +145,8 @@ def test_components_are_born_confirmed_and_keep_their_identities(rejuvenation):
 
     tracks = run([corners(t) for t in range(12)], chosen)
     assert [living(each) for each in tracks] == [[1, 2]] * 5 + [[1, 2, 3]] * 7
-    assert [believed(each) for each in tracks] == [[]] + [[1, 2]] * 5 + [[1, 2, 3]] * 6
+    # Who is there at the start is believed in at once, and the newcomer in its second frame.
+    assert [believed(each) for each in tracks] == [[1, 2]] * 6 + [[1, 2, 3]] * 6
     assert all((each.unseen == 0).all() for each in tracks)
     for t, each in enumerate(tracks[8:], 8):
         ids = [1, 2] if abs(box_of(each, 1)[0] - 8 - t) < 3 else [2, 1]
@@ -161,12 +164,14 @@ def test_a_component_outlives_its_detections_for_as_long_as_its_patience():
 
 
 def test_what_is_not_yet_believed_dies_at_once_and_its_identity_is_not_used_again():
-    def seen(t, corners):
-        return boxes_at(corners if t in (0, 2, 4, 5) else [])
+    """Beside one who is there from the start."""
 
-    tracks = run([[(20, 20)]] * 6, seen=seen)
-    assert [living(each) for each in tracks] == [[1], [], [2], [], [3], [3]]
-    assert [believed(each) for each in tracks] == [[]] * 5 + [[3]]
+    def seen(t, corners):
+        return boxes_at(corners if t in (1, 3, 5, 6) else corners[:1])
+
+    tracks = run([[(50, 5), (20, 20)]] * 7, seen=seen)
+    assert [living(each) for each in tracks] == [[1], [1, 2], [1], [1, 3], [1], [1, 4], [1, 4]]
+    assert [believed(each) for each in tracks] == [[1]] * 6 + [[1, 4]]
 
 
 def test_a_detection_after_a_gap_is_the_same_object():
@@ -345,6 +350,49 @@ def test_who_is_in_contact_teaches_nobody():
     # They touch at t = 5, and overlap by a fifth at t = 6.
     assert not np.array_equal(references[5], references[4])
     np.testing.assert_array_equal(references[7], references[6])
+
+
+CROSSING = range(26)
+WIDE = np.array([14.0, 22.0])
+
+
+def crossing(pixels, alike, pace):
+    """Two who walk through each other, found as one box about both while they overlap by a third.
+
+    The tracks, and where the two are: the first goes to the right, and the second to the left.
+    """
+    state, tracks, places = TRACKER.init(), [], []
+    for t in CROSSING:
+        x = np.array([23 + pace * (t - 13), 23 + pace * (13 - t)])
+        boxes = np.column_stack([x, [14, 15], [WIDE[0]] * 2, [WIDE[1]] * 2])
+        picture = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+        for (left, top, w, h), shirt in reversed(list(zip(boxes, SHIRTS, strict=False))):
+            rows, columns = slice(int(top), int(top + h)), slice(round(left), round(left + w))
+            picture[rows, columns] = SHIRTS[0] if alike else shirt
+        merged = abs(x[1] - x[0]) < 10
+        low, high = boxes[:, :2].min(0), (boxes[:, :2] + boxes[:, 2:]).max(0)
+        found = np.r_[low, high - low][None] if merged else boxes
+        frame = jnp.asarray(picture) if pixels else None
+        state, track = TRACKER.step(KEYS[t], state, frame, detections(found))
+        tracks.append(jax.tree.map(np.asarray, track))
+        places.append(boxes[:, :2] + WIDE / 2)
+    return tracks, places
+
+
+@pytest.mark.parametrize(
+    ("pixels", "alike", "pace"), [(False, True, 1.5), (True, True, 1.5), (True, False, 1.0)]
+)
+def test_two_who_cross_and_are_found_as_one_keep_their_names(pixels, alike, pace):
+    """By motion alone where they look alike; and both are shown all the time."""
+    tracks, places = crossing(pixels, alike, pace)
+    assert [living(each) for each in tracks] == [[1, 2]] * len(tracks)
+    assert all(each.shown.sum() == 2 for each in tracks)
+    first = [box_of(tracks[0], 1)[0], box_of(tracks[0], 2)[0]]
+    names = [1, 2] if first[0] < first[1] else [2, 1]
+    for name, place in zip(names, places[-1], strict=True):
+        np.testing.assert_allclose(box_of(tracks[-1], name)[:2], place, atol=3)
+        # Nobody has become as wide as the two together were.
+        np.testing.assert_allclose(box_of(tracks[-1], name)[2:], WIDE, rtol=0.25)
 
 
 def test_a_weak_detection_sustains_a_component_and_founds_none():

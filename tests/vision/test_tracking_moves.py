@@ -11,9 +11,10 @@ from scipy.optimize import linear_sum_assignment
 import mpfjax
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision import Detections, HSVColours, SampledHistogram
-from mpfjax.vision.tracking.assignment import Assign
+from mpfjax.vision.tracking.assignment import Assign, marginals
 from mpfjax.vision.tracking.births import Found, ShareMass
 from mpfjax.vision.tracking.colours import LearnColours
+from mpfjax.vision.tracking.contact import ShareDetections
 from mpfjax.vision.tracking.deaths import Bury
 from mpfjax.vision.tracking.memory import Lives, Scores
 from mpfjax.vision.tracking.model import AssignedFrame, DetectedObjectModel, ObjectState
@@ -52,6 +53,7 @@ def start(num_particles):
         num_components=1,
         memory={
             "assigned": jnp.zeros(1, jnp.int32),
+            "doubts": jnp.zeros(1),
             "references": jnp.zeros((1, 1, 1, 2)),
             "scores": Scores(jnp.zeros(4), jnp.zeros((), jnp.int32), zero, zero),
         },
@@ -119,7 +121,9 @@ def frame_of_two():
     found = Detections(
         jnp.asarray([[1.0, 2.0, 7.0, 8.0]] * 2, jnp.float32), jnp.array([True, False]), jnp.ones(2)
     )
-    return AssignedFrame(found, jnp.array([True, False]), None, jnp.zeros((2, 1, 1, 2)))
+    first, nobody = jnp.array([True, False]), jnp.array([False, False])
+    doubts = jnp.array([0.02, 0.0])
+    return AssignedFrame(found, first, nobody, nobody, doubts, None, jnp.zeros((2, 1, 1, 2)))
 
 
 def test_the_proposal_is_optimal():
@@ -201,6 +205,8 @@ def tracked(seed=0):
             "scores": Scores(jnp.zeros(512), jnp.zeros((), jnp.int32), weak, strong),
             "lives": lives,
             "assigned": jnp.array([0, -1, 2, -1], jnp.int32),
+            "shared": jnp.full(M, -1, jnp.int32),
+            "hidden": jnp.zeros(M, jnp.int32),
             "references": jnp.asarray(references, jnp.float32),
             "extent": jnp.array([0, 0, 80, 60], jnp.float32),
         },
@@ -219,6 +225,7 @@ def tracked(seed=0):
 
 MODEL = DetectedObjectModel([0.06, 0.03], [0.02, 0.01], [0.03, 0.015], [0.2, 0.1, 0.2, 0.12])
 QUIET = {"scores": RankScores(), "assign": Assign(MODEL), "learn": LearnColours(COLOURS, 2)}
+CHANGES = {"scores": ["scores"], "assign": ["assigned"], "learn": ["references"]}
 
 
 @pytest.mark.parametrize("name", QUIET)
@@ -236,11 +243,18 @@ def test_what_only_remembers_leaves_the_distribution_as_it_is(name):
         for name, kept in mixture.memory.items()
         if not all(jax.tree.leaves(jax.tree.map(np.array_equal, kept, moved.memory[name])))
     ]
-    assert len(changed) == 1
+    assert changed == CHANGES[name]
 
 
 def test_what_decides_is_approximate_and_what_follows_is_not():
-    approximate = [Assign(MODEL), Bury(), Found(MODEL, P), LearnColours(COLOURS), ShareMass()]
+    approximate = [
+        Assign(MODEL),
+        ShareDetections(MODEL),
+        Bury(),
+        Found(MODEL, P),
+        LearnColours(COLOURS),
+        ShareMass(),
+    ]
     assert all(move.approximate for move in approximate)
     assert not PropagateObjects(MODEL).approximate
     assert not RankScores().approximate
@@ -285,6 +299,108 @@ def test_the_assignment_is_scipys():
     assigned = Assign(MODEL)(KEY, mixture, frame).memory["assigned"]
     np.testing.assert_array_equal(assigned, source)
     assert (source >= 0).sum() == 3
+
+
+def brute_force(odds):
+    """The marginals, by summing over all assignments."""
+    m, d = odds.shape
+    total, pairs = 0.0, np.zeros((m, d))
+    for columns in itertools.product(range(-1, d), repeat=m):
+        taken = [column for column in columns if column >= 0]
+        if len(set(taken)) == len(taken):
+            chosen = [(row, column) for row, column in enumerate(columns) if column >= 0]
+            weight = np.prod([odds[pair] for pair in chosen]) if chosen else 1.0
+            total += weight
+            for pair in chosen:
+                pairs[pair] += weight
+    return pairs / total
+
+
+@pytest.mark.parametrize(("loops", "bound"), [(False, 1e-5), (True, 0.15)])
+def test_the_marginals_are_those_of_all_assignments(loops, bound):
+    """Exact where the pairs form no loop, and else off by .03 on average."""
+    rng = np.random.default_rng(7)
+    compute, gaps = jax.jit(marginals), []
+    for _ in range(20):
+        log_odds = rng.normal(1, 2, (3, 4))
+        if not loops:  # a chain: row 0 with columns 0 and 1, row 1 with 1 and 2, row 2 with 2 and 3
+            log_odds[np.abs(np.arange(4)[None] - np.arange(3)[:, None] - 0.5) > 0.5] = -np.inf
+        expected = brute_force(np.exp(log_odds))
+        gaps.append(np.abs(np.asarray(compute(jnp.asarray(log_odds))) - expected))
+    assert np.max(gaps) < bound
+    assert np.mean(gaps) < bound / 5
+
+
+def test_doubts_weigh_a_detection_by_its_marginal():
+    """Prediction and likelihood with the floor have the odds (1 - p) : p of the two, by hand."""
+    mixture, frame = tracked()
+    move = Assign(MODEL)
+    moved = move(KEY, mixture, frame)
+    source = np.asarray(moved.memory["assigned"])
+    doubts = np.asarray(moved.memory["doubts"], float)
+    costs = np.asarray(move.costs(mixture, frame), float)
+    odds = np.where(costs < 1e4, np.exp((20.0 - costs) / 4), 0)
+    probability = brute_force(odds)
+    nobody_known = mixture.memory | {"references": 0 * mixture.memory["references"]}
+    colourless = mixture.replace(memory=nobody_known)
+    quiet = np.asarray(
+        Assign(MODEL, 1e3, weak_cost=0, doubt_cost=0).costs(colourless, frame), float
+    )
+    assert (source[:3] >= 0).all()
+    for m in range(3):
+        z, p = np.exp(-0.5 * quiet[m, source[m]]), probability[m, source[m]]
+        np.testing.assert_allclose(doubts[m], z * (1 - p) / p, rtol=0.2, atol=1e-6)
+    assert doubts[3] == 0
+
+
+# --- contact ------------------------------------------------------------------------------------
+
+
+def shared_by(source, boxes, confirmed=(True, True, True), unseen=(0, 0, 0)):
+    """Who shares which detection: objects at (20, 20), (24, 21), (60, 40), about 7 x 12 pixels."""
+    mixture, frame = tracked()
+    place = mixture.particles.place.at[P : 2 * P, :2].add(jnp.array([-4.0, 0.0]))
+    lives = mixture.memory["lives"]._replace(
+        confirmed=jnp.array([*confirmed, False]), unseen=jnp.array([*unseen, 0], jnp.int32)
+    )
+    move = ShareDetections(MODEL, 0.7, 2)
+    assigned = jnp.array([*source, -1], jnp.int32)
+    memory = mixture.memory | move.initial_memory(M) | {"lives": lives, "assigned": assigned}
+    still = ObjectState(place, 0 * mixture.particles.velocity, mixture.particles.label)
+    mixture = mixture.replace(particles=still, memory=memory)
+    padded = np.ones((D, 4), np.float32)
+    padded[: len(boxes)] = boxes
+    found = Detections(jnp.asarray(padded), jnp.arange(D) < len(boxes), jnp.ones(D))
+    rows = []
+    for _ in range(3):
+        mixture = move(KEY, mixture, frame._replace(detections=found))
+        rows.append(np.asarray(mixture.memory["shared"]).tolist())
+    np.testing.assert_array_equal(mixture.particles.place, place)
+    return rows
+
+
+BOTH, FIRST, FAR = [22, 20, 14, 14], [20, 20, 7, 12], [60, 40, 8, 13]
+
+
+@pytest.mark.parametrize(
+    ("source", "boxes", "options", "expected"),
+    [
+        # The first's detection covers the second, and not a third that is far from it.
+        ((0, -1, -1), [BOTH], {}, [-1, 0, -1, -1]),
+        ((0, -1, 1), [BOTH, FAR], {}, [-1, 0, -1, -1]),
+        # One that covers half of it hides nobody, nor does a component that nobody believes in.
+        ((0, -1, -1), [FIRST], {}, [-1] * 4),
+        ((0, -1, -1), [BOTH], {"confirmed": (False, True, True)}, [-1] * 4),
+        # Nor is anybody hidden who has been lost for long, or whom nobody believes in.
+        ((0, -1, -1), [BOTH], {"unseen": (0, 9, 0)}, [-1] * 4),
+        ((0, -1, -1), [BOTH], {"confirmed": (True, False, True)}, [-1] * 4),
+        # One that is nobody's hides nobody.
+        ((-1, -1, -1), [BOTH], {}, [-1] * 4),
+    ],
+)  # fmt: skip
+def test_who_is_hidden_shares_the_detection_of_who_hides_it(source, boxes, options, expected):
+    """For two frames at the most, here."""
+    assert shared_by(source, boxes, **options) == [expected, expected, [-1] * 4]
 
 
 # --- scores, births, deaths, masses -------------------------------------------------------------

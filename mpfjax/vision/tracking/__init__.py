@@ -4,6 +4,7 @@ from mpfjax.vision.tracking.assignment import Assign as Assign
 from mpfjax.vision.tracking.births import Found as Found
 from mpfjax.vision.tracking.births import ShareMass as ShareMass
 from mpfjax.vision.tracking.colours import LearnColours as LearnColours
+from mpfjax.vision.tracking.contact import ShareDetections as ShareDetections
 from mpfjax.vision.tracking.deaths import Bury as Bury
 from mpfjax.vision.tracking.model import DetectedObjectModel as DetectedObjectModel
 from mpfjax.vision.tracking.model import ObjectState as ObjectState

@@ -1,6 +1,7 @@
-"""Which detection is whose: one for each component, at the least total cost."""
+"""Which detection is whose: the likeliest for all together, and how sure that is for each."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 from optax.assignment import hungarian_algorithm
@@ -11,11 +12,20 @@ from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.indexing import take
 from mpfjax.vision.detections import Detections
 from mpfjax.vision.histograms import bhattacharyya
-from mpfjax.vision.tracking.memory import ASSIGNED, LIVES, REFERENCES, SCORES, remember
+from mpfjax.vision.tracking.memory import (
+    ASSIGNED,
+    DOUBTS,
+    LIVES,
+    REFERENCES,
+    SCORES,
+    remember,
+)
 from mpfjax.vision.tracking.model import DetectedObjectModel
 from mpfjax.vision.tracking.observation import TrackedFrame
 
 _NONE, _IMPOSSIBLE = -1, 1e4
+_ROUNDS = 15  # of messages; where two components compete for two detections fewer are enough
+_LEAST = 1e-3  # a marginal below this counts as this
 
 
 class Assign(AbstractMove):
@@ -27,11 +37,21 @@ class Assign(AbstractMove):
     colours from the component's, `weak_cost` for a weak detection, and `doubt_cost` for a component
     that is not yet confirmed. A pair that costs more than `gate` is impossible: the detection is
     rather that of a newcomer, above all where the component has been unseen for long. So objects
-    that meet are settled together. It leaves the particles as they are; memory: the row of each
-    component's detection, -1 for none.
+    that meet are settled together.
+
+    How sure a component can be of its detection is the pair's probability in the joint distribution
+    of all assignments, p ∝ Π exp((gate - cost) / 2T) over its pairs, by `marginals`. The
+    `temperature` T, above 1, allows for cues that are not as independent as they are taken for.
+    With p_m that of the chosen pair and Z_m = ∫ p(x | past) exp(-½ |(d - x) / deviations|²) dx, the
+    posterior of joint probabilistic data association (Fortmann, Bar-Shalom and Scheffe 1983), that
+    of the pair with weight p_m and the prediction otherwise, is that of a likelihood with the floor
+    Z_m (1 - p_m) / p_m: of two in contact, who cannot tell whose a detection is follows it less.
+
+    It leaves the particles as they are; memory: the row of each component's detection, -1 for none,
+    and the doubts, those floors.
 
     One assignment stands for all that there are (`approximate` is true). Raises `ValueError` for a
-    gate that is not positive and a cost below zero.
+    gate or temperature that is not positive and a cost below zero.
     """
 
     model: DetectedObjectModel
@@ -39,9 +59,10 @@ class Assign(AbstractMove):
     colour_cost: float = eqx.field(static=True, default=28.0)
     weak_cost: float = eqx.field(static=True, default=10.0)
     doubt_cost: float = eqx.field(static=True, default=8.0)
+    temperature: float = eqx.field(static=True, default=2.0)
 
     def __check_init__(self) -> None:
-        check_positive(gate=self.gate)
+        check_positive(gate=self.gate, temperature=self.temperature)
         check_not_negative(
             colour_cost=self.colour_cost, weak_cost=self.weak_cost, doubt_cost=self.doubt_cost
         )
@@ -53,11 +74,15 @@ class Assign(AbstractMove):
 
     def initial_memory(self, num_components: int) -> dict[str, Array]:
         """Nobody has a detection."""
-        return {ASSIGNED: jnp.full(num_components, _NONE, jnp.int32)}
+        nothing = jnp.full(num_components, _NONE, jnp.int32)
+        return {ASSIGNED: nothing, DOUBTS: jnp.zeros(num_components)}
 
     def forget(self, memory: dict, dead: Array) -> dict:
         """The dead have none."""
-        return memory | {ASSIGNED: jnp.where(dead, _NONE, memory[ASSIGNED])}
+        return memory | {
+            ASSIGNED: jnp.where(dead, _NONE, memory[ASSIGNED]),
+            DOUBTS: jnp.where(dead, 0.0, memory[DOUBTS]),
+        }
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
@@ -74,7 +99,28 @@ class Assign(AbstractMove):
         )
         source = jnp.full(mixture.num_components, _NONE, jnp.int32)
         chosen = jnp.where(columns < cost.shape[1], columns.astype(jnp.int32), _NONE)
-        return remember(mixture, assigned=source.at[rows].set(chosen))
+        source = source.at[rows].set(chosen)
+        doubts = self._doubts(source, cost, mixture, observation)
+        return remember(mixture, assigned=source, doubts=doubts)
+
+    def _doubts(
+        self,
+        source: Int[Array, " m"],
+        cost: Float[Array, "m d"],
+        mixture: ParticleMixture,
+        observation: TrackedFrame,
+    ) -> Float[Array, " m"]:
+        """Z_m (1 - p_m) / p_m of the chosen pairs, and 0 where there is none."""
+        log_odds = jnp.where(
+            cost < _IMPOSSIBLE, (self.gate - cost) / (2 * self.temperature), -jnp.inf
+        )
+        chosen = jnp.maximum(source, 0)[:, None]
+        probability = jnp.take_along_axis(marginals(log_odds), chosen, axis=1)[:, 0]
+        squares, volumes = self._distances(mixture, observation.detections.boxes)
+        log_z = -0.5 * (jnp.take_along_axis(squares, chosen, axis=1)[:, 0] + volumes)
+        probability = jnp.clip(probability, _LEAST, 1.0)
+        doubts = jnp.exp(log_z) * (1 - probability) / probability
+        return jnp.where(source >= 0, doubts, 0.0)
 
     def costs(self, mixture: ParticleMixture, observation: TrackedFrame) -> Float[Array, "m d"]:
         """What each pair costs, or a number beyond all costs where it is impossible."""
@@ -119,6 +165,25 @@ class Assign(AbstractMove):
         distances = bhattacharyya(seen[None], references[:, None])
         known = jnp.any(references > 0, axis=(1, 2, 3))[:, None]
         return self.colour_cost * jnp.where(known, jnp.mean(jnp.sum(distances, 3), 2), 0.0)
+
+
+def marginals(log_odds: Float[Array, "m d"]) -> Float[Array, "m d"]:
+    """The probability of each pair where no row and no column is in more than one.
+
+    An assignment has the weight Π exp(log_odds) over its pairs; a row or column in none counts 1.
+    The marginals of that joint distribution by messages from rows to columns and back (loopy belief
+    propagation, Williams and Lau 2014): exact where the possible pairs form no loop, and otherwise
+    off by a few hundredths, mostly towards more certainty.
+    """
+    odds = jnp.exp(log_odds)
+
+    def reply(_: Int[Array, ""], back: Float[Array, "m d"]) -> Float[Array, "m d"]:
+        weighed = odds * back
+        forth = odds / (1 + jnp.sum(weighed, axis=1, keepdims=True) - weighed)
+        return 1 / (1 + jnp.sum(forth, axis=0, keepdims=True) - forth)
+
+    weighed = odds * jax.lax.fori_loop(0, _ROUNDS, reply, jnp.ones_like(odds))
+    return weighed / (1 + jnp.sum(weighed, axis=1, keepdims=True))
 
 
 def own_detections(source: Int[Array, " m"], detections: Detections) -> Detections:

@@ -9,6 +9,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.indexing import take
 from mpfjax.vision.colours import AbstractColours
+from mpfjax.vision.tracking.contact import in_front
 from mpfjax.vision.tracking.memory import ASSIGNED, LIVES, REFERENCES, mean_boxes, remember
 from mpfjax.vision.tracking.observation import TrackedFrame, overlap
 
@@ -18,9 +19,9 @@ class LearnColours(AbstractMove):
 
     h_ref <- (1 - adaptation) h_ref + adaptation h(d), in frames in which a detection bears the
     component out and no other component overlaps its box by more than `contact` (intersection over
-    union): of two in contact, either would learn the other's colours. The first detection of a
-    component gives it its reference. It leaves the particles as they are; memory: the references,
-    (m, parts, channels, bins), all zero for a component that has none.
+    union) or shares that detection: of two in contact, either would learn the other's colours. The
+    first detection of a component gives it its reference. It leaves the particles as they are;
+    memory: the references, (m, parts, channels, bins), all zero for a component that has none.
 
     The model changes with the data (`approximate` is true). Raises `ValueError` for shares outside
     [0, 1] and a number of parts that is no whole number from 1 on.
@@ -65,6 +66,7 @@ class LearnColours(AbstractMove):
         alone = ~jnp.any((overlap(boxes, boxes) > self.contact) & others, axis=1)
         known = jnp.any(references > 0, axis=(1, 2, 3))
         # What holds no pixel teaches nothing.
+        alone &= ~in_front(mixture)
         teaches = (source >= 0) & jnp.any(seen > 0, axis=(1, 2, 3)) & (alone | ~known)
         rate = jnp.where(teaches, jnp.where(known, self.adaptation, 1.0), 0.0)
         rate = rate.astype(references.dtype)[:, None, None, None]

@@ -8,7 +8,15 @@ from mpfjax.checks import check_positive, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.segments import spread
-from mpfjax.vision.tracking.memory import ASSIGNED, EXTENT, LIVES, Lives, mean_boxes, remember
+from mpfjax.vision.tracking.memory import (
+    ASSIGNED,
+    EXTENT,
+    LIVES,
+    Lives,
+    mean_boxes,
+    remember,
+    shared_detections,
+)
 from mpfjax.vision.tracking.observation import TrackedFrame, covered, within
 
 
@@ -21,7 +29,8 @@ class Bury(AbstractMove):
     in `confirmation` frames in which it stood alone, or in `confirmation_in_contact` of whatever
     kind. It does not stand alone where older, confirmed components cover more than the share
     `contact` of its box: what is found between or before two objects is often a second detection of
-    one of them. Where there are no pixels, the frame reaches as far as all detections so far.
+    one of them. Frames in which another hides it (`ShareDetections`) do not count as without a
+    detection. Where there are no pixels, the frame reaches as far as all detections so far.
     Memory: `Lives`, with `Found`, and that extent.
 
     Deaths are decided and not sampled (`approximate` is true). Raises `ValueError` for a number of
@@ -71,11 +80,11 @@ class Bury(AbstractMove):
         lives: Lives = mixture.memory[LIVES]
         borne_out = mixture.memory[ASSIGNED] >= 0
         seen = lives.seen + borne_out.astype(jnp.int32)
-        unseen = jnp.where(borne_out, 0, lives.unseen + 1)
+        missed = ~borne_out & (shared_detections(mixture) < 0)
+        unseen = jnp.where(borne_out, 0, lives.unseen + missed.astype(jnp.int32))
         alone = lives.alone + (borne_out & ~self._in_contact(mixture)).astype(jnp.int32)
-        confirmed = lives.alive & (
-            (alone >= self.confirmation) | (seen >= self.confirmation_in_contact)
-        )
+        often = (alone >= self.confirmation) | (seen >= self.confirmation_in_contact)
+        confirmed = lives.alive & (lives.confirmed | often)
         patience = jnp.where(confirmed, self.patience, 0)
         stays = lives.alive & mixture.active & (unseen <= patience)
         extent = observation.extent(mixture.memory[EXTENT])

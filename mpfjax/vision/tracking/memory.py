@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mpfjax.mixture import ParticleMixture
 
 SCORES, ASSIGNED, LIVES, REFERENCES = "scores", "assigned", "lives", "references"
-EXTENT = "extent"
+EXTENT, SHARED, HIDDEN, DOUBTS = "extent", "shared", "hidden", "doubts"
 
 
 class Scores(NamedTuple):
@@ -53,8 +53,25 @@ class Lives(NamedTuple):
 
 def mean_boxes(mixture: ParticleMixture) -> Float[Array, "m 4"]:
     """The box of each component, centre and size in pixels: the mean place of its particles."""
-    places = mixture.component_averages(mixture.particles.place)
+    return boxes_of(mixture.component_averages(mixture.particles.place))
+
+
+def boxes_of(places: Float[Array, "m 4"]) -> Float[Array, "m 4"]:
+    """Centre and size in pixels, of places (x, y, log w, log h)."""
     return jnp.concatenate([places[:, :2], jnp.exp(places[:, 2:])], axis=1)
+
+
+def frames_unseen(mixture: ParticleMixture) -> Int[Array, " m"]:
+    """For how many frames no detection has borne each out, or stood for it while it was hidden."""
+    lives: Lives = mixture.memory[LIVES]
+    hidden = mixture.memory.get(HIDDEN, jnp.zeros_like(lives.unseen))
+    return lives.unseen + jnp.where(shared_detections(mixture) < 0, hidden, 0)
+
+
+def shared_detections(mixture: ParticleMixture) -> Int[Array, " m"]:
+    """The row of the detection that each component shares; -1 for all where no move shares any."""
+    nobody = jnp.full(mixture.num_components, -1, jnp.int32)
+    return mixture.memory.get(SHARED, nobody)
 
 
 def remember(mixture: ParticleMixture, **memory: Any) -> ParticleMixture:

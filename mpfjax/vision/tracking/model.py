@@ -15,6 +15,9 @@ from mpfjax.vision.detections import Detections
 from mpfjax.vision.histograms import IntegralHistogram, bhattacharyya, normalise
 from mpfjax.vision.sampled_histograms import SampledBoxes, SampledHistogram
 
+# So many times the deviations of a size say nothing of it.
+_NOTHING = 10.0
+
 Pixels = IntegralHistogram | SampledHistogram | SampledBoxes
 
 
@@ -40,7 +43,10 @@ class AssignedFrame(NamedTuple):
     """What is seen of each object in a frame: the observation of a `DetectedObjectModel`.
 
     - `detections`: a row for each object, its own detection, valid where it has one.
-    - `weak`: (m,), which of them are weak ones.
+    - `weak`: (m,), which of them are weak ones; `merged`: which stand for others as well, whom the
+      object hides; `borrowed`: which are those of another object, which hides this one.
+    - `doubts`: (m,), the floor of each object's likelihood beside the model's own: what speaks for
+      its detection being another's.
     - `pixels`: the colours of the frame; None where nobody looks at them.
     - `references`: (m, parts, channels, bins), the histograms that each object is known by, all
       zero where it has none.
@@ -48,6 +54,9 @@ class AssignedFrame(NamedTuple):
 
     detections: Detections
     weak: Bool[Array, " m"]
+    merged: Bool[Array, " m"]
+    borrowed: Bool[Array, " m"]
+    doubts: Float[Array, " m"]
     pixels: Pixels | None
     references: Float[Array, "m parts channels bins"]
 
@@ -66,8 +75,10 @@ class DetectedObjectModel(AbstractStateSpaceModel):
 
     - `position_noise`, `velocity_noise`: σ_x and σ_v of x and y, in boxes a frame.
     - `size_noise`: of log w and log h in a frame.
-    - `detection_deviations`: of (x, y, log w, log h); `weak_error` times as much for a weak one.
-    - `miss`: against 1 where detection and box agree.
+    - `detection_deviations`: of (x, y, log w, log h); `weak_error` times as much for a weak one,
+      `merged_error` times for one that stands for two, and `borrowed_error` times in the place for
+      one of another object, which says nothing of the size.
+    - `miss`: against 1 where detection and box agree; a frame's doubts come on top of it.
     - `sigma`: σ, None where the particles are not weighed by colours.
 
     Raises `ValueError` for a number that is not positive. Use it in an `ObjectTracker`.
@@ -78,6 +89,8 @@ class DetectedObjectModel(AbstractStateSpaceModel):
     size_noise: Float[Array, "2"] = eqx.field(converter=to_array("size_noise"))
     detection_deviations: Float[Array, "4"] = eqx.field(converter=to_array("detection_deviations"))
     weak_error: float = eqx.field(static=True, default=1.35)
+    merged_error: float = eqx.field(static=True, default=2.0)
+    borrowed_error: float = eqx.field(static=True, default=3.0)
     miss: float = eqx.field(static=True, default=1e-4)
     sigma: float | None = eqx.field(static=True, default=None)
 
@@ -88,7 +101,13 @@ class DetectedObjectModel(AbstractStateSpaceModel):
             if value.shape != (length,):
                 raise ValueError(f"{name}: {value} are not {length} numbers")
             check_positive_array(**{name: value})
-        check_positive(miss=self.miss, weak_error=self.weak_error, **given(sigma=self.sigma))
+        check_positive(
+            miss=self.miss,
+            weak_error=self.weak_error,
+            merged_error=self.merged_error,
+            borrowed_error=self.borrowed_error,
+            **given(sigma=self.sigma),
+        )
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> ObjectState:
         """Boxes of one pixel about the origin: objects are founded later, by detections."""
@@ -163,17 +182,25 @@ class DetectedObjectModel(AbstractStateSpaceModel):
         found = observation.detections
         places = jnp.concatenate([found.boxes[:, :2], jnp.log(found.boxes[:, 2:])], axis=1)
         unit = jnp.concatenate([found.boxes[:, 2:], jnp.ones_like(found.boxes[:, 2:])], axis=1)
-        unit = jnp.where(observation.weak[:, None], self.weak_error, 1.0) * unit
+        unit = unit * self._errors(observation)
         deviations = jnp.where(
             found.valid[:, None], unit * self.detection_deviations[None], jnp.inf
         )
         return take(places, states.label), take(deviations, states.label)
 
+    def _errors(self, observation: AssignedFrame) -> Float[Array, "m 4"]:
+        """How many times the deviations of a sure detection each object's own has."""
+        borrowed = jnp.array([self.borrowed_error, self.borrowed_error, _NOTHING, _NOTHING])
+        errors = jnp.where(observation.weak, self.weak_error, 1.0)[:, None]
+        errors = errors * jnp.where(observation.merged[:, None], self.merged_error, 1.0)
+        return errors * jnp.where(observation.borrowed[:, None], borrowed[None], 1.0)
+
     def log_likelihood(self, observation: AssignedFrame, states: ObjectState) -> Float[Array, " n"]:
         """log (miss + exp(-½ ...)) where there is a detection, and -B² / 2σ²."""
         places, deviations = self.detection_of(observation, states)
         gaps = (places - states.place) / deviations
-        log_detected = jnp.log(self.miss + jnp.exp(-0.5 * jnp.sum(gaps**2, axis=1)))
+        floor = self.miss + take(observation.doubts, states.label)
+        log_detected = jnp.log(floor + jnp.exp(-0.5 * jnp.sum(gaps**2, axis=1)))
         detected = take(observation.detections.valid, states.label)
         log_detected = jnp.where(detected, log_detected, 0.0)
         if observation.pixels is None or self.sigma is None:

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float, Key
 
 from mpfjax.checks import check_shape, check_type
 from mpfjax.operations.generator import fast_key
+from mpfjax.operations.indexing import take
 from mpfjax.operations.matrices import row_sums
 from mpfjax.proposals import AbstractProposal
 from mpfjax.vision.tracking.model import (
@@ -20,9 +21,10 @@ class DetectionProposal(AbstractProposal):
     """Draw places from p(x_t | x_{t-1}, d), the posterior given an object's own detection.
 
     The likelihood of a `DetectedObjectModel` is a Gaussian bump over a floor, so that the posterior
-    of a place is a mixture of two: with probability Z / (Z + miss) the product of prediction and
-    bump, otherwise the prediction, where Z is the integral of their product. Without colours the
-    weights L D / q are Z + miss, whatever is drawn: this is the optimal proposal (Doucet,
+    of a place is a mixture of two: with probability Z / (Z + floor) the product of prediction and
+    bump, otherwise the prediction, where Z is the integral of their product and the floor is the
+    model's `miss` and the object's doubt. Without colours the
+    weights L D / q are Z + floor, whatever is drawn: this is the optimal proposal (Doucet,
     Godsill and Andrieu 2000). The velocity is drawn given the place, as in D. Where an object has
     no detection q is D.
     """
@@ -67,7 +69,8 @@ class DetectionProposal(AbstractProposal):
         """x_t and its log density; `which` is uniform."""
         mean, deviations = self.model.predicted(previous_states)
         places, errors = self.model.detection_of(observation, previous_states)
-        share = self._share(places - mean, deviations, errors)
+        floor = self.model.miss + take(observation.doubts, previous_states.label)
+        share = self._share(places - mean, deviations, errors, floor)
         gain = deviations**2 / (deviations**2 + errors**2)
         posterior_mean = mean + gain * (places - mean)
         posterior_deviations = deviations * jnp.sqrt(1 - gain)
@@ -89,12 +92,13 @@ class DetectionProposal(AbstractProposal):
         gaps: Float[Array, "n 4"],
         deviations: Float[Array, "n 4"],
         errors: Float[Array, "n 4"],
+        floor: Float[Array, " n"],
     ) -> Float[Array, " n"]:
-        """Z / (Z + miss), with Z = Π_k N(d_k; ...) relative to the bump's height of one."""
+        """Z / (Z + floor), with Z = Π_k N(d_k; ...) relative to the bump's height of one."""
         total = deviations**2 + errors**2
         detected = jnp.isfinite(errors[:, 0])
         shrinkage = jnp.where(detected[:, None], jnp.log(errors**2 / total), 0.0)
         log_z = row_sums(0.5 * shrinkage - 0.5 * gaps**2 / total)
-        odds = log_z - jnp.log(jnp.asarray(self.model.miss, log_z.dtype))
+        odds = log_z - jnp.log(floor.astype(log_z.dtype))
         # Shares of exactly one would make a log density of zero times infinity.
         return jnp.where(detected, jnp.clip(jax.nn.sigmoid(odds), 1e-6, 1 - 1e-6), 0.0)
