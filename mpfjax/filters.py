@@ -9,6 +9,7 @@ from mpfjax.checks import check_one_of, check_type, check_whole, given
 from mpfjax.filter import Filter
 from mpfjax.models.base import AbstractStateSpaceModel, mapped
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
+from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.clusters import PropagateInClusters
 from mpfjax.moves.every import Every
@@ -343,6 +344,7 @@ def _gaussian_moves(
 
 def _standing(sort_by: SortBy | None, noise: str) -> SortBy | None:
     """What particles are sorted by: for point sets they must stand in some order of their state."""
+    check_one_of(NOISES, noise=noise)
     return HILBERT if sort_by is None and noise == "rqmc" else sort_by
 
 

@@ -15,6 +15,7 @@ from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation import likelihoods, predict
 from mpfjax.moves.resampling import Resample
 from mpfjax.operations.generator import normal, split, uniform
+from mpfjax.operations.logarithms import finite_max
 
 EXPONENTS = (1 / 64, 1 / 16, 1 / 4, 1.0)
 
@@ -102,6 +103,9 @@ class PropagateInStages(AbstractPropagation):
         log_likelihoods = likelihoods(self.model, observation, states)
         # Resampling may lose a NaN, or a particle whose likelihood is infinite.
         broken = jnp.any(mixture.occupied & ~(log_likelihoods < jnp.inf))
+        # A common constant of any size would drown the differences that the stages weigh.
+        common = finite_max(jnp.where(mixture.occupied, log_likelihoods, -jnp.inf))
+        log_likelihoods = log_likelihoods - common
         travellers = Travellers(states, parents, noise, log_likelihoods)
         mixture = mixture.replace(particles=travellers)
         mixture = mixture.weighed(self.exponents[0] * log_likelihoods)
@@ -113,13 +117,14 @@ class PropagateInStages(AbstractPropagation):
             key_draw, *keys = split(key, 1 + self.num_moves)
             mixture = self.resample(key_draw, mixture)
             for key_move in keys:
-                mixture = self._moved(key_move, mixture, observation, now)
+                mixture = self._moved(key_move, mixture, observation, now, common)
             log_factors = (later - now) * mixture.particles.log_likelihoods
             return mixture.weighed(log_factors), None
 
         exponents = jnp.asarray(self.exponents, mixture.log_weights.dtype)
         stages = (jax.random.split(key_stages, len(exponents) - 1), exponents[:-1], exponents[1:])
         mixture, _ = jax.lax.scan(next_stage, mixture, stages)
+        mixture = mixture.weighed(common[None])
         log_weights = jnp.where(broken, jnp.nan, mixture.log_weights)
         return mixture.replace(particles=mixture.particles.states, log_weights=log_weights)
 
@@ -133,6 +138,7 @@ class PropagateInStages(AbstractPropagation):
         mixture: ParticleMixture,
         observation: PyTree,
         exponent: Float[Array, ""],
+        common: Float[Array, ""],
     ) -> ParticleMixture:
         """Each particle after one step of Metropolis in its noise, its parent kept."""
         now = mixture.particles
@@ -141,7 +147,7 @@ class PropagateInStages(AbstractPropagation):
         step = jnp.asarray(self.least_step, dtype) ** uniform(key_step, (n, 1), dtype)
         noise = jnp.sqrt(1 - step**2) * now.noise + step * normal(key_noise, now.noise.shape, dtype)
         states = cast(Any, self.model).transition_from_noise(noise, now.parents)
-        log_likelihoods = likelihoods(self.model, observation, states)
+        log_likelihoods = likelihoods(self.model, observation, states) - common
         log_ratio = exponent * log_likelihoods - exponent * now.log_likelihoods
         taken = jnp.log(uniform(key_taken, (n,), dtype)) < log_ratio
         proposed = Travellers(states, now.parents, noise, log_likelihoods)
