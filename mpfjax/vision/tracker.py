@@ -139,7 +139,7 @@ class ObjectTracker(eqx.Module):
             moves = (
                 RankScores(strong_score=strong_score, weak_score=weak_score),
                 Assign(model),
-                ShareDetections(model, longest=round(10 * max(frames_per_second / 25, 1.0))),
+                ShareDetections(model, longest=round(7 * max(frames_per_second / 25, 1.0))),
                 rejuvenation,
                 PropagateObjects(model),
                 Bury(patience=patience),

@@ -44,7 +44,7 @@ class ShareDetections(AbstractMove):
 
     model: DetectedObjectModel
     cover: float = eqx.field(static=True, default=0.7)
-    longest: int = eqx.field(static=True, default=10)
+    longest: int = eqx.field(static=True, default=7)
     recent: int = eqx.field(static=True, default=3)
 
     def __check_init__(self) -> None:
