@@ -39,6 +39,7 @@ from mpfjax.moves import Partitioned as Partitioned
 from mpfjax.moves import Pool as Pool
 from mpfjax.moves import Predict as Predict
 from mpfjax.moves import Propagate as Propagate
+from mpfjax.moves import PropagateFamilies as PropagateFamilies
 from mpfjax.moves import PropagateInClusters as PropagateInClusters
 from mpfjax.moves import PropagateIndependently as PropagateIndependently
 from mpfjax.moves import PropagateInStages as PropagateInStages

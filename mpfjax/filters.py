@@ -13,6 +13,7 @@ from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.clusters import PropagateInClusters
 from mpfjax.moves.every import Every
+from mpfjax.moves.families import PropagateFamilies
 from mpfjax.moves.features import Scale
 from mpfjax.moves.gaussian import GaussianRegeneration
 from mpfjax.moves.independent import PropagateIndependently
@@ -38,6 +39,7 @@ def particle_filter(
     ess_threshold: float = 1.0,
     sort_by: SortBy | None = None,
     noise: str = "independent",
+    num_draws: int = 1,
     gradient: str = "none",
 ) -> Filter:
     """The standard particle filter: resample, propagate.
@@ -45,6 +47,7 @@ def particle_filter(
     Vermaak et al. (2003), section 3, with one component; bootstrap unless a proposal is given.
     Use it for a filtering distribution with one mode; of several modes it loses all but one.
     `gradient` is that of `Resample`. "stop" is also that of `Propagate`: take it for tuning.
+    `num_draws` is that of `PropagateFamilies`, how many x_t each particle draws to keep one.
     `noise` is that of `Propagate`. With "rqmc", particles stand along a Hilbert curve of their
     state unless `sort_by` says otherwise, and the filter is sequential quasi-Monte Carlo (Gerber
     and Chopin 2015).
@@ -53,7 +56,7 @@ def particle_filter(
     resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
     return Filter(
         model,
-        moves=[resample, Propagate(model, proposal, _of_draws(gradient), noise)],
+        moves=[resample, _propagation(model, proposal, gradient, noise, num_draws)],
         num_particles=num_particles,
         initial_noise=noise,
     )
@@ -69,6 +72,7 @@ def auxiliary_particle_filter(
     ess_threshold: float = 1.0,
     sort_by: SortBy | None = None,
     noise: str = "independent",
+    num_draws: int = 1,
     gradient: str = "none",
 ) -> Filter:
     """The auxiliary particle filter: resample by w times a look-ahead to y_t, propagate.
@@ -78,8 +82,8 @@ def auxiliary_particle_filter(
     Ẑ is unbiased whatever it is; see `ResampleAhead`. With
     `GaussNewtonProposal(model, 1, inflation=1.0)` for a `LinearGaussianModel` the filter is fully
     adapted: ν is p(y_t | x_{t-1}), x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are
-    equal. `noise` is that of `particle_filter`. Use it where the likelihood is narrow and tells
-    early which particles will survive.
+    equal. `noise` and `num_draws` are those of `particle_filter`. Use it where the likelihood is
+    narrow and tells early which particles will survive.
     """
     sort_by = _standing(sort_by, noise)
     resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
@@ -88,7 +92,7 @@ def auxiliary_particle_filter(
         model,
         moves=[
             ResampleAhead(resample, lookahead),
-            Propagate(model, proposal, _of_draws(gradient), noise),
+            _propagation(model, proposal, gradient, noise, num_draws),
         ],
         num_particles=num_particles,
         initial_noise=noise,
@@ -108,6 +112,7 @@ def mixture_particle_filter(
     allocation: str = "equal",
     sort_by: SortBy | None = None,
     noise: str = "independent",
+    num_draws: int = 1,
     gradient: str = "none",
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
@@ -126,8 +131,8 @@ def mixture_particle_filter(
     these three moves see the particles (see `Features`; features of one particle, if the model
     is wrapped by `per_particle`). `merge`, `split` and `kmeans` replace those moves, for example
     with other thresholds, and bring their own features and scale. `regroup_every` is k where they
-    are to run at every k-th step only (see `Every`). `gradient` and `noise` are those of
-    `particle_filter`, `lookahead` that of `auxiliary_particle_filter`, and `allocation` that of
+    are to run at every k-th step only (see `Every`). `gradient`, `noise` and `num_draws` are those
+    of `particle_filter`, `lookahead` that of `auxiliary_particle_filter`, and `allocation` that of
     `Resample`. With `noise="rqmc"` each component has a point set of its own, and the masses of
     modes are far more accurate. Use it where the filtering distribution has several modes and all
     of them must be kept.
@@ -137,7 +142,7 @@ def mixture_particle_filter(
         scheme, ess_threshold, particles_per_component, sort_by, gradient, allocation=allocation
     )
     proposal = propagating_proposal(proposal, lookahead)
-    propagate = Propagate(model, proposal, _of_draws(gradient), noise)
+    propagate = _propagation(model, proposal, gradient, noise, num_draws)
     moves = [resampling(resample, lookahead), propagate]
     return _mixture_filter(
         model, num_particles, max_components, moves, features, scale,
@@ -348,9 +353,17 @@ def _standing(sort_by: SortBy | None, noise: str) -> SortBy | None:
     return HILBERT if sort_by is None and noise == "rqmc" else sort_by
 
 
-def _of_draws(gradient: str) -> str:
-    """What propagation does where resampling has this gradient."""
-    return "stop" if gradient == "stop" else "none"
+def _propagation(
+    model: AbstractStateSpaceModel,
+    proposal: AbstractProposal | None,
+    gradient: str,
+    noise: str,
+    num_draws: int,
+) -> Propagate | PropagateFamilies:
+    """x_t, one or several draws of it, with the gradient that goes with that of resampling."""
+    check_whole(num_draws=num_draws)
+    propagate = Propagate(model, proposal, "stop" if gradient == "stop" else "none", noise)
+    return propagate if num_draws == 1 else PropagateFamilies(propagate, num_draws)
 
 
 def _mixture_filter(

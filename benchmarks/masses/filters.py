@@ -43,9 +43,11 @@ FILTERS: dict[str, Make] = {
     "PF, rqmc": _plain(noise="rqmc"),
     "MPF": _mixture(),
     "MPF, rqmc": _mixture(noise="rqmc"),
+    "MPF, 4 draws": _mixture(num_draws=4),
+    "MPF, rqmc, 4 draws": _mixture(noise="rqmc", num_draws=4),
     "MPF, by variance": _mixture(allocation="variance"),
     "MPF, every 4th": _mixture(regroup_every=4),
     "MPF, look-ahead": _mixture(ahead=True),
     "MPF, in stages": _in_stages,
-    "MPF, all": _mixture(ahead=True, noise="rqmc", allocation="variance", regroup_every=4),
+    "MPF, all": _mixture(noise="rqmc", num_draws=4, allocation="variance", regroup_every=4),
 }

@@ -8,6 +8,7 @@ from mpfjax.moves.clusters import PropagateInClusters as PropagateInClusters
 from mpfjax.moves.every import Every as Every
 from mpfjax.moves.exchange import Exchange as Exchange
 from mpfjax.moves.exclusion import Exclusion as Exclusion
+from mpfjax.moves.families import PropagateFamilies as PropagateFamilies
 from mpfjax.moves.features import Features as Features
 from mpfjax.moves.gaussian import GaussianRegeneration as GaussianRegeneration
 from mpfjax.moves.independent import PropagateIndependently as PropagateIndependently

@@ -1,0 +1,95 @@
+"""Propagation of families: each particle draws several x_t, and one of them is kept."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.checks import check_type, check_whole
+from mpfjax.mixture import ParticleMixture
+from mpfjax.models.noise import draw_noise
+from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.propagation import Propagate
+from mpfjax.operations.generator import split, uniform
+from mpfjax.operations.indexing import take
+
+
+class PropagateFamilies(AbstractPropagation):
+    """Draw K of x_t for each particle, and keep one by its weight.
+
+    With the factors g_ik = L D / q of the K draws x_t^ik of particle i, the particle is weighed by
+    their mean, (1 / K) Σ_k g_ik, and keeps draw k with the probability g_ik / Σ_j g_ij. So it is a
+    filter of K N particles of which N are drawn again, one for each parent, in proportion to their
+    weights: Ẑ is that of K N particles, and unbiased. The model is evaluated K N times, but only N
+    particles are resampled, sorted and regrouped.
+
+    - `propagate`: the `Propagate` that draws. With its noise "rqmc" the draws of a component are
+      one point set, over its slots and their draws.
+    - `num_draws`: K.
+
+    Raises `ValueError` for K < 1, and for gradient "stop", which knows nothing of the draw that was
+    kept. Use it where the likelihood is narrow and cheap, with four to sixteen draws.
+    """
+
+    propagate: Propagate
+    num_draws: int = eqx.field(static=True, default=4)
+
+    def __check_init__(self) -> None:
+        check_type(Propagate, "a Propagate", propagate=self.propagate)
+        check_whole(num_draws=self.num_draws)
+        if self.propagate.gradient == "stop":
+            raise ValueError("propagate: gradient 'stop' knows nothing of the draw that is kept")
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Propagate every particle and weigh it by y_t."""
+        n, k = mixture.num_particles, self.num_draws
+        key_draws, key_kept = split(key, 2)
+        families = self.propagate(key_draws, _repeated(mixture, k), observation)
+        log_weights = families.log_weights.reshape(n, k)
+        largest = jnp.max(log_weights, axis=1, keepdims=True)
+        largest = jnp.where(largest > -jnp.inf, largest, 0.0)
+        weights = jnp.exp(log_weights - largest)
+        upto = jnp.cumsum(jax.lax.stop_gradient(weights), axis=1)
+        shares = self._shares(key_kept, mixture).astype(upto.dtype)
+        # The last is left out: rounding must not keep a draw that is not there.
+        kept = jnp.sum(upto[:, :-1] <= shares[:, None] * upto[:, -1:], axis=1, dtype=jnp.int32)
+        places = jnp.arange(n, dtype=jnp.int32) * k + kept
+        return mixture.replace(
+            particles=jax.tree.map(lambda leaf: take(leaf, places), families.particles),
+            log_weights=largest[:, 0] + jnp.log(jnp.sum(weights, axis=1)),
+            log_scale=families.log_scale,
+        )
+
+    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """One draw of x_t for each particle: without an observation all weigh the same."""
+        return self.propagate.predict(key, mixture)
+
+    def _shares(self, key: Key[Array, ""], mixture: ParticleMixture) -> Float[Array, " n"]:
+        """A uniform number for each slot, spread over a component's slots where the noise is."""
+        n, dtype = mixture.num_particles, mixture.log_weights.dtype
+        if self.propagate.noise == "independent":
+            return uniform(key, (n,), dtype)
+        labels, num_components = mixture.component_indicators, mixture.num_components
+        noise = draw_noise(self.propagate.noise, key, (n, 1), dtype, labels, num_components)
+        return jax.scipy.special.ndtr(noise[:, 0])
+
+
+def _repeated(mixture: ParticleMixture, num_draws: int) -> ParticleMixture:
+    """Every particle K times, side by side, with its weight shared among them."""
+    n = mixture.num_particles
+
+    def repeat(leaf: Array) -> Array:
+        shape = leaf.shape[1:]
+        rows = jnp.broadcast_to(leaf.reshape(n, 1, *shape), (n, num_draws, *shape))
+        return rows.reshape(n * num_draws, *shape)
+
+    return mixture.replace(
+        particles=jax.tree.map(repeat, mixture.particles),
+        log_weights=repeat(mixture.log_weights) - math.log(num_draws),
+        component_indicators=repeat(mixture.component_indicators),
+        ancestor_indices=repeat(mixture.ancestor_indices),
+    )
