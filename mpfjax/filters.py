@@ -13,7 +13,7 @@ from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.clusters import PropagateInClusters
 from mpfjax.moves.every import Every
-from mpfjax.moves.families import PropagateFamilies
+from mpfjax.moves.families import propagation
 from mpfjax.moves.features import Scale
 from mpfjax.moves.gaussian import GaussianRegeneration
 from mpfjax.moves.independent import PropagateIndependently
@@ -56,7 +56,7 @@ def particle_filter(
     resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
     return Filter(
         model,
-        moves=[resample, _propagation(model, proposal, gradient, noise, num_draws)],
+        moves=[resample, propagation(model, proposal, gradient, noise, num_draws)],
         num_particles=num_particles,
         initial_noise=noise,
     )
@@ -92,7 +92,7 @@ def auxiliary_particle_filter(
         model,
         moves=[
             ResampleAhead(resample, lookahead),
-            _propagation(model, proposal, gradient, noise, num_draws),
+            propagation(model, proposal, gradient, noise, num_draws),
         ],
         num_particles=num_particles,
         initial_noise=noise,
@@ -142,7 +142,7 @@ def mixture_particle_filter(
         scheme, ess_threshold, particles_per_component, sort_by, gradient, allocation=allocation
     )
     proposal = propagating_proposal(proposal, lookahead)
-    propagate = _propagation(model, proposal, gradient, noise, num_draws)
+    propagate = propagation(model, proposal, gradient, noise, num_draws)
     moves = [resampling(resample, lookahead), propagate]
     return _mixture_filter(
         model, num_particles, max_components, moves, features, scale,
@@ -351,19 +351,6 @@ def _standing(sort_by: SortBy | None, noise: str) -> SortBy | None:
     """What particles are sorted by: for point sets they must stand in some order of their state."""
     check_one_of(NOISES, noise=noise)
     return HILBERT if sort_by is None and noise == "rqmc" else sort_by
-
-
-def _propagation(
-    model: AbstractStateSpaceModel,
-    proposal: AbstractProposal | None,
-    gradient: str,
-    noise: str,
-    num_draws: int,
-) -> Propagate | PropagateFamilies:
-    """x_t, one or several draws of it, with the gradient that goes with that of resampling."""
-    check_whole(num_draws=num_draws)
-    propagate = Propagate(model, proposal, "stop" if gradient == "stop" else "none", noise)
-    return propagate if num_draws == 1 else PropagateFamilies(propagate, num_draws)
 
 
 def _mixture_filter(

@@ -195,6 +195,7 @@ QUICK_CHAINS = (
     "pf",
     "pf rqmc",
     "mixture in stages",
+    "mpf rqmc of families",
     "mpf",
     "mpf rqmc, M = 6",
     "guided mpf",
@@ -229,6 +230,11 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "regrouped every second step": _mpf(regroup_every=2),
     "resampled every second step": _chain(Every(2, [Resample("stratified"), KMeans(2)])),
     "in stages": _in_stages(1),
+    "pf of families": _pf(num_draws=3),
+    "guided mpf rqmc of families": lambda model: _mpf(
+        proposal=GaussNewtonProposal(model), noise="rqmc", num_draws=3
+    )(model),
+    "mpf rqmc of families": _mpf(noise="rqmc", num_draws=3),
     "mixture in stages": _in_stages(NUM_COMPONENTS),
     "predict and weigh": lambda model: Filter(
         model, [Resample(), Predict(model), Weigh(model)], NUM_PARTICLES

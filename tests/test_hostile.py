@@ -81,7 +81,8 @@ BUILT = {
     "Resample": (
         mpfjax.Resample,
         {"scheme": "systematic", "ess_threshold": 0.5, "particles_per_component": 2,
-         "sort_by": None, "gradient": "none", "softness": 0.5, "regularisation": 0.5},
+         "allocation": "equal", "sort_by": None, "gradient": "none", "softness": 0.5,
+         "regularisation": 0.5},
     ),
     "ResampleAhead": (
         mpfjax.ResampleAhead,
@@ -115,6 +116,9 @@ BUILT = {
     ),
     "Predict": (mpfjax.Predict, {"model": MODEL, "gradient": "none", "noise": "stratified"}),
     "Weigh": (mpfjax.Weigh, {"model": MODEL}),
+    "PropagateFamilies": (
+        mpfjax.PropagateFamilies, {"propagate": mpfjax.Propagate(MODEL), "num_draws": 2}
+    ),
     "PropagateInStages": (
         mpfjax.PropagateInStages,
         {"model": MODEL, "resample": None, "exponents": (0.1, 1.0), "num_moves": 1,
@@ -140,7 +144,8 @@ BUILT = {
     "particle_filter": (
         mpfjax.particle_filter,
         {"model": MODEL, "num_particles": 4, "proposal": None, "scheme": "systematic",
-         "ess_threshold": 1.0, "sort_by": None, "noise": "rqmc", "gradient": "none"},
+         "ess_threshold": 1.0, "sort_by": None, "noise": "rqmc", "num_draws": 2,
+         "gradient": "none"},
     ),
     "auxiliary_particle_filter": (
         mpfjax.auxiliary_particle_filter,
@@ -153,7 +158,8 @@ BUILT = {
         {"model": MODEL, "num_particles": 4, "max_components": 2, "proposal": None,
          "lookahead": None,
          "scheme": "systematic", "ess_threshold": 1.0, "particles_per_component": None,
-         "sort_by": "hilbert", "noise": "rqmc", "gradient": "none", "features": None,
+         "allocation": "equal", "sort_by": "hilbert", "noise": "rqmc", "num_draws": 2,
+         "gradient": "none", "features": None,
          "scale": 1.0, "merge": None, "split": None, "kmeans": None, "initial_kmeans": None,
          "regroup_every": 1},
     ),

@@ -9,11 +9,13 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_type, check_whole
 from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.noise import draw_noise
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation import Propagate
 from mpfjax.operations.generator import split, uniform
 from mpfjax.operations.indexing import take
+from mpfjax.proposals import AbstractProposal
 
 
 class PropagateFamilies(AbstractPropagation):
@@ -93,3 +95,16 @@ def _repeated(mixture: ParticleMixture, num_draws: int) -> ParticleMixture:
         component_indicators=repeat(mixture.component_indicators),
         ancestor_indices=repeat(mixture.ancestor_indices),
     )
+
+
+def propagation(
+    model: AbstractStateSpaceModel,
+    proposal: AbstractProposal | None,
+    gradient: str,
+    noise: str,
+    num_draws: int,
+) -> Propagate | PropagateFamilies:
+    """x_t, one or several draws of it, with the gradient that goes with that of resampling."""
+    check_whole(num_draws=num_draws)
+    propagate = Propagate(model, proposal, "stop" if gradient == "stop" else "none", noise)
+    return propagate if num_draws == 1 else PropagateFamilies(propagate, num_draws)
