@@ -1,6 +1,7 @@
 """(d) The posterior of σ_x and σ_y by three samplers, beside that of the grid filter."""
 
 import time
+import warnings
 from typing import Any, NamedTuple
 
 import jax
@@ -61,6 +62,9 @@ def exact(job: Quadratic) -> dict[str, np.ndarray]:
     table = np.exp(table - table.max()) * AXIS[:, None] * AXIS[None]  # per step of the logarithm
     step = float(np.log(AXIS[1] / AXIS[0]))
     marginals = dict(zip(NAMES, (table.sum(axis=1), table.sum(axis=0)), strict=True))
+    for name, values in marginals.items():
+        if max(values[0], values[-1]) > 0.01 * values.max():
+            warnings.warn(f"the posterior of {name} reaches the end of the grid", stacklevel=2)
     return {name: values / (values.sum() * step) / AXIS for name, values in marginals.items()}
 
 
