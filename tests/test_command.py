@@ -86,16 +86,23 @@ def test_the_summary_is_that_of_the_file(finished):
     assert summary["objects"] == len(np.unique(rows[:, 1])) == 2
 
 
-def test_rows_are_of_what_was_known_when_the_frame_came(sequence, finished, tmp_path):
-    online = read_tracks(finished / "tracks.txt")
-    assert online[0, 0] > 1, "an object was believed in at first sight"
-    assert run(sequence, "--detections", sequence / "det.txt", "--out", tmp_path, *SMALL,
-               "--offline", "--no-video") == 0  # fmt: skip
-    offline = read_tracks(tmp_path / "tracks.txt")
-    assert offline[0, 0] == 1
-    later = offline[offline[:, 0] >= online[0, 0]]
-    np.testing.assert_array_equal(later, online)
-    assert not (tmp_path / "tracking.mp4").exists()
+def test_rows_are_of_what_was_known_when_the_frame_came(sequence, tmp_path):
+    """A newcomer is believed in at second sight; only `--offline` goes back to the first."""
+    rows = (sequence / "det.txt").read_text().splitlines(keepends=True)
+    late = [row for k, row in enumerate(rows) if k < NUM_FRAMES or int(row.split(",")[0]) >= 3]
+    (tmp_path / "late.txt").write_text("".join(late))
+    found = {}
+    for name, options in {"online": (), "offline": ("--offline",)}.items():
+        assert run(sequence, "--detections", tmp_path / "late.txt", "--out", tmp_path / name,
+                   *SMALL, "--no-video", *options) == 0  # fmt: skip
+        found[name] = read_tracks(tmp_path / name / "tracks.txt")
+        assert not (tmp_path / name / "tracking.mp4").exists()
+    firsts = {
+        name: [rows[rows[:, 1] == id, 0].min() for id in (1, 2)] for name, rows in found.items()
+    }
+    assert firsts == {"online": [1, 4], "offline": [1, 3]}
+    was_known = (found["offline"][:, 1] == 1) | (found["offline"][:, 0] >= 4)
+    np.testing.assert_array_equal(found["offline"][was_known], found["online"])
 
 
 def test_some_frames_of_a_video_without_colours_or_truth(sequence, tmp_path):

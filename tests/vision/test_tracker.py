@@ -134,6 +134,11 @@ def test_nothing_is_tracked_where_nothing_is_detected():
         assert believed(tracks) == []
 
 
+def test_who_is_found_first_but_later_is_a_newcomer():
+    tracks = run([[]] * 2 + [[(20, 20)]] * 2)
+    assert [believed(each) for each in tracks] == [[], [], [], [1]]
+
+
 @pytest.mark.parametrize("rejuvenation", ["gaussian", "resample"])
 def test_components_are_born_confirmed_and_keep_their_identities(rejuvenation):
     """Two walk from the first frame on, a third comes later; every mean box stays on its own."""

@@ -189,6 +189,7 @@ def tracked(seed=0):
         jnp.array([0, 2, 0, 0], jnp.int32),
         jnp.array([True, True, False, False]),
         jnp.asarray(False),
+        jnp.asarray(True),
     )
     weak, strong = jnp.asarray(0.2, jnp.float32), jnp.asarray(0.5, jnp.float32)
     mixture = ParticleMixture(

@@ -29,8 +29,8 @@ class Found(AbstractMove):
     Its particles scatter about the detection as the detector errs, with velocities that scatter
     about zero. A detection that overlaps a living component's box by more than `birth_overlap`
     (intersection over union), or a stronger founding detection, founds none: it is a second one of
-    the same object. Who is found before anybody ever was is no newcomer, since objects are there
-    when a video starts, and is believed in at once. Of more than there is room for, the strongest
+    the same object. Who is found in the first frame is no newcomer, since objects are there when a
+    video starts, and is believed in at once. Of more than there is room for, the strongest
     are chosen. Memory: `Lives`, with `Bury`, which keeps it; the assignments, so that a founding
     detection is its component's own.
 
@@ -96,7 +96,7 @@ class Found(AbstractMove):
             component_indicators=jnp.where(filled, seats, mixture.component_indicators),
         )
         number = jnp.cumsum(born, dtype=jnp.int32)
-        at_the_start = born & (lives.last_identity == 0)
+        at_the_start = born & ~lives.begun
         lives = lives._replace(
             identities=jnp.where(born, lives.last_identity + number, lives.identities),
             last_identity=lives.last_identity + number[-1],
@@ -105,6 +105,7 @@ class Found(AbstractMove):
             unseen=jnp.where(born, 0, lives.unseen),
             confirmed=lives.confirmed | at_the_start,
             full=jnp.sum(founding, dtype=jnp.int32) > number[-1],
+            begun=jnp.ones_like(lives.begun),
         )
         assigned = jnp.where(born, source, mixture.memory[ASSIGNED])
         return remember(mixture, lives=lives, assigned=assigned)

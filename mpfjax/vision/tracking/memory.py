@@ -28,6 +28,7 @@ class Lives(NamedTuple):
       `alone`: in how many of the first it stood alone.
     - `confirmed`: whether it was borne out often enough to be believed.
     - `full`: whether there was no room for a component in the last frame.
+    - `begun`: whether there was a frame before.
     """
 
     identities: Int[Array, " m"]
@@ -37,13 +38,14 @@ class Lives(NamedTuple):
     unseen: Int[Array, " m"]
     confirmed: Bool[Array, " m"]
     full: Bool[Array, ""]
+    begun: Bool[Array, ""]
 
     @classmethod
     def none(cls, num_components: int) -> "Lives":
         """Nobody lives yet."""
         nobody = jnp.zeros(num_components, jnp.int32)
         zero = jnp.zeros((), jnp.int32)
-        return cls(nobody, zero, nobody, nobody, nobody, nobody > 0, zero > 0)
+        return cls(nobody, zero, nobody, nobody, nobody, nobody > 0, zero > 0, zero > 0)
 
     @property
     def alive(self) -> Bool[Array, " m"]:
