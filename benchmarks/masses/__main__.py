@@ -28,6 +28,8 @@ from mpfjax.models.base import HasInitialNoise
 
 # A reference of so many particles where the likelihood of a particle is that of its pixels.
 _FEWER = {"look-alikes": 10}
+# A picture has room for as many lines as there are colours.
+_IN_THE_TABLE_ONLY = ("MPF, 4 draws", "MPF, by variance", "MPF, look-ahead")
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -131,7 +133,7 @@ def picture(rows: list[dict[str, Any]]) -> Any:
         for scene in scenes:
             lines: dict[str, list[tuple[float, float]]] = {}
             for row in rows:
-                if row["scene"] == scene:
+                if row["scene"] == scene and row["filter"] not in _IN_THE_TABLE_ONLY:
                     lines.setdefault(row["filter"], []).append((row["ms"], row[what]))
             line.append(plotting.CostPanel(scene, "milliseconds a step", label, lines))
         panels.append(line)
