@@ -1,7 +1,7 @@
 """A filter: a chain of moves on a particle mixture, one step at a time."""
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -23,6 +23,7 @@ from mpfjax.models.base import (
     HasInitialNoise,
     check_model,
     check_states,
+    starts_from_noise,
 )
 from mpfjax.models.noise import NOISES, draw_noise
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
@@ -271,11 +272,12 @@ def sample_initial(
     noise: str = "independent",
 ) -> PyTree:
     """The model's x_0, of this noise if it can be; raises for leaves of another length."""
-    if noise == "independent" or not isinstance(model, HasInitialNoise):
+    if noise == "independent" or not starts_from_noise(model):
         particles = model.sample_initial(key, num_particles)
     else:
-        shape = (num_particles, model.initial_noise_dimension)
-        particles = model.initial_from_noise(draw_noise(noise, key, shape, default_float()))
+        maker = cast(HasInitialNoise, model)
+        shape = (num_particles, maker.initial_noise_dimension)
+        particles = maker.initial_from_noise(draw_noise(noise, key, shape, default_float()))
     check_states(particles, model, "sample_initial", num_particles)
     return particles
 

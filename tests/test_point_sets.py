@@ -105,7 +105,10 @@ LABELS = jnp.asarray(np.sort(np.random.default_rng(2).integers(0, 3, 30)), jnp.i
 @pytest.fixture(scope="module", params=[1, 3])
 def draws(request):
     """Noise of thirty particles in three components, at many keys."""
-    draw = lambda key: rqmc_normal(key, (30, request.param), FLOAT, LABELS, 3)  # noqa: E731
+
+    def draw(key):
+        return rqmc_normal(key, (30, request.param), FLOAT, LABELS, 3)
+
     return np.asarray(jax.jit(jax.vmap(draw))(KEYS))
 
 
@@ -137,7 +140,9 @@ class TestRqmcNormal:
         slots = (np.arange(n) % 64 / 64)[:, None]
 
         def error(kind, d):
-            draw = lambda key: draw_noise(kind, key, (n, d), FLOAT, labels, 2)  # noqa: E731
+            def draw(key):
+                return draw_noise(kind, key, (n, d), FLOAT, labels, 2)
+
             z = np.asarray(jax.jit(jax.vmap(draw))(KEYS[:500]))
             return (slots * np.tanh(z))[:, 64:].mean(axis=(1, 2)).std()
 

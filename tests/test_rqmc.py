@@ -273,3 +273,21 @@ def test_boxes_made_of_noise_switch_as_often_and_to_all_references():
     ):
         shares = np.bincount(np.asarray(moved.reference)[np.asarray(states.reference) == 0])
         np.testing.assert_allclose(shares / shares.sum(), [0.8, 0.1, 0.1], atol=0.015)
+
+
+class OneSided(mpfjax.QuadraticModel):
+    """A subclass that draws another x_0, and inherits how the old one was made of noise."""
+
+    def sample_initial(self, key, num_particles):
+        return jnp.full(num_particles, 1.5) + 0 * super().sample_initial(key, num_particles)
+
+
+def test_an_x_0_of_another_law_is_not_replaced_by_an_inherited_one():
+    filter = mpfjax.particle_filter(OneSided(0.3, 0.5), 20, noise="rqmc")
+    np.testing.assert_array_equal(filter.init(jax.random.key(0)).particles, 1.5)
+
+
+def test_x_0_is_spread_over_a_range_as_evenly_as_a_point_set():
+    model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0, "independent")
+    start = mpfjax.particle_filter(model, 100, noise="rqmc").init(jax.random.key(0))
+    assert np.diff(np.sort(start.particles)).max() < 4 * 4.0 / 100

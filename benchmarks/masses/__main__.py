@@ -24,7 +24,7 @@ from benchmarks.masses.filters import FILTERS
 from benchmarks.masses.scenes import SCENES, Scene
 from mpfjax import plotting
 from mpfjax.console import exit_status, format_table, seed, whole, write_json
-from mpfjax.models.base import HasInitialNoise
+from mpfjax.models.base import starts_from_noise
 
 # A reference of so many particles where the likelihood of a particle is that of its pixels.
 _FEWER = {"look-alikes": 10}
@@ -94,7 +94,7 @@ def _rows(
     for each, filter in filters.items():
         found = measure.errors(scene, filter, known, options.seeds, options.seed)
         rows.append({"scene": name, "filter": each, "N": num_particles, **found, "ms": times[each]})
-    if with_particles and isinstance(scene.model, HasInitialNoise):
+    if with_particles and starts_from_noise(scene.model):
         from benchmarks.masses import through_particles
 
         found, time = through_particles.errors_and_time(

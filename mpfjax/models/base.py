@@ -102,17 +102,24 @@ class HasInitialNoise(Protocol):
 def is_made_of_noise(model: Any) -> bool:
     """Whether the model makes x_t of noise, and draws no x_t of another law."""
     has_noise = hasattr(model, "transition_from_noise") and hasattr(model, "noise_dimension")
-    return has_noise and not _draws_otherwise(model)
+    return has_noise and not _draws_otherwise(model, "sample_transition", "transition_from_noise")
 
 
-def _draws_otherwise(model: Any) -> bool:
-    """Whether a class draws x_t itself, and inherits how it is made of noise."""
+def starts_from_noise(model: Any) -> bool:
+    """Whether the model makes x_0 of noise, and draws no x_0 of another law."""
+    return isinstance(model, HasInitialNoise) and not _draws_otherwise(
+        model, "sample_initial", "initial_from_noise"
+    )
+
+
+def _draws_otherwise(model: Any, drawing: str, making: str) -> bool:
+    """Whether a class draws a state itself, and inherits how it is made of noise."""
     own = model.model if isinstance(model, _PerParticleModel) else model
     for owner in type(own).__mro__:
-        if "transition_from_noise" in vars(owner):
+        if making in vars(owner):
             return False
-        if "sample_transition" in vars(owner):
-            return callable(getattr(type(own), "transition_from_noise", None))
+        if drawing in vars(owner):
+            return callable(getattr(type(own), making, None))
     return False
 
 
