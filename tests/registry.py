@@ -194,20 +194,12 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
 QUICK_CHAINS = (
     "pf",
     "pf rqmc",
-    "mixture in stages",
-    "mpf rqmc of families",
     "mpf",
     "mpf rqmc, M = 6",
     "guided mpf",
-    "auxiliary mpf",
-    "random labels, residual",
-    "split only, adaptive",
     "gaussian mixture",
-    "ps adaptive, random order",
     "dps",
-    "dps prior",
     "partitioned in clusters",
-    "clusters",
 )
 CHAINS: dict[str, Callable[..., Filter]] = {
     "pf": _pf(),

@@ -93,7 +93,7 @@ QUICK = [
     (chain, model)
     for chain, model in EXACT
     if chain in QUICK_CHAINS
-    if model == "quadratic" or chain in ("pf", "pf rqmc", "guided pf", "guided mpf", "dps")
+    if model == "quadratic" or chain == "pf rqmc"
 ]
 
 

@@ -150,7 +150,7 @@ def island_chains():
 
 
 class TestIslands:
-    @pytest.mark.parametrize("chain", ["pf, exchange", "mixture, exchange"])
+    @pytest.mark.parametrize("chain", ["mixture, exchange", *thorough(["pf, exchange"])])
     def test_evidence_and_means_are_unbiased(self, chain):
         runs, keys = 1500, jax.random.split(jax.random.key(3), 1500)
         filter = island_chains()[chain]
@@ -449,7 +449,7 @@ class TestChoosingDevices:
             assert choose_devices(None) == jax.devices()[:1]
 
 
-@pytest.mark.parametrize("num_components", [3, 6])
+@pytest.mark.parametrize("num_components", [3, *thorough([6])])
 def test_a_constant_moves_the_evidence_of_islands_and_nothing_else(num_components):
     """Every island has a scale of its own, beside which none may be rounded away."""
 

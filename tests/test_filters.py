@@ -237,9 +237,9 @@ class TestSlots:
         "chain",
         [
             "mpf",
-            "dps",
             *thorough(
                 [
+                    "dps",
                     "pf adaptive",
                     "random labels, residual",
                     "gaussian mixture",
@@ -317,7 +317,7 @@ class TestBrokenLikelihoods:
 class TestUsersModel:
     """The batched form runs through every chain in `test_chains.py`."""
 
-    @pytest.mark.parametrize("chain", ["guided pf", "kmeans only"])
+    @pytest.mark.parametrize("chain", ["guided pf", *thorough(["kmeans only"])])
     def test_written_for_one_particle_it_agrees_with_the_kalman_filter(self, chain):
         filter = CHAINS[chain](mpfjax.per_particle(DriftOfOne()))
         keys = jax.random.split(jax.random.key(15), 2000)

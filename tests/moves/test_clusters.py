@@ -268,6 +268,7 @@ class TestClusters:
         np.testing.assert_allclose(after.particles, before.particles, atol=0.1)
 
 
+@pytest.mark.thorough
 def test_gradient_is_finite_through_meeting_objects():
     filter = mpfjax.clustered_particle_filter(PAIR, 20, start="together")
 

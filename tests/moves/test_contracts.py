@@ -22,20 +22,31 @@ QUICK_MIXTURES = (
     "dead components",
     "empty slots with stale states",
     "masses 200 nats apart",
-    "ordinary, M = 3",
-    "masses 200 nats apart, M = 3",
+    "dead components, M = 3",
+)
+# One of each way to place the offspring, to share the slots, and to choose who is due.
+QUICK_REJUVENATIONS = (
+    "systematic",
+    "multinomial",
+    "ssp, adaptive",
+    "systematic, along a Hilbert curve",
+    "residual, fixed number, adaptive",
+    "residual, shared by variance, adaptive",
+    "soft, fixed number, adaptive",
+    "gaussian",
+    "gaussian, point sets",
 )
 NUM_DRAWS = 4000
 
 over_mixtures = pytest.mark.parametrize("mixture", MIXTURES.values(), ids=MIXTURES)
 over_regroupings = pytest.mark.parametrize("name", REGROUPINGS)
-over_rejuvenations = pytest.mark.parametrize("name", REJUVENATIONS)
+over_rejuvenations = pytest.mark.parametrize("name", quick_of(REJUVENATIONS, QUICK_REJUVENATIONS))
 RESAMPLINGS = [
     name
     for name, move in REJUVENATIONS.items()
     if isinstance(move, Resample) and not move.approximate
 ]
-over_resamplings = pytest.mark.parametrize("name", RESAMPLINGS)
+over_resamplings = pytest.mark.parametrize("name", quick_of(RESAMPLINGS, QUICK_REJUVENATIONS))
 
 
 @cache

@@ -9,6 +9,7 @@ import mpfjax
 from mpfjax import GaussNewtonProposal, Propagate, PropagateFamilies
 from mpfjax.exact import grid_filter
 from tests.examples import make_mixture
+from tests.marking import thorough
 
 MODEL = mpfjax.QuadraticModel(0.5, 0.1, -2.0, 2.0)
 SEEN = jnp.array([1.0, 1.4, 0.9, 0.6, 1.1])
@@ -35,7 +36,7 @@ class Marked(mpfjax.AbstractStateSpaceModel):
         return jnp.log(self.likelihoods[states]) + 0 * observation
 
 
-@pytest.mark.parametrize("noise", ["independent", "rqmc"])
+@pytest.mark.parametrize("noise", ["rqmc", *thorough(["independent"])])
 def test_weights_are_means_and_draws_are_kept_by_theirs(noise):
     """E[weight of those that keep a value] is its likelihood, for every value, one of them zero."""
     likelihoods = jnp.array([0.0, 1.0, 2.0, 5.0])

@@ -226,6 +226,7 @@ def test_moments_are_the_kalman_filters(max_components, importance):
         np.testing.assert_array_less(np.abs(found.mean(0) - expected), bound)
 
 
+@pytest.mark.thorough
 def test_only_the_mixture_keeps_both_modes():
     model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
     times = jnp.arange(1.0, 61.0)

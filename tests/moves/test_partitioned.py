@@ -15,6 +15,7 @@ from mpfjax import MultiObjectModel, PairwiseRepulsion, Partitioned
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.partitioned import circular_orders
 from tests.examples import make_mixture, stack, walker
+from tests.marking import thorough
 from tests.user_models import TrickyQuadraticModel, nothing_traced
 
 KEY = jax.random.key(0)
@@ -117,6 +118,7 @@ class TestWithInteraction:
         means = [grid @ density.sum(axis=1 - j) * cell**2 for j in (0, 1)]
         return log_evidence, np.array(means)
 
+    @pytest.mark.thorough
     def test_ps_and_dps_are_unbiased(self):
         filters = [
             mpfjax.partitioned_sampling(self.MODEL, 80, (1, 0)),
@@ -136,7 +138,7 @@ REPELLING = MultiObjectModel(stack(OBJECTS), 3, PairwiseRepulsion(2.0, 2.0))
 
 
 class TestWeights:
-    @pytest.mark.parametrize("orders", [None, (2, 0, 1), "random"], ids=str)
+    @pytest.mark.parametrize("orders", [None, *thorough([((2, 0, 1),), "random"])], ids=str)
     def test_without_resampling_they_are_those_of_the_joint_state(self, orders):
         """Every likelihood and every pair counts once, in any order and component."""
         components = 1 if orders == (2, 0, 1) else 2
@@ -189,6 +191,7 @@ class TestOrders:
         expected = [[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 1, 2]]
         assert circular_orders(4, 3).tolist() == expected
 
+    @pytest.mark.thorough
     def test_the_object_moved_last_keeps_every_hypothesis(self):
         """It tells which order each component took."""
         mixture = mpfjax.particle_filter(APART, 90).init(KEY)

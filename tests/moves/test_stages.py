@@ -32,6 +32,7 @@ def log_errors(filter, seen, exact):
     return np.asarray(found.log_marginal_likelihood, float) - float(exact)
 
 
+@pytest.mark.thorough
 def test_it_costs_less_than_more_particles_where_the_likelihood_is_narrow_in_four_dimensions():
     seen = jnp.asarray(np.random.default_rng(0).normal(size=(5, 4)), jnp.float32)
     exact = kalman_filter(FOUR, seen).log_marginal_likelihood

@@ -147,10 +147,8 @@ CASES = [
 QUICK_CASES = [
     *((smoother, chain, model)
       for smoother in SMOOTHERS if SMOOTHERS[smoother].of_run
-      for chain, model in (("mpf", "one dimension"), ("pf", "four dimensions"),
-                           ("dps", "one dimension"), ("mpf", "two modes"))),
+      for chain, model in (("pf", "four dimensions"), ("dps", "one dimension"),
+                           ("mpf", "two modes"))),
     ("PaRIS", "pf", "four dimensions"),
-    ("PaRIS, MCMC", "mpf", "two modes"),
-    ("fixed lag", "pf", "one dimension"),
     ("fixed lag, MCMC", "mpf", "one dimension"),
 ]  # fmt: skip

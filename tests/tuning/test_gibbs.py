@@ -59,6 +59,7 @@ class TestPosterior:
         assert (run.renewal_rates > 0.5).all()
         assert run.stopped is None
 
+    @pytest.mark.thorough
     def test_of_metropolis_steps_through_a_mixture_is_the_exact_one(self):
         """With K-means, merging and splitting in the chain."""
         run = sample(

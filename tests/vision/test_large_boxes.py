@@ -15,6 +15,7 @@ from mpfjax.vision import (
     joint_colour_model,
 )
 from mpfjax.vision.histograms import normalise
+from tests.marking import thorough
 
 HEIGHT, WIDTH, BINS = 600, 620, 4
 COLOURS = RGBColours(BINS)
@@ -133,7 +134,7 @@ def test_templates_of_many_pixels_are_learned(frame):
     )
 
 
-@pytest.mark.parametrize("exact_colours", [False, True])
+@pytest.mark.parametrize("exact_colours", [False, *thorough([True])])
 def test_a_tracker_learns_the_colours_of_large_objects(frame, exact_colours):
     """An object that grows beyond what 16 bits count."""
     tracker = ObjectTracker(1, 8, colours=COLOURS, exact_colours=exact_colours)

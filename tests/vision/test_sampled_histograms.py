@@ -14,6 +14,7 @@ from mpfjax.vision import (
 )
 from mpfjax.vision.histograms import normalise
 from mpfjax.vision.sampled_histograms import SampledBoxes
+from tests.marking import thorough
 
 RNG = np.random.default_rng(0)
 FRAME = RNG.integers(0, 256, (30, 40, 3), dtype=np.uint8)
@@ -113,7 +114,7 @@ def test_a_bad_argument_is_named(as_installed, arguments, said):
         SampledHistogram(**{"frame": FRAME, "colours": HSVColours()} | arguments)
 
 
-@pytest.mark.parametrize("num_parts", [1, 3])
+@pytest.mark.parametrize("num_parts", [3, *thorough([1])])
 def test_boxes_looked_up_before_count_the_same(num_parts):
     boxes = np.concatenate([BOXES, [[-50, 10, 8, 8], [10, 10, 0, 8]]]).astype(np.float32)
     colours = HSVColours(4, 2, 2)
