@@ -79,7 +79,7 @@ class BearingsModel(mpfjax.AbstractStateSpaceModel):
 def heard(motion: Float[Array, "n 4"]) -> Float[Array, "2 n"]:
     """The angles between each axis and the direction to the target, from 0 to pi."""
     # A row for each array: in short rows nothing would run on vectors.
-    x, y = motion[:, 0] - SENSORS[:, :1], motion[:, 1] - SENSORS[:, 1:]
+    x, y = motion[None, :, 0] - SENSORS[:, :1], motion[None, :, 1] - SENSORS[:, 1:]
     cos, sin = np.cos(AXES)[:, None], np.sin(AXES)[:, None]
     return jnp.arctan2(jnp.abs(cos * y - sin * x), cos * x + sin * y)
 

@@ -110,22 +110,22 @@ def draw_family_noise(
     key_matrix, key_shift = split(key, 2)
     within = components if kind == "rqmc" else None
     ranks, shifts = _ranks_and_shifts(key_shift, (n, d + 1), within, num_components)
-    draw = jnp.arange(num_draws, dtype=jnp.uint32)
-    own, draws = ranks.astype(jnp.uint32), jnp.ravel(ranks[:, None] * num_draws + draw[None])
+    draw = jnp.arange(num_draws, dtype=jnp.int32)[None]
+    draws = jnp.ravel(ranks[:, None] * num_draws + draw)
     shift_of_draws = jnp.repeat(shifts[1:d], num_draws if shifts.shape[1] > 1 else 1, axis=1)
     if kind == "rqmc":
         num_digits = max((n * num_draws - 1).bit_length(), 1)
         directions = scrambled_directions(key_matrix, min(d + 1, MOST_DIMENSIONS), num_digits)
-        first = sobol_points(own, directions[:1])[0] ^ shifts[0]
-        last = sobol_points(own, directions[-1:])[0] ^ shifts[d]
+        first = sobol_points(ranks, directions[:1])[0] ^ shifts[0]
+        last = sobol_points(ranks, directions[-1:])[0] ^ shifts[d]
         rest = sobol_points(draws, directions[1:d]) ^ shift_of_draws
     else:
-        multipliers = _multipliers(d + 1)
+        multipliers, own = _multipliers(d + 1), ranks.astype(jnp.uint32)
         first = own * multipliers[0] + shifts[0]
         last = own * multipliers[d] + shifts[d]
         rest = draws.astype(jnp.uint32)[None] * multipliers[1:d, None] + shift_of_draws
-    first = jnp.ravel(first[:, None] // num_draws + draw[None] * (2**32 // num_draws))
-    points = jnp.concatenate([first[None], rest])
+    strata = draw.astype(jnp.uint32) * ((2**32 // num_draws) % 2**32)
+    points = jnp.concatenate([jnp.ravel(first[:, None] // num_draws + strata)[None], rest])
     return stored(_normal_of(points, dtype)).T, _uniform_of(last, dtype)
 
 

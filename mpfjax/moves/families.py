@@ -27,8 +27,9 @@ class PropagateFamilies(AbstractPropagation):
     weights: Ẑ is that of K N particles, and unbiased. The model is evaluated K N times, but only N
     particles are resampled, sorted and regrouped.
 
-    - `propagate`: the `Propagate` that draws. With its noise "rqmc" the draws of a component are
-      one point set, over its slots and their draws.
+    - `propagate`: the `Propagate` that draws. With its noise "rqmc" or "stratified" the draws of a
+      family fill K strata of the first dimension of the noise, and one more dimension of the same
+      point set says which of them is kept. So what is kept is spread over slot and noise as well.
     - `num_draws`: K.
 
     Raises `ValueError` for K < 1, and for gradient "stop", which knows nothing of the draw that was
