@@ -223,6 +223,7 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "resampled every second step": _chain(Every(2, [Resample("stratified"), KMeans(2)])),
     "in stages": _in_stages(1),
     "pf of families": _pf(num_draws=3),
+    "pf of families, stratified": _pf(num_draws=4, noise="stratified"),
     "guided mpf rqmc of families": lambda model: _mpf(
         proposal=GaussNewtonProposal(model), noise="rqmc", num_draws=3
     )(model),

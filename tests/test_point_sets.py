@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 from scipy.stats import qmc
 
-from mpfjax.models.noise import draw_noise, rqmc_normal
+from mpfjax.models.noise import draw_family_noise, draw_noise, rqmc_normal
 from mpfjax.operations.hilbert import bits_per_dimension, hilbert_index
 from mpfjax.operations.sobol import (
     MOST_DIMENSIONS,
@@ -18,6 +18,7 @@ from mpfjax.operations.sobol import (
     sobol_points,
 )
 from mpfjax.operations.sorting import order_by_key, sortable_bits
+from tests.marking import thorough
 
 FLOAT = np.dtype("float32")
 KEYS = jax.random.split(jax.random.key(7), 4000)
@@ -156,3 +157,56 @@ class TestRqmcNormal:
 
     def test_one_row(self):
         assert rqmc_normal(jax.random.key(8), (1, 2), FLOAT).shape == (1, 2)
+
+
+FAMILY = 4
+OF_FAMILIES = ["rqmc, 1", *thorough(["rqmc, 3", "stratified, 1", "stratified, 3"])]
+
+
+@pytest.fixture(scope="module", params=OF_FAMILIES)
+def families(request):
+    """Noise of four draws of each of thirty particles in three components, at many keys."""
+    kind, d = request.param.split(", ")
+
+    def draw(key):
+        return draw_family_noise(kind, key, (30, int(d)), FAMILY, FLOAT, LABELS, 3)
+
+    noise, shares = jax.jit(jax.vmap(draw))(jax.random.split(jax.random.key(8), len(KEYS)))
+    return np.asarray(noise).reshape(len(KEYS), 30, FAMILY, -1), np.asarray(shares)
+
+
+class TestNoiseOfFamilies:
+    def test_one_draw_at_random_is_exactly_normal(self, families):
+        noise, _ = families
+        which = np.random.default_rng(3).integers(0, FAMILY, len(KEYS))
+        for slot in (0, 1, 13, 29):
+            drawn = noise[np.arange(len(KEYS)), slot, which]
+            for column in drawn.T:
+                assert scipy.stats.kstest(column, "norm").pvalue > 1e-4
+
+    def test_the_share_is_uniform_and_independent_of_the_noise(self, families):
+        noise, shares = families
+        for slot in (0, 7, 29):
+            assert scipy.stats.kstest(shares[:, slot], "uniform").pvalue > 1e-4
+            for draw, column in itertools.product((0, FAMILY - 1), range(noise.shape[3])):
+                levels = scipy.stats.rankdata(noise[:, slot, draw, column]) / len(KEYS)
+                both = np.mod(shares[:, slot] + levels, 1)
+                assert scipy.stats.kstest(both, "uniform").pvalue > 1e-4
+
+    def test_the_draws_of_a_particle_fill_strata_in_order(self, families):
+        noise, _ = families
+        strata = np.floor(FAMILY * scipy.stats.norm.cdf(noise[..., 0])).astype(int)
+        assert (strata == np.arange(FAMILY)).all()
+
+
+def test_families_and_what_they_keep_are_one_net():
+    """One of all draws in each cell of a coordinate; a draw kept by its share is even as well."""
+    n, labels = 64, jnp.zeros(64, jnp.int32)
+    draw = lambda key: draw_family_noise("rqmc", key, (n, 2), FAMILY, FLOAT, labels, 1)  # noqa: E731
+    noise, shares = map(np.asarray, jax.jit(jax.vmap(draw))(KEYS[:200]))
+    points = np.floor(n * FAMILY * scipy.stats.norm.cdf(noise)).astype(int)
+    assert (np.sort(points, axis=1) == np.arange(n * FAMILY)[None, :, None]).all()
+    kept = np.floor(FAMILY * shares).astype(int)
+    first = noise[..., 0].reshape(-1, n, FAMILY)
+    means = np.take_along_axis(first, kept[..., None], axis=2).mean(axis=(1, 2))
+    assert means.std() < 0.25 / np.sqrt(n)

@@ -5,6 +5,8 @@ are not quite in line, so that the target's mirror image is no exact one: prior 
 little of which is which, and the masses of the two sides are not equal.
 """
 
+from statistics import NormalDist
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,8 @@ SENSORS = np.array([[0.0, 0.0], [10.0, 0.0]], np.float32)
 AXES = np.array([0.0, 0.1], np.float32)
 TURNS = np.array([0.0, 0.12, -0.12], np.float32)
 _STAYS = 0.9
+# A normal number below the first keeps the mode; those above it, in equal parts, are for each mode.
+_DRAWS_OF_MODE = [NormalDist().inv_cdf(_STAYS + (1 - _STAYS) * i / 3) for i in range(3)]
 _ACCELERATION = 0.1
 _NOISE = 0.1
 _START = np.array([5.0, 0.0, 0.0, 0.0], np.float32)
@@ -54,9 +58,8 @@ class BearingsModel(mpfjax.AbstractStateSpaceModel):
 
     def transition_from_noise(self, noise: Float[Array, "n 3"], states: PyTree) -> PyTree:
         """Two accelerations and a mode from three standard normal numbers."""
-        share = jax.scipy.special.ndtr(noise[:, 2])
-        drawn = ((share - _STAYS) / (1 - _STAYS) * len(TURNS)).astype(jnp.int32)
-        mode = jnp.where(share < _STAYS, states["mode"], jnp.clip(drawn, 0, len(TURNS) - 1))
+        drawn = sum((noise[:, 2] > bound).astype(jnp.int32) for bound in _DRAWS_OF_MODE[1:])
+        mode = jnp.where(noise[:, 2] < _DRAWS_OF_MODE[0], states["mode"], drawn)
         return {
             "motion": _moved(states["motion"], mode, _ACCELERATION * noise[:, :2]),
             "mode": mode,
@@ -69,15 +72,16 @@ class BearingsModel(mpfjax.AbstractStateSpaceModel):
 
     def log_likelihood(self, observation: Float[Array, "2"], states: PyTree) -> Float[Array, " n"]:
         """Independent Gaussian errors of the two angles."""
-        errors = (observation[None] - heard(states["motion"])) / _NOISE
-        return -0.5 * jnp.sum(errors**2, axis=1) - 2 * jnp.log(_NOISE * jnp.sqrt(2 * jnp.pi))
+        errors = (observation[:, None] - heard(states["motion"])) / _NOISE
+        return -0.5 * jnp.sum(errors**2, axis=0) - 2 * jnp.log(_NOISE * jnp.sqrt(2 * jnp.pi))
 
 
-def heard(motion: Float[Array, "n 4"]) -> Float[Array, "n 2"]:
+def heard(motion: Float[Array, "n 4"]) -> Float[Array, "2 n"]:
     """The angles between each axis and the direction to the target, from 0 to pi."""
-    offsets = motion[:, None, :2] - SENSORS[None]
-    angles = jnp.arctan2(offsets[:, :, 1], offsets[:, :, 0]) - AXES[None]
-    return jnp.abs(jnp.mod(angles + jnp.pi, 2 * jnp.pi) - jnp.pi)
+    # A row for each array: in short rows nothing would run on vectors.
+    x, y = motion[None, :, 0] - SENSORS[:, :1], motion[None, :, 1] - SENSORS[:, 1:]
+    cos, sin = np.cos(AXES)[:, None], np.sin(AXES)[:, None]
+    return jnp.arctan2(jnp.abs(cos * y - sin * x), cos * x + sin * y)
 
 
 def is_above(states: PyTree) -> Array:
@@ -98,7 +102,7 @@ def observations(num_steps: int, seed: int) -> np.ndarray:
         turning = num_steps // 3 <= step < num_steps // 2
         pushed = jnp.asarray(_ACCELERATION * rng.normal(size=(1, 2)), jnp.float32)
         motion = _moved(motion, jnp.asarray([2 if turning else 0]), pushed)
-        found.append(np.asarray(heard(motion))[0] + _NOISE * rng.normal(size=2))
+        found.append(np.asarray(heard(motion))[:, 0] + _NOISE * rng.normal(size=2))
     return np.array(found, np.float32)
 
 
@@ -106,9 +110,9 @@ def _moved(
     motion: Float[Array, "n 4"], mode: Array, pushed: Float[Array, "n 2"]
 ) -> Float[Array, "n 4"]:
     """A step on: the velocity turned by the mode's angle and pushed, the position half-way."""
-    turn = jnp.asarray(TURNS)[mode]
-    sin, cos = jnp.sin(turn), jnp.cos(turn)
+    sin, cos = jnp.asarray(np.sin(TURNS))[mode], jnp.asarray(np.cos(TURNS))[mode]
     x, y, across, along = motion.T
-    velocity = jnp.stack([cos * across - sin * along, sin * across + cos * along], axis=1) + pushed
-    place = jnp.stack([x, y], axis=1) + 0.5 * (motion[:, 2:] + velocity)
-    return jnp.concatenate([place, velocity], axis=1)
+    new_across = cos * across - sin * along + pushed[:, 0]
+    new_along = sin * across + cos * along + pushed[:, 1]
+    x, y = x + 0.5 * (across + new_across), y + 0.5 * (along + new_along)
+    return jnp.stack([x, y, new_across, new_along], axis=1)

@@ -49,5 +49,6 @@ FILTERS: dict[str, Make] = {
     "MPF, every 4th": _mixture(regroup_every=4),
     "MPF, look-ahead": _mixture(ahead=True),
     "MPF, in stages": _in_stages,
+    "MPF, all but draws": _mixture(noise="rqmc", allocation="variance", regroup_every=4),
     "MPF, all": _mixture(noise="rqmc", num_draws=4, allocation="variance", regroup_every=4),
 }

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 from mpfjax.operations.floats import default_float
 from mpfjax.operations.generator import bits, normal, normal_quantile, split, uniform
 from mpfjax.operations.segments import first_places, spread
-from mpfjax.operations.sobol import scrambled_directions, sobol_points
+from mpfjax.operations.sobol import MOST_DIMENSIONS, scrambled_directions, sobol_points
 from mpfjax.operations.stored import EXACT_IN_FLOAT32, stored
 
 NOISES = ("independent", "rqmc", "stratified")
@@ -78,30 +78,85 @@ def rqmc_normal(
     Raises `ValueError` for more dimensions than the table of direction numbers holds.
     """
     n, d = shape
-    ranks = jnp.arange(n, dtype=jnp.int32)
     key_matrix, key_shift = split(key, 2)
-    shifts = stored(bits(key_shift, (num_components, d)) >> _UNUSED, EXACT_IN_FLOAT32)
-    if components is None or num_components == 1:
-        own = shifts[0][:, None]
-    else:
-        ranks = stored(ranks - spread(first_places(components, num_components), components), n)
-        own = [spread(shifts[:, k], components) for k in range(d)]
-        own = stored(jnp.stack(own), EXACT_IN_FLOAT32)
-    own = own << _UNUSED
+    ranks, shifts = _ranks_and_shifts(key_shift, shape, components, num_components)
     if d == 1:
-        points = (ranks.astype(jnp.uint32) * _multipliers(1))[None] + own
+        points = (ranks.astype(jnp.uint32) * _multipliers(1))[None] + shifts
     else:
         directions = scrambled_directions(key_matrix, d, max((n - 1).bit_length(), 1))
-        points = sobol_points(ranks, directions) ^ own
+        points = sobol_points(ranks, directions) ^ shifts
     # Row by row, and only then in columns: in short rows nothing runs on vectors.
     return stored(_normal_of(points, dtype)).T
 
 
+def draw_family_noise(
+    kind: str,
+    key: Key[Array, ""],
+    shape: tuple[int, int],
+    num_draws: int,
+    dtype: jnp.dtype,
+    components: Int[Array, " n"],
+    num_components: int,
+) -> tuple[Float[Array, "nk d"], Float[Array, " n"]]:
+    """Noise for K draws of each particle, side by side, and a uniform number for each particle.
+
+    They are made of one point set of d + 1 dimensions, "rqmc" or "stratified". In the first, the K
+    draws of a particle fill K strata, in order: a draw's noise on its own is not normal, but one of
+    the K at random is. So an average over the draws keeps its expectation. The last dimension is
+    the uniform number, by which one of the draws is kept. Each particle's share of the point set
+    is independent of the past, and its uniform number of its noise.
+    """
+    n, d = shape
+    key_matrix, key_shift = split(key, 2)
+    within = components if kind == "rqmc" else None
+    ranks, shifts = _ranks_and_shifts(key_shift, (n, d + 1), within, num_components)
+    draw = jnp.arange(num_draws, dtype=jnp.int32)[None]
+    draws = jnp.ravel(ranks[:, None] * num_draws + draw)
+    shift_of_draws = jnp.repeat(shifts[1:d], num_draws if shifts.shape[1] > 1 else 1, axis=1)
+    if kind == "rqmc":
+        num_digits = max((n * num_draws - 1).bit_length(), 1)
+        directions = scrambled_directions(key_matrix, min(d + 1, MOST_DIMENSIONS), num_digits)
+        first = sobol_points(ranks, directions[:1])[0] ^ shifts[0]
+        last = sobol_points(ranks, directions[-1:])[0] ^ shifts[d]
+        rest = sobol_points(draws, directions[1:d]) ^ shift_of_draws
+    else:
+        multipliers, own = _multipliers(d + 1), ranks.astype(jnp.uint32)
+        first = own * multipliers[0] + shifts[0]
+        last = own * multipliers[d] + shifts[d]
+        rest = draws.astype(jnp.uint32)[None] * multipliers[1:d, None] + shift_of_draws
+    strata = draw.astype(jnp.uint32) * ((2**32 // num_draws) % 2**32)
+    points = jnp.concatenate([jnp.ravel(first[:, None] // num_draws + strata)[None], rest])
+    return stored(_normal_of(points, dtype)).T, _uniform_of(last, dtype)
+
+
+def _ranks_and_shifts(
+    key: Key[Array, ""],
+    shape: tuple[int, int],
+    components: Int[Array, " n"] | None,
+    num_components: int,
+) -> tuple[Int[Array, " n"], UInt32[Array, "d #n"]]:
+    """The rank of each slot in its component, and the shift of the component's points."""
+    n, d = shape
+    ranks = jnp.arange(n, dtype=jnp.int32)
+    if components is None:
+        num_components = 1
+    shifts = stored(bits(key, (num_components, d)) >> _UNUSED, EXACT_IN_FLOAT32)
+    if components is None or num_components == 1:
+        return ranks, shifts.T << _UNUSED
+    ranks = stored(ranks - spread(first_places(components, num_components), components), n)
+    own = jnp.stack([spread(shifts[:, k], components) for k in range(d)])
+    return ranks, stored(own, EXACT_IN_FLOAT32) << _UNUSED
+
+
 def _normal_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
     """Quantiles of the standard normal at points in units of 2^-32."""
-    # The top 23 bits, at the middle of their cells, keep clear of -1 and 1 in float32 as well.
-    centred = ((points >> _UNUSED).astype(dtype) + 0.5) * jnp.array(2.0**-22, dtype) - 1
-    return normal_quantile(centred)
+    return normal_quantile(2 * _uniform_of(points, dtype) - 1)
+
+
+def _uniform_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:
+    """Points in units of 2^-32 as numbers in (0, 1)."""
+    # The top 23 bits, at the middle of their cells, keep clear of 0 and 1 in float32 as well.
+    return ((points >> _UNUSED).astype(dtype) + 0.5) * jnp.array(2.0**-23, dtype)
 
 
 def stratified_uniform(key: Key[Array, ""], num_points: int) -> Float[Array, " n"]:

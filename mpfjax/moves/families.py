@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import check_type, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
-from mpfjax.models.noise import draw_noise
+from mpfjax.models.noise import draw_family_noise, noise_dtype
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation import Propagate
 from mpfjax.operations.generator import split, uniform
@@ -27,8 +27,9 @@ class PropagateFamilies(AbstractPropagation):
     weights: Ẑ is that of K N particles, and unbiased. The model is evaluated K N times, but only N
     particles are resampled, sorted and regrouped.
 
-    - `propagate`: the `Propagate` that draws. With its noise "rqmc" the draws of a component are
-      one point set, over its slots and their draws.
+    - `propagate`: the `Propagate` that draws. With its noise "rqmc" or "stratified" the draws of a
+      family fill K strata of the first dimension of the noise, and one more dimension of the same
+      point set says which of them is kept. So what is kept is spread over slot and noise as well.
     - `num_draws`: K.
 
     Raises `ValueError` for K < 1, and for gradient "stop", which knows nothing of the draw that was
@@ -49,14 +50,13 @@ class PropagateFamilies(AbstractPropagation):
     ) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
         n, k = mixture.num_particles, self.num_draws
-        key_draws, key_kept = split(key, 2)
-        families = self.propagate(key_draws, _repeated(mixture, k), observation)
+        families, shares = self._drawn(key, mixture, observation)
         log_weights = families.log_weights.reshape(n, k)
         largest = jnp.max(log_weights, axis=1, keepdims=True)
         largest = jnp.where(largest > -jnp.inf, largest, 0.0)
         weights = jnp.exp(log_weights - largest)
         upto = jnp.cumsum(jax.lax.stop_gradient(weights), axis=1)
-        shares = self._shares(key_kept, mixture).astype(upto.dtype)
+        shares = shares.astype(upto.dtype)
         # The last is left out: rounding must not keep a draw that is not there.
         kept = jnp.sum(upto[:, :-1] <= shares[:, None] * upto[:, -1:], axis=1, dtype=jnp.int32)
         places = jnp.arange(n, dtype=jnp.int32) * k + kept
@@ -70,14 +70,22 @@ class PropagateFamilies(AbstractPropagation):
         """One draw of x_t for each particle: without an observation all weigh the same."""
         return self.propagate.predict(key, mixture)
 
-    def _shares(self, key: Key[Array, ""], mixture: ParticleMixture) -> Float[Array, " n"]:
-        """A uniform number for each slot, spread over a component's slots where the noise is."""
-        n, dtype = mixture.num_particles, mixture.log_weights.dtype
-        if self.propagate.noise == "independent":
-            return uniform(key, (n,), dtype)
-        labels, num_components = mixture.component_indicators, mixture.num_components
-        noise = draw_noise(self.propagate.noise, key, (n, 1), dtype, labels, num_components)
-        return jax.scipy.special.ndtr(noise[:, 0])
+    def _drawn(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> tuple[ParticleMixture, Float[Array, " n"]]:
+        """The weighed mixture of all draws, and by which uniform number each particle keeps one."""
+        n, k, propagate = mixture.num_particles, self.num_draws, self.propagate
+        repeated = _repeated(mixture, k)
+        if propagate.noise == "independent":
+            key_draws, key_kept = split(key, 2)
+            shares = uniform(key_kept, (n,), mixture.log_weights.dtype)
+            return propagate(key_draws, repeated, observation), shares
+        shape, dtype = (n, propagate.noise_dimension(mixture)), noise_dtype(mixture.particles)
+        noise, shares = draw_family_noise(
+            propagate.noise, key, shape, k, dtype,
+            mixture.component_indicators, mixture.num_components,
+        )  # fmt: skip
+        return propagate.from_noise(noise, repeated, observation), shares
 
 
 def _repeated(mixture: ParticleMixture, num_draws: int) -> ParticleMixture:

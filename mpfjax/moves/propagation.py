@@ -72,15 +72,31 @@ class Propagate(AbstractPropagation):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
+        if self.noise != "independent":
+            noise = _noise(self.noise, key, self.noise_dimension(mixture), mixture)
+            return self.from_noise(noise, mixture, observation)
         if self.proposal is None:
             return _weigh(self.model, self.predict(key, mixture), observation)
-        previous = mixture.particles
-        states, log_density = self._propose(key, mixture, observation)
-        check_moved(states, previous, self.proposal, "propose")
-        if self.gradient == "stop":
-            states, log_density = jax.lax.stop_gradient((states, log_density))
-        log_ratio = log_transition(self.model, states, previous) - log_density
-        return _weigh(self.model, mixture.replace(particles=states), observation, log_ratio)
+        drawn = self.proposal.propose(key, observation, mixture.particles)
+        return self._weighed(drawn, mixture, observation)
+
+    def from_noise(
+        self, noise: Float[Array, "n k"], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """The same with x_t made of this noise, a row for each slot."""
+        if self.proposal is None:
+            moved = _made_of(noise, self.model, mixture, self.gradient)
+            return _weigh(self.model, moved, observation)
+        proposal: Any = self.proposal
+        drawn = proposal.propose_from_noise(noise, observation, mixture.particles)
+        return self._weighed(drawn, mixture, observation)
+
+    def noise_dimension(self, mixture: ParticleMixture) -> int:
+        """k, of how many standard normal numbers x_t is made."""
+        if self.proposal is None:
+            return cast(HasTransitionNoise, self.model).noise_dimension
+        proposal: Any = self.proposal
+        return proposal.noise_dimension(mixture.particles)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
@@ -89,17 +105,19 @@ class Propagate(AbstractPropagation):
         noise = self.noise if spreads else "independent"
         return predict(key, self.model, mixture, self.gradient, noise)
 
-    def _propose(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> tuple[PyTree, Float[Array, " n"]]:
-        """x_t from the proposal, and its log density."""
-        proposal: Any = self.proposal
-        previous = mixture.particles
-        if self.noise == "independent":
-            return proposal.propose(key, observation, previous)
-        dimension = proposal.noise_dimension(previous)
-        noise = _noise(self.noise, key, dimension, mixture)
-        return proposal.propose_from_noise(noise, observation, previous)
+    def _weighed(
+        self,
+        drawn: tuple[PyTree, Float[Array, " n"]],
+        mixture: ParticleMixture,
+        observation: PyTree,
+    ) -> ParticleMixture:
+        """The mixture of the proposal's draws, with the log density of each."""
+        (states, log_density), previous = drawn, mixture.particles
+        check_moved(states, previous, self.proposal, "propose")
+        if self.gradient == "stop":
+            states, log_density = jax.lax.stop_gradient((states, log_density))
+        log_ratio = log_transition(self.model, states, previous) - log_density
+        return _weigh(self.model, mixture.replace(particles=states), observation, log_ratio)
 
 
 class Predict(AbstractPropagation):
@@ -191,16 +209,32 @@ def predict(
     noise: str = "independent",
 ) -> ParticleMixture:
     """Draws of x_t, with the weights' derivatives times D / ⊥D where the draws have none."""
-    if noise == "independent":
-        states = model.sample_transition(key, mixture.particles)
-        check_moved(states, mixture.particles, model)
-    else:
-        maker = cast(HasTransitionNoise, model)
-        drawn = _noise(noise, key, maker.noise_dimension, mixture)
-        who = f"model: {model_name(model)}.transition_from_noise"
-        with saying(f"in {who}, of noise of shape {drawn.shape}, as noise_dimension says"):
-            states = maker.transition_from_noise(drawn, mixture.particles)
-        check_moved(states, mixture.particles, model, "transition_from_noise")
+    if noise != "independent":
+        dimension = cast(HasTransitionNoise, model).noise_dimension
+        return _made_of(_noise(noise, key, dimension, mixture), model, mixture, gradient)
+    states = model.sample_transition(key, mixture.particles)
+    check_moved(states, mixture.particles, model)
+    return _moved(states, model, mixture, gradient)
+
+
+def _made_of(
+    noise: Float[Array, "n k"],
+    model: AbstractStateSpaceModel,
+    mixture: ParticleMixture,
+    gradient: str,
+) -> ParticleMixture:
+    """The mixture of x_t made of this noise."""
+    who = f"model: {model_name(model)}.transition_from_noise"
+    with saying(f"in {who}, of noise of shape {noise.shape}, as noise_dimension says"):
+        states = cast(HasTransitionNoise, model).transition_from_noise(noise, mixture.particles)
+    check_moved(states, mixture.particles, model, "transition_from_noise")
+    return _moved(states, model, mixture, gradient)
+
+
+def _moved(
+    states: PyTree, model: AbstractStateSpaceModel, mixture: ParticleMixture, gradient: str
+) -> ParticleMixture:
+    """The mixture with these states, and the density that "stop" differentiates."""
     if gradient == "none":
         return mixture.replace(particles=states)
     states = jax.lax.stop_gradient(states)
