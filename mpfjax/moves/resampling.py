@@ -6,13 +6,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import (
+    check_callable,
     check_one_of,
     check_positive,
     check_share,
-    check_type,
     check_whole,
     given,
 )
@@ -123,7 +123,7 @@ class Resample(AbstractResampling):
                 f"allocation: {self.allocation!r} has no say where particles_per_component is"
                 f" {self.particles_per_component}"
             )
-        check_type(Callable, "a function of the states", **given(share_by=self.share_by))
+        check_callable("a function of the particles", **given(share_by=self.share_by))
         if self.share_by is not None:
             check_one_of(("equal",), allocation=self.allocation)
             if self.particles_per_component is not None:

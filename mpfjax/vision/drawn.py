@@ -27,10 +27,10 @@ def follow_boxes(
 ) -> Iterator[Tracks]:
     """Follow boxes (x, y, w, h) of the first frame by their colours: yields `Tracks`, k rows each.
 
-    Row j, with the identity j + 1, is what the recipe "objects" of `PRESETS` holds for the likeliest place
-    of box j: the mean of the heaviest of the components that stand for it. An object of which no
-    component is left has the identity 0. Nothing is detected, so that `confirmed` says whether
-    the object is held at all, and `unseen` is 0.
+    Row j, with the identity j + 1, is what the recipe "objects" of `PRESETS` holds for the
+    likeliest place of box j: the mean of the heaviest of the components that stand for it. An
+    object of which no component is left has the identity 0. Nothing is detected, so that
+    `confirmed` says whether the object is held at all, and `unseen` is 0.
 
     - `frames`: as for `track`; the boxes, top-left corner first, in pixels, lie in the first.
     - `key`: of the random numbers; None takes `jax.random.key(0)`.

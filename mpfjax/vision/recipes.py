@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, UInt8
 from mpfjax.filter import Filter
 from mpfjax.filters import mixture_particle_filter, particle_filter
 from mpfjax.models.jumps import RandomWalkWithJumps
-from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.base import AbstractMove, AbstractRegrouping
 from mpfjax.moves.exclusion import Exclusion
 from mpfjax.moves.kmeans import KMeans
 from mpfjax.moves.merge import Merge
@@ -160,7 +160,7 @@ def _started_at_the_boxes(
     return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
 
 
-def _one_component_a_box(size: np.ndarray) -> list[AbstractMove]:
+def _one_component_a_box(size: np.ndarray) -> list[AbstractRegrouping]:
     return [
         KMeans(10, reseed=True, **_apart(size)),
         Merge(None, 0.5, features=_reference),
@@ -179,7 +179,7 @@ PRESETS = {
 }
 
 
-def _centre(states: BoxState) -> Array:
+def _centre(states: BoxState | LearnedBoxState) -> Array:
     return states.box[:, :2]
 
 
@@ -187,9 +187,9 @@ def _object(states: BoxState | LearnedBoxState) -> Array:
     return states.reference
 
 
-def _reference(states: BoxState) -> Array:
+def _reference(states: BoxState | LearnedBoxState) -> Array:
     return states.reference[:, None].astype(states.box.dtype)
 
 
-def _centre_and_reference(states: BoxState) -> Array:
+def _centre_and_reference(states: BoxState | LearnedBoxState) -> Array:
     return jnp.concatenate([_centre(states), _reference(states)], axis=1)
