@@ -6,7 +6,8 @@
     python -m benchmarks.visual_tracking --sequence DIR --detect          # nobody draws a box
 
 Both filters have the same model and the same particles at the start: 200 for the PF, at most 10
-components of 20 for the MPF. Into --out DIR go an annotated video, a contact sheet as the paper's
+components of 20 for the MPF; with --preset objects more of both from four objects on. Into --out
+DIR go an annotated video, a contact sheet as the paper's
 figure 3, the tracks in MOTChallenge form, and the scores, null where there is no truth. With
 --detect, for a camera that stands still, objects are found by background subtraction: the PF
 starts at those of the first frame that has any, and in the MPF and the GM-MPF a component is born
