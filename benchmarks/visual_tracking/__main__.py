@@ -6,7 +6,8 @@
     python -m benchmarks.visual_tracking --sequence DIR --detect          # nobody draws a box
 
 Both filters have the same model and the same particles at the start: 200 for the PF, at most 10
-components of 20 for the MPF. Into --out DIR go an annotated video, a contact sheet as the paper's
+components of 20 for the MPF; with --preset objects more of both from four objects on. Into --out
+DIR go an annotated video, a contact sheet as the paper's
 figure 3, the tracks in MOTChallenge form, and the scores, null where there is no truth. With
 --detect, for a camera that stands still, objects are found by background subtraction: the PF
 starts at those of the first frame that has any, and in the MPF and the GM-MPF a component is born
@@ -35,9 +36,9 @@ from mpfjax.console import exit_status, seed, whole, write_json
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision.recipes import (
     MAX_COMPONENTS,
-    NUM_PARTICLES,
     PARTICLES_PER_COMPONENT,
     PRESETS,
+    room_for,
 )
 from mpfjax.vision.snapshots import Snapshot, follow, track_rows
 
@@ -149,6 +150,9 @@ def track(
 
 
 def _write_scores(options, source: Source, num_frames: int, results) -> None:
+    components = MAX_COMPONENTS
+    if options.preset == "objects" and not options.detect:
+        components = room_for(len(source.boxes))
     settings = {
         "source": source.name,
         "preset": options.preset,
@@ -158,8 +162,8 @@ def _write_scores(options, source: Source, num_frames: int, results) -> None:
         "ids": None if source.truth is None else np.unique(source.truth[:, 1]).astype(int).tolist(),
         "seed": options.seed,
         "seeds": options.seeds,
-        "num_particles": NUM_PARTICLES,
-        "max_components": MAX_COMPONENTS,
+        "num_particles": PARTICLES_PER_COMPONENT * components,
+        "max_components": components,
         "particles_per_component": PARTICLES_PER_COMPONENT,
     }
     write_json(options.out / "visual_tracking.json", {"settings": settings, "results": results})

@@ -1,13 +1,15 @@
 """Resampling within components: systematic, stratified, multinomial, residual or SSP."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import (
+    check_callable,
     check_one_of,
     check_positive,
     check_share,
@@ -58,6 +60,10 @@ class Resample(AbstractResampling):
       independent particles give the mass of m, times k_m^(1/2): for a sum of such masses, these
       numbers leave the least variance (Neyman 1934). Each living component has at least a tenth of
       an equal share. Use it where components of little mass hold slots that others need.
+    - `share_by`: a function that gives each particle the whole number of its group, the same within
+      a component. Groups with a component that is resampled share the slots equally, and so do the
+      components within a group. None makes no groups. Use it where components are rival hypotheses
+      about several objects, so that an object with many does not take the slots of the others.
     - `sort_by`: a function that gives each particle a number, (n,), or several, (n, d). Within
       their component the particles are resampled in the order of these numbers. Several numbers,
       up to 8, are standardised within the component, and the order is that along a Hilbert curve
@@ -103,6 +109,7 @@ class Resample(AbstractResampling):
     softness: float = eqx.field(static=True, default=0.5)
     regularisation: float = eqx.field(static=True, default=0.5)
     allocation: str = eqx.field(static=True, default="equal")
+    share_by: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
         check_one_of(SCHEMES, scheme=self.scheme)
@@ -116,6 +123,14 @@ class Resample(AbstractResampling):
                 f"allocation: {self.allocation!r} has no say where particles_per_component is"
                 f" {self.particles_per_component}"
             )
+        check_callable("a function of the particles", **given(share_by=self.share_by))
+        if self.share_by is not None:
+            check_one_of(("equal",), allocation=self.allocation)
+            if self.particles_per_component is not None:
+                raise ValueError(
+                    "share_by: groups have no say where particles_per_component is"
+                    f" {self.particles_per_component}"
+                )
         check_positive(softness=self.softness, regularisation=self.regularisation)
         check_share(softness=self.softness)
         if self.gradient == "ot":
@@ -212,6 +227,8 @@ class Resample(AbstractResampling):
             weights, _ = scaled_exp(mixture.log_weights)
             sizes = mixture.component_counts.astype(weights.dtype)
             demands = jnp.sqrt(sizes * mixture.component_sums(weights**2))
+        elif self.share_by is not None:
+            demands = _shares_of_groups(mixture, self.share_by(mixture.particles), due)
         return deal_slots(counts, due, mixture, self.particles_per_component, demands)
 
     def _drawn_from(self, mixture: ParticleMixture) -> ParticleMixture:
@@ -246,6 +263,15 @@ class Resample(AbstractResampling):
         return redrawn.replace(
             particles=particles, ancestor_indices=take(mixture.ancestor_indices, nearest)
         )
+
+
+def _shares_of_groups(
+    mixture: ParticleMixture, groups: Int[Array, " n"], due: Bool[Array, " m"]
+) -> Float[Array, " m"]:
+    """One over the number of components of the same group that share with each."""
+    group = jnp.round(mixture.component_averages(groups)).astype(jnp.int32)
+    rivals = jnp.sum((group[:, None] == group[None]) & due[None], axis=1)
+    return 1 / jnp.maximum(rivals, 1).astype(mixture.log_weights.dtype)
 
 
 class _Drawn(NamedTuple):

@@ -26,6 +26,9 @@ from mpfjax.vision.joint_colour import object_boxes as object_boxes
 from mpfjax.vision.joint_colour import with_lambda as with_lambda
 from mpfjax.vision.labels import boxes_around as boxes_around
 from mpfjax.vision.labels import labelled_states as labelled_states
+from mpfjax.vision.learned_colours import LearnedBoxState as LearnedBoxState
+from mpfjax.vision.learned_colours import LearnedColourModel as LearnedColourModel
+from mpfjax.vision.learned_colours import LearnLooks as LearnLooks
 from mpfjax.vision.loop import make_tracker as make_tracker
 from mpfjax.vision.loop import offline_rows as offline_rows
 from mpfjax.vision.loop import online_rows as online_rows

@@ -271,17 +271,32 @@ class ColourModel(AbstractBoxModel):
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
     ) -> Float[Array, " n"]:
         """-(Σ_c B² - contrast Σ_c B²_around) / 2σ², each B² averaged over the bands."""
-        num_parts = self.references.shape[1]
-        observation = self._counted(observation)
-        distances = self.squared_distances(observation, states)
-        if self.contrast > 0:
-            boxes = self.boxes(states)
-            wide = boxes * jnp.array([[1.0, 1.0, _SURROUND, 1.0]], boxes.dtype)
-            sides = observation.counts(wide, num_parts) - observation.counts(boxes, num_parts)
-            uncounted = jnp.isnan(sides[:, 0, 0, 0])
-            around = jnp.where(uncounted, 0.0, self._to_reference(sides, states))
-            distances -= self.contrast * around
+        counts, sides = self.counts(observation, states)
+        weights, references = self._own(counts, states)
+        distances = self._contrasted(counts, sides, weights, references)
         return -0.5 * distances / self.sigma**2
+
+    def counts(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
+    ) -> tuple[Float[Array, "n parts channels bins"], Float[Array, "n parts channels bins"] | None]:
+        """Pixels of each colour in each box, and at its sides if there is a `contrast`."""
+        num_parts = self.references.shape[1]
+        observation, boxes = self._counted(observation), self.boxes(states)
+        counts = observation.counts(boxes, num_parts)
+        if self.contrast == 0:
+            return counts, None
+        wide = boxes * jnp.array([[1.0, 1.0, _SURROUND, 1.0]], boxes.dtype)
+        return counts, observation.counts(wide, num_parts) - counts
+
+    def contrasted(
+        self,
+        counts: Float[Array, "n parts channels bins"],
+        sides: Float[Array, "n parts channels bins"] | None,
+        states: BoxState,
+        references: Float[Array, "n parts channels bins"],
+    ) -> Float[Array, " n"]:
+        """Σ_c B² - contrast Σ_c B²_around of counted boxes, from references of their own."""
+        return self._contrasted(counts, sides, self.colour_weights[states.reference], references)
 
     def prepare_observation(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"]
@@ -296,24 +311,42 @@ class ColourModel(AbstractBoxModel):
         number of channels.
         """
         counts = self._counted(observation).counts(self.boxes(states), self.references.shape[1])
-        return self._to_reference(counts, states)
+        return _distances(counts, *self._own(counts, states))
 
     def _counted(self, observation: IntegralHistogram | UInt8[Array, "h w 3"]) -> IntegralHistogram:
         if isinstance(observation, IntegralHistogram):
             return observation
         return integral_histogram(observation, self.colours, self.wide_counts)
 
-    def _to_reference(
-        self, counts: Float[Array, "n parts channels bins"], states: BoxState
+    def _contrasted(
+        self, counts: Array, sides: Array | None, weights: Array, references: Array
     ) -> Float[Array, " n"]:
+        distances = _distances(counts, weights, references)
+        if sides is None:
+            return distances
+        uncounted = jnp.isnan(sides[:, 0, 0, 0])
+        around = jnp.where(uncounted, 0.0, _distances(sides, weights, references))
+        return distances - self.contrast * around
+
+    def _own(self, counts: Array, states: BoxState) -> tuple[Array, Array]:
+        """The weights and the references of the particles."""
         weights, references = self.colour_weights, self.references
         # With one reference, a gather of it costs more than the distance. Only under vmap, where
         # each particle has a model of its own, the two gathers fuse.
         if references.shape[0] > 1 or counts.shape[0] == 1:
             weights, references = weights[states.reference], references[states.reference]
-        histograms = normalise(counts, weights)
-        distances = bhattacharyya(histograms, jnp.broadcast_to(references, histograms.shape))
-        return jnp.mean(jnp.sum(distances, axis=2), axis=1)
+        return weights, references
+
+
+def _distances(
+    counts: Float[Array, "n parts channels bins"],
+    weights: Float[Array, "#n parts channels bins"],
+    references: Float[Array, "#n parts channels bins"],
+) -> Float[Array, " n"]:
+    """Σ_c B² of counted colours from references, averaged over the bands."""
+    histograms = normalise(counts, weights)
+    distances = bhattacharyya(histograms, jnp.broadcast_to(references, histograms.shape))
+    return jnp.mean(jnp.sum(distances, axis=2), axis=1)
 
 
 def positive_deviations(deviations: Any, num_boxes: int) -> np.ndarray:

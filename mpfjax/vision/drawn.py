@@ -15,7 +15,7 @@ from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision.frames import of_one_kind
 from mpfjax.vision.object_moves import best_components
-from mpfjax.vision.recipes import drawn_filter
+from mpfjax.vision.recipes import objects_filters
 from mpfjax.vision.tracker import Tracks
 
 
@@ -27,10 +27,10 @@ def follow_boxes(
 ) -> Iterator[Tracks]:
     """Follow boxes (x, y, w, h) of the first frame by their colours: yields `Tracks`, k rows each.
 
-    Row j, with the identity j + 1, is what the recipe `drawn_filter` holds for the likeliest place
-    of box j: the mean of the heaviest of the components that stand for it. An object of which no
-    component is left has the identity 0. Nothing is detected, so that `confirmed` says whether
-    the object is held at all, and `unseen` is 0.
+    Row j, with the identity j + 1, is what the recipe "objects" of `PRESETS` holds for the
+    likeliest place of box j: the mean of the heaviest of the components that stand for it. An
+    object of which no component is left has the identity 0. Nothing is detected, so that
+    `confirmed` says whether the object is held at all, and `unseen` is 0.
 
     - `frames`: as for `track`; the boxes, top-left corner first, in pixels, lie in the first.
     - `key`: of the random numbers; None takes `jax.random.key(0)`.
@@ -51,7 +51,7 @@ def _followed(stills: Iterator[np.ndarray], boxes: np.ndarray, key: Array) -> It
     first = next(stills, None)
     if first is None:
         return
-    filter = drawn_filter(first, boxes)
+    filter = objects_filters(first, boxes)["mpf"]
     mixture = filter.init(key)
     for t, still in enumerate(itertools.chain([first], stills)):
         step_key = jax.random.fold_in(key, t)

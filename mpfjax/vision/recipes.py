@@ -2,7 +2,8 @@
 
 Each recipe takes the first frame and a box for each object. It returns two filters with the same
 model and the same particles at the start: a particle filter of 200 particles, and a mixture
-particle filter of at most 10 components of 20. `PRESETS` has the recipes by name.
+particle filter of at most 10 components of 20. Of more than three objects, "objects" has more of
+both, see `room_for`. `PRESETS` has the recipes by name.
 """
 
 from typing import Any
@@ -14,7 +15,7 @@ from jaxtyping import Array, Float, UInt8
 from mpfjax.filter import Filter
 from mpfjax.filters import mixture_particle_filter, particle_filter
 from mpfjax.models.jumps import RandomWalkWithJumps
-from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.base import AbstractMove, AbstractRegrouping
 from mpfjax.moves.exclusion import Exclusion
 from mpfjax.moves.kmeans import KMeans
 from mpfjax.moves.merge import Merge
@@ -23,9 +24,11 @@ from mpfjax.moves.resampling import Resample
 from mpfjax.moves.split import Split
 from mpfjax.vision.colour_model import BoxState, ColourModel
 from mpfjax.vision.colours import RGBColours
+from mpfjax.vision.learned_colours import LearnedBoxState, LearnedColourModel, LearnLooks
 from mpfjax.vision.object_moves import ObjectExclusion, PruneHypotheses
 
 NUM_PARTICLES, MAX_COMPONENTS, PARTICLES_PER_COMPONENT = 200, 10, 20
+HYPOTHESES = 3
 
 
 def paper_filters(
@@ -57,16 +60,7 @@ def default_filters(
     """
     size = boxes[:, 2:].mean(axis=0)
     steps = _steps(boxes)
-    model = _own_references(
-        frame,
-        boxes,
-        colours=RGBColours(16),
-        sigma=0.2,
-        num_parts=8,
-        contrast=0.25,
-        switch_probability=0.05,
-        dynamics=RandomWalkWithJumps(steps, steps * np.array([6.0, 6.0, 1.0, 1.0]), 0.05),
-    )
+    model = _own_references(frame, boxes, steps, jump_probability=0.05, switch_probability=0.05)
     where: dict[str, Any] = {"features": _centre, "scale": size}
     moves = [
         Exclusion(strength=4.0, radius=0.5, **where),
@@ -81,34 +75,64 @@ def objects_filters(
 ) -> dict[str, Filter]:
     """The recipe with the fewest strays and swaps: every component keeps to its object.
 
-    Every particle is compared only with the box that it started from. So the components of an
-    object are rival hypotheses about it. Only components of one object merge, a component splits
-    where hypotheses diverge, and hopeless ones are pruned. Objects exclude each other.
+    Every particle is compared only with the box that it started from, and learns how its object
+    looks now. So the components of an object are rival hypotheses about it. It may be hidden, and
+    then they wait. Only components of one object merge, a component splits where hypotheses
+    diverge, and hopeless ones are pruned. Objects exclude each other. They share the particles
+    equally: 200, and from four objects on 60 for each object.
     """
-    return _objects(frame, boxes, MAX_COMPONENTS)
-
-
-def drawn_filter(frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]) -> Filter:
-    """The MPF of `objects_filters`, with room for two hypotheses about each of many boxes."""
-    return _objects(frame, boxes, max(MAX_COMPONENTS, 2 * len(boxes)))["mpf"]
-
-
-def _objects(frame: np.ndarray, boxes: np.ndarray, num_components: int) -> dict[str, Filter]:
     size = boxes[:, 2:].mean(axis=0)
-    model = _own_references(frame, boxes, sigma=0.15, num_parts=5, contrast=0.25)
+    steps = _steps(boxes) * np.array([0.6, 1.0, 1.0, 1.0])
+    model = LearnedColourModel(_own_references(frame, boxes, steps, jump_probability=0.1))
     apart = _apart(size)
-    moves = [
-        ObjectExclusion(strength=3.0, radius=0.5, scale=(float(size[0]), float(size[1]))),
-        Merge(None, 0.25, patience=10, **apart),
-        PruneHypotheses(least_share=1e-6),
-        Split(4.0, 0.5, min_share=0.15, **apart),
-    ]
-    return _started_at_the_boxes(model, moves, size, num_components)
+    learn = LearnLooks(model)
+    num_components = room_for(len(boxes))
+    num_particles = PARTICLES_PER_COMPONENT * num_components
+    mixture = Filter(
+        model,
+        moves=[
+            Resample(share_by=_object),
+            Propagate(model),
+            ObjectExclusion(strength=3.0, radius=0.5, scale=(float(size[0]), float(size[1]))),
+            learn,
+            Merge(None, 0.25, patience=10, **apart),
+            PruneHypotheses(least_share=1e-15),
+            Split(4.0, 0.5, min_share=0.15, **apart),
+        ],
+        num_particles=num_particles,
+        num_components=num_components,
+        initial_moves=_one_component_a_box(size),
+    )
+    alone = Filter(model, moves=[Resample(), Propagate(model), learn], num_particles=num_particles)
+    return {"pf": alone, "mpf": mixture}
 
 
-def _own_references(frame: np.ndarray, boxes: np.ndarray, **options: Any) -> ColourModel:
+def room_for(num_objects: int) -> int:
+    """The most components of `objects_filters`: three hypotheses about each of many objects."""
+    return max(MAX_COMPONENTS, HYPOTHESES * num_objects)
+
+
+def _own_references(
+    frame: np.ndarray,
+    boxes: np.ndarray,
+    steps: np.ndarray,
+    *,
+    jump_probability: float,
+    switch_probability: float = 0.0,
+) -> ColourModel:
+    """Each box is a reference; some steps are six times as long, though sizes never jump."""
+    long_steps = steps * np.array([6.0, 6.0, 1.0, 1.0])
     return ColourModel.from_frame(
-        frame, boxes, deviations=_steps(boxes), weigh_colours=True, **options
+        frame,
+        boxes,
+        colours=RGBColours(16),
+        sigma=0.2,
+        deviations=steps,
+        dynamics=RandomWalkWithJumps(steps, long_steps, jump_probability),
+        num_parts=8,
+        weigh_colours=True,
+        switch_probability=switch_probability,
+        contrast=0.25,
     )
 
 
@@ -119,10 +143,7 @@ def _steps(boxes: np.ndarray) -> np.ndarray:
 
 
 def _started_at_the_boxes(
-    model: ColourModel,
-    moves: list[AbstractMove],
-    size: np.ndarray,
-    num_components: int = MAX_COMPONENTS,
+    model: ColourModel, moves: list[AbstractMove], size: np.ndarray
 ) -> dict[str, Filter]:
     """Both filters; the mixture starts with one component for each box."""
     mixture = Filter(
@@ -132,14 +153,18 @@ def _started_at_the_boxes(
             Propagate(model),
             *moves,
         ],
-        num_particles=PARTICLES_PER_COMPONENT * num_components,
-        num_components=num_components,
-        initial_moves=[
-            KMeans(10, reseed=True, **_apart(size)),
-            Merge(None, 0.5, features=_reference),
-        ],
+        num_particles=NUM_PARTICLES,
+        num_components=MAX_COMPONENTS,
+        initial_moves=_one_component_a_box(size),
     )
     return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
+
+
+def _one_component_a_box(size: np.ndarray) -> list[AbstractRegrouping]:
+    return [
+        KMeans(10, reseed=True, **_apart(size)),
+        Merge(None, 0.5, features=_reference),
+    ]
 
 
 def _apart(size: np.ndarray) -> dict[str, Any]:
@@ -154,13 +179,17 @@ PRESETS = {
 }
 
 
-def _centre(states: BoxState) -> Array:
+def _centre(states: BoxState | LearnedBoxState) -> Array:
     return states.box[:, :2]
 
 
-def _reference(states: BoxState) -> Array:
+def _object(states: BoxState | LearnedBoxState) -> Array:
+    return states.reference
+
+
+def _reference(states: BoxState | LearnedBoxState) -> Array:
     return states.reference[:, None].astype(states.box.dtype)
 
 
-def _centre_and_reference(states: BoxState) -> Array:
+def _centre_and_reference(states: BoxState | LearnedBoxState) -> Array:
     return jnp.concatenate([_centre(states), _reference(states)], axis=1)

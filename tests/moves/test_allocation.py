@@ -84,6 +84,38 @@ def test_fewer_slots_than_components_fill_up_all_the_same(n):
     assert (found >= np.asarray(mixture.active)).all()
 
 
+def group(states):
+    return states[:, 0].astype(jnp.int32)
+
+
+@pytest.mark.parametrize(
+    ("groups", "expected"),
+    [((0, 0, 1), [30, 30, 60]), ((0, 1, 0), [30, 60, 30]), ((4, 4, 4), [40, 40, 40])],
+)
+def test_groups_share_equally_and_so_do_the_components_of_a_group(groups, expected):
+    mixture = three_components((0.9, 0.01, 0.09), (1.0, 2.0, 0.0))
+    labels = jnp.asarray(groups, jnp.float32)[mixture.component_indicators]
+    found = dealt(mixture.replace(particles=labels[:, None]), Resample(share_by=group))
+    # A tenth of an equal share over all is dealt first.
+    np.testing.assert_allclose(found, expected, atol=2)
+    assert found.sum() == 120
+
+
+def test_a_dead_component_takes_nothing_from_its_group():
+    mixture = three_components((0.5, 0.3, 0.2), (1.0, 1.0, 1.0))
+    labels = jnp.asarray((0.0, 0.0, 1.0))[mixture.component_indicators]
+    log_weights = jnp.where(mixture.component_indicators == 1, -jnp.inf, mixture.log_weights)
+    alive = mixture.replace(particles=labels[:, None], log_weights=log_weights)
+    np.testing.assert_allclose(dealt(alive, Resample(share_by=group)), [60, 0, 60], atol=1)
+
+
+def test_groups_that_would_have_no_say_are_refused():
+    with pytest.raises(ValueError, match=r"share_by.*particles_per_component is 5"):
+        Resample(particles_per_component=5, share_by=group)
+    with pytest.raises(ValueError, match="allocation"):
+        Resample(allocation="variance", share_by=group)
+
+
 def test_an_allocation_beside_a_fixed_number_or_of_an_unknown_name_is_refused():
     with pytest.raises(ValueError, match=r"allocation: 'variance'.*particles_per_component is 5"):
         Resample(particles_per_component=5, allocation="variance")

@@ -21,7 +21,8 @@ COLOUR = {"frame": "array", "boxes": "rows", "sigma": "positive", "num_parts": "
 def built(name):
     if name == "joint":
         return vision.joint_colour_model(FRAME, BOXES)
-    return vision.ColourModel.from_frame(FRAME, BOXES, colours=vision.RGBColours(4))
+    model = vision.ColourModel.from_frame(FRAME, BOXES, colours=vision.RGBColours(4))
+    return vision.LearnedColourModel(model) if name == "learned" else model
 
 
 def late(function, **builds):
@@ -177,6 +178,16 @@ TABLE = {
          "most_pixels": "count", "background_share": "inner share",
          "shadow_brightness": "inner share?", "cut_depth": "inner share", "largest_gap": "share",
          "area": "range", "aspect": "range?"},
+    ),
+    "LearnedColourModel": (
+        late(vision.LearnedColourModel, colour_model="colour"),
+        {},
+        {"colour_model": "kind", "anchor": "share", "hidden_distance": "positive"},
+    ),
+    "LearnLooks": (
+        late(vision.LearnLooks, model="learned"),
+        {},
+        {"model": "kind", "rate": "share"},
     ),
     "PruneHypotheses": (vision.PruneHypotheses, {}, {"least_share": "inner share"}),
     "ObjectTracker": (

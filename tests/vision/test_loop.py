@@ -12,7 +12,7 @@ from mpfjax.vision.detectors import LEAST_ROOM, MOST_ROOM, Rows
 from mpfjax.vision.drawn import follow_boxes
 from mpfjax.vision.loop import make_tracker, offline_rows, online_rows
 from mpfjax.vision.object_moves import best_components
-from mpfjax.vision.recipes import drawn_filter
+from mpfjax.vision.recipes import objects_filters
 from mpfjax.vision.tracker import LONGEST_GUESS
 
 SHAPE = (48, 64, 3)
@@ -342,10 +342,10 @@ def test_drawn_boxes_give_one_track_each_in_the_order_given():
 
 
 @pytest.mark.thorough
-def test_more_boxes_than_the_recipes_have_components_have_one_each():
+def test_of_many_boxes_each_has_a_component():
     corners = np.stack(np.meshgrid([2.0, 18, 34, 50], [1.0, 17, 33]), axis=-1).reshape(-1, 2)
     boxes = np.concatenate([corners, np.tile([10.0, 14.0], (12, 1))], axis=1)
-    mixture = drawn_filter(stills()[0], boxes).init(jax.random.key(0))
+    mixture = objects_filters(stills()[0], boxes)["mpf"].init(jax.random.key(0))
     best, held = best_components(mixture, 12)
     assert held.all()
     assert len(set(best.tolist())) == 12

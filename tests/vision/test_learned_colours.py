@@ -1,0 +1,97 @@
+"""Colours that are learned on the way: by hand, and in a scene where an object hides."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpfjax.mixture import single_component
+from mpfjax.vision import (
+    BoxState,
+    ColourModel,
+    LearnedBoxState,
+    LearnedColourModel,
+    LearnLooks,
+    RGBColours,
+)
+
+RNG = np.random.default_rng(0)
+FIRST, NOW = (RNG.integers(0, 256, (40, 50, 3), dtype=np.uint8) for _ in range(2))
+BOXES = np.array([[5.0, 5, 10, 20], [20, 10, 10, 15]])
+BINS = 4
+
+
+def colour_model(contrast=0.0):
+    return ColourModel.from_frame(
+        FIRST, BOXES, colours=RGBColours(BINS), sigma=0.5, contrast=contrast
+    )
+
+
+def states_of(model, xs=(10.0, 12.0, 25.0), references=(0, 0, 1)):
+    box = jnp.asarray([[x, 16.0, 1.0, 1.0] for x in xs], jnp.float32)
+    reference = jnp.asarray(references, jnp.int32)
+    return LearnedBoxState(box, reference, None, model.references[reference])
+
+
+def counted(frame, x, y, w, h):
+    """Histograms (channels, bins) of a box about (x, y), pixel by pixel."""
+    rows, columns = slice(int(y - h / 2), int(y + h / 2)), slice(int(x - w / 2), int(x + w / 2))
+    pixels = frame[rows, columns].reshape(-1, 3) // (256 // BINS)
+    counts = np.stack([np.bincount(pixels[:, c], minlength=BINS) for c in range(3)])
+    return counts / counts.sum(axis=1, keepdims=True)
+
+
+def squared(first, second):
+    return np.sum(1 - np.sum(np.sqrt(first * second), axis=1))
+
+
+def by_hand(anchor, hidden, rate):
+    """log L and the new looks of the first particle, which stands where box 0 was."""
+    first, now = counted(FIRST, 10, 15, 10, 20), counted(NOW, 10, 16, 10, 20)
+    # Its looks are already those of the other box.
+    looks = counted(FIRST, 25, 17.5, 10, 15)
+    distance = anchor * squared(first, now) + (1 - anchor) * squared(looks, now)
+    seen, unseen = np.exp(-0.5 * distance / 0.25), np.exp(-0.5 * hidden / 0.25)
+    share = rate * seen / (seen + unseen)
+    return np.log(seen + unseen), looks + share * (now - looks)
+
+
+@pytest.mark.parametrize(("anchor", "hidden", "rate"), [(0.3, 0.4, 0.5), (0.0, 1.0, 1.0)])
+def test_the_likelihood_and_what_is_learned_by_hand(anchor, hidden, rate):
+    inner = colour_model()
+    model = LearnedColourModel(inner, anchor=anchor, hidden_distance=hidden)
+    states = states_of(inner)
+    looks = states.looks.at[0].set(inner.references[1])
+    states = LearnedBoxState(states.box, states.reference, None, looks)
+    log_likelihood, learned = by_hand(anchor, hidden, rate)
+    frame = jnp.asarray(NOW)
+    np.testing.assert_allclose(model.log_likelihood(frame, states)[0], log_likelihood, atol=1e-4)
+    mixture = single_component(states)
+    moved = LearnLooks(model, rate)(jax.random.key(0), mixture, frame)
+    np.testing.assert_allclose(moved.particles.looks[0, 0], learned, atol=1e-4)
+    np.testing.assert_array_equal(moved.log_weights, mixture.log_weights)
+    np.testing.assert_array_equal(moved.particles.box, states.box)
+
+
+def test_with_nothing_learned_and_nothing_hidden_it_is_the_colour_model():
+    inner = colour_model(contrast=0.25)
+    model = LearnedColourModel(inner, anchor=0.5, hidden_distance=1e3)
+    states, frame = states_of(inner), jnp.asarray(NOW)
+    bare = BoxState(states.box, states.reference)
+    expected = inner.log_likelihood(frame, bare)
+    np.testing.assert_allclose(model.log_likelihood(frame, states), expected, rtol=1e-5)
+
+
+def test_outside_the_frame_nothing_is_learned_and_the_object_is_hidden():
+    inner = colour_model()
+    model = LearnedColourModel(inner, hidden_distance=0.1)
+    states, frame = states_of(inner, xs=(-500.0, np.nan, 10.0)), jnp.asarray(NOW)
+    learned = model.learned(frame, states, 1.0)
+    np.testing.assert_array_equal(learned.looks[:2], states.looks[:2])
+    assert not np.allclose(learned.looks[2], states.looks[2])
+    hidden = -0.5 * 0.1 / 0.5**2
+    assert model.log_likelihood(frame, states)[0] == pytest.approx(hidden, abs=0.01)
+
+
+def test_it_says_that_it_is_approximate():
+    assert LearnLooks(LearnedColourModel(colour_model())).approximate
