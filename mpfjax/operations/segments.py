@@ -11,6 +11,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mpfjax.operations.floats import default_float
@@ -35,6 +36,8 @@ _FEW_COLUMNS = 9
 # In float32, a million equal numbers, added one after the other, give a thousandth too much.
 _LONGEST_SUM = 2**10
 _COUNTED_BLOCK = 32
+# Which segments are there is kept in the bits of so many words at most.
+_WORD, _MOST_WORDS = 32, 8
 _MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # eight counts for each particle
 
 
@@ -86,6 +89,22 @@ def segment_max(
         return _scattered("max", values, segments, num_segments, -jnp.inf)
     member = _members(segments, num_segments)
     return jnp.max(jnp.where(member, values[None], jnp.array(-jnp.inf, values.dtype)), axis=1)
+
+
+def segment_any(
+    mask: Bool[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Bool[Array, " num_segments"]:
+    """Which segments have a masked entry; labels are in [0, num_segments)."""
+    if num_segments > _MOST_WORDS * _WORD:
+        return _scattered("max", mask.astype(jnp.int32), segments, num_segments, 0) > 0
+    bits = jnp.uint32(1) << (segments % _WORD).astype(jnp.uint32)
+    words = []
+    for word in range(-(-num_segments // _WORD)):
+        own = jnp.where(mask & (segments // _WORD == word), bits, jnp.uint32(0))
+        words.append(jax.lax.reduce(own, np.uint32(0), jax.lax.bitwise_or, (0,)))
+    label = np.arange(num_segments)
+    shifts = jnp.asarray(label % _WORD, jnp.uint32)
+    return (jnp.stack(words)[label // _WORD] >> shifts) & 1 > 0
 
 
 def segment_counts(
