@@ -5,13 +5,13 @@ segment's first and last block is all its own, so its sum is taken as it is. Onl
 last block the entries are looked at. There is no scatter, and nothing is recomputed.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mpfjax.operations.indexing import take
+from mpfjax.operations.segments import REDUCTIONS, segment_reduce
 from mpfjax.operations.stored import block_size, stored, whole_blocks
 
 
@@ -24,42 +24,39 @@ class Runs(NamedTuple):
 
     def sums(self, values: Float[Array, " p"]) -> Float[Array, " m"]:
         """The sum of each segment's values."""
-        return self._reduced(values, jnp.sum, 0.0)
+        return self._reduced("add", values, 0.0)
 
     def maxima(self, values: Float[Array, " p"]) -> Float[Array, " m"]:
         """The largest value of each segment, -inf for an empty one."""
-        return self._reduced(values, jnp.max, -jnp.inf)
+        return self._reduced("max", values, -jnp.inf)
 
     def extents(self, mask: Bool[Array, " p"]) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
         """The first and the last masked place of each segment; some place where it has none."""
         places = jnp.arange(mask.shape[0], dtype=jnp.int32)
         last = mask.shape[0] - 1
-        firsts = self._reduced(jnp.where(mask, places, last), jnp.min, last)
-        lasts = self._reduced(jnp.where(mask, places, 0), jnp.max, 0)
-        return firsts, lasts
+        firsts = self._reduced("min", jnp.where(mask, places, last), last)
+        return firsts, self._reduced("max", jnp.where(mask, places, 0), 0)
 
     def _reduced(
-        self, values: Shaped[Array, " p"], reduce: Callable[..., Array], nothing: float
+        self, how: str, values: Shaped[Array, " p"], nothing: float
     ) -> Shaped[Array, " m"]:
-        blocks = values.reshape(self.labels.shape)
-        empty = jnp.array(nothing, values.dtype)
-        block = jnp.arange(blocks.shape[0], dtype=jnp.int32)[:, None]
-        is_inside = (block > self.first_blocks[None]) & (block < self.last_blocks[None])
-        of_blocks = reduce(blocks, axis=1)
-        inside = reduce(jnp.where(is_inside, of_blocks[:, None], empty), axis=0)
-        label = jnp.arange(self.first_blocks.shape[0], dtype=self.labels.dtype)[:, None]
+        m, blocks = self.first_blocks.shape[0], values.reshape(self.labels.shape)
+        is_whole = self.labels[:, 0] == self.labels[:, -1]
+        reduce = REDUCTIONS[how]
+        found = segment_reduce(
+            how, reduce(blocks, axis=1), jnp.where(is_whole, self.labels[:, 0], m), m, nothing
+        )
 
-        def within(block: Int[Array, " m"], counts: Bool[Array, " m"]) -> Shaped[Array, " m"]:
-            is_own = (take(self.labels, block) == label) & counts[:, None]
-            return reduce(jnp.where(is_own, take(blocks, block), empty), axis=1)
+        def at(block: Int[Array, " m"], counts: bool | Bool[Array, " m"]) -> Shaped[Array, " m"]:
+            """Of the segment's own entries in this block, unless the block is whole."""
+            labels = take(self.labels, block)
+            counts &= labels[:, 0] != labels[:, -1]
+            is_own = labels == jnp.arange(m, dtype=labels.dtype)[:, None]
+            own = jnp.where(is_own & counts[:, None], take(blocks, block), nothing)
+            return reduce(own.astype(values.dtype), axis=1)
 
-        is_another = self.last_blocks > self.first_blocks
-        parts = [
-            inside,
-            within(self.first_blocks, jnp.ones_like(is_another)),
-            within(self.last_blocks, is_another),
-        ]
-        return reduce(jnp.stack(parts), axis=0)
+        ends = at(self.first_blocks, True), at(self.last_blocks, self.last_blocks > self.first_blocks)
+        return reduce(jnp.stack([found, *ends]), axis=0)
 
 
 def runs_of(labels: Int[Array, " p"], num_segments: int) -> Runs:

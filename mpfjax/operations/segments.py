@@ -107,6 +107,20 @@ def segment_any(
     return (jnp.stack(words)[label // _WORD] >> shifts) & 1 > 0
 
 
+def segment_reduce(
+    how: str,
+    values: Shaped[Array, " n"],
+    segments: Int[Array, " n"],
+    num_segments: int,
+    nothing: float,
+) -> Shaped[Array, " num_segments"]:
+    """The sum ("add"), "max" or "min" of each segment's values, `nothing` for an empty one."""
+    if num_segments > FEW_SEGMENTS:
+        return _scattered(how, values, segments, num_segments, nothing)
+    own = jnp.where(_members(segments, num_segments), values[None], nothing)
+    return REDUCTIONS[how](own.astype(values.dtype), axis=1)
+
+
 def segment_counts(
     mask: Bool[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Int[Array, " num_segments"]:
@@ -162,7 +176,7 @@ def _scattered(
         combine = getattr(line.at[from_the_start(places.reshape(-1))], how)
         lines = combine(jnp.pad(rows, padding).reshape(-1), mode="promise_in_bounds")
         lines = lines.reshape(-1, num_lanes, num_rows)[:num_segments]
-        return _OVER_LANES[how](lines, axis=1).T.astype(rows.dtype)
+        return REDUCTIONS[how](lines, axis=1).T.astype(rows.dtype)
 
     return in_rows(scatter)(values, segments)
 
@@ -172,7 +186,7 @@ def _num_lanes(n: int) -> int:
     return max(_LANES, 1 << max(-(-n // _LONGEST_SUM) - 1, 0).bit_length())
 
 
-_OVER_LANES: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": jnp.max, "min": jnp.min}
+REDUCTIONS: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": jnp.max, "min": jnp.min}
 
 
 def segment_log_sum_exp(
