@@ -181,7 +181,7 @@ class Resample(AbstractResampling):
             line = as_they_are(mixture)
         else:
             stays = None if all_are_due else ~spread(due, mixture.component_indicators)
-            # Who keeps its place by rank, or is transported, needs those of its component beside it.
+            # Who stays by rank, or is transported, needs those of its component beside it.
             without_gaps = not all_are_due or self.gradient == "ot"
             line = side_by_side(mixture, stays, self.sort_by, without_gaps)
         # If all living components are due, none keeps its particles.

@@ -8,7 +8,6 @@ a scheme, write such a function and name it in `SCHEMES`.
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
@@ -32,9 +31,7 @@ def stratified(key, expected, before, targets, slots, line):
     return _points_before(before, take(shift, slot))
 
 
-def _points_before(
-    before: Float[Array, " p"], shift: Float[Array, " #p"]
-) -> Int[Array, " p"]:
+def _points_before(before: Float[Array, " p"], shift: Float[Array, " #p"]) -> Int[Array, " p"]:
     """How many of the points s + shift, one in each slot s, come before a particle's stretch."""
     whole = jnp.floor(before)
     return to_int(whole, before.shape[-1]) + (shift < before - whole).astype(jnp.int32)

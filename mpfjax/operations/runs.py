@@ -55,7 +55,10 @@ class Runs(NamedTuple):
             own = jnp.where(is_own & counts[:, None], take(blocks, block), nothing)
             return reduce(own.astype(values.dtype), axis=1)
 
-        ends = at(self.first_blocks, True), at(self.last_blocks, self.last_blocks > self.first_blocks)
+        ends = (
+            at(self.first_blocks, True),
+            at(self.last_blocks, self.last_blocks > self.first_blocks),
+        )
         return reduce(jnp.stack([found, *ends]), axis=0)
 
 

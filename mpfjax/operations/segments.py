@@ -24,7 +24,7 @@ from mpfjax.operations.indexing import (
 )
 from mpfjax.operations.logarithms import exp, finite_or_zero, log_or_nothing, masked_shares
 from mpfjax.operations.prefix_sums import count_starts, count_upto
-from mpfjax.operations.stored import EXACT_IN_FLOAT32, whole_blocks
+from mpfjax.operations.stored import EXACT_IN_FLOAT32, stored, whole_blocks
 
 FEW_SEGMENTS = 4
 # Neighbours that are added to the same place go to different lanes, each with a place of its own.
@@ -57,6 +57,17 @@ def spread(
         is_member = (segments == m).reshape(-1, *[1] * (values.ndim - 1))
         chosen = jnp.where(is_member, values[m][None], chosen)
     return chosen
+
+
+def spread_finite(
+    values: Shaped[Array, "m *rest"], segments: Int[Array, " n"], bound: int | None = None
+) -> Shaped[Array, "n *rest"]:
+    """`spread` of finite numbers that are computed once, not again for every entry.
+
+    Whole numbers must be in [0, bound).
+    """
+    columns = stored(values.reshape(values.shape[0], -1).T, bound)
+    return spread(columns.T.reshape(values.shape), segments)
 
 
 def segment_sum(
@@ -194,7 +205,7 @@ def segment_log_sum_exp(
 ) -> Float[Array, " num_segments"]:
     """log Σ exp in each segment, -inf in one that is empty or holds nothing but -inf."""
     shift = finite_or_zero(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
-    total = segment_sum(exp(log_values - spread(shift, segments)), segments, num_segments)
+    total = segment_sum(exp(log_values - spread_finite(shift, segments)), segments, num_segments)
     return log_or_nothing(total) + shift
 
 
@@ -203,9 +214,9 @@ def segment_softmax(
 ) -> Float[Array, " n"]:
     """exp of the values as shares of their segment's sum, zero where that sum is zero."""
     shift = finite_or_zero(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
-    values = exp(log_values - spread(shift, segments))
+    values = exp(log_values - spread_finite(shift, segments))
     totals = segment_sum(values, segments, num_segments)
-    shares = values / spread(jnp.where(totals == 0, 1.0, totals), segments)
+    shares = values / spread_finite(jnp.where(totals == 0, 1.0, totals), segments)
     return masked_shares(log_values, shares)
 
 
@@ -215,7 +226,10 @@ def segment_argmax(
     """The index of the largest value in each segment, some index where it is empty."""
     n = values.shape[0]
     values = jax.lax.stop_gradient(values)  # an index has no derivative
-    is_largest = values >= spread(segment_max(values, segments, num_segments), segments)
+    limits = jnp.finfo(values.dtype)
+    values = jnp.clip(values, limits.min, limits.max)
+    largest = jnp.maximum(segment_max(values, segments, num_segments), limits.min)
+    is_largest = values >= spread_finite(largest, segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
     if num_segments > FEW_SEGMENTS:
         return _scattered("min", index, segments, num_segments, n - 1)
