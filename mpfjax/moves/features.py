@@ -12,7 +12,6 @@ from mpfjax.checks import check_callable, check_positive_array, given, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations.floats import as_inexact
 from mpfjax.operations.segments import column_sums, segment_sum, spread_finite
-from mpfjax.operations.stored import stored
 
 # So many are worked on one by one, which runs on vectors; more would take long to compile.
 _FEW_FEATURES = 8
@@ -87,7 +86,7 @@ def summarise(
     """Weighted mass, mean and covariance of the particles under each label."""
     masses = segment_sum(weights, labels, num_groups)
     safe = jnp.where(masses > 0, masses, 1.0)
-    shares = stored((weights / spread_finite(safe, labels)).astype(features.dtype))
+    shares = (weights / spread_finite(safe, labels)).astype(features.dtype)
     means = segment_sum(shares[:, None] * features, labels, num_groups)
     num_features = features.shape[1]
     if num_features > _FEW_FEATURES:

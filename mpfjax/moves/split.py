@@ -13,7 +13,6 @@ from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.features import Features, Scale, separation, summarise
 from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import segment_argmax, segment_sum, spread_finite
-from mpfjax.operations.stored import stored
 
 
 class Split(AbstractRegrouping):
@@ -63,7 +62,7 @@ class Split(AbstractRegrouping):
         """The lighter half of every component that is too diffuse, to a free label."""
         del key
         features, m = self.features(mixture), mixture.num_components
-        weights = stored(mixture.component_weights)
+        weights = mixture.component_weights
         parent = mixture.component_indicators
         side = self._halve(features, weights, mixture)
         halves = summarise(features, weights, parent + m * side, 2 * m)

@@ -64,8 +64,10 @@ def spread_finite(
 ) -> Shaped[Array, "n *rest"]:
     """`spread` of finite numbers that are computed once, not again for every entry.
 
-    Whole numbers must be in [0, bound).
+    Whole numbers must be in [0, bound). A choice between few values runs on vectors anyway.
     """
+    if values.shape[0] <= FEW_SEGMENTS:
+        return spread(values, segments)
     columns = stored(values.reshape(values.shape[0], -1).T, bound)
     return spread(columns.T.reshape(values.shape), segments)
 
