@@ -55,7 +55,7 @@ def assert_same(run, other, **tolerance):
 class TestAgainstReferences:
     def test_one_component_is_the_particle_filter_to_the_bit(self):
         plain, key = CHAINS["pf"](QUADRATIC), jax.random.key(0)
-        mixture = mpfjax.mixture_particle_filter(QUADRATIC, plain.num_particles, 1)
+        mixture = mpfjax.mixture_particle_filter(QUADRATIC, plain.num_particles, 1, regroup_every=1)
         assert_same(
             mpfjax.run_filter(key, plain, OBSERVATIONS),
             mpfjax.run_filter(key, mixture, OBSERVATIONS),

@@ -123,26 +123,27 @@ class SideBySide(NamedTuple):
 
     def places_of(self, parents: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
         """The place of each slot's parent; rounding must not cross a border of components."""
-        firsts, lasts = self._extents()
+        firsts, lasts = self._extents(self.is_drawn)
         return jnp.clip(parents, spread(firsts, slots.components), spread(lasts, slots.components))
 
     def stretches(self, slots: Slots) -> Stretches:
         """The components' particles and slots, side by side."""
-        firsts, lasts = self._extents()
+        # Those that nothing is drawn from are among them, so that every place has a rank from 0 on.
+        firsts, lasts = self._extents(jnp.ones_like(self.is_drawn))
         counts = lasts - firsts + 1
         return Stretches(*map(self.of_places, (firsts, counts, slots.firsts)))
 
     def places_by_rank(self, ranks: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
         """The place of a rank in each slot's component."""
-        firsts, _ = self._extents()
+        firsts, _ = self._extents(self.is_drawn)
         return spread(firsts, slots.components) + ranks
 
     def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
         """Which particles stand at these places."""
         return take(self.order, stored(places, self.order.shape[0]))
 
-    def _extents(self) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
-        firsts, lasts = self.runs.extents(self.is_drawn)
+    def _extents(self, mask: Bool[Array, " p"]) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
+        firsts, lasts = self.runs.extents(mask)
         num_places = self.order.shape[0]
         return stored(firsts, num_places), stored(lasts, num_places)
 
