@@ -1,8 +1,8 @@
 """Sums, maxima and places of segments that stand side by side, with labels in ascending order.
 
-In numpy: `np.add.reduceat(values, firsts)`. Values are taken in blocks, whose sums run on vectors. A
-block of one label goes to its segment as a whole. Of the others, which hold a border, each segment
-takes its own entries: they can only be in the first and the last block that it stands in.
+In numpy: `np.add.reduceat(values, firsts)`. Values are taken in blocks, whose sums run on vectors.
+A block of one label goes to its segment as a whole. Of the others, which hold a border, each
+segment takes its own entries: they can only be in the first and the last block that it stands in.
 """
 
 from typing import NamedTuple
