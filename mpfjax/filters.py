@@ -29,6 +29,9 @@ from mpfjax.moves.split import Split
 from mpfjax.moves.standing import HILBERT, SortBy
 from mpfjax.proposals import AbstractProposal
 
+# Components that were right a few steps before need no more iterations of K-means.
+_WARM_ITERATIONS = 2
+
 
 def particle_filter(
     model: AbstractStateSpaceModel,
@@ -120,22 +123,23 @@ def mixture_particle_filter(
     split: Split | None = None,
     kmeans: KMeans | None = None,
     initial_kmeans: KMeans | None = None,
-    regroup_every: int = 1,
+    regroup_every: int = 3,
 ) -> Filter:
     """The mixture particle filter: resample within components, propagate, regroup.
 
     Vermaak et al. (2003), sections 3 and 4. Each component is resampled on its own and competes
     with the others only through its mixture weight. So no component takes particles from another.
-    At every step components that overlap merge, diffuse components split, and K-means refines the
-    grouping. All of it is exact. `features` and `scale` are the coordinates and units in which
-    these three moves see the particles (see `Features`; features of one particle, if the model
-    is wrapped by `per_particle`). `merge`, `split` and `kmeans` replace those moves, for example
-    with other thresholds, and bring their own features and scale. `regroup_every` is k where they
-    are to run at every k-th step only (see `Every`). `gradient`, `noise` and `num_draws` are those
-    of `particle_filter`, `lookahead` that of `auxiliary_particle_filter`, and `allocation` that of
-    `Resample`. With `noise="rqmc"` each component has a point set of its own, and the masses of
-    modes are far more accurate. Use it where the filtering distribution has several modes and all
-    of them must be kept.
+    At every third step components that overlap merge, diffuse components split, and two iterations
+    of K-means refine the grouping. All of it is exact. `features` and `scale` are the coordinates
+    and units in which these three moves see the particles (see `Features`; features of one
+    particle, if the model is wrapped by `per_particle`). `merge`, `split` and `kmeans` replace
+    those moves, for example with other thresholds, and bring their own features and scale.
+    `regroup_every` is k where they run at every k-th step (see `Every`): take 1 where modes move
+    fast, or where a `Merge` counts frames with its `patience`. `gradient`, `noise` and `num_draws`
+    are those of `particle_filter`, `lookahead` that of `auxiliary_particle_filter`, and
+    `allocation` that of `Resample`. With `noise="rqmc"` each component has a point set of its own,
+    and the masses of modes are far more accurate. Use it where the filtering distribution has
+    several modes and all of them must be kept.
     """
     sort_by = _standing(sort_by, noise)
     resample = Resample(
@@ -144,6 +148,8 @@ def mixture_particle_filter(
     proposal = propagating_proposal(proposal, lookahead)
     propagate = propagation(model, proposal, gradient, noise, num_draws)
     moves = [resampling(resample, lookahead), propagate]
+    seen: dict[str, Any] = {"features": mapped(model, features), "scale": scale}
+    kmeans = KMeans(_WARM_ITERATIONS, **seen) if kmeans is None else kmeans
     return _mixture_filter(
         model, num_particles, max_components, moves, features, scale,
         merge, split, kmeans, initial_kmeans, regroup_every, noise,

@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree, Shaped
 from mpfjax.operations.floats import as_inexact, default_float
 from mpfjax.operations.logarithms import exp, finite_max, log_sum_exp, scaled_exp, softmax
 from mpfjax.operations.segments import (
+    segment_any,
     segment_counts,
     segment_log_sum_exp,
     segment_softmax,
@@ -122,7 +123,10 @@ class ParticleMixture(eqx.Module):
     @property
     def active(self) -> Bool[Array, " m"]:
         """Which components are alive."""
-        return self.log_mixture_weights > -jnp.inf
+        self._require_one()
+        if self.num_components == 1:
+            return jnp.any(self.occupied)[None]
+        return segment_any(self.occupied, self.component_indicators, self.num_components)
 
     @property
     def log_component_weights(self) -> Float[Array, " n"]:

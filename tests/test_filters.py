@@ -55,7 +55,7 @@ def assert_same(run, other, **tolerance):
 class TestAgainstReferences:
     def test_one_component_is_the_particle_filter_to_the_bit(self):
         plain, key = CHAINS["pf"](QUADRATIC), jax.random.key(0)
-        mixture = mpfjax.mixture_particle_filter(QUADRATIC, plain.num_particles, 1)
+        mixture = mpfjax.mixture_particle_filter(QUADRATIC, plain.num_particles, 1, regroup_every=1)
         assert_same(
             mpfjax.run_filter(key, plain, OBSERVATIONS),
             mpfjax.run_filter(key, mixture, OBSERVATIONS),
@@ -382,8 +382,8 @@ class TestGroupsOfRuns:
         [
             (10, 5_000, 1, 10),
             (20, 10_000, 1, 2),
-            (20, 10_000, 2, 1),
-            (50, 2_000, 2, 5),
+            (20, 10_000, 2, 2),
+            (50, 2_000, 2, 10),
             (50, 2_000, 99, 10),
             (11, 100_000, 1, 1),
             (1, 10**7, 1, 1),
@@ -521,14 +521,14 @@ class TestWhatAUserHandsIt:
         def first(states):
             return states[:, 0]
 
-        filter = getattr(mpfjax, make)(Drift(), 20, 2, features=first, scale=3.0)
+        filter = getattr(mpfjax, make)(Drift(), 20, 2, features=first, scale=3.0, regroup_every=1)
         regrouping = [m for m in (*filter.moves, *filter._initial_moves) if hasattr(m, "features")]
         assert len(regrouping) == 4
         for move in regrouping:
             assert move.features.function is first
             assert move.features.scale == (3.0,)
         own = mpfjax.KMeans(2, features=lambda states: states[:, 1])
-        filter = getattr(mpfjax, make)(Drift(), 20, 2, features=first, kmeans=own)
+        filter = getattr(mpfjax, make)(Drift(), 20, 2, features=first, kmeans=own, regroup_every=1)
         assert own in filter.moves
 
     def test_features_of_a_wrapped_model_are_of_one_particle(self):
@@ -538,7 +538,7 @@ class TestWhatAUserHandsIt:
         )
         many = mpfjax.mixture_particle_filter(
             mpfjax.per_particle(DriftOfOne()),
-            kmeans=mpfjax.KMeans(features=lambda states: states[:, 0], scale=0.5),
+            kmeans=mpfjax.KMeans(2, features=lambda states: states[:, 0], scale=0.5),
             merge=mpfjax.Merge(features=lambda states: states[:, 0], scale=0.5),
             split=mpfjax.Split(features=lambda states: states[:, 0], scale=0.5),
             **options,

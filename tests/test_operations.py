@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mpfjax.operations.choices import cond_if_any
 from mpfjax.operations.floats import default_float
 from mpfjax.operations.indexing import count_places, take
 from mpfjax.operations.logarithms import exp, log_sum_exp, softmax
@@ -16,8 +17,10 @@ from mpfjax.operations.prefix_sums import (
     count_upto,
     sum_before,
 )
+from mpfjax.operations.runs import runs_of, whole
 from mpfjax.operations.segments import (
     order_by_segment,
+    segment_any,
     segment_argmax,
     segment_counts,
     segment_log_sum_exp,
@@ -240,6 +243,83 @@ def test_runs_of_one_segment_are_added_up_in_lanes():
     gradient = jax.grad(lambda v: jnp.sum(own(v, every[1]) * weights[None]))(every[0])
     inside = (labels >= 0) & (labels < 7)
     np.testing.assert_array_equal(gradient, np.where(inside, labels + 1, 0))
+
+
+@pytest.mark.parametrize("m", [1, 4, 5, 33])
+@pytest.mark.parametrize("n", [20, 32, 1000])
+def test_runs_are_summed_as_their_labels_say(n, m):
+    """Segments of no entry, of one and of many blocks, and entries of none at the end."""
+    rng = np.random.default_rng(n + m)
+    labels = np.sort(rng.choice([*rng.integers(0, m, 4).tolist(), m - 1, m], n))
+    values = rng.normal(size=n).astype(np.float32)
+    mask = rng.random(n) < 0.7
+
+    @jax.jit
+    def reduced(labels, values, mask):
+        runs = runs_of(whole(labels, m), m)
+        filled = whole(values, 0.0), whole(values, -jnp.inf), whole(mask, False)
+        return runs.sums(filled[0]), runs.maxima(filled[1]), *runs.extents(filled[2])
+
+    found = reduced(jnp.asarray(labels, jnp.int32), values, mask)
+    sums, maxima, firsts, lasts = map(np.asarray, found)
+    for label in range(m):
+        own = values[labels == label]
+        np.testing.assert_allclose(sums[label], own.sum(), rtol=1e-5, atol=1e-5)
+        assert maxima[label] == own.max(initial=-np.inf)
+        places = np.flatnonzero((labels == label) & mask)
+        if places.size:
+            assert (firsts[label], lasts[label]) == (places[0], places[-1])
+
+
+@pytest.mark.parametrize("m", [1, 4, 33, 300])
+def test_segment_any_says_which_segments_have_an_entry(m):
+    rng = np.random.default_rng(m)
+    labels, mask = rng.integers(0, m, 50), rng.random(50) < 0.5
+    found = segment_any(jnp.asarray(mask), jnp.asarray(labels, jnp.int32), m)
+    np.testing.assert_array_equal(found, np.bincount(labels[mask], minlength=m) > 0)
+
+
+def test_runs_of_a_vmap_choose_together():
+    """The condition stays one, whatever is batched, so that only one branch runs."""
+
+    def doubled(needed, x):
+        return cond_if_any(needed, lambda: jnp.where(needed, 2 * x, x), lambda: x)
+
+    needed = jnp.asarray([[False, False], [False, True], [True, True]])
+    values = jnp.arange(6.0).reshape(3, 2)
+    run = jax.vmap(jax.vmap(doubled))
+    np.testing.assert_array_equal(run(needed, values), jnp.where(needed, 2 * values, values))
+    np.testing.assert_array_equal(jax.vmap(doubled)(needed[0], values[0]), values[0])
+    (chosen,) = (
+        line for line in str(jax.make_jaxpr(run)(needed, values)).split("\n") if "= cond[" in line
+    )
+    assert ":f32[3,2] = cond[" in chosen
+    slopes = jax.grad(lambda x: jnp.sum(run(needed, x)))(values)
+    np.testing.assert_array_equal(slopes, jnp.where(needed, 2.0, 1.0))
+
+
+class TestTake:
+    VALUES = np.arange(24.0, dtype=np.float32).reshape(2, 4, 3)
+    INDICES = np.array([[3, 3, 0, 1, 2], [0, 1, 1, 3, 3]], np.int32)
+
+    @pytest.mark.parametrize("axes", [(0, 0), (0, None), (None, 0)])
+    def test_under_vmap_it_takes_each_runs_own(self, axes):
+        values = self.VALUES if axes[0] == 0 else self.VALUES[0]
+        indices = self.INDICES if axes[1] == 0 else self.INDICES[0]
+        found = jax.vmap(take, axes)(jnp.asarray(values), jnp.asarray(indices))
+        for run in range(2):
+            own = self.VALUES[run if axes[0] == 0 else 0][self.INDICES[run if axes[1] == 0 else 0]]
+            np.testing.assert_array_equal(found[run], own)
+
+    def test_its_derivatives_are_those_of_indexing(self):
+        def total(take, values):
+            return jnp.sum(jax.vmap(take)(values, jnp.asarray(self.INDICES)) ** 3)
+
+        values = jnp.asarray(self.VALUES)
+        plain = lambda v, i: v[i]  # noqa: E731
+        for slope in (jax.grad, jax.hessian):
+            ours, theirs = (slope(lambda v, t=t: total(t, v))(values) for t in (take, plain))
+            np.testing.assert_allclose(ours, theirs, rtol=1e-6)
 
 
 class TestSoftmax:

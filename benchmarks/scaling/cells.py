@@ -16,8 +16,8 @@ FILTERS = {
     "pf": "PF",
     "mpf_fixed": "MPF, labels fixed",
     "mpf_kmeans": "MPF, K-means at every step",
-    "mpf_every": "MPF: merge, split, K-means at every 10th step",
-    "mpf": "MPF: merge, split, K-means",
+    "mpf_default": "MPF: merge, split, K-means at every third step",
+    "mpf": "MPF: merge, split, K-means at every step",
     "dps": "DPS, J = M objects",
 }
 AXES = {
@@ -85,9 +85,10 @@ def build(cell: Cell) -> tuple[mpfjax.Filter, jax.Array]:
     n, m = cell.particles, cell.components
     if cell.filter == "pf":
         return mpfjax.particle_filter(model, n), observations
-    if cell.filter in ("mpf", "mpf_every"):
-        every = 10 if cell.filter == "mpf_every" else 1
-        return mpfjax.mixture_particle_filter(model, n, m, regroup_every=every), observations
+    if cell.filter == "mpf":
+        return mpfjax.mixture_particle_filter(model, n, m, regroup_every=1), observations
+    if cell.filter == "mpf_default":
+        return mpfjax.mixture_particle_filter(model, n, m), observations
     if cell.filter == "dps":
         objects = mpfjax.MultiObjectModel(model, m)
         every = jnp.broadcast_to(observations[:, None], (cell.steps, m))

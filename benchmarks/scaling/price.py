@@ -13,7 +13,7 @@ from mpfjax.console import format_table
 PRICED = {
     "mpf_fixed": "labels fixed",
     "mpf_kmeans": "K-means at every step",
-    "mpf_every": "merge, split, K-means at every 10th step",
+    "mpf_default": "merge, split, K-means at every third step, the default",
     "mpf": "merge, split, K-means at every step",
 }
 

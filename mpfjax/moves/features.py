@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from mpfjax.checks import check_callable, check_positive_array, given, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations.floats import as_inexact
-from mpfjax.operations.segments import column_sums, segment_sum, spread
+from mpfjax.operations.segments import column_sums, segment_sum, spread_finite
 
 # So many are worked on one by one, which runs on vectors; more would take long to compile.
 _FEW_FEATURES = 8
@@ -86,16 +86,16 @@ def summarise(
     """Weighted mass, mean and covariance of the particles under each label."""
     masses = segment_sum(weights, labels, num_groups)
     safe = jnp.where(masses > 0, masses, 1.0)
-    shares = (weights / spread(safe, labels)).astype(features.dtype)
+    shares = (weights / spread_finite(safe, labels)).astype(features.dtype)
     means = segment_sum(shares[:, None] * features, labels, num_groups)
     num_features = features.shape[1]
     if num_features > _FEW_FEATURES:
-        centred = features - spread(means, labels)
+        centred = features - spread_finite(means, labels)
         squares = shares[:, None, None] * centred[:, :, None] * centred[:, None, :]
         return Groups(masses, means, segment_sum(squares, labels, num_groups))
     # A covariance is symmetric: one triangle of it, a row of products for each entry.
     pairs = [(i, j) for i in range(num_features) for j in range(i + 1)]
-    rows = [features[:, k] - spread(means[:, k], labels) for k in range(num_features)]
+    rows = [features[:, k] - spread_finite(means[:, k], labels) for k in range(num_features)]
     products = jnp.stack([shares * rows[i] * rows[j] for i, j in pairs])
     entries = np.zeros((num_features, num_features), int)
     for entry, (i, j) in enumerate(pairs):

@@ -1,71 +1,74 @@
-"""How particles stand in line to be resampled: a row for each component, or all in one row.
+"""How particles stand in line to be resampled: side by side, component by component.
 
 Imagine the particles along a line, each with a stretch as long as its expected number of offspring.
-Every slot places a point on the line and takes the particle whose stretch holds it. With few
-components, each has a line of its own, over all particles, as they stand (`AsTheyStand`). With
-many, the particles are first put side by side, component by component, on one line (`SideBySide`).
+Every slot places a point on the line and takes the particle whose stretch holds it. The particles
+of a component must stand together. After resampling they do, so as long as nobody regroups them
+there is nothing to put in order.
 """
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.slots import Slots
 from mpfjax.moves.standing import SortBy, standing_order
+from mpfjax.operations.choices import cond_if_any
 from mpfjax.operations.indexing import take
-from mpfjax.operations.segments import order_by_segment, segment_counts, segment_sum, spread
-from mpfjax.operations.stored import stored, whole_blocks
+from mpfjax.operations.logarithms import exp, finite_or_zero, log_or_nothing
+from mpfjax.operations.runs import Runs, runs_of, whole
+from mpfjax.operations.segments import order_by_segment, segment_counts, spread
+from mpfjax.operations.stored import stored
 
 
 class Stretches(NamedTuple):
-    """For each place, where in its row the particles and the slots of its component are."""
+    """For each place, where in the line the particles and the slots of its component are."""
 
-    firsts: Int[Array, "rows p"]
-    counts: Int[Array, "rows p"]  # how many places the component has
-    first_slots: Int[Array, "rows p"]  # counted from the first slot of the row
+    firsts: Int[Array, " p"]
+    counts: Int[Array, " p"]  # how many places the component has
+    first_slots: Int[Array, " p"]
 
 
 class AsTheyStand(NamedTuple):
-    """The particles as they stand, in a row for each component, where only its own have a weight.
+    """The particles of one component as they stand.
 
-    A row has p places, as many as make whole blocks for the prefix sums.
+    The line has p places, as many as make whole blocks for the prefix sums.
     """
 
-    weights: Float[Array, "m p"]  # within the component, zero at another's place and an empty one
-    counts: Int[Array, " m"]
+    weights: Float[Array, " p"]  # zero at an empty place
+    counts: Int[Array, " 1"]
 
-    def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, "m 1"]:
-        """For each row the value of its component."""
-        return values[:, None]
+    def of_places(self, values: Shaped[Array, " 1"]) -> Shaped[Array, " 1"]:
+        """At each place the value of its component, the only one."""
+        return values
 
-    def sums(self, values: Float[Array, "m p"]) -> Float[Array, " m"]:
-        """The sum over each component's places."""
-        return jnp.sum(values, axis=1)
+    def expected(self, targets: Int[Array, " 1"]) -> Float[Array, " p"]:
+        """The expected number of offspring of each particle."""
+        return self.weights * targets.astype(self.weights.dtype)
 
-    def first_slots(self, slots: Slots) -> Int[Array, "m 1"]:
-        """Where the slots of each row begin."""
-        return slots.firsts[:, None]
+    def sums(self, values: Float[Array, " p"]) -> Float[Array, " 1"]:
+        """The sum over all places."""
+        return jnp.sum(values, keepdims=True)
 
-    def num_slots(self, targets: Int[Array, " m"], num_particles: int) -> Int[Array, "m 1"]:
-        """How many slots each row has."""
+    def num_slots(self, targets: Int[Array, " 1"], num_particles: int) -> Int[Array, ""]:
+        """How many slots there are to fill."""
         del num_particles
-        return targets[:, None]
+        return targets[0]
 
     def places_of(self, parents: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
-        """The place in its row of each slot's parent, counted over all rows."""
-        return parents - self.weights.shape[1] * slots.components
+        """The place of each slot's parent."""
+        del slots
+        return parents
 
-    def stretches(self, slots: Slots) -> "Stretches":
-        """Each row is the stretch of its component."""
+    def stretches(self, slots: Slots) -> Stretches:
+        """The whole line is one stretch."""
         del slots
         zeros = jnp.zeros(self.weights.shape, jnp.int32)
-        return Stretches(zeros, zeros + self.weights.shape[1], zeros)
+        return Stretches(zeros, zeros + self.weights.shape[0], zeros)
 
     def places_by_rank(self, ranks: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
-        """The place of a rank in each slot's component, which is the only one."""
+        """The place of a rank in the component."""
         del slots
         return ranks
 
@@ -75,90 +78,124 @@ class AsTheyStand(NamedTuple):
 
 
 class SideBySide(NamedTuple):
-    """The particles in one row of p places, component by component, and empty places at the end."""
+    """The particles in a line of p places, component by component."""
 
-    weights: Float[Array, "1 p"]  # within the component, zero at an empty place
-    counts: Int[Array, " m"]
-    firsts: Int[Array, " m"]  # the place of each component's first particle
+    relative_weights: Float[Array, " p"]  # beside the component's largest; zero at an empty place
+    log_largest: Float[Array, " m"]  # the logarithm of that largest weight, or 0
     order: Int[Array, " p"]  # which particle stands at each place
     components: Int[Array, " p"]
+    is_drawn: Bool[Array, " p"]  # at which places a particle may be drawn, or stays as it is
+    runs: Runs
 
-    def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, "1 p"]:
+    @property
+    def counts(self) -> Int[Array, " m"]:
+        """How many places each component has."""
+        return segment_counts(self.is_drawn, self.components, self.log_largest.shape[0])
+
+    @property
+    def totals(self) -> Float[Array, " m"]:
+        """The sum of each component's relative weights, zero for a dead one."""
+        return self.sums(self.relative_weights)
+
+    @property
+    def log_masses(self) -> Float[Array, " m"]:
+        """The logarithm of each component's mass."""
+        return log_or_nothing(self.totals) + self.log_largest
+
+    def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, " p"]:
         """At each place the value of its component."""
-        return spread(values, self.components)[None]
+        return spread(values, self.components)
 
-    def sums(self, values: Float[Array, "1 p"]) -> Float[Array, " m"]:
+    def expected(self, targets: Int[Array, " m"]) -> Float[Array, " p"]:
+        """The expected number of offspring of each particle."""
+        totals = self.totals
+        shares = targets.astype(totals.dtype) / jnp.where(totals > 0, totals, 1.0)
+        return self.relative_weights * self.of_places(stored(shares))
+
+    def sums(self, values: Float[Array, " p"]) -> Float[Array, " m"]:
         """The sum over each component's places."""
-        return segment_sum(values[0], self.components, self.counts.shape[0])
+        return self.runs.sums(values)
 
-    def first_slots(self, slots: Slots) -> Int[Array, "1 1"]:
-        """Where the slots of the row begin."""
-        del slots
-        return jnp.zeros((1, 1), jnp.int32)
-
-    def num_slots(self, targets: Int[Array, " m"], num_particles: int) -> Int[Array, "1 1"]:
-        """How many slots the row has."""
+    def num_slots(self, targets: Int[Array, " m"], num_particles: int) -> Int[Array, ""]:
+        """How many slots there are to fill; the last ones may stay empty."""
         del targets
-        return jnp.full((1, 1), num_particles, jnp.int32)
+        return jnp.asarray(num_particles, jnp.int32)
 
     def places_of(self, parents: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
         """The place of each slot's parent; rounding must not cross a border of components."""
-        firsts = spread(self.firsts, slots.components)
-        return jnp.clip(parents, firsts, firsts + spread(self.counts, slots.components) - 1)
+        firsts, lasts = self._extents(self.is_drawn)
+        return jnp.clip(parents, spread(firsts, slots.components), spread(lasts, slots.components))
 
-    def stretches(self, slots: Slots) -> "Stretches":
+    def stretches(self, slots: Slots) -> Stretches:
         """The components' particles and slots, side by side."""
-        of_places = lambda values: spread(values, self.components)[None]  # noqa: E731
-        return Stretches(of_places(self.firsts), of_places(self.counts), of_places(slots.firsts))
+        # Those that nothing is drawn from are among them, so that every place has a rank from 0 on.
+        firsts, lasts = self._extents(jnp.ones_like(self.is_drawn))
+        counts = lasts - firsts + 1
+        return Stretches(*map(self.of_places, (firsts, counts, slots.firsts)))
 
     def places_by_rank(self, ranks: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
         """The place of a rank in each slot's component."""
-        return spread(self.firsts, slots.components) + ranks
+        firsts, _ = self._extents(self.is_drawn)
+        return spread(firsts, slots.components) + ranks
 
     def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
         """Which particles stand at these places."""
         return take(self.order, stored(places, self.order.shape[0]))
 
+    def _extents(self, mask: Bool[Array, " p"]) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
+        firsts, lasts = self.runs.extents(mask)
+        num_places = self.order.shape[0]
+        return stored(firsts, num_places), stored(lasts, num_places)
+
 
 def as_they_are(mixture: ParticleMixture) -> AsTheyStand:
-    """A row for each component, of all the particles."""
-    m = mixture.num_components
-    is_member = mixture.component_indicators[None] == jnp.arange(m, dtype=jnp.int32)[:, None]
-    weights = mixture.component_weights[None]
-    if m > 1:
-        weights = jnp.where(is_member, weights, 0.0)
-    return AsTheyStand(jax.vmap(lambda row: padded(row, 0.0))(weights), mixture.component_counts)
+    """All particles of the only component."""
+    return AsTheyStand(whole(mixture.component_weights, 0.0), mixture.component_counts)
 
 
 def side_by_side(
     mixture: ParticleMixture,
     stays: Bool[Array, " n"] | None,
     sort_by: SortBy | None,
+    without_gaps: bool,
 ) -> SideBySide:
-    """One row of components, without particles that only a rounding error could draw.
+    """The components in a line.
 
-    A weight may underflow to zero where its logarithm does not. Such a particle is left out of
-    the row where its component is resampled, and kept where its component `stays` as it is.
+    If `without_gaps`, the particles of a component stand without others between them that nothing
+    is drawn from. A weight may underflow to zero where its logarithm does not. Such a particle is
+    not drawn where its component is resampled, and is kept where its component `stays` as it is.
     """
     m = mixture.num_components
-    weights = mixture.component_weights
-    stands = weights > 0
-    if stays is not None:
-        stands |= mixture.occupied & stays
-    labels = jnp.where(stands, mixture.component_indicators, m)
+    labels = mixture.component_indicators
+    if without_gaps or sort_by is not None:
+        stands = mixture.component_weights > 0
+        if stays is not None:
+            stands |= mixture.occupied & stays
+        labels = jnp.where(stands, labels, m)
+    log_weights, labels = whole(mixture.log_weights, -jnp.inf), whole(labels, m)
+
+    def in_line(order: Int[Array, " p"]) -> tuple[Array, Array, Array]:
+        own = take(labels, order)
+        # Labels that nothing stands under come last.
+        return order, jnp.where(own < m, take(log_weights, order), -jnp.inf), own
+
+    def by_component() -> tuple[Array, Array, Array]:
+        return in_line(order_by_segment(labels, m)[0])
+
+    def as_they_are() -> tuple[Array, Array, Array]:
+        return jnp.arange(labels.shape[0], dtype=jnp.int32), log_weights, labels
+
     if sort_by is None:
-        order, counts = order_by_segment(padded(labels, m), m)
+        is_mixed = jnp.any(labels[1:] < labels[:-1])
+        order, log_weights, labels = cond_if_any(is_mixed, by_component, as_they_are)
     else:
-        order = padded(standing_order(mixture, labels, sort_by), mixture.num_particles - 1)
-        counts = segment_counts(stands, mixture.component_indicators, m)
-    num_standing = jnp.sum(counts, dtype=jnp.int32)
-    is_filled = jnp.arange(order.shape[0], dtype=jnp.int32) < num_standing
-    weights = jnp.where(is_filled, take(padded(weights, 0.0), order), 0.0)
-    components = take(padded(mixture.component_indicators, 0), order)
-    return SideBySide(weights[None], counts, jnp.cumsum(counts) - counts, order, components)
-
-
-def padded(values: Array, fill: float) -> Array:
-    """The values, filled up to whole blocks of the prefix sums."""
-    n = values.shape[0]
-    return jnp.pad(values, (0, whole_blocks(n) - n), constant_values=fill)
+        order = standing_order(mixture, labels[: mixture.num_particles], sort_by)
+        order, log_weights, labels = in_line(whole(order, labels.shape[0] - 1))
+    runs = runs_of(labels, m)
+    labels = jnp.minimum(labels, m - 1)
+    log_largest = finite_or_zero(runs.maxima(log_weights))
+    relative = exp(log_weights - spread(stored(log_largest), labels))
+    is_drawn = relative > 0
+    if stays is not None:
+        is_drawn |= (log_weights > -jnp.inf) & take(whole(stays, False), order)
+    return SideBySide(relative, log_largest, order, labels, is_drawn, runs)

@@ -12,7 +12,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.features import Features, Scale, separation, summarise
 from mpfjax.operations.indexing import take
-from mpfjax.operations.segments import spread
+from mpfjax.operations.segments import spread_finite
 
 
 class Merge(AbstractRegrouping):
@@ -73,7 +73,8 @@ class Merge(AbstractRegrouping):
             durations = jnp.where(overlap, memory["overlap_durations"] + 1, 0)
             overlap = durations >= self.patience
             memory = memory | {"overlap_durations": durations}
-        return spread(lowest_connected(overlap), mixture.component_indicators), memory
+        labels = lowest_connected(overlap)
+        return spread_finite(labels, mixture.component_indicators, len(labels)), memory
 
     def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
         """No pair with a dead component has overlapped yet."""

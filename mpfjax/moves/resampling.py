@@ -29,9 +29,8 @@ from mpfjax.operations.indexing import take
 from mpfjax.operations.logarithms import scaled_exp
 from mpfjax.operations.prefix_sums import count_starts, sum_before
 from mpfjax.operations.segments import segment_log_sum_exp, spread
+from mpfjax.operations.stored import stored
 
-# Up to this number of components, each is resampled in a pass of its own over all particles.
-FEW_ROWS = 4
 ALLOCATIONS = ("equal", "variance")
 GRADIENTS = ("none", "stop", "soft", "ot", "straight_through")
 
@@ -168,7 +167,9 @@ class Resample(AbstractResampling):
         slots = drawn.slots
         copies = _copies(mixture, drawn)
         num_slots = jnp.maximum(drawn.targets, 1).astype(mixture.log_weights.dtype)
-        log_shares = mixture.log_mixture_weights - jnp.log(num_slots)
+        log_shares = self._log_masses(mixture, drawn.line) - jnp.log(num_slots)
+        # A dead component has no slots; its share must be finite to be stored.
+        log_shares = stored(jnp.where(log_shares == -jnp.inf, 0.0, log_shares))
         redrawn = copies.replace(log_weights=spread(log_shares, slots.components))
         if self.gradient == "stop":
             log_weights = jax.lax.stop_gradient(redrawn.log_weights)
@@ -190,27 +191,27 @@ class Resample(AbstractResampling):
     ) -> "_Drawn":
         """Each slot's parent: drawn by weight where its component is due, itself elsewhere."""
         num_particles, num_components = mixture.num_particles, mixture.num_components
-        # A component that keeps its particles needs them side by side, unless it is the only one.
         all_are_due = self.ess_threshold == 1.0
-        as_they_stand = num_components == 1 or (num_components <= FEW_ROWS and all_are_due)
-        as_they_stand &= self.sort_by is None
-        as_they_stand &= self.gradient != "ot"  # which needs places without gaps
-        stays = None if all_are_due else ~spread(due, mixture.component_indicators)
-        line = as_they_are(mixture) if as_they_stand else side_by_side(mixture, stays, self.sort_by)
+        if num_components == 1 and self.sort_by is None and self.gradient != "ot":
+            line = as_they_are(mixture)
+        else:
+            stays = None if all_are_due else ~spread(due, mixture.component_indicators)
+            # Who stays by rank, or is transported, needs those of its component beside it.
+            without_gaps = not all_are_due or self.gradient == "ot"
+            line = side_by_side(mixture, stays, self.sort_by, without_gaps)
         # If all living components are due, none keeps its particles.
         counts = due.astype(jnp.int32) if all_are_due else line.counts
         targets = self.deal(mixture, due, counts)
-        if as_they_stand and num_components == 1:
+        if isinstance(line, AsTheyStand):
             # What is not redrawn keeps its place, and there may be empty slots before it.
             targets = jnp.where(due, targets, num_particles)
         slots = place_slots(targets, num_particles)
-        expected = line.weights * line.of_places(targets).astype(line.weights.dtype)
-        before, total = jax.vmap(sum_before)(expected)
+        expected = line.expected(targets)
+        before, total = sum_before(expected)
         starts = SCHEMES[self.scheme](key, expected, before, targets, slots, line)
         # Rounding must not give a slot to particles after the last weight.
         num_slots = line.num_slots(targets, num_particles)
-        starts = jnp.minimum(starts, num_slots)
-        starts = jnp.where(before < total[:, None], starts, num_slots) + line.first_slots(slots)
+        starts = jnp.where(before < total, jnp.minimum(starts, num_slots), num_slots)
         parents = line.places_of(count_starts(starts, num_particles), slots)
         if not all_are_due:
             unmoved = line.places_by_rank(slots.ranks, slots)
@@ -230,6 +231,14 @@ class Resample(AbstractResampling):
         elif self.share_by is not None:
             demands = _shares_of_groups(mixture, self.share_by(mixture.particles), due)
         return deal_slots(counts, due, mixture, self.particles_per_component, demands)
+
+    def _log_masses(
+        self, mixture: ParticleMixture, line: AsTheyStand | SideBySide
+    ) -> Float[Array, " m"]:
+        """The logarithm of each component's mass, which the line knows where it drew from it."""
+        if isinstance(line, AsTheyStand) or self.gradient == "soft":
+            return mixture.log_mixture_weights
+        return add_gradient(line.log_masses, mixture.log_mixture_weights)
 
     def _drawn_from(self, mixture: ParticleMixture) -> ParticleMixture:
         """The mixture whose weights the offspring are drawn in proportion to."""

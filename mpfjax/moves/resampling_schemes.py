@@ -1,14 +1,13 @@
 """The schemes of resampling: systematic, stratified, multinomial, residual, SSP.
 
-A scheme returns the first slot of every particle's offspring, counted from the first slot of its
-row. Each particle has a stretch of its row, as long as its expected number of offspring k_m w_i.
+A scheme returns the first slot of every particle's offspring. Each particle has a stretch of the
+line, as long as its expected number of offspring k_m w_i.
 The scheme knows where each stretch begins, and places one point in the share of each slot. To add
 a scheme, write such a function and name it in `SCHEMES`.
 """
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
@@ -28,14 +27,11 @@ def systematic(key, expected, before, targets, slots, line):
 
 def stratified(key, expected, before, targets, slots, line):
     shift = uniform(key, slots.components.shape, expected.dtype)
-    slot = line.first_slots(slots) + before.astype(jnp.int32)
-    slot = jnp.clip(slot, 0, shift.shape[0] - 1)
-    return _points_before(before, take(shift, slot.reshape(-1)).reshape(slot.shape))
+    slot = jnp.clip(before.astype(jnp.int32), 0, shift.shape[0] - 1)
+    return _points_before(before, take(shift, slot))
 
 
-def _points_before(
-    before: Float[Array, "rows p"], shift: Float[Array, "rows #p"]
-) -> Int[Array, "rows p"]:
+def _points_before(before: Float[Array, " p"], shift: Float[Array, " #p"]) -> Int[Array, " p"]:
     """How many of the points s + shift, one in each slot s, come before a particle's stretch."""
     whole = jnp.floor(before)
     return to_int(whole, before.shape[-1]) + (shift < before - whole).astype(jnp.int32)
@@ -43,18 +39,18 @@ def _points_before(
 
 def multinomial(key, expected, before, targets, slots, line):
     points = sorted_points(key, slots, targets, expected.dtype)
-    return _sorted_points_before(before, points, line.first_slots(slots))
+    return _sorted_points_before(before, points)
 
 
 def residual(key, expected, before, targets, slots, line):
     # In floating point, k times a weight of 1 / k may be a little less than 1; it must count as 1.
     whole = jnp.floor(expected * (1 + 16 * jnp.finfo(expected.dtype).eps))
-    certain, _ = jax.vmap(sum_before)(whole)
+    certain, _ = sum_before(whole)
     left = jnp.maximum(targets - line.sums(whole).astype(jnp.int32), 0)
     rest = place_slots(left, slots.components.shape[0])
     points = sorted_points(key, rest, left, expected.dtype)
-    rests_before, _ = jax.vmap(sum_before)(jnp.maximum(expected - whole, 0.0))
-    drawn = _sorted_points_before(rests_before, points, line.first_slots(rest))
+    rests_before, _ = sum_before(jnp.maximum(expected - whole, 0.0))
+    drawn = _sorted_points_before(rests_before, points)
     return certain.astype(jnp.int32) + drawn
 
 
@@ -69,11 +65,11 @@ def ssp(key, expected, before, targets, slots, line):
     places = line.stretches(slots)
     whole = jnp.floor(expected * (1 + 16 * jnp.finfo(expected.dtype).eps))
     uniforms = uniform(key, expected.shape, expected.dtype)
-    is_up = jax.vmap(_settle)(jnp.maximum(expected - whole, 0.0), uniforms, places)
+    is_up = _settle(jnp.maximum(expected - whole, 0.0), uniforms, places)
     offspring = whole.astype(jnp.int32) + is_up.astype(jnp.int32)
     # Counted from the first of its component: a rounding error does not pass to the next.
-    earlier = jnp.cumsum(offspring, axis=1) - offspring
-    return earlier - jax.vmap(take)(earlier, places.firsts) + places.first_slots
+    earlier = jnp.cumsum(offspring) - offspring
+    return earlier - take(earlier, places.firsts) + places.first_slots
 
 
 def _settle(
@@ -108,11 +104,10 @@ def _settle(
 
 
 def _sorted_points_before(
-    before: Float[Array, "rows p"], points: Float[Array, " n"], first_slots: Int[Array, "rows 1"]
-) -> Int[Array, "rows p"]:
-    """How many of the points of its row come before a particle's stretch."""
-    found = jnp.searchsorted(points, before + first_slots.astype(before.dtype), side="left")
-    return found.astype(jnp.int32) - first_slots
+    before: Float[Array, " p"], points: Float[Array, " n"]
+) -> Int[Array, " p"]:
+    """How many of the points come before a particle's stretch."""
+    return jnp.searchsorted(points, before, side="left").astype(jnp.int32)
 
 
 def sorted_points(

@@ -12,7 +12,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.features import Features, Scale, separation, summarise
 from mpfjax.operations.indexing import take
-from mpfjax.operations.segments import segment_argmax, segment_sum, spread
+from mpfjax.operations.segments import segment_argmax, segment_sum, spread_finite
 
 
 class Split(AbstractRegrouping):
@@ -78,8 +78,8 @@ class Split(AbstractRegrouping):
         )
         lighter = jnp.where(masses[1] <= masses[0], 1, 0)
         labels = free_labels(splits, deviations, mixture.active)
-        moves = (side == spread(lighter, parent)) & mixture.occupied
-        return jnp.where(moves, spread(labels, parent), parent), mixture.memory
+        moves = (side == spread_finite(lighter, parent, 2)) & mixture.occupied
+        return jnp.where(moves, spread_finite(labels, parent, m), parent), mixture.memory
 
     def _halve(
         self, features: Float[Array, "n k"], weights: Float[Array, " n"], mixture: ParticleMixture
@@ -120,8 +120,8 @@ def _nearer(
 ) -> Int[Array, " n"]:
     """Which of its own component's two centroids each particle is nearer to."""
     m = centroids.shape[0] // 2
-    first = jnp.sum((features - spread(centroids[:m], parent)) ** 2, axis=1)
-    second = jnp.sum((features - spread(centroids[m:], parent)) ** 2, axis=1)
+    first = jnp.sum((features - spread_finite(centroids[:m], parent)) ** 2, axis=1)
+    second = jnp.sum((features - spread_finite(centroids[m:], parent)) ** 2, axis=1)
     return (second < first).astype(jnp.int32)
 
 
@@ -130,6 +130,6 @@ def _farthest_members(
 ) -> Float[Array, "m k"]:
     """In each component, the particle farthest from the component's point."""
     parent = mixture.component_indicators
-    distance = jnp.sum((features - spread(points, parent)) ** 2, axis=1)
+    distance = jnp.sum((features - spread_finite(points, parent)) ** 2, axis=1)
     distance = jnp.where(mixture.occupied, distance, -1.0)
     return take(features, segment_argmax(distance, parent, mixture.num_components))

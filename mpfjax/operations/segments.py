@@ -11,6 +11,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mpfjax.operations.floats import default_float
@@ -23,7 +24,7 @@ from mpfjax.operations.indexing import (
 )
 from mpfjax.operations.logarithms import exp, finite_or_zero, log_or_nothing, masked_shares
 from mpfjax.operations.prefix_sums import count_starts, count_upto
-from mpfjax.operations.stored import EXACT_IN_FLOAT32, whole_blocks
+from mpfjax.operations.stored import EXACT_IN_FLOAT32, stored, whole_blocks
 
 FEW_SEGMENTS = 4
 # Neighbours that are added to the same place go to different lanes, each with a place of its own.
@@ -35,6 +36,8 @@ _FEW_COLUMNS = 9
 # In float32, a million equal numbers, added one after the other, give a thousandth too much.
 _LONGEST_SUM = 2**10
 _COUNTED_BLOCK = 32
+# Which segments are there is kept in the bits of so many words at most.
+_WORD, _MOST_WORDS = 32, 8
 _MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # eight counts for each particle
 
 
@@ -54,6 +57,19 @@ def spread(
         is_member = (segments == m).reshape(-1, *[1] * (values.ndim - 1))
         chosen = jnp.where(is_member, values[m][None], chosen)
     return chosen
+
+
+def spread_finite(
+    values: Shaped[Array, "m *rest"], segments: Int[Array, " n"], bound: int | None = None
+) -> Shaped[Array, "n *rest"]:
+    """`spread` of finite numbers that are computed once, not again for every entry.
+
+    Whole numbers must be in [0, bound). A choice between few values runs on vectors anyway.
+    """
+    if values.shape[0] <= FEW_SEGMENTS:
+        return spread(values, segments)
+    columns = stored(values.reshape(values.shape[0], -1).T, bound)
+    return spread(columns.T.reshape(values.shape), segments)
 
 
 def segment_sum(
@@ -86,6 +102,36 @@ def segment_max(
         return _scattered("max", values, segments, num_segments, -jnp.inf)
     member = _members(segments, num_segments)
     return jnp.max(jnp.where(member, values[None], jnp.array(-jnp.inf, values.dtype)), axis=1)
+
+
+def segment_any(
+    mask: Bool[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Bool[Array, " num_segments"]:
+    """Which segments have a masked entry; labels are in [0, num_segments)."""
+    if num_segments > _MOST_WORDS * _WORD:
+        return _scattered("max", mask.astype(jnp.int32), segments, num_segments, 0) > 0
+    bits = jnp.uint32(1) << (segments % _WORD).astype(jnp.uint32)
+    words = []
+    for word in range(-(-num_segments // _WORD)):
+        own = jnp.where(mask & (segments // _WORD == word), bits, jnp.uint32(0))
+        words.append(jax.lax.reduce(own, np.uint32(0), jax.lax.bitwise_or, (0,)))
+    label = np.arange(num_segments)
+    shifts = jnp.asarray(label % _WORD, jnp.uint32)
+    return (jnp.stack(words)[label // _WORD] >> shifts) & 1 > 0
+
+
+def segment_reduce(
+    how: str,
+    values: Shaped[Array, " n"],
+    segments: Int[Array, " n"],
+    num_segments: int,
+    nothing: float,
+) -> Shaped[Array, " num_segments"]:
+    """The sum ("add"), "max" or "min" of each segment's values, `nothing` for an empty one."""
+    if num_segments > FEW_SEGMENTS:
+        return _scattered(how, values, segments, num_segments, nothing)
+    own = jnp.where(_members(segments, num_segments), values[None], nothing)
+    return REDUCTIONS[how](own.astype(values.dtype), axis=1)
 
 
 def segment_counts(
@@ -143,7 +189,7 @@ def _scattered(
         combine = getattr(line.at[from_the_start(places.reshape(-1))], how)
         lines = combine(jnp.pad(rows, padding).reshape(-1), mode="promise_in_bounds")
         lines = lines.reshape(-1, num_lanes, num_rows)[:num_segments]
-        return _OVER_LANES[how](lines, axis=1).T.astype(rows.dtype)
+        return REDUCTIONS[how](lines, axis=1).T.astype(rows.dtype)
 
     return in_rows(scatter)(values, segments)
 
@@ -153,7 +199,7 @@ def _num_lanes(n: int) -> int:
     return max(_LANES, 1 << max(-(-n // _LONGEST_SUM) - 1, 0).bit_length())
 
 
-_OVER_LANES: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": jnp.max, "min": jnp.min}
+REDUCTIONS: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": jnp.max, "min": jnp.min}
 
 
 def segment_log_sum_exp(
@@ -161,7 +207,7 @@ def segment_log_sum_exp(
 ) -> Float[Array, " num_segments"]:
     """log Σ exp in each segment, -inf in one that is empty or holds nothing but -inf."""
     shift = finite_or_zero(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
-    total = segment_sum(exp(log_values - spread(shift, segments)), segments, num_segments)
+    total = segment_sum(exp(log_values - spread_finite(shift, segments)), segments, num_segments)
     return log_or_nothing(total) + shift
 
 
@@ -170,9 +216,9 @@ def segment_softmax(
 ) -> Float[Array, " n"]:
     """exp of the values as shares of their segment's sum, zero where that sum is zero."""
     shift = finite_or_zero(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
-    values = exp(log_values - spread(shift, segments))
+    values = exp(log_values - spread_finite(shift, segments))
     totals = segment_sum(values, segments, num_segments)
-    shares = values / spread(jnp.where(totals == 0, 1.0, totals), segments)
+    shares = values / spread_finite(jnp.where(totals == 0, 1.0, totals), segments)
     return masked_shares(log_values, shares)
 
 
@@ -182,7 +228,10 @@ def segment_argmax(
     """The index of the largest value in each segment, some index where it is empty."""
     n = values.shape[0]
     values = jax.lax.stop_gradient(values)  # an index has no derivative
-    is_largest = values >= spread(segment_max(values, segments, num_segments), segments)
+    limits = jnp.finfo(values.dtype)
+    values = jnp.clip(values, limits.min, limits.max)
+    largest = jnp.maximum(segment_max(values, segments, num_segments), limits.min)
+    is_largest = values >= spread_finite(largest, segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
     if num_segments > FEW_SEGMENTS:
         return _scattered("min", index, segments, num_segments, n - 1)

@@ -11,7 +11,6 @@ from jaxtyping import Array, Key, PyTree
 from mpfjax.checks import check_key, check_whole, given
 from mpfjax.filter import Filter, Start, sample_initial, split_keys
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.resampling import FEW_ROWS
 from mpfjax.observations import as_arrays, present_steps
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import choose_devices, over_devices
@@ -151,8 +150,7 @@ def _run_each(starts, filter, observations, present, collect):
 
 def _group_size(num_runs: int, filter: Filter) -> int:
     """How many runs go on together: on a CPU, no more than fit into its cache."""
-    num_rows = filter.num_components if filter.num_components <= FEW_ROWS else 1
-    one_run = filter.num_particles * num_rows
+    one_run = filter.num_particles
     if jax.default_backend() != "cpu" or num_runs * one_run <= _IN_CACHE:
         return num_runs
     sizes = [size for size in range(1, num_runs + 1) if num_runs % size == 0]

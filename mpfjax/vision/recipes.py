@@ -45,6 +45,7 @@ def paper_filters(
         merge=Merge(None, 0.5, **where),
         split=Split(4.0, 0.5, min_share=0.15, **where),
         kmeans=KMeans(5, **where),
+        regroup_every=1,
     )
     return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
 

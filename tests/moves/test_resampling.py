@@ -1,5 +1,7 @@
 """Resampling at its edges; what every scheme must keep is in `test_contracts.py`."""
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -39,9 +41,12 @@ def assert_sound(mixture, moved):
     )
 
 
-def large_mixture(kind, n, m):
+def large_mixture(kind, n, m, in_order=False):
+    """Components mixed, or side by side, as after a resampling that nothing regrouped."""
     rng = np.random.default_rng(7)
     labels = rng.integers(0, m, n)
+    if in_order:
+        labels = np.sort(labels)
     log_weights = rng.normal(size=n)
     if kind == "empty slots":
         log_weights[rng.random(n) < 0.5] = -np.inf
@@ -99,8 +104,8 @@ class TestAtScale:
     @pytest.mark.parametrize("num_components", [9, *thorough([1])])
     def test_no_particle_of_zero_weight_is_ever_fed(self, scheme, num_components):
         """Not with random draws, nor with uniform draws at their ends."""
-        for kind in KINDS:
-            mixture = large_mixture(kind, 100_000, num_components)
+        for kind, in_order in itertools.product(KINDS, (False, True)):
+            mixture = large_mixture(kind, 100_000, num_components, in_order)
             for seed, uniform in enumerate((np.nan, 0.0, NEARLY_ONE)):
                 key, value = jax.random.key(seed), jnp.asarray(uniform, jnp.float32)
                 assert_sound(mixture, redraw_with(Resample(scheme), key, value, mixture))
@@ -130,6 +135,21 @@ def test_offspring_are_the_floor_or_the_ceiling_of_what_is_expected(scheme, num_
         counts = offspring(mixture, draw(Resample(scheme), mixture, seed))
         assert (counts >= np.floor(expected - 1e-4)).all()
         assert (counts <= np.ceil(expected + 1e-4)).all()
+
+
+def test_who_stands_in_order_beside_a_run_that_does_not_is_resampled_alike():
+    """Runs put their particles in order together; for one that has them so, nothing changes."""
+    mixtures = [
+        large_mixture("underflowing weights", 600, 5, in_order) for in_order in (True, False)
+    ]
+    key, resample = jax.random.key(4), Resample()
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *mixtures)
+    both = jax.jit(jax.vmap(resample, (None, 0)))(key, together)
+    for index, mixture in enumerate(mixtures):
+        found = jax.tree.map(lambda leaf: leaf[index], both)  # noqa: B023
+        assert_sound(mixture, found)
+        alone = draw(resample, mixture, 4)
+        np.testing.assert_array_equal(found.ancestor_indices, alone.ancestor_indices)
 
 
 class TestSSP:
