@@ -196,6 +196,8 @@ def study_of(
     mixture: dict[str, Any] = {
         "max_components": options.components,
         "regroup_every": options.regroup_every,
+        # As the tables were made.
+        "kmeans": mpfjax.KMeans(),
     }
     return mpfjax.Study(
         filters={name: functools.partial(build, name, model, mixture) for name in options.filters},

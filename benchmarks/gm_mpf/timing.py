@@ -63,7 +63,7 @@ def time_quadratic(
     every = {
         "pf": mpfjax.particle_filter(model, n),
         "gpf": mpfjax.gaussian_particle_filter(model, n),
-        "mpf": mpfjax.mixture_particle_filter(model, n, 2),
+        "mpf": mpfjax.mixture_particle_filter(model, n, 2, regroup_every=1, kmeans=mpfjax.KMeans()),
         "gm_mpf": mpfjax.gaussian_mixture_particle_filter(model, n, 2),
     }
     filters = {name: every[name] for name in names}
