@@ -25,8 +25,9 @@ class Merge(AbstractRegrouping):
       that joins them (Ashman's D; at 1 two equal Gaussians share 62% of their mass, at 2 32%);
     - their means are less than `max_distance` apart, in units of `scale`.
 
-    None leaves out a condition. `patience` is the number of steps (frames) in a row for which they
-    must overlap before they merge, so that two objects which pass each other do not become one.
+    None leaves out a condition. `patience` is how many times in a row they must be found to overlap
+    before they merge, so that two objects which pass each other do not become one: frames, where
+    this move runs at every frame, and k frames each within `Every(k, ...)`.
     A chain of overlapping components becomes one component, which keeps the lowest label.
 
     Raises `ValueError` where both conditions are None, for a threshold that is not positive, or
@@ -57,7 +58,7 @@ class Merge(AbstractRegrouping):
         self.features = Features(features, scale)
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """For how many steps each pair of components has overlapped, where patience counts."""
+        """How many times in a row each pair of components has overlapped, where patience counts."""
         if self.patience == 1:
             return {}
         return {"overlap_durations": jnp.zeros((num_components, num_components), jnp.int32)}
