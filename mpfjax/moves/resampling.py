@@ -168,8 +168,9 @@ class Resample(AbstractResampling):
         copies = _copies(mixture, drawn)
         num_slots = jnp.maximum(drawn.targets, 1).astype(mixture.log_weights.dtype)
         log_shares = self._log_masses(mixture, drawn.line) - jnp.log(num_slots)
-        # A dead component has no slots; its share must be finite to be stored.
-        log_shares = stored(jnp.where(log_shares == -jnp.inf, 0.0, log_shares))
+        if mixture.num_components > 1:
+            # A dead one of several has no slots; its share must be finite to be stored.
+            log_shares = stored(jnp.where(log_shares == -jnp.inf, 0.0, log_shares))
         redrawn = copies.replace(log_weights=spread(log_shares, slots.components))
         if self.gradient == "stop":
             log_weights = jax.lax.stop_gradient(redrawn.log_weights)

@@ -22,8 +22,10 @@ from mpfjax.moves.merge import Merge
 from mpfjax.moves.propagation import Propagate
 from mpfjax.moves.resampling import Resample
 from mpfjax.moves.split import Split
+from mpfjax.vision.boxes import check_boxes
 from mpfjax.vision.colour_model import BoxState, ColourModel
 from mpfjax.vision.colours import RGBColours
+from mpfjax.vision.frames import check_frame
 from mpfjax.vision.learned_colours import LearnedBoxState, LearnedColourModel, LearnLooks
 from mpfjax.vision.object_moves import ObjectExclusion, PruneHypotheses
 
@@ -122,6 +124,8 @@ def _own_references(
     switch_probability: float = 0.0,
 ) -> ColourModel:
     """Each box is a reference; some steps are six times as long, though sizes never jump."""
+    check_frame(frame)
+    check_boxes(boxes, *frame.shape[:2])
     long_steps = steps * np.array([6.0, 6.0, 1.0, 1.0])
     return ColourModel.from_frame(
         frame,

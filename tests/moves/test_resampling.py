@@ -294,6 +294,17 @@ def test_one_component_that_is_not_due_keeps_its_particles_among_empty_slots(
     np.testing.assert_array_equal(moved.particles, mixture.particles)
 
 
+@pytest.mark.parametrize("num_components", [1, 6])
+def test_what_has_no_mass_gets_none(num_components):
+    """As an island does that has died."""
+    mixture = make_mixture(
+        np.zeros((12, 1)), np.zeros(12), np.arange(12) % num_components, num_components
+    )
+    mixture = mixture.replace(log_weights=jnp.full(12, -jnp.inf))
+    moved = Resample()(jax.random.key(0), mixture)
+    np.testing.assert_array_equal(moved.log_weights, -np.inf)
+
+
 def test_soft_resampling_draws_from_the_softened_weights_and_weighs_by_the_ratio():
     """w / q on offspring drawn from q = 0.7 w + 0.3 / k, within each of two components."""
     labels = np.repeat([0, 1], [4, 6])
