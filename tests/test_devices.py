@@ -309,7 +309,8 @@ class TestProcesses:
         assert "leaves 1 of the processes without any" in told["left out"]
 
 
-@pytest.mark.parametrize("which", ["eight", *thorough(["first", "second"])])
+@pytest.mark.thorough
+@pytest.mark.parametrize("which", ["eight", "first", "second"])
 class TestManyDevices:
     def test_they_take_part(self, started, which):
         assert started[which][1]["devices"] == (8 if which == "eight" else 2)
@@ -324,6 +325,7 @@ class TestManyDevices:
             np.testing.assert_allclose(runs[name], on_one_device[name], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.thorough
 class TestTheCompiledProgram:
     """Of islands of 256 particles in two components each, on eight devices."""
 

@@ -6,12 +6,11 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-from tests.marking import quick_of
-
 NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 
 
-@pytest.mark.parametrize("path", quick_of(NOTEBOOKS, NOTEBOOKS[:1]), ids=lambda path: path.stem)
+@pytest.mark.thorough
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_runs_in_its_short_form(path, monkeypatch):
     monkeypatch.setenv("MPFJAX_SHORT", "1")
     notebook = nbformat.read(path, as_version=4)

@@ -107,6 +107,7 @@ def test_whole_numbers_become_integers():
     np.testing.assert_array_equal(found, whole)
 
 
+@pytest.mark.thorough
 def test_more_places_than_float32_can_number():
     firsts = np.array([0, 1, 2**24 + 1, 2**24 + 3, 2**24 + 7])
     segments = segments_in_order(jnp.asarray(firsts, jnp.int32), 2**24 + 40)

@@ -30,6 +30,7 @@ def log_evidence(noise, num_particles):
     return np.asarray(run.log_marginal_likelihood - exact, float)
 
 
+@pytest.mark.thorough
 def test_the_error_of_the_evidence_falls_faster_than_that_of_independent_noise():
     """Sobol points in the plane, particles along a Hilbert curve; 400 runs give sd to 3.5%."""
     few, many = 64, 512

@@ -177,6 +177,7 @@ def test_sensitivity_has_the_tables_scene_on_every_axis_and_the_old_one():
     assert [case.setting.speed for case in sensitivity.CASES if case.axis == sensitivity.OLD] == [6]
 
 
+@pytest.mark.thorough
 class TestMaps:
     """The likelihood read off a map is the colour model's."""
 

@@ -90,6 +90,7 @@ def test_a_filter_has_the_size_that_its_cell_says(name):
     assert observations.shape == ((5, 4) if name == "dps" else (5,))
 
 
+@pytest.mark.thorough
 def test_processes_share_the_seeds():
     found = spread.spread_over("processes", [2], {"particles": 16, "seeds": 3}, repeats=1)
     assert [(entry["kind"], entry["number"]) for entry in found] == [("processes", 2)]

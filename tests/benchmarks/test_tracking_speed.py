@@ -34,6 +34,7 @@ def test_the_detector_finds_them():
     assert (gaps.max(axis=2).min(axis=1) < 0.5).sum() >= 0.8 * NUM_OBJECTS
 
 
+@pytest.mark.thorough
 def test_a_round_is_timed_in_a_process_of_its_own(tmp_path, monkeypatch, capsys):
     alone = WAYS[-1]
     assert alone.size is None

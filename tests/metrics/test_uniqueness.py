@@ -52,6 +52,7 @@ def test_effective_dynamics_of_whole_numbers():
     np.testing.assert_allclose(effective_dynamics(mixture), labels.var(axis=0), rtol=1e-5)
 
 
+@pytest.mark.thorough
 class TestFigure4:
     """Seven objects that walk with a deviation of 2 and are seen to half a unit, N = 300."""
 

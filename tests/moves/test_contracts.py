@@ -16,13 +16,12 @@ from tests.registry import REGROUPINGS, REJUVENATIONS
 # On either side of the number of components up to which they are worked on as rows.
 FEW = ("ordinary", "dead components", "masses 200 nats apart")
 MIXTURES = example_mixtures() | {f"{name}, M = 3": example_mixtures(3)[name] for name in FEW}
-# One of each way in which a mixture can be out of the ordinary, and either number of components.
+# One of each way in which a mixture can be out of the ordinary.
 QUICK_MIXTURES = (
     "ordinary",
     "dead components",
     "empty slots with stale states",
     "masses 200 nats apart",
-    "dead components, M = 3",
 )
 # One of each way to place the offspring, to share the slots, and to choose who is due.
 QUICK_REJUVENATIONS = (

@@ -86,7 +86,7 @@ SQUARES = np.array([1.2, 0.8, 1.5, 1.0, 0.6, 0.9, 1.1, 1.3], np.float32)
 @pytest.mark.parametrize(
     ("filter", "observations"),
     [
-        (mpfjax.particle_filter(ONE, 1000, **DRAWS), np.sin(np.arange(8.0))[:, None]),
+        *thorough([(mpfjax.particle_filter(ONE, 1000, **DRAWS), np.sin(np.arange(8.0))[:, None])]),
         (labelled(SQUARE, 1000, regrouping=KMeans(), m=2), SQUARES),
     ],
     ids=["pf", "mpf"],

@@ -62,7 +62,7 @@ def exact_errors(names):
     return dict(zip(names, np.sqrt(np.diag(np.linalg.inv(information))), strict=True))
 
 
-@pytest.mark.parametrize("unit", [1e-3, *thorough([100.0, 1e4])])
+@pytest.mark.parametrize("unit", thorough([1e-3, 100.0, 1e4]))
 def test_a_location_has_its_error_in_any_unit(unit):
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of seeds that would be too few

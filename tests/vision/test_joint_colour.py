@@ -158,6 +158,7 @@ def assert_defined(run):
 
 
 class TestScenesGoneWrong:
+    @pytest.mark.thorough
     def test_two_objects_on_the_same_spot_with_the_same_looks(self, frame, run_all):
         model = joint_colour_model(frame, BOXES[[1, 1, 2]], colours=COLOURS)
         for run in run_all(model, frame):

@@ -37,6 +37,7 @@ def test_the_kits_are_where_the_boxes_are(scene):
         assert redness > 80 if scene.kits[int(id)] == 0 else redness < 40
 
 
+@pytest.mark.thorough
 def test_the_camera_moves_and_players_change_places():
     long = football_scene(jax.random.key(0), 110, height=96, width=160)
     centres = long.tracks[:, 2] + long.tracks[:, 4] / 2
