@@ -37,7 +37,7 @@ def test_scores_are_those_of_the_filters_own_particles(study):
     model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
     truth, observations = benchmark.simulate(written["settings"]["data_seed"])
     keys = jax.random.split(jax.random.fold_in(jax.random.key(written["settings"]["seed"]), 1), 3)
-    filter = mpfjax.mixture_particle_filter(model, 20, 2)
+    filter = mpfjax.mixture_particle_filter(model, 20, 2, regroup_every=1, kmeans=mpfjax.KMeans())
     collected = mpfjax.run_filter(keys[1], filter, observations).collected
     positions = np.where(collected.log_weights > -np.inf, collected.particles, np.inf)
     near = [np.abs(positions - sign * np.asarray(truth)[:, None]).min(1) < 0.3 for sign in (1, -1)]
