@@ -20,7 +20,7 @@ NAMES = [str(page.relative_to(REPOSITORY)) for page in PAGES]
 COMMAND = re.compile(r"python -m (benchmarks\.[a-z_]+|mpfjax\b)((?: [^\n`|#]*)?)")
 WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
 # The others are run where the thorough tests are.
-QUICK_PAGES = [page for page in WITH_CODE if page.stem in ("README", "start")]
+QUICK_PAGES = [page for page in WITH_CODE if page.stem in ("README",)]
 
 sybil = Sybil(parsers=[PythonCodeBlockParser(), SkipParser()], path=str(REPOSITORY))
 

@@ -236,11 +236,11 @@ class TestSlots:
     @pytest.mark.parametrize(
         "chain",
         [
-            "mpf",
+            "pf adaptive",
             *thorough(
                 [
+                    "mpf",
                     "dps",
-                    "pf adaptive",
                     "random labels, residual",
                     "gaussian mixture",
                     "ps adaptive, random order",

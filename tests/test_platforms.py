@@ -55,7 +55,7 @@ def test_a_whole_filter_is_lowered_for_a_gpu():
     assert lowered.platforms == ("cuda",)
 
 
-@pytest.mark.parametrize("chain", quick_of(CHAINS, ["mpf, M = 6"]))
+@pytest.mark.parametrize("chain", quick_of(CHAINS, ["pf"]))
 def test_a_chain_on_the_default_forms_is_the_same_filter(chain):
     """Most runs; in the others a particle stands on the border between two offspring.
 

@@ -216,6 +216,7 @@ class TestNetworkProposal:
         assert standard_error < 0.03
         assert abs(ratios.mean() - 1) < 4 * standard_error
 
+    @pytest.mark.thorough
     def test_it_learns_by_the_filters_own_bound(self):
         """It ends above where it began, and below log Z as every bound must.
 

@@ -66,6 +66,7 @@ class Switching(mpfjax.AbstractStateSpaceModel):
         return -0.5 * jnp.sum((observation[None] - states["place"]) ** 2, axis=1)
 
 
+@pytest.mark.thorough
 def test_of_a_mode_beside_a_place_the_place_is_sorted_and_the_mode_goes_along():
     filter = mpfjax.mixture_particle_filter(
         Switching(), 64, 3, noise="rqmc", features=lambda states: states["place"]

@@ -153,6 +153,7 @@ def true_boxes(until=NUM):
     return [truth[(truth[:, 0] == t) & (t <= until)][:, 2:] for t in range(1, NUM + 1)]
 
 
+@pytest.mark.thorough
 def test_rows_are_of_believed_objects_and_end_with_the_last_guess(sequence):
     rows, _ = tracked(sequence, true_boxes(until=15))
     assert set(rows[:, 1]) == {1, 2, 3}

@@ -149,6 +149,5 @@ QUICK_CASES = [
       for smoother in SMOOTHERS if SMOOTHERS[smoother].of_run
       for chain, model in (("pf", "four dimensions"), ("dps", "one dimension"),
                            ("mpf", "two modes"))),
-    ("PaRIS", "pf", "four dimensions"),
     ("fixed lag, MCMC", "mpf", "one dimension"),
 ]  # fmt: skip

@@ -483,6 +483,7 @@ class TestBias:
                 jax.random.key(0), filter, OBSERVATIONS, parameters=NOISE, num_seeds=2
             )  # fmt: skip
 
+    @pytest.mark.thorough
     def test_what_is_right_is_not(self):
         weights = {"w": lambda filter: filter.moves[1].proposal.network}
         learning = mpfjax.particle_filter(ScalarLinear(), 16, proposal=self.PROPOSAL)

@@ -67,6 +67,7 @@ def assert_posterior(runs, values, exact):
 
 
 class TestPosterior:
+    @pytest.mark.thorough
     def test_waste_free_through_a_mixture_is_the_exact_one(self):
         """With K-means, merging and splitting in the chain."""
         filter = eager_mixture()
