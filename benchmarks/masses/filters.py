@@ -17,7 +17,7 @@ def _plain(**options: Any) -> Make:
 
 def _mixture(ahead: bool = False, **options: Any) -> Make:
     def make(scene: Scene, num_particles: int) -> mpfjax.Filter:
-        regrouped = {"regroup_every": 1} | options
+        regrouped: dict[str, Any] = {"regroup_every": 1} | options
         lookahead = {"lookahead": scene.lookahead} if ahead else {}
         return mpfjax.mixture_particle_filter(
             scene.model, num_particles, scene.max_components,
