@@ -451,7 +451,7 @@ class TestChoosingDevices:
             assert choose_devices(None) == jax.devices()[:1]
 
 
-@pytest.mark.parametrize("num_components", [3, *thorough([6])])
+@pytest.mark.parametrize("num_components", thorough([3, 6]))
 def test_a_constant_moves_the_evidence_of_islands_and_nothing_else(num_components):
     """Every island has a scale of its own, beside which none may be rounded away."""
 

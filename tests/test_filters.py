@@ -74,7 +74,7 @@ class TestAgainstReferences:
 
     @pytest.mark.parametrize(
         ("kind", "model"),
-        [("mpf", LINEAR_1D), ("guided pf", LINEAR_2D)],
+        [("mpf", LINEAR_1D), *thorough([("guided pf", LINEAR_2D)])],
         ids=["mpf in 1d", "guided pf in 2d"],
     )
     def test_agrees_with_the_kalman_filter(self, kind, model):
@@ -426,6 +426,7 @@ class TestGradients:
         np.testing.assert_allclose(gradient.m0, exact.m0, rtol=0.05, atol=0.01)
         np.testing.assert_allclose(gradient.A, exact.A, rtol=0.05, atol=0.01)
 
+    @pytest.mark.thorough
     def test_is_passed_on_by_what_is_collected(self):
         key = jax.random.key(19)
         filter = mpfjax.particle_filter(mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0), 16)

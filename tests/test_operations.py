@@ -487,6 +487,7 @@ def test_columns_of_no_weight_are_not_drawn_at_the_borders_of_blocks():
         assert (table[np.arange(len(table)), np.asarray(found)] > 0).all()
 
 
+@pytest.mark.thorough
 def test_the_last_column_is_drawn_of_a_row_without_weight():
     found = draw_columns(jnp.array([0.0, 0.7]), jnp.zeros((2, 11)))
     np.testing.assert_array_equal(found, [10, 10])

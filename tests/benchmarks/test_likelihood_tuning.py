@@ -10,6 +10,7 @@ from benchmarks.likelihood_tuning import labels, scores, starts
 from benchmarks.likelihood_tuning.quadratic import COARSE_GRID, exact_quadratic
 
 
+@pytest.mark.thorough
 def test_scores_are_written_with_their_bias_and_cost(tmp_path, capsys):
     arguments = ["--parts", "a", "--runs", "10", "--particles", "20", "--filters", "pf"]
     arguments += ["--models", "quadratic", "--estimators", "none", "stop"]

@@ -80,7 +80,7 @@ def test_masses_are_those_of_regions():
     np.testing.assert_allclose(masses(scene, mixture), [1 - above, above], rtol=1e-5)
 
 
-@pytest.mark.parametrize("scenes", [["corridor"], *thorough([["bearings", "look-alikes"]])])
+@pytest.mark.parametrize("scenes", thorough([["corridor"], ["bearings", "look-alikes"]]))
 def test_a_row_for_each_scene_filter_and_size(scenes, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command.importlib.util, "find_spec", lambda name: None)
     arguments = [

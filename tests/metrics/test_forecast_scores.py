@@ -59,6 +59,7 @@ class TestCrps:
 
 
 class TestLogScore:
+    @pytest.mark.thorough
     def test_one_step_ahead_is_the_next_increment(self):
         """Up to the Monte Carlo error of two predictions."""
         model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)

@@ -167,6 +167,7 @@ class Momentum(mpfjax.AbstractStateSpaceModel):
         return jax.scipy.stats.norm.logpdf(observation[0] - states[:, 0], scale=jnp.sqrt(0.5))
 
 
+@pytest.mark.thorough
 def test_objects_apart_are_independent_filters_row_order_aside():
     seen = OBSERVATIONS[0]
     plain, filter = mpfjax.independent_particle_filters, mpfjax.clustered_particle_filter
@@ -184,6 +185,7 @@ def test_objects_apart_are_independent_filters_row_order_aside():
     assert labels_of(mixture).tolist() == [0, 1, 2]
 
 
+@pytest.mark.thorough
 def test_what_one_object_is_shown_costs_another_no_hypotheses():
     """Three objects in one cluster, the second of them seen sharply."""
     sharp = MultiObjectModel(stack([walker(0.0), walker(1.0, 1e-4), walker(-1.0)]), 3)

@@ -117,6 +117,7 @@ def test_box_states_of_second_order_keep_the_spread_of_every_coordinate():
     assert (np.abs(found - expected) < 5 * scale * np.sqrt(2 / len(draws)) + 0.01 * scale).all()
 
 
+@pytest.mark.thorough
 def test_identical_boxes_and_a_box_of_all_the_weight_are_drawn_again():
     mixture = box_states(np.array([5.0, 5, 0.02, 0.02]))
     after = GaussianRegeneration(10, where=motion)(jax.random.key(0), mixture)

@@ -66,6 +66,7 @@ class TestAgainstKalmanFilters:
         log_evidence = sum(float(run.log_marginal_likelihood) for run in runs)
         return log_evidence, np.array([run.means[-1, 0] for run in runs])
 
+    @pytest.mark.thorough
     def test_every_order_is_unbiased(self):
         keys = jax.random.split(jax.random.key(1), NUM_RUNS)
 
@@ -342,6 +343,7 @@ class TestReassembly:
 
 
 class TestGradient:
+    @pytest.mark.thorough
     def test_is_that_of_finite_differences_where_nothing_is_resampled(self):
         """Of the objects' parameters and of the interaction's, through every stage."""
 

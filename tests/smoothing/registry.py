@@ -147,7 +147,6 @@ CASES = [
 QUICK_CASES = [
     *((smoother, chain, model)
       for smoother in SMOOTHERS if SMOOTHERS[smoother].of_run
-      for chain, model in (("pf", "four dimensions"), ("dps", "one dimension"),
-                           ("mpf", "two modes"))),
+      for chain, model in (("pf", "four dimensions"), ("mpf", "two modes"))),
     ("fixed lag, MCMC", "mpf", "one dimension"),
 ]  # fmt: skip

@@ -166,6 +166,7 @@ def test_averages_of_pairs_are_close_to_the_pairs_themselves(num_components):
     assert len(twice._initial_moves) == len(filter._initial_moves) + 1
 
 
+@pytest.mark.thorough
 def test_every_step_reports_them_and_no_other_filter_does():
     filter = with_first_ancestors(labelled(SQUARE, 80, regrouping=KMeans()))
     mixture = filter.init(jax.random.key(0))

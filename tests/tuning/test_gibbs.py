@@ -147,6 +147,7 @@ def test_bad_arguments_are_refused_by_name(options, named):
         sample(**options)
 
 
+@pytest.mark.thorough
 def test_one_step_of_time_and_no_observation_at_all():
     """Without observations the posterior is the prior."""
     run = sample(observations=jnp.full(1, jnp.nan), missing="skip")

@@ -59,6 +59,7 @@ def test_the_posterior_is_the_exact_one():
     assert run.stopped is None
 
 
+@pytest.mark.thorough
 def test_the_likelihoods_are_those_of_the_states():
     """They change when, and only when, a step moves, and spread about the exact one."""
     run = sample(30, num_chains=3)
@@ -157,6 +158,7 @@ def test_without_blackjax_it_says_how_to_get_it(monkeypatch):
         sample()
 
 
+@pytest.mark.thorough
 def test_all_of_the_model_is_sampled_where_nothing_is_named():
     run = sample(2, parameters=None, transforms=None, log_prior=lambda p: -sum(
         0.5 * value**2 for value in p.values()

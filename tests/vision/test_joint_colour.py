@@ -183,6 +183,7 @@ class TestScenesGoneWrong:
         value = model.log_likelihood(jnp.asarray(frame), tiny)
         np.testing.assert_allclose(value, [-20.0 * 3 * 2], rtol=1e-5)
 
+    @pytest.mark.thorough
     def test_one_object(self, frame):
         """PS of one object is the particle filter on it bit for bit, and DPS has one component."""
         model = joint_colour_model(frame, BOXES[:1], colours=COLOURS)

@@ -69,6 +69,7 @@ def test_what_is_no_box_in_the_frame_counts_nothing(box):
     assert not np.asarray(table.counts(jnp.asarray([box], jnp.float32), 3)).any()
 
 
+@pytest.mark.thorough
 def test_distances_are_nearly_those_of_all_pixels():
     """A frame of broad patches, boxes of many pixels: the mean error of B² stays small."""
     coarse = RNG.integers(0, 256, (12, 16, 3), dtype=np.uint8)
