@@ -199,6 +199,15 @@ class TestNoiseOfFamilies:
         assert (strata == np.arange(FAMILY)).all()
 
 
+@pytest.mark.parametrize("num_draws", [2, 3])
+def test_any_number_of_draws_fills_its_strata(num_draws):
+    """Two strata are half of all numbers of 32 bits each, which int32 does not hold."""
+    draw = lambda key: draw_family_noise("rqmc", key, (30, 1), num_draws, FLOAT, LABELS, 3)[0]  # noqa: E731
+    noise = np.asarray(jax.vmap(draw)(KEYS[:20])).reshape(-1, 30, num_draws)
+    strata = np.floor(num_draws * scipy.stats.norm.cdf(noise)).astype(int)
+    assert (strata == np.arange(num_draws)).all()
+
+
 def test_families_and_what_they_keep_are_one_net():
     """One of all draws in each cell of a coordinate; a draw kept by its share is even as well."""
     n, labels = 64, jnp.zeros(64, jnp.int32)

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
 from mpfjax.operations.floats import default_float
@@ -124,7 +125,7 @@ def draw_family_noise(
         first = own * multipliers[0] + shifts[0]
         last = own * multipliers[d] + shifts[d]
         rest = draws.astype(jnp.uint32)[None] * multipliers[1:d, None] + shift_of_draws
-    strata = draw.astype(jnp.uint32) * ((2**32 // num_draws) % 2**32)
+    strata = draw.astype(jnp.uint32) * np.uint32((2**32 // num_draws) % 2**32)
     points = jnp.concatenate([jnp.ravel(first[:, None] // num_draws + strata)[None], rest])
     return stored(_normal_of(points, dtype)).T, _uniform_of(last, dtype)
 
