@@ -37,7 +37,7 @@ from tests.precision import float64
 RNG = np.random.default_rng(0)
 SIZES = (1, 2, 31, 32, 33, 100, 1024, 1025, 33_000)
 # On either side of the number of segments up to which sums are unrolled.
-FEW_AND_MANY = (1, 3, 4, 5, 17)
+FEW_AND_MANY = (1, 2, 4, 5, 16, 17)
 
 
 @pytest.mark.parametrize("n", SIZES)

@@ -26,7 +26,10 @@ from mpfjax.operations.logarithms import exp, finite_or_zero, log_or_nothing, ma
 from mpfjax.operations.prefix_sums import count_starts, count_upto
 from mpfjax.operations.stored import EXACT_IN_FLOAT32, stored, whole_blocks
 
+# A sum over each of so many segments has a mask for each.
 FEW_SEGMENTS = 4
+# One of so many values is chosen by comparing, which runs on vectors; a gather does not.
+FEW_CHOICES = 16
 # Neighbours that are added to the same place go to different lanes, each with a place of its own.
 # In one place, a CPU would have to wait for each addition before the next.
 _LANES = 8
@@ -46,17 +49,20 @@ def spread(
 ) -> Shaped[Array, "n *rest"]:
     """values[segments], each entry its segment's value; a label out of range gets some value.
 
-    With few segments it is a choice between them, with many a gather: on a CPU, nothing that is
-    fused with a gather runs on vectors.
+    With up to 16 segments it is a choice between them, with more a gather: on a CPU, nothing that
+    is fused with a gather runs on vectors.
     """
     num_segments = values.shape[0]
-    if num_segments > FEW_SEGMENTS:
+    if num_segments > FEW_CHOICES:
         return take(values, segments)
-    chosen = jnp.broadcast_to(values[0], (*segments.shape, *values.shape[1:]))
-    for m in range(1, num_segments):
-        is_member = (segments == m).reshape(-1, *[1] * (values.ndim - 1))
-        chosen = jnp.where(is_member, values[m][None], chosen)
-    return chosen
+    shape = (*segments.shape, *values.shape[1:])
+    cases = [
+        jnp.broadcast_to(jax.lax.slice_in_dim(values, m, m + 1), shape) for m in range(num_segments)
+    ]
+    if num_segments == 1:
+        return cases[0]
+    which = jax.lax.broadcast_in_dim(segments.astype(jnp.int32), shape, (0,))
+    return jax.lax.select_n(which, *cases)
 
 
 def spread_finite(
@@ -66,7 +72,7 @@ def spread_finite(
 
     Whole numbers must be in [0, bound). A choice between few values runs on vectors anyway.
     """
-    if values.shape[0] <= FEW_SEGMENTS:
+    if values.shape[0] <= FEW_CHOICES:
         return spread(values, segments)
     columns = stored(values.reshape(values.shape[0], -1).T, bound)
     return spread(columns.T.reshape(values.shape), segments)
@@ -219,6 +225,9 @@ def segment_softmax(
     values = exp(log_values - spread_finite(shift, segments))
     totals = segment_sum(values, segments, num_segments)
     shares = values / spread_finite(jnp.where(totals == 0, 1.0, totals), segments)
+    if num_segments > FEW_SEGMENTS:
+        # Or a scatter of them would choose every particle's total, one after the other.
+        shares = stored(shares)
     return masked_shares(log_values, shares)
 
 
@@ -234,7 +243,7 @@ def segment_argmax(
     is_largest = values >= spread_finite(largest, segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
     if num_segments > FEW_SEGMENTS:
-        return _scattered("min", index, segments, num_segments, n - 1)
+        return _scattered("min", stored(index, n), segments, num_segments, n - 1)
     member = _members(segments, num_segments)
     return jnp.min(jnp.where(member, index[None], n - 1), axis=1)
 
