@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, ArrayLike, Float, Key
 
 from mpfjax.checks import check_not_negative_array, check_type, shown, to_array
 from mpfjax.models.dynamics import AbstractDynamics, AbstractRandomWalk
@@ -49,7 +49,7 @@ class WalkWithVelocity(AbstractDynamics):
         self,
         walk: AbstractRandomWalk,
         gain: float | Sequence[float] = 0.1,
-        initial_velocity: Float[Array, "*n d"] | None = None,
+        initial_velocity: ArrayLike | Sequence[float] | None = None,
     ) -> None:
         check_type(AbstractRandomWalk, "a walk such as RandomWalk(deviations)", walk=walk)
         still = jnp.zeros_like(walk.deviations)

@@ -1,5 +1,7 @@
 """Labelled boxes as states of a model, and boxes around them."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,7 +37,7 @@ def labelled_states(model: AbstractBoxModel, boxes: Float[np.ndarray, "t k 4"]) 
         return BoxState(box, reference)
     dynamics = model.dynamics_of(BoxState(box[0], reference[0]))
 
-    def follow(past: Array, places: tuple[Array, Array]) -> tuple[Array, Array]:
+    def follow(past: Any, places: tuple[Array, Array]) -> tuple[Any, Any]:
         before, now = places
         past = dynamics.remembered(now, before, past)
         return past, past

@@ -82,10 +82,10 @@ def objects_filters(
     """The recipe with the fewest strays and swaps: every component keeps to its object.
 
     Every particle is compared only with the box that it started from, and learns how its object
-    looks and moves now. So the components of an object are rival hypotheses about it. It may be hidden, and
-    then they wait. Only components of one object merge, a component splits where hypotheses
-    diverge, and hopeless ones are pruned. Objects exclude each other. They share the particles
-    equally: 200, and from four objects on 60 for each object.
+    looks and moves now. So the components of an object are rival hypotheses about it. It may be
+    hidden, and then they walk on. Only components of one object merge, a component splits where
+    hypotheses diverge, and hopeless ones are pruned. Objects exclude each other. They share the
+    particles equally: 200, and from four objects on 60 for each object.
     """
     size = boxes[:, 2:].mean(axis=0)
     steps = _steps(boxes) * np.array([0.4, 1.0, 1.0, 1.0])

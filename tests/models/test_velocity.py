@@ -1,5 +1,7 @@
 """The walk with a velocity against the joint normal density of a path, with no recursion at all."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +20,7 @@ def path(seed=0):
 def log_density_of(dynamics, places, past):
     """The sum of the log densities of the steps, carrying the past along."""
     total, past = 0.0, jnp.full((1, 1), past)
-    for before, now in zip(places[:-1], places[1:], strict=True):
+    for before, now in itertools.pairwise(places):
         before, now = jnp.full((1, 1), before), jnp.full((1, 1), now)
         total += float(dynamics.log_density(now, before, past)[0])
         past = dynamics.remembered(now, before, past)
@@ -61,7 +63,8 @@ def test_long_steps_are_those_of_the_walk():
     walk = RandomWalkWithJumps([0.5, 2.0], [3.0, 2.5], 0.1)
     dynamics = WalkWithVelocity(walk, (0.2, 0.0))
     current, past, point = jnp.array([[[3.0, 1.0]], [[2.0, 2.0]], [[4.5, 0.5]]])
-    expected = [norm([4.0, 0.0], s).pdf(np.asarray(point[0])).prod() for s in ([0.5, 2], [3, 2.5])]
+    centre = np.array([4.0, 0.0])
+    expected = [norm(centre, s).pdf(np.asarray(point[0])).prod() for s in ([0.5, 2], [3, 2.5])]
     np.testing.assert_allclose(
         dynamics.log_density(point, current, past)[0],
         np.log(0.9 * expected[0] + 0.1 * expected[1]), rtol=1e-5,
@@ -87,7 +90,7 @@ def test_velocities_at_the_start():
 @pytest.mark.parametrize(
     ("error", "message", "make"),
     [
-        (TypeError, "walk: ", lambda walk: WalkWithVelocity(3.0)),
+        (TypeError, "walk: ", lambda walk: WalkWithVelocity(None)),
         (ValueError, r"gain: \(1.5,\)", lambda walk: WalkWithVelocity(walk, 1.5)),
         (ValueError, "gain: .* is not one or 2", lambda walk: WalkWithVelocity(walk, (0.1,) * 3)),
         (
