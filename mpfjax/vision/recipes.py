@@ -63,6 +63,8 @@ def default_filters(
     it takes a long step. Components exclude each other. They split if they cover two places, and
     merge only after ten frames at the same place.
     """
+    check_frame(frame)
+    check_boxes(boxes, *frame.shape[:2])
     size = boxes[:, 2:].mean(axis=0)
     steps = _steps(boxes)
     walk = _with_jumps(steps, probability=0.05)
@@ -87,6 +89,8 @@ def objects_filters(
     hypotheses diverge, and hopeless ones are pruned. Objects exclude each other. They share the
     particles equally: 200, and from four objects on 60 for each object.
     """
+    check_frame(frame)
+    check_boxes(boxes, *frame.shape[:2])
     size = boxes[:, 2:].mean(axis=0)
     steps = _steps(boxes) * np.array([0.4, 1.0, 1.0, 1.0])
     walk = _walking(_with_jumps(steps, probability=0.1), boxes)
@@ -128,8 +132,6 @@ def _own_references(
     switch_probability: float = 0.0,
 ) -> ColourModel:
     """Each box is a reference."""
-    check_frame(frame)
-    check_boxes(boxes, *frame.shape[:2])
     return ColourModel.from_frame(
         frame,
         boxes,
