@@ -24,6 +24,7 @@ from mpfjax.models import PairwiseRepulsion as PairwiseRepulsion
 from mpfjax.models import QuadraticModel as QuadraticModel
 from mpfjax.models import RandomWalk as RandomWalk
 from mpfjax.models import RandomWalkWithJumps as RandomWalkWithJumps
+from mpfjax.models import WalkWithVelocity as WalkWithVelocity
 from mpfjax.models import per_particle as per_particle
 from mpfjax.moves import AbstractMove as AbstractMove
 from mpfjax.moves import AbstractPropagation as AbstractPropagation

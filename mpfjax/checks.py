@@ -151,6 +151,13 @@ def check_positive_array(**arguments: Any) -> None:
     _check_entries(lambda array: (array > 0) & np.isfinite(array), "positive and finite", arguments)
 
 
+def check_not_negative_array(**arguments: Any) -> None:
+    """Each array has numbers, all of them finite and none negative, as far as they are known."""
+    _check_entries(
+        lambda array: (array >= 0) & np.isfinite(array), "finite and not negative", arguments
+    )
+
+
 def check_finite_array(**arguments: Any) -> None:
     """Each array has numbers, all of them finite, as far as they are known."""
     _check_entries(np.isfinite, "finite", arguments)

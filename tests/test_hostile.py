@@ -54,6 +54,10 @@ BUILT = {
         mpfjax.RandomWalkWithJumps,
         {"deviations": [1.0], "jump_deviations": [5.0], "jump_probability": 0.1},
     ),
+    "WalkWithVelocity": (
+        mpfjax.WalkWithVelocity,
+        {"walk": mpfjax.RandomWalk([1.0]), "gain": 0.1, "initial_velocity": [0.5]},
+    ),
     "Autoregression": (
         mpfjax.Autoregression, {"A1": EYE, "A2": EYE, "B": EYE, "mean": np.zeros(1)}
     ),

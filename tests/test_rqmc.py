@@ -248,6 +248,7 @@ ROWS = jnp.tile(jnp.array([[1.0, -2.0]]), (20_000, 1))
 DYNAMICS = {
     "walk": mpfjax.RandomWalk([1.0, 2.0]),
     "jumps": mpfjax.RandomWalkWithJumps([1.0, 2.0], [9.0, 8.0], 0.2),
+    "velocity": mpfjax.WalkWithVelocity(mpfjax.RandomWalk([1.0, 2.0]), 0.3),
     "momentum": mpfjax.Autoregression.with_momentum(0.5, jnp.array([1.0, 2.0])),
 }
 

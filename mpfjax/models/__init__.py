@@ -10,3 +10,4 @@ from mpfjax.models.jumps import RandomWalkWithJumps as RandomWalkWithJumps
 from mpfjax.models.linear_gaussian import LinearGaussianModel as LinearGaussianModel
 from mpfjax.models.multi_object import MultiObjectModel as MultiObjectModel
 from mpfjax.models.quadratic import QuadraticModel as QuadraticModel
+from mpfjax.models.velocity import WalkWithVelocity as WalkWithVelocity

@@ -22,7 +22,8 @@ class AbstractDynamics(eqx.Module):
     """D(x_t | x_{t-1}, x_{t-2}) of a vector: a part of a model, not a model itself.
 
     There is one set of parameters for all particles, or one for each, along a leading axis. Where
-    `order` is 2, a model keeps x_{t-1} beside x_t in its state.
+    `order` is 2, a model keeps the past of x_t beside it in its state: x_{t-1}, or what else
+    `remembered` gives, which is then `previous` in the next step.
     """
 
     @property
@@ -73,6 +74,23 @@ class AbstractDynamics(eqx.Module):
         self, current: Float[Array, "n d"], previous: Float[Array, "n d"] | None = None
     ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
         """Mean and standard deviation of every coordinate of x_t."""
+
+    def remembered(
+        self,
+        following: Float[Array, "n d"],
+        current: Float[Array, "n d"],
+        previous: Float[Array, "n d"] | None,
+    ) -> Float[Array, "n d"] | None:
+        """The past of x_t, in `following`: x_{t-1} where the order is 2, and None where it is 1."""
+        del following, previous
+        return current if self.order == 2 else None
+
+    def initial_past(
+        self, key: Key[Array, ""], current: Float[Array, "n d"]
+    ) -> Float[Array, "n d"] | None:
+        """The past of x_0: x_0 itself where the order is 2, which then stands still."""
+        del key
+        return current if self.order == 2 else None
 
 
 class AbstractRandomWalk(AbstractDynamics):

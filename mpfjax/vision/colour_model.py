@@ -45,7 +45,8 @@ class BoxState(eqx.Module):
 
     - `box`: (x, y, s_x, s_y), the centre in pixels and the size in units of the reference box.
     - `reference`: r, the reference box it is compared with, in [0, number of references).
-    - `previous`: the box one frame before, if the dynamics are of second order.
+    - `previous`: what the dynamics remember of the past, if they are of second order: the box one
+    frame before, or what else their `remembered` gives.
     """
 
     box: Float[Array, "*n 4"]
@@ -77,7 +78,9 @@ class AbstractBoxModel(AbstractStateSpaceModel):
         )
         noise = jax.random.normal(key_noise, (num_particles, 4), centre.dtype)
         box = centre[reference] + self.initial_deviations[reference] * noise
-        return BoxState(box, reference, self._remembered(box))
+        states = BoxState(box, reference)
+        past = self.dynamics_of(states).initial_past(jax.random.fold_in(key_noise, 1), box)
+        return BoxState(box, reference, past)
 
     def sample_transition(self, key: Key[Array, ""], states: BoxState) -> BoxState:
         """x_t from the dynamics; with the switch probability, r is drawn again."""
@@ -90,7 +93,7 @@ class AbstractBoxModel(AbstractStateSpaceModel):
             reference = jnp.where(switches, drawn, reference)
         dynamics = self.dynamics_of(states)
         box = dynamics.sample(key_noise, states.box, states.previous)
-        return BoxState(box, reference, self._remembered(states.box))
+        return BoxState(box, reference, dynamics.remembered(box, states.box, states.previous))
 
     @property
     def noise_dimension(self) -> int:
@@ -110,7 +113,7 @@ class AbstractBoxModel(AbstractStateSpaceModel):
         dynamics = self.dynamics_of(states)
         noise = noise[:, : self.dynamics.noise_dimension]
         box = dynamics.from_noise(noise, states.box, states.previous)
-        return BoxState(box, reference, self._remembered(states.box))
+        return BoxState(box, reference, dynamics.remembered(box, states.box, states.previous))
 
     def log_transition(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
         """log D(x_t | x_{t-1}) + log P(r_t | r_{t-1}), -inf where r cannot have changed."""
@@ -130,14 +133,13 @@ class AbstractBoxModel(AbstractStateSpaceModel):
 
     def with_history(self, states: BoxState, previous_states: BoxState) -> BoxState:
         """The states as children of the previous ones: they remember those boxes."""
-        return BoxState(states.box, states.reference, self._remembered(previous_states.box))
+        dynamics = self.dynamics_of(previous_states)
+        past = dynamics.remembered(states.box, previous_states.box, previous_states.previous)
+        return BoxState(states.box, states.reference, past)
 
     def dynamics_of(self, states: BoxState) -> AbstractDynamics:
         """The dynamics of each particle's own reference."""
         return jax.tree.map(lambda leaf: leaf[states.reference], self.dynamics)
-
-    def _remembered(self, box: Float[Array, "n 4"]) -> Float[Array, "n 4"] | None:
-        return box if self.dynamics.order == 2 else None
 
     def boxes(self, states: BoxState) -> Float[Array, "n 4"]:
         """(x, y, s_x l_x, s_y l_y): the hypothesised boxes, centre and size in pixels."""

@@ -1,5 +1,7 @@
 """Labelled boxes as states of a model, and boxes around them."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,8 +33,17 @@ def labelled_states(model: AbstractBoxModel, boxes: Float[np.ndarray, "t k 4"]) 
     scales = places[..., 2:] / model.reference_boxes[None, :, 2:]
     box = jnp.concatenate([places[..., :2], scales], axis=-1)
     reference = jnp.broadcast_to(jnp.arange(k, dtype=jnp.int32)[None], box.shape[:2])
-    second = model.dynamics.order == 2
-    return BoxState(box, reference, jnp.concatenate([box[:1], box[:-1]]) if second else None)
+    if model.dynamics.order == 1:
+        return BoxState(box, reference)
+    dynamics = model.dynamics_of(BoxState(box[0], reference[0]))
+
+    def follow(past: Any, places: tuple[Array, Array]) -> tuple[Any, Any]:
+        before, now = places
+        past = dynamics.remembered(now, before, past)
+        return past, past
+
+    _, pasts = jax.lax.scan(follow, box[0], (box[:-1], box[1:]))
+    return BoxState(box, reference, jnp.concatenate([box[:1], pasts]))
 
 
 def boxes_around(

@@ -14,7 +14,9 @@ from jaxtyping import Array, Float, UInt8
 
 from mpfjax.filter import Filter
 from mpfjax.filters import mixture_particle_filter, particle_filter
+from mpfjax.models.dynamics import AbstractDynamics
 from mpfjax.models.jumps import RandomWalkWithJumps
+from mpfjax.models.velocity import WalkWithVelocity
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping
 from mpfjax.moves.exclusion import Exclusion
 from mpfjax.moves.kmeans import KMeans
@@ -61,9 +63,12 @@ def default_filters(
     it takes a long step. Components exclude each other. They split if they cover two places, and
     merge only after ten frames at the same place.
     """
+    check_frame(frame)
+    check_boxes(boxes, *frame.shape[:2])
     size = boxes[:, 2:].mean(axis=0)
     steps = _steps(boxes)
-    model = _own_references(frame, boxes, steps, jump_probability=0.05, switch_probability=0.05)
+    walk = _with_jumps(steps, probability=0.05)
+    model = _own_references(frame, boxes, steps, walk, switch_probability=0.05)
     where: dict[str, Any] = {"features": _centre, "scale": size}
     moves = [
         Exclusion(strength=4.0, radius=0.5, **where),
@@ -79,14 +84,17 @@ def objects_filters(
     """The recipe with the fewest strays and swaps: every component keeps to its object.
 
     Every particle is compared only with the box that it started from, and learns how its object
-    looks now. So the components of an object are rival hypotheses about it. It may be hidden, and
-    then they wait. Only components of one object merge, a component splits where hypotheses
-    diverge, and hopeless ones are pruned. Objects exclude each other. They share the particles
-    equally: 200, and from four objects on 60 for each object.
+    looks and moves now. So the components of an object are rival hypotheses about it. It may be
+    hidden, and then they walk on. Only components of one object merge, a component splits where
+    hypotheses diverge, and hopeless ones are pruned. Objects exclude each other. They share the
+    particles equally: 200, and from four objects on 60 for each object.
     """
+    check_frame(frame)
+    check_boxes(boxes, *frame.shape[:2])
     size = boxes[:, 2:].mean(axis=0)
-    steps = _steps(boxes) * np.array([0.6, 1.0, 1.0, 1.0])
-    model = LearnedColourModel(_own_references(frame, boxes, steps, jump_probability=0.1))
+    steps = _steps(boxes) * np.array([0.4, 1.0, 1.0, 1.0])
+    walk = _walking(_with_jumps(steps, probability=0.1), boxes)
+    model = LearnedColourModel(_own_references(frame, boxes, steps, walk))
     apart = _apart(size)
     learn = LearnLooks(model)
     num_components = room_for(len(boxes))
@@ -118,22 +126,19 @@ def room_for(num_objects: int) -> int:
 def _own_references(
     frame: np.ndarray,
     boxes: np.ndarray,
-    steps: np.ndarray,
+    deviations: np.ndarray,
+    dynamics: AbstractDynamics,
     *,
-    jump_probability: float,
     switch_probability: float = 0.0,
 ) -> ColourModel:
-    """Each box is a reference; some steps are six times as long, though sizes never jump."""
-    check_frame(frame)
-    check_boxes(boxes, *frame.shape[:2])
-    long_steps = steps * np.array([6.0, 6.0, 1.0, 1.0])
+    """Each box is a reference."""
     return ColourModel.from_frame(
         frame,
         boxes,
         colours=RGBColours(16),
         sigma=0.2,
-        deviations=steps,
-        dynamics=RandomWalkWithJumps(steps, long_steps, jump_probability),
+        deviations=deviations,
+        dynamics=dynamics,
         num_parts=8,
         weigh_colours=True,
         switch_probability=switch_probability,
@@ -145,6 +150,18 @@ def _steps(boxes: np.ndarray) -> np.ndarray:
     """Deviations of the random walk: 0.4 widths, 0.08 heights of each box; sizes hardly change."""
     still = np.full(len(boxes), 0.01)
     return np.stack([0.4 * boxes[:, 2], 0.08 * boxes[:, 3], still, still], axis=1)
+
+
+def _with_jumps(steps: np.ndarray, probability: float) -> RandomWalkWithJumps:
+    """Some steps are six times as long, though sizes never jump."""
+    return RandomWalkWithJumps(steps, steps * np.array([6.0, 6.0, 1.0, 1.0]), probability)
+
+
+def _walking(walk: RandomWalkWithJumps, boxes: np.ndarray) -> WalkWithVelocity:
+    """Places keep their velocity, which is about a tenth of a width a frame at first."""
+    width, still = 0.1 * boxes[:, 2], np.zeros(len(boxes))
+    speeds = np.stack([width, width, still, still], axis=1)
+    return WalkWithVelocity(walk, (0.1, 0.1, 0.0, 0.0), speeds)
 
 
 def _started_at_the_boxes(

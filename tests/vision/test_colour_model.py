@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax import Autoregression, RandomWalk
+from mpfjax import Autoregression, RandomWalk, WalkWithVelocity
 from mpfjax.vision.colour_model import BoxState, ColourModel
 from mpfjax.vision.colours import HSVColours, RGBColours
 from mpfjax.vision.histograms import integral_histogram
@@ -210,6 +210,24 @@ def test_second_order_dynamics_carry_the_last_box_along(frame):
     filter = mpfjax.particle_filter(model, 40)
     run = mpfjax.run_filter(jax.random.key(0), filter, jnp.asarray(np.stack([frame] * 3)))
     assert np.isfinite(float(run.log_marginal_likelihood))
+
+
+def test_dynamics_with_a_velocity_carry_it_along(frame):
+    walk = RandomWalk(jnp.asarray(DEVIATIONS))
+    model = model_of(frame, dynamics=WalkWithVelocity(walk, 0.5, jnp.asarray([3.0, 1, 0, 0])))
+    start = model.sample_initial(jax.random.key(0), 4000)
+    velocity = np.asarray(start.box - start.previous)
+    np.testing.assert_allclose(velocity.std(axis=0), [3, 1, 0, 0], rtol=0.06, atol=1e-6)
+    assert abs(np.corrcoef(velocity[:, 0], np.asarray(start.box)[:, 0])[0, 1]) < 5 / np.sqrt(4000)
+    after = model.sample_transition(jax.random.key(1), start)
+    surprise = np.asarray(after.box - start.box) - velocity
+    np.testing.assert_allclose(after.box - after.previous, velocity + 0.5 * surprise, atol=1e-3)
+    assert (np.abs(surprise.std(axis=0) / DEVIATIONS - 1) < 4 / np.sqrt(2 * 4000)).all()
+    # Adopted by parents one pixel to the right, which have the same past.
+    parents = BoxState(start.box + jnp.array([[1.0, 0, 0, 0]]), start.reference, start.previous)
+    adopted = model.with_history(after, parents)
+    learned = 0.5 * (velocity + np.array([1, 0, 0, 0])) + 0.5 * np.asarray(after.box - parents.box)
+    np.testing.assert_allclose(adopted.box - adopted.previous, learned, atol=1e-3)
 
 
 def test_a_shared_reference_is_the_mean_of_all(frame):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax import Autoregression
+from mpfjax import Autoregression, RandomWalk, WalkWithVelocity
 from mpfjax.vision.boxes import centred
 from mpfjax.vision.colour_model import ColourModel
 from mpfjax.vision.labels import boxes_around, labelled_states
@@ -32,6 +32,16 @@ def test_states_of_second_order_remember_the_frame_before():
     dynamics = Autoregression.with_momentum(0.5, jnp.ones(4))
     states = labelled_states(ColourModel.from_frame(FRAME, BOXES, dynamics=dynamics), TRACK)
     np.testing.assert_array_equal(states.previous, states.box[jnp.array([0, 0])])
+
+
+def test_states_with_a_velocity_remember_it_over_all_frames():
+    dynamics = WalkWithVelocity(RandomWalk(np.ones(4)), 0.25)
+    track = np.concatenate([TRACK, TRACK[1:] + np.array([2.0, 1, 0, 0])])
+    states = labelled_states(ColourModel.from_frame(FRAME, BOXES, dynamics=dynamics), track)
+    velocity = np.zeros_like(states.box[0])
+    for t in range(1, 3):
+        velocity += 0.25 * np.asarray(states.box[t] - states.box[t - 1] - velocity)
+        np.testing.assert_allclose(states.box[t] - states.previous[t], velocity, atol=1e-5)
 
 
 def test_boxes_around_fill_the_neighbourhood_evenly(model):
