@@ -30,7 +30,7 @@ from mpfjax.models.base import starts_from_noise
 _FEWER = {"look-alikes": 10}
 # A picture has room for as many lines as there are colours.
 _IN_THE_TABLE_ONLY = (
-    "MPF, 4 draws", "MPF, rqmc, 4 draws", "MPF, by variance", "MPF, look-ahead"
+    "APF", "APF, rqmc", "MPF, 4 draws", "MPF, rqmc, 4 draws", "MPF, by variance", "MPF, look-ahead"
 )  # fmt: skip
 
 

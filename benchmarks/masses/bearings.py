@@ -110,7 +110,9 @@ def _moved(
     motion: Float[Array, "n 4"], mode: Array, pushed: Float[Array, "n 2"]
 ) -> Float[Array, "n 4"]:
     """A step on: the velocity turned by the mode's angle and pushed, the position half-way."""
-    sin, cos = jnp.asarray(np.sin(TURNS))[mode], jnp.asarray(np.cos(TURNS))[mode]
+    # Chosen by comparing: nothing that is fused with a gather runs on vectors.
+    is_turn = [mode == turn for turn in range(len(TURNS))]
+    sin, cos = (jnp.select(is_turn, [*values]) for values in (np.sin(TURNS), np.cos(TURNS)))
     x, y, across, along = motion.T
     new_across = cos * across - sin * along + pushed[:, 0]
     new_along = sin * across + cos * along + pushed[:, 1]

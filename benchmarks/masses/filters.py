@@ -15,6 +15,12 @@ def _plain(**options: Any) -> Make:
     )
 
 
+def _auxiliary(**options: Any) -> Make:
+    return lambda scene, num_particles: mpfjax.auxiliary_particle_filter(
+        scene.model, num_particles, scene.lookahead, **options
+    )
+
+
 def _mixture(ahead: bool = False, **options: Any) -> Make:
     def make(scene: Scene, num_particles: int) -> mpfjax.Filter:
         regrouped: dict[str, Any] = {"regroup_every": 1} | options
@@ -42,6 +48,8 @@ def _in_stages(scene: Scene, num_particles: int) -> mpfjax.Filter:
 FILTERS: dict[str, Make] = {
     "PF": _plain(),
     "PF, rqmc": _plain(noise="rqmc"),
+    "APF": _auxiliary(),
+    "APF, rqmc": _auxiliary(noise="rqmc"),
     "MPF": _mixture(),
     "MPF, rqmc": _mixture(noise="rqmc"),
     "MPF, 4 draws": _mixture(num_draws=4),
