@@ -18,7 +18,10 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx_copybutton", "mpfjax_docs
 exclude_patterns = ["_ext", "_build"]
 nitpicky = True
 # Signatures name the types of other projects, whose pages the build does not ask for.
-nitpick_ignore_regex = [("py:.*", r"(?!mpfjax\.).*"), ("py:class", r"mpfjax\..*\.Abstract(BoxModel|RandomWalk)")]
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!mpfjax\.).*"),
+    ("py:class", r"mpfjax\..*\.Abstract(BoxModel|RandomWalk)"),
+]
 
 html_theme = "furo"
 html_title = f"mpfjax {version}"
