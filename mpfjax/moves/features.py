@@ -11,9 +11,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from mpfjax.checks import check_callable, check_positive_array, given, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations.floats import as_inexact
-from mpfjax.operations.segments import column_sums, segment_sum, spread_finite
+from mpfjax.operations.logarithms import exp, finite_or_zero
+from mpfjax.operations.segments import FEW_SEGMENTS, column_sums, segment_max, spread_finite
+from mpfjax.operations.stored import stored
 
-# So many are worked on one by one, which runs on vectors; more would take long to compile.
+# So many features are multiplied one by one, which runs on vectors.
 _FEW_FEATURES = 8
 Scale = ArrayLike | Sequence[float]
 
@@ -77,6 +79,27 @@ class Groups(eqx.Module):
         return self.masses > 0
 
 
+def relative_weights(mixture: ParticleMixture) -> Float[Array, " n"]:
+    """The weights within each component, in units of its largest; a dead one's are zero."""
+    log_weights, labels = mixture.log_weights, mixture.component_indicators
+    largest = finite_or_zero(segment_max(log_weights, labels, mixture.num_components))
+    weights = exp(log_weights - spread_finite(largest, labels))
+    # Or a scatter of them would choose every particle's largest, one after the other.
+    return weights if mixture.num_components <= FEW_SEGMENTS else stored(weights)
+
+
+def weighted_means(
+    features: Float[Array, "n k"],
+    weights: Float[Array, " n"],
+    labels: Int[Array, " n"],
+    num_groups: int,
+) -> tuple[Float[Array, " g"], Float[Array, "g k"]]:
+    """The mass and the mean of the particles under each label, zero for an empty one."""
+    sums = column_sums(_first_moments(features, weights), labels, num_groups)
+    masses = sums[:, 0]
+    return masses, sums[:, 1:] / _or_one(masses)[:, None]
+
+
 def summarise(
     features: Float[Array, "n k"],
     weights: Float[Array, " n"],
@@ -84,23 +107,61 @@ def summarise(
     num_groups: int,
 ) -> Groups:
     """Weighted mass, mean and covariance of the particles under each label."""
-    masses = segment_sum(weights, labels, num_groups)
-    safe = jnp.where(masses > 0, masses, 1.0)
-    shares = (weights / spread_finite(safe, labels)).astype(features.dtype)
-    means = segment_sum(shares[:, None] * features, labels, num_groups)
-    num_features = features.shape[1]
-    if num_features > _FEW_FEATURES:
-        centred = features - spread_finite(means, labels)
-        squares = shares[:, None, None] * centred[:, :, None] * centred[:, None, :]
-        return Groups(masses, means, segment_sum(squares, labels, num_groups))
-    # A covariance is symmetric: one triangle of it, a row of products for each entry.
+    masses, means = weighted_means(features, weights, labels, num_groups)
+    products, entries = _products(features - spread_finite(means, labels), weights)
+    covariances = column_sums(products, labels, num_groups) / _or_one(masses)[:, None]
+    return Groups(masses, means, covariances[:, entries])
+
+
+def summarise_about(
+    points: Float[Array, "g k"],
+    gaps: Float[Array, "n k"],
+    weights: Float[Array, " n"],
+    labels: Int[Array, " n"],
+) -> Groups:
+    """`summarise` in one pass, of particles that are `gaps` away from a point of their group.
+
+    It is exact as long as the points are within many deviations of the means, as those of
+    K-means are.
+    """
+    k = points.shape[1]
+    products, entries = _products(gaps, weights)
+    columns = jnp.concatenate([_first_moments(gaps, weights), products])
+    sums = column_sums(columns, labels, len(points))
+    masses = sums[:, 0]
+    averages = sums[:, 1:] / _or_one(masses)[:, None]
+    offsets = averages[:, :k]
+    covariances = averages[:, k:][:, entries] - offsets[:, :, None] * offsets[:, None, :]
+    return Groups(masses, jnp.where((masses > 0)[:, None], points + offsets, 0.0), covariances)
+
+
+def _or_one(masses: Float[Array, " g"]) -> Float[Array, " g"]:
+    return jnp.where(masses > 0, masses, 1.0)
+
+
+def _first_moments(
+    features: Float[Array, "n k"], weights: Float[Array, " n"]
+) -> Float[Array, "c n"]:
+    """The weights, and the weighted features, column by column."""
+    weights = weights.astype(features.dtype)
+    return jnp.stack([weights, *(weights * column for column in features.T)])
+
+
+def _products(
+    gaps: Float[Array, "n k"], weights: Float[Array, " n"]
+) -> tuple[Float[Array, "c n"], Int[np.ndarray, "k k"]]:
+    """The weighted products of each pair of features, column by column, and which is whose."""
+    num_features = gaps.shape[1]
+    # A covariance is symmetric: one triangle of it.
     pairs = [(i, j) for i in range(num_features) for j in range(i + 1)]
-    rows = [features[:, k] - spread_finite(means[:, k], labels) for k in range(num_features)]
-    products = jnp.stack([shares * rows[i] * rows[j] for i, j in pairs])
     entries = np.zeros((num_features, num_features), int)
     for entry, (i, j) in enumerate(pairs):
         entries[i, j] = entries[j, i] = entry
-    return Groups(masses, means, column_sums(products, labels, num_groups)[:, entries])
+    columns, weights = gaps.T, weights.astype(gaps.dtype)
+    if num_features > _FEW_FEATURES:
+        left, right = np.array(pairs).T
+        return weights[None] * columns[left] * columns[right], entries
+    return jnp.stack([weights * columns[i] * columns[j] for i, j in pairs]), entries
 
 
 def separation(

@@ -12,7 +12,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.features import Features, Scale
 from mpfjax.moves.nearest import nearest
-from mpfjax.operations.segments import segment_counts, segment_sum
+from mpfjax.operations.segments import segment_argmax, segment_counts, segment_sum
 
 
 class KMeans(AbstractRegrouping):
@@ -75,8 +75,10 @@ def farthest_first(
     weight = occupied.astype(features.dtype)[:, None]
     mean = jnp.sum(weight * features, axis=0) / jnp.maximum(jnp.sum(weight), 1.0)
 
+    everywhere = jnp.zeros(features.shape[0], jnp.int32)
+
     def farthest(distance: Float[Array, " n"]) -> Float[Array, " k"]:
-        return features[jnp.argmax(jnp.where(occupied, distance, -1.0))]
+        return features[segment_argmax(jnp.where(occupied, distance, -1.0), everywhere, 1)[0]]
 
     def squared_distance(point: Float[Array, " k"]) -> Float[Array, " n"]:
         return jnp.sum((features - point[None]) ** 2, axis=1)

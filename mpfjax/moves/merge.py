@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 from mpfjax.checks import check_positive, check_whole, given
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
-from mpfjax.moves.features import Features, Scale, separation, summarise
+from mpfjax.moves.features import Features, Scale, relative_weights, separation, summarise
 from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import spread_finite
 
@@ -88,7 +88,7 @@ class Merge(AbstractRegrouping):
     def _overlap(self, mixture: ParticleMixture) -> Bool[Array, "m m"]:
         groups = summarise(
             self.features(mixture),
-            mixture.component_weights,
+            relative_weights(mixture),
             mixture.component_indicators,
             mixture.num_components,
         )

@@ -1,18 +1,28 @@
 """Split: a component that is spread too far becomes two."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_not_negative, check_share, check_whole
+from mpfjax.checks import check_not_negative, check_share, check_whole, given
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
-from mpfjax.moves.features import Features, Scale, separation, summarise
+from mpfjax.moves.features import (
+    Features,
+    Scale,
+    relative_weights,
+    separation,
+    summarise_about,
+    weighted_means,
+)
 from mpfjax.operations.indexing import take
-from mpfjax.operations.segments import segment_argmax, segment_sum, spread_finite
+from mpfjax.operations.matrices import row_sums
+from mpfjax.operations.segments import segment_argmax, spread_finite
+from mpfjax.operations.stored import VECTOR, stored
 
 
 class Split(AbstractRegrouping):
@@ -35,6 +45,7 @@ class Split(AbstractRegrouping):
     min_distance: float = eqx.field(static=True)
     min_share: float = eqx.field(static=True)
     num_iterations: int = eqx.field(static=True)
+    sample_size: int | None = eqx.field(static=True)
     features: Features
 
     def __init__(
@@ -44,16 +55,18 @@ class Split(AbstractRegrouping):
         *,
         min_share: float = 0.05,
         num_iterations: int = 3,
+        sample_size: int | None = 32,
         features: Callable[[PyTree], Array] | None = None,
         scale: Scale = 1.0,
     ) -> None:
         check_not_negative(min_deviations=min_deviations, min_distance=min_distance)
         check_share(0.5, min_share=min_share)
-        check_whole(num_iterations=num_iterations)
+        check_whole(num_iterations=num_iterations, **given(sample_size=sample_size))
         self.min_deviations = min_deviations
         self.min_distance = min_distance
         self.min_share = min_share
         self.num_iterations = num_iterations
+        self.sample_size = sample_size
         self.features = Features(features, scale)
 
     def regroup(
@@ -62,17 +75,20 @@ class Split(AbstractRegrouping):
         """The lighter half of every component that is too diffuse, to a free label."""
         del key
         features, m = self.features(mixture), mixture.num_components
-        weights = mixture.component_weights
-        parent = mixture.component_indicators
-        side = self._halve(features, weights, mixture)
-        halves = summarise(features, weights, parent + m * side, 2 * m)
+        weights, parent = relative_weights(mixture), mixture.component_indicators
+        sample = _sampled(self.sample_size, features, weights, mixture)
+        centres = _two_means(sample, m, self.num_iterations)
+        side, gaps = _nearer(features, centres, parent)
+        halves = summarise_about(centres, gaps, weights, parent + m * side)
         masses = halves.masses.reshape(2, m)
+        total = jnp.sum(masses, axis=0)
+        least_share = jnp.min(masses, axis=0) / jnp.where(total > 0, total, 1.0)
         distance, deviations = separation(
             halves.means[:m], halves.covariances[:m], halves.means[m:], halves.covariances[m:]
         )
         splits = (
-            (jnp.min(masses, axis=0) >= self.min_share)
-            & (jnp.min(masses, axis=0) > 0)
+            (least_share >= self.min_share)
+            & (least_share > 0)
             & (deviations > self.min_deviations)
             & (distance > self.min_distance)
         )
@@ -81,23 +97,53 @@ class Split(AbstractRegrouping):
         moves = (side == spread_finite(lighter, parent, 2)) & mixture.occupied
         return jnp.where(moves, spread_finite(labels, parent, m), parent), mixture.memory
 
-    def _halve(
-        self, features: Float[Array, "n k"], weights: Float[Array, " n"], mixture: ParticleMixture
-    ) -> Int[Array, " n"]:
-        """0 or 1 for each particle: which half of its component it belongs to."""
-        m, parent = mixture.num_components, mixture.component_indicators
-        mean = mixture.component_averages(features)
-        one_end = _farthest_members(features, mean, mixture)
-        centroids = jnp.concatenate([one_end, _farthest_members(features, one_end, mixture)])
 
-        def iterate(_: int | Int[Array, ""], centroids: Float[Array, "g k"]) -> Float[Array, "g k"]:
-            labels = parent + m * _nearer(features, centroids, parent)
-            masses = segment_sum(weights, labels, 2 * m)[:, None]
-            sums = segment_sum(weights[:, None] * features, labels, 2 * m)
-            return jnp.where(masses > 0, sums / jnp.where(masses > 0, masses, 1.0), centroids)
+class _Sample(NamedTuple):
+    """Some of the particles, from which the centres of the halves are found."""
 
-        centroids = jax.lax.fori_loop(0, self.num_iterations, iterate, centroids)
-        return _nearer(features, centroids, parent)
+    features: Float[Array, "s k"]
+    weights: Float[Array, " s"]
+    parent: Int[Array, " s"]
+    occupied: Bool[Array, " s"]
+
+
+def _sampled(
+    size: int | None,
+    features: Float[Array, "n k"],
+    weights: Float[Array, " n"],
+    mixture: ParticleMixture,
+) -> _Sample:
+    """Every k-th of the usable slots, `size` for each component in the mean, or all of them."""
+    n, m = mixture.num_particles, mixture.num_components
+    everything = _Sample(features, weights, mixture.component_indicators, mixture.occupied)
+    if size is None or n <= size * m:
+        return everything
+    room = mixture.num_usable_slots
+    stride = -(-room // (size * m))
+    num_sampled = size * m if mixture.usable_slots is not None else -(-n // stride)
+    # A whole number of vectors, or nothing that is made of the sample would run on them.
+    num_sampled = -(-num_sampled // VECTOR) * VECTOR
+    places = stride * jnp.arange(num_sampled, dtype=jnp.int32)
+    inside = places < room
+    sample = jax.tree.map(lambda values: take(values, jnp.minimum(places, n - 1)), everything)
+    return sample._replace(
+        weights=jnp.where(inside, sample.weights, 0.0), occupied=sample.occupied & inside
+    )
+
+
+def _two_means(sample: _Sample, m: int, num_iterations: int) -> Float[Array, "g k"]:
+    """The centres of two halves of each component, by weighted 2-means from its two ends."""
+    features, weights, parent, _ = sample
+    _, means = weighted_means(features, weights, parent, m)
+    one_end = _farthest_members(sample, means, m)
+    centres = jnp.concatenate([one_end, _farthest_members(sample, one_end, m)])
+
+    def iterate(_: int | Int[Array, ""], centres: Float[Array, "g k"]) -> Float[Array, "g k"]:
+        side, _ = _nearer(features, centres, parent)
+        masses, means = weighted_means(features, weights, parent + m * side, 2 * m)
+        return jnp.where((masses > 0)[:, None], means, centres)
+
+    return jax.lax.fori_loop(0, num_iterations, iterate, centres)
 
 
 def free_labels(
@@ -116,20 +162,21 @@ def free_labels(
 
 
 def _nearer(
-    features: Float[Array, "n k"], centroids: Float[Array, "g k"], parent: Int[Array, " n"]
-) -> Int[Array, " n"]:
-    """Which of its own component's two centroids each particle is nearer to."""
-    m = centroids.shape[0] // 2
-    first = jnp.sum((features - spread_finite(centroids[:m], parent)) ** 2, axis=1)
-    second = jnp.sum((features - spread_finite(centroids[m:], parent)) ** 2, axis=1)
-    return (second < first).astype(jnp.int32)
+    features: Float[Array, "n k"], centres: Float[Array, "g k"], parent: Int[Array, " n"]
+) -> tuple[Int[Array, " n"], Float[Array, "n k"]]:
+    """Which of its own component's two centres each particle is nearer to, and how far from it."""
+    m = centres.shape[0] // 2
+    to_first = features - spread_finite(centres[:m], parent)
+    to_second = features - spread_finite(centres[m:], parent)
+    is_second = row_sums(to_second**2) < row_sums(to_first**2)
+    is_second = stored(is_second.astype(jnp.int32), 2) > 0
+    return is_second.astype(jnp.int32), jnp.where(is_second[:, None], to_second, to_first)
 
 
 def _farthest_members(
-    features: Float[Array, "n k"], points: Float[Array, "m k"], mixture: ParticleMixture
+    sample: _Sample, points: Float[Array, "m k"], num_components: int
 ) -> Float[Array, "m k"]:
     """In each component, the particle farthest from the component's point."""
-    parent = mixture.component_indicators
-    distance = jnp.sum((features - spread_finite(points, parent)) ** 2, axis=1)
-    distance = jnp.where(mixture.occupied, distance, -1.0)
-    return take(features, segment_argmax(distance, parent, mixture.num_components))
+    distance = row_sums((sample.features - spread_finite(points, sample.parent)) ** 2)
+    distance = jnp.where(sample.occupied, distance, -1.0)
+    return take(sample.features, segment_argmax(distance, sample.parent, num_components))

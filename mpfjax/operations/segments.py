@@ -94,10 +94,19 @@ def column_sums(
     columns: Float[Array, "c n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, "num_segments c"]:
     """`segment_sum` of values that lie column by column, each entry beside the next."""
+    if len(columns) <= _FEW_COLUMNS:
+        # A sum of several columns at once would be of columns that are chosen number by number.
+        return jnp.stack([_column_sum(column, segments, num_segments) for column in columns], 1)
+    return jax.vmap(lambda column: _column_sum(column, segments, num_segments))(columns).T
+
+
+def _column_sum(
+    column: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> Float[Array, " num_segments"]:
     if num_segments > FEW_SEGMENTS:
-        return jax.vmap(lambda column: _scattered_sum(column, segments, num_segments))(columns).T
-    member = _members(segments, num_segments)[:, None]
-    return jnp.sum(jnp.where(member, columns[None], jnp.zeros((), columns.dtype)), axis=2)
+        return _scattered_sum(stored(column), segments, num_segments)
+    member = _members(segments, num_segments)
+    return jnp.sum(jnp.where(member, column[None], jnp.zeros((), column.dtype)), axis=1)
 
 
 def segment_max(
@@ -202,6 +211,8 @@ def _scattered(
 
 def _num_lanes(n: int) -> int:
     """A power of two: enough lanes that the rounding error of each lane's sum stays small."""
+    if n % _LANES and n % (_LANES // 2) == 0 and n // (_LANES // 2) <= _LONGEST_SUM:
+        return _LANES // 2  # rather than to fill up the last row
     return max(_LANES, 1 << max(-(-n // _LONGEST_SUM) - 1, 0).bit_length())
 
 
