@@ -50,6 +50,7 @@ from mpfjax.moves import Resample as Resample
 from mpfjax.moves import ResampleAhead as ResampleAhead
 from mpfjax.moves import Split as Split
 from mpfjax.moves import Weigh as Weigh
+from mpfjax.operations.compiling import keep_programs as keep_programs
 from mpfjax.operations.generator import normal as normal
 from mpfjax.proposals import AbstractProposal as AbstractProposal
 from mpfjax.proposals import GaussNewtonProposal as GaussNewtonProposal

@@ -16,6 +16,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from mpfjax.operations.compiling import keep_programs
 from mpfjax.running.storage import write_whole
 
 
@@ -100,7 +101,12 @@ def format_table(header: list[str], rows: list[list[str]]) -> str:
 
 
 def exit_status(run: Callable[[], None]) -> int:
-    """Run a command: bad input is one line on the error stream and 2, an interruption 130."""
+    """Run a command: bad input is one line on the error stream and 2, an interruption 130.
+
+    What it compiles is kept for the next run, where there is a folder for it.
+    """
+    with contextlib.suppress(OSError, RuntimeError):  # the latter where there is no home
+        keep_programs()
     try:
         run()
     except (ValueError, OSError, ImportError) as error:

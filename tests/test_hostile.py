@@ -363,7 +363,7 @@ def test_every_public_constructor_and_runner_is_tried():
     # Records of results, what takes no argument to check, and what other tests are about.
     assert others == {
         "FilterRun", "StepInfo", "ParticleMixture", "Pool", "join_processes", "load_checkpoint",
-        "save_checkpoint", "normal", "read_study", "run_study", "NetworkProposal",
+        "save_checkpoint", "normal", "read_study", "run_study", "NetworkProposal", "keep_programs",
     } - tried  # fmt: skip
 
 

@@ -123,7 +123,7 @@ def test_count_starts_is_a_search_for_the_last_start(n):
     np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("n", [1, 7, 8, 31, 32, 1000, 1025])
+@pytest.mark.parametrize("n", [1, 7, 8, 31, 32, 700, 1000, 1025, 1500])
 def test_whole_blocks_need_no_filling_up(n):
     length = whole_blocks(n)
     assert n <= length < n + 32

@@ -1,10 +1,13 @@
 """What a mixture costs over a plain filter: ratios by N and M, and the seconds of a first call."""
 
+import contextlib
 import time
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.experimental.compilation_cache import compilation_cache
 
 import mpfjax
 from benchmarks.scaling.cells import Cell, build, compile_cells, fit_slope, measure, nothing
@@ -60,14 +63,28 @@ def first_calls(sizes: PriceSizes) -> list[dict[str, Any]]:
     cells = [Cell(filter="pf", components=1, **size)]
     cells += [Cell(filter=name, components=m, **size) for name in PRICED for m in sizes.components]
     entries = []
-    for cell in cells:
-        jax.clear_caches()
-        filter, observations = build(cell)
-        keys = jax.random.split(jax.random.key(0), cell.seeds)
-        start = time.perf_counter()
-        jax.block_until_ready(mpfjax.monte_carlo(keys, filter, observations, nothing))
-        entries.append(cell._asdict() | {"first_call": time.perf_counter() - start})
+    with _nothing_kept():
+        for cell in cells:
+            jax.clear_caches()
+            filter, observations = build(cell)
+            keys = jax.random.split(jax.random.key(0), cell.seeds)
+            start = time.perf_counter()
+            jax.block_until_ready(mpfjax.monte_carlo(keys, filter, observations, nothing))
+            entries.append(cell._asdict() | {"first_call": time.perf_counter() - start})
     return entries
+
+
+@contextlib.contextmanager
+def _nothing_kept() -> Iterator[None]:
+    """Without the programs of earlier processes."""
+    folder = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    compilation_cache.reset_cache()
+    try:
+        yield
+    finally:
+        jax.config.update("jax_compilation_cache_dir", folder)
+        compilation_cache.reset_cache()
 
 
 def price_table(entries: list[dict[str, Any]], calls: list[dict[str, Any]]) -> str:

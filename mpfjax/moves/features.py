@@ -121,8 +121,8 @@ def summarise_about(
 ) -> Groups:
     """`summarise` in one pass, of particles that are `gaps` away from a point of their group.
 
-    It is exact as long as the points are within many deviations of the means, as those of
-    K-means are.
+    Of a group whose point is many deviations away from its mean, rounding leaves few digits of the
+    covariance. Points of K-means are near the means.
     """
     k = points.shape[1]
     products, entries = _products(gaps, weights)

@@ -36,6 +36,11 @@ class Split(AbstractRegrouping):
     - they are more than `min_distance` apart, in units of `scale`;
     - the lighter half holds at least `min_share` of the component's mass.
 
+    The centres of the halves are found from every k-th particle, such that they are about
+    `sample_size` times M; None takes all. After resampling, copies stand side by side, so a part
+    that holds one in `sample_size` of them or more is met. What is a half, how far apart they are
+    and whether they split is then found from all particles.
+
     The lighter half takes a free label. If there are too few free labels, the clearest splits come
     first. Raises `ValueError` for a threshold that is negative or a share not in [0, 0.5].
     Exact: a relabelling only.
@@ -113,7 +118,7 @@ def _sampled(
     weights: Float[Array, " n"],
     mixture: ParticleMixture,
 ) -> _Sample:
-    """Every k-th of the usable slots, `size` for each component in the mean, or all of them."""
+    """Every k-th of the usable slots, at most `size` for each component in the mean."""
     n, m = mixture.num_particles, mixture.num_components
     everything = _Sample(features, weights, mixture.component_indicators, mixture.occupied)
     if size is None or n <= size * m:

@@ -1,8 +1,9 @@
-"""How programs are compiled: on wide vectors, and once for all values of a model's floats."""
+"""How programs are compiled: on wide vectors, once for all values of a model's floats, and kept."""
 
 import functools
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import jax
 import jax.extend.core
 import jax.numpy as jnp
 from jax.core import Tracer
+from jax.experimental.compilation_cache import compilation_cache
 from jaxtyping import PyTree
 
 from mpfjax.operations.floats import default_float
@@ -73,6 +75,33 @@ def in_little_memory() -> dict[str, bool]:
     except jax.errors.JaxRuntimeError:
         return {}
     return options
+
+
+def keep_programs(folder: str | Path | None = None) -> Path:
+    """Keep compiled programs in a folder: a later process that needs the same ones starts sooner.
+
+    This is JAX's persistent compilation cache, for programs of any size. A program is found again
+    where the code, the shapes and types, the options, JAX and the processor are the same; numbers
+    in a model may differ. Nothing is ever deleted: the folder may be, at any time.
+
+    - `folder`: None takes `jax_compilation_cache_dir` if that is set, and otherwise `mpfjax` in
+      the user's folder of caches ($XDG_CACHE_HOME, or ~/.cache).
+
+    Returns the folder. Raises `OSError` where it cannot be made. Use it once, at the beginning of
+    a script or notebook; the commands of mpfjax and its benchmarks do.
+    """
+    if folder is None:
+        caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = jax.config.jax_compilation_cache_dir or Path(caches) / "mpfjax"
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    if str(folder) != jax.config.jax_compilation_cache_dir:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+        # What was compiled before has settled whether there is a cache.
+        compilation_cache.reset_cache()
+    return folder
 
 
 def is_traced(tree: PyTree) -> bool:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mpfjax import Filter, KMeans, Merge, Pool, QuadraticModel, RandomPartition, Split
+from mpfjax.moves.features import summarise, summarise_about
 from mpfjax.moves.kmeans import farthest_first
 from mpfjax.moves.merge import lowest_connected
 from mpfjax.moves.split import free_labels
@@ -150,7 +151,8 @@ class TestMerge:
     def test_a_label_that_is_taken_again_has_no_past(self):
         """A label that Merge frees and Split takes in the same step starts its counts anew."""
         merge = Merge(None, 0.7, patience=3)
-        states = np.concatenate([np.zeros(20), np.full(20, 0.5), np.full(10, -10), np.full(10, 12)])
+        near = np.linspace(-0.25, 0.75, 40)  # the halves' means are 0.5 apart
+        states = np.concatenate([near, np.full(10, -10), np.full(10, 12)])
         mixture = make_mixture(states[:, None], np.zeros(60), np.repeat([0, 1, 2], 20), 3)
         # 0 and 1 overlap for the third time, 1 and 2, whose mean lies at 1, for the second.
         durations = jnp.array([[0, 2, 0], [2, 0, 1], [0, 1, 0]], jnp.int32)
@@ -223,6 +225,36 @@ class TestSplit:
         assert all(len(group) == 1 for group in groups)
         assert len(set.union(*groups)) == 4
 
+    @pytest.mark.parametrize("room", [None, 3000, 40])
+    def test_a_sample_finds_the_halves_that_all_particles_show(self, room):
+        """Copies stand side by side; a part of one in 20 of a component is in a sample of 32."""
+        whole = 4000 if room is None else room
+        sizes = [whole // 2, whole // 20, whole // 4, whole // 5]
+        centres = np.repeat([0.0, 12.0, 200.0, 260.0], sizes)
+        parent = np.repeat([0, 0, 1, 1], sizes)
+        log_weights = np.zeros(4000)
+        log_weights[len(centres) :] = -np.inf
+        empty = 4000 - len(centres)
+        states = np.pad(centres, (0, empty)) + RNG.normal(size=4000)
+        mixture = make_mixture(states[:, None], log_weights, np.pad(parent, (0, empty)), 5)
+        if room is not None:
+            mixture = mixture.replace(usable_slots=jnp.asarray(len(centres)))
+        filled = np.asarray(mixture.occupied)
+        by_sample, by_all = (
+            labels_after(Split(min_share=0.01, sample_size=size), mixture)[filled]
+            for size in (32, None)
+        )
+        np.testing.assert_array_equal(by_sample, by_all)
+        assert len(np.unique(by_all)) == 4
+
+    def test_a_sample_is_spread_over_all_usable_slots(self):
+        """Of 100 slots where 2 * 32 are enough, every second is taken, not the first 64."""
+        states = np.concatenate([np.zeros(66), np.full(34, 9.0), np.zeros(900)])
+        log_weights = np.where(np.arange(1000) < 100, 0.0, -np.inf)
+        mixture = make_mixture(states[:, None], log_weights, np.zeros(1000), 2)
+        mixture = mixture.replace(usable_slots=jnp.asarray(100))
+        np.testing.assert_array_equal(labels_after(Split(), mixture)[:100], states[:100] == 9)
+
     def test_two_points_split_and_one_does_not(self):
         assert labels_after(Split(), self.one([[0.0], [0.0], [5.0], [5.0]])).max() == 1
         assert labels_after(Split(), self.one([[5.0]] * 4)).max() == 0
@@ -269,3 +301,29 @@ class TestPoolAndRandomPartition:
             RandomPartition(0)
         with pytest.raises(ValueError, match="num_sets: 7 is more than num_components, 6"):
             RandomPartition(7)(KEY, self.MIXTURE)
+
+
+@pytest.mark.parametrize("num_groups", [3, 12])
+@pytest.mark.parametrize("num_features", [1, 3, 10])
+def test_moments_of_groups_equal_those_of_numpy(num_groups, num_features):
+    features = RNG.normal(size=(300, num_features)) + 5
+    weights = RNG.random(300) * (RNG.random(300) < 0.8)
+    labels = RNG.integers(0, num_groups - 1, 300)  # the last group is empty
+    points = 5 + RNG.normal(size=(num_groups, num_features))
+    jitted = jnp.asarray(features), jnp.asarray(weights), jnp.asarray(labels)
+    two_passes = eqx.filter_jit(summarise)(*jitted, num_groups)
+    gaps = jnp.asarray(features - points[labels])
+    one_pass = eqx.filter_jit(summarise_about)(jnp.asarray(points), gaps, *jitted[1:])
+    for found in (two_passes, one_pass):
+        for group in range(num_groups - 1):
+            own = labels == group
+            mass = weights[own].sum()
+            mean = np.average(features[own], axis=0, weights=weights[own])
+            covariance = np.cov(features[own].T, aweights=weights[own], ddof=0).reshape(
+                num_features, num_features
+            )
+            np.testing.assert_allclose(found.masses[group], mass, rtol=1e-5)
+            np.testing.assert_allclose(found.means[group], mean, rtol=1e-5)
+            np.testing.assert_allclose(found.covariances[group], covariance, atol=1e-5)
+        for empty in (found.masses[-1], found.means[-1], found.covariances[-1]):
+            np.testing.assert_array_equal(empty, 0)

@@ -1,0 +1,57 @@
+"""Programs that are kept from process to process."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+from mpfjax import keep_programs
+
+SETTINGS = [
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_min_entry_size_bytes",
+]
+
+
+@pytest.fixture
+def settings(monkeypatch, tmp_path):
+    """JAX's settings, put back when the test ends, and a folder of caches of our own."""
+    before = {name: getattr(jax.config, name) for name in SETTINGS}
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+    yield before
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+def test_a_program_is_found_again_after_all_are_forgotten(settings, tmp_path):
+    hits = []
+    jax.monitoring.register_event_listener(
+        lambda event, **_: hits.append(event) if event.endswith("cache_hits") else None
+    )
+    assert keep_programs(tmp_path / "kept" / "here") == tmp_path / "kept" / "here"
+    triple = lambda x: 3 * x + 1.25  # noqa: E731
+    for is_kept in (False, True):
+        jax.clear_caches()
+        hits.clear()
+        assert jax.jit(triple)(jnp.float32(2.0)) == 7.25
+        assert bool(hits) == is_kept
+    assert any((tmp_path / "kept" / "here").iterdir())
+
+
+def test_the_folder_is_the_users_own_unless_jax_has_one(settings, tmp_path):
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "of jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 7.0)
+    assert keep_programs() == tmp_path / "of jax"
+    assert jax.config.jax_persistent_cache_min_compile_time_secs == 7.0
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert keep_programs() == tmp_path / "caches" / "mpfjax"
+    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "caches" / "mpfjax")
+
+
+def test_a_folder_that_cannot_be_made_is_an_error(settings, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="file"):
+        keep_programs(tmp_path / "file" / "folder")
+    assert jax.config.jax_compilation_cache_dir == settings["jax_compilation_cache_dir"]
