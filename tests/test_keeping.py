@@ -1,5 +1,7 @@
 """Programs that are kept from process to process."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -7,6 +9,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from mpfjax import keep_programs
 
+CONFIG: Any = jax.config
 SETTINGS = [
     "jax_compilation_cache_dir",
     "jax_persistent_cache_min_compile_time_secs",
@@ -44,14 +47,14 @@ def test_the_folder_is_the_users_own_unless_jax_has_one(settings, tmp_path):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path / "of jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 7.0)
     assert keep_programs() == tmp_path / "of jax"
-    assert jax.config.jax_persistent_cache_min_compile_time_secs == 7.0
+    assert CONFIG.jax_persistent_cache_min_compile_time_secs == 7.0
     jax.config.update("jax_compilation_cache_dir", None)
     assert keep_programs() == tmp_path / "caches" / "mpfjax"
-    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "caches" / "mpfjax")
+    assert CONFIG.jax_compilation_cache_dir == str(tmp_path / "caches" / "mpfjax")
 
 
 def test_a_folder_that_cannot_be_made_is_an_error(settings, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="file"):
         keep_programs(tmp_path / "file" / "folder")
-    assert jax.config.jax_compilation_cache_dir == settings["jax_compilation_cache_dir"]
+    assert CONFIG.jax_compilation_cache_dir == settings["jax_compilation_cache_dir"]

@@ -77,7 +77,8 @@ def first_calls(sizes: PriceSizes) -> list[dict[str, Any]]:
 @contextlib.contextmanager
 def _nothing_kept() -> Iterator[None]:
     """Without the programs of earlier processes."""
-    folder = jax.config.jax_compilation_cache_dir
+    settings: Any = jax.config
+    folder = settings.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)
     compilation_cache.reset_cache()
     try:

@@ -18,6 +18,7 @@ from mpfjax.operations.floats import default_float
 
 _VECTOR_WIDTH = "xla_cpu_prefer_vector_width"
 _FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
+_settings: Any = jax.config  # whose attributes no type checker knows
 
 
 def wide_vectors() -> dict[str, int]:
@@ -92,10 +93,10 @@ def keep_programs(folder: str | Path | None = None) -> Path:
     """
     if folder is None:
         caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = jax.config.jax_compilation_cache_dir or Path(caches) / "mpfjax"
+        folder = _settings.jax_compilation_cache_dir or Path(caches) / "mpfjax"
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    if str(folder) != jax.config.jax_compilation_cache_dir:
+    if str(folder) != _settings.jax_compilation_cache_dir:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
