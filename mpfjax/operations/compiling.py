@@ -92,17 +92,18 @@ def keep_programs(folder: str | Path | None = None) -> Path:
     a script or notebook; the commands of mpfjax and its benchmarks do.
     """
     if folder is None:
-        caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = _settings.jax_compilation_cache_dir or Path(caches) / "mpfjax"
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    if str(folder) != _settings.jax_compilation_cache_dir:
-        jax.config.update("jax_compilation_cache_dir", str(folder))
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        own: str | None = _settings.jax_compilation_cache_dir
+        folder = own or caches / "mpfjax"
+    kept = Path(folder)
+    kept.mkdir(parents=True, exist_ok=True)
+    if str(kept) != _settings.jax_compilation_cache_dir:
+        jax.config.update("jax_compilation_cache_dir", str(kept))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
         # What was compiled before has settled whether there is a cache.
         compilation_cache.reset_cache()
-    return folder
+    return kept
 
 
 def is_traced(tree: PyTree) -> bool:
