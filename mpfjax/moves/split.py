@@ -19,6 +19,7 @@ from mpfjax.moves.features import (
     summarise_about,
     weighted_means,
 )
+from mpfjax.operations.choices import cond_if_any
 from mpfjax.operations.indexing import take
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.segments import segment_argmax, spread_finite
@@ -79,32 +80,48 @@ class Split(AbstractRegrouping):
     ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
         """The lighter half of every component that is too diffuse, to a free label."""
         del key
-        features, m = self.features(mixture), mixture.num_components
-        weights, parent = relative_weights(mixture), mixture.component_indicators
-        sample = _sampled(self.sample_size, features, weights, mixture)
+        labels = cond_if_any(
+            jnp.any(~mixture.active),
+            lambda: self._split_where_diffuse(mixture),
+            lambda: mixture.component_indicators,
+        )
+        return labels, mixture.memory
+
+    def _split_where_diffuse(self, mixture: ParticleMixture) -> Int[Array, " n"]:
+        """The new labels, where at least one is free."""
+        m, size = mixture.num_components, self.sample_size
+        particles = _Particles(
+            self.features(mixture),
+            relative_weights(mixture),
+            mixture.component_indicators,
+            mixture.occupied,
+        )
+        sample = particles
+        if size is not None and mixture.num_particles > size * m:
+            sample = _sampled(particles, size * m, mixture)
         centres = _two_means(sample, m, self.num_iterations)
+        features, weights, parent, occupied = particles
         side, gaps = _nearer(features, centres, parent)
         halves = summarise_about(centres, gaps, weights, parent + m * side)
         masses = halves.masses.reshape(2, m)
-        total = jnp.sum(masses, axis=0)
-        least_share = jnp.min(masses, axis=0) / jnp.where(total > 0, total, 1.0)
+        least_mass, total = jnp.min(masses, axis=0), jnp.sum(masses, axis=0)
         distance, deviations = separation(
             halves.means[:m], halves.covariances[:m], halves.means[m:], halves.covariances[m:]
         )
         splits = (
-            (least_share >= self.min_share)
-            & (least_share > 0)
+            (least_mass > 0)
+            & (least_mass >= self.min_share * total)
             & (deviations > self.min_deviations)
             & (distance > self.min_distance)
         )
         lighter = jnp.where(masses[1] <= masses[0], 1, 0)
         labels = free_labels(splits, deviations, mixture.active)
-        moves = (side == spread_finite(lighter, parent, 2)) & mixture.occupied
-        return jnp.where(moves, spread_finite(labels, parent, m), parent), mixture.memory
+        moves = (side == spread_finite(lighter, parent, 2)) & occupied
+        return jnp.where(moves, spread_finite(labels, parent, m), parent)
 
 
-class _Sample(NamedTuple):
-    """Some of the particles, from which the centres of the halves are found."""
+class _Particles(NamedTuple):
+    """What is seen of the particles, or of some of them."""
 
     features: Float[Array, "s k"]
     weights: Float[Array, " s"]
@@ -112,31 +129,22 @@ class _Sample(NamedTuple):
     occupied: Bool[Array, " s"]
 
 
-def _sampled(
-    size: int | None,
-    features: Float[Array, "n k"],
-    weights: Float[Array, " n"],
-    mixture: ParticleMixture,
-) -> _Sample:
-    """Every k-th of the usable slots, at most `size` for each component in the mean."""
-    n, m = mixture.num_particles, mixture.num_components
-    everything = _Sample(features, weights, mixture.component_indicators, mixture.occupied)
-    if size is None or n <= size * m:
-        return everything
+def _sampled(particles: _Particles, most: int, mixture: ParticleMixture) -> _Particles:
+    """Every k-th of the usable slots, at most so many."""
     room = mixture.num_usable_slots
-    stride = -(-room // (size * m))
-    num_sampled = size * m if mixture.usable_slots is not None else -(-n // stride)
+    stride = -(-room // most)
+    number = most if mixture.usable_slots is not None else -(-mixture.num_particles // stride)
     # A whole number of vectors, or nothing that is made of the sample would run on them.
-    num_sampled = -(-num_sampled // VECTOR) * VECTOR
-    places = stride * jnp.arange(num_sampled, dtype=jnp.int32)
+    places = stride * jnp.arange(-(-number // VECTOR) * VECTOR, dtype=jnp.int32)
     inside = places < room
-    sample = jax.tree.map(lambda values: take(values, jnp.minimum(places, n - 1)), everything)
+    places = jnp.minimum(places, mixture.num_particles - 1)
+    sample = jax.tree.map(lambda values: take(values, places), particles)
     return sample._replace(
         weights=jnp.where(inside, sample.weights, 0.0), occupied=sample.occupied & inside
     )
 
 
-def _two_means(sample: _Sample, m: int, num_iterations: int) -> Float[Array, "g k"]:
+def _two_means(sample: _Particles, m: int, num_iterations: int) -> Float[Array, "g k"]:
     """The centres of two halves of each component, by weighted 2-means from its two ends."""
     features, weights, parent, _ = sample
     _, means = weighted_means(features, weights, parent, m)
@@ -179,7 +187,7 @@ def _nearer(
 
 
 def _farthest_members(
-    sample: _Sample, points: Float[Array, "m k"], num_components: int
+    sample: _Particles, points: Float[Array, "m k"], num_components: int
 ) -> Float[Array, "m k"]:
     """In each component, the particle farthest from the component's point."""
     distance = row_sums((sample.features - spread_finite(points, sample.parent)) ** 2)
