@@ -8,9 +8,10 @@
 Both filters have the same model and the same particles at the start: 200 for the PF, at most 10
 components of 20 for the MPF; with --preset objects twice as many particles, and from four objects
 on more of both. Into --out DIR go an annotated video, a contact sheet as the paper's figure 3, the
-tracks in MOTChallenge form, and the scores, null where there is no truth. With --detect, for a camera that stands still, objects are found by background subtraction: the PF
-starts at those of the first frame that has any, and in the MPF and the GM-MPF a component is born
-for every new one and dies when its object is gone (Lin et al. 2012, section 5).
+tracks in MOTChallenge form, and the scores, null where there is no truth. With --detect, for a
+camera that stands still, objects are found by background subtraction: the PF starts at those of the
+first frame that has any, and in the MPF and the GM-MPF a component is born for every new one and
+dies when its object is gone (Lin et al. 2012, section 5).
 """
 
 import argparse
