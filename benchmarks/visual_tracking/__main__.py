@@ -6,12 +6,12 @@
     python -m benchmarks.visual_tracking --sequence DIR --detect          # nobody draws a box
 
 Both filters have the same model and the same particles at the start: 200 for the PF, at most 10
-components of 20 for the MPF; with --preset objects more of both from four objects on. Into --out
-DIR go an annotated video, a contact sheet as the paper's
-figure 3, the tracks in MOTChallenge form, and the scores, null where there is no truth. With
---detect, for a camera that stands still, objects are found by background subtraction: the PF
-starts at those of the first frame that has any, and in the MPF and the GM-MPF a component is born
-for every new one and dies when its object is gone (Lin et al. 2012, section 5).
+components of 20 for the MPF; with --preset objects twice as many particles, and from four objects
+on more of both. Into --out DIR go an annotated video, a contact sheet as the paper's figure 3, the
+tracks in MOTChallenge form, and the scores, null where there is no truth. With --detect, for a
+camera that stands still, objects are found by background subtraction: the PF starts at those of the
+first frame that has any, and in the MPF and the GM-MPF a component is born for every new one and
+dies when its object is gone (Lin et al. 2012, section 5).
 """
 
 import argparse
@@ -37,6 +37,7 @@ from mpfjax.vision import boxes as box_files
 from mpfjax.vision.recipes import (
     MAX_COMPONENTS,
     PARTICLES_PER_COMPONENT,
+    PARTICLES_PER_HYPOTHESIS,
     PRESETS,
     room_for,
 )
@@ -150,9 +151,9 @@ def track(
 
 
 def _write_scores(options, source: Source, num_frames: int, results) -> None:
-    components = MAX_COMPONENTS
+    components, particles = MAX_COMPONENTS, PARTICLES_PER_COMPONENT
     if options.preset == "objects" and not options.detect:
-        components = room_for(len(source.boxes))
+        components, particles = room_for(len(source.boxes)), PARTICLES_PER_HYPOTHESIS
     settings = {
         "source": source.name,
         "preset": options.preset,
@@ -162,9 +163,9 @@ def _write_scores(options, source: Source, num_frames: int, results) -> None:
         "ids": None if source.truth is None else np.unique(source.truth[:, 1]).astype(int).tolist(),
         "seed": options.seed,
         "seeds": options.seeds,
-        "num_particles": PARTICLES_PER_COMPONENT * components,
+        "num_particles": particles * components,
         "max_components": components,
-        "particles_per_component": PARTICLES_PER_COMPONENT,
+        "particles_per_component": particles,
     }
     write_json(options.out / "visual_tracking.json", {"settings": settings, "results": results})
 

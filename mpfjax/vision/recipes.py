@@ -2,8 +2,8 @@
 
 Each recipe takes the first frame and a box for each object. It returns two filters with the same
 model and the same particles at the start: a particle filter of 200 particles, and a mixture
-particle filter of at most 10 components of 20. Of more than three objects, "objects" has more of
-both, see `room_for`. `PRESETS` has the recipes by name.
+particle filter of at most 10 components of 20. "objects" has twice as many particles, and of more
+than three objects more of both, see `room_for`. `PRESETS` has the recipes by name.
 """
 
 from typing import Any
@@ -32,7 +32,7 @@ from mpfjax.vision.learned_colours import LearnedBoxState, LearnedColourModel, L
 from mpfjax.vision.object_moves import ObjectExclusion, PruneHypotheses
 
 NUM_PARTICLES, MAX_COMPONENTS, PARTICLES_PER_COMPONENT = 200, 10, 20
-HYPOTHESES = 3
+HYPOTHESES, PARTICLES_PER_HYPOTHESIS = 3, 40
 
 
 def paper_filters(
@@ -86,29 +86,31 @@ def objects_filters(
     Every particle is compared only with the box that it started from, and learns how its object
     looks and moves now. So the components of an object are rival hypotheses about it. It may be
     hidden, and then they walk on. Only components of one object merge, a component splits where
-    hypotheses diverge, and hopeless ones are pruned. Objects exclude each other. They share the
-    particles equally: 200, and from four objects on 60 for each object.
+    hypotheses diverge, and hopeless ones are pruned. Objects exclude each other where they are
+    nearly at one place. They share the particles equally: 400, and from four objects on 120 for
+    each object.
     """
     check_frame(frame)
     check_boxes(boxes, *frame.shape[:2])
     size = boxes[:, 2:].mean(axis=0)
-    steps = _steps(boxes) * np.array([0.4, 1.0, 1.0, 1.0])
-    walk = _walking(_with_jumps(steps, probability=0.1), boxes)
+    # Around their velocity people keep their way, up and down more than to the side.
+    steps = _steps(boxes) * np.array([0.3, 0.5, 1.0, 1.0])
+    walk = _walking(_with_jumps(steps, probability=0.1, times=(8.0, 6.0)), boxes)
     model = LearnedColourModel(_own_references(frame, boxes, steps, walk))
     apart = _apart(size)
-    learn = LearnLooks(model)
+    learn = LearnLooks(model, rate=0.03)
     num_components = room_for(len(boxes))
-    num_particles = PARTICLES_PER_COMPONENT * num_components
+    num_particles = PARTICLES_PER_HYPOTHESIS * num_components
     mixture = Filter(
         model,
         moves=[
             Resample(share_by=_object),
             Propagate(model),
-            ObjectExclusion(strength=3.0, radius=0.5, scale=(float(size[0]), float(size[1]))),
+            ObjectExclusion(strength=3.0, radius=0.35, scale=(float(size[0]), float(size[1]))),
             learn,
             Merge(None, 0.25, patience=10, **apart),
             PruneHypotheses(least_share=1e-15),
-            Split(4.0, 0.5, min_share=0.15, **apart),
+            Split(4.0, 0.5, min_share=0.05, **apart),
         ],
         num_particles=num_particles,
         num_components=num_components,
@@ -152,9 +154,11 @@ def _steps(boxes: np.ndarray) -> np.ndarray:
     return np.stack([0.4 * boxes[:, 2], 0.08 * boxes[:, 3], still, still], axis=1)
 
 
-def _with_jumps(steps: np.ndarray, probability: float) -> RandomWalkWithJumps:
-    """Some steps are six times as long, though sizes never jump."""
-    return RandomWalkWithJumps(steps, steps * np.array([6.0, 6.0, 1.0, 1.0]), probability)
+def _with_jumps(
+    steps: np.ndarray, probability: float, times: tuple[float, float] = (6.0, 6.0)
+) -> RandomWalkWithJumps:
+    """Some steps are so many times as long, to the side and up, though sizes never jump."""
+    return RandomWalkWithJumps(steps, steps * np.array([*times, 1.0, 1.0]), probability)
 
 
 def _walking(walk: RandomWalkWithJumps, boxes: np.ndarray) -> WalkWithVelocity:

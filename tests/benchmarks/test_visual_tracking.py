@@ -59,6 +59,12 @@ def test_all_that_the_issue_names_is_written(finished):
     assert all(list(result) == FIELDS for result in results)
 
 
+def test_the_settings_say_how_many_particles_there_are(finished):
+    settings = results_in(finished)["settings"]
+    expected = 400 if settings["preset"] == "objects" else 200
+    assert (settings["num_particles"], settings["max_components"]) == (expected, 10)
+
+
 def test_the_scores_are_those_of_the_tracks(finished, sequence):
     truth = read_tracks(sequence / "gt.txt")
     truth = truth[truth[:, 0] >= 3]

@@ -347,6 +347,7 @@ def test_of_many_boxes_each_has_a_component():
     boxes = np.concatenate([corners, np.tile([10.0, 14.0], (12, 1))], axis=1)
     mixture = objects_filters(stills()[0], boxes)["mpf"].init(jax.random.key(0))
     best, held = best_components(mixture, 12)
+    assert (mixture.num_particles, mixture.num_components) == (12 * 120, 36)
     assert held.all()
     assert len(set(best.tolist())) == 12
 
