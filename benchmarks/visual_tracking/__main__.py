@@ -91,7 +91,14 @@ def run(options: argparse.Namespace) -> None:
             # Also on the way out of an interrupted run.
             if tracked[name]:
                 tracks = rows_of_run(tracked[name])
-                result = score(name, tracks, len(tracked[name]), seconds, source)
+                result = score(
+                    name,
+                    tracks,
+                    len(tracked[name]),
+                    seconds,
+                    source,
+                    _by_object(options, tracked[name], source),
+                )
                 if options.detect:
                     result |= tracking_scores(tracks, source, len(tracked[name]))
                 results.append(result)
@@ -116,6 +123,17 @@ def _plain_run(filter: mpfjax.Filter, source: Source, keys: Array) -> tuple[Call
         lambda bar: track(filter, keys, source, bar),
         lambda snapshots: [track_rows(snapshots, run, source.first) for run in range(len(keys))],
     )
+
+
+def _by_object(
+    options: argparse.Namespace, snapshots: list[Snapshot], source: Source
+) -> list[np.ndarray] | None:
+    """Each run's tracks with objects for ids, where components keep to their first box."""
+    if options.preset != "objects" or options.detect:
+        return None
+    return [
+        track_rows(snapshots, run, source.first, by_reference=True) for run in range(options.seeds)
+    ]
 
 
 def _detected_runs(options, source: Source, keys: Array) -> tuple[dict[str, Any], Source]:

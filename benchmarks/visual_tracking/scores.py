@@ -13,11 +13,20 @@ from mpfjax.metrics.coverage import coverage
 
 
 def score(
-    name: str, tracks: list[np.ndarray], num_frames: int, seconds: list[float], source: Source
+    name: str,
+    tracks: list[np.ndarray],
+    num_frames: int,
+    seconds: list[float],
+    source: Source,
+    by_object: list[np.ndarray] | None = None,
 ) -> dict[str, Any]:
-    """One entry of the results: means over the runs' tracks, null where there is no truth."""
+    """One entry of the results: means over the runs' tracks, null where there is no truth.
+
+    `by_object` are the same tracks with whom they are hypotheses about as their ids.
+    """
     result = {"filter": name, "all_covered": None, "per_object": None, "on_object": None}
-    result |= {"on_other": None, "id_swaps": None, "ms_per_frame": _milliseconds(seconds)}
+    result |= {"on_other": None, "id_swaps": None, "object_swaps": None}
+    result |= {"ms_per_frame": _milliseconds(seconds)}
     truth = source.truth
     if truth is not None:
         truth = truth[truth[:, 0] < source.first + num_frames]
@@ -29,6 +38,8 @@ def score(
         str(id): _mean([s.per_object[id] for s in scores]) for id in scores[0].per_object
     }
     result["id_swaps"] = _mean([s.id_swaps for s in scores])
+    if by_object is not None:
+        result["object_swaps"] = _mean([coverage(rows, truth).id_swaps for rows in by_object])
     if source.all_labelled:
         result["on_object"] = _mean([s.on_object for s in scores])
         result["on_other"] = _mean([s.on_other for s in scores])
@@ -65,6 +76,7 @@ def table(results: list[dict[str, Any]]) -> str:
         "on_object": "on object",
         "on_other": "on another",
         "id_swaps": "id swaps",
+        "object_swaps": "by object",
         "ms_per_frame": "ms a frame",
     }
     columns |= {name: name for name in ("HOTA", "MOTA", "IDF1") if name in results[-1]}

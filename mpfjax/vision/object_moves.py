@@ -43,7 +43,7 @@ class ObjectExclusion(AbstractExclusion):
     ) -> ParticleMixture:
         """Weigh down every particle by the other objects' nearness."""
         del key, observation
-        states, owners = mixture.particles, _objects(mixture)
+        states, owners = mixture.particles, component_references(mixture)
         centres = states.box[:, :2] / jnp.array([self.scale], states.box.dtype)
         filled = mixture.occupied.astype(centres.dtype)[:, None]
         counts = jnp.maximum(mixture.component_sums(filled), 1.0)
@@ -85,7 +85,7 @@ class PruneHypotheses(AbstractPropagation):
         """Take all weight from the hopeless components."""
         del key, observation
         masses = mixture.log_mixture_weights
-        rivals = _same_object(mixture, _objects(mixture))
+        rivals = _same_object(mixture, component_references(mixture))
         heaviest = jnp.max(jnp.where(rivals, masses[None], -jnp.inf), axis=1)
         hopeless = mixture.active & (masses < heaviest + jnp.log(self.least_share))
         dies = hopeless[mixture.component_indicators]
@@ -96,12 +96,12 @@ def best_components(
     mixture: ParticleMixture, num_objects: int
 ) -> tuple[Int[Array, " k"], Bool[Array, " k"]]:
     """The heaviest component of each object, and whether the object has one at all."""
-    own = _objects(mixture)[None] == jnp.arange(num_objects, dtype=jnp.int32)[:, None]
+    own = component_references(mixture)[None] == jnp.arange(num_objects, dtype=jnp.int32)[:, None]
     masses = jnp.where(own & mixture.active[None], mixture.log_mixture_weights[None], -jnp.inf)
     return jnp.argmax(masses, axis=1), jnp.max(masses, axis=1) > -jnp.inf
 
 
-def _objects(mixture: ParticleMixture) -> Int[Array, " m"]:
+def component_references(mixture: ParticleMixture) -> Int[Array, " m"]:
     """The reference of each component: the whole number nearest to its particles' mean."""
     reference = mixture.particles.reference.astype(mixture.log_weights.dtype)
     return jnp.round(mixture.component_averages(reference)).astype(jnp.int32)

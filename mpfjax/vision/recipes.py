@@ -110,7 +110,7 @@ def objects_filters(
             learn,
             Merge(None, 0.25, patience=10, **apart),
             PruneHypotheses(least_share=1e-15),
-            Split(4.0, 0.5, min_share=0.05, **apart),
+            Split(4.0, 0.5, min_share=0.05, sample_size=None, **apart),
         ],
         num_particles=num_particles,
         num_components=num_components,

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import check_key, check_type, check_whole
+from mpfjax.checks import check_flag, check_key, check_type, check_whole
 from mpfjax.filter import Filter
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import drawing
+from mpfjax.vision.object_moves import component_references
 
 
 class Snapshot(NamedTuple):
@@ -22,12 +23,15 @@ class Snapshot(NamedTuple):
     - `active`: (runs, m), which components are alive.
     - `points`: (runs, n, 2), the centres of the particles.
     - `labels`: (runs, n), the component of each particle, -1 in an empty slot.
+    - `references`: (runs, m), which of the given boxes each component is compared with
+      (`BoxState.reference`, its mean over the component); None where particles carry none.
     """
 
     means: Any
     active: Any
     points: Any
     labels: Any
+    references: Any = None
 
 
 def follow(
@@ -60,21 +64,29 @@ def _advance(filter, keys, t, mixtures, frame):
         places = filter.model.boxes(mixture.particles)
         labels = jnp.where(mixture.occupied, mixture.component_indicators, -1)
         means = mixture.component_averages(places)
-        return mixture, Snapshot(means, mixture.active, places[:, :2], labels)
+        carried = hasattr(mixture.particles, "reference")
+        references = component_references(mixture) if carried else None
+        return mixture, Snapshot(means, mixture.active, places[:, :2], labels, references)
 
     # The frame is not mapped over, so its histogram is built once for all runs.
     return jax.vmap(step)(keys, mixtures)
 
 
 def track_rows(
-    snapshots: list[Snapshot], run: int = 0, first: int = 1
+    snapshots: list[Snapshot], run: int = 0, first: int = 1, *, by_reference: bool = False
 ) -> Float[np.ndarray, "rows 6"]:
     """Rows (frame, id, x, y, w, h) of one run: an id for each life of each component.
 
     (x, y) is the top-left corner in pixels, as `write_tracks` takes it; the first snapshot is of
-    frame `first`. Raises `ValueError` for a run or a frame that is not a whole number from 0 on.
+    frame `first`. With `by_reference` the id is 1 for all components of the first given box, 2 for
+    those of the second and so on: whom a row is a hypothesis about, several rows a frame. Raises
+    `ValueError` for a run or a frame that is not a whole number from 0 on, and where snapshots have
+    no references.
     """
     check_whole(0, run=run, first=first)
+    check_flag(by_reference=by_reference)
+    if by_reference and any(snapshot.references is None for snapshot in snapshots):
+        raise ValueError("by_reference: the snapshots are of particles without a reference")
     rows, alive, next_id = [], {}, 1
     for frame, snapshot in enumerate(snapshots, first):
         for m, (mean, active) in enumerate(
@@ -83,7 +95,9 @@ def track_rows(
             if not active:
                 alive.pop(m, None)
                 continue
-            if m not in alive:
+            if by_reference:
+                alive[m] = 1 + int(snapshot.references[run][m])
+            elif m not in alive:
                 alive[m], next_id = next_id, next_id + 1
             rows.append([frame, alive[m], *box_files.top_left(mean[None])[0]])
     # Rounded as in the file, so that scores from the file are the same.

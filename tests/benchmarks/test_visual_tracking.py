@@ -17,7 +17,8 @@ pytest.importorskip("imageio", reason="reading and writing frames needs the extr
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
 
 FIELDS = [
-    "filter", "all_covered", "per_object", "on_object", "on_other", "id_swaps", "ms_per_frame"
+    "filter", "all_covered", "per_object", "on_object", "on_other", "id_swaps", "object_swaps",
+    "ms_per_frame",
 ]  # fmt: skip
 
 
@@ -70,12 +71,17 @@ def test_the_scores_are_those_of_the_tracks(finished, sequence):
     truth = truth[truth[:, 0] >= 3]
     is_started = np.isin(truth[:, 1], [1, 2, 3])
     truth, others = truth[is_started], truth[~is_started]
+    settings = results_in(finished)["settings"]
     for result in results_in(finished)["results"]:
         expected = coverage(read_tracks(finished / f"tracks_{result['filter']}.txt"), truth, others)
         assert result["on_other"] == pytest.approx(expected.on_other)
         assert result["all_covered"] == pytest.approx(expected.all_covered)
         assert result["on_object"] == pytest.approx(expected.on_object)
         assert result["id_swaps"] == expected.id_swaps
+        if settings["preset"] == "objects":
+            assert 0 <= result["object_swaps"] <= result["id_swaps"]
+        else:
+            assert result["object_swaps"] is None
         per_object = {str(id): share for id, share in expected.per_object.items()}
         assert result["per_object"] == pytest.approx(per_object)
         assert result["ms_per_frame"] > 0
@@ -100,7 +106,7 @@ def test_without_a_truth_the_scores_are_null_and_the_rest_is_written(sequence, t
     assert run("--video", video, "--box", f"{x},{y},{w},{h}", "--frames", "1:4", "--out", out,
                "--seeds", 2, "--gif") == 0  # fmt: skip
     for result in results_in(out)["results"]:
-        assert [result[field] for field in FIELDS[1:6]] == [None] * 5
+        assert [result[field] for field in FIELDS[1:7]] == [None] * 6
         assert result["ms_per_frame"] > 0
     assert {path.name for path in out.iterdir()} >= {"contact_sheet.png", "tracking.gif"}
     assert len(read_tracks(out / "tracks_pf.txt")) == 4
