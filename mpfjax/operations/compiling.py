@@ -2,6 +2,7 @@
 
 import functools
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,8 @@ def jit_on_wide_vectors(function: Callable[..., PyTree]) -> Callable[..., PyTree
     """
     plain = eqx.filter_jit(function)
 
+    one_at_a_time = threading.Lock()
+
     @functools.cache
     def wide() -> Callable[..., PyTree]:
         # Asking JAX for the platform before the first call would keep processes from joining.
@@ -48,8 +51,10 @@ def jit_on_wide_vectors(function: Callable[..., PyTree]) -> Callable[..., PyTree
     @functools.wraps(function)
     def run(*arguments: Any, **named: Any) -> PyTree:
         if not is_traced((arguments, named)):
+            with one_at_a_time:  # threads that come first would each compile a program of their own
+                compiled = wide()
             try:
-                return wide()(*arguments, **named)
+                return compiled(*arguments, **named)
             except ValueError as error:
                 # All arguments are constants of the caller's program, or a function among them
                 # closes over a tracer.
