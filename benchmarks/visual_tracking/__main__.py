@@ -97,7 +97,7 @@ def run(options: argparse.Namespace) -> None:
                     len(tracked[name]),
                     seconds,
                     source,
-                    _by_object(options, tracked[name], source),
+                    _by_object(name, options, tracked[name], source),
                 )
                 if options.detect:
                     result |= tracking_scores(tracks, source, len(tracked[name]))
@@ -126,10 +126,10 @@ def _plain_run(filter: mpfjax.Filter, source: Source, keys: Array) -> tuple[Call
 
 
 def _by_object(
-    options: argparse.Namespace, snapshots: list[Snapshot], source: Source
+    name: str, options: argparse.Namespace, snapshots: list[Snapshot], source: Source
 ) -> list[np.ndarray] | None:
     """Each run's tracks with objects for ids, where components keep to their first box."""
-    if options.preset != "objects" or options.detect:
+    if name != "mpf" or options.preset != "objects" or options.detect:
         return None
     return [
         track_rows(snapshots, run, source.first, by_reference=True) for run in range(options.seeds)
