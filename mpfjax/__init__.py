@@ -34,6 +34,7 @@ from mpfjax.moves import Every as Every
 from mpfjax.moves import Exchange as Exchange
 from mpfjax.moves import Exclusion as Exclusion
 from mpfjax.moves import GaussianRegeneration as GaussianRegeneration
+from mpfjax.moves import GroupBy as GroupBy
 from mpfjax.moves import KMeans as KMeans
 from mpfjax.moves import Merge as Merge
 from mpfjax.moves import Partitioned as Partitioned

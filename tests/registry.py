@@ -21,6 +21,7 @@ from mpfjax import (
     Filter,
     GaussianRegeneration,
     GaussNewtonProposal,
+    GroupBy,
     KMeans,
     Merge,
     MultiObjectModel,
@@ -74,6 +75,7 @@ REGROUPINGS: dict[str, AbstractRegrouping] = {
     "pool": Pool(),
     "random partition": RandomPartition(),
     "random partition in two": RandomPartition(2),
+    "grouped by a label": GroupBy(lambda states: (states[:, 0] > 0).astype(jnp.int32)),
 }
 
 REJUVENATIONS: dict[str, AbstractRejuvenation] = {
@@ -145,6 +147,11 @@ def _joint(make: Callable[[MultiObjectModel], Filter]) -> Callable[..., Filter]:
     return lambda model: make(MultiObjectModel(model, 2, shared_observation=True))
 
 
+def _side(states):
+    """Which side of zero the first number of the state is on."""
+    return (states.reshape(NUM_PARTICLES, -1)[:, 0] > 0).astype(jnp.int32)
+
+
 def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
     """The chains that regroup, with M components."""
     return {
@@ -165,6 +172,7 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
             then=[KMeans(2)],
         ),
         "patient merge": _chain(Resample(), m=m, then=[Merge(2.0, 1.0, patience=2)]),
+        "grouped by a label": _chain(Resample(), m=m, then=[GroupBy(_side)]),
         "kmeans only": _chain(Resample("stratified"), m=m, then=[KMeans()]),
         "split only, adaptive": _chain(Resample(ess_threshold=0.5), m=m, then=[Split(2.0)]),
         "random labels, multinomial": _chain(Resample("multinomial"), m=m, then=[RandomLabels()]),

@@ -109,6 +109,7 @@ BUILT = {
          "features": None, "scale": 1.0},
     ),
     "RandomPartition": (mpfjax.RandomPartition, {"num_sets": 2}),
+    "GroupBy": (mpfjax.GroupBy, {"function": nothing}),
     "Exclusion": (
         mpfjax.Exclusion, {"strength": 1.0, "radius": 0.5, "features": None, "scale": 1.0}
     ),

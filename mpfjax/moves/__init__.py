@@ -11,6 +11,7 @@ from mpfjax.moves.exclusion import Exclusion as Exclusion
 from mpfjax.moves.families import PropagateFamilies as PropagateFamilies
 from mpfjax.moves.features import Features as Features
 from mpfjax.moves.gaussian import GaussianRegeneration as GaussianRegeneration
+from mpfjax.moves.group_by import GroupBy as GroupBy
 from mpfjax.moves.independent import PropagateIndependently as PropagateIndependently
 from mpfjax.moves.kmeans import KMeans as KMeans
 from mpfjax.moves.lookahead import ResampleAhead as ResampleAhead
