@@ -27,7 +27,7 @@ class GroupBy(AbstractRegrouping):
 
     A label outside [0, M) of a filled slot is a RuntimeError that names the move. Raises
     `ValueError` for what is no function, or a function that returns other than whole numbers (n,).
-    Use it where you know what the modes are; `KMeans`, `Merge` and `Split` are for where you do not.
+    Use it where you know what the modes are, and `KMeans`, `Merge` and `Split` where you do not.
     """
 
     function: Callable[[PyTree], Int[Array, " n"]] = eqx.field(static=True)
