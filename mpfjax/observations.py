@@ -49,14 +49,8 @@ def checked_observation(observation: PyTree, model: Any) -> PyTree:
     return jax.tree.map(check, observation)
 
 
-def present_steps(
-    observations: PyTree, missing: str, model: Any = None
-) -> Bool[Array, " t"] | None:
-    """Which observations are there, or None where all are; raises for what cannot be run.
-
-    For a model with `handles_missing`, a NaN is a missing number, and a step is missing only if
-    all its numbers are.
-    """
+def check_series(observations: PyTree, missing: str) -> None:
+    """Raise a `ValueError` for what no model can be run on: no numbers, or no common axis t."""
     check_one_of(("error", "skip"), missing=missing)
     leaves = jax.tree.leaves(observations)
     if not leaves:
@@ -70,6 +64,16 @@ def present_steps(
     if lengths == {0}:
         raise ValueError("observations: the leading axis t is empty")
     _require_numbers(leaves, "observations")
+
+
+def present_steps(observations: PyTree, missing: str, model: Any) -> Bool[Array, " t"] | None:
+    """Which observations are there, or None where all are; raises for what cannot be run.
+
+    For a `model` with `handles_missing`, a NaN is a missing number, and a step is missing only if
+    all its numbers are.
+    """
+    check_series(observations, missing)
+    leaves = jax.tree.leaves(observations)
     inexact = [leaf for leaf in leaves if jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)]
     if not inexact:
         return None

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.scipy.stats import norm
 from scipy.stats import multivariate_normal
 
 import mpfjax
@@ -21,6 +20,7 @@ from tests.user_models import (
     Drift,
     DriftOfOne,
     TrickyQuadraticModel,
+    TwoSensors,
     nothing_traced,
 )
 
@@ -548,21 +548,10 @@ class TestWhatAUserHandsIt:
         labels = [run.final.component_indicators for run in runs]
         np.testing.assert_array_equal(*labels)
 
-    class TwoSensors(Drift):
-        """Either of two sensors may be missing; what is there is weighed."""
-
-        handles_missing = True
-
-        def log_likelihood(self, observation, states):
-            seen = ~jnp.isnan(observation)
-            residuals = jnp.where(seen, observation, 0.0)[None] - states
-            terms = norm.logpdf(residuals, scale=0.7)
-            return jnp.sum(jnp.where(seen[None], terms, 0.0), axis=1)
-
     def test_one_of_two_sensors_may_be_missing(self):
         """Against the Kalman filter, whose missing sensor has a variance of 10⁸."""
         observations = np.array([[1.0, np.nan], [np.nan, 0.3], [0.4, 0.1], [np.nan, np.nan]])
-        filter = mpfjax.particle_filter(self.TwoSensors(), 4000)
+        filter = mpfjax.particle_filter(TwoSensors(), 4000)
         keys = jax.random.split(jax.random.key(3), 200)
         runs = {
             missing: mpfjax.monte_carlo(
@@ -592,7 +581,7 @@ class TestWhatAUserHandsIt:
         assert float(runs["skip"].log_likelihood_increments[0, -1]) == 0.0
 
     def test_infinity_is_no_missing_number(self):
-        filter = mpfjax.particle_filter(self.TwoSensors(), 10)
+        filter = mpfjax.particle_filter(TwoSensors(), 10)
         with pytest.raises(ValueError, match="observations: infinite at index 1"):
             mpfjax.run_filter(jax.random.key(0), filter, np.array([[0.0, np.nan], [np.inf, 0.0]]))
         mixture = filter.init(jax.random.key(0))

@@ -376,7 +376,7 @@ class TestBadInput:
             ({"settings": {"noise": [mpfjax.Pool()]}}, "noise: .* no number or string"),
             ({"settings": {"filter": [1]}}, "settings: 'filter'"),
             ({"keys": jax.random.key(0)}, "keys: "),
-            ({"observations": np.array([1.0, np.nan])}, "observations: "),
+            ({"observations": np.array([])}, "observations: "),
             ({"missing": "no"}, "missing: "),
             ({"filters": None}, "filters: None"),
             ({"filters": 3}, "filters: 3"),
@@ -422,6 +422,7 @@ class TestBadInput:
         [
             ({"num_particles": [8, 0]}, "num_particles: 0"),
             ({"filters": {"pf": lambda n, noise: noise}}, "filters: pf made"),
+            ({"observations": np.array([1.0, np.nan])}, "observations: NaN or infinite at index 1"),
         ],
     )
     def test_to_one_cell_is_an_error_before_any_is_run(self, tmp_path, changes, named):

@@ -311,6 +311,27 @@ def mapped(model: Any, function: Any) -> Any:
     return _OverParticles(function)
 
 
+@dataclass(frozen=True)
+class _DrawnForEach:
+    """A draw of one particle, mapped over all of them with a key for each."""
+
+    draw: Callable[..., Any]
+
+    def __call__(self, key: Key[Array, ""], states: PyTree) -> PyTree:
+        num_particles = jax.tree.leaves(states)[0].shape[0]
+        return jax.vmap(self.draw)(split(key, num_particles), states)
+
+
+def mapped_draw(model: Any, draw: Any) -> Any:
+    """A draw `(key, states)` for all particles from one in the terms of the model: of one, or all.
+
+    A function of one particle that got the key of all of them would draw them one and the same.
+    """
+    if not isinstance(model, _PerParticleModel) or isinstance(draw, _DrawnForEach):
+        return draw
+    return _DrawnForEach(draw)
+
+
 def per_particle(model: Any) -> AbstractStateSpaceModel:
     """Make a batched model of one that is written for a single particle.
 

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from mpfjax.checks import check_callable, check_key, check_type, check_whole, given, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.observations import present_steps
+from mpfjax.observations import check_series, present_steps
 from mpfjax.running.run import monte_carlo
 from mpfjax.running.scan import FilterRun
 from mpfjax.running.storage import (
@@ -99,7 +99,7 @@ class Study:
                 raise ValueError(f"{_argument(name)}: {values} is empty or has the same twice")
         for number in _axes(self)["num_particles"]:
             check_whole(num_particles=number)
-        present_steps(self.observations, self.missing)
+        check_series(self.observations, self.missing)
 
 
 def run_study(
@@ -203,6 +203,7 @@ def _cells(study: Study) -> list[_Cell]:
         filter = study.filters[name](num_particles, **settings)
         if not isinstance(filter, Filter):
             raise ValueError(f"filters: {name} made {filter!r}, no Filter")
+        present_steps(study.observations, study.missing, filter.model)
         words = [name, f"N{num_particles}", *(f"{k}_{v}" for k, v in settings.items())]
         stem = re.sub(r"[^\w.+-]+", "_", "-".join([f"{index:04d}", *words]))[:100]
         cells.append(_Cell(f"{stem}.npz", description, filter))

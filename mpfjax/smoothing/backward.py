@@ -30,7 +30,8 @@ def draw(uniforms: Float[Array, "*shape"], log_weights: Float[Array, " n"]) -> I
     before, total = sum_before(weights)
     indices = jnp.searchsorted(before, uniforms * total, side="right").astype(jnp.int32) - 1
     # Rounding must not lead past the last particle of positive weight.
-    return jnp.minimum(indices, jnp.max(jnp.where(weights > 0, jnp.arange(len(weights)), 0)))
+    places = jnp.arange(len(weights), dtype=jnp.int32)
+    return jnp.minimum(indices, jnp.max(jnp.where(weights > 0, places, 0)))
 
 
 def draw_exactly(

@@ -5,11 +5,21 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.checks import check_callable, check_key, check_type, check_whole, given, saying
+from mpfjax.checks import (
+    check_callable,
+    check_key,
+    check_type,
+    check_whole,
+    given,
+    saying,
+    shown,
+)
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import mapped_draw
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 
@@ -40,13 +50,14 @@ def forecast(
     masses, so that a component's mixture weight is the probability of its mode.
 
     - `simulate_observation(key, states)`: draws y given each of the n states, leaves (n, ...), as
-      the model's likelihood would have it; for intervals of what will be observed.
+      the model's likelihood would have it; for intervals of what will be observed. If the model is
+      wrapped by `per_particle`, it draws y given one state, and gets a key for each.
 
     `key` is one that nothing else was given: `jax.random.fold_in(key, 1)` of the run's own key is
     a key that the run has used.
 
-    Raises `ValueError` for arguments of another kind and for moves that do not say what they do
-    without an observation. Use it for forecasts with intervals, and for what a filter is scored by.
+    Raises `ValueError` for arguments of another kind, for moves that do not say what they do
+    without an observation, and for simulated observations that are not one a particle. Use it for forecasts with intervals, and for what a filter is scored by.
     """
     check_key(key)
     check_type(Filter, "a Filter", filter=filter)
@@ -55,8 +66,9 @@ def forecast(
     check_callable(
         "a function of a key and states", **given(simulate_observation=simulate_observation)
     )
+    simulate = mapped_draw(filter.model, simulate_observation) if simulate_observation else None
     return with_floats_traced(
-        lambda filter: _forecast(key, filter, mixture, num_steps, simulate_observation), filter
+        lambda filter: _forecast(key, filter, mixture, num_steps, simulate), filter
     )
 
 
@@ -69,7 +81,23 @@ def _forecast(key, filter, mixture, num_steps, simulate_observation):
         if simulate_observation is not None:
             with saying("in simulate_observation, which is called with a key and the particles"):
                 observations = simulate_observation(key_observation, mixture.particles)
+            _check_simulated(observations, mixture.num_particles)
         return mixture, (mixture, observations)
 
     _, (mixtures, observations) = jax.lax.scan(advance, mixture, jax.random.split(key, num_steps))
     return Forecast(mixtures, observations)
+
+
+def _check_simulated(observations: PyTree, num_particles: int) -> None:
+    """Raise a `ValueError` for what holds no observation, or not one for each particle."""
+    leaves = jax.tree.leaves(observations)
+    if not leaves:
+        raise ValueError(
+            f"simulate_observation: it returned {shown(observations)}, which holds no array"
+        )
+    for leaf in leaves:
+        if jnp.shape(leaf)[:1] != (num_particles,):
+            raise ValueError(
+                f"simulate_observation: it returned an array of shape {jnp.shape(leaf)}, whose"
+                f" leading axis is not that of the {num_particles} particles"
+            )

@@ -152,7 +152,8 @@ def pose_evidence(
 ) -> Problem:
     """The problem of the log marginal likelihood; without `parameters`, in those of the model."""
     check_type(Filter, "a filter", filter=filter)
-    return pose_filter(filter, LogEvidence(_groups(observations, missing)), parameters, transforms)
+    objective = LogEvidence(_groups(observations, missing, filter.model))
+    return pose_filter(filter, objective, parameters, transforms)
 
 
 def pose_filter(
@@ -323,7 +324,7 @@ def _chosen(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[st
     return {name + jax.tree_util.keystr(path): place.index for path, place in found}
 
 
-def _groups(observations: PyTree, missing: str) -> list[tuple[PyTree, Array | None]]:
+def _groups(observations: PyTree, missing: str, model: Any) -> list[tuple[PyTree, Array | None]]:
     sequences = observations if isinstance(observations, list) else [observations]
     if not sequences:
         raise ValueError("observations: there are no sequences")
@@ -332,7 +333,7 @@ def _groups(observations: PyTree, missing: str) -> list[tuple[PyTree, Array | No
         for leaf in jax.tree.leaves(sequence):
             if not eqx.is_array_like(leaf):
                 raise ValueError(f"observations: {shown(leaf)} is no array of numbers")
-        present = present_steps(sequence, missing)
+        present = present_steps(sequence, missing, model)
         shapes = jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf).name), sequence)
         by_shape.setdefault(str(shapes), []).append((sequence, present))
     return [_stacked(group) for group in by_shape.values()]

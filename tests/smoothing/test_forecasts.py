@@ -8,6 +8,7 @@ import pytest
 import mpfjax
 from mpfjax import forecast
 from mpfjax.exact import kalman_filter
+from tests.user_models import DriftOfOne
 
 LINEAR = mpfjax.LinearGaussianModel(
     A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.4]], m0=[0.5], P0=[[1.0]]
@@ -64,6 +65,33 @@ def test_a_component_keeps_its_mass():
     masses = jax.vmap(lambda mixture: jnp.sort(mixture.mixture_weights))(ahead.mixtures)
     expected = np.sort(np.asarray(run.final.mixture_weights))
     np.testing.assert_allclose(masses, np.tile(expected, (4, 1)), rtol=1e-5)
+
+
+def test_a_wrapped_models_observations_are_drawn_one_by_one():
+    """Of one particle, as all functions of such a model are, each with noise of its own."""
+    filter = mpfjax.particle_filter(mpfjax.per_particle(DriftOfOne()), 400)
+    mixture = filter.init(jax.random.key(0))
+    simulate = lambda key, state: state[0] + jax.random.normal(key)  # noqa: E731
+    ahead = forecast(jax.random.key(1), filter, mixture, 2, simulate_observation=simulate)
+    noise = ahead.observations - ahead.mixtures.particles[..., 0]
+    assert noise.shape == (2, 400)
+    np.testing.assert_allclose(noise.std(axis=1), 1.0, atol=4 / np.sqrt(2 * 400))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda key, states: jax.random.normal(key),
+        lambda key, states: {"y": states, "bearing": states[:3, 0]},
+        lambda key, states: states.T,
+        lambda key, states: None,
+    ],
+)
+def test_observations_that_are_not_one_a_particle_are_refused(wrong):
+    filter = mpfjax.particle_filter(LINEAR, 10)
+    mixture = filter.init(jax.random.key(0))
+    with pytest.raises(ValueError, match="simulate_observation: it returned"):
+        forecast(jax.random.key(1), filter, mixture, 2, simulate_observation=wrong)
 
 
 @pytest.mark.usefixtures("as_installed")
