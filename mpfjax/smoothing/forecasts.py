@@ -57,7 +57,8 @@ def forecast(
     a key that the run has used.
 
     Raises `ValueError` for arguments of another kind, for moves that do not say what they do
-    without an observation, and for simulated observations that are not one a particle. Use it for forecasts with intervals, and for what a filter is scored by.
+    without an observation, and for simulated observations that are not one a particle. Use it for
+    forecasts with intervals, and for what a filter is scored by.
     """
     check_key(key)
     check_type(Filter, "a Filter", filter=filter)
