@@ -6,6 +6,7 @@ import os
 import struct
 import tracemalloc
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
@@ -172,6 +173,20 @@ class TestFiles:
                 faults.append(str(error))
         assert faults
         assert all("cut off, damaged" in fault for fault in faults)
+
+    def test_several_writers_of_one_path_leave_a_whole_file(self, path):
+        """And whoever reads it meanwhile finds one that is whole."""
+        states = [np.full(1000, writer) for writer in range(4)]
+        mpfjax.save_checkpoint(path, states[0])
+
+        def write_and_read(state):
+            for _ in range(20):
+                mpfjax.save_checkpoint(path, state)
+                assert len(set(mpfjax.load_checkpoint(path, like=state))) == 1
+
+        with ThreadPoolExecutor(len(states)) as writers:
+            list(writers.map(write_and_read, states))
+        assert list(path.parent.iterdir()) == [path]
 
     def test_a_missing_file_is_named(self, path):
         with pytest.raises(FileNotFoundError, match=r"checkpoint.npz"):

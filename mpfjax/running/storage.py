@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import secrets
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
@@ -43,13 +44,8 @@ def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
             if state["t"] % 1000 == 0:
                 mpfjax.save_checkpoint(path, state)
     """
-    path = as_path(path)
-    arrays = {}
-    for place, leaf in jax.tree_util.tree_leaves_with_path(state):
-        if _is_data(leaf):
-            array = _as_numpy(leaf)
-            arrays[jax.tree_util.keystr(place)] = array.view(_stored_dtype(array.dtype))
-    write_arrays(path, arrays | {_DESCRIPTION: np.array(json.dumps(describe(state)))})
+    description = {_DESCRIPTION: np.array(json.dumps(describe(state)))}
+    write_arrays(as_path(path), arrays_of(state) | description)
 
 
 def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
@@ -68,10 +64,25 @@ def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
     saved, own = _description(path, arrays), describe(like)
     if saved != own:
         raise ValueError(f"like: {path} holds another state: {differences(saved, own)}")
+    return filled(path, arrays, like)
+
+
+def arrays_of(state: PyTree) -> dict[str, np.ndarray]:
+    """Every array, key and number of a pytree by its place, as a file can hold it."""
+    arrays = {}
+    for place, leaf in jax.tree_util.tree_leaves_with_path(state):
+        if is_data(leaf):
+            array = _as_numpy(leaf)
+            arrays[jax.tree_util.keystr(place)] = array.view(_stored_dtype(array.dtype))
+    return arrays
+
+
+def filled(path: Path, arrays: Mapping[str, np.ndarray], like: PyTree) -> PyTree:
+    """A pytree like this one with the `arrays_of` another; `ValueError` where they do not fit."""
     places, structure = jax.tree_util.tree_flatten_with_path(like)
     return structure.unflatten(
         _as_leaf(_found(path, arrays, jax.tree_util.keystr(place), leaf), leaf)
-        if _is_data(leaf)
+        if is_data(leaf)
         else leaf
         for place, leaf in places
     )
@@ -80,7 +91,7 @@ def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
 def describe(tree: PyTree) -> dict[str, str]:
     """Every leaf's shape and dtype, every static field, and what else there is, by its place."""
     return _static_fields(tree, ()) | {
-        jax.tree_util.keystr(place): _kind(leaf) if _is_data(leaf) else named(leaf)
+        jax.tree_util.keystr(place): _kind(leaf) if is_data(leaf) else named(leaf)
         for place, leaf in jax.tree_util.tree_leaves_with_path(tree)
     }
 
@@ -88,7 +99,7 @@ def describe(tree: PyTree) -> dict[str, str]:
 def fingerprint(tree: PyTree) -> str:
     """SHA-256 of all that a pytree holds: its description and its arrays' bytes."""
     digest = hashlib.sha256(json.dumps(describe(tree)).encode())
-    for leaf in filter(_is_data, jax.tree.leaves(tree)):
+    for leaf in filter(is_data, jax.tree.leaves(tree)):
         digest.update(_as_numpy(leaf).tobytes())
     return digest.hexdigest()
 
@@ -122,13 +133,16 @@ def as_path(path: str | os.PathLike[str], name: str = "path") -> Path:
 def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
     """Write a file so that an interruption or an error leaves the old one or the new one.
 
-    Raises `OSError` that names the file where there is no room for it, or no permission.
+    Several threads and processes may write one path: whoever ends last has written the file, and
+    who reads it finds one that is whole. Raises `OSError` that names the file where there is no
+    room for it, or no permission.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
+    # Writers that shared a name would write into each other's file, and take it from each other.
+    partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")
     try:
-        with open(partial, "wb") as file:
+        with open(partial, "xb") as file:
             write(file)
             file.flush()
             # Without it, the file could be empty under its new name after a power cut.
@@ -258,7 +272,8 @@ def _stored_dtype(dtype: np.dtype) -> np.dtype:
     return np.dtype(f"u{dtype.itemsize}") if dtype.kind == "V" else dtype
 
 
-def _is_data(leaf: Any) -> bool:
+def is_data(leaf: Any) -> bool:
+    """Whether it is an array, a key or a number, the shape of one included."""
     arrays = (jax.Array, np.ndarray, np.generic, jax.ShapeDtypeStruct)
     return isinstance(leaf, (*arrays, bool, int, float, complex))
 
