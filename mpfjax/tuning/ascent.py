@@ -1,9 +1,7 @@
 """One climb: steps up the gradient until they are done, converged, or not finite."""
 
-import functools
 import os
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,12 +10,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Key
+from jaxtyping import Array, Key, PyTree
 from tqdm import tqdm
 
-from mpfjax.tuning.checkpoints import State, load, save
-from mpfjax.tuning.identity import contents_of
+from mpfjax.tuning.checkpoints import Checkpoint, Notes, identity_of
 from mpfjax.tuning.problem import Problem, Reals, scores
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a climb stands: all that a checkpoint holds."""
+
+    step: int
+    reals: Reals
+    optimizer: PyTree
+    values: tuple[float, ...] = ()
+    deviations: tuple[float, ...] = ()
+    path: tuple[Reals, ...] = ()
+    fault: str | None = None
+    """what was not finite; no further step can repair it."""
 
 
 @dataclass(frozen=True)
@@ -40,15 +51,18 @@ class Climb:
         problem: Problem,
         optimizer: optax.GradientTransformation,
         num_seeds: int,
-        described: Callable[[], dict[str, str]],
+        settings: dict[str, Any],
+        code: dict[str, Any],
     ) -> None:
+        """`settings` and `code` of the objective, as `identity_of` takes them."""
         self.caller = caller
         self.objective = objective
         self.key = key
         self.problem = problem
         self.optimizer = optimizer
         self.num_seeds = num_seeds
-        self.described = described
+        self.settings = settings
+        self.code = code
         self.common_random_numbers = False
 
     @property
@@ -64,14 +78,17 @@ class Climb:
         tolerance: float,
         checkpoint: str | os.PathLike[str] | None,
         checkpoint_every: int,
+        checkpoint_name: str | None,
         progress: bool,
     ) -> End:
         """All steps, from the start or from the step of the checkpoint."""
         self.common_random_numbers = common_random_numbers
-        state = self.start()
-        path = None if checkpoint is None else Path(checkpoint)
-        if path is not None and path.exists():
-            state = load(path, self.identity, state, self.caller)
+        state, file = self.start(), None
+        if checkpoint is not None:
+            # Before the first step, at which an optimiser may change what its closures hold.
+            identity = self.identity(checkpoint_name)
+            file = Checkpoint(Path(checkpoint), self.caller, lambda step: identity)
+            state = self.saved(file, state)
         if state.fault is not None:
             self.warn(state.fault, stacklevel=4)
         saved = state
@@ -86,14 +103,14 @@ class Climb:
                     bar.update()
                     bar.set_postfix({self.objective: f"{state.values[-1]:.2f}"}, refresh=False)
                     stopped = _converged(state.values, patience, tolerance)
-                if path is not None and state.step % checkpoint_every == 0:
-                    save(path, self.identity, state, stopped)
+                if file is not None and state.step % checkpoint_every == 0:
+                    self.save(file, state, stopped)
                     saved = state
             state, value = self.finish(state)
         finally:
             bar.close()
-            if path is not None and state.step > 0 and state is not saved:
-                save(path, self.identity, state, state.fault or stopped)
+            if file is not None and state.step > 0 and state is not saved:
+                self.save(file, state, state.fault or stopped)
         return End(state, value, state.fault or stopped)
 
     def history(self, state: State) -> dict[str, np.ndarray]:
@@ -173,21 +190,61 @@ class Climb:
             state = self.back(state, fault)
         return state, state.values[-1]
 
-    @functools.cached_property
-    def identity(self) -> dict[str, str]:
+    def identity(self, name: str | None) -> dict[str, str]:
         """What has to be the same for a checkpoint to be of this climb, by name."""
         leaves = jax.tree_util.tree_leaves_with_path(self.problem.tree)
-        return (
-            {
-                f"parameters {name}": jax.tree_util.keystr(leaves[index][0])
-                for name, index in self.problem.tuned
-            }
-            | contents_of("transforms", self.problem.transforms)
-            | contents_of("key", self.key)
-            | contents_of("num_seeds", int(self.num_seeds))
-            | contents_of("common_random_numbers", bool(self.common_random_numbers))
-            | contents_of("optimizer", self.optimizer)
-            | self.described()
+        places = {
+            f"parameters {name}": jax.tree_util.keystr(leaves[index][0])
+            for name, index in self.problem.tuned
+        }
+        settings = {
+            "transforms": self.problem.transforms,
+            "key": self.key,
+            "num_seeds": int(self.num_seeds),
+            "common_random_numbers": bool(self.common_random_numbers),
+        }
+        code = {"optimizer": self.optimizer} | self.code
+        return places | identity_of(name, settings | self.settings, code)
+
+    def save(self, file: Checkpoint, state: State, stopped: str | None) -> None:
+        """Write the whole state, and why the climb ended, if it has."""
+        rows = {
+            name: np.array([point[name] for point in state.path], value.dtype)
+            for name, value in state.reals.items()
+        }
+        rows = {name: row.reshape(-1, *state.reals[name].shape) for name, row in rows.items()}
+        arrays = {
+            "reals": state.reals, "optimizer": state.optimizer, "path": rows,
+            "values": np.array(state.values), "deviations": np.array(state.deviations),
+        }  # fmt: skip
+        file.save(state.step, arrays, stopped=stopped, broken=state.fault is not None)
+
+    def saved(self, file: Checkpoint, start: State) -> State:
+        """The state that a file holds, or the start where there is none."""
+
+        def like(notes: Notes) -> PyTree:
+            by_step = np.zeros(notes["step"])
+            rows = lambda u: jax.ShapeDtypeStruct((notes["step"], *u.shape), u.dtype)  # noqa: E731
+            return {
+                "reals": start.reals, "optimizer": start.optimizer,
+                "path": jax.tree.map(rows, start.reals), "values": by_step, "deviations": by_step,
+            }  # fmt: skip
+
+        found = file.load(like)
+        if found is None:
+            return start
+        notes, arrays = found
+        return State(
+            step=notes["step"],
+            reals=arrays["reals"],
+            optimizer=arrays["optimizer"],
+            values=tuple(map(float, arrays["values"])),
+            deviations=tuple(map(float, arrays["deviations"])),
+            path=tuple(
+                {name: rows[k] for name, rows in arrays["path"].items()}
+                for k in range(notes["step"])
+            ),
+            fault=notes["stopped"] if notes["broken"] else None,
         )
 
 

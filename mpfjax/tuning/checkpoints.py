@@ -1,127 +1,99 @@
-"""The file of a climb: all of its state, and a description of what it is a climb of."""
+"""The file of a climb or of chains: all of their state, and a description of what it is of."""
 
 import json
+import os
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
-from mpfjax.checks import shown
-from mpfjax.running.storage import load_arrays, write_arrays
-from mpfjax.tuning.identity import unlike
-from mpfjax.tuning.problem import Reals
+from mpfjax.checks import check_type, check_whole, given
+from mpfjax.running.storage import (
+    arrays_of,
+    as_path,
+    filled,
+    fingerprint,
+    load_arrays,
+    write_arrays,
+)
+from mpfjax.tuning.identity import contents_of, unlike
+
+_NOTES = "notes"
+Notes = dict[str, Any]
+"""what is no array: the step, and whatever else says how to read the arrays."""
 
 
 @dataclass(frozen=True)
-class State:
-    """Where a climb stands: all that a checkpoint holds."""
+class Checkpoint:
+    """A file that the public function `caller` goes on from where it exists.
 
-    step: int
-    reals: Reals
-    optimizer: PyTree
-    values: tuple[float, ...] = ()
-    deviations: tuple[float, ...] = ()
-    path: tuple[Reals, ...] = ()
-    fault: str | None = None
-    """what was not finite; no further step can repair it."""
+    `identity` describes all that has to be the same, as far as a step.
+    """
 
+    path: Path
+    caller: str
+    identity: Callable[[int], Mapping[str, str]]
 
-def save(path: Path, identity: dict[str, str], state: State, stopped: str | None) -> None:
-    """Write the whole state, and why the climb ended, if it has."""
-    arrays = {"fit": np.array(json.dumps(identity)), "step": np.array(state.step)}
-    arrays["stopped"] = np.array(stopped or "")
-    arrays["broken"] = np.array(state.fault is not None)
-    write_arrays(path, arrays | _arrays_of(state))
+    def save(self, step: int, state: PyTree, **notes: Any) -> None:
+        """Write the whole state after a step, with what to note about it."""
+        notes |= {"caller": self.caller, "identity": dict(self.identity(step)), "step": int(step)}
+        write_arrays(self.path, arrays_of(state) | {_NOTES: np.array(json.dumps(notes))})
 
+    def load(self, like: Callable[[Notes], PyTree]) -> tuple[Notes, PyTree] | None:
+        """The notes and the state, which looks `like` what the notes say; None without a file.
 
-def _arrays_of(state: State) -> dict[str, np.ndarray]:
-    """The numbers of a state, by their names in a file."""
-    arrays = {"values": np.array(state.values), "deviations": np.array(state.deviations)}
-    for i, leaf in enumerate(jax.tree.leaves(state.optimizer)):
-        arrays[f"optimizer {i}"] = _written(leaf)
-    for name, value in state.reals.items():
-        arrays[f"reals {name}"] = own = _written(value)
-        rows = [_written(point[name]) for point in state.path]
-        arrays[f"path {name}"] = np.array(rows, own.dtype).reshape(len(rows), *own.shape)
-    return arrays
-
-
-def load(path: Path, identity: dict[str, str], start: State, caller: str) -> State:
-    """The state that was saved; raises `ValueError` for that of another fit, or half of one."""
-    arrays = load_arrays(path)
-    found = _parsed(arrays.get("fit"))
-    if found is None:
-        raise ValueError(f"checkpoint: {path} is no checkpoint of a climb")
-    if found != identity:
-        raise ValueError(f"checkpoint: {path} is of another {caller}: {unlike(found, identity)}")
-    step = _check_arrays(path, arrays, start)
-    leaves, structure = jax.tree.flatten(start.optimizer)
-    path_of = {name: arrays[f"path {name}"] for name in start.reals}
-    return State(
-        step=step,
-        reals={name: _read(arrays[f"reals {name}"], like) for name, like in start.reals.items()},
-        optimizer=structure.unflatten(
-            _read(arrays[f"optimizer {i}"], like) for i, like in enumerate(leaves)
-        ),
-        values=tuple(map(float, arrays["values"])),
-        deviations=tuple(map(float, arrays["deviations"])),
-        path=tuple(
-            {name: _read(rows[k, ...], start.reals[name]) for name, rows in path_of.items()}
-            for k in range(step)
-        ),
-        fault=str(arrays["stopped"]) if arrays["broken"] else None,
-    )
-
-
-def _check_arrays(path: Path, arrays: dict[str, np.ndarray], start: State) -> int:
-    """The step; raises `ValueError` for arrays that are missing or of another kind."""
-    step = arrays.get("step", np.array(-1))
-    if step.shape != () or step.dtype.kind != "i" or step < 1:
-        raise ValueError(f"checkpoint: {path} is damaged: its step is {shown(step)}")
-    expected: dict[str, tuple[tuple[int, ...], str]] = {
-        "stopped": ((), "U"),
-        "broken": ((), "b"),
-    }
-    for name, array in _arrays_of(start).items():
-        by_step = name in ("values", "deviations") or name.startswith("path ")
-        shape = (int(step), *array.shape[1:]) if by_step else array.shape
-        expected[name] = (shape, array.dtype.name)
-    for name, (shape, kind) in expected.items():
-        if name not in arrays:
-            raise ValueError(f"checkpoint: {path} is damaged: it lacks the array {name!r}")
-        array = arrays[name]
-        if array.shape != shape or kind not in (array.dtype.name, array.dtype.kind):
+        Raises `ValueError` for the file of another run, or for half of one.
+        """
+        if not self.path.exists():
+            return None
+        arrays = load_arrays(self.path)
+        notes = self._notes(arrays)
+        found, own = notes["identity"], dict(self.identity(notes["step"]))
+        if found != own:
             raise ValueError(
-                f"checkpoint: {path} is damaged: {name!r} is {array.dtype}{list(array.shape)},"
-                f" not {kind}{list(shape)}"
+                f"checkpoint: {self.path} is of another {self.caller}: {unlike(found, own)}"
             )
-    return int(step)
+        try:
+            return notes, filled(self.path, arrays, like(notes))
+        except ValueError as error:
+            raise ValueError(f"checkpoint: {error}") from error
+
+    def _notes(self, arrays: Mapping[str, np.ndarray]) -> Notes:
+        try:
+            notes = json.loads(str(arrays[_NOTES]))
+            is_own = notes["caller"] == self.caller and notes["step"] >= 0
+        except (KeyError, TypeError, ValueError):
+            is_own, notes = False, {}
+        if not is_own or not isinstance(notes.get("identity"), dict):
+            raise ValueError(f"checkpoint: {self.path} is no checkpoint of {self.caller}")
+        return notes
 
 
-def _written(leaf: Any) -> np.ndarray:
-    """A number of a state as a file can hold it."""
-    if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        leaf = jax.random.key_data(leaf)
-    array = np.asarray(leaf)
-    # numpy has no name for bfloat16 and the like, and could not read them back.
-    return array.view(f"u{array.itemsize}") if array.dtype.kind == "V" else array
+def check_checkpoint(checkpoint: Any, checkpoint_every: Any, checkpoint_name: Any) -> None:
+    """The three arguments by which a function writes a file, before anything compiles."""
+    check_whole(1, checkpoint_every=checkpoint_every)
+    check_type(str, "a name", **given(checkpoint_name=checkpoint_name))
+    check_type((str, os.PathLike), "the path of a file", **given(checkpoint=checkpoint))
+    if checkpoint is not None and as_path(checkpoint, "checkpoint").is_dir():
+        raise ValueError(f"checkpoint: {checkpoint} is a directory, not a file")
 
 
-def _read(array: np.ndarray, like: Any) -> Array:
-    """The number that was written, with the type of `like`."""
-    if isinstance(like, jax.Array) and jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
-        return jax.random.wrap_key_data(jnp.asarray(array), impl=jax.random.key_impl(like))
-    return jnp.asarray(array.view(like.dtype) if hasattr(like, "dtype") else array)
+def identity_of(
+    name: str | None, settings: Mapping[str, Any], code: Mapping[str, Any]
+) -> dict[str, str]:
+    """What has to be the same for a file to be of this run, as text.
 
-
-def _parsed(description: np.ndarray | None) -> dict[str, str] | None:
-    """What a file says that it is of, or None for one that says nothing."""
-    try:
-        identity = json.loads(str(description))
-    except ValueError:
-        return None
-    return identity if isinstance(identity, dict) else None
+    `settings` are texts, numbers, arrays and modules, and always compared. `code` are functions and
+    optimisers: all that they hold is compared, or only the name that the user gave it.
+    """
+    told = {part: held for part, held in settings.items() if isinstance(held, str)}
+    rest = {part: held for part, held in settings.items() if part not in told}
+    if name is not None:
+        prints = {part: fingerprint(held)[:16] for part, held in rest.items()}
+        return {"checkpoint_name": name} | told | prints
+    for part, held in {**rest, **code}.items():
+        told |= contents_of(part, held)
+    return told

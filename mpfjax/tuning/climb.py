@@ -3,7 +3,6 @@
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -18,7 +17,6 @@ from mpfjax.checks import (
     check_finite,
     check_flag,
     check_key,
-    check_type,
     check_whole,
     given,
     shown,
@@ -26,8 +24,8 @@ from mpfjax.checks import (
 from mpfjax.filter import Filter
 from mpfjax.running.storage import fingerprint
 from mpfjax.tuning.ascent import Climb
+from mpfjax.tuning.checkpoints import check_checkpoint
 from mpfjax.tuning.curvature import errors_at
-from mpfjax.tuning.identity import contents_of
 from mpfjax.tuning.problem import Objective, Parameters, Problem, pose, pose_evidence, warn_of_bias
 from mpfjax.tuning.transforms import AbstractTransform
 
@@ -68,6 +66,7 @@ def fit(
     curvature_seeds: int = 0,
     checkpoint: str | os.PathLike[str] | None = None,
     checkpoint_every: int = 50,
+    checkpoint_name: str | None = None,
     progress: bool = True,
 ) -> TuningRun:
     """Climb the log marginal likelihood in some of a filter's parameters.
@@ -103,6 +102,9 @@ def fit(
       the numbers in its closures and schedules. Your own functions are compared by their code;
       classes and functions of libraries by their names. Take a new file after you change what
       those do. With another version of Python or optax, the file may be refused.
+    - `checkpoint_name`: what the climb is called, such as "adam, cosine". Its file is then told by
+      this name, and no function or optimiser is looked into; numbers and arrays are compared as
+      before. Use it for functions that change what they hold, and across versions.
 
     If the log marginal likelihood or the gradient is not finite, the climb ends with the last good
     parameters, a warning, and the step in `stopped`. Raises `ValueError` for a parameter that is
@@ -112,17 +114,16 @@ def fit(
     """
     _check_climb(
         key, optimizer, num_steps, num_seeds, common_random_numbers, patience, tolerance,
-        checkpoint, checkpoint_every, progress,
+        checkpoint, checkpoint_every, checkpoint_name, progress,
     )  # fmt: skip
     check_whole(0, curvature_seeds=curvature_seeds)
     problem = pose_evidence(filter, observations, parameters, transforms, missing)
     warn_of_bias("fit", problem)
 
-    def described() -> dict[str, str]:
-        observed = {"observations": fingerprint(problem.objective), "missing": missing}
-        return contents_of("filter", problem.tree) | observed
-
-    climb = Climb("fit", "log_marginal_likelihood", key, problem, optimizer, num_seeds, described)
+    observed = fingerprint(problem.objective)
+    settings = {"filter": problem.tree, "observations": observed, "missing": missing}
+    objective = "log_marginal_likelihood"
+    climb = Climb("fit", objective, key, problem, optimizer, num_seeds, settings, {})
     end = climb.run(
         num_steps,
         common_random_numbers,
@@ -130,6 +131,7 @@ def fit(
         tolerance,
         checkpoint,
         checkpoint_every,
+        checkpoint_name,
         progress,
     )
     errors = None
@@ -179,6 +181,7 @@ def maximise(
     tolerance: float = 0.0,
     checkpoint: str | os.PathLike[str] | None = None,
     checkpoint_every: int = 50,
+    checkpoint_name: str | None = None,
     progress: bool = True,
 ) -> Maximisation:
     """Climb any objective in some of a model's, or a filter's, parameters.
@@ -199,16 +202,14 @@ def maximise(
     """
     _check_climb(
         key, optimizer, num_steps, num_seeds, common_random_numbers, patience, tolerance,
-        checkpoint, checkpoint_every, progress,
+        checkpoint, checkpoint_every, checkpoint_name, progress,
     )  # fmt: skip
     check_callable("a function of a key and a model", objective=objective)
     problem = pose(model, objective, parameters, transforms)
     _check_scalar(problem, key)
 
-    def described() -> dict[str, str]:
-        return contents_of("model", problem.tree) | contents_of("objective", objective)
-
-    climb = Climb("maximise", "value", key, problem, optimizer, num_seeds, described)
+    settings, code = {"model": problem.tree}, {"objective": objective}
+    climb = Climb("maximise", "value", key, problem, optimizer, num_seeds, settings, code)
     end = climb.run(
         num_steps,
         common_random_numbers,
@@ -216,6 +217,7 @@ def maximise(
         tolerance,
         checkpoint,
         checkpoint_every,
+        checkpoint_name,
         progress,
     )
     return Maximisation(
@@ -237,6 +239,7 @@ def _check_climb(
     tolerance: Any,
     checkpoint: Any,
     checkpoint_every: Any,
+    checkpoint_name: Any,
     progress: Any,
 ) -> None:
     """The arguments that `fit` and `maximise` share, before anything compiles."""
@@ -247,13 +250,11 @@ def _check_climb(
                 f"optimizer: {shown(optimizer)} has no {method}; take one of optax, such as"
                 " optax.adam(0.05)"
             )
-    check_whole(1, num_steps=num_steps, num_seeds=num_seeds, checkpoint_every=checkpoint_every)
+    check_whole(1, num_steps=num_steps, num_seeds=num_seeds)
     check_whole(1, **given(patience=patience))
     check_finite(tolerance=tolerance)
     check_flag(common_random_numbers=common_random_numbers, progress=progress)
-    check_type((str, os.PathLike), "the path of a file", **given(checkpoint=checkpoint))
-    if checkpoint is not None and Path(checkpoint).is_dir():
-        raise ValueError(f"checkpoint: {checkpoint} is a directory, not a file")
+    check_checkpoint(checkpoint, checkpoint_every, checkpoint_name)
 
 
 def _check_scalar(problem: Problem, key: Key[Array, ""]) -> None:

@@ -95,10 +95,13 @@ def _parts_of_function(function: types.FunctionType) -> dict[str, Any]:
     cells = function.__closure__ or ()
     for variable, cell in zip(function.__code__.co_freevars, cells, strict=True):
         try:
-            parts[f".{variable}"] = cell.cell_contents
+            held = cell.cell_contents
         except ValueError:
             # Not assigned yet.
             continue
+        # optax's cosine schedule writes its whole numbers as floats into its closure when it is
+        # first called.
+        parts[f".{variable}"] = float(held) if _is_count(held) else held
     parts |= {f".default {i}": value for i, value in enumerate(function.__defaults__ or ())}
     parts |= {f".{name}": value for name, value in (function.__kwdefaults__ or {}).items()}
     if _of_library(function):
@@ -137,6 +140,11 @@ def _digest(code: types.CodeType) -> str:
 
 def _is_data(value: Any) -> bool:
     return isinstance(value, jax.Array | np.ndarray | np.generic | bool | int | float | complex)
+
+
+def _is_count(value: Any) -> bool:
+    """A whole number that is the same as a float."""
+    return type(value) is int and abs(value) < 2**53
 
 
 def _value(value: Any) -> str:

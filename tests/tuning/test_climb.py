@@ -1,6 +1,7 @@
 """`fit` finds the maximum, says what is wrong, and goes on where it was interrupted."""
 
 import functools
+import json
 import os
 import subprocess
 import sys
@@ -141,8 +142,7 @@ class TestResuming:
         monkeypatch.setattr(mpfjax.tuning.ascent, "scores", interrupted)
         with pytest.raises(KeyboardInterrupt):
             short_fit(checkpoint=path)
-        with np.load(path, allow_pickle=False) as file:
-            assert int(file["step"]) == 3
+        assert notes_of(path)["step"] == 3
         monkeypatch.undo()
         assert short_fit(checkpoint=path).parameters["r"] == short_fit().parameters["r"]
 
@@ -183,8 +183,7 @@ class TestResuming:
         options |= {"tolerance": 1.0, "checkpoint": tmp_path / "fit.npz"}
         first = short_fit(40, **options)
         assert "3 steps gained" in first.stopped
-        with np.load(options["checkpoint"], allow_pickle=False) as file:
-            assert str(file["stopped"]) == first.stopped
+        assert notes_of(options["checkpoint"])["stopped"] == first.stopped
         assert_same(short_fit(40, **options), first)
         assert_same(short_fit(80, **options), first)
         further = short_fit(10, **options | {"patience": None})
@@ -207,14 +206,12 @@ class TestResuming:
     @pytest.mark.parametrize(
         ("name", "array"),
         [
-            ("reals r", np.zeros(2, np.float32)),
-            ("reals r", np.zeros((), np.float64)),
-            ("optimizer 0", None),
-            ("optimizer 1", np.zeros((), np.int32)),
-            ("path r", np.zeros(1, np.float32)),
-            ("values", None),
-            ("step", np.array(1.5)),
-            ("step", np.array(9)),
+            ("['reals']['r']", np.zeros(2, np.float32)),
+            ("['reals']['r']", np.zeros((), np.float64)),
+            ("['optimizer'][0].count", None),
+            ("['optimizer'][0].mu['r']", np.zeros((), np.int32)),
+            ("['path']['r']", np.zeros(1, np.float32)),
+            ("['values']", None),
         ],
     )
     def test_a_file_with_other_arrays_is_damaged(self, tmp_path, name, array):
@@ -223,13 +220,13 @@ class TestResuming:
         arrays = mpfjax.running.storage.load_arrays(path)
         del arrays[name]
         mpfjax.running.storage.write_arrays(path, arrays | ({} if array is None else {name: array}))
-        with pytest.raises(ValueError, match=r"checkpoint: .*fit\.npz is damaged"):
+        with pytest.raises(ValueError, match=r"checkpoint: .*fit\.npz: damaged"):
             short_fit(checkpoint=path)
 
     def test_a_file_of_something_else_is_refused(self, tmp_path):
         path = tmp_path / "fit.npz"
         mpfjax.running.storage.write_arrays(path, {"step": np.array(3)})
-        with pytest.raises(ValueError, match=r"fit\.npz is no checkpoint of a climb"):
+        with pytest.raises(ValueError, match=r"fit\.npz is no checkpoint of fit"):
             short_fit(checkpoint=path)
 
     def test_an_optimiser_with_a_key_and_short_floats_goes_on(self, tmp_path):
@@ -260,6 +257,36 @@ class TestResuming:
         with pytest.raises(OSError, match=r"fit\.npz"), no_room_beyond(500):
             short_fit(checkpoint=path)
         assert path.read_bytes() == before
+
+    @pytest.mark.parametrize("name", [None, "cosine"])
+    def test_a_schedule_that_writes_into_its_closure_goes_on(self, tmp_path, name):
+        """As optax's cosine does when it is first called, in this process and in a new one."""
+        make = lambda: optax.adam(optax.cosine_decay_schedule(0.05, 10))  # noqa: E731
+        options = {"checkpoint": tmp_path / "fit.npz", "checkpoint_name": name}
+        optimizer = make()
+        short_fit(2, optimizer=optimizer, **options)
+        short_fit(3, optimizer=optimizer, **options)
+        resumed = short_fit(4, optimizer=make(), **options)
+        np.testing.assert_array_equal(
+            resumed.history["r"], short_fit(4, optimizer=make()).history["r"]
+        )
+
+    def test_of_a_name_the_name_and_the_data_are_compared_alone(self, tmp_path):
+        options = {"checkpoint": tmp_path / "fit.npz", "checkpoint_name": "mine"}
+        short_fit(1, **options)
+        assert len(short_fit(2, optimizer=optax.adam(0.07), **options).history["r"]) == 2
+        for other, named in (
+            ({"checkpoint_name": "yours"}, "checkpoint_name is mine there and yours here"),
+            ({"start": {"r": 0.7}}, "filter is"),
+            ({"observations": OBSERVATIONS.at[3].add(1e-6)}, "observations is"),
+        ):
+            with pytest.raises(ValueError, match=named):
+                short_fit(3, **options | other)
+
+
+def notes_of(path):
+    with np.load(path, allow_pickle=False) as file:
+        return json.loads(str(file["notes"]))
 
 
 def assert_same(run, other):
