@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from mpfjax.vision import boxes as box_files
-from mpfjax.vision import frames
+from mpfjax.vision import frames, read_truth
 from mpfjax.vision.scenes import football_scene
 
 DEFAULT_IDS, DEFAULT_FRAMES = [11, 13], "129:199"
@@ -38,7 +38,7 @@ def open_targets(options: argparse.Namespace) -> Targets:
         ids = DEFAULT_IDS if ids is None else ids
         span = DEFAULT_FRAMES if span is None else span
     first, last = frames.parse_range(span, "--frames")
-    rows = box_files.read_tracks(sequence / "gt.txt")
+    rows = read_truth(sequence / "gt.txt").objects
     if ids is None:
         ids = sorted(box_files.boxes_of_frame(rows, first))[:2]
     stills = np.stack(list(frames.read_frames(sequence, first, last)))

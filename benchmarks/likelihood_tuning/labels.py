@@ -33,7 +33,7 @@ from mpfjax.vision import (
     football_scene,
     labelled_states,
     read_frames,
-    read_tracks,
+    read_truth,
 )
 
 SEQUENCES = ("rendered", "otb_jogging", "vot_basketball")
@@ -70,7 +70,8 @@ def read_labelled(name: str, seed: int) -> Labelled:
         folder = Path(os.environ.get("MPFJAX_DATA", "../shared/data")) / name
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: no such sequence")
-        frames, rows = np.stack(list(read_frames(folder, 1, last))), read_tracks(folder / "gt.txt")
+        frames = np.stack(list(read_frames(folder, 1, last)))
+        rows = read_truth(folder / "gt.txt").objects
         ids = sorted(set(rows[rows[:, 0] <= last, 1]))
     boxes = [[rows[(rows[:, 0] == t) & (rows[:, 1] == id)][0, 2:] for id in ids]
              for t in range(1, last + 1)]  # fmt: skip

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.vision import read_tracks
+from mpfjax.vision import read_truth
 
 LEAST_FRAMES, LEAST_COVER, LEAST_WAY = 6, 0.5, 0.5
 AROUND = 10  # frames that are shown before and after
@@ -40,7 +40,7 @@ def find_events(folder: Path) -> list[Event]:
     """
     if not folder.is_dir():
         raise ValueError(f"--sequence: {folder} is not a folder")
-    ids, boxes = tracks(read_tracks(folder / "gt.txt"))
+    ids, boxes = tracks(read_truth(folder / "gt.txt").objects)
     events = [event for j in range(len(ids)) for event in _events_of(j, ids, boxes)]
     if not events:
         raise ValueError(

@@ -178,7 +178,7 @@ def real_scene(folder: Path, event: Event) -> Scene:
     if not folder.is_dir():
         raise ValueError(f"--sequence: {folder} is not a folder")
     stills = np.stack(list(vision.read_frames(folder, first, last)))
-    rows = vision.read_tracks(folder / "gt.txt")
+    rows = vision.read_truth(folder / "gt.txt").objects
     started = box_files.boxes_of_frame(rows, first)
     ids = event.ids or tuple(sorted(started))
     missing = [id for id in ids if id not in started]

@@ -40,6 +40,7 @@ from mpfjax.vision import boxes as box_files
 from mpfjax.vision import frames
 from mpfjax.vision.detectors import Rows
 from mpfjax.vision.loop import make_tracker, online_rows, track
+from mpfjax.vision.truth import Truth, read_truth
 
 OURS = {"gm_mpf": "GM-MPF", "mpf": "MPF"}
 SCORES = ("HOTA", "MOTA", "IDF1", "id_switches")
@@ -52,7 +53,7 @@ class Sequence(NamedTuple):
     name: str
     detections: str
     rows: np.ndarray
-    truth: np.ndarray
+    truth: Truth
     first: int
     last: int
     frames_per_second: float | None
@@ -114,7 +115,7 @@ def open_sequences(options: argparse.Namespace) -> list[Sequence]:
                 f" {'a' if truth_path else 'no'} gt.txt; all three are needed"
             )
         end = min(last or held, held)
-        truth = _between(box_files.read_tracks(truth_path), first, end)
+        truth = read_truth(truth_path).between(first, end)
         rate = options.fps or frames.frame_rate(folder)
         for path in files:
             rows = _between(box_files.read_detections(path), first, end)
@@ -129,6 +130,7 @@ def _rendered(match: football.Match, seed: int, first: int, last: int | None) ->
     truth = _between(scene.tracks, first, last)
     rows = football.detect(match, truth, seed)
     rate = football.FRAMES_PER_SECOND
+    truth = Truth(truth, np.zeros((0, 6)))
     return Sequence(match.name, "simulated", rows, truth, first, last, rate, scene.frames)
 
 
@@ -225,7 +227,9 @@ def otsu(scores: np.ndarray) -> float:
 
 def _result(name: str, sequence: Sequence, runs: list[Run]) -> dict[str, Any]:
     span = (sequence.first, sequence.last)
-    scores = [multi_object_scores(run.rows, sequence.truth, span) for run in runs]
+    truth = sequence.truth
+    away = {"ignored": truth.ignored, "min_height": truth.min_height}
+    scores = [multi_object_scores(run.rows, truth.objects, span, **away) for run in runs]
     result: dict[str, Any] = {
         "tracker": name,
         "sequence": sequence.name,

@@ -9,7 +9,7 @@ import numpy as np
 
 from mpfjax.metrics.coverage import covers
 from mpfjax.vision import boxes as box_files
-from mpfjax.vision import football_scene, frames
+from mpfjax.vision import football_scene, frames, read_truth
 from mpfjax.vision.recipes import MAX_COMPONENTS
 
 
@@ -46,7 +46,7 @@ def open_source(options: argparse.Namespace) -> Source:
     elif last is not None:
         count = last - first + 1
     truth_path = path / "gt.txt"
-    rows = box_files.read_tracks(truth_path) if truth_path.is_file() else None
+    rows = read_truth(truth_path).objects if truth_path.is_file() else None
     read = lambda: frames.read_frames(path, first, last)  # noqa: E731
     return _with_objects(options, str(path), read, first, last, count, rows, still)
 

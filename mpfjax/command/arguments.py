@@ -2,13 +2,14 @@
 
 import argparse
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from mpfjax.console import finite, positive, seed, whole
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import frames
+from mpfjax.vision.truth import Truth, read_truth
 
 DESCRIPTION = """\
 Track objects in a video or a folder of images. What to track comes from one of three: detections
@@ -30,7 +31,7 @@ class Source(NamedTuple):
     last: int | None  # None where only reading on will tell
     num_frames: int | None
     frames_per_second: float | None
-    truth: np.ndarray | None  # rows of gt.txt
+    truth: Truth | None
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -121,12 +122,11 @@ def read_boxes(options: argparse.Namespace, still: np.ndarray) -> np.ndarray:
     return boxes
 
 
-def _truth(path: Path, first: int, last: int | None) -> Any:
-    """The rows of the gt.txt beside the frames that lie in the range, or None."""
+def _truth(path: Path, first: int, last: int | None) -> Truth | None:
+    """What the gt.txt beside the frames says of those in the range, or None."""
     places = [path, path / "gt"] if path.is_dir() else []
     for place in (*places, path.parent):
         if (place / "gt.txt").is_file():
-            rows = box_files.read_tracks(place / "gt.txt")
-            rows = rows[(rows[:, 0] >= first) & (rows[:, 0] <= (last or np.inf))]
-            return rows if len(rows) else None
+            truth = read_truth(place / "gt.txt").between(first, last or np.inf)
+            return truth if len(truth.objects) else None
     return None

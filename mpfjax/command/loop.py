@@ -161,10 +161,13 @@ def _track(results: Results, start: Start) -> None:
 def _scores(rows: np.ndarray, source: Source, num_frames: int) -> dict[str, float]:
     """HOTA, MOTA and IDF1 where there is a truth, and TrackEval to score with."""
     span = (source.first, source.first + num_frames - 1)
-    if source.truth is None or not np.any(source.truth[:, 0] <= span[1]):
+    truth = source.truth
+    if truth is None or not np.any(truth.objects[:, 0] <= span[1]):
         return {}
     try:
-        scores = multi_object_scores(rows, source.truth, span)
+        scores = multi_object_scores(
+            rows, truth.objects, span, ignored=truth.ignored, min_height=truth.min_height
+        )
     except ImportError as error:
         print(f"no HOTA, MOTA and IDF1: {error}", file=sys.stderr)
         return {}

@@ -8,5 +8,6 @@ from mpfjax.metrics.set_distances import ospa as ospa
 from mpfjax.metrics.tracking_quality import TrackingQuality as TrackingQuality
 from mpfjax.metrics.tracking_quality import tracking_quality as tracking_quality
 from mpfjax.metrics.tracking_scores import multi_object_scores as multi_object_scores
+from mpfjax.metrics.tracking_scores import remove_ignored as remove_ignored
 from mpfjax.metrics.uniqueness import effective_dynamics as effective_dynamics
 from mpfjax.metrics.uniqueness import uniqueness as uniqueness

@@ -5,8 +5,11 @@ from types import ModuleType
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.checks import check_type, check_whole, to_rows
+from mpfjax.checks import check_not_negative, check_type, check_whole, to_rows
 
+# The kinds of what counts for nothing, in the second column of its rows.
+IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT = 1, 2, 3
+_ROUNDING = float(np.finfo(float).eps)
 _SETTINGS = {"THRESHOLD": 0.5, "PRINT_CONFIG": False}
 
 
@@ -14,12 +17,17 @@ def multi_object_scores(
     tracks: Float[np.ndarray, "r 6"],
     truth: Float[np.ndarray, "s 6"],
     frames: tuple[int, int] | None = None,
+    *,
+    ignored: Float[np.ndarray, "i 6"] | None = None,
+    min_height: float = 0.0,
 ) -> dict[str, float]:
     """Score tracks against the true boxes as TrackEval does, by the overlap of boxes (IoU).
 
     Both are rows (frame, id, x, y, w, h) as MOTChallenge files have them, (x, y) the top-left
     corner, in pixels. `frames` is the first and the last frame to score; rows outside are left
-    out. Without it every frame in which either has a box counts. The scores:
+    out. Without it every frame in which either has a box counts. `ignored` and `min_height` are
+    those of `remove_ignored`, which takes away first what counts for nothing; `read_truth` of
+    `mpfjax.vision` reads all three. The scores:
 
     - "HOTA", "DetA" and "AssA", Luiten et al. (2021), each the mean over IoU thresholds of 0.05
       to 0.95;
@@ -30,11 +38,12 @@ def multi_object_scores(
     Without tracks every object is a miss and every ratio 0. A box without area overlaps nothing.
     Raises `ValueError` for what is no rows of six numbers, where an id has two boxes in one frame,
     where a number is not finite, where `frames` ends before it begins or is no pair of whole
-    numbers, and where there are no true boxes to score against;
+    numbers, where there are no true boxes to score against, and as `remove_ignored` does;
     `ImportError` without the extra "trackeval". Use it to compare with published trackers;
     `coverage` is looser about the boxes' size.
     """
     tracks, truth = _checked(tracks, "tracks"), _checked(truth, "truth")
+    check_not_negative(min_height=min_height)
     if frames is not None:
         check_type((tuple, list), "the first and the last frame", frames=frames)
         if len(frames) != 2:
@@ -49,6 +58,9 @@ def multi_object_scores(
         )
     if len(truth) == 0:
         raise ValueError("truth: there are no true boxes to score against")
+    if ignored is not None or min_height > 0:
+        ignored = np.zeros((0, 6)) if ignored is None else ignored
+        tracks = remove_ignored(tracks, truth, ignored, min_height)
     metrics = _trackeval_metrics()
     sequence = _sequence(tracks, truth)
     hota = metrics.HOTA().eval_sequence(sequence)
@@ -63,6 +75,73 @@ def multi_object_scores(
         "misses": clear["CLR_FN"],
     }
     return {name: float(score) for name, score in scores.items()}
+
+
+def remove_ignored(
+    tracks: Float[np.ndarray, "r 6"],
+    truth: Float[np.ndarray, "s 6"],
+    ignored: Float[np.ndarray, "i 6"],
+    min_height: float = 0.0,
+) -> Float[np.ndarray, "k 6"]:
+    """The tracked boxes that count, as MOTChallenge and KITTI choose them before they score.
+
+    In each frame, tracked boxes are matched with all boxes that somebody labelled, one to one, at
+    the largest sum of overlaps (IoU) of at least a half. Then these are taken away:
+
+    - what is matched to an ignored object;
+    - of what is matched to nothing, a box of which more than half lies in one ignored region, and
+      where `min_height` is above zero a box that is no higher than this, in pixels.
+
+    `tracks` and `truth` are rows (frame, id, x, y, w, h), and `ignored` rows (frame, kind, x, y, w,
+    h). Kind 1 is an ignored object, such as a rider where pedestrians are tracked; kind 2 a region
+    that nobody labelled; kind 3 an unscored object, that can be matched and excuses nobody.
+
+    Raises `ValueError` for what is no rows of six finite numbers, for another kind, and for a
+    height below zero. Use it before scores of another library; `multi_object_scores` calls it.
+    """
+    tracks, truth = _checked(tracks, "tracks"), _checked(truth, "truth")
+    ignored = to_rows(6, "ignored", ignored)
+    if not np.all(np.isfinite(ignored)):
+        raise ValueError("ignored: holds numbers that are not finite")
+    for kind in np.setdiff1d(ignored[:, 1], (IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT)):
+        raise ValueError(f"ignored: {kind:g} is none of the kinds 1, 2 and 3")
+    check_not_negative(min_height=min_height)
+    regions = ignored[:, 1] == IGNORED_REGION
+    labelled = np.concatenate([np.insert(truth[:, [0, *range(2, 6)]], 1, 0, 1), ignored[~regions]])
+    kept = np.ones(len(tracks), bool)
+    for frame in np.unique(tracks[:, 0]):
+        here = np.flatnonzero(tracks[:, 0] == frame)
+        objects = labelled[labelled[:, 0] == frame]
+        fields = ignored[regions & (ignored[:, 0] == frame), 2:]
+        matched, owners = _matches(tracks[here, 2:], objects[:, 2:])
+        kept[here[matched[objects[owners, 1] == IGNORED_OBJECT]]] = False
+        left = np.delete(here, matched)
+        boxes = tracks[left, 2:]
+        inside = np.any(_share_within(boxes, fields) > 0.5 + _ROUNDING, axis=1)
+        low = (min_height > 0) & (boxes[:, 3] <= min_height + _ROUNDING)
+        kept[left[inside | low]] = False
+    return tracks[kept]
+
+
+def _matches(boxes: np.ndarray, objects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows of boxes and of objects that are matched, at an overlap of at least a half."""
+    from scipy.optimize import linear_sum_assignment
+
+    shares = overlap(boxes, objects)
+    shares[shares < 0.5 - _ROUNDING] = 0
+    # The objects come first, as in TrackEval: of equal sums it then finds the same.
+    owners, matched = linear_sum_assignment(-shares.T)
+    real = shares[matched, owners] > 0
+    return matched[real], owners[real]
+
+
+def _share_within(boxes: np.ndarray, regions: np.ndarray) -> np.ndarray:
+    """The share of each box's area that lies in each region; 0 of a box without area."""
+    near = np.maximum(boxes[:, None, :2], regions[None, :, :2])
+    far = np.minimum(*(part[..., :2] + part[..., 2:] for part in (boxes[:, None], regions[None])))
+    shared = np.prod(np.maximum(far - near, 0.0), axis=-1)
+    areas = np.prod(np.maximum(boxes[:, 2:], 0.0), axis=-1)[:, None]
+    return np.where(areas > 0, shared / np.where(areas > 0, areas, 1.0), 0.0)
 
 
 def overlap(

@@ -48,3 +48,5 @@ from mpfjax.vision.soft_histograms import SoftColourModel as SoftColourModel
 from mpfjax.vision.soft_histograms import soft_histograms as soft_histograms
 from mpfjax.vision.tracker import ObjectTracker as ObjectTracker
 from mpfjax.vision.tracker import Tracks as Tracks
+from mpfjax.vision.truth import Truth as Truth
+from mpfjax.vision.truth import read_truth as read_truth

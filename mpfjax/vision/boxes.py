@@ -1,5 +1,8 @@
 """Boxes as users and MOTChallenge files write them: (x, y) of the top-left corner, w, h."""
 
+import codecs
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -56,15 +59,24 @@ def top_left(boxes: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k 4"]:
 def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     """Read a MOTChallenge file into rows (frame, id, x, y, w, h), (x, y) the top-left corner.
 
-    Frames count from 1. Raises `ValueError` for a line that cannot be read, naming the file and the
-    line, and for a file without any box.
+    Frames count from 1. Every row is read, whatever stands in its further columns; for a ground
+    truth, whose flags and classes say what counts, use `read_truth`. Raises `ValueError` for a line
+    that cannot be read, naming the file and the line, and for a file without any box. Warns where
+    the seventh column is that of a ground truth of which some rows do not count.
     """
     check_type((str, Path), "a path", path=path)
-    lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
-    rows = [_parse_row(path, i, line) for i, line in enumerate(lines, 1) if line.strip()]
+    rows = [parse_track(path, number, line) for number, line in numbered_lines(path)]
     if not rows:
         raise ValueError(f"{path}: holds no boxes")
-    return np.array(rows)
+    flags = [row[6] for row in rows]
+    if set(flags) == {0.0, 1.0}:
+        warnings.warn(
+            f"{path}: {flags.count(0.0)} rows are flagged 0, as a ground truth flags what does not"
+            " count; read_truth leaves them out",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return np.array([row[:6] for row in rows])
 
 
 def read_detections(path: str | Path) -> Float[np.ndarray, "rows columns"]:
@@ -76,11 +88,8 @@ def read_detections(path: str | Path) -> Float[np.ndarray, "rows columns"]:
     holds no detection at all.
     """
     check_type((str, Path), "a path", path=path)
-    lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
     rows: list[list[float]] = []
-    for number, line in enumerate(lines, 1):
-        if not line.strip():
-            continue
+    for number, line in numbered_lines(path):
         row = _parse_detection(path, number, line)
         if rows and len(row) != len(rows[0]):
             raise ValueError(f"{path}, line {number}: has a score, or none, unlike those before it")
@@ -119,6 +128,43 @@ def boxes_of_frame(rows: Float[np.ndarray, "rows 6"], frame: int) -> dict[int, n
     return {int(row[1]): row[2:6] for row in rows if row[0] == frame}
 
 
+def numbered_lines(path: str | Path) -> Iterator[tuple[int, str]]:
+    """The lines of a text file that are not blank, and their numbers from 1.
+
+    A byte order mark, which Windows puts before UTF-8 and UTF-16, is no part of the text.
+    """
+    content = Path(path).read_bytes()
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
+    return ((number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip())
+
+
+def parse_track(path: str | Path, number: int, line: str) -> list[float]:
+    """The numbers of a row frame,id,x,y,w,h,... of seven to ten columns; further ones may be NaN.
+
+    Raises `ValueError` naming the file and the line for what is no such row.
+    """
+    fields = line.split(",")
+    try:
+        values = [float(field) for field in fields[:6]]
+        whole = all(value == int(value) and value >= 0 for value in values[:2])
+    except (ValueError, OverflowError):
+        values, whole = [], False
+    if len(fields) not in _COLUMNS or not whole or not np.all(np.isfinite(values)):
+        raise ValueError(
+            f"{path}, line {number}: {shown(line.strip())} is not frame,id,x,y,w,h and one to four"
+            " more columns"
+        )
+    return values + [_number(field) for field in fields[6:]]
+
+
+def _number(field: str) -> float:
+    try:
+        return float(field)
+    except ValueError:
+        return np.nan
+
+
 def _parse_detection(path: str | Path, number: int, line: str) -> list[float]:
     fields = line.split(",")
     try:
@@ -128,22 +174,7 @@ def _parse_detection(path: str | Path, number: int, line: str) -> list[float]:
         values, whole = [], False
     if not 6 <= len(fields) <= 10 or not whole or not np.all(np.isfinite(values)):
         raise ValueError(
-            f"{path}, line {number}: {line.strip()!r} is not frame,id,x,y,w,h,score and up to three"
-            " more columns"
-        )
-    return values
-
-
-def _parse_row(path: str | Path, number: int, line: str) -> list[float]:
-    fields = line.split(",")
-    try:
-        values = [float(field) for field in fields[:6]]
-        whole = all(value == int(value) and value >= 0 for value in values[:2])
-    except (ValueError, OverflowError):
-        values, whole = [], False
-    if len(fields) not in _COLUMNS or not whole or not np.all(np.isfinite(values)):
-        raise ValueError(
-            f"{path}, line {number}: {line.strip()!r} is not frame,id,x,y,w,h and one to four"
-            " more columns"
+            f"{path}, line {number}: {shown(line.strip())} is not frame,id,x,y,w,h,score and up to"
+            " three more columns"
         )
     return values

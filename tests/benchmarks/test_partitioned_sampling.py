@@ -503,7 +503,7 @@ def test_the_events_are_those_of_the_data(data):
             of_folder = events.find_events(folder)
         except ValueError:
             continue
-        ids, boxes = events.tracks(events.read_tracks(folder / "gt.txt"))
+        ids, boxes = events.tracks(events.read_truth(folder / "gt.txt").objects)
         for event in of_folder:
             found += 1
             own = [ids.index(id) for id in event.ids]

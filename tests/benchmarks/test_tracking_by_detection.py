@@ -137,7 +137,7 @@ def test_a_scene_is_a_sequence(tmp_path, monkeypatch):
     options = ["--scene", "football", "--frames", "2:4"]
     (sequence,) = benchmark.open_sequences(benchmark.parse_arguments(options))
     assert len(list(sequence.stills())) == 3
-    assert set(sequence.truth[:, 0]) == {2, 3, 4} >= set(sequence.rows[:, 0])
+    assert set(sequence.truth.objects[:, 0]) == {2, 3, 4} >= set(sequence.rows[:, 0])
     assert (sequence.name, sequence.detections) == ("small", "simulated")
 
 

@@ -64,7 +64,12 @@ TABLE = {
     "multi_object_scores": (
         metrics.multi_object_scores,
         {"tracks": ROWS, "truth": ROWS, "frames": (1, 2)},
-        {"tracks": "rows", "truth": "rows"},
+        {"tracks": "rows", "truth": "rows", "ignored": "rows?", "min_height": "not negative"},
+    ),
+    "remove_ignored": (
+        metrics.remove_ignored,
+        {"tracks": ROWS, "truth": ROWS, "ignored": ROWS},
+        {"tracks": "rows", "truth": "rows", "ignored": "rows", "min_height": "not negative"},
     ),
     "uniqueness": (metrics.uniqueness, {"mixture": MIXTURE}, {"mixture": "kind"}),
     "effective_dynamics": (metrics.effective_dynamics, {"mixture": MIXTURE}, {"mixture": "kind"}),

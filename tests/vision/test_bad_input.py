@@ -104,6 +104,7 @@ TABLE = {
     ),
     "parse_box": (lambda box: vision.parse_box(box), {}, {"box": "path"}),
     "read_tracks": (vision.read_tracks, {}, {"path": "path"}),
+    "read_truth": (vision.read_truth, {}, {"path": "path"}),
     "write_tracks": (
         vision.write_tracks,
         {"path": "/nowhere", "rows": []},
