@@ -155,9 +155,12 @@ def make_tracker(
     """The tracker by the name of its filter, "gm_mpf" or "mpf", with room for so many objects.
 
     They differ in how a component's particles are redrawn: from a Gaussian, or by resampling.
-    `settings` are the tracker's own. Raises `ValueError` for another name.
+    `settings` are the tracker's own. Raises `ValueError` for another name, and for `moves`, which
+    an `ObjectTracker` takes.
     """
     check_one_of(("gm_mpf", "mpf"), filter=filter)
+    if "moves" in settings:
+        raise ValueError("moves: they are in place of a filter's; give them to ObjectTracker")
     if frames_per_second is not None:
         settings["frames_per_second"] = frames_per_second
     tracker = ObjectTracker(max_objects, **settings)

@@ -20,6 +20,7 @@ from mpfjax.vision.histograms import integral_histogram
 from mpfjax.vision.sampled_histograms import SampledBoxes, SampledHistogram
 from mpfjax.vision.tracking.assignment import Assign
 from mpfjax.vision.tracking.births import Found, ShareMass
+from mpfjax.vision.tracking.chain import check_chain
 from mpfjax.vision.tracking.colours import LearnColours
 from mpfjax.vision.tracking.contact import ShareDetections
 from mpfjax.vision.tracking.deaths import Bury
@@ -84,8 +85,8 @@ class ObjectTracker(eqx.Module):
     track an unknown and changing number of objects, with any detector.
 
     - `max_objects`: M; `particles_per_object`: P.
-    - `frames_per_second`: of the video. Above 25, objects move less in a frame, and wait for
-      more frames; from 7 to 25 the same settings hold.
+    - `frames_per_second`: of the video, 25 where it is None. Above 25, objects move less in a
+      frame, and wait for more frames; from 7 to 25 the same settings hold.
     - `rejuvenation`: `Resample(particles_per_component=P)` for an MPF, or
       `GaussianRegeneration(P, where=lambda states: (states.place, states.velocity))`, by default
       with stratified noise.
@@ -96,11 +97,14 @@ class ObjectTracker(eqx.Module):
       default, looks at colours only to assign detections, which costs less.
     - `strong_score`, `weak_score`: the scores from which a detection founds a component, and from
       which it counts at all; None takes them from the scores seen so far.
-    - `moves`: a chain of your own in place of all of these; it needs a `LearnColours` for colours.
+    - `moves`: a chain of your own in place of all of these, with settings of its own; colours are
+      learned where it holds a `LearnColours`, by whose bins.
 
     Raises `ValueError` for a count that is no whole number from 1 on, a rate or σ that is not
     positive and finite, a weak score above the strong one, and a rejuvenation that does not give
-    every component P particles or would redraw their labels.
+    every component P particles or would redraw their labels. Raises `ValueError` for a setting
+    beside `moves` that they have themselves, for moves that share one memory, and for a move that
+    needs the memory of one that is not there.
     """
 
     moves: tuple[AbstractMove, ...]
@@ -114,7 +118,7 @@ class ObjectTracker(eqx.Module):
         max_objects: int = 24,
         particles_per_object: int = 64,
         *,
-        frames_per_second: float = 25.0,
+        frames_per_second: float | None = None,
         rejuvenation: AbstractRejuvenation | None = None,
         colours: AbstractColours | None = None,
         exact_colours: bool = False,
@@ -124,22 +128,34 @@ class ObjectTracker(eqx.Module):
         moves: Iterable[AbstractMove] | None = None,
     ) -> None:
         check_whole(max_objects=max_objects, particles_per_object=particles_per_object)
-        check_positive(frames_per_second=frames_per_second, **given(sigma=sigma))
+        check_positive(**given(frames_per_second=frames_per_second, sigma=sigma))
         check_flag(exact_colours=exact_colours)
+        if moves is not None:
+            moves = _own_chain(
+                moves,
+                particles_per_object,
+                frames_per_second=frames_per_second,
+                rejuvenation=rejuvenation,
+                sigma=sigma,
+                strong_score=strong_score,
+                weak_score=weak_score,
+            )
+            colours = _learned_colours(moves, colours)
         colours = HSVColours(8, 4, 6) if colours is None else colours
         check_type(AbstractColours, "AbstractColours such as HSVColours()", colours=colours)
-        if rejuvenation is None:
-            rejuvenation = GaussianRegeneration(
-                particles_per_object, where=_motion, noise="stratified"
-            )
-        _check_rejuvenation(rejuvenation, particles_per_object)
         if moves is None:
-            model = object_model(frames_per_second, sigma)
-            patience = round(20 * max(frames_per_second / 25, 1.0))
+            if rejuvenation is None:
+                rejuvenation = GaussianRegeneration(
+                    particles_per_object, where=_motion, noise="stratified"
+                )
+            _check_rejuvenation(rejuvenation, particles_per_object)
+            rate = 25.0 if frames_per_second is None else frames_per_second
+            model = object_model(rate, sigma)
+            patience = round(20 * max(rate / 25, 1.0))
             moves = (
                 RankScores(strong_score=strong_score, weak_score=weak_score),
                 Assign(model),
-                ShareDetections(model, longest=round(7 * max(frames_per_second / 25, 1.0))),
+                ShareDetections(model, longest=round(7 * max(rate / 25, 1.0))),
                 rejuvenation,
                 PropagateObjects(model),
                 Bury(patience=patience),
@@ -147,14 +163,7 @@ class ObjectTracker(eqx.Module):
                 LearnColours(colours),
                 ShareMass(),
             )
-        check_type(Iterable, "a sequence of moves", moves=moves)
         self.moves = tuple(moves)
-        if not self.moves:
-            raise ValueError(f"moves: {shown(moves)} holds none, and a tracker needs some")
-        for move in self.moves:
-            check_type(AbstractMove, "a sequence of moves", moves=move)
-            if isinstance(move, AbstractRejuvenation):
-                _check_rejuvenation(move, particles_per_object, "moves")
         self.colours = colours
         self.max_objects = int(max_objects)
         self.particles_per_object = int(particles_per_object)
@@ -259,6 +268,40 @@ def object_model(
         detection_deviations=jnp.array([0.2, 0.1, 0.2, 0.12]),
         sigma=sigma,
     )
+
+
+def _own_chain(
+    moves: Iterable[AbstractMove], particles_per_object: int, **settings: Any
+) -> tuple[AbstractMove, ...]:
+    """The user's moves, or a `ValueError` for settings that they have and for moves that fail."""
+    check_type(Iterable, "a sequence of moves", moves=moves)
+    for name, value in given(**settings).items():
+        raise ValueError(
+            f"{name}: {shown(value)} is given beside moves, which have settings of their own"
+        )
+    chain = tuple(moves)
+    if not chain:
+        raise ValueError(f"moves: {shown(moves)} holds none, and a tracker needs some")
+    for move in chain:
+        check_type(AbstractMove, "a sequence of moves", moves=move)
+        if isinstance(move, AbstractRejuvenation):
+            _check_rejuvenation(move, particles_per_object, "moves")
+    check_chain(chain)
+    return chain
+
+
+def _learned_colours(
+    moves: Iterable[AbstractMove], colours: AbstractColours | None
+) -> AbstractColours | None:
+    """The bins of the chain's `LearnColours`, which those that are given have to be."""
+    for move in moves:
+        if isinstance(move, LearnColours):
+            if colours is not None and not eqx.tree_equal(colours, move.colours):
+                raise ValueError(
+                    f"colours: {shown(colours)} are not those of LearnColours, {move.colours}"
+                )
+            return move.colours
+    return colours
 
 
 def _check_rejuvenation(

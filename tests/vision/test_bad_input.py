@@ -195,7 +195,7 @@ TABLE = {
         vision.ObjectTracker,
         {},
         {"max_objects": "count", "particles_per_object": "count", "rejuvenation": "kind?",
-         "colours": "kind?", "sigma": "positive?", "frames_per_second": "positive",
+         "colours": "kind?", "sigma": "positive?", "frames_per_second": "positive?",
          "exact_colours": "flag", "moves": "kind?"},
     ),
 }  # fmt: skip

@@ -1,5 +1,6 @@
 """The object tracker on tiny drawn frames: who is born, who lives on, who dies, and no leaks."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -505,3 +506,61 @@ def test_a_bad_setting_is_named(as_installed, name, value):
 def test_a_rejuvenation_that_would_leave_no_room_is_named(rejuvenation, said):
     with pytest.raises(ValueError, match=f"^rejuvenation: .*{said}"):
         ObjectTracker(rejuvenation=rejuvenation)
+
+
+def chain_without(*kinds):
+    return [move for move in TRACKER.moves if not isinstance(move, kinds)]
+
+
+@pytest.mark.parametrize("sees", [True, False])
+def test_a_chain_that_learns_no_colours_runs_with_pixels_and_without(sees):
+    tracker = ObjectTracker(M, P, moves=chain_without(LearnColours))
+    pixels = np.zeros((40, 60, 3), np.uint8) if sees else None
+    found = Detections.from_boxes(np.array([[5.0, 5, 10, 20]]), 8)
+    state, _ = eqx.filter_eval_shape(tracker.step, KEYS[0], tracker.init(), pixels, found)
+    assert "references" not in state.memory
+
+
+def test_the_bins_are_those_that_the_chain_learns(as_installed):
+    assert ObjectTracker(M, P, moves=TRACKER.moves).colours == COLOURS
+    with pytest.raises(ValueError, match=r"^colours: .* are not those of LearnColours"):
+        ObjectTracker(M, P, moves=TRACKER.moves, colours=HSVColours(4, 2, 3))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("sigma", 0.3),
+        ("strong_score", 0.5),
+        ("weak_score", 0.1),
+        ("frames_per_second", 25.0),
+        ("rejuvenation", mpfjax.Resample(particles_per_component=P)),
+    ],
+)
+def test_a_setting_that_a_chain_of_moves_has_itself_is_refused_beside_it(name, value):
+    with pytest.raises(ValueError, match=rf"^{name}: [\s\S]* is given beside moves"):
+        ObjectTracker(M, P, moves=TRACKER.moves, **{name: value})
+
+
+def weighing_by_colours():
+    model = object_model(sigma=0.3)
+    return [
+        PropagateObjects(model) if isinstance(move, PropagateObjects) else move
+        for move in chain_without(LearnColours)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("moves", "said"),
+    [
+        ([*TRACKER.moves, LearnColours(COLOURS)], "LearnColours and LearnColours would share"),
+        ([RankScores(), *TRACKER.moves], "RankScores and RankScores would share one memory"),
+        (chain_without(Bury), "a tracker needs Bury"),
+        (chain_without(Assign), "ShareDetections needs Assign"),
+        (chain_without(RankScores), "Assign needs RankScores"),
+        (weighing_by_colours(), "PropagateObjects weighs by colours .* needs LearnColours"),
+    ],
+)
+def test_a_chain_that_cannot_run_is_refused(moves, said):
+    with pytest.raises(ValueError, match=f"^moves: {said}"):
+        ObjectTracker(M, P, moves=moves)

@@ -158,9 +158,9 @@ class Assign(AbstractMove):
     def _unlikeness(
         self, mixture: ParticleMixture, observation: TrackedFrame
     ) -> Float[Array, "m d"]:
-        if observation.pixels is None or self.colour_cost == 0:
+        references = mixture.memory.get(REFERENCES)
+        if observation.pixels is None or references is None or self.colour_cost == 0:
             return jnp.zeros((mixture.num_components, len(observation.detections.boxes)))
-        references = mixture.memory[REFERENCES]
         seen = observation.detected_colours(references.shape[1])
         distances = bhattacharyya(seen[None], references[:, None])
         known = jnp.any(references > 0, axis=(1, 2, 3))[:, None]

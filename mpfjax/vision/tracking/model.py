@@ -49,7 +49,7 @@ class AssignedFrame(NamedTuple):
       its detection being another's.
     - `pixels`: the colours of the frame; None where nobody looks at them.
     - `references`: (m, parts, channels, bins), the histograms that each object is known by, all
-      zero where it has none.
+      zero where it has none; None where nobody learns any.
     """
 
     detections: Detections
@@ -58,7 +58,7 @@ class AssignedFrame(NamedTuple):
     borrowed: Bool[Array, " m"]
     doubts: Float[Array, " m"]
     pixels: Pixels | None
-    references: Float[Array, "m parts channels bins"]
+    references: Float[Array, "m parts channels bins"] | None
 
 
 class DetectedObjectModel(AbstractStateSpaceModel):
@@ -203,9 +203,10 @@ class DetectedObjectModel(AbstractStateSpaceModel):
         log_detected = jnp.log(floor + jnp.exp(-0.5 * jnp.sum(gaps**2, axis=1)))
         detected = take(observation.detections.valid, states.label)
         log_detected = jnp.where(detected, log_detected, 0.0)
-        if observation.pixels is None or self.sigma is None:
+        references = observation.references
+        if observation.pixels is None or references is None or self.sigma is None:
             return log_detected
-        references = take(observation.references, states.label)
+        references = take(references, states.label)
         unlike = unlikeness(observation.pixels, states.boxes, references)
         return log_detected - 0.5 * unlike / self.sigma**2
 

@@ -38,7 +38,7 @@ class PropagateObjects(AbstractPropagation):
             borrowed=borrowed,
             doubts=jnp.where(borrowed, 0.0, mixture.memory[DOUBTS]),
             pixels=observation.pixels,
-            references=mixture.memory[REFERENCES],
+            references=mixture.memory.get(REFERENCES),
         )
         propagate = Propagate(self.model, DetectionProposal(self.model))
         return propagate(key, mixture, seen)
