@@ -1,11 +1,13 @@
-"""Frames in and out: folders of images, video files, animated GIFs, all through imageio."""
+"""Frames in and out: folders of images and GIFs through imageio, video files through PyAV too."""
 
 import contextlib
+import functools
 import math
 import re
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+import warnings
+from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -25,11 +27,13 @@ def read_frames(
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Read frames `first` to `last` in RGB, counted from 1 and both ends in, one at a time.
 
-    `path` is a video file, a folder of images in the order of their names, or a folder with
-    such a folder `img` or `img1`. Raises `ImportError` if imageio is missing, and
-    `FileNotFoundError` if `path` is. Raises `ValueError` naming `path` if it cannot be read, has
-    no frames, or has frames of different sizes. Raises `ValueError` for `first` and `last` that are
-    no range.
+    `path` is a video file, a folder of images in the natural order of their names (2.png before
+    10.png), or a folder with such a folder `img` or `img1`. The frames of a video are those that
+    it holds, one after the other, whatever time lies between them, turned as the file says; a
+    `RuntimeWarning` says where some are too damaged to be decoded. Raises `ImportError` if imageio
+    or PyAV is missing, `FileNotFoundError` if `path` is, and `ValueError` naming `path` if it
+    cannot be read, has no frames, or has frames of different sizes, and for `first` and `last` that
+    are no range.
     """
     check_type((str, Path), "a path", path=path)
     check_whole(first=first, **given(last=last))
@@ -67,16 +71,19 @@ def num_images(path: str | Path) -> int:
 def frame_rate(path: str | Path) -> float | None:
     """Frames per second of a video file, or of a folder whose `seqinfo.ini` names a `frameRate`.
 
-    None where nothing says it. Raises `ValueError` for a file that is no video.
+    The mean over a video whose rate varies. None where nothing says it. Raises `ValueError` for a
+    file that is no video.
     """
     check_type((str, Path), "a path", path=path)
     path = Path(path)
     if path.is_dir():
         return _rate_of_folder(path)
-    try:
-        rate = _imageio().immeta(path, plugin=_plugin(path)).get("fps")
-    except (OSError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{path}: cannot be read as a video ({error})") from error
+    if path.suffix.lower() == ".gif":
+        with _naming(path, "a video"):
+            rate = _imageio().immeta(path, plugin="pillow").get("fps")
+    else:
+        with _opened(path) as (_, stream):
+            rate = stream.average_rate or stream.guessed_rate
     return float(rate) if rate and 0 < rate < math.inf else None
 
 
@@ -185,10 +192,6 @@ def _even(frame: np.ndarray) -> np.ndarray:
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
-def _plugin(path: Path) -> str:
-    return "pillow" if path.suffix.lower() == ".gif" else "FFMPEG"
-
-
 def _rate_of_folder(folder: Path) -> float | None:
     for place in (folder, folder.parent):
         if (place / "seqinfo.ini").is_file():
@@ -200,7 +203,15 @@ def _rate_of_folder(folder: Path) -> float | None:
 
 def _image_paths(folder: Path) -> list[Path]:
     folder = next((folder / name for name in _INNER if (folder / name).is_dir()), folder)
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in _IMAGES)
+    # Other systems leave hidden companions of the images behind.
+    shown = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    return sorted((path for path in shown if path.suffix.lower() in _IMAGES), key=_natural)
+
+
+def _natural(path: Path) -> tuple[list[Any], str]:
+    """By its numbers as numbers and the text between them; by the name where these are the same."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
 
 def _read_images(folder: Path, first: int, last: int | None) -> Iterator[np.ndarray]:
@@ -208,24 +219,97 @@ def _read_images(folder: Path, first: int, last: int | None) -> Iterator[np.ndar
     if first > len(paths):
         raise ValueError(f"{folder}: holds {len(paths)} images, frame {first} is not among them")
     for path in paths[first - 1 : last]:
-        try:
-            yield _rgb(imageio.imread(path))
-        except (OSError, ValueError) as error:
-            raise ValueError(f"{path}: cannot be read as an image ({error})") from error
+        with _naming(path, "an image"):
+            image = _rgb(imageio.imread(path))
+        yield image
 
 
 def _read_video(path: Path, first: int, last: int | None) -> Iterator[np.ndarray]:
-    imageio, number = _imageio(), 0
-    try:
-        for number, frame in enumerate(imageio.imiter(path, plugin=_plugin(path)), 1):
-            if last is not None and number > last:
-                return
-            if number >= first:
-                yield _rgb(frame)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{path}: cannot be read as a video ({error})") from error
+    number = 0
+    decoded = _decode_gif(path) if path.suffix.lower() == ".gif" else _decode_video(path)
+    for number, image in enumerate(decoded, 1):
+        if number >= first:
+            with _naming(path, "a video"):
+                frame = image()
+            yield frame
+        if number == last:
+            decoded.close()
+            return
     if number < first:
         raise ValueError(f"{path}: holds {number} frames, frame {first} is not among them")
+
+
+def _decode_gif(path: Path) -> Generator[Callable[[], np.ndarray]]:
+    """What makes an image of each frame of a GIF."""
+    images = iter(_imageio().imiter(path, plugin="pillow"))
+    while True:
+        with _naming(path, "a video"):
+            image = next(images, None)
+        if image is None:
+            return
+        yield functools.partial(_rgb, image)
+
+
+def _decode_video(path: Path) -> Generator[Callable[[], np.ndarray]]:
+    """What makes an image of each frame of a video: most frames before the first need none."""
+    with _opened(path) as (container, stream):
+        stream.thread_type = "AUTO"
+        packets, any_frame, damaged = container.demux(stream), False, None
+        while True:
+            with _naming(path, "a video"):
+                packet = next(packets, None)
+            if packet is None:
+                break
+            try:
+                frames = packet.decode()
+            except (OSError, ValueError) as error:  # what the library says of a damaged packet
+                damaged = damaged or error
+                continue
+            for frame in frames:
+                any_frame = True
+                yield functools.partial(_upright, frame)
+        if damaged and not any_frame:
+            raise ValueError(f"{path}: cannot be read as a video ({damaged})")
+    if damaged:
+        warnings.warn(
+            f"{path}: some frames are damaged, and were left out", RuntimeWarning, stacklevel=2
+        )
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """A video file and its first stream of frames."""
+    library = _av()
+    with _naming(path, "a video"):
+        container = library.open(str(path))
+    with container:
+        if not container.streams.video:
+            raise ValueError(f"{path}: cannot be read as a video (it holds no frames)")
+        yield container, container.streams.video[0]
+
+
+def _upright(frame: Any) -> np.ndarray:
+    """The pixels of a decoded frame, turned and mirrored by quarters as its file says."""
+    image = frame.to_ndarray(format="rgb24")
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return image
+    # (x, y) moves to (a x + c y, b x + d y), up to a shift.
+    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()
+    if abs(b) > abs(a):
+        image, a, d = image.transpose(1, 0, 2), c, b
+    return np.ascontiguousarray(image[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
+
+
+@contextlib.contextmanager
+def _naming(path: Path, what: str) -> Iterator[None]:
+    """Say of whatever a library raises that this file cannot be read, in one line."""
+    try:
+        yield
+    # Of a damaged file decoders raise nearly anything, SyntaxError and struct.error among it.
+    except Exception as error:
+        said = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
+        raise ValueError(f"{path}: cannot be read as {what} ({said.splitlines()[0]})") from error
 
 
 def _of_one_size(path: Path, frames: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
@@ -262,3 +346,11 @@ def _imageio() -> ModuleType:
             'imageio is needed to read and write video: pip install "mpfjax[video]"'
         ) from error
     return imageio
+
+
+def _av() -> ModuleType:
+    try:
+        import av
+    except ImportError as error:
+        raise ImportError('av is needed to read video: pip install "mpfjax[video]"') from error
+    return av

@@ -1,13 +1,15 @@
 """Folders of images, videos and GIFs in and out."""
 
 import signal
+import struct
 import sys
+from fractions import Fraction
 
 import numpy as np
 import pytest
 from PIL import Image as pillow
 
-from mpfjax.vision.frames import num_images, read_frames, write_image, write_video
+from mpfjax.vision.frames import frame_rate, num_images, read_frames, write_image, write_video
 
 
 def shades(num, height=32, width=48):
@@ -29,6 +31,65 @@ def test_a_folder_is_read_in_order_and_both_ends_are_in(folder):
     np.testing.assert_array_equal(np.stack(list(read_frames(folder, 2, 4))), shades(5)[1:4])
     np.testing.assert_array_equal(np.stack(list(read_frames(folder / "img"))), shades(5))
     assert num_images(folder) == 5
+
+
+def test_images_come_in_natural_order_without_hidden_companions(tmp_path):
+    names = ["1.png", "02.png", "2.png", "10.png", "11.png", "a1.png", "a1b9.png", "a1b10.png"]
+    for name, still in zip(names, shades(len(names)), strict=True):
+        write_image(tmp_path / name, still)
+    (tmp_path / "._1.png").write_bytes(b"what another system says of 1.png")
+    np.testing.assert_array_equal(np.stack(list(read_frames(tmp_path))), shades(len(names)))
+    assert num_images(tmp_path) == len(names)
+
+
+def at_times(path, times, stills):
+    """A video whose frames are at these multiples of 1/600 s."""
+    av = pytest.importorskip("av", reason="the extra 'video' is missing")
+    with av.open(str(path), "w") as video:
+        stream = video.add_stream("libx264", rate=30)
+        stream.height, stream.width = stills.shape[1:3]
+        stream.codec_context.time_base = Fraction(1, 600)
+        for time, still in zip(times, stills, strict=True):
+            frame = av.VideoFrame.from_ndarray(still, format="rgb24")
+            frame.pts, frame.time_base = time, Fraction(1, 600)
+            video.mux(stream.encode(frame))
+        video.mux(stream.encode())
+
+
+def test_a_video_of_variable_frame_rate_has_the_frames_that_it_holds(tmp_path):
+    """30 and 10 a second by turns: resampled to the higher rate they would be twice as many."""
+    path, stills = tmp_path / "varies.mp4", shades(12)
+    at_times(path, np.cumsum([0] + [60, 20] * 5 + [60]).tolist(), stills)
+    back = np.stack(list(read_frames(path))).astype(int)
+    assert back.shape == stills.shape
+    assert np.abs(back - stills).max() <= 8
+    np.testing.assert_array_equal(back[4:7], np.stack(list(read_frames(path, 5, 7))))
+    assert frame_rate(path) == pytest.approx(15, rel=0.1)
+
+
+# a, b, c, d of a file that moves (x, y) to (a x + c y, b x + d y), and what becomes of a frame.
+TURNS = {
+    (0, 1, -1, 0): lambda still: np.rot90(still, -1),
+    (-1, 0, 0, -1): lambda still: np.rot90(still, 2),
+    (0, -1, 1, 0): np.rot90,
+    (-1, 0, 0, 1): lambda still: still[:, ::-1],
+    (0, 1, 1, 0): lambda still: still.transpose(1, 0, 2),
+}
+
+
+@pytest.mark.parametrize(("turn", "turned"), TURNS.items(), ids=str)
+def test_a_video_is_turned_and_mirrored_as_its_file_says(tmp_path, turn, turned):
+    still = shades(1)[0].copy()
+    still[:8, :24] = (220, 30, 30)
+    path = tmp_path / "turned.mp4"
+    at_times(path, [0, 20], np.stack([still, still]))
+    (upright, _) = read_frames(path)
+    content = path.read_bytes()
+    place = content.index(b"tkhd") + 44
+    a, b, c, d = (65536 * number for number in turn)
+    matrix = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(content[:place] + matrix + content[place + len(matrix) :])
+    np.testing.assert_array_equal(next(read_frames(path)), turned(upright))
 
 
 @pytest.mark.parametrize("ending", ["mp4", "gif"])
@@ -58,8 +119,44 @@ def test_an_unreadable_file_is_named(tmp_path, name):
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(b"not a picture")
-    with pytest.raises(ValueError, match=rf"{path.name}: cannot be read"):
+    with pytest.raises(ValueError, match=rf"{path.name}: cannot be read") as raised:
         list(read_frames(tmp_path if name.startswith("img") else path))
+    assert "\n" not in str(raised.value)
+
+
+def test_an_image_whose_content_is_damaged_is_named(folder):
+    """Of which the decoder raises a SyntaxError."""
+    path = folder / "img" / "000003.png"
+    content = bytearray(path.read_bytes())
+    content[29] ^= 255
+    path.write_bytes(content)
+    frames = read_frames(folder)
+    assert len([next(frames), next(frames)]) == 2
+    with pytest.raises(ValueError, match=r"000003\.png: cannot be read as an image \(.*\)$"):
+        next(frames)
+
+
+def test_a_damaged_stretch_of_a_video_is_said(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (40, 32, 48, 3), dtype=np.uint8)
+    at_times(tmp_path / "damaged.mp4", list(range(0, 800, 20)), noise)
+    content = bytearray((tmp_path / "damaged.mp4").read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 3000] = bytes(3000)
+    (tmp_path / "damaged.mp4").write_bytes(content)
+    with pytest.warns(RuntimeWarning, match=r"damaged\.mp4: some frames are damaged"):
+        assert 0 < len(list(read_frames(tmp_path / "damaged.mp4"))) < 40
+
+
+def test_a_sound_is_no_video(tmp_path):
+    av = pytest.importorskip("av", reason="the extra 'video' is missing")
+    with av.open(str(tmp_path / "sound.mp4"), "w") as file:
+        stream = file.add_stream("aac", rate=44100)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
+        frame.sample_rate = 44100
+        file.mux(stream.encode(frame) + stream.encode(None))
+    for read in (frame_rate, lambda path: next(read_frames(path))):
+        with pytest.raises(ValueError, match=r"sound\.mp4: cannot be read as a video"):
+            read(tmp_path / "sound.mp4")
 
 
 def test_a_range_past_the_end_and_an_empty_one_are_named(folder):
@@ -114,6 +211,13 @@ def test_a_missing_imageio_says_how_to_install_it(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio.v3", None)
     with pytest.raises(ImportError, match=r'pip install "mpfjax\[video\]"'):
         next(read_frames(folder))
+
+
+def test_a_missing_pyav_says_how_to_install_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    (tmp_path / "video.mp4").write_bytes(b"a video")
+    with pytest.raises(ImportError, match=r'pip install "mpfjax\[video\]"'):
+        next(read_frames(tmp_path / "video.mp4"))
 
 
 def test_an_interrupt_while_a_frame_is_written_leaves_a_whole_video(tmp_path, monkeypatch):
