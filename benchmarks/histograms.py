@@ -33,7 +33,7 @@ MEAN_SIDE, SPREAD_OF_SIDES = 40.0, 5.0
 def main(arguments: list[str] | None = None) -> int:
     """Time both, print a table, and write the results."""
     options = parse(arguments)
-    return exit_status(lambda: run(options))
+    return exit_status(lambda: run(options), arguments)
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:

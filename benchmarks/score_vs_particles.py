@@ -45,7 +45,7 @@ OF_PARTICLES = ("positions", "occupied", "component_indicators")
 def main(arguments: list[str] | None = None) -> int:
     """Run the study, print its table, and write its results and figures."""
     options = parse(arguments)
-    return exit_status(lambda: run(options))
+    return exit_status(lambda: run(options), arguments)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -146,7 +146,7 @@ def serve(way: Way, pipe: Connection) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Time every way, print a table, and write the results."""
     options = parse(arguments)
-    return exit_status(lambda: run(options))
+    return exit_status(lambda: run(options), arguments)
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:

@@ -7,10 +7,11 @@ import argparse
 import contextlib
 import json
 import math
+import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,21 @@ def write_json(path: Path, content: Any) -> None:
     write_whole(path, lambda file: file.write(text.encode()))
 
 
+def refuse_overwriting(folder: Path, outputs: Iterable[str], inputs: dict[str, Any]) -> None:
+    """Raise `ValueError` where an output in `folder` is a file that is read, by any of its names.
+
+    `inputs`: the files that are read, by the argument that names each; None for one not given.
+    """
+    for output in outputs:
+        for argument, path in inputs.items():
+            if path is None or not (folder / output).exists() or not Path(path).exists():
+                continue
+            if (folder / output).samefile(path):
+                raise ValueError(
+                    f"--out: {folder / output} is the file of {argument}, and would be overwritten"
+                )
+
+
 def format_table(header: list[str], rows: list[list[str]]) -> str:
     """A table in plain text, columns aligned to the right but for the first."""
     widths = [max(len(line[i]) for line in [header, *rows]) for i in range(len(header))]
@@ -100,10 +116,13 @@ def format_table(header: list[str], rows: list[list[str]]) -> str:
     return "\n".join([format_line(header), rule, *map(format_line, rows)])
 
 
-def exit_status(run: Callable[[], None]) -> int:
+def exit_status(run: Callable[[], None], arguments: Sequence[str] | None = ()) -> int:
     """Run a command: bad input is one line on the error stream and 2, an interruption 130.
 
-    What it compiles is kept for the next run, where there is a folder for it.
+    What it compiles is kept for the next run, where there is a folder for it. Where `arguments` is
+    None, the process is the command's own, and an interruption ends it here: one that comes while
+    JAX traces or compiles leaves its caches such that clearing them, at a process's usual end, is
+    a segmentation fault.
     """
     with contextlib.suppress(OSError, RuntimeError):  # the latter where there is no home
         keep_programs()
@@ -114,6 +133,10 @@ def exit_status(run: Callable[[], None]) -> int:
         return 2
     except KeyboardInterrupt:
         print("interrupted; what was finished is written", file=sys.stderr)
+        if arguments is None:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(130)
         return 130
     return 0
 

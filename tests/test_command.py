@@ -1,12 +1,16 @@
 """The command: what it writes, and what it says of bad input."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
+import mpfjax
 from mpfjax import command
 from mpfjax.command import loop as command_loop
+from mpfjax.command.scoring import find_truth, scores_of
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import frames as frame_files
 from mpfjax.vision.boxes import read_tracks, write_tracks
@@ -137,6 +141,35 @@ def test_an_interrupt_leaves_what_was_done(sequence, tmp_path, monkeypatch, caps
     assert len(list(read_frames(tmp_path / "tracking.mp4"))) == 4
 
 
+def test_an_interrupt_before_the_first_frame_leaves_an_older_runs_files(
+    sequence, tmp_path, monkeypatch
+):
+    older = {name: f"older {name}" for name in ("tracks.txt", "summary.json", "tracking.mp4")}
+    for name, text in older.items():
+        (tmp_path / name).write_text(text)
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr(command_loop, "track", interrupted)
+    assert run(sequence, "--detections", sequence / "det.txt", "--out", tmp_path, *SMALL) == 130
+    assert {name: (tmp_path / name).read_text() for name in older} == older
+
+
+def test_an_interrupt_ends_the_commands_own_process_at_once():
+    """Past JAX's cleaning up, which a trace that was broken off can bring down."""
+    code = (
+        "import atexit; from mpfjax.console import exit_status\n"
+        "def interrupted(): raise KeyboardInterrupt\n"
+        "atexit.register(print, 'cleaned up')\n"
+        "print(exit_status(interrupted, [])); print(exit_status(interrupted, None))"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (130, "130\n")
+    assert ended.stderr.count("interrupted") == 2
+
+
 @pytest.mark.parametrize("spoil", ["cut short", "another size"])
 def test_frames_that_cannot_be_read_on_leave_what_was_done(sequence, tmp_path, capsys, spoil):
     (tmp_path / "img").mkdir()
@@ -174,6 +207,57 @@ def test_warnings_are_a_line_each(sequence, tmp_path, capsys):
     assert "1 lie in frames after the last, 7" in lines[1]
 
 
+def test_only_a_folder_of_images_has_a_truth_of_its_own(sequence, tmp_path):
+    video, images = tmp_path / "video.mp4", tmp_path / "street"
+    images.mkdir()
+    video.write_bytes(b"")
+    write_tracks(tmp_path / "gt.txt", two_walkers(3))
+    assert find_truth(video, None, 1, None) is None
+    assert find_truth(images, None, 1, None) is None
+    assert len(find_truth(video, tmp_path / "gt.txt", 2, None).objects) == 4
+    for folder in (sequence, sequence / "img"):
+        assert len(find_truth(folder, None, 1, 3).objects) == 6
+    with pytest.raises(ValueError, match=r"--truth: .*gone\.txt is neither"):
+        find_truth(video, tmp_path / "gone.txt", 1, None)
+    with pytest.raises(ValueError, match=r"--truth: .*gt\.txt has no box in these frames"):
+        find_truth(video, tmp_path / "gt.txt", 4, 9)
+
+
+@pytest.mark.parametrize("text", ["", "1,1,2,3\n", "\x00\x01"])
+def test_a_truth_that_cannot_be_read_is_a_warning(tmp_path, text):
+    (tmp_path / "gt.txt").write_text(text)
+    with pytest.warns(RuntimeWarning, match=r"no HOTA, MOTA and IDF1: .*gt\.txt"):
+        assert find_truth(tmp_path, None, 1, None) is None
+
+
+def test_a_truth_that_cannot_be_scored_with_ends_no_run(tmp_path, capsys):
+    """An object with two boxes in one frame."""
+    rows = two_walkers(2)
+    write_tracks(tmp_path / "gt.txt", np.vstack([rows, rows[:1]]))
+    truth = find_truth(tmp_path, None, 1, None)
+    assert scores_of(rows, truth, 1, 2, None) == {}
+    assert "no HOTA, MOTA and IDF1: truth: id 1 has more than one box" in capsys.readouterr().err
+
+
+def test_drawn_boxes_are_scored_against_those_whom_they_were_drawn_around(tmp_path, capsys):
+    rows = two_walkers(3)
+    write_tracks(tmp_path / "gt.txt", rows)
+    truth = find_truth(tmp_path, None, 1, None)
+    second = rows[rows[:, 1] == 2]
+    tracked = second.copy()
+    tracked[:, 1] = 1  # the one track is that of the first box
+    perfect = dict.fromkeys(SCORES, 1.0)
+    assert scores_of(tracked, truth, 1, 3, second[:1, 2:]) == perfect
+    assert not capsys.readouterr().err
+    # A second box, around nobody, and its track do not count.
+    drawn = np.vstack([[40.0, 0, 5, 5], second[0, 2:]])
+    tracked = np.vstack([tracked, tracked])
+    tracked[:3, 1], tracked[3:, 2] = 2, 0.0
+    assert scores_of(tracked, truth, 1, 3, drawn) == perfect
+    assert "scored: 1 of 2 boxes" in capsys.readouterr().err
+    assert scores_of(tracked, truth, 1, 3, drawn[:1]) == {}
+
+
 def nothing_tracked(*_, **__):
     pytest.fail("it went on to track")
 
@@ -209,6 +293,50 @@ def test_bad_arguments_are_named_before_anything_is_written(
     assert run(sequence, "--out", tmp_path / "out", *arguments) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "named"),
+    [
+        ("out/tracking.mp4", ["--detect"], "tracking.mp4 is the file of SOURCE"),
+        ("other.mp4", ["--detect"], "tracking.mp4 is the file of SOURCE"),
+        ("img", ["--detections", "out/tracks.txt"], "tracks.txt is the file of --detections"),
+        ("img", ["--detect", "--truth", "out/tracks.txt"], "tracks.txt is the file of --truth"),
+    ],
+)
+def test_what_is_read_is_not_written_over(tmp_path, capsys, monkeypatch, source, options, named):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("out", "img"):
+        (tmp_path / folder).mkdir()
+    write_image(tmp_path / "img" / "1.png", np.zeros((8, 8, 3), np.uint8))
+    (tmp_path / "out" / "tracking.mp4").write_bytes(b"a video")
+    (tmp_path / "out" / "tracks.txt").write_text("1,1,2,2,5,5,1\n")
+    (tmp_path / "other.mp4").symlink_to("out/tracking.mp4")
+    assert run(source, "--out", "out", *options) == 2
+    assert named in capsys.readouterr().err
+    assert (tmp_path / "out" / "tracks.txt").read_text() == "1,1,2,2,5,5,1\n"
+
+
+def test_the_version_is_said(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        command.main(["--version"])
+    assert stopped.value.code == 0
+    assert capsys.readouterr().out == f"mpfjax {mpfjax.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"\x89PNG\r\n\x1a\n\x00\x00", b"\x00" * 50, bytes(range(256)) * 4],
+    ids=["a picture", "zeros", "all bytes"],
+)
+def test_detections_that_are_no_text_are_named_in_one_line(sequence, tmp_path, capsys, content):
+    (tmp_path / "det.txt").write_bytes(content)
+    out = tmp_path / "out"
+    assert run(sequence, "--detections", tmp_path / "det.txt", "--out", out) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "det.txt, line " in line
+    assert len(line) < 500
+    assert line.isprintable()
 
 
 @pytest.mark.parametrize(

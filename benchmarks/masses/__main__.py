@@ -148,7 +148,7 @@ def _numbers(values: np.ndarray) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the benchmark; bad input is one line on the error stream and exit status 2."""
-    return exit_status(lambda: run(parse_arguments(arguments)))
+    return exit_status(lambda: run(parse_arguments(arguments)), arguments)
 
 
 if __name__ == "__main__":

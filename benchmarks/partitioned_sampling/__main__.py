@@ -113,7 +113,7 @@ def _key_range(text: str) -> range:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the benchmark; bad input is one line on the error stream and exit status 2."""
-    return exit_status(lambda: run(parse_arguments(arguments)))
+    return exit_status(lambda: run(parse_arguments(arguments)), arguments)
 
 
 if __name__ == "__main__":

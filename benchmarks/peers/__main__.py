@@ -46,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the comparison; 1 where a library was refused."""
     options = parse(arguments)
     refused: list[str] = []
-    return exit_status(lambda: run(options, refused)) or int(bool(refused))
+    return exit_status(lambda: run(options, refused), arguments) or int(bool(refused))
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:

@@ -44,7 +44,7 @@ from mpfjax.console import exit_status, whole, write_json
 def main(arguments: list[str] | None = None) -> int:
     """Run the study, print its tables, and write its results and figure."""
     options = parse(arguments)
-    return exit_status(lambda: run(options))
+    return exit_status(lambda: run(options), arguments)
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:

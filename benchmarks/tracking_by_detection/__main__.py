@@ -278,7 +278,7 @@ def _rate(count: int, seconds: float) -> float:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the benchmark; bad input is one line on the error stream and exit status 2."""
-    return exit_status(lambda: run(parse_arguments(arguments)))
+    return exit_status(lambda: run(parse_arguments(arguments)), arguments)
 
 
 if __name__ == "__main__":

@@ -192,7 +192,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the benchmark; bad input is one line on the error stream and exit status 2."""
     # Writing a video starts an encoder, whose fork and exec JAX's threads do not touch.
     warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
-    return exit_status(lambda: run(parse_arguments(arguments)))
+    return exit_status(lambda: run(parse_arguments(arguments)), arguments)
 
 
 if __name__ == "__main__":

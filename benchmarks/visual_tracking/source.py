@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from mpfjax.console import refuse_overwriting
 from mpfjax.metrics.coverage import covers
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import football_scene, frames, read_truth
@@ -37,6 +38,7 @@ def open_source(options: argparse.Namespace) -> Source:
         raise ValueError(f"--sequence: {path} is not a folder")
     if options.video is not None and not path.is_file():
         raise ValueError(f"--video: {path} is not a file")
+    refuse_overwriting(options.out, ["tracking.mp4", "tracking.gif"], {name: path})
     still = next(frames.read_frames(path, first, first), None)
     if still is None:
         raise ValueError(f"{name}: {path} has no frame {first}")

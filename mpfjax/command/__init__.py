@@ -14,4 +14,4 @@ def main(arguments: list[str] | None = None) -> int:
         say_warnings(RuntimeWarning)
         # Writing a video starts an encoder, whose fork and exec JAX's threads do not touch.
         warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
-        return exit_status(lambda: run(options))
+        return exit_status(lambda: run(options), arguments)

@@ -1,15 +1,17 @@
 """What the command is asked to do, and where the frames come from."""
 
 import argparse
+import importlib
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from mpfjax.console import finite, positive, seed, whole
+from mpfjax.command.scoring import find_truth
+from mpfjax.console import finite, positive, refuse_overwriting, seed, whole
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import frames
-from mpfjax.vision.truth import Truth, read_truth
+from mpfjax.vision.truth import Truth
 
 DESCRIPTION = """\
 Track objects in a video or a folder of images. What to track comes from one of three: detections
@@ -21,6 +23,8 @@ examples:
   mpfjax track street/ --detect --out tracks
   mpfjax track street/ --box 120,80,30,70 --box 200,90,28,66 --out tracks
 """
+
+TRACKS, VIDEO, SUMMARY = OUTPUTS = ("tracks.txt", "tracking.mp4", "summary.json")
 
 
 class Source(NamedTuple):
@@ -37,6 +41,8 @@ class Source(NamedTuple):
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """The arguments, each checked as far as it can be without the frames."""
     parser = argparse.ArgumentParser(prog="mpfjax", description="Particle filters that track.")
+    package = importlib.import_module(__name__.partition(".")[0])
+    parser.add_argument("--version", action="version", version=f"mpfjax {package.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     track = commands.add_parser(
         "track",
@@ -70,6 +76,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     track.add_argument(
         "--no-colour", action="store_true", help="track the detections alone, without pixels"
     )
+    track.add_argument(
+        "--truth", type=Path, metavar="FILE", help="gt.txt to score with, where none is beside img/"
+    )
     track.add_argument("--no-video", action="store_true", help="do not draw tracking.mp4")
     track.add_argument(
         "--offline",
@@ -92,6 +101,12 @@ def open_source(options: argparse.Namespace) -> Source:
     path = options.source
     if not path.exists():
         raise ValueError(f"SOURCE: {path} is neither a video nor a folder of images")
+    written = [name for name in OUTPUTS if not (options.no_video and name == VIDEO)]
+    refuse_overwriting(
+        options.out,
+        written,
+        {"SOURCE": path, "--detections": options.detections, "--truth": options.truth},
+    )
     num_frames = None
     if path.is_dir():
         held = frames.num_images(path)
@@ -101,7 +116,8 @@ def open_source(options: argparse.Namespace) -> Source:
     elif last is not None:
         num_frames = last - first + 1
     rate = options.fps or frames.frame_rate(path)
-    return Source(path, first, last, num_frames, rate, _truth(path, first, last))
+    truth = find_truth(path, options.truth, first, last)
+    return Source(path, first, last, num_frames, rate, truth)
 
 
 def read_detections(options: argparse.Namespace, source: Source) -> np.ndarray:
@@ -120,13 +136,3 @@ def read_boxes(options: argparse.Namespace, still: np.ndarray) -> np.ndarray:
     height, width, _ = still.shape
     box_files.check_boxes(boxes, height, width, "--box")
     return boxes
-
-
-def _truth(path: Path, first: int, last: int | None) -> Truth | None:
-    """What the gt.txt beside the frames says of those in the range, or None."""
-    places = [path, path / "gt"] if path.is_dir() else []
-    for place in (*places, path.parent):
-        if (place / "gt.txt").is_file():
-            truth = read_truth(place / "gt.txt").between(first, last or np.inf)
-            return truth if len(truth.objects) else None
-    return None

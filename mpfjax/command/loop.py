@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -10,9 +9,17 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from mpfjax.command.arguments import Source, open_source, read_boxes, read_detections
+from mpfjax.command.arguments import (
+    SUMMARY,
+    TRACKS,
+    VIDEO,
+    Source,
+    open_source,
+    read_boxes,
+    read_detections,
+)
+from mpfjax.command.scoring import SCORES, scores_of
 from mpfjax.console import Clock, format_table, peak_memory, write_json
-from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import drawing, frames
 from mpfjax.vision.detection import BackgroundSubtraction
@@ -20,8 +27,6 @@ from mpfjax.vision.detectors import LEAST_ROOM, Rows
 from mpfjax.vision.drawn import follow_boxes
 from mpfjax.vision.loop import make_tracker, offline_rows, online_rows, track
 from mpfjax.vision.tracker import Tracks
-
-_SCORES = ("HOTA", "MOTA", "IDF1")
 
 
 class Results:
@@ -34,6 +39,7 @@ class Results:
         self.rows: list[np.ndarray] = []
         self.kept: list[Tracks] = []  # for --offline alone
         self.num_frames = 0
+        self.drawn: np.ndarray | None = None  # the boxes of --box
 
     def add(self, tracks: Tracks) -> np.ndarray:
         """Keep a frame's tracks, and return its rows."""
@@ -67,7 +73,8 @@ class Results:
             "frames_per_second": round(rate, 2),
             "peak_memory_mb": round(peak_memory(), 1),
         }
-        return summary | _scores(rows, self.source, n)
+        first = self.source.first
+        return summary | scores_of(rows, self.source.truth, first, first + n - 1, self.drawn)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -77,16 +84,16 @@ def run(options: argparse.Namespace) -> None:
     still = next(frames.read_frames(source.path, source.first, source.first), None)
     if still is None:
         raise ValueError(f"SOURCE: {source.path} has no frame {source.first}")
-    start = _start(options, source, still)
+    start = _start(results, still)
     options.out.mkdir(parents=True, exist_ok=True)
     try:
         _track(results, start)
     finally:
         # Also on the way out of an interrupted run, or of one whose frames cannot be read on.
         if results.num_frames:
-            box_files.write_tracks(options.out / "tracks.txt", results.all_rows())
+            box_files.write_tracks(options.out / TRACKS, results.all_rows())
             summary = results.summary()
-            write_json(options.out / "summary.json", summary)
+            write_json(options.out / SUMMARY, summary)
             print(_table(summary))
             print(f"written to {options.out}")
 
@@ -95,11 +102,12 @@ def run(options: argparse.Namespace) -> None:
 Start = Callable[[Iterable[np.ndarray], Clock], Iterator[Tracks]]
 
 
-def _start(options: argparse.Namespace, source: Source, still: np.ndarray) -> Start:
+def _start(results: Results, still: np.ndarray) -> Start:
     """The tracker that was asked for; everything that can be wrong with it is found here."""
+    options, source = results.options, results.source
     key = jax.random.key(options.seed)
     if options.box is not None:
-        boxes = read_boxes(options, still)
+        boxes = results.drawn = read_boxes(options, still)
         return lambda stills, clock: follow_boxes(stills, boxes, key=key)
     rows = None if options.detect else Rows(read_detections(options, source), source.first)
     room = LEAST_ROOM if rows is None else rows.most_objects()
@@ -144,12 +152,17 @@ def _track(results: Results, start: Start) -> None:
     video = contextlib.nullcontext(None)
     if not options.no_video:
         rate = source.frames_per_second or 10.0
-        video = frames.open_video(options.out / "tracking.mp4", rate)
+        video = frames.open_video(options.out / VIDEO, rate)
     bar = tqdm(total=source.num_frames, desc="Tracking", unit="frame", disable=None)
-    with open(options.out / "tracks.txt", "w", encoding="utf-8") as file, video as append, bar:
+    with contextlib.ExitStack() as opened, video as append, bar:
+        file = None
         for tracks in clock.over("track", start(watched(), clock)):
             rows = results.add(tracks)
             with clock.of("write"):
+                if file is None:
+                    # Until there is something to write, an older run's files stay as they are.
+                    (options.out / SUMMARY).unlink(missing_ok=True)
+                    file = opened.enter_context(open(options.out / TRACKS, "w", encoding="utf-8"))
                 # A line at once, so that a run that is killed leaves them too.
                 file.write(box_files.format_tracks(rows))
                 file.flush()
@@ -158,24 +171,8 @@ def _track(results: Results, start: Start) -> None:
             bar.update()
 
 
-def _scores(rows: np.ndarray, source: Source, num_frames: int) -> dict[str, float]:
-    """HOTA, MOTA and IDF1 where there is a truth, and TrackEval to score with."""
-    span = (source.first, source.first + num_frames - 1)
-    truth = source.truth
-    if truth is None or not np.any(truth.objects[:, 0] <= span[1]):
-        return {}
-    try:
-        scores = multi_object_scores(
-            rows, truth.objects, span, ignored=truth.ignored, min_height=truth.min_height
-        )
-    except ImportError as error:
-        print(f"no HOTA, MOTA and IDF1: {error}", file=sys.stderr)
-        return {}
-    return {name: round(scores[name], 4) for name in _SCORES}
-
-
 def _table(summary: dict[str, Any]) -> str:
     columns = ["frames", "objects", "frames_per_second", "peak_memory_mb"]
-    columns += [name for name in _SCORES if name in summary]
+    columns += [name for name in SCORES if name in summary]
     names = ["frames", "objects", "frames a second", "peak MB", *columns[4:]]
     return format_table(names, [[f"{summary[column]:g}" for column in columns]])

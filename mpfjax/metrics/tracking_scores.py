@@ -113,7 +113,7 @@ def remove_ignored(
         here = np.flatnonzero(tracks[:, 0] == frame)
         objects = labelled[labelled[:, 0] == frame]
         fields = ignored[regions & (ignored[:, 0] == frame), 2:]
-        matched, owners = _matches(tracks[here, 2:], objects[:, 2:])
+        matched, owners = matches(tracks[here, 2:], objects[:, 2:])
         kept[here[matched[objects[owners, 1] == IGNORED_OBJECT]]] = False
         left = np.delete(here, matched)
         boxes = tracks[left, 2:]
@@ -123,8 +123,8 @@ def remove_ignored(
     return tracks[kept]
 
 
-def _matches(boxes: np.ndarray, objects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rows of boxes and of objects that are matched, at an overlap of at least a half."""
+def matches(boxes: np.ndarray, objects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows of boxes and of objects, matched one to one, that overlap (IoU) by half or more."""
     from scipy.optimize import linear_sum_assignment
 
     shares = overlap(boxes, objects)

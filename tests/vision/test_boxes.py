@@ -8,6 +8,7 @@ from mpfjax.vision.boxes import (
     centred,
     check_boxes,
     parse_box,
+    read_detections,
     read_tracks,
     top_left,
     write_tracks,
@@ -85,6 +86,13 @@ def test_a_line_that_does_not_parse_is_named(tmp_path, line):
     path.write_text(f"1,2,10,20,30,40,1,-1,-1,-1\n{line}\n")
     with pytest.raises(ValueError, match=r"gt\.txt, line 2: "):
         read_tracks(path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path, encoding):
+    path = tmp_path / "det.txt"
+    path.write_text("1,-1,10,20,30,40,.5\r\n2,-1,10,20,30,40,.5\r\n", encoding=encoding)
+    np.testing.assert_array_equal(read_detections(path)[:, 0], [1, 2])
 
 
 def test_an_empty_file_is_named(tmp_path):
