@@ -14,7 +14,9 @@ from mpfjax.filters import independent_particle_filters as independent_particle_
 from mpfjax.filters import mixture_particle_filter as mixture_particle_filter
 from mpfjax.filters import particle_filter as particle_filter
 from mpfjax.filters import partitioned_sampling as partitioned_sampling
+from mpfjax.mixture import MarginalisedState as MarginalisedState
 from mpfjax.mixture import ParticleMixture as ParticleMixture
+from mpfjax.models import AbstractConditionallyLinearModel as AbstractConditionallyLinearModel
 from mpfjax.models import AbstractDynamics as AbstractDynamics
 from mpfjax.models import AbstractStateSpaceModel as AbstractStateSpaceModel
 from mpfjax.models import Autoregression as Autoregression
@@ -24,6 +26,7 @@ from mpfjax.models import PairwiseRepulsion as PairwiseRepulsion
 from mpfjax.models import QuadraticModel as QuadraticModel
 from mpfjax.models import RandomWalk as RandomWalk
 from mpfjax.models import RandomWalkWithJumps as RandomWalkWithJumps
+from mpfjax.models import SwitchingLinearGaussianModel as SwitchingLinearGaussianModel
 from mpfjax.models import WalkWithVelocity as WalkWithVelocity
 from mpfjax.models import per_particle as per_particle
 from mpfjax.moves import AbstractMove as AbstractMove
@@ -45,6 +48,7 @@ from mpfjax.moves import PropagateFamilies as PropagateFamilies
 from mpfjax.moves import PropagateInClusters as PropagateInClusters
 from mpfjax.moves import PropagateIndependently as PropagateIndependently
 from mpfjax.moves import PropagateInStages as PropagateInStages
+from mpfjax.moves import PropagateMarginalised as PropagateMarginalised
 from mpfjax.moves import Prune as Prune
 from mpfjax.moves import RandomPartition as RandomPartition
 from mpfjax.moves import Resample as Resample

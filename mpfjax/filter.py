@@ -25,6 +25,7 @@ from mpfjax.models.base import (
     check_states,
     starts_from_noise,
 )
+from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.noise import NOISES, draw_noise
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
 from mpfjax.moves.every import Every
@@ -271,7 +272,7 @@ def sample_initial(
     num_particles: int,
     noise: str = "independent",
 ) -> PyTree:
-    """The model's x_0, of this noise if it can be; raises for leaves of another length."""
+    """The particles of x_0, of this noise if the model can; raises for leaves of another length."""
     if noise == "independent" or not starts_from_noise(model):
         particles = model.sample_initial(key, num_particles)
     else:
@@ -279,7 +280,7 @@ def sample_initial(
         shape = (num_particles, maker.initial_noise_dimension)
         particles = maker.initial_from_noise(draw_noise(noise, key, shape, default_float()))
     check_states(particles, model, "sample_initial", num_particles)
-    return particles
+    return with_moments(model, particles)
 
 
 def _normalise(

@@ -1,5 +1,7 @@
 """The particle mixture: one set of joint weights, and all that is derived from it."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,6 +17,22 @@ from mpfjax.operations.segments import (
     segment_sum,
     spread,
 )
+
+
+class MarginalisedState(NamedTuple):
+    """Particles of a conditionally linear model: a latent, and the moments of the rest given it.
+
+    - `latent`: z_t, a pytree whose leaves have a leading axis n.
+    - `mean`, `covariance`: E and Cov of x_t given z_0, ..., z_t and y_1..y_t, (n, d) and (n, d, d).
+
+    Means over particles, as `ParticleMixture.mean` and `component_means`, are in this form too:
+    their covariance is that of x_t, E[Cov[x | z]] + Cov[E[x | z]]. Distances between particles,
+    and the flattened state, are those of `latent` and `mean`.
+    """
+
+    latent: PyTree
+    mean: Float[Array, "*n d"]
+    covariance: Float[Array, "*n d d"]
 
 
 class ParticleMixture(eqx.Module):
@@ -176,17 +194,34 @@ class ParticleMixture(eqx.Module):
 
         Leaves that are not floating point are averaged as `component_averages` does.
         """
-        return jax.tree.map(self.component_averages, self.particles)
+        means = jax.tree.map(self.component_averages, self.particles)
+        if not isinstance(means, MarginalisedState):
+            return means
+        within = self._component_spread(self.particles.mean)
+        return means._replace(covariance=means.covariance + within)
 
     def component_covariances(self) -> Float[Array, "m d d"]:
         """The weighted covariance of each component's flattened state, zero for a dead one."""
-        states = flatten_states(self.particles)
-        centred = states - spread(self.component_averages(states), self.component_indicators)
+        covariances = self._component_spread(flatten_states(self.particles))
+        if not isinstance(self.particles, MarginalisedState):
+            return covariances
+        d = self.particles.mean.shape[1]
+        within = self.component_averages(self.particles.covariance)
+        return covariances.at[:, -d:, -d:].add(within.astype(covariances.dtype))
+
+    def _component_spread(self, values: Float[Array, "n d"]) -> Float[Array, "m d d"]:
+        """The weighted covariance of the values in each component."""
+        centred = values - spread(self.component_averages(values), self.component_indicators)
         return self.component_averages(centred[:, :, None] * centred[:, None, :])
 
     def mean(self) -> PyTree:
         """E[x_t | y_1..y_t], leaf by leaf, over the whole mixture; see `average`."""
-        return jax.tree.map(self.average, self.particles)
+        means = jax.tree.map(self.average, self.particles)
+        if not isinstance(means, MarginalisedState):
+            return means
+        centred = self.particles.mean - means.mean[None]
+        between = self.average(centred[:, :, None] * centred[:, None, :])
+        return means._replace(covariance=means.covariance + between)
 
     def average(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, " *rest"]:
         """Σ_i exp(ℓ_i) v_i, the estimate of an expectation under the filtering distribution.
@@ -256,9 +291,17 @@ def single_component(
     )
 
 
+def points(particles: PyTree) -> PyTree:
+    """What of the particles says where they are: all but the covariances that they may carry."""
+    if isinstance(particles, MarginalisedState):
+        return particles.latent, particles.mean
+    return particles
+
+
 def flatten_states(particles: PyTree) -> Float[Array, "n d"]:
     """All leaves of the particles side by side, one row a particle."""
-    leaves = [as_inexact(leaf.reshape(leaf.shape[0], -1)) for leaf in jax.tree.leaves(particles)]
+    leaves = jax.tree.leaves(points(particles))
+    leaves = [as_inexact(leaf.reshape(leaf.shape[0], -1)) for leaf in leaves]
     widest = max((leaf.dtype for leaf in leaves), key=lambda dtype: jnp.finfo(dtype).bits)
     return jnp.concatenate([leaf.astype(widest) for leaf in leaves], axis=1)
 

@@ -29,6 +29,7 @@ MIXTURE = FILTER.init(KEY)
 HISTORY = mpfjax.run_filter(KEY, FILTER, np.ones(2, np.float32))
 TRACED = mpfjax.smoothing.with_first_ancestors(FILTER).init(KEY)
 EYE = np.eye(1)
+SWITCHING = mpfjax.SwitchingLinearGaussianModel(EYE, EYE, EYE, EYE, EYE, np.zeros(1), EYE)
 
 
 def nothing(mixture):
@@ -120,6 +121,15 @@ BUILT = {
         mpfjax.Propagate, {"model": MODEL, "proposal": None, "gradient": "none", "noise": "rqmc"}
     ),
     "Predict": (mpfjax.Predict, {"model": MODEL, "gradient": "none", "noise": "stratified"}),
+    "PropagateMarginalised": (
+        mpfjax.PropagateMarginalised,
+        {"model": SWITCHING, "proposal": None, "gradient": "none", "noise": "rqmc"},
+    ),
+    "SwitchingLinearGaussianModel": (
+        mpfjax.SwitchingLinearGaussianModel,
+        {"transition_matrix": EYE, "F": EYE, "Q": EYE, "H": EYE, "R": EYE, "m0": np.zeros(1),
+         "P0": EYE, "b": None, "c": np.zeros(1), "initial_probabilities": np.ones(1)},
+    ),
     "Weigh": (mpfjax.Weigh, {"model": MODEL}),
     "PropagateFamilies": (
         mpfjax.PropagateFamilies, {"propagate": mpfjax.Propagate(MODEL), "num_draws": 2}
@@ -363,8 +373,8 @@ def test_every_public_constructor_and_runner_is_tried():
     others = {name for name in public - tried if not name.startswith(("Abstract", "_"))}
     # Records of results, what takes no argument to check, and what other tests are about.
     assert others == {
-        "FilterRun", "StepInfo", "ParticleMixture", "Pool", "join_processes", "load_checkpoint",
-        "save_checkpoint", "normal", "read_study", "run_study", "NetworkProposal", "keep_programs",
+        "FilterRun", "StepInfo", "ParticleMixture", "MarginalisedState", "Pool", "join_processes",
+        "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study", "NetworkProposal", "keep_programs",
     } - tried  # fmt: skip
 
 

@@ -34,8 +34,8 @@ ORDER = (
 FLOORS = {
     "operations": (
         "floats", "gradients", "platforms", "stored", "indexing", "prefix_sums", "logarithms",
-        "segments", "runs", "choices", "matrices", "across_islands", "generator", "sobol",
-        "hilbert", "sorting", "compiling",
+        "segments", "runs", "choices", "matrices", "stacks", "gaussians", "across_islands",
+        "generator", "sobol", "hilbert", "sorting", "compiling",
     ),
     "running": (
         "storage", "processes", "devices", "threads", "scan", "run", "islands", "studies",

@@ -162,7 +162,8 @@ def check_model(model: Any, needed_by: str, argument: str = "model") -> None:
         raise ValueError(f"{argument}: {shown(model)} is a class; write {model.__name__}(...)")
     for method in ("sample_initial", "sample_transition", "log_likelihood"):
         require(model, method, needed_by, argument)
-    if getattr(type(model), "sample_transition", None) is _FROM_NOISE:
+    own_law = callable(getattr(model, "latent_dynamics", None))
+    if getattr(type(model), "sample_transition", None) is _FROM_NOISE and not own_law:
         for name in ("transition_from_noise", "noise_dimension"):
             if not hasattr(model, name):
                 raise ValueError(

@@ -15,6 +15,7 @@ from mpfjax.moves.group_by import GroupBy as GroupBy
 from mpfjax.moves.independent import PropagateIndependently as PropagateIndependently
 from mpfjax.moves.kmeans import KMeans as KMeans
 from mpfjax.moves.lookahead import ResampleAhead as ResampleAhead
+from mpfjax.moves.marginalised import PropagateMarginalised as PropagateMarginalised
 from mpfjax.moves.merge import Merge as Merge
 from mpfjax.moves.partitioned import Partitioned as Partitioned
 from mpfjax.moves.pool import Pool as Pool

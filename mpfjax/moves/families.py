@@ -10,8 +10,10 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import check_type, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.conditionally_linear import AbstractConditionallyLinearModel
 from mpfjax.models.noise import draw_family_noise, noise_dtype
 from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.marginalised import PropagateMarginalised
 from mpfjax.moves.propagation import Propagate
 from mpfjax.operations.generator import split, uniform
 from mpfjax.operations.indexing import take
@@ -27,20 +29,22 @@ class PropagateFamilies(AbstractPropagation):
     weights: Ẑ is that of K N particles, and unbiased. The model is evaluated K N times, but only N
     particles are resampled, sorted and regrouped.
 
-    - `propagate`: the `Propagate` that draws. With its noise "rqmc" or "stratified" the draws of a
-      family fill K strata of the first dimension of the noise, and one more dimension of the same
-      point set says which of them is kept. So what is kept is spread over slot and noise as well.
+    - `propagate`: the `Propagate`, or `PropagateMarginalised`, that draws. With its noise "rqmc" or
+      "stratified" the draws of a family fill K strata of the first dimension of the noise, and one
+      more dimension of the same point set says which of them is kept. So what is kept is spread
+      over slot and noise as well.
     - `num_draws`: K.
 
     Raises `ValueError` for K < 1, and for gradient "stop", which knows nothing of the draw that was
     kept. Use it where the likelihood is narrow and cheap, with four to sixteen draws.
     """
 
-    propagate: Propagate
+    propagate: Propagate | PropagateMarginalised
     num_draws: int = eqx.field(static=True, default=4)
 
     def __check_init__(self) -> None:
-        check_type(Propagate, "a Propagate", propagate=self.propagate)
+        kinds = (Propagate, PropagateMarginalised)
+        check_type(kinds, "a Propagate, nor a PropagateMarginalised", propagate=self.propagate)
         check_whole(num_draws=self.num_draws)
         if self.propagate.gradient == "stop":
             raise ValueError("propagate: gradient 'stop' knows nothing of the draw that is kept")
@@ -111,8 +115,15 @@ def propagation(
     gradient: str,
     noise: str,
     num_draws: int,
-) -> Propagate | PropagateFamilies:
-    """x_t, one or several draws of it, with the gradient that goes with that of resampling."""
+) -> Propagate | PropagateMarginalised | PropagateFamilies:
+    """How x_t is drawn: by the kind of the model, once or several times for each particle.
+
+    The gradient is the one that goes with that of resampling.
+    """
     check_whole(num_draws=num_draws)
-    propagate = Propagate(model, proposal, "stop" if gradient == "stop" else "none", noise)
+    own_gradient = "stop" if gradient == "stop" else "none"
+    if isinstance(model, AbstractConditionallyLinearModel):
+        propagate = PropagateMarginalised(model, proposal, own_gradient, noise)
+    else:
+        propagate = Propagate(model, proposal, own_gradient, noise)
     return propagate if num_draws == 1 else PropagateFamilies(propagate, num_draws)

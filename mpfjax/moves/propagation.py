@@ -21,6 +21,7 @@ from mpfjax.models.base import (
     require,
     require_noise,
 )
+from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.operations.gradients import add_gradient
@@ -60,7 +61,7 @@ class Propagate(AbstractPropagation):
     noise: str = eqx.field(static=True, default="independent")
 
     def __check_init__(self) -> None:
-        check_model(self.model, type(self).__name__)
+        _check_whole_states(self.model, type(self).__name__)
         check_propagated_gradient(self.gradient, self.model)
         check_noise(self.noise, self.model, self.proposal)
         if self.proposal is not None:
@@ -133,7 +134,7 @@ class Predict(AbstractPropagation):
     noise: str = eqx.field(static=True, default="independent")
 
     def __check_init__(self) -> None:
-        check_model(self.model, type(self).__name__)
+        _check_whole_states(self.model, type(self).__name__)
         check_propagated_gradient(self.gradient, self.model)
         check_noise(self.noise, self.model)
 
@@ -158,7 +159,7 @@ class Weigh(AbstractPropagation):
     model: AbstractStateSpaceModel
 
     def __check_init__(self) -> None:
-        check_model(self.model, "Weigh")
+        _check_whole_states(self.model, "Weigh")
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -171,6 +172,12 @@ class Weigh(AbstractPropagation):
         """The mixture as it is: there is nothing to weigh by."""
         del key
         return mixture
+
+
+def _check_whole_states(model: Any, needed_by: str) -> None:
+    """Raise a `ValueError` for what is no model, or one whose particles carry moments."""
+    check_model(model, needed_by)
+    refuse_marginalised(model, needed_by)
 
 
 def check_propagated_gradient(gradient: str, model: object) -> None:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import check_inner_share, check_type, check_whole, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, require_noise
+from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import noise_dtype
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation import likelihoods, predict
@@ -72,6 +73,7 @@ class PropagateInStages(AbstractPropagation):
         least_step: float = 0.02,
     ) -> None:
         check_model(model, "PropagateInStages")
+        refuse_marginalised(model, "PropagateInStages")
         require_noise(model, "PropagateInStages")
         self.model = model
         self.resample = Resample() if resample is None else resample

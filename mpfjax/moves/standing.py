@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
 from mpfjax.checks import check_callable, saying, shown
-from mpfjax.mixture import ParticleMixture
+from mpfjax.mixture import ParticleMixture, points
 from mpfjax.operations.floats import as_inexact
 from mpfjax.operations.hilbert import bits_per_dimension, hilbert_index
 from mpfjax.operations.segments import column_sums, spread
@@ -52,7 +52,7 @@ def _coordinates(mixture: ParticleMixture, sort_by: SortBy) -> Array:
     if isinstance(sort_by, str):
         leaves = [
             leaf.reshape(n, -1)
-            for leaf in jax.tree.leaves(mixture.particles)
+            for leaf in jax.tree.leaves(points(mixture.particles))
             if jnp.issubdtype(leaf.dtype, jnp.floating)
         ]
         if sum(leaf.shape[1] for leaf in leaves) == 0:

@@ -1,0 +1,330 @@
+"""Models that are linear and Gaussian but for a latent part of the state: a Kalman filter for each
+particle, which carries the moments of the rest in place of a draw.
+"""
+
+import abc
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.checks import shown
+from mpfjax.mixture import MarginalisedState
+from mpfjax.models.base import AbstractStateSpaceModel, check_moved, model_name
+from mpfjax.operations import gaussians
+from mpfjax.operations.floats import default_float
+from mpfjax.operations.gaussians import Gaussian, Linear
+from mpfjax.operations.stacks import (
+    applied,
+    cholesky,
+    particles_first,
+    particles_last,
+    product,
+    solve_lower,
+    solve_upper,
+    transposed,
+)
+
+
+class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
+    """A latent z_t with its own law, and x_t that is linear and Gaussian given z.
+
+    z_t ~ p(. | z_{t-1}), and given z_0, ..., z_t
+
+        x_0 ~ N(m0, P0),    x_t = F x_{t-1} + b + N(0, Q),    y_t = H x_t + c + N(0, R),
+
+    where all of these may depend on z. The first observation is y_1. Particles are
+    `MarginalisedState`s (latent, mean, covariance): a draw of z_t, and E and Cov of x_t given
+    z_0, ..., z_t and y_1..y_t, by the Kalman filter. So x takes no particles (Doucet, de Freitas,
+    Murphy and Russell 2000; Chen and Liu 2000). The latent is a pytree whose leaves have a leading
+    axis n, as the states of any model.
+
+    A model defines
+
+    - `sample_initial(key, num_particles)`: z_0;
+    - `initial_moments(latent)`: m0 (d,) and P0 (d, d), of each z_0;
+    - `sample_transition(key, latent)`: z_t; or `transition_from_noise(noise, latent)` and
+      `noise_dimension`, as in `AbstractStateSpaceModel`;
+    - `dynamics(latent, previous_latent)`: F (d, d), b (d,), Q (d, d), given z_t and z_{t-1};
+    - `emission(latent)`: H (p, d), c (p,), R (p, p), given z_t; or None where nothing is seen of x.
+
+    Each array may have a leading n, one for each particle, or not, where all share it. Q and R may
+    be singular. It may also define
+
+    - `log_transition(latent, previous_latent)`: log p(z_t | z_{t-1}), (n,), which proposals,
+      gradient "stop" and smoothing need;
+    - `log_likelihood(observation, latent)`: log of the density of what is seen of z alone, (n,);
+      zero unless it is defined;
+    - `linear_observation(observation)`: the y_t, (p,), that `emission` is about; the observation
+      itself unless it is defined;
+    - `all_transitions(latent)`: where z_t takes finitely many values, all that may follow: K pairs
+      of a z_t and log p(z_t | z_{t-1}), (n,). See `RegimeProposal` and `PropagateRegimes`;
+    - `latent_dynamics(previous_latent)`: in place of `sample_transition`, where z_t depends on
+      x_{t-1}: the mixed form of Schön, Gustafsson and Nordlund (2005). z_t is then (n, k), and
+
+        z_t = f + A x_{t-1} + v,    v ~ N(0, V),    Cov(w, v) = S,
+
+      where w is the noise of x_t, whose covariance is Q. It returns f (k,), A (k, d), V (k, k), or
+      also S (d, k), for which V must be invertible. A draw of z_t then says something of x_{t-1}.
+
+    An entry of y_t that is NaN is missing, and `log_likelihood` must know so as well; a class
+    with `handles_missing = False` never gets one. `particle_filter`, `mixture_particle_filter` and
+    `auxiliary_particle_filter` take such a model like any other: their move is
+    `PropagateMarginalised`. Use it where a part of the state is linear given the rest: regimes,
+    velocities and biases beside a position, maps.
+    """
+
+    handles_missing = True
+
+    @abc.abstractmethod
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
+        """Draw z_0 for `num_particles` particles: every leaf has shape (n, ...)."""
+
+    @abc.abstractmethod
+    def initial_moments(self, latent: PyTree) -> tuple[Array, Array]:
+        """m0 and P0, the moments of x_0 given z_0: (d,) and (d, d), or one for each particle."""
+
+    @abc.abstractmethod
+    def dynamics(self, latent: PyTree, previous_latent: PyTree) -> tuple[Array, Array, Array]:
+        """F, b, Q of x_t = F x_{t-1} + b + N(0, Q), given z_t and z_{t-1}."""
+
+    @abc.abstractmethod
+    def emission(self, latent: PyTree) -> tuple[Array, Array, Array] | None:
+        """H, c, R of y_t = H x_t + c + N(0, R), given z_t; None where nothing is seen of x."""
+
+    def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
+        """log of the density of what is seen of z alone; zero here."""
+        del observation
+        return jnp.zeros(jax.tree.leaves(states)[0].shape[0], default_float())
+
+    def linear_observation(self, observation: PyTree) -> Float[Array, " p"]:
+        """What of an observation is y_t = H x_t + c + N(0, R)."""
+        return observation
+
+
+def is_marginalised(model: Any) -> bool:
+    """Whether the model's particles carry moments in place of draws."""
+    return isinstance(model, AbstractConditionallyLinearModel)
+
+
+def refuse_marginalised(model: Any, needed_by: str) -> None:
+    """Raise a `ValueError` for a conditionally linear model, which is not moved as a whole."""
+    if is_marginalised(model):
+        raise ValueError(
+            f"model: {model_name(model)} is conditionally linear, and {needed_by} moves states"
+            " that are drawn as a whole; take PropagateMarginalised"
+        )
+
+
+def require_marginalised(model: Any, needed_by: str) -> None:
+    """Raise a `ValueError` for a model that is not conditionally linear."""
+    if not is_marginalised(model):
+        raise ValueError(
+            f"model: {shown(model)} is no AbstractConditionallyLinearModel, which {needed_by} needs"
+        )
+
+
+def is_mixed(model: Any) -> bool:
+    """Whether z_t depends on x_{t-1}."""
+    return callable(getattr(model, "latent_dynamics", None))
+
+
+def with_moments(model: Any, drawn: PyTree) -> PyTree:
+    """The particles of x_0: what the model drew, or beside it the moments of the rest."""
+    if not is_marginalised(model):
+        return drawn
+    n = jax.tree.leaves(drawn)[0].shape[0]
+    moments = model.initial_moments(drawn)
+    mean, covariance = _arrays(model, "initial_moments", moments, (1, 2), "m0 and P0")
+    d = mean.shape[-1]
+    _check_shape(model, "initial_moments", "P0", covariance, (d, d), n)
+    _check_shape(model, "initial_moments", "m0", mean, (d,), n)
+    return MarginalisedState(
+        drawn,
+        jnp.broadcast_to(mean, (n, d)),
+        jnp.broadcast_to(covariance, (n, d, d)),
+    )
+
+
+def predicted(model: Any, latent: PyTree, state: MarginalisedState) -> MarginalisedState:
+    """The moments of x_t given z_t and y_1..y_{t-1}, from those of x_{t-1}."""
+    n, moved = state.mean.shape[0], predicted_gaussian(model, latent, state)
+    check_moved(latent, state.latent, model)
+    return MarginalisedState(
+        latent, particles_first(moved.mean, n), particles_first(moved.covariance, n)
+    )
+
+
+def predicted_gaussian(model: Any, latent: PyTree, state: MarginalisedState) -> Gaussian:
+    """The same with the particles last."""
+    law = gaussian_of(state)
+    dynamics = dynamics_of(model, latent, state)
+    if is_mixed(model):
+        mixed, shared = latent_dynamics_of(model, state)
+        law, _ = gaussians.update(law, latent_rows(model, latent), mixed)
+        dynamics = decorrelated(dynamics, mixed, shared, latent_rows(model, latent))
+    return gaussians.predict(law, dynamics)
+
+
+def decorrelated(
+    dynamics: Linear, mixed: Linear, shared: Float[Array, "d k n"] | None, latent: Array
+) -> Linear:
+    """The dynamics of x given z_t, where their noises are correlated: v is z_t - f - A x."""
+    if shared is None:
+        return dynamics
+    factor = cholesky(mixed.noise, floor=True)
+    half = solve_lower(factor, transposed(shared))
+    slope = transposed(solve_upper(factor, half))
+    return Linear(
+        dynamics.matrix - product(slope, mixed.matrix),
+        dynamics.offset + applied(slope, latent - mixed.offset),
+        dynamics.noise - product(transposed(half), half),
+    )
+
+
+def updated(
+    model: Any, observation: PyTree, state: MarginalisedState
+) -> tuple[MarginalisedState, Float[Array, " n"] | None]:
+    """The moments of x_t given y_t as well, and log p(y_t | z, y_1..y_{t-1}); None if unseen."""
+    seen = emission_of(model, state.latent, state)
+    if seen is None:
+        return state, None
+    n, rows = state.mean.shape[0], observation_rows(model, observation, seen, state.mean.dtype)
+    law, log_density = gaussians.update(gaussian_of(state), rows, seen)
+    mean, covariance = particles_first(law.mean, n), particles_first(law.covariance, n)
+    return MarginalisedState(state.latent, mean, covariance), jnp.broadcast_to(log_density, (n,))
+
+
+def log_predictive(
+    model: Any, observation: PyTree, latent: PyTree, state: MarginalisedState
+) -> Float[Array, " n"]:
+    """log p(y_t | z_t, z, y_1..y_{t-1}) of each particle, what is seen of z_t included."""
+    log_density = model.log_likelihood(observation, latent)
+    seen = emission_of(model, latent, state)
+    if seen is None:
+        return log_density
+    law = predicted_gaussian(model, latent, state)
+    rows = observation_rows(model, observation, seen, state.mean.dtype)
+    return log_density + gaussians.update(law, rows, seen)[1]
+
+
+def latent_law(model: Any, state: MarginalisedState) -> Gaussian:
+    """N(f + A m, A P Aᵀ + V), the law of z_t in the mixed form, the particles last."""
+    mixed, _ = latent_dynamics_of(model, state)
+    return gaussians.predict(gaussian_of(state), mixed)
+
+
+def latent_from_noise(
+    model: Any, noise: Float[Array, "n k"], state: MarginalisedState
+) -> Float[Array, "n k"]:
+    """z_t of the mixed form, made of standard normal noise."""
+    law = latent_law(model, state)
+    drawn = law.mean + applied(cholesky(law.covariance), noise.T.astype(law.mean.dtype))
+    return drawn.T.reshape(state.latent.shape)
+
+
+def log_latent_density(model: Any, latent: Array, state: MarginalisedState) -> Float[Array, " n"]:
+    """log p(z_t | z_{t-1}, y_1..y_{t-1}) of the mixed form."""
+    mixed, _ = latent_dynamics_of(model, state)
+    return gaussians.update(gaussian_of(state), latent_rows(model, latent), mixed)[1]
+
+
+def latent_rows(model: Any, latent: Any) -> Float[Array, "k n"]:
+    """z_t of the mixed form with the particles last; a `ValueError` for other than one array."""
+    if not isinstance(latent, jax.Array | np.ndarray) or latent.ndim != 2:
+        raise ValueError(
+            f"model: {model_name(model)} has latent_dynamics, so that its latent must be one array"
+            f" (n, k), and it is {shown(latent)}"
+        )
+    return jnp.asarray(latent).T
+
+
+def gaussian_of(state: MarginalisedState) -> Gaussian:
+    """The moments of each particle, the particles last."""
+    return Gaussian(particles_last(state.mean, 1), particles_last(state.covariance, 2))
+
+
+def dynamics_of(model: Any, latent: PyTree, state: MarginalisedState) -> Linear:
+    """F, b and Q, checked, the particles last."""
+    d = state.mean.shape[-1]
+    parts = model.dynamics(latent, state.latent)
+    return _linear(model, "dynamics", parts, "FbQ", d, d, state.mean.shape[0])
+
+
+def emission_of(model: Any, latent: PyTree, state: MarginalisedState) -> Linear | None:
+    """H, c and R, checked, the particles last; None where nothing is seen of x."""
+    parts = model.emission(latent)
+    if parts is None:
+        return None
+    (n, d), p = state.mean.shape, jnp.shape(parts[0])[-2] if jnp.ndim(parts[0]) > 1 else 0
+    return _linear(model, "emission", parts, "HcR", p, d, n)
+
+
+def latent_dynamics_of(
+    model: Any, state: MarginalisedState
+) -> tuple[Linear, Float[Array, "d k n"] | None]:
+    """f, A and V of the mixed form, and S if there is one, checked, the particles last."""
+    parts = model.latent_dynamics(state.latent)
+    (n, d), k = state.mean.shape, latent_rows(model, state.latent).shape[0]
+    if not isinstance(parts, tuple) or len(parts) not in (3, 4):
+        raise ValueError(
+            f"model: {model_name(model)}.latent_dynamics returned {shown(parts)}, not f, A and V,"
+            " nor f, A, V and S"
+        )
+    offset, matrix, noise, *rest = parts
+    mixed = _linear(model, "latent_dynamics", (matrix, offset, noise), "AfV", k, d, n)
+    if not rest:
+        return mixed, None
+    _check_shape(model, "latent_dynamics", "S", rest[0], (d, k), n)
+    return mixed, particles_last(jnp.asarray(rest[0]), 2)
+
+
+def observation_rows(
+    model: Any, observation: PyTree, seen: Linear, dtype: jnp.dtype
+) -> Float[Array, "p 1"]:
+    """y_t as a column, checked."""
+    found: Any = model.linear_observation(observation)
+    p = seen.matrix.shape[0]
+    if not isinstance(found, jax.Array | np.ndarray | np.generic | float | int):
+        raise ValueError(
+            f"observation: {shown(found)} is no array ({p},), as the H of"
+            f" {model_name(model)}.emission asks for; define linear_observation, which picks it"
+        )
+    if jnp.shape(found) != (p,) and not (p == 1 and jnp.shape(found) == ()):
+        raise ValueError(
+            f"observation: shape {jnp.shape(found)} is not ({p},), the rows of H, which"
+            f" {model_name(model)}.emission returned"
+        )
+    return jnp.reshape(jnp.asarray(found, dtype), (p, 1))
+
+
+def _linear(model: Any, method: str, parts: Any, names: str, e: int, d: int, n: int) -> Linear:
+    ranks = (2, 1, 2)
+    arrays = _arrays(model, method, parts, ranks, f"{names[0]}, {names[1]} and {names[2]}")
+    for name, array, shape in zip(names, arrays, ((e, d), (e,), (e, e)), strict=True):
+        _check_shape(model, method, name, array, shape, n)
+    matrix, offset, noise = map(particles_last, arrays, ranks)
+    return Linear(matrix, offset, noise)
+
+
+def _arrays(
+    model: Any, method: str, parts: Any, ranks: tuple[int, ...], names: str
+) -> tuple[Array, ...]:
+    is_tuple = isinstance(parts, tuple | list) and len(parts) == len(ranks)
+    if not is_tuple or not all(isinstance(part, jax.Array | np.ndarray) for part in parts):
+        raise ValueError(
+            f"model: {model_name(model)}.{method} returned {shown(parts)}, not the arrays {names}"
+        )
+    return tuple(jnp.asarray(part) for part in parts)
+
+
+def _check_shape(
+    model: Any, method: str, name: str, array: Any, shape: tuple[int, ...], n: int
+) -> None:
+    if jnp.shape(array) not in (shape, (n, *shape)):
+        raise ValueError(
+            f"model: {model_name(model)}.{method} returned {name} of shape {jnp.shape(array)},"
+            f" which is neither {shape} nor {(n, *shape)}"
+        )

@@ -1,0 +1,126 @@
+"""The switching model, and its exact answer by enumeration, against formulas of other kinds."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+import mpfjax
+from mpfjax.exact import kalman_filter, switching_filter
+from tests.switching import INITIAL, MODEL, NUM_REGIMES, OBSERVATIONS, PARTS, TRANSITIONS
+
+EYE = np.eye(2)
+GOOD = {
+    "transition_matrix": np.full((2, 2), 0.5), "F": EYE, "Q": EYE, "H": EYE[:1], "R": np.eye(1),
+    "m0": np.zeros(2), "P0": EYE,
+}  # fmt: skip
+
+
+def parts_of(regime):
+    """The matrices of one regime, as numpy."""
+    own = {name: np.array(value, float) for name, value in PARTS.items()}
+    return {
+        name: value[regime] if name in ("F", "Q", "R", "b") else value
+        for name, value in own.items()
+    }
+
+
+def test_the_evidence_and_the_smoothed_regimes_are_those_of_the_joint_normal_of_all_observations():
+    """p(y_1, y_2 | z_0, z_1, z_2) is one normal density, whose moments follow from x_0."""
+    ys = np.asarray(OBSERVATIONS[:2, 0], float)
+    log_joint = {}
+    for sequence in itertools.product(range(NUM_REGIMES), repeat=3):
+        prior = INITIAL[sequence[0]]
+        mean = np.array(PARTS["m0"])
+        # x_t as a linear map of x_0, w_1, w_2; y_t as one of these and its own noise.
+        covariance, rows, means = np.array(PARTS["P0"]), [], []
+        maps = [np.eye(2)]
+        sources = [covariance]
+        for t in (1, 2):
+            prior *= TRANSITIONS[sequence[t - 1], sequence[t]]
+            part = parts_of(sequence[t])
+            maps = [part["F"] @ one for one in maps] + [np.eye(2)]
+            sources.append(part["Q"])
+            mean = part["F"] @ mean + part["b"]
+            rows.append([part["H"] @ one for one in maps])
+            means.append((part["H"] @ mean)[0])
+        joint = np.zeros((2, 2))
+        for i, j in itertools.product(range(2), repeat=2):
+            shared = zip(rows[i], rows[j], sources, strict=False)
+            joint[i, j] = sum((a @ source @ b.T)[0, 0] for a, b, source in shared)
+            joint[i, j] += (i == j) * parts_of(sequence[i + 1])["R"][0, 0]
+        log_joint[sequence] = np.log(prior) + multivariate_normal.logpdf(ys, means, joint)
+    run = switching_filter(MODEL, OBSERVATIONS[:2])
+    log_evidence = np.logaddexp.reduce(list(log_joint.values()))
+    np.testing.assert_allclose(run.log_marginal_likelihood, log_evidence, rtol=1e-5)
+    for time in range(3):
+        found = np.asarray(run.smoothed_regime_probabilities)[time]
+        for k in range(NUM_REGIMES):
+            expected = sum(np.exp(log_joint[s] - log_evidence) for s in log_joint if s[time] == k)
+            np.testing.assert_allclose(found[k], expected, rtol=1e-4)
+
+
+def test_with_equal_regimes_it_is_the_kalman_filter_and_the_smoother_ends_where_the_filter_does():
+    alike = {name: value for name, value in GOOD.items() if name != "transition_matrix"}
+    model = mpfjax.SwitchingLinearGaussianModel(TRANSITIONS, **alike)
+    linear = mpfjax.LinearGaussianModel(
+        A=alike["F"], **{k: alike[k] for k in "QHR"}, m0=np.zeros(2), P0=EYE
+    )
+    found, expected = switching_filter(model, OBSERVATIONS), kalman_filter(linear, OBSERVATIONS)
+    np.testing.assert_allclose(found.means, expected.means, atol=1e-4)
+    np.testing.assert_allclose(found.covariances, expected.covariances, atol=1e-4)
+    np.testing.assert_allclose(
+        found.log_likelihood_increments, expected.log_likelihood_increments, atol=1e-4
+    )
+    np.testing.assert_allclose(found.smoothed_means[-1], expected.means[-1], atol=1e-4)
+
+
+def test_draws_of_regimes_follow_the_transition_matrix():
+    latent = jnp.repeat(jnp.arange(NUM_REGIMES), 4000)
+    noise = jax.random.normal(jax.random.key(1), (12000, 1))
+    for drawn in (
+        MODEL.sample_transition(jax.random.key(0), latent),
+        MODEL.transition_from_noise(noise, latent),
+    ):
+        rows = np.asarray(drawn).reshape(NUM_REGIMES, 4000)
+        shares = np.stack([np.bincount(row, minlength=NUM_REGIMES) / 4000 for row in rows])
+        assert np.abs(shares - TRANSITIONS).max() < 4 * 0.5 / np.sqrt(4000)
+    start = np.asarray(MODEL.sample_initial(jax.random.key(2), 4000))
+    shares = np.bincount(start, minlength=NUM_REGIMES) / 4000
+    assert np.abs(shares - INITIAL).max() < 4 * 0.5 / np.sqrt(4000)
+    pairs = MODEL.all_transitions(latent)
+    for k, (regime, log_probability) in enumerate(pairs):
+        assert (np.asarray(regime) == k).all()
+        np.testing.assert_allclose(log_probability, MODEL.log_transition(regime, latent), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("transition_matrix", np.full((2, 2), 0.6)),
+        ("transition_matrix", np.array([[1.5, -0.5], [0.5, 0.5]])),
+        ("transition_matrix", np.ones(2)),
+        ("F", np.zeros((3, 2, 2))),
+        ("H", EYE[0]),
+        ("R", EYE),
+        ("b", np.zeros(3)),
+        ("P0", np.full((2, 2), np.nan)),
+        ("initial_probabilities", np.array([0.5, 0.6])),
+        ("initial_probabilities", np.ones(1)),
+    ],
+)
+def test_what_does_not_fit_together_is_named(name, value):
+    with pytest.raises(ValueError, match=name):
+        mpfjax.SwitchingLinearGaussianModel(**(GOOD | {name: value}))
+
+
+def test_too_long_a_series_is_refused():
+    with pytest.raises(ValueError, match="observations: 20 steps of 3 regimes"):
+        switching_filter(MODEL, jnp.zeros((20, 1)))
+    with pytest.raises(ValueError, match="observations: shape"):
+        switching_filter(MODEL, jnp.zeros(7))
+    with pytest.raises(ValueError, match="model:"):
+        switching_filter(mpfjax.QuadraticModel(), OBSERVATIONS)

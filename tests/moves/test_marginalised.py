@@ -1,0 +1,261 @@
+"""Rao-Blackwellised propagation against enumeration, Kalman filters and numpy."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax import Filter, GroupBy, PropagateFamilies, PropagateMarginalised, Resample
+from mpfjax.exact import kalman_filter, switching_filter
+from tests.marking import thorough
+from tests.switching import MODEL, NUM_REGIMES, OBSERVATIONS, moments, regimes, truth
+
+NUM_RUNS, NUM_PARTICLES = 1000, 30
+KEY = jax.random.key(0)
+
+
+def by_regime(state):
+    return state.latent
+
+
+FILTERS = {
+    "pf": lambda: mpfjax.particle_filter(MODEL, NUM_PARTICLES),
+    "pf rqmc": lambda: mpfjax.particle_filter(MODEL, NUM_PARTICLES, noise="rqmc"),
+    "mpf": lambda: mpfjax.mixture_particle_filter(MODEL, NUM_PARTICLES, 3, regroup_every=1),
+    "families": lambda: mpfjax.particle_filter(MODEL, NUM_PARTICLES, num_draws=3),
+    "a component for each regime": lambda: Filter(
+        MODEL,
+        [Resample(), PropagateMarginalised(MODEL), GroupBy(by_regime)],
+        NUM_PARTICLES,
+        NUM_REGIMES,
+        initial_moves=[GroupBy(by_regime)],
+    ),
+}
+QUICK = ("pf", "a component for each regime")
+
+
+@cache
+def runs(name):
+    keys = jax.random.split(jax.random.key(1), NUM_RUNS)
+    return jax.tree.map(
+        np.asarray, mpfjax.monte_carlo(keys, FILTERS[name](), OBSERVATIONS, moments)
+    )
+
+
+@pytest.mark.parametrize(
+    "name", [*QUICK, *thorough([name for name in FILTERS if name not in QUICK])]
+)
+def test_evidence_regimes_and_moments_are_unbiased(name):
+    """E[Ẑ/Z] = 1 and E[Ẑ/Z φ̂] = E[φ | y] at every step, against all sequences of regimes."""
+    run, exact = runs(name), truth()
+    ratios = np.exp(np.cumsum(run.log_likelihood_increments, axis=1) - exact.log_evidence)
+    assert_unbiased(ratios, 1.0)
+    for found, expected in zip(run.collected, exact[1:], strict=True):
+        own = ratios.reshape(*ratios.shape, *[1] * (found.ndim - 2))
+        assert_unbiased(own * found, expected)
+
+
+def assert_unbiased(estimates, expected):
+    """The mean over runs is within 4 standard errors of what is expected, in every entry."""
+    standard_error = estimates.std(axis=0) / np.sqrt(NUM_RUNS)
+    assert (standard_error < 0.1).all()  # loose estimates would prove nothing
+    z = (estimates.mean(axis=0) - expected) / standard_error
+    assert np.abs(z).max() < 4, f"standard errors away: {z}"
+
+
+@pytest.mark.thorough
+def test_a_hundred_particles_know_the_regimes():
+    keys = jax.random.split(jax.random.key(2), 300)
+    run = mpfjax.monte_carlo(keys, mpfjax.particle_filter(MODEL, 100), OBSERVATIONS, regimes)
+    error = np.asarray(run.collected) - truth().regimes
+    assert np.sqrt((error**2).mean()) < 0.08
+
+
+class OnePath(mpfjax.AbstractConditionallyLinearModel):
+    """A latent that counts the steps, so that every particle is the Kalman filter itself."""
+
+    linear: mpfjax.LinearGaussianModel
+
+    def sample_initial(self, key, num_particles):
+        return jnp.zeros(num_particles)
+
+    def initial_moments(self, latent):
+        return self.linear.m0, self.linear.P0
+
+    def sample_transition(self, key, latent):
+        return latent + 1
+
+    def dynamics(self, latent, previous_latent):
+        return self.linear.A, jnp.zeros(2), self.linear.Q
+
+    def emission(self, latent):
+        # One for each particle here, and shared above.
+        n = len(latent)
+        return jnp.broadcast_to(self.linear.H, (n, 2, 2)), jnp.zeros((n, 2)), self.linear.R
+
+
+LINEAR = mpfjax.LinearGaussianModel(
+    A=[[1.0, 0.5], [0.0, 0.8]], Q=[[0.2, 0.1], [0.1, 0.3]], H=[[1.0, 0.2], [0.3, 1.0]],
+    R=[[0.5, 0.2], [0.2, 0.4]], m0=[0.3, -0.2], P0=[[1.0, 0.1], [0.1, 0.5]],
+)  # fmt: skip
+SERIES = jnp.array([[0.4, 1.0], [-0.3, 0.2], [1.3, 0.9], [0.7, -0.8]])
+ONE = mpfjax.particle_filter(OnePath(LINEAR), 4)
+
+
+def test_each_particle_is_a_kalman_filter():
+    run = mpfjax.run_filter(KEY, ONE, SERIES, lambda mixture: mixture.particles)
+    exact = kalman_filter(LINEAR, SERIES)
+    latent, mean, covariance = run.collected
+    np.testing.assert_array_equal(latent[:, 0], [1, 2, 3, 4])
+    for i in range(4):
+        np.testing.assert_allclose(mean[:, i], exact.means, atol=1e-5)
+        np.testing.assert_allclose(covariance[:, i], exact.covariances, atol=1e-5)
+    np.testing.assert_allclose(
+        run.log_likelihood_increments, exact.log_likelihood_increments, atol=1e-5
+    )
+
+
+def test_an_entry_that_is_missing_is_left_out_and_a_step_without_any_is_predicted():
+    gaps = SERIES.at[1, 0].set(jnp.nan).at[2].set(jnp.nan)
+    regimes_alike = mpfjax.SwitchingLinearGaussianModel(
+        np.ones((1, 1)), LINEAR.A, LINEAR.Q, LINEAR.H, LINEAR.R, LINEAR.m0, LINEAR.P0
+    )
+    exact = switching_filter(regimes_alike, gaps)
+    for missing in ("error", "skip"):
+        run = mpfjax.run_filter(KEY, ONE, gaps, lambda m: m.mean(), missing=missing)
+        np.testing.assert_allclose(run.collected.mean, exact.means, atol=1e-5)
+        np.testing.assert_allclose(run.collected.covariance, exact.covariances, atol=1e-5)
+        np.testing.assert_allclose(
+            run.log_likelihood_increments, exact.log_likelihood_increments, atol=1e-5
+        )
+
+
+def test_a_forecast_is_the_kalman_predictor():
+    run = mpfjax.run_filter(KEY, ONE, SERIES, lambda mixture: None)
+    ahead = mpfjax.forecast(jax.random.key(1), ONE, run.final, 2).mixtures.particles
+    exact = kalman_filter(LINEAR, SERIES)
+    mean, covariance = np.asarray(exact.means[-1]), np.asarray(exact.covariances[-1])
+    for step in range(2):
+        mean, covariance = LINEAR.A @ mean, LINEAR.A @ covariance @ LINEAR.A.T + LINEAR.Q
+        np.testing.assert_allclose(ahead.mean[step, 0], mean, atol=1e-5)
+        np.testing.assert_allclose(ahead.covariance[step, 0], covariance, atol=1e-5)
+
+
+def test_moments_of_a_mixture_are_those_of_its_gaussians():
+    filter = FILTERS["a component for each regime"]()
+    mixture = mpfjax.run_filter(KEY, filter, OBSERVATIONS, lambda mixture: None).final
+    state, weights = mixture.particles, np.asarray(mixture.weights, float)
+    means, covariances = np.asarray(state.mean, float), np.asarray(state.covariance, float)
+
+    def of(chosen):
+        w = np.where(chosen, weights, 0)
+        w = w / w.sum()
+        mean = w @ means
+        gaps = means - mean
+        return mean, np.einsum("n,nde->de", w, covariances + gaps[:, :, None] * gaps[:, None, :])
+
+    mean, covariance = of(np.ones(NUM_PARTICLES, bool))
+    np.testing.assert_allclose(mixture.mean().mean, mean, atol=1e-5)
+    np.testing.assert_allclose(mixture.mean().covariance, covariance, atol=1e-5)
+    components, flattened = mixture.component_means(), mixture.component_covariances()
+    for m in range(NUM_REGIMES):
+        mean, covariance = of(np.asarray(mixture.component_indicators) == m)
+        np.testing.assert_allclose(components.mean[m], mean, atol=1e-5)
+        np.testing.assert_allclose(components.covariance[m], covariance, atol=1e-5)
+        np.testing.assert_allclose(flattened[m][1:, 1:], covariance, atol=1e-5)
+        np.testing.assert_allclose(flattened[m][0], 0, atol=1e-5)  # one regime: it has no variance
+
+
+@pytest.mark.thorough
+def test_ten_thousand_steps_in_float32_leave_covariances_positive_and_log_z_as_in_float64():
+    """Q of rank 2 in 4 dimensions, and R a millionth of the variance of what is seen."""
+    # Near zero: of a mean far from it, float32 itself loses what R asks for.
+    matrix = 0.9 * np.eye(4) + 0.9 * np.eye(4, k=2)
+    push = np.vstack([0.5 * np.eye(2), np.eye(2)])
+    parts = {
+        "F": matrix, "Q": 1e-4 * push @ push.T, "H": np.eye(2, 4), "R": 1e-8 * np.eye(2),
+        "m0": np.zeros(4), "P0": np.eye(4),
+    }  # fmt: skip
+    rng, state, series = np.random.default_rng(0), np.zeros(4), []
+    for _ in range(10_000):
+        state = matrix @ state + 1e-2 * push @ rng.normal(size=2)
+        series.append(state[:2] + 1e-4 * rng.normal(size=2))
+    model = mpfjax.SwitchingLinearGaussianModel(np.ones((1, 1)), **parts)
+    filter = mpfjax.particle_filter(model, 1)
+    collect = lambda mixture: mixture.particles.covariance[0]  # noqa: E731
+    run = mpfjax.run_filter(KEY, filter, jnp.asarray(series, jnp.float32), collect)
+    assert run.collected.dtype == jnp.float32
+    assert np.linalg.eigvalsh(np.asarray(run.collected, float)).min() > 0
+    exact = increments_of_numpy(parts, np.array(series, np.float32).astype(float))
+    gaps = np.asarray(run.log_likelihood_increments, float) - exact
+    assert np.abs(gaps.reshape(100, 100).sum(axis=1)).max() < 0.01
+
+
+def increments_of_numpy(parts, series):
+    """log p(y_t | y_1..y_{t-1}) in float64, with the parts rounded to float32."""
+    parts = {name: np.asarray(value, np.float32).astype(float) for name, value in parts.items()}
+    matrix, noise, seen = parts["F"], parts["Q"], parts["H"]
+    mean, covariance, found = parts["m0"], parts["P0"], []
+    for observation in series:
+        mean, covariance = matrix @ mean, matrix @ covariance @ matrix.T + noise
+        spread = seen @ covariance @ seen.T + parts["R"]
+        gain, missed = np.linalg.solve(spread, seen @ covariance).T, observation - seen @ mean
+        squares = missed @ np.linalg.solve(spread, missed)
+        found.append(-0.5 * (squares + np.linalg.slogdet(2 * np.pi * spread)[1]))
+        mean, left = mean + gain @ missed, np.eye(4) - gain @ seen
+        covariance = left @ covariance @ left.T + gain @ parts["R"] @ gain.T
+    return np.array(found)
+
+
+class Wrong(OnePath):
+    """One of its parts is not as it should be."""
+
+    part: str = ""
+
+    def initial_moments(self, latent):
+        m0, P0 = super().initial_moments(latent)
+        return (m0, P0[:1]) if self.part == "P0" else (m0, P0)
+
+    def dynamics(self, latent, previous_latent):
+        F, b, Q = super().dynamics(latent, previous_latent)
+        return {"F": (F[0], b, Q), "b": (F, b[:1], Q), "Q": (F, b)}.get(self.part, (F, b, Q))
+
+    def emission(self, latent):
+        H, c, R = super().emission(latent)
+        return (H[:, :1], c, R) if self.part == "R" else (H, c, R)
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ("P0", "Wrong.initial_moments returned P0 of shape"),
+        ("F", "Wrong.dynamics returned F of shape"),
+        ("b", "Wrong.dynamics returned b of shape"),
+        ("Q", "Wrong.dynamics returned .* not the arrays F, b and Q"),
+        ("R", "Wrong.emission returned c of shape"),
+    ],
+)
+def test_parts_of_other_shapes_are_named(part, message):
+    with pytest.raises(ValueError, match=message):
+        mpfjax.run_filter(KEY, mpfjax.particle_filter(Wrong(LINEAR, part), 4), SERIES)
+
+
+def test_misuse_is_named():
+    with pytest.raises(ValueError, match="observation: shape"):
+        mpfjax.run_filter(KEY, ONE, SERIES[:, :1])
+    for make in (mpfjax.Propagate, mpfjax.Predict, mpfjax.Weigh, mpfjax.PropagateInStages):
+        with pytest.raises(ValueError, match=r"model: .* is conditionally linear"):
+            make(MODEL)
+    with pytest.raises(ValueError, match=r"model: .* conditionally linear"):
+        mpfjax.gaussian_particle_filter(MODEL, 10)
+    with pytest.raises((ValueError, TypeError), match="AbstractConditionallyLinearModel"):
+        PropagateMarginalised(LINEAR)
+    with pytest.raises(ValueError, match="log_transition"):
+        PropagateMarginalised(OnePath(LINEAR), gradient="stop")
+    with pytest.raises(ValueError, match="transition_from_noise"):
+        PropagateMarginalised(OnePath(LINEAR), noise="rqmc")
+    with pytest.raises(ValueError, match="propagate:"):
+        PropagateFamilies(PropagateMarginalised(MODEL, gradient="stop"))
