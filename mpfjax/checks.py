@@ -121,6 +121,78 @@ def check_key(key: Any, name: str = "key", *, batch: bool = False) -> None:
         )
 
 
+def as_numbers(
+    name: str, value: Any, *, floating: bool = False, may_be_complex: bool = False
+) -> Any:
+    """The argument as an array of JAX or numpy that holds the same numbers for JAX.
+
+    By itself JAX reads bytes of another order as they stand, keeps the lower half of whole numbers
+    beyond 32 bits, and drops masks. Raises `ValueError` for masked numbers, durations, what is no
+    number, complex ones unless they may be, and what JAX's own type cannot hold. With `floating`,
+    whole numbers and booleans become floating point numbers.
+    """
+    if isinstance(value, jax.ShapeDtypeStruct):
+        return value
+    if isinstance(value, jax.Array):
+        _check_numbers(name, value, value, may_be_complex)
+        is_whole = floating and not jnp.issubdtype(value.dtype, jnp.inexact)
+        return value.astype(jnp.result_type(float)) if is_whole else value
+    if np.ma.is_masked(value):
+        raise ValueError(f"{name}: {shown(value)} is masked; fill it, as by .filled(np.nan)")
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{name}: {shown(value)} is no array of numbers") from error
+    _check_numbers(name, array, value, may_be_complex)
+    if floating and not jnp.issubdtype(array.dtype, jnp.inexact):
+        array = array.astype(float)
+    return _of_jax(name, array)
+
+
+def _check_numbers(name: str, array: Any, value: Any, may_be_complex: bool) -> None:
+    """Raise a `ValueError` for an argument whose array is not one of numbers."""
+    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
+        raise ValueError(f"{name}: {shown(value)} is a key, no array of numbers")
+    if jnp.issubdtype(array.dtype, jnp.complexfloating) and not may_be_complex:
+        # Further down the imaginary part would be dropped, at the latest in a density.
+        raise ValueError(
+            f"{name}: {array.dtype} is complex; give the real and the imaginary part as two numbers"
+        )
+    if jnp.issubdtype(array.dtype, np.timedelta64):
+        raise ValueError(
+            f"{name}: {array.dtype} is a duration; divide it by its unit, as np.timedelta64(1, 's')"
+        )
+    if not _has_numbers(array):
+        raise ValueError(f"{name}: {shown(value)} is no array of numbers")
+
+
+def _of_jax(name: str, array: np.ndarray) -> np.ndarray:
+    """The array in the type that JAX would take it for; a `ValueError` where numbers would change.
+
+    Floating point numbers may be rounded.
+    """
+    shorter = {"g": np.float64, "G": np.complex128}.get(array.dtype.char, array.dtype)
+    native = np.dtype(shorter).newbyteorder("=")
+    dtype = jax.dtypes.canonicalize_dtype(native)
+    if array.dtype == dtype and array.dtype.isnative:
+        return array
+    with np.errstate(over="ignore"):
+        held = array.astype(dtype)
+    if jnp.issubdtype(dtype, np.inexact):
+        lost, instead = np.isfinite(array) & ~np.isfinite(held), "choose other units"
+    else:
+        lost, instead = held != array, "give floating point numbers"
+    if lost.any():
+        first = tuple(np.argwhere(lost)[0].tolist())
+        place = ", ".join(map(str, first))
+        where = f" at index {place if len(first) < 2 else f'({place})'}" if first else ""
+        raise ValueError(
+            f"{name}: {array[first]:g}{where} is more than {dtype} holds; set jax_enable_x64, or"
+            f" {instead}"
+        )
+    return held
+
+
 def to_array(name: str, *, floating: bool = True) -> Callable[[Any], Array]:
     """A converter of the argument of this name to an array, for `eqx.field(converter=...)`.
 
@@ -128,22 +200,35 @@ def to_array(name: str, *, floating: bool = True) -> Callable[[Any], Array]:
     """
 
     def convert(value: Any) -> Array:
-        if isinstance(value, jax.ShapeDtypeStruct):
-            return value  # pyright: ignore[reportReturnType]
-        try:
-            # JAX takes a string for the name of a type.
-            array = jnp.asarray(None if isinstance(value, str | bytes) else value)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise ValueError(f"{name}: {shown(value)} is no array of numbers") from error
-        if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
-            raise ValueError(f"{name}: {shown(value)} is a key, no array of numbers")
-        if jnp.issubdtype(array.dtype, jnp.complexfloating):
-            raise ValueError(f"{name}: {shown(value)} is complex, and must be real")
-        if floating and not jnp.issubdtype(array.dtype, jnp.floating):
-            return array.astype(jnp.result_type(float))
-        return array
+        if isinstance(value, list | tuple) and _holds_arrays(value):
+            try:
+                value = jnp.asarray(value)
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{name}: {shown(value)} is no array of numbers") from error
+        numbers = as_numbers(name, value, floating=floating)
+        if isinstance(value, int | float) and not isinstance(value, np.generic):
+            return jnp.asarray(value, float if floating else None)
+        return numbers if isinstance(numbers, jax.ShapeDtypeStruct) else jnp.asarray(numbers)  # pyright: ignore[reportReturnType]
 
     return convert
+
+
+def real_arrays(shape: str, /, **arguments: Any) -> Any:
+    """The arguments as arrays of JAX in floating point, all of this shape, see `check_shape`.
+
+    Floating point numbers have 32 bits at least. One array alone comes as itself.
+    """
+    check_shape(shape, **arguments)
+    arrays = []
+    for name, value in arguments.items():
+        array = jnp.asarray(as_numbers(name, value, floating=True))
+        is_short = jnp.finfo(array.dtype).bits < 32
+        arrays.append(array.astype(jnp.result_type(float)) if is_short else array)
+    return arrays if len(arrays) > 1 else arrays[0]
+
+
+def _holds_arrays(value: Any) -> bool:
+    return any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
 
 
 def check_positive_array(**arguments: Any) -> None:
@@ -185,8 +270,13 @@ def check_shape(shape: str, /, **arguments: Any) -> None:
 
 def to_rows(width: int, name: str, value: Any) -> np.ndarray:
     """The argument as rows of `width` numbers; a vector is one row, and an empty list is none."""
+    if np.ma.is_masked(value):
+        raise ValueError(f"{name}: {shown(value)} are masked in part; fill them, as by .filled(0)")
     try:
-        rows = np.asarray(value, float)
+        rows = np.asarray(value)
+        if rows.dtype.kind in "cmM":  # numpy would drop an imaginary part, or a unit
+            raise TypeError
+        rows = rows.astype(float)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: {shown(value)} are no rows of {width} numbers") from error
     if rows.ndim > 0 and rows.size == 0:

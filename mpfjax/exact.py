@@ -1,5 +1,5 @@
-"""Exact references: the grid filter for scalar models, the Kalman filter for linear ones, and all
-sequences of regimes for switching ones.
+"""Exact references: a grid filter for scalar models, Kalman's filter and smoother for linear ones,
+and all sequences of regimes for switching ones.
 """
 
 from typing import Any
@@ -8,12 +8,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from mpfjax.checks import check_type
+from mpfjax.checks import as_numbers, check_one_of, check_type, real_arrays
 from mpfjax.models.base import require
 from mpfjax.models.linear_gaussian import LinearGaussianModel
 from mpfjax.models.switching import SwitchingLinearGaussianModel
+from mpfjax.observations import as_arrays
 from mpfjax.operations.logarithms import log_sum_exp
 
 
@@ -42,7 +44,6 @@ class GridFilterRun(eqx.Module):
         return self.probabilities @ jnp.clip((self.grid - threshold) / cell + 0.5, 0.0, 1.0)
 
 
-@eqx.filter_jit
 def grid_filter(
     model: Any,
     observations: Float[Array, "t ..."],
@@ -64,17 +65,24 @@ def grid_filter(
     is not one ascending row, or a model without these densities. Use it as the truth for a
     scalar model.
     """
+    observations = jax.tree.map(jnp.asarray, as_arrays(observations))
+    grid = real_arrays("...", grid=grid)
     if grid.ndim != 1 or grid.shape[0] < 2:
         raise ValueError(f"grid: shape {grid.shape} is not one row of at least two points")
     for density in ("log_transition", "log_likelihood"):
         require(model, density, "grid_filter")
-    num_points = grid.shape[0]
-    states = grid.reshape(-1, *state_shape)
     if log_initial is None:
         require(model, "log_initial", "grid_filter without log_initial")
-        log_prior: Float[Array, " g"] = model.log_initial(states)
     else:
-        log_prior = log_initial
+        log_initial = real_arrays("g", log_initial=log_initial)
+    return _grid_filter(model, observations, grid, log_initial, state_shape)
+
+
+@eqx.filter_jit
+def _grid_filter(model, observations, grid, log_initial, state_shape):
+    num_points = grid.shape[0]
+    states = grid.reshape(-1, *state_shape)
+    log_prior = model.log_initial(states) if log_initial is None else log_initial
     log_cell = jnp.log(grid[1] - grid[0])
     kernel = jnp.exp(
         log_cell
@@ -112,35 +120,125 @@ class KalmanFilterRun(eqx.Module):
     log_marginal_likelihood: Float[Array, ""]
 
 
-@eqx.filter_jit
-def kalman_filter(model: LinearGaussianModel, observations: Float[Array, "t p"]) -> KalmanFilterRun:
+class KalmanSmootherRun(eqx.Module):
+    """The smoothing distribution of a linear-Gaussian model; its first time is that of x_0."""
+
+    means: Float[Array, "t d"]
+    """E[x_s | y_1..y_t] for s = 0, ..., t."""
+    covariances: Float[Array, "t d d"]
+    """Cov[x_s | y_1..y_t] for s = 0, ..., t."""
+    lagged_covariances: Float[Array, "s d d"]
+    """Cov[x_s, x_{s-1} | y_1..y_t] for s = 1, ..., t, which EM needs."""
+    log_marginal_likelihood: Float[Array, ""]
+
+
+def kalman_filter(
+    model: LinearGaussianModel, observations: Float[Array, "t p"], *, missing: str = "error"
+) -> KalmanFilterRun:
     """The Kalman filter (Kalman 1960), with the library's convention: y_1 follows x_1, not x_0.
 
-    Covariances are updated in Joseph's form, which stays positive in float32. Differentiable.
-    Raises `ValueError` for observations that are not (t, p). Use it as the truth for a
-    linear-Gaussian model.
+    Covariances are updated in Joseph's form, which stays positive in float32. Differentiable, and
+    `jax.vmap` maps it over several series.
+
+    - `missing`: "error" raises a `ValueError` for a NaN or an infinity, as far as the numbers are
+      known. "skip" leaves out each number that is NaN: of two sensors, the one that is there
+      counts. (A particle filter leaves out the whole step, unless its model has `handles_missing`.)
+
+    Raises `ValueError` for another model and observations that are not (t, p). Use it as the truth
+    for a linear-Gaussian model.
     """
-    if observations.ndim != 2 or observations.shape[1] != model.H.shape[0]:
-        raise ValueError(f"observations: shape {observations.shape} is not (t, {model.H.shape[0]})")
+    filtered, increments = _kalman_filter(model, _checked(model, observations, missing))
+    return KalmanFilterRun(*filtered, increments, jnp.sum(increments))
+
+
+def kalman_smoother(
+    model: LinearGaussianModel, observations: Float[Array, "t p"], *, missing: str = "error"
+) -> KalmanSmootherRun:
+    """E and Cov of x_0, ..., x_t given y_1..y_t, by the recursion of Rauch, Tung and Striebel 1965.
+
+    After the Kalman filter it goes back from x_t. With (m, P) the filter's moments at s, and (m',
+    P') the smoothed ones at s + 1,
+
+        G = P Aᵀ (A P Aᵀ + Q)⁻¹,   mean m + G (m' - A m),   covariance
+        (I - G A) P (I - G A)ᵀ + G (Q + P') Gᵀ,
+
+    a sum of positive terms, which stays positive in float32. Differentiable, and `jax.vmap` maps it
+    over several series. Arguments and errors are those of `kalman_filter`. Use it as the truth for
+    what a particle smoother says of a linear-Gaussian model.
+    """
+    return _smooth(model, _checked(model, observations, missing))
+
+
+def _checked(model: Any, observations: Any, missing: str) -> Float[Array, "t p"]:
+    check_type(LinearGaussianModel, "a LinearGaussianModel", model=model)
+    check_one_of(("error", "skip"), missing=missing)
+    rows = jnp.asarray(as_numbers("observations", observations, floating=True))
+    if rows.ndim != 2 or rows.shape[1] != model.H.shape[0]:
+        raise ValueError(f"observations: shape {rows.shape} is not (t, {model.H.shape[0]})")
+    if not isinstance(rows, Tracer):
+        values = np.asarray(rows)
+        usable = ~np.isinf(values) if missing == "skip" else np.isfinite(values)
+        if not usable.all():
+            what = "infinite" if missing == "skip" else "NaN or infinite"
+            first = int(np.argmin(usable.all(axis=1)))
+            raise ValueError(f"observations: {what} at index {first} of the leading axis")
+    return rows.astype(model.m0.dtype)
+
+
+@eqx.filter_jit
+def _kalman_filter(model, observations):
+    """Means and covariances of x_1, ..., x_t, and the increments; a NaN is a missing number."""
     identity = jnp.eye(model.m0.shape[0], dtype=model.m0.dtype)
 
     def advance(carry, observation):
         mean, covariance = carry
         mean = model.A @ mean
         covariance = model.A @ covariance @ model.A.T + model.Q
-        innovation = observation - model.H @ mean
-        factor = jnp.linalg.cholesky(model.H @ covariance @ model.H.T + model.R)
+        seen = ~jnp.isnan(observation)
+        # A number that is missing is one of variance one, of nothing and equal to what is expected.
+        H = jnp.where(seen[:, None], model.H, 0.0)
+        R = jnp.where(seen[:, None] & seen[None], model.R, jnp.eye(*model.R.shape, dtype=H.dtype))
+        innovation = jnp.where(seen, observation, 0.0) - H @ mean
+        factor = jnp.linalg.cholesky(H @ covariance @ H.T + R)
         white = jax.scipy.linalg.solve_triangular(factor, innovation, lower=True)
         increment = -0.5 * jnp.sum(white**2) - jnp.sum(jnp.log(jnp.diagonal(factor)))
-        increment -= 0.5 * innovation.shape[0] * jnp.log(2 * jnp.pi)
-        gain = jax.scipy.linalg.cho_solve((factor, True), model.H @ covariance).T
-        left = identity - gain @ model.H
+        increment -= 0.5 * jnp.sum(seen).astype(mean.dtype) * jnp.log(2 * jnp.pi)
+        gain = jax.scipy.linalg.cho_solve((factor, True), H @ covariance).T
+        left = identity - gain @ H
         mean = mean + gain @ innovation
-        covariance = left @ covariance @ left.T + gain @ model.R @ gain.T
+        covariance = left @ covariance @ left.T + gain @ R @ gain.T
         return (mean, covariance), (mean, covariance, increment)
 
     _, (means, covariances, increments) = jax.lax.scan(advance, (model.m0, model.P0), observations)
-    return KalmanFilterRun(means, covariances, increments, jnp.sum(increments))
+    return (means, covariances), increments
+
+
+@eqx.filter_jit
+def _smooth(model, observations):
+    (means, covariances), increments = _kalman_filter(model, observations)
+    identity = jnp.eye(model.m0.shape[0], dtype=model.m0.dtype)
+
+    def back(later, filtered):
+        (later_mean, later_covariance), (mean, covariance) = later, filtered
+        predicted = model.A @ covariance @ model.A.T + model.Q
+        gain = jnp.linalg.solve(predicted, model.A @ covariance).T
+        left = identity - gain @ model.A
+        mean = mean + gain @ (later_mean - model.A @ mean)
+        covariance = left @ covariance @ left.T + gain @ (model.Q + later_covariance) @ gain.T
+        return (mean, covariance), (mean, covariance, later_covariance @ gain.T)
+
+    last = means[-1], covariances[-1]
+    earlier = (
+        jnp.concatenate([model.m0[None], means[:-1]]),
+        jnp.concatenate([model.P0[None], covariances[:-1]]),
+    )
+    _, (smoothed, spreads, lagged) = jax.lax.scan(back, last, earlier, reverse=True)
+    return KalmanSmootherRun(
+        means=jnp.concatenate([smoothed, last[0][None]]),
+        covariances=jnp.concatenate([spreads, last[1][None]]),
+        lagged_covariances=lagged,
+        log_marginal_likelihood=jnp.sum(increments),
+    )
 
 
 class SwitchingFilterRun(eqx.Module):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree, Shaped
 
+from mpfjax.checks import as_numbers
 from mpfjax.operations.floats import as_inexact, default_float
 from mpfjax.operations.logarithms import exp, finite_max, log_sum_exp, scaled_exp, softmax
 from mpfjax.operations.segments import (
@@ -174,17 +175,17 @@ class ParticleMixture(eqx.Module):
         values, _ = scaled_exp(self.log_weights)
         return jnp.sum(values) ** 2 * _inverse(jnp.sum(values**2))
 
-    def component_sums(self, values: Float[Array, "n *rest"]) -> Float[Array, "m *rest"]:
-        """Σ_{c_i = m} v_i over each component's slots."""
+    def component_sums(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, "m *rest"]:
+        """Σ_{c_i = m} v_i over each component's slots, in floating point."""
         self._require_one()
-        return segment_sum(values, self.component_indicators, self.num_components)
+        return segment_sum(_numbers(values), self.component_indicators, self.num_components)
 
     def component_averages(self, values: Shaped[Array, "n *rest"]) -> Inexact[Array, "m *rest"]:
         """Σ_{c_i = m} w_i v_i, the weighted average of `values` in each component, zero if dead.
 
         Whole numbers and booleans are averaged as floating point numbers.
         """
-        values = as_inexact(values)
+        values = _numbers(values)
         weights = self.component_weights.astype(values.dtype)
         filled = jnp.where(_rows(self.occupied, values), values, jnp.zeros((), values.dtype))
         return self.component_sums(_rows(weights, values) * filled)
@@ -229,7 +230,7 @@ class ParticleMixture(eqx.Module):
         The average of an event is its probability: `m.average(m.particles["mode"] == 2)`. Whole
         numbers and booleans are averaged as floating point numbers.
         """
-        values = as_inexact(values)
+        values = _numbers(values)
         is_filled, zero = _rows(self.occupied, values), jnp.zeros((), values.dtype)
         products = _rows(self.weights.astype(values.dtype), values) * jnp.where(
             is_filled, values, zero
@@ -304,6 +305,11 @@ def flatten_states(particles: PyTree) -> Float[Array, "n d"]:
     leaves = [as_inexact(leaf.reshape(leaf.shape[0], -1)) for leaf in leaves]
     widest = max((leaf.dtype for leaf in leaves), key=lambda dtype: jnp.finfo(dtype).bits)
     return jnp.concatenate([leaf.astype(widest) for leaf in leaves], axis=1)
+
+
+def _numbers(values: Shaped[Array, "*shape"]) -> Inexact[Array, "*shape"]:
+    """What is averaged: also of numpy, and in floating point."""
+    return jnp.asarray(as_numbers("values", values, floating=True, may_be_complex=True))
 
 
 def _inverse(squares: Float[Array, " *shape"]) -> Float[Array, " *shape"]:

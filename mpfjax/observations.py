@@ -9,30 +9,19 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree
 
-from mpfjax.checks import check_one_of, shown
+from mpfjax.checks import as_numbers, check_one_of
 
 
-def as_arrays(observations: PyTree) -> PyTree:
-    """Python's numbers as arrays of JAX's own types, everything else as it is."""
-
-    def convert(leaf: Any) -> Any:
-        if isinstance(leaf, jax.Array | np.ndarray | np.generic):
-            return leaf
-        return jnp.asarray(np.asarray(leaf))
-
-    return jax.tree.map(convert, observations)
+def as_arrays(observations: PyTree, name: str = "observations") -> PyTree:
+    """The observations as arrays of numbers that JAX takes as they are."""
+    return jax.tree.map(lambda leaf: as_numbers(name, leaf), observations)
 
 
 def one_observation(observation: PyTree) -> PyTree:
     """The arrays of y_t; a `ValueError` for none, for what is no number, and for too large ones."""
-    leaves = jax.tree.leaves(observation)
-    if not leaves:
+    if not jax.tree.leaves(observation):
         raise ValueError("observation: there is none; use predict to skip it")
-    _require_numbers(leaves, "observation")
-    for leaf in leaves:
-        if _is_plain(leaf):
-            _require_fitting(np.asarray(leaf), "observation")
-    return as_arrays(observation)
+    return as_arrays(observation, "observation")
 
 
 def checked_observation(observation: PyTree, model: Any) -> PyTree:
@@ -49,21 +38,21 @@ def checked_observation(observation: PyTree, model: Any) -> PyTree:
     return jax.tree.map(check, observation)
 
 
-def check_series(observations: PyTree, missing: str) -> None:
-    """Raise a `ValueError` for what no model can be run on: no numbers, or no common axis t."""
+def check_series(observations: PyTree, missing: str) -> list[Any]:
+    """The arrays of y_1..y_t; a `ValueError` for what no model can be run on."""
     check_one_of(("error", "skip"), missing=missing)
-    leaves = jax.tree.leaves(observations)
+    leaves = jax.tree.leaves(as_arrays(observations))
     if not leaves:
         raise ValueError("observations: there are none")
-    lengths = {jnp.shape(leaf)[0] if jnp.ndim(leaf) else None for leaf in leaves}
+    lengths = {leaf.shape[0] if leaf.ndim else None for leaf in leaves}
     if len(lengths) > 1 or None in lengths:
-        shapes = [jnp.shape(leaf) for leaf in leaves]
+        shapes = [leaf.shape for leaf in leaves]
         is_list = isinstance(observations, list | tuple)
         hint = "; a list is so many arrays, jnp.asarray(observations) is one" if is_list else ""
         raise ValueError(f"observations: shapes {shapes} do not share a leading axis t{hint}")
     if lengths == {0}:
         raise ValueError("observations: the leading axis t is empty")
-    _require_numbers(leaves, "observations")
+    return leaves
 
 
 def present_steps(observations: PyTree, missing: str, model: Any) -> Bool[Array, " t"] | None:
@@ -72,16 +61,13 @@ def present_steps(observations: PyTree, missing: str, model: Any) -> Bool[Array,
     For a `model` with `handles_missing`, a NaN is a missing number, and a step is missing only if
     all its numbers are.
     """
-    check_series(observations, missing)
-    leaves = jax.tree.leaves(observations)
-    inexact = [leaf for leaf in leaves if jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)]
+    leaves = check_series(observations, missing)
+    inexact = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     if not inexact:
         return None
     takes_nan = getattr(model, "handles_missing", False)
     if any(isinstance(leaf, Tracer) for leaf in inexact):
         return _present_traced(inexact, missing, takes_nan)
-    for leaf in inexact:
-        _require_fitting(np.asarray(leaf), "observations")
     usable = np.logical_and.reduce(_each_step(np, _usable(np, inexact, takes_nan), "all"))
     if not usable.all() and (missing == "error" or takes_nan):
         what = "infinite" if takes_nan else "NaN or infinite"
@@ -105,40 +91,6 @@ def _usable(numpy: Any, leaves: list[Any], takes_nan: bool) -> list[Any]:
 def _each_step(numpy: Any, masks: list[Any], how: str) -> list[Any]:
     """For every leaf, whether all or any of a step's numbers are in the mask."""
     return [getattr(numpy, how)(mask.reshape(mask.shape[0], -1), axis=1) for mask in masks]
-
-
-def _require_numbers(leaves: list[Any], name: str) -> None:
-    """Raise a `ValueError` for what is no number, and for complex ones.
-
-    Without this check, the imaginary part would be dropped, at the latest in the density.
-    """
-    for leaf in leaves:
-        dtype = leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
-        if jnp.issubdtype(dtype, jnp.complexfloating):
-            raise ValueError(
-                f"{name}: {dtype} is complex; give the real and the imaginary part as two numbers"
-            )
-        if not (jnp.issubdtype(dtype, jnp.number) or jnp.issubdtype(dtype, jnp.bool_)):
-            raise ValueError(f"{name}: {shown(leaf)} is no array of numbers")
-
-
-def _is_plain(leaf: Any) -> bool:
-    return not isinstance(leaf, jax.Array | jax.ShapeDtypeStruct)
-
-
-def _require_fitting(leaf: np.ndarray, name: str) -> None:
-    """Raise a `ValueError` for finite numbers that JAX's own type would make infinite."""
-    dtype = jax.dtypes.canonicalize_dtype(leaf.dtype)
-    if dtype == leaf.dtype:
-        return
-    with np.errstate(over="ignore"):
-        lost = np.isfinite(leaf) & ~np.isfinite(leaf.astype(dtype))
-    if lost.any():
-        first = tuple(map(int, np.argwhere(lost)[0]))
-        raise ValueError(
-            f"{name}: {leaf[first]:g} at index {first if len(first) != 1 else first[0]} is more"
-            f" than {dtype} holds; set jax_enable_x64, or choose other units"
-        )
 
 
 def _present_traced(leaves: list[Array], missing: str, takes_nan: bool) -> Bool[Array, " t"] | None:

@@ -7,7 +7,8 @@ import pytest
 import scipy.stats
 
 import mpfjax
-from mpfjax.exact import grid_filter, kalman_filter
+from mpfjax.exact import grid_filter, kalman_filter, kalman_smoother
+from tests.marking import thorough
 from tests.user_models import ScalarLinear
 
 OBSERVATIONS = np.array([[0.4, -0.2], [1.0, 0.3], [0.1, 0.8]])
@@ -22,8 +23,11 @@ MODEL = {
 SCALAR = {"A": [[0.8]], "Q": [[0.2]], "H": [[1.5]], "R": [[0.3]], "m0": [0.4], "P0": [[0.6]]}
 
 
-def joint_gaussian(A, Q, H, R, m0, P0, length):
-    """Mean and covariance of (x_1..x_T, y_1..y_T), from the definition of the model."""
+def joint_gaussian(A, Q, H, R, m0, P0, length, with_first=False):
+    """Mean and covariance of (x_1..x_T, y_1..y_T), from the definition of the model.
+
+    `with_first` has x_0 before them.
+    """
     A, Q, H, R, m0, P0 = (np.asarray(part, float) for part in (A, Q, H, R, m0, P0))
     d, p = len(m0), len(H)
     # (x_0, w_1..w_T, v_1..v_T), independent, to (x_1..x_T, y_1..y_T).
@@ -37,6 +41,8 @@ def joint_gaussian(A, Q, H, R, m0, P0, length):
         matrix[seen] = H @ matrix[rows]
         noise = d * (length + 1) + t * p
         matrix[seen, noise : noise + p] = np.eye(p)
+    if with_first:
+        matrix = np.concatenate([np.eye(d, len(source)), matrix])
     mean = matrix[:, :d] @ m0
     return mean, matrix @ source @ matrix.T
 
@@ -58,6 +64,62 @@ def test_kalman_filter_conditions_the_joint_gaussian(parts):
         np.testing.assert_allclose(run.means[t], mean[x] + gain @ residual, rtol=1e-3, atol=1e-4)
         posterior = covariance[x, x] - gain @ covariance[y, x]
         np.testing.assert_allclose(run.covariances[t], posterior, rtol=1e-3, atol=1e-4)
+
+
+NAN = np.nan
+GAPS = np.array([[0.4, NAN], [NAN, NAN], [0.1, 0.8], [NAN, -0.5]])
+
+
+@pytest.mark.parametrize(
+    ("parts", "observations"),
+    [(MODEL, GAPS), *thorough([(MODEL, OBSERVATIONS), (SCALAR, GAPS[:, :1]), (MODEL, GAPS[1:2])])],
+)
+def test_kalman_smoother_conditions_the_joint_gaussian(parts, observations):
+    """Whatever is missing: means, covariances, those of neighbours, and the evidence."""
+    d, length = len(parts["m0"]), len(observations)
+    model, seen = mpfjax.LinearGaussianModel(**parts), jnp.asarray(observations)
+    run = kalman_smoother(model, seen, missing="skip")
+    filtered = kalman_filter(model, seen, missing="skip")
+    mean, covariance = joint_gaussian(**parts, length=length, with_first=True)
+    states, seen = d * (length + 1), np.flatnonzero(~np.isnan(observations.ravel()))
+    y = states + seen
+    gain = covariance[:states, y] @ np.linalg.inv(covariance[np.ix_(y, y)])
+    residual = observations.ravel()[seen] - mean[y]
+    means = (mean[:states] + gain @ residual).reshape(-1, d)
+    joint = covariance[:states, :states] - gain @ covariance[y, :states]
+    blocks = joint.reshape(length + 1, d, length + 1, d)
+    np.testing.assert_allclose(run.means, means, rtol=1e-3, atol=1e-4)
+    for s in range(length + 1):
+        np.testing.assert_allclose(run.covariances[s], blocks[s, :, s], rtol=1e-3, atol=1e-4)
+    for s in range(length):
+        lagged = run.lagged_covariances[s]
+        np.testing.assert_allclose(lagged, blocks[s + 1, :, s], rtol=1e-3, atol=1e-4)
+    evidence = 0.0
+    if len(seen):
+        evidence = scipy.stats.multivariate_normal(mean[y], covariance[np.ix_(y, y)]).logpdf(
+            observations.ravel()[seen]
+        )
+    np.testing.assert_allclose(run.log_marginal_likelihood, evidence, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(filtered.log_marginal_likelihood, evidence, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(filtered.means[-1], means[-1], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.thorough
+def test_kalman_smoother_of_several_series_at_once_and_its_derivative():
+    model, batch = mpfjax.LinearGaussianModel(**MODEL), np.stack([OBSERVATIONS, -OBSERVATIONS])
+    together = jax.vmap(lambda rows: kalman_smoother(model, rows))(jnp.asarray(batch))
+    for one, rows in enumerate(batch):
+        alone = kalman_smoother(model, jnp.asarray(rows)).means
+        np.testing.assert_allclose(together.means[one], alone, rtol=1e-5, atol=1e-6)
+
+    def first(rows):
+        return kalman_smoother(model, rows, missing="skip").means[0, 0]
+
+    slope = jax.jit(jax.grad(first))(jnp.asarray(GAPS))
+    assert np.isfinite(slope).all()
+    step = 0.1 * np.eye(8)[4].reshape(4, 2)
+    expected = (first(jnp.asarray(GAPS + step)) - first(jnp.asarray(GAPS - step))) / 0.2
+    np.testing.assert_allclose(slope[2, 0], expected, rtol=1e-3)
 
 
 def test_grid_filter_agrees_with_the_kalman_filter():
@@ -119,10 +181,18 @@ def test_both_are_differentiable():
     np.testing.assert_allclose(jax.grad(by_grid)(jnp.array(0.5)), slope, rtol=1e-2)
 
 
+@pytest.mark.usefixtures("as_installed")
 def test_bad_input_is_named():
     model = mpfjax.LinearGaussianModel(**MODEL)
     with pytest.raises(ValueError, match=r"observations: shape \(3, 1\) is not \(t, 2\)"):
         kalman_filter(model, jnp.zeros((3, 1)))
+    for exact in (kalman_filter, kalman_smoother):
+        with pytest.raises(ValueError, match="observations: NaN or infinite at index 1"):
+            exact(model, GAPS[[2, 1]])
+        with pytest.raises(ValueError, match="observations: infinite at index 0"):
+            exact(model, np.full((1, 2), np.inf), missing="skip")
+        with pytest.raises(ValueError, match=r"model: QuadraticModel.* is not a LinearGaussian"):
+            exact(mpfjax.QuadraticModel(), GAPS)
     with pytest.raises(ValueError, match="grid: shape"):
         grid_filter(mpfjax.QuadraticModel(), jnp.zeros(2), jnp.zeros(1))
     with pytest.raises(ValueError, match="model: ScalarLinear defines no log_initial"):

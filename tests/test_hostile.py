@@ -4,7 +4,11 @@ One or two arguments of a good call are replaced by whatever the generator comes
 built in spite of it, draws and weighs finite numbers. `pytest -m hostile` runs a hundred thousand.
 """
 
+import array
 import collections
+import datetime
+import decimal
+import fractions
 import functools
 import inspect
 import re
@@ -275,6 +279,11 @@ SPECIAL = (
     1e300, 1e-320, "", "systematic", "none", b"x", 1j, object(), int, len, nothing, [], (), {},
     [1.0], [[1.0]], [1, [2]], {"a": 1.0}, np.float32(0.5), np.int64(2), np.bool_(True),
     np.array([]), np.zeros((2, 0)), np.array([np.nan]), np.array("a"), np.array([None]),
+    np.array([1.0, 2.0], ">f8"), np.array([1, 2], ">i4"), np.array([1.0, 2.0], np.longdouble),
+    np.longdouble(0.5), np.array([1, 2], np.uint8), np.array([2**40, 1]), np.array([1 + 1j, 2]),
+    np.ma.masked_array([1.0, 2.0], [True, False]), np.array([1, 2], "m8[s]"),
+    np.timedelta64(2, "s"), datetime.timedelta(seconds=2), array.array("d", [1.0, 2.0]),
+    collections.deque([1.0, 2.0]), decimal.Decimal("0.5"), fractions.Fraction(1, 2),
     jnp.array(0.5), jnp.array(2), jnp.zeros((2, 2)), KEY, KEY[None], jax.random.PRNGKey(0),
     MODEL, JOINT, FILTER, MIXTURE, mpfjax.QuadraticModel, mpfjax.Resample(), mpfjax.KMeans(1),
     mpfjax.Merge(), mpfjax.GaussNewtonProposal(MODEL), mpfjax.RandomWalk([1.0]),
@@ -374,7 +383,8 @@ def test_every_public_constructor_and_runner_is_tried():
     # Records of results, what takes no argument to check, and what other tests are about.
     assert others == {
         "FilterRun", "StepInfo", "ParticleMixture", "MarginalisedState", "Pool", "join_processes",
-        "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study", "NetworkProposal", "keep_programs",
+        "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
+        "NetworkProposal", "keep_programs",
     } - tried  # fmt: skip
 
 

@@ -3,9 +3,10 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.checks import check_shape, check_type
+from mpfjax.checks import check_not_negative_array, check_type, real_arrays
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_log_density, check_model
+from mpfjax.observations import one_observation
 from mpfjax.operations.logarithms import log_sum_exp
 
 
@@ -19,13 +20,15 @@ def crps(
     CRPS = ∫ (F(z) - 1{z >= y})² dz = E|Y - y| - E|Y - Y'| / 2 of the distribution F of the draws
     (Gneiting and Raftery 2007, section 4.2), by a sum over the draws in order, O(n log n). It is
     the absolute error where all weight is in one draw. A weight of zero leaves a draw out, and
-    weights need not sum to one.
+    weights need not sum to one. A NaN in a row makes its score NaN.
 
     Use it for what `mpfjax.forecast(..., simulate_observation=...)` draws, with the weights of the
-    forecast's mixtures. Raises `ValueError` for what is no array, or of shapes that do not fit.
+    forecast's mixtures. Raises `ValueError` for what is no array of real numbers, for shapes that
+    do not fit, and for a weight below zero.
     """
-    check_shape("... n", values=values, weights=weights)
-    check_shape("...", observations=observations)
+    values, weights = real_arrays("... n", values=values, weights=weights)
+    observations = real_arrays("...", observations=observations)
+    check_not_negative_array(weights=weights)
     if weights.shape != values.shape:
         raise ValueError(f"weights: shape {weights.shape} is not that of values, {values.shape}")
     if observations.shape != values.shape[:-1]:
@@ -57,6 +60,7 @@ def log_score(
     """
     check_model(model, "log_score")
     check_type(ParticleMixture, "a mixture, as in a Forecast", mixture=mixture)
+    observation = one_observation(observation)
     values = model.log_likelihood(observation, mixture.particles)
     values = check_log_density(values, model, "log_likelihood", mixture.num_particles)
     joint = jnp.where(mixture.occupied, mixture.log_weights + values, -jnp.inf)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.checks import check_finite, check_positive, check_shape, check_type
+from mpfjax.checks import check_finite, check_positive, check_shape, check_type, real_arrays
 from mpfjax.mixture import ParticleMixture
 
 
@@ -23,8 +23,9 @@ def modes_represented(
     a model whose modes are known. Raises `ValueError` for what is no array, masks of another shape
     than the positions, and a radius that is not positive and finite.
     """
-    check_shape("... n", positions=positions, occupied=occupied)
-    check_shape("... k", modes=modes)
+    check_shape("... n", occupied=occupied)
+    positions = real_arrays("... n", positions=positions)
+    modes = real_arrays("... k", modes=modes)
     if occupied.shape != positions.shape or occupied.dtype != bool:
         raise ValueError(f"occupied: {occupied.dtype}{occupied.shape} is no mask of the positions")
     if modes.shape[:-1] != positions.shape[:-1]:
@@ -49,5 +50,6 @@ def mass_above(mixture: ParticleMixture, threshold: float) -> Float[Array, ""]:
     if not isinstance(threshold, jax.Array):
         check_finite(threshold=threshold)
     positions = jax.tree.leaves(mixture.particles)[0].reshape(mixture.num_particles)
-    above = jnp.where(positions > threshold, 1.0, jnp.where(positions == threshold, 0.5, 0.0))
-    return mixture.average(above.astype(positions.dtype))
+    below = jnp.where(positions < threshold, 0.0, jnp.nan)
+    above = jnp.where(positions > threshold, 1.0, jnp.where(positions == threshold, 0.5, below))
+    return mixture.average(above.astype(mixture.log_weights.dtype))

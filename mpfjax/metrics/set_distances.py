@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 from optax.assignment import hungarian_algorithm
 
-from mpfjax.checks import check_callable, check_finite, check_positive, check_shape
+from mpfjax.checks import check_callable, check_finite, check_positive, check_shape, real_arrays
 
 # Without this, every call outside of `jax.jit` would compile the search again.
 _assign = jax.jit(hungarian_algorithm)
@@ -70,7 +70,8 @@ def ospa(
     positive and finite, and an order below 1 or infinite. Use it for an error per object;
     `gospa` says how many objects were missed.
     """
-    _check(estimates, truths, estimate_mask, truth_mask, cutoff, order, base_distance)
+    estimates, truths = _checked_sets(estimates, truths, estimate_mask, truth_mask)
+    _check_numbers(cutoff, order, base_distance)
     pairing = _cheapest_pairing(
         base_distance(estimates, truths) / cutoff, estimate_mask, truth_mask, order, 1.0
     )
@@ -102,7 +103,8 @@ def gospa(
     Raises `ValueError` as `ospa` does, and for an alpha outside (0, 2]. Use it to score trackers
     that may lose objects or invent them, with alpha at 2.
     """
-    _check(estimates, truths, estimate_mask, truth_mask, cutoff, order, base_distance)
+    estimates, truths = _checked_sets(estimates, truths, estimate_mask, truth_mask)
+    _check_numbers(cutoff, order, base_distance)
     check_positive(alpha=alpha)
     if alpha > 2:
         raise ValueError(f"alpha: {alpha} is not in (0, 2]")
@@ -155,15 +157,10 @@ def _all_unless_given(mask: Bool[Array, " k"] | None, size: int) -> Bool[Array, 
     return jnp.ones(size, bool) if mask is None else mask
 
 
-def _check(
-    estimates: Any,
-    truths: Any,
-    estimate_mask: Any,
-    truth_mask: Any,
-    cutoff: float,
-    order: float,
-    base_distance: Any,
-) -> None:
+def _checked_sets(
+    estimates: Any, truths: Any, estimate_mask: Any, truth_mask: Any
+) -> tuple[Float[Array, "k d"], Float[Array, "l d"]]:
+    """The two sets in floating point; a `ValueError` for what is none, and for other masks."""
     sets = {"estimate": ("estimates", estimates), "truth": ("truths", truths)}
     masks = {"estimate": estimate_mask, "truth": truth_mask}
     for kind, (name, entries) in sets.items():
@@ -175,6 +172,11 @@ def _check(
                 raise ValueError(
                     f"{kind}_mask: {mask.dtype}{mask.shape} is no mask of {entries.shape[0]} {name}"
                 )
+    estimates = real_arrays("number d", estimates=estimates)
+    return estimates, real_arrays("number d", truths=truths)
+
+
+def _check_numbers(cutoff: float, order: float, base_distance: Any) -> None:
     check_positive(cutoff=cutoff)
     check_finite(order=order)
     if order < 1:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.checks import check_shape, check_whole
+from mpfjax.checks import check_whole, real_arrays
 
 
 class TrackingQuality(NamedTuple):
@@ -107,8 +107,8 @@ def tracking_quality(
     it. `num_last` is that of `recovery_rate`. Raises `ValueError` for no runs or no frames, for
     boxes of other shapes, and as `recovery_rate` does.
     """
-    check_shape("runs t objects 4", estimates=estimates)
-    check_shape("t objects 4", truth=truth)
+    estimates = real_arrays("runs t objects 4", estimates=estimates)
+    truth = real_arrays("t objects 4", truth=truth)
     if truth.shape != estimates.shape[1:]:
         raise ValueError(
             f"truth: shape {truth.shape} is not {estimates.shape[1:]}, that of one run's estimates"

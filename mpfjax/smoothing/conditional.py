@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
-from mpfjax.checks import check_flag, check_key, check_type, shown
+from mpfjax.checks import as_numbers, check_flag, check_key, check_type, shown
 from mpfjax.filter import Filter, Start, sample_initial
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, model_name, require
@@ -282,8 +282,7 @@ def _as_states(trajectory: Any, model: AbstractStateSpaceModel, length: int) -> 
         )
 
     def convert(leaf: Any, state: jax.ShapeDtypeStruct) -> Array:
-        if not eqx.is_array_like(leaf):
-            raise ValueError(f"trajectory: {shown(leaf)} is no array of numbers")
+        leaf = as_numbers("trajectory", leaf)
         shape = (length, *state.shape[1:])
         if jnp.shape(leaf) != shape:
             raise ValueError(

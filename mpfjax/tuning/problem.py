@@ -17,7 +17,7 @@ from mpfjax.filter import Filter
 from mpfjax.moves.clusters import PropagateInClusters
 from mpfjax.moves.independent import PropagateIndependently
 from mpfjax.moves.resampling import Resample
-from mpfjax.observations import present_steps
+from mpfjax.observations import as_arrays, present_steps
 from mpfjax.proposals import AbstractProposal
 from mpfjax.running.scan import scan_filter
 from mpfjax.tuning.transforms import AbstractTransform, Unconstrained
@@ -330,10 +330,8 @@ def _groups(observations: PyTree, missing: str, model: Any) -> list[tuple[PyTree
         raise ValueError("observations: there are no sequences")
     by_shape: dict[Any, list[tuple[PyTree, Any]]] = {}
     for sequence in sequences:
-        for leaf in jax.tree.leaves(sequence):
-            if not eqx.is_array_like(leaf):
-                raise ValueError(f"observations: {shown(leaf)} is no array of numbers")
         present = present_steps(sequence, missing, model)
+        sequence = as_arrays(sequence)
         shapes = jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf).name), sequence)
         by_shape.setdefault(str(shapes), []).append((sequence, present))
     return [_stacked(group) for group in by_shape.values()]

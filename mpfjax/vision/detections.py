@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.checks import check_whole, shown, to_rows
+from mpfjax.checks import as_numbers, check_whole, shown, to_array, to_rows
 from mpfjax.vision.boxes import centred
 
 
@@ -19,9 +19,9 @@ class Detections(eqx.Module):
     - `scores`: (d,), how sure the detector was of each, on any scale, higher for surer.
     """
 
-    boxes: Float[Array, "d 4"]
-    valid: Bool[Array, " d"]
-    scores: Float[Array, " d"]
+    boxes: Float[Array, "d 4"] = eqx.field(converter=to_array("boxes"))
+    valid: Bool[Array, " d"] = eqx.field(converter=to_array("valid", floating=False))
+    scores: Float[Array, " d"] = eqx.field(converter=to_array("scores"))
 
     @classmethod
     def from_boxes(
@@ -58,10 +58,7 @@ def _checked_scores(scores: Any, number: int) -> np.ndarray:
     """A finite score for each of so many boxes, all one where there are none given."""
     if scores is None:
         return np.ones(number, np.float32)
-    try:
-        values = np.asarray(scores, np.float32)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"scores: {shown(scores)} are no numbers") from error
+    values = np.asarray(as_numbers("scores", scores, floating=True), np.float32)
     if values.shape != (number,):
         raise ValueError(f"scores: shape {values.shape} is not that of one a box, ({number},)")
     if not np.isfinite(values).all():

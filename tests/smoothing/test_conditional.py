@@ -200,7 +200,7 @@ class TestBadInput:
             ({"trajectory": {"x": np.zeros(4)}}, "trajectory: .*structure"),
             ({"trajectory": None}, "trajectory: None"),
             ({"trajectory": "abcd"}, "trajectory: .*abcd"),
-            ({"trajectory": np.zeros(4, complex)}, "trajectory: complex64 is not float32"),
+            ({"trajectory": np.zeros(4, complex)}, "trajectory: complex128 is complex"),
             ({"backward": 1}, "backward: 1"),
             ({"missing": "no"}, "missing: 'no'"),
             ({"observations": np.full(3, np.nan)}, "observations: NaN"),
