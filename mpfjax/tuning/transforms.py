@@ -1,6 +1,7 @@
 """Maps between a parameter's domain and unconstrained numbers, in which optimisers step."""
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -55,16 +56,21 @@ class Positive(AbstractTransform):
     """exp: for scales; a step of the optimiser is then a relative change."""
 
     def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
-        """exp u."""
-        return jnp.exp(reals)
+        """exp u, no less than the least normal number and no more than the largest."""
+        limits = jnp.finfo(reals.dtype)
+        # One step inside, so that rounding leads past neither.
+        ends = np.log([float(limits.tiny), float(limits.max)]).astype(reals.dtype)
+        first, last = np.nextafter(ends, ends[::-1])
+        return jnp.exp(jnp.clip(reals, first, last))
 
     def unconstrain(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """log x."""
         return jnp.log(value)
 
     def contains(self, value: Float[np.ndarray, "..."]) -> bool:
-        """Whether all entries are positive and finite."""
-        return bool((np.isfinite(value) & (value > 0)).all())
+        """Whether all entries are positive and finite, and none subnormal, which is zero to XLA."""
+        least = np.finfo(value.dtype).tiny if np.issubdtype(value.dtype, np.floating) else 1
+        return bool((np.isfinite(value) & (value >= least)).all())
 
     def log_jacobian(self, reals: Float[Array, "..."]) -> Float[Array, ""]:
         """The sum of u."""
@@ -86,8 +92,9 @@ class Interval(AbstractTransform):
             raise ValueError(f"high: {self.high} is not above low, {self.low}")
 
     def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Between the ends."""
-        return self.low + (self.high - self.low) * jax.nn.sigmoid(reals)
+        """Between the ends, and never rounded to one of them."""
+        inside = self.low + (self.high - self.low) * jax.nn.sigmoid(reals)
+        return jnp.clip(inside, *self._range(inside.dtype))
 
     def unconstrain(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """The logit of where it lies between the ends."""
@@ -102,6 +109,13 @@ class Interval(AbstractTransform):
         slopes = jax.nn.log_sigmoid(reals) + jax.nn.log_sigmoid(-reals)
         return jnp.sum(slopes + jnp.log(jnp.asarray(self.high - self.low, reals.dtype)))
 
+    def _range(self, dtype: jnp.dtype) -> tuple[Any, Any]:
+        """The first and the last number between the ends that is neither an end nor subnormal."""
+        low, high = np.asarray(self.low, dtype), np.asarray(self.high, dtype)
+        tiny = np.finfo(dtype).tiny
+        first, last = np.nextafter(low, high), np.nextafter(high, low)
+        return first if low != 0 else tiny, last if high != 0 else -tiny
+
 
 class Simplex(AbstractTransform):
     """Softmax along the last axis: for probabilities, and histograms, that sum to one.
@@ -110,9 +124,9 @@ class Simplex(AbstractTransform):
     """
 
     def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Positive entries that sum to one."""
-        last = jnp.zeros((*reals.shape[:-1], 1), reals.dtype)
-        return jax.nn.softmax(jnp.concatenate([reals, last], axis=-1), axis=-1)
+        """Positive entries that sum to one, none less than the least normal number."""
+        shares = jax.nn.softmax(_with_last(reals), axis=-1)
+        return jnp.maximum(shares, jnp.finfo(shares.dtype).tiny)
 
     def unconstrain(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Logits relative to the last entry's."""
@@ -127,4 +141,10 @@ class Simplex(AbstractTransform):
 
     def log_jacobian(self, reals: Float[Array, "..."]) -> Float[Array, ""]:
         """The sum of all log probabilities: of the first k - 1 entries in the logits."""
-        return jnp.sum(jnp.log(self.constrain(reals)))
+        return jnp.sum(jax.nn.log_softmax(_with_last(reals), axis=-1))
+
+
+def _with_last(reals: Float[Array, "... k"]) -> Float[Array, "... k1"]:
+    """All logits, the last one zero."""
+    last = jnp.zeros((*reals.shape[:-1], 1), reals.dtype)
+    return jnp.concatenate([reals, last], axis=-1)

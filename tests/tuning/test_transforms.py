@@ -32,6 +32,39 @@ def test_every_real_number_is_a_parameter_inside(name):
         assert transform.contains(np.asarray(transform.constrain(reals + shift)))
 
 
+FAR = (18.0, -18.0, 88.0, -88.0, 104.0, -104.0, 1e4, -1e4)
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [Positive(), Interval(0.0, 1.0), Interval(-1.0, 0.0), Interval(2.0, 3.7), Simplex()],
+    ids=str,
+)
+def test_numbers_far_from_zero_are_parameters_inside(transform):
+    """Also where float32 rounds exp and the logistic function to the ends of the domain."""
+    reals = jnp.array(FAR).reshape(-1, 1)
+    if isinstance(transform, Simplex):
+        reals = jnp.concatenate([reals, jnp.zeros_like(reals)], axis=1)
+    values = transform.constrain(reals)
+    for row, value in zip(reals, np.asarray(values), strict=True):
+        assert transform.contains(value), (row, value)
+        assert np.isfinite(transform.unconstrain(jnp.asarray(value))).all()
+        assert np.isfinite(transform.log_jacobian(row))
+    slopes = jax.grad(lambda u: jnp.sum(transform.constrain(u) / values))(reals)
+    assert np.isfinite(slopes).all()
+
+
+@pytest.mark.parametrize("shift", [150.0, -150.0, 2e3])
+def test_the_jacobian_far_from_zero_is_that_of_more_digits(shift):
+    logits = np.array([shift, 0.0, 0.0])
+    of_simplex = np.sum(logits - np.logaddexp.reduce(logits))
+    found = Simplex().log_jacobian(jnp.asarray(logits[:2]))
+    np.testing.assert_allclose(found, of_simplex, rtol=1e-6)
+    of_interval = np.log(4.0) - np.logaddexp(0, shift) - np.logaddexp(0, -shift)
+    found = Interval(-1.0, 3.0).log_jacobian(jnp.array(shift))
+    np.testing.assert_allclose(found, of_interval, rtol=1e-6)
+
+
 @pytest.mark.parametrize("name", INSIDE)
 def test_the_jacobian_is_that_of_automatic_differentiation(name):
     transform, values = INSIDE[name]
@@ -49,6 +82,7 @@ def test_the_jacobian_is_that_of_automatic_differentiation(name):
         (Positive(), [1.0, 0.0]),
         (Positive(), [np.inf]),
         (Positive(), [np.nan]),
+        (Positive(), np.float32([1e-42])),
         (Interval(0.0, 1.0), [0.5, 1.0]),
         (Interval(0.0, 1.0), [np.nan]),
         (Simplex(), [0.5, 0.4]),
