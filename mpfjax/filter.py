@@ -93,8 +93,8 @@ class Filter(eqx.Module):
     - `initial_noise`: what x_0 is made of where the model has `initial_from_noise`: "independent",
       as the model's own `sample_initial` draws it, "rqmc" or "stratified"; see `Propagate`.
 
-    Raises `ValueError` for N < 1, M < 1, N < M, no moves, or fewer slots than
-    `particles_per_component` asks for.
+    Raises `ValueError` for N < 1, M < 1, N < M, no moves, moves that never see an observation, or
+    fewer slots than `particles_per_component` asks for.
     """
 
     model: AbstractStateSpaceModel
@@ -119,6 +119,12 @@ class Filter(eqx.Module):
         _check_sizes(num_particles, num_components)
         if not moves:
             raise ValueError("moves: a filter needs at least one")
+        if not any(getattr(move, "weighs", True) for move in moves):
+            names = ", ".join(type(move).__name__ for move in moves)
+            raise ValueError(
+                f"moves: {names} never weigh the particles by what is observed, and log Ẑ would be"
+                " 0; Propagate does, or Weigh after Predict"
+            )
         for move in _with_inner(moves):
             per_component = getattr(move, "particles_per_component", None)
             if per_component is not None and per_component * num_components > num_particles:

@@ -51,6 +51,22 @@ def test_no_moves():
 
 
 @pytest.mark.parametrize(
+    "moves",
+    [
+        [Resample()],
+        [mpfjax.Predict(MODEL)],
+        [Resample(), mpfjax.Predict(MODEL), KMeans(), mpfjax.Prune()],
+        [mpfjax.Every(2, [Resample(), Merge()]), mpfjax.Exclusion(), mpfjax.Exchange()],
+        [mpfjax.ResampleAhead(Resample(), lambda observation, states: -states)],
+    ],
+)
+def test_a_chain_that_never_sees_an_observation(moves):
+    """Its log Ẑ would be zero whatever is observed."""
+    with pytest.raises(ValueError, match=r"moves: \w+.* never weigh the particles"):
+        Filter(MODEL, moves, 10)
+
+
+@pytest.mark.parametrize(
     ("move", "options", "name"),
     [
         (Resample, {"scheme": "optimal"}, "scheme"),

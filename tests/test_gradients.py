@@ -148,7 +148,8 @@ def test_propagation_with_stopped_gradients_is_the_same_to_the_bit(kind):
         "partitioned": lambda gradient: mpfjax.Partitioned(joint, gradient=gradient),
     }[kind]
     model, observation = (joint, TWO[0]) if kind == "partitioned" else (MODEL, ONE[0])
-    mixture = mpfjax.Filter(model, [make("none")], NUM_PARTICLES).init(jax.random.key(6))
+    moves = [make("none"), mpfjax.Weigh(model)]
+    mixture = mpfjax.Filter(model, moves, NUM_PARTICLES).init(jax.random.key(6))
     moved = [
         eqx.filter_jit(make(gradient))(jax.random.key(7), mixture, observation)
         for gradient in ("none", "stop")

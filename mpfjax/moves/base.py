@@ -24,6 +24,11 @@ class AbstractMove(eqx.Module):
         """Whether the move departs from the exact recursion."""
         return False
 
+    @property
+    def weighs(self) -> bool:
+        """Whether the move may change the weights by what was observed; a filter needs one."""
+        return True
+
     @abc.abstractmethod
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -63,6 +68,11 @@ class AbstractRegrouping(AbstractMove):
     mixture has the same distribution as the old one, whatever the new indicators are.
     """
 
+    @property
+    def weighs(self) -> bool:
+        """False: the observation changes no weight."""
+        return False
+
     @abc.abstractmethod
     def regroup(
         self, key: Key[Array, ""], mixture: ParticleMixture
@@ -82,6 +92,11 @@ class AbstractRegrouping(AbstractMove):
 
 class AbstractRejuvenation(AbstractMove):
     """A move that redraws the particles within each component and keeps the component's mass."""
+
+    @property
+    def weighs(self) -> bool:
+        """False: the observation changes no weight."""
+        return False
 
 
 class AbstractResampling(AbstractRejuvenation):

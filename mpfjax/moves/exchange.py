@@ -37,6 +37,11 @@ class Exchange(AbstractMove):
     def __check_init__(self) -> None:
         check_share(threshold=self.threshold)
 
+    @property
+    def weighs(self) -> bool:
+        """False: the observation changes no weight."""
+        return False
+
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, ""]:
         """Whether the masses of the islands are uneven enough, the same for each."""
         log_masses = over_islands(mixture.log_mass)

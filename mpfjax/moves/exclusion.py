@@ -27,6 +27,11 @@ class AbstractExclusion(AbstractPropagation):
         """True: it makes components interact, on top of the model."""
         return True
 
+    @property
+    def weighs(self) -> bool:
+        """False: the observation changes no weight."""
+        return False
+
     def nearness(self, squared_distances: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
         """exp(-d² / (2 radius²)), of squared distances to a mean."""
         return jnp.exp(-squared_distances / (2 * self.radius**2))

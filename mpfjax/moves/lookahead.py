@@ -57,6 +57,11 @@ class ResampleAhead(AbstractMove):
         return self.resample.approximate
 
     @property
+    def weighs(self) -> bool:
+        """False: what the look-ahead adds to the weights is taken away again."""
+        return False
+
+    @property
     def particles_per_component(self) -> int | None:
         """That of the resampling."""
         return self.resample.particles_per_component

@@ -138,6 +138,11 @@ class Predict(AbstractPropagation):
         check_propagated_gradient(self.gradient, self.model)
         check_noise(self.noise, self.model)
 
+    @property
+    def weighs(self) -> bool:
+        """False: the observation changes no weight."""
+        return False
+
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:

@@ -32,6 +32,11 @@ class Prune(AbstractMove):
         """True: a little mass is thrown away."""
         return True
 
+    @property
+    def weighs(self) -> bool:
+        """False: the observation changes no weight."""
+        return False
+
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
     ) -> ParticleMixture:

@@ -157,7 +157,8 @@ class TestMerge:
         # 0 and 1 overlap for the third time, 1 and 2, whose mean lies at 1, for the second.
         durations = jnp.array([[0, 2, 0], [2, 0, 1], [0, 1, 0]], jnp.int32)
         mixture = mixture.replace(memory={"overlap_durations": durations})
-        filter = Filter(QuadraticModel(), [merge, Split()], 60, 3)
+        seen = lambda key, mixture, observation: mixture  # noqa: E731
+        filter = Filter(QuadraticModel(), [merge, Split(), seen], 60, 3)
         moved, _ = eqx.filter_jit(filter._step)(KEY, mixture, jnp.zeros(()))
         labels = np.asarray(moved.component_indicators)
         assert set(labels[:40]) == {0}
