@@ -49,8 +49,10 @@ from mpfjax.moves import PropagateInClusters as PropagateInClusters
 from mpfjax.moves import PropagateIndependently as PropagateIndependently
 from mpfjax.moves import PropagateInStages as PropagateInStages
 from mpfjax.moves import PropagateMarginalised as PropagateMarginalised
+from mpfjax.moves import PropagateRegimes as PropagateRegimes
 from mpfjax.moves import Prune as Prune
 from mpfjax.moves import RandomPartition as RandomPartition
+from mpfjax.moves import RegimeProposal as RegimeProposal
 from mpfjax.moves import Resample as Resample
 from mpfjax.moves import ResampleAhead as ResampleAhead
 from mpfjax.moves import Split as Split

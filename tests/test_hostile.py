@@ -129,6 +129,10 @@ BUILT = {
         mpfjax.PropagateMarginalised,
         {"model": SWITCHING, "proposal": None, "gradient": "none", "noise": "rqmc"},
     ),
+    "RegimeProposal": (mpfjax.RegimeProposal, {"model": SWITCHING}),
+    "PropagateRegimes": (
+        mpfjax.PropagateRegimes, {"model": SWITCHING, "group": None, "scheme": "systematic"}
+    ),
     "SwitchingLinearGaussianModel": (
         mpfjax.SwitchingLinearGaussianModel,
         {"transition_matrix": EYE, "F": EYE, "Q": EYE, "H": EYE, "R": EYE, "m0": np.zeros(1),

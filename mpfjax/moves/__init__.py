@@ -24,6 +24,8 @@ from mpfjax.moves.propagation import Propagate as Propagate
 from mpfjax.moves.propagation import Weigh as Weigh
 from mpfjax.moves.prune import Prune as Prune
 from mpfjax.moves.random_partition import RandomPartition as RandomPartition
+from mpfjax.moves.regimes import PropagateRegimes as PropagateRegimes
+from mpfjax.moves.regimes import RegimeProposal as RegimeProposal
 from mpfjax.moves.resampling import Resample as Resample
 from mpfjax.moves.split import Split as Split
 from mpfjax.moves.stages import PropagateInStages as PropagateInStages

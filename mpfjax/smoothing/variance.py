@@ -19,11 +19,12 @@ from mpfjax.moves.lineages import (
     mass_variances,
     with_new_lineage,
 )
+from mpfjax.moves.regimes import PropagateRegimes
 from mpfjax.moves.resampling import Resample
 from mpfjax.running.scan import FilterRun
 
 # After these a particle has no one ancestor, or one on another island.
-_NO_LINEAGE = (PropagateIndependently, PropagateInClusters, Exchange)
+_NO_LINEAGE = (PropagateIndependently, PropagateInClusters, PropagateRegimes, Exchange)
 
 
 class _KeepFirstAncestors(AbstractRegrouping):

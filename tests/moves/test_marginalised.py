@@ -2,16 +2,35 @@
 
 from functools import cache
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax import Filter, GroupBy, PropagateFamilies, PropagateMarginalised, Resample
+from mpfjax import (
+    Filter,
+    GroupBy,
+    KMeans,
+    PropagateFamilies,
+    PropagateMarginalised,
+    PropagateRegimes,
+    RegimeProposal,
+    Resample,
+)
 from mpfjax.exact import kalman_filter, switching_filter
+from mpfjax.moves.regimes import children
 from tests.marking import thorough
-from tests.switching import MODEL, NUM_REGIMES, OBSERVATIONS, moments, regimes, truth
+from tests.switching import (
+    MODEL,
+    NUM_REGIMES,
+    OBSERVATIONS,
+    TRANSITIONS,
+    moments,
+    regimes,
+    truth,
+)
 
 NUM_RUNS, NUM_PARTICLES = 1000, 30
 KEY = jax.random.key(0)
@@ -25,6 +44,23 @@ FILTERS = {
     "pf": lambda: mpfjax.particle_filter(MODEL, NUM_PARTICLES),
     "pf rqmc": lambda: mpfjax.particle_filter(MODEL, NUM_PARTICLES, noise="rqmc"),
     "mpf": lambda: mpfjax.mixture_particle_filter(MODEL, NUM_PARTICLES, 3, regroup_every=1),
+    "fully adapted": lambda: mpfjax.auxiliary_particle_filter(
+        MODEL, NUM_PARTICLES, RegimeProposal(MODEL)
+    ),
+    "optimal proposal, mpf rqmc": lambda: mpfjax.mixture_particle_filter(
+        MODEL, NUM_PARTICLES, 3, proposal=RegimeProposal(MODEL), noise="rqmc"
+    ),
+    "all children": lambda: Filter(MODEL, [PropagateRegimes(MODEL)], NUM_PARTICLES),
+    "all children, by regime": lambda: Filter(
+        MODEL, [PropagateRegimes(MODEL, GroupBy(by_regime))], NUM_PARTICLES, NUM_REGIMES
+    ),
+    "all children, in components": lambda: Filter(
+        MODEL,
+        [PropagateRegimes(MODEL, scheme="stratified"), KMeans(2)],
+        NUM_PARTICLES,
+        2,
+        initial_moves=[KMeans(2, reseed=True)],
+    ),
     "families": lambda: mpfjax.particle_filter(MODEL, NUM_PARTICLES, num_draws=3),
     "a component for each regime": lambda: Filter(
         MODEL,
@@ -34,7 +70,7 @@ FILTERS = {
         initial_moves=[GroupBy(by_regime)],
     ),
 }
-QUICK = ("pf", "a component for each regime")
+QUICK = ("pf", "a component for each regime", "all children, by regime")
 
 
 @cache
@@ -259,3 +295,91 @@ def test_misuse_is_named():
         PropagateMarginalised(OnePath(LINEAR), noise="rqmc")
     with pytest.raises(ValueError, match="propagate:"):
         PropagateFamilies(PropagateMarginalised(MODEL, gradient="stop"))
+
+
+def test_with_the_optimal_proposal_all_weights_are_equal():
+    filter = mpfjax.auxiliary_particle_filter(MODEL, NUM_PARTICLES, RegimeProposal(MODEL))
+    run = mpfjax.run_filter(KEY, filter, OBSERVATIONS, lambda mixture: mixture.log_weights)
+    np.testing.assert_allclose(run.collected, -np.log(NUM_PARTICLES), atol=1e-4)
+
+
+def test_optimal_resampling_keeps_heavy_children_and_none_twice():
+    filter = Filter(MODEL, [PropagateRegimes(MODEL)], NUM_PARTICLES)
+    start = mpfjax.run_filter(KEY, filter, OBSERVATIONS[:4], lambda mixture: None).final
+    step = jax.jit(jax.vmap(lambda key: filter.step(key, start, OBSERVATIONS[4])[0]))
+    after = jax.tree.map(np.asarray, step(jax.random.split(KEY, 2000)))
+    child = after.ancestor_indices * NUM_REGIMES + after.particles.latent
+    assert all(len(set(row)) == NUM_PARTICLES for row in child)
+    # The children's own weights, and the threshold by trying all numbers of heavy ones.
+    _, _, log_factors = children(MODEL, OBSERVATIONS[4], start.particles)
+    weights = np.exp(np.asarray(start.log_weights[None] + log_factors, float)).T.ravel()
+    weights /= weights.sum()
+    falling = np.sort(weights)[::-1]
+    for num_heavy in range(NUM_PARTICLES):
+        threshold = falling[num_heavy:].sum() / (NUM_PARTICLES - num_heavy)
+        if falling[num_heavy] < threshold:
+            break
+    kept = np.zeros((2000, len(weights)))
+    np.put_along_axis(kept, child, np.exp(after.log_weights), axis=1)
+    heavy = weights >= threshold
+    assert 0 < heavy.sum() < NUM_PARTICLES
+    np.testing.assert_allclose(kept[:, heavy], np.tile(weights[heavy], (2000, 1)), rtol=1e-3)
+    light = kept[:, ~heavy]
+    np.testing.assert_allclose(light[light > 0], threshold, rtol=1e-3)
+    error = 4.5 * light.std(axis=0) / np.sqrt(2000) + 4 * threshold / 2000
+    assert (np.abs(light.mean(axis=0) - weights[~heavy]) <= error).all()
+
+
+def test_by_regime_each_keeps_its_share_of_the_slots():
+    filter = FILTERS["all children, by regime"]()
+    run = mpfjax.run_filter(KEY, filter, 5 + 0 * OBSERVATIONS, lambda m: m.component_counts)
+    assert (np.asarray(run.collected) == NUM_PARTICLES // NUM_REGIMES).all()
+
+
+def test_regimes_need_a_model_that_lists_them():
+    for make in (RegimeProposal, PropagateRegimes):
+        with pytest.raises(ValueError, match="all_transitions"):
+            make(OnePath(LINEAR))
+
+
+def test_a_forecast_of_all_children_moves_regimes_by_their_matrix():
+    filter = Filter(MODEL, [PropagateRegimes(MODEL)], 3000)
+    start = mpfjax.run_filter(KEY, filter, OBSERVATIONS[:3], lambda mixture: None).final
+    ahead, info = filter.predict(jax.random.key(5), start)
+    assert float(info.log_likelihood_increment) == 0
+    np.testing.assert_allclose(float(ahead.log_mass), 0, atol=1e-4)
+    np.testing.assert_allclose(regimes(ahead), regimes(start) @ TRANSITIONS, atol=0.01)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", ["stop", "stop, optimal proposal", "all children"])
+def test_derivatives_of_the_evidence_are_unbiased(kind):
+    """E[∇Ẑ] = ∇Z, for a parameter of the law of z and one of the noise of x."""
+
+    def model_of(parameters):
+        stays, scale = parameters
+        matrix = TRANSITIONS + stays * jnp.array([[1.0, -1, 0], [0, 1, -1], [-1, 0, 1]])
+        return eqx.tree_at(lambda m: (m.transition_matrix, m.Q), MODEL, (matrix, scale * MODEL.Q))
+
+    def run_of(parameters, key):
+        model = model_of(parameters)
+        if kind == "all children":
+            filter = Filter(model, [PropagateRegimes(model)], 10)
+        else:
+            proposal = RegimeProposal(model) if "proposal" in kind else None
+            filter = mpfjax.particle_filter(model, 10, proposal=proposal, gradient="stop")
+        run = mpfjax.run_filter(key, filter, OBSERVATIONS[:4], lambda mixture: None)
+        return run.log_marginal_likelihood
+
+    at = (jnp.array(0.0), jnp.array(1.0))
+    exact, slope = jax.value_and_grad(
+        lambda p: switching_filter(model_of(p), OBSERVATIONS[:4]).log_marginal_likelihood
+    )(at)
+    keys = jax.random.split(jax.random.key(3), 4000)
+    logs, slopes = jax.jit(jax.vmap(jax.value_and_grad(run_of), (None, 0)))(at, keys)
+    ratios = np.exp(np.asarray(logs - exact))
+    for found, expected in zip(slopes, slope, strict=True):
+        values = ratios * np.asarray(found)
+        error = values.std() / np.sqrt(len(keys))
+        assert error < 0.3 * abs(float(expected))
+        assert abs(values.mean() - float(expected)) < 4 * error
