@@ -9,13 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from mpfjax.checks import as_numbers, check_one_of, check_type, real_arrays
 from mpfjax.models.base import require
+from mpfjax.models.inputs import with_inputs
 from mpfjax.models.linear_gaussian import LinearGaussianModel
 from mpfjax.models.switching import SwitchingLinearGaussianModel
-from mpfjax.observations import as_arrays
+from mpfjax.observations import as_arrays, steps_of_inputs
 from mpfjax.operations.logarithms import log_sum_exp
 
 
@@ -51,6 +52,7 @@ def grid_filter(
     log_initial: Float[Array, " g"] | None = None,
     *,
     state_shape: tuple[int, ...] = (),
+    inputs: PyTree = None,
 ) -> GridFilterRun:
     """The recursion of Vermaak et al. (2003), eqs. 1 and 2, by quadrature on an even grid.
 
@@ -60,6 +62,7 @@ def grid_filter(
       the smallest standard deviation of the model. The error then falls faster than any power of
       the spacing.
     - `log_initial`: log p(x_0) at the grid points; None calls the model's own `log_initial`.
+    - `inputs`: u_1, ..., u_t, as for `run_filter`.
 
     Costs O(t g²). Differentiable in the model's parameters. Raises `ValueError` for a grid that
     is not one ascending row, or a model without these densities. Use it as the truth for a
@@ -75,37 +78,42 @@ def grid_filter(
         require(model, "log_initial", "grid_filter without log_initial")
     else:
         log_initial = real_arrays("g", log_initial=log_initial)
-    return _grid_filter(model, observations, grid, log_initial, state_shape)
+    length = jax.tree.leaves(observations)[0].shape[0]
+    inputs = steps_of_inputs(inputs, length, model)
+    return _grid_filter(model, observations, grid, log_initial, state_shape, inputs)
 
 
 @eqx.filter_jit
-def _grid_filter(model, observations, grid, log_initial, state_shape):
+def _grid_filter(model, observations, grid, log_initial, state_shape, inputs):
     num_points = grid.shape[0]
     states = grid.reshape(-1, *state_shape)
     log_prior = model.log_initial(states) if log_initial is None else log_initial
     log_cell = jnp.log(grid[1] - grid[0])
-    kernel = jnp.exp(
-        log_cell
-        + jax.vmap(
-            lambda previous: model.log_transition(
-                states, jnp.broadcast_to(previous, (num_points, *state_shape))
-            )
-        )(states)
-    )
+
+    def kernel_of(model: Any) -> Float[Array, "g g"]:
+        def row(previous: Float[Array, "..."]) -> Float[Array, " g"]:
+            copies = jnp.broadcast_to(previous, (num_points, *state_shape))
+            return model.log_transition(states, copies)
+
+        return jnp.exp(log_cell + jax.vmap(row)(states))
+
+    shared = None if inputs is not None else kernel_of(model)
 
     def advance(
-        probabilities: Float[Array, " g"], observation: Float[Array, "..."]
+        probabilities: Float[Array, " g"], step: tuple[Float[Array, "..."], PyTree]
     ) -> tuple[Float[Array, " g"], tuple[Float[Array, " g"], Float[Array, ""]]]:
-        predicted = probabilities @ kernel
+        observation, now = step
+        given = with_inputs(model, now)
+        predicted = probabilities @ (kernel_of(given) if shared is None else shared)
         positive = predicted > 0
         log_predicted = jnp.where(positive, jnp.log(jnp.where(positive, predicted, 1.0)), -jnp.inf)
-        log_joint = log_predicted + model.log_likelihood(observation, states)
+        log_joint = log_predicted + given.log_likelihood(observation, states)
         increment = log_sum_exp(log_joint)
         updated = jnp.exp(log_joint - increment)
         return updated, (updated, increment)
 
     initial = jnp.exp(log_prior - log_sum_exp(log_prior))
-    _, (probabilities, increments) = jax.lax.scan(advance, initial, observations)
+    _, (probabilities, increments) = jax.lax.scan(advance, initial, (observations, inputs))
     return GridFilterRun(grid, probabilities, increments, jnp.sum(increments))
 
 
@@ -133,13 +141,18 @@ class KalmanSmootherRun(eqx.Module):
 
 
 def kalman_filter(
-    model: LinearGaussianModel, observations: Float[Array, "t p"], *, missing: str = "error"
+    model: LinearGaussianModel,
+    observations: Float[Array, "t p"],
+    *,
+    inputs: PyTree = None,
+    missing: str = "error",
 ) -> KalmanFilterRun:
     """The Kalman filter (Kalman 1960), with the library's convention: y_1 follows x_1, not x_0.
 
     Covariances are updated in Joseph's form, which stays positive in float32. Differentiable, and
     `jax.vmap` maps it over several series.
 
+    - `inputs`: the model's, with a leading axis t: controls, or matrices that change in time.
     - `missing`: "error" raises a `ValueError` for a NaN or an infinity, as far as the numbers are
       known. "skip" leaves out each number that is NaN: of two sensors, the one that is there
       counts. (A particle filter leaves out the whole step, unless its model has `handles_missing`.)
@@ -147,12 +160,17 @@ def kalman_filter(
     Raises `ValueError` for another model and observations that are not (t, p). Use it as the truth
     for a linear-Gaussian model.
     """
-    filtered, increments = _kalman_filter(model, _checked(model, observations, missing))
+    series = _checked(model, observations, inputs, missing)
+    filtered, increments = _kalman_filter(model, *series)
     return KalmanFilterRun(*filtered, increments, jnp.sum(increments))
 
 
 def kalman_smoother(
-    model: LinearGaussianModel, observations: Float[Array, "t p"], *, missing: str = "error"
+    model: LinearGaussianModel,
+    observations: Float[Array, "t p"],
+    *,
+    inputs: PyTree = None,
+    missing: str = "error",
 ) -> KalmanSmootherRun:
     """E and Cov of x_0, ..., x_t given y_1..y_t, by the recursion of Rauch, Tung and Striebel 1965.
 
@@ -166,10 +184,12 @@ def kalman_smoother(
     over several series. Arguments and errors are those of `kalman_filter`. Use it as the truth for
     what a particle smoother says of a linear-Gaussian model.
     """
-    return _smooth(model, _checked(model, observations, missing))
+    return _smooth(model, *_checked(model, observations, inputs, missing))
 
 
-def _checked(model: Any, observations: Any, missing: str) -> Float[Array, "t p"]:
+def _checked(
+    model: Any, observations: Any, inputs: PyTree, missing: str
+) -> tuple[Float[Array, "t p"], PyTree]:
     check_type(LinearGaussianModel, "a LinearGaussianModel", model=model)
     check_one_of(("error", "skip"), missing=missing)
     rows = jnp.asarray(as_numbers("observations", observations, floating=True))
@@ -182,17 +202,18 @@ def _checked(model: Any, observations: Any, missing: str) -> Float[Array, "t p"]
             what = "infinite" if missing == "skip" else "NaN or infinite"
             first = int(np.argmin(usable.all(axis=1)))
             raise ValueError(f"observations: {what} at index {first} of the leading axis")
-    return rows.astype(model.m0.dtype)
+    return rows.astype(model.m0.dtype), steps_of_inputs(inputs, rows.shape[0], model)
 
 
 @eqx.filter_jit
-def _kalman_filter(model, observations):
+def _kalman_filter(constant, observations, inputs):
     """Means and covariances of x_1, ..., x_t, and the increments; a NaN is a missing number."""
-    identity = jnp.eye(model.m0.shape[0], dtype=model.m0.dtype)
+    identity = jnp.eye(constant.m0.shape[0], dtype=constant.m0.dtype)
 
-    def advance(carry, observation):
-        mean, covariance = carry
-        mean = model.A @ mean
+    def advance(carry, step):
+        (mean, covariance), (observation, now) = carry, step
+        model = with_inputs(constant, now)
+        mean = _moved(model, mean)
         covariance = model.A @ covariance @ model.A.T + model.Q
         seen = ~jnp.isnan(observation)
         # A number that is missing is one of variance one, of nothing and equal to what is expected.
@@ -209,28 +230,36 @@ def _kalman_filter(model, observations):
         covariance = left @ covariance @ left.T + gain @ R @ gain.T
         return (mean, covariance), (mean, covariance, increment)
 
-    _, (means, covariances, increments) = jax.lax.scan(advance, (model.m0, model.P0), observations)
+    start, steps = (constant.m0, constant.P0), (observations, inputs)
+    _, (means, covariances, increments) = jax.lax.scan(advance, start, steps)
     return (means, covariances), increments
 
 
-@eqx.filter_jit
-def _smooth(model, observations):
-    (means, covariances), increments = _kalman_filter(model, observations)
-    identity = jnp.eye(model.m0.shape[0], dtype=model.m0.dtype)
+def _moved(model: LinearGaussianModel, mean: Float[Array, " d"]) -> Float[Array, " d"]:
+    """A m + B u."""
+    return model.A @ mean if model.control is None else model.A @ mean + model.control
 
-    def back(later, filtered):
-        (later_mean, later_covariance), (mean, covariance) = later, filtered
+
+@eqx.filter_jit
+def _smooth(constant, observations, inputs):
+    (means, covariances), increments = _kalman_filter(constant, observations, inputs)
+    identity = jnp.eye(constant.m0.shape[0], dtype=constant.m0.dtype)
+
+    def back(later, earlier):
+        (later_mean, later_covariance), (mean, covariance, now) = later, earlier
+        model = with_inputs(constant, now)
         predicted = model.A @ covariance @ model.A.T + model.Q
         gain = jnp.linalg.solve(predicted, model.A @ covariance).T
         left = identity - gain @ model.A
-        mean = mean + gain @ (later_mean - model.A @ mean)
+        mean = mean + gain @ (later_mean - _moved(model, mean))
         covariance = left @ covariance @ left.T + gain @ (model.Q + later_covariance) @ gain.T
         return (mean, covariance), (mean, covariance, later_covariance @ gain.T)
 
     last = means[-1], covariances[-1]
     earlier = (
-        jnp.concatenate([model.m0[None], means[:-1]]),
-        jnp.concatenate([model.P0[None], covariances[:-1]]),
+        jnp.concatenate([constant.m0[None], means[:-1]]),
+        jnp.concatenate([constant.P0[None], covariances[:-1]]),
+        inputs,
     )
     _, (smoothed, spreads, lagged) = jax.lax.scan(back, last, earlier, reverse=True)
     return KalmanSmootherRun(

@@ -31,7 +31,13 @@ from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvena
 from mpfjax.moves.every import Every
 from mpfjax.moves.exchange import Exchange
 from mpfjax.moves.lineages import LINEAGE, evidence_variance, mass_variances
-from mpfjax.observations import checked_observation, one_observation
+from mpfjax.moves.sharing import give_inputs, tie, untie
+from mpfjax.observations import (
+    checked_inputs,
+    checked_observation,
+    one_input,
+    one_observation,
+)
 from mpfjax.operations.across_islands import excess_over_islands, island_index, num_islands
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.floats import default_float
@@ -71,10 +77,6 @@ class Start(NamedTuple):
     particles: PyTree = None
     """one for each slot; the slots after the first `num_particles` are empty."""
     num_particles: Int[Array, "*seeds"] | None = None
-
-
-class _Tied(eqx.Module):
-    """Stands in a move where the filter's own model belongs, so that it is stored only once."""
 
 
 class Filter(eqx.Module):
@@ -137,8 +139,8 @@ class Filter(eqx.Module):
         if len(set(names)) < len(names):
             raise ValueError(f"moves: two of them would share one memory, of {sorted(names)}")
         self.model = model
-        self._moves = _tie(moves, model)
-        self._initial_moves = _tie(initial_moves, model)
+        self._moves = tie(moves, model)
+        self._initial_moves = tie(initial_moves, model)
         self.num_particles = int(num_particles)
         self.num_components = int(num_components)
         check_one_of(NOISES, initial_noise=initial_noise)
@@ -184,10 +186,22 @@ class Filter(eqx.Module):
             mixture = move(move_key, mixture)
         return mixture
 
+    def with_inputs(self, inputs: PyTree) -> "Filter":
+        """The filter at a step whose known inputs are u_t: every model of it has them.
+
+        `step`, `predict` and the runners do this themselves. None leaves the filter as it is.
+        """
+        return give_inputs(self, self.model, inputs)
+
     def step(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+        self,
+        key: Key[Array, ""],
+        mixture: ParticleMixture,
+        observation: PyTree,
+        *,
+        inputs: PyTree = None,
     ) -> tuple[ParticleMixture, StepInfo]:
-        """The mixture at t and a report, from the mixture at t-1 and y_t.
+        """The mixture at t and a report, from the mixture at t-1, y_t and the known inputs u_t.
 
         A NaN or infinite observation is an error, unless the model has `handles_missing`. For a
         step without an observation call `predict`. If every particle has zero likelihood, the
@@ -197,12 +211,13 @@ class Filter(eqx.Module):
         check_key(key)
         check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
         observation = one_observation(observation)
+        inputs = one_input(inputs, self.model)
         return with_floats_traced(
-            lambda filter: _checked_step(filter, key, mixture, observation), self
+            lambda filter: _checked_step(filter, key, mixture, observation, inputs), self
         )
 
     def predict(
-        self, key: Key[Array, ""], mixture: ParticleMixture
+        self, key: Key[Array, ""], mixture: ParticleMixture, *, inputs: PyTree = None
     ) -> tuple[ParticleMixture, StepInfo]:
         """One step without an observation: the particles propagate, the weights stay.
 
@@ -211,7 +226,10 @@ class Filter(eqx.Module):
         """
         check_key(key)
         check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
-        return with_floats_traced(lambda filter: _checked_predict(filter, key, mixture), self)
+        inputs = one_input(inputs, self.model)
+        return with_floats_traced(
+            lambda filter: _checked_predict(filter, key, mixture, inputs), self
+        )
 
     def _step(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -260,16 +278,16 @@ class Filter(eqx.Module):
 
 
 @jit_on_wide_vectors
-def _checked_step(filter, key, mixture, observation):
+def _checked_step(filter, key, mixture, observation, inputs):
     observation = checked_observation(observation, filter.model)
-    moved, info = filter._step(key, mixture, observation)
+    moved, info = filter.with_inputs(checked_inputs(inputs))._step(key, mixture, observation)
     broken = ~(info.log_likelihood_increment < jnp.inf)
     return eqx.error_if((moved, info), broken, BROKEN_DENSITY)
 
 
 @jit_on_wide_vectors
-def _checked_predict(filter, key, mixture):
-    return filter._predict(key, mixture)
+def _checked_predict(filter, key, mixture, inputs):
+    return filter.with_inputs(checked_inputs(inputs))._predict(key, mixture)
 
 
 def sample_initial(
@@ -354,16 +372,6 @@ def _with_inner(moves: Iterable[Any]) -> Iterator[Any]:
 
 def _own_memory(move: AbstractMove) -> list[str]:
     return [move.name] if isinstance(move, Every) else list(move.initial_memory(1))
-
-
-def _tie(moves: tuple[Any, ...], model: Any) -> tuple[Any, ...]:
-    is_model = lambda node: node is model  # noqa: E731
-    return jax.tree.map(lambda node: _Tied() if node is model else node, moves, is_leaf=is_model)
-
-
-def untie(moves: tuple[Any, ...], model: Any) -> tuple[Any, ...]:
-    is_tied = lambda node: isinstance(node, _Tied)  # noqa: E731
-    return jax.tree.map(lambda node: model if is_tied(node) else node, moves, is_leaf=is_tied)
 
 
 def _as_moves(moves: Any, name: str) -> tuple[Any, ...]:

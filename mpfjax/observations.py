@@ -1,4 +1,4 @@
-"""The observations that a user gives: arrays of finite numbers, and which steps are missing."""
+"""What a user gives for each step: observations, which of them are missing, and known inputs."""
 
 from typing import Any
 
@@ -10,6 +10,88 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree
 
 from mpfjax.checks import as_numbers, check_one_of
+from mpfjax.models.base import model_name
+from mpfjax.models.inputs import takes_inputs
+
+
+class Series(eqx.Module):
+    """What a filter is given at the steps 1, ..., t; every leaf has a leading axis t."""
+
+    observations: PyTree
+    """y_1, ..., y_t."""
+    present: Bool[Array, " t"] | None = None
+    """which observations are there; None is all of them."""
+    inputs: PyTree = None
+    """u_1, ..., u_t; None where the model knows none."""
+
+    @property
+    def length(self) -> int:
+        """t."""
+        return jax.tree.leaves(self.observations)[0].shape[0]
+
+
+def as_series(observations: PyTree, inputs: PyTree, missing: str, model: Any) -> Series:
+    """The observations and inputs as arrays; a `ValueError` for what cannot be run.
+
+    A missing y_t does not miss its u_t: inputs are always finite numbers.
+    """
+    present = present_steps(observations, missing, model)
+    series = Series(as_arrays(observations), present)
+    return Series(series.observations, present, steps_of_inputs(inputs, series.length, model))
+
+
+def steps_of_inputs(
+    inputs: PyTree, length: int, model: Any, of_what: str = "observations"
+) -> PyTree:
+    """u_1, ..., u_t as arrays; a `ValueError` unless they are finite numbers, one for each step."""
+    if inputs is None:
+        return None
+    _require_place_for(inputs, model)
+    arrays = as_arrays(inputs, "inputs")
+    leaves = jax.tree.leaves(arrays)
+    own_length = _length(leaves, inputs, "inputs")
+    if own_length != length:
+        raise ValueError(
+            f"inputs: the leading axis t is {own_length}, and that of the {of_what} is {length}"
+        )
+    known = [leaf for leaf in leaves if not isinstance(leaf, Tracer) and _is_inexact(leaf)]
+    for usable in _each_step(np, _usable(np, known, False), "all"):
+        if not usable.all():
+            raise ValueError(
+                f"inputs: NaN or infinite at index {int(np.argmin(usable))} of the leading axis"
+            )
+    # Under the caller's jit no value can be named: the check runs with the program.
+    check = lambda leaf: checked_inputs(leaf) if isinstance(leaf, Tracer) else leaf  # noqa: E731
+    return jax.tree.map(check, arrays)
+
+
+def one_input(inputs: PyTree, model: Any) -> PyTree:
+    """The arrays of u_t; a `ValueError` for what is no number, or a model without a place."""
+    if inputs is None:
+        return None
+    _require_place_for(inputs, model)
+    if not jax.tree.leaves(inputs):
+        raise ValueError("inputs: there are none")
+    return as_arrays(inputs, "inputs")
+
+
+def checked_inputs(inputs: PyTree) -> PyTree:
+    """The inputs; an error at run time for a NaN or an infinity."""
+
+    def check(leaf: Any) -> Any:
+        if not _is_inexact(leaf):
+            return leaf
+        return eqx.error_if(leaf, ~jnp.all(jnp.isfinite(leaf)), "inputs: NaN or infinite")
+
+    return jax.tree.map(check, inputs)
+
+
+def _require_place_for(inputs: PyTree, model: Any) -> None:
+    if not takes_inputs(model):
+        raise ValueError(
+            f"inputs: {model_name(model)} has no place for them; declare a field"
+            " `inputs: PyTree = None`, which is then u_t at each step, or define with_inputs"
+        )
 
 
 def as_arrays(observations: PyTree, name: str = "observations") -> PyTree:
@@ -30,7 +112,7 @@ def checked_observation(observation: PyTree, model: Any) -> PyTree:
     what = "infinite" if takes_nan else "NaN or infinite"
 
     def check(leaf: Array) -> Array:
-        if not jnp.issubdtype(leaf.dtype, jnp.inexact):
+        if not _is_inexact(leaf):
             return leaf
         (usable,) = _usable(jnp, [leaf], takes_nan)
         return eqx.error_if(leaf, ~jnp.all(usable), f"observation: {what}; use predict to skip it")
@@ -42,16 +124,7 @@ def check_series(observations: PyTree, missing: str) -> list[Any]:
     """The arrays of y_1..y_t; a `ValueError` for what no model can be run on."""
     check_one_of(("error", "skip"), missing=missing)
     leaves = jax.tree.leaves(as_arrays(observations))
-    if not leaves:
-        raise ValueError("observations: there are none")
-    lengths = {leaf.shape[0] if leaf.ndim else None for leaf in leaves}
-    if len(lengths) > 1 or None in lengths:
-        shapes = [leaf.shape for leaf in leaves]
-        is_list = isinstance(observations, list | tuple)
-        hint = "; a list is so many arrays, jnp.asarray(observations) is one" if is_list else ""
-        raise ValueError(f"observations: shapes {shapes} do not share a leading axis t{hint}")
-    if lengths == {0}:
-        raise ValueError("observations: the leading axis t is empty")
+    _length(leaves, observations, "observations")
     return leaves
 
 
@@ -62,7 +135,7 @@ def present_steps(observations: PyTree, missing: str, model: Any) -> Bool[Array,
     all its numbers are.
     """
     leaves = check_series(observations, missing)
-    inexact = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+    inexact = [leaf for leaf in leaves if _is_inexact(leaf)]
     if not inexact:
         return None
     takes_nan = getattr(model, "handles_missing", False)
@@ -81,6 +154,25 @@ def present_steps(observations: PyTree, missing: str, model: Any) -> Bool[Array,
         seen = [~np.isnan(leaf) for leaf in inexact]
         present = np.logical_or.reduce(_each_step(np, seen, "any")) | whole
     return None if present.all() else jnp.asarray(present)
+
+
+def _length(leaves: list[Any], tree: PyTree, name: str) -> int:
+    """t, the length of the leading axis that all leaves share; a `ValueError` without one."""
+    if not leaves:
+        raise ValueError(f"{name}: there are none")
+    lengths = {leaf.shape[0] if leaf.ndim else None for leaf in leaves}
+    if len(lengths) > 1 or None in lengths:
+        shapes = [leaf.shape for leaf in leaves]
+        is_list = isinstance(tree, list | tuple)
+        hint = f"; a list is so many arrays, jnp.asarray({name}) is one" if is_list else ""
+        raise ValueError(f"{name}: shapes {shapes} do not share a leading axis t{hint}")
+    if lengths == {0}:
+        raise ValueError(f"{name}: the leading axis t is empty")
+    return lengths.pop()
+
+
+def _is_inexact(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jnp.inexact)
 
 
 def _usable(numpy: Any, leaves: list[Any], takes_nan: bool) -> list[Any]:

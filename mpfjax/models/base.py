@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_whole, shown
+from mpfjax.models.inputs import replaced, takes_inputs, with_inputs
 from mpfjax.models.noise import noise_dtype
 from mpfjax.operations.generator import normal, split
 from mpfjax.operations.sobol import direction_numbers
@@ -39,9 +40,29 @@ class AbstractStateSpaceModel(eqx.Module):
     `jax.scipy.special.ndtr` of a normal one. `Propagate(noise="rqmc")` needs this form: its noise
     is spread evenly over the particles. `initial_from_noise(noise)` and `initial_noise_dimension`
     do the same for x_0.
+
+    A model that declares a field `inputs`, None by default, finds u_t there at each step: what is
+    known beside the observation, such as a control, a covariate or the time since the last step.
+    All its methods see `self.inputs`. A model that makes something else of u_t defines
+    `with_inputs` itself. x_0 has no input.
     """
 
     handles_missing = False
+
+    @property
+    def takes_inputs(self) -> bool:
+        """Whether the model has a place for u_t: a field `inputs`, or its own `with_inputs`."""
+        default = AbstractStateSpaceModel.with_inputs
+        is_field = "inputs" in type(self).__dataclass_fields__
+        return is_field or type(self).with_inputs is not default
+
+    def with_inputs(self, inputs: PyTree) -> "AbstractStateSpaceModel":
+        """The model at a step whose known inputs are u_t: the field `inputs` is set.
+
+        A model may define it otherwise, and so let any of its parameters change in time. It is
+        called while JAX traces a step, so it must not ask for the values of u_t in Python.
+        """
+        return replaced(self, inputs=inputs)
 
     @abc.abstractmethod
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
@@ -272,6 +293,13 @@ class _PerParticleModel(AbstractStateSpaceModel):
     def handles_missing(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return getattr(self.model, "handles_missing", False)
 
+    @property
+    def takes_inputs(self) -> bool:
+        return takes_inputs(self.model)
+
+    def with_inputs(self, inputs: PyTree) -> "_PerParticleModel":
+        return _PerParticleModel(with_inputs(self.model, inputs))
+
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         return jax.vmap(self.model.sample_initial)(split(key, num_particles))
 
@@ -342,8 +370,10 @@ def per_particle(model: Any) -> AbstractStateSpaceModel:
     previous_state)`, `transition_from_noise(noise, state)` with noise (k,) (also in place of
     `sample_transition`), `transition_mean(state)` and `observation_mean(state)`, and, for all
     particles, `noise_dimension`, `transition_covariance`, `observation_covariance` and
-    `prepare_observation(observation)`. Use it for a first version of a model: with a key for each
-    particle, draws take four to five times as long as those of a batched model.
+    `prepare_observation(observation)`. Known inputs u_t are set as its `inputs` where it has an
+    attribute of this name, or handed to its `with_inputs(inputs)`. Use it for a first version of a
+    model: with a key for each particle, draws take four to five times as long as those of a batched
+    model.
 
     Raises `ValueError` where one of the three methods is missing.
     """

@@ -1,20 +1,35 @@
 """The linear-Gaussian model, whose filtering distribution the Kalman filter gives exactly."""
 
+import dataclasses
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_finite_array, check_shape, to_array
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.operations.generator import normal
 from mpfjax.operations.matrices import row_sums, solve_lower
 
+_IN_TIME = ("A", "Q", "H", "R", "B", "inputs")
+
+
+def _if_given(name: str) -> Any:
+    """A converter of an argument that may be None."""
+    return lambda value: None if value is None else to_array(name)(value)
+
 
 class LinearGaussianModel(AbstractStateSpaceModel):
-    """x_t = A x_{t-1} + N(0, Q), y_t = H x_t + N(0, R), x_0 ~ N(m0, P0).
+    """x_t = A x_{t-1} + B u_t + N(0, Q), y_t = H x_t + N(0, R), x_0 ~ N(m0, P0).
 
     - `A`, `Q`: (d, d); `H`: (p, d); `R`: (p, p); `m0`: (d,); `P0`: (d, d). Covariances are
       positive definite. States have shape (n, d), observations (p,).
+    - `B`: (d, k), the control matrix, for inputs u_t, (k,). None leaves B u_t out.
+
+    Inputs are u_t alone, or a dict of the fields that change in time by their names, such as
+    {"A": ..., "Q": ..., "inputs": ...}: each is that field at step t. So the matrices of a
+    continuous-time system at irregular times are inputs too.
 
     Raises `ValueError` for shapes that do not fit together. Use it to compare a filter
     with the Kalman filter, or where the system is linear.
@@ -26,6 +41,8 @@ class LinearGaussianModel(AbstractStateSpaceModel):
     R: Float[Array, "p p"] = eqx.field(converter=to_array("R"))
     m0: Float[Array, " d"] = eqx.field(converter=to_array("m0"))
     P0: Float[Array, "d d"] = eqx.field(converter=to_array("P0"))
+    B: Float[Array, "d k"] | None = eqx.field(converter=_if_given("B"), default=None)
+    inputs: Float[Array, " k"] | None = eqx.field(converter=_if_given("inputs"), default=None)
 
     def __check_init__(self) -> None:
         d = self.m0.shape[-1] if self.m0.ndim == 1 else None
@@ -40,6 +57,31 @@ class LinearGaussianModel(AbstractStateSpaceModel):
                     f" {self.m0.shape} and H of shape {self.H.shape}"
                 )
             check_finite_array(**{name: getattr(self, name)})
+        if self.B is not None:
+            if self.B.ndim != 2 or self.B.shape[0] != d:
+                raise ValueError(f"B: shape {self.B.shape} is not ({d}, k), for m0 of shape ({d},)")
+            check_finite_array(B=self.B)
+
+        if self.inputs is not None:
+            shape = None if self.B is None else self.B.shape[1:]
+            if self.inputs.shape != shape:
+                raise ValueError(
+                    f"inputs: shape {self.inputs.shape} of u_t, where B is"
+                    f" {None if self.B is None else f'of shape {self.B.shape}'}"
+                )
+
+    def with_inputs(self, inputs: PyTree) -> "LinearGaussianModel":
+        """The model at step t: u_t, (k,), or a dict of the fields that change in time."""
+        fields = inputs if isinstance(inputs, dict) else {"inputs": inputs}
+        unknown = sorted(set(fields) - set(_IN_TIME))
+        if unknown:
+            raise ValueError(f"inputs: {unknown} are not among {list(_IN_TIME)}")
+        return dataclasses.replace(self, **fields)
+
+    @property
+    def control(self) -> Float[Array, " d"] | None:
+        """B u_t; None where there is no B, or no u_t."""
+        return None if self.B is None or self.inputs is None else self.B @ self.inputs
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n d"]:
         """x_0 ~ N(m0, P0)."""
@@ -64,7 +106,7 @@ class LinearGaussianModel(AbstractStateSpaceModel):
     def transition_from_noise(
         self, noise: Float[Array, "n d"], states: Float[Array, "n d"]
     ) -> Float[Array, "n d"]:
-        """x_t ~ N(A x_{t-1}, Q)."""
+        """x_t ~ N(A x_{t-1} + B u_t, Q)."""
         check_shape(f"n {self.noise_dimension}", noise=noise)
         return self.transition_mean(states) + noise @ jnp.linalg.cholesky(self.Q).T
 
@@ -82,7 +124,7 @@ class LinearGaussianModel(AbstractStateSpaceModel):
     def log_transition(
         self, states: Float[Array, "n d"], previous_states: Float[Array, "n d"]
     ) -> Float[Array, " n"]:
-        """log N(x_t; A x_{t-1}, Q)."""
+        """log N(x_t; A x_{t-1} + B u_t, Q)."""
         return _log_normal(states - self.transition_mean(previous_states), self.Q)
 
     def log_initial(self, states: Float[Array, "n d"]) -> Float[Array, " n"]:
@@ -90,8 +132,9 @@ class LinearGaussianModel(AbstractStateSpaceModel):
         return _log_normal(states - self.m0[None], self.P0)
 
     def transition_mean(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
-        """A x_{t-1}."""
-        return states @ self.A.T
+        """A x_{t-1} + B u_t."""
+        mean = states @ self.A.T
+        return mean if self.control is None else mean + self.control[None]
 
     def observation_mean(self, states: Float[Array, "n d"]) -> Float[Array, "n p"]:
         """H x_t."""

@@ -17,6 +17,7 @@ from mpfjax.models.base import (
     is_made_of_noise,
     model_name,
 )
+from mpfjax.models.inputs import replaced, takes_inputs, with_inputs
 from mpfjax.operations.generator import split
 
 # A number of particles that is hardly ever the length of a parameter's axis.
@@ -41,6 +42,8 @@ class MultiObjectModel(AbstractStateSpaceModel):
       With True, all objects see the whole observation, such as an image. If `object_model` then
       has a method `prepare_observation(observation)`, it is called once in each step, for all
       particles and objects, and its result goes to `log_likelihood`.
+    - `shared_inputs`: with True, all objects have the same known inputs u_t. With False, object j
+      has `inputs[j]`, every leaf indexed by j.
     - `per_object`: whether the arrays have an object axis. None finds it out by tracing the
       model's draws both ways, without computing them.
 
@@ -55,6 +58,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
     interaction: Callable[[PyTree, PyTree], Float[Array, " n"]] | None
     shared_observation: bool = eqx.field(static=True)
     per_object: bool = eqx.field(static=True)
+    shared_inputs: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -64,12 +68,15 @@ class MultiObjectModel(AbstractStateSpaceModel):
         shared_observation: bool = False,
         *,
         per_object: bool | None = None,
+        shared_inputs: bool = True,
     ) -> None:
         check_whole(num_objects=num_objects)
         check_model(object_model, "MultiObjectModel", "object_model")
         potential = "a function of the states of two objects, such as PairwiseRepulsion(...)"
         check_callable(potential, **given(interaction=interaction))
         check_flag(shared_observation=shared_observation, **given(per_object=per_object))
+        check_flag(shared_inputs=shared_inputs)
+        self.shared_inputs = shared_inputs
         self.object_model = object_model
         self.num_objects = int(num_objects)
         self.interaction = interaction
@@ -87,6 +94,24 @@ class MultiObjectModel(AbstractStateSpaceModel):
     def handles_missing(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether the objects' model does."""
         return getattr(self.object_model, "handles_missing", False)
+
+    @property
+    def takes_inputs(self) -> bool:
+        """Whether the objects' model does."""
+        return takes_inputs(self.object_model)
+
+    def with_inputs(self, inputs: PyTree) -> "MultiObjectModel":
+        """The model whose objects have u_t, all the same or each its own."""
+        model, per_object = self.object_model, self.per_object
+        if self.shared_inputs and not per_object:
+            model = with_inputs(model, inputs)
+        else:
+            if not self.shared_inputs:
+                self._require_object_axis("inputs", inputs)
+            axes = (eqx.if_array(0) if per_object else None, None if self.shared_inputs else 0)
+            give = eqx.filter_vmap(with_inputs, in_axes=axes, axis_size=self.num_objects)
+            model, per_object = give(model, inputs), True
+        return replaced(self, object_model=model, per_object=per_object)
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
         """x_0 of every object, independent: every leaf (n, J, ...)."""
@@ -210,12 +235,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
     def prepare_observation(self, observation: PyTree) -> PyTree:
         """What the objects' likelihoods look at: y_t, or what the object model makes of it."""
         if not self.shared_observation:
-            for leaf in jax.tree.leaves(observation):
-                if jnp.shape(leaf)[:1] != (self.num_objects,):
-                    raise ValueError(
-                        f"observation: shape {jnp.shape(leaf)} has no leading axis of"
-                        f" num_objects, {self.num_objects}; is it shared by all objects?"
-                    )
+            self._require_object_axis("observation", observation)
             return observation
         prepare = getattr(self.object_at(0), "prepare_observation", None)
         return observation if prepare is None else prepare(observation)
@@ -256,6 +276,14 @@ class MultiObjectModel(AbstractStateSpaceModel):
             return model.log_transition(_many(state), _many(previous))[0]
 
         return jax.vmap(weigh)(states, previous_states, objects)
+
+    def _require_object_axis(self, name: str, tree: PyTree) -> None:
+        for leaf in jax.tree.leaves(tree):
+            if jnp.shape(leaf)[:1] != (self.num_objects,):
+                raise ValueError(
+                    f"{name}: shape {jnp.shape(leaf)} has no leading axis of"
+                    f" num_objects, {self.num_objects}; is it shared by all objects?"
+                )
 
     def _seen_by(self, observation: PyTree, index: Int[Array, ""]) -> PyTree:
         if self.shared_observation:

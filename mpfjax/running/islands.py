@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_key, check_whole
-from mpfjax.filter import Filter
+from mpfjax.filter import Filter, Start
 from mpfjax.mixture import ParticleMixture
-from mpfjax.observations import as_arrays, present_steps
+from mpfjax.observations import as_series
 from mpfjax.operations.across_islands import DEVICE_AXIS, ISLAND_AXIS
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import choose_devices, over_devices
-from mpfjax.running.scan import FilterRun, check_run, checked, scan_filter
+from mpfjax.running.scan import FilterRun, check_run, checked, scan
 
 
 def run_islands(
@@ -24,6 +24,7 @@ def run_islands(
     collect: Callable[[ParticleMixture], PyTree] | None = None,
     *,
     num_islands: int,
+    inputs: PyTree = None,
     missing: str = "error",
     devices: int | Sequence[Any] | None = None,
 ) -> FilterRun:
@@ -49,20 +50,19 @@ def run_islands(
 
     The result is that of `run_filter` on the whole mixture. Slots and component labels of island g
     come after those of island g - 1, ancestors may be on other islands, and only `memory` keeps a
-    leading axis of islands. `observations`, `missing` and errors are those of `run_filter`. Also
-    raises `ValueError` for G < 1, and for devices that do not exist or do not divide G. Use it if
-    one filter is too large or too slow for one device. For many runs of a filter that fits on one
-    device, use `monte_carlo`.
+    leading axis of islands. `observations`, `inputs`, `missing` and errors are those of
+    `run_filter`. Also raises `ValueError` for G < 1, and for devices that do not exist or do not
+    divide G. Use it if one filter is too large or too slow for one device. For many runs of a
+    filter that fits on one device, use `monte_carlo`.
     """
     check_key(key)
     check_run(filter, collect)
     check_whole(num_islands=num_islands)
-    present = present_steps(observations, missing, filter.model)
-    observations = as_arrays(observations)
+    series = as_series(observations, inputs, missing, filter.model)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_islands, dtype=jnp.uint32))
 
     def run(filter: Filter) -> FilterRun:
-        arguments = (filter, observations, present, collect)
+        arguments = (filter, series, collect)
         leave_to_caller = devices is None and is_traced((key, arguments))
         chosen = None if leave_to_caller else _dividing(num_islands, devices)
         return over_devices(_run_block, _run_on_one, keys, arguments, chosen)
@@ -82,15 +82,15 @@ def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any
     return chosen[: max(d for d in range(1, len(chosen)) if num_islands % d == 0)]
 
 
-def _run_block(keys, filter, observations, present, collect):
+def _run_block(keys, filter, series, collect):
     """The islands of one device."""
-    run_one = lambda key: scan_filter(key, filter, observations, present, collect)  # noqa: E731
+    run_one = lambda key: scan(Start(key), filter, series, collect)  # noqa: E731
     return jax.vmap(run_one, axis_name=ISLAND_AXIS)(keys)
 
 
 @jit_on_wide_vectors
-def _run_on_one(keys, filter, observations, present, collect):
-    run_block = lambda keys: _run_block(keys, filter, observations, present, collect)  # noqa: E731
+def _run_on_one(keys, filter, series, collect):
+    run_block = lambda keys: _run_block(keys, filter, series, collect)  # noqa: E731
     run = jax.vmap(run_block, axis_name=DEVICE_AXIS)(keys[None])
     return jax.tree.map(lambda leaf: leaf[0], run)
 

@@ -11,10 +11,10 @@ from jaxtyping import Array, Key, PyTree
 from mpfjax.checks import check_key, check_whole, given
 from mpfjax.filter import Filter, Start, sample_initial, split_keys
 from mpfjax.mixture import ParticleMixture
-from mpfjax.observations import as_arrays, present_steps
+from mpfjax.observations import as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import choose_devices, over_devices
-from mpfjax.running.scan import FilterRun, check_run, checked, scan, scan_filter
+from mpfjax.running.scan import FilterRun, check_run, checked, scan
 from mpfjax.running.threads import num_processors, over_threads
 
 # How many particles, with all that a step makes of them, fit into a CPU's caches. Few components
@@ -29,6 +29,7 @@ def run_filter(
     observations: PyTree,
     collect: Callable[[ParticleMixture], PyTree] | None = None,
     *,
+    inputs: PyTree = None,
     missing: str = "error",
 ) -> FilterRun:
     """Run a filter over observations y_1..y_t in one scan.
@@ -38,21 +39,23 @@ def run_filter(
       keeps the whole mixture. The same function object compiles once; a new lambda in every call
       compiles again. Methods of a mixture are for one mixture: `jax.vmap(lambda m: m.mean())`
       maps them over a collected stack.
+    - `inputs`: u_1, ..., u_t, what is known beside the observations: a pytree of finite numbers
+      whose leaves have a leading axis t. At each step the model finds u_t in its field `inputs`;
+      see `AbstractStateSpaceModel`. A step without an observation has an input all the same.
     - `missing`: "error" raises a `ValueError` that names the first step whose observation holds a
       NaN or an infinity. "skip" treats such steps as missing and only predicts. A model with
       `handles_missing = True` gets the NaN; with "skip", only a step of nothing but NaN is
       missing.
 
     Raises `ValueError` before anything compiles: for an argument of another kind, no observations,
-    leaves of different lengths, complex numbers, or numbers that JAX's type cannot hold. Raises
-    `ValueError` during tracing for a model whose draws or densities have the wrong shape or type,
-    and RuntimeError if its densities give NaN.
+    leaves of different lengths, complex numbers, numbers that JAX's type cannot hold, or inputs of
+    a model that has no place for them. Raises `ValueError` during tracing for a model whose draws
+    or densities have the wrong shape or type, and RuntimeError if its densities give NaN.
     """
     check_key(key)
     check_run(filter, collect)
-    present = present_steps(observations, missing, filter.model)
-    observations = as_arrays(observations)
-    run = lambda filter: _run(key, filter, observations, present, collect)  # noqa: E731
+    series = as_series(observations, inputs, missing, filter.model)
+    run = lambda filter: _run(key, filter, series, collect)  # noqa: E731
     return checked(with_floats_traced(run, filter))
 
 
@@ -62,11 +65,12 @@ def monte_carlo(
     observations: PyTree,
     collect: Callable[[ParticleMixture], PyTree] | None = None,
     *,
+    inputs: PyTree = None,
     missing: str = "error",
     devices: int | Sequence[Any] | None = None,
     slots: int | None = None,
 ) -> FilterRun:
-    """Run a filter once for each key, all on the same observations, under `vmap`.
+    """Run a filter once for each key, all on the same observations and inputs, under `vmap`.
 
     Every field of the result has a leading axis of seeds. Arguments and errors are those of
     `run_filter`; run k equals `run_filter(keys[k], ...)`.
@@ -89,14 +93,13 @@ def monte_carlo(
     check_key(keys, "keys", batch=True)
     check_run(filter, collect)
     check_whole(**given(slots=slots))
-    present = present_steps(observations, missing, filter.model)
-    observations = as_arrays(observations)
+    series = as_series(observations, inputs, missing, filter.model)
 
     def run(filter: Filter) -> FilterRun:
         starts = Start(keys)
         if slots is not None:
             starts, filter = _in_slots(keys, filter, slots)
-        arguments = (filter, observations, present, collect)
+        arguments = (filter, series, collect)
         leave_to_caller = devices is None and is_traced((starts, arguments))
         chosen = None if leave_to_caller else choose_devices(devices)
         return over_devices(_run_each, _run_on_threads, starts, arguments, chosen)
@@ -105,8 +108,8 @@ def monte_carlo(
 
 
 @jit_on_wide_vectors
-def _run(key, filter, observations, present, collect):
-    return scan_filter(key, filter, observations, present, collect)
+def _run(key, filter, series, collect):
+    return scan(Start(key), filter, series, collect)
 
 
 def _in_slots(keys: Key[Array, " seeds"], filter: Filter, slots: int) -> tuple[Start, Filter]:
@@ -137,8 +140,8 @@ def _sample_each(keys, model, num_particles, slots, noise):
     return jax.vmap(sample)(keys)
 
 
-def _run_each(starts, filter, observations, present, collect):
-    run_together = jax.vmap(lambda start: scan(start, filter, observations, present, collect))
+def _run_each(starts, filter, series, collect):
+    run_together = jax.vmap(lambda start: scan(start, filter, series, collect))
     num_runs = starts.key.shape[0]
     size = _group_size(num_runs, filter)
     if size == num_runs:
@@ -160,13 +163,13 @@ def _group_size(num_runs: int, filter: Filter) -> int:
 _run_all = jit_on_wide_vectors(_run_each)
 
 
-def _run_on_threads(starts, filter, observations, present, collect):
+def _run_on_threads(starts, filter, series, collect):
     """All runs on one device; on a CPU, several threads share them."""
     num_runs = starts.key.shape[0]
     num_worth_it = num_runs * filter.num_particles // _WORTH_A_THREAD
     num_threads = min(num_processors(), num_runs, num_worth_it)
     keeps_all = collect is None  # threads would hold two copies of it for a while
-    arguments = (filter, observations, present, collect)
+    arguments = (filter, series, collect)
     leave_to_caller = is_traced((starts, arguments)) or jax.default_backend() != "cpu"
     if num_threads < 2 or keeps_all or leave_to_caller:
         return _run_all(starts, *arguments)

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from mpfjax.checks import check_callable, check_type, given, saying
 from mpfjax.filter import BROKEN_DENSITY, Filter, Start, StepInfo, split_keys
 from mpfjax.mixture import ParticleMixture
+from mpfjax.observations import Series
 from mpfjax.operations.across_islands import num_islands
 
 
@@ -42,29 +43,29 @@ def scan_filter(
     collect: Callable[[ParticleMixture], PyTree] | None,
 ) -> FilterRun:
     """`run_filter` under the caller's jit, unchecked; `present` is what `present_steps` gives."""
-    return scan(Start(key), filter, observations, present, collect)
+    return scan(Start(key), filter, Series(observations, present), collect)
 
 
 def scan(
     start: Start,
     filter: Filter,
-    observations: PyTree,
-    present: Bool[Array, " t"] | None,
+    series: Series,
     collect: Callable[[ParticleMixture], PyTree] | None,
 ) -> FilterRun:
     key_initial, key_steps = split_keys(start.key, 2)
-    length = jax.tree.leaves(observations)[0].shape[0]
 
-    def advance(mixture: ParticleMixture, inputs: PyTree) -> tuple[ParticleMixture, PyTree]:
-        step_key, observation, is_present = inputs
-        mixture, info = step_or_predict(filter, step_key, mixture, observation, is_present)
+    def advance(
+        mixture: ParticleMixture, step: tuple[Array, Series]
+    ) -> tuple[ParticleMixture, PyTree]:
+        step_key, now = step
+        mixture, info = step_or_predict(filter, step_key, mixture, now)
         with saying("in collect, which is called with the mixture after each step"):
             kept = mixture if collect is None else collect(mixture)
         return mixture, (kept, report_of(info))
 
-    inputs = (jax.random.split(key_steps, length), observations, present)
+    steps = (jax.random.split(key_steps, series.length), series)
     initial = _share_of_islands(filter._init(start._replace(key=key_initial)))
-    final, outputs = jax.lax.scan(advance, initial, inputs)
+    final, outputs = jax.lax.scan(advance, initial, steps)
     return run_of(initial, final, *outputs)
 
 
@@ -100,15 +101,15 @@ def step_or_predict(
     filter: Filter,
     key: Key[Array, ""],
     mixture: ParticleMixture,
-    observation: PyTree,
-    is_present: Bool[Array, ""] | None,
+    now: Series,
 ) -> tuple[ParticleMixture, StepInfo]:
-    """A step of the filter, or a prediction where the observation is missing; None is present."""
-    if is_present is None:
-        return filter._step(key, mixture, observation)
+    """A step of the filter, or a prediction where the observation is missing; `now` is of one t."""
+    filter = filter.with_inputs(now.inputs)
+    if now.present is None:
+        return filter._step(key, mixture, now.observations)
     return jax.lax.cond(
-        is_present,
-        lambda: filter._step(key, mixture, observation),
+        now.present,
+        lambda: filter._step(key, mixture, now.observations),
         lambda: filter._predict(key, mixture),
     )
 

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from mpfjax.checks import check_callable, check_key, check_type, check_whole, given, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.observations import check_series, present_steps
+from mpfjax.observations import as_series, check_series
 from mpfjax.running.run import monte_carlo
 from mpfjax.running.scan import FilterRun
 from mpfjax.running.storage import (
@@ -77,6 +77,8 @@ class Study:
     """as for `run_filter`, for `measure` to use; None keeps all of every mixture."""
     missing: str = "error"
     """as for `run_filter`."""
+    inputs: PyTree = None
+    """u_1..u_t, as for `run_filter`; the same in all cells."""
 
     def __post_init__(self) -> None:
         check_type(Mapping, "functions by name, {name: function}", filters=self.filters)
@@ -203,7 +205,7 @@ def _cells(study: Study) -> list[_Cell]:
         filter = study.filters[name](num_particles, **settings)
         if not isinstance(filter, Filter):
             raise ValueError(f"filters: {name} made {filter!r}, no Filter")
-        present_steps(study.observations, study.missing, filter.model)
+        as_series(study.observations, study.inputs, study.missing, filter.model)
         words = [name, f"N{num_particles}", *(f"{k}_{v}" for k, v in settings.items())]
         stem = re.sub(r"[^\w.+-]+", "_", "-".join([f"{index:04d}", *words]))[:100]
         cells.append(_Cell(f"{stem}.npz", description, filter))
@@ -252,6 +254,7 @@ def _manifest(study: Study, cells: list[_Cell]) -> dict[str, Any]:
         "measure": named(study.measure),
         "collect": named(study.collect),
         "missing": study.missing,
+        **({} if study.inputs is None else {"inputs": _summary(study.inputs)}),
         "cells": {
             cell.file: {"is": cell.description, "filter": fingerprint(cell.filter)}
             for cell in cells
@@ -367,6 +370,7 @@ def _measure(
             cell.filter,
             study.observations,
             study.collect,
+            inputs=study.inputs,
             missing=study.missing,
             slots=slots,
         )

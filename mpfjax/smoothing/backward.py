@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import check_log_density
+from mpfjax.models.inputs import with_inputs
 from mpfjax.operations.generator import uniform
 from mpfjax.operations.indexing import take
 from mpfjax.operations.logarithms import exp, finite_or_zero
@@ -117,6 +118,22 @@ def walk(
     log_uniforms = jnp.log(uniform(key, proposed.shape, mixture.log_weights.dtype))
     (_, current), indices = jax.lax.scan(move, first, (proposed, log_uniforms))
     return _with_a_past(indices, current, needed)
+
+
+def log_transitions(model: Any, trajectory: PyTree, inputs: PyTree) -> Float[Array, " t"]:
+    """log D(x_s | x_{s-1}) at every step of one trajectory, leaves (t + 1, ...)."""
+    before, after = (
+        jax.tree.map(lambda leaf, cut=cut: leaf[cut], trajectory)
+        for cut in (slice(None, -1), slice(1, None))
+    )
+    if inputs is None:
+        return model.log_transition(after, before)
+
+    def at_step(now: PyTree, after: PyTree, before: PyTree) -> Float[Array, ""]:
+        states, previous = jax.tree.map(lambda leaf: leaf[None], (after, before))
+        return with_inputs(model, now).log_transition(states, previous)[0]
+
+    return jax.vmap(at_step)(inputs, after, before)
 
 
 def _with_a_past(

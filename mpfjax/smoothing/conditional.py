@@ -26,12 +26,13 @@ from mpfjax.moves.every import Every
 from mpfjax.moves.exchange import Exchange
 from mpfjax.moves.propagation import Predict, Propagate, Weigh
 from mpfjax.moves.resampling import Resample
-from mpfjax.observations import as_arrays, present_steps
+from mpfjax.observations import Series, as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.generator import split, uniform
 from mpfjax.operations.logarithms import softmax
 from mpfjax.operations.matrices import draw_columns
 from mpfjax.running.scan import FilterRun, checked, scan
+from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.history import mixtures_of
 from mpfjax.smoothing.trajectories import sample_trajectories
 
@@ -61,6 +62,7 @@ def conditional_filter(
     trajectory: PyTree,
     *,
     backward: bool = True,
+    inputs: PyTree = None,
     missing: str = "error",
 ) -> ConditionalRun:
     """Run a filter around a trajectory that is kept, and draw a new one from all its particles.
@@ -87,7 +89,7 @@ def conditional_filter(
     - `backward`: draw the new trajectory by backward sampling, which needs the model's
       `log_transition`. Without it, by the genealogy: it then differs from the old one only
       in the last steps, unless N is large.
-    - `observations`, `missing`: as for `run_filter`.
+    - `observations`, `inputs`, `missing`: as for `run_filter`.
 
     x_0 is drawn one particle at a time, also where the model would draw it in strata. The model's
     `sample_transition` must draw particles independently of each other.
@@ -103,13 +105,11 @@ def conditional_filter(
     check_type(Filter, "a Filter", filter=filter)
     check_flag(backward=backward)
     check_conditional(filter, backward, "conditional_filter")
-    present = present_steps(observations, missing, filter.model)
-    observations = as_arrays(observations)
-    length = jax.tree.leaves(observations)[0].shape[0]
-    trajectory = _as_states(trajectory, filter.model, length + 1)
+    series = as_series(observations, inputs, missing, filter.model)
+    trajectory = _as_states(trajectory, filter.model, series.length + 1)
     # Before the run: backward sampling would not find where the trajectory has come from.
-    _require(_steps_are_possible(filter.model, trajectory))
-    run = lambda filter: _run(key, filter, observations, present, trajectory, backward)  # noqa: E731
+    _require(_steps_are_possible(filter.model, trajectory, series.inputs))
+    run = lambda filter: _run(key, filter, series, trajectory, backward)  # noqa: E731
     found = with_floats_traced(run, filter)
     found = eqx.tree_at(lambda found: found.run, found, checked(found.run))
     if isinstance(found.possible, Tracer):
@@ -126,22 +126,23 @@ def _require(possible: Bool[Array, " t"]) -> None:
 
 
 @eqx.filter_jit
-def _steps_are_possible(model: AbstractStateSpaceModel, trajectory: PyTree) -> Bool[Array, " t"]:
+def _steps_are_possible(
+    model: AbstractStateSpaceModel, trajectory: PyTree, inputs: PyTree
+) -> Bool[Array, " t"]:
     """At which times the trajectory is possible, without regard to what was observed."""
     length = jax.tree.leaves(trajectory)[0].shape[0] - 1
-    return _possible(model, trajectory, jnp.ones(length, bool))
+    return _possible(model, trajectory, inputs, jnp.ones(length, bool))
 
 
 @jit_on_wide_vectors
-def _run(key, filter, observations, present, trajectory, backward):
-    return renew(key, filter, observations, present, trajectory, backward)
+def _run(key, filter, series, trajectory, backward):
+    return renew(key, filter, series, trajectory, backward)
 
 
 def renew(
     key: Key[Array, ""],
     filter: Filter,
-    observations: PyTree,
-    present: Bool[Array, " t"] | None,
+    series: Series,
     trajectory: PyTree,
     backward: bool,
 ) -> ConditionalRun:
@@ -152,13 +153,13 @@ def renew(
     particles = _independent_initial(key_initial, filter.model, n)
     start = jax.tree.map(lambda leaf, own: put(leaf, own[0], first_slot), particles, trajectory)
     around = _around(filter, trajectory, first_slot)
-    run = scan(Start(key_run, start), around, observations, present, None)
+    run = scan(Start(key_run, start), around, series, None)
     reference = run.collected.memory[REFERENCE]["slot"]
     log_weights = jax.vmap(at)(run.collected.log_weights, reference)
     later = (log_weights > -jnp.inf) & ~run.degenerate
     slots = jnp.concatenate([first_slot[None], reference])
-    drawn = draw_trajectory(key_back, filter.model, run, backward)
-    possible = _possible(filter.model, trajectory, later)
+    drawn = draw_trajectory(key_back, filter.model, run, series.inputs, backward)
+    possible = _possible(filter.model, trajectory, series.inputs, later)
     return ConditionalRun(drawn, run, slots, possible)
 
 
@@ -189,12 +190,17 @@ def _independent_initial(key: Key[Array, ""], model: Any, num_particles: int) ->
 
 
 def draw_trajectory(
-    key: Key[Array, ""], model: AbstractStateSpaceModel, run: FilterRun, backward: bool
+    key: Key[Array, ""],
+    model: AbstractStateSpaceModel,
+    run: FilterRun,
+    inputs: PyTree,
+    backward: bool,
 ) -> PyTree:
     """One trajectory of a run, by backward sampling or the genealogy: leaves (t + 1, ...)."""
     if not backward:
         return _of_the_genealogy(key, mixtures_of(run))
-    return jax.tree.map(lambda leaf: leaf[0], sample_trajectories(key, model, run, 1))
+    drawn = sample_trajectories(key, model, run, 1, inputs=inputs)
+    return jax.tree.map(lambda leaf: leaf[0], drawn)
 
 
 def _of_the_genealogy(key: Key[Array, ""], mixtures: ParticleMixture) -> PyTree:
@@ -211,17 +217,15 @@ def _of_the_genealogy(key: Key[Array, ""], mixtures: ParticleMixture) -> PyTree:
     return jax.tree.map(lambda leaf: jax.vmap(at)(leaf, indices), mixtures.particles)
 
 
-def _possible(model: Any, trajectory: PyTree, later: Bool[Array, " t"]) -> Bool[Array, " all"]:
+def _possible(
+    model: Any, trajectory: PyTree, inputs: PyTree, later: Bool[Array, " t"]
+) -> Bool[Array, " all"]:
     """At which times the trajectory has a density above zero, as far as the model knows it."""
-    before, after = (
-        jax.tree.map(lambda leaf, cut=cut: leaf[cut], trajectory)
-        for cut in (slice(None, -1), slice(1, None))
-    )
     start = jnp.ones((1,), bool)
     if callable(getattr(model, "log_initial", None)):
         start = model.log_initial(jax.tree.map(lambda leaf: leaf[:1], trajectory)) > -jnp.inf
     if callable(getattr(model, "log_transition", None)):
-        later &= model.log_transition(after, before) > -jnp.inf
+        later &= log_transitions(model, trajectory, inputs) > -jnp.inf
     return jnp.concatenate([start, later])
 
 

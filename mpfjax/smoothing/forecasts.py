@@ -20,6 +20,8 @@ from mpfjax.checks import (
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped_draw
+from mpfjax.moves.sharing import give_inputs
+from mpfjax.observations import require_place_for, steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 
@@ -43,6 +45,7 @@ def forecast(
     num_steps: int,
     *,
     simulate_observation: Callable[[Key[Array, ""], PyTree], PyTree] | None = None,
+    inputs: PyTree = None,
 ) -> Forecast:
     """The distribution of x_{t+1}, ..., x_{t+k} given y_1..y_t, from the mixture at t.
 
@@ -52,6 +55,8 @@ def forecast(
     - `simulate_observation(key, states)`: draws y given each of the n states, leaves (n, ...), as
       the model's likelihood would have it; for intervals of what will be observed. If the model is
       wrapped by `per_particle`, it draws y given one state, and gets a key for each.
+    - `inputs`: u_{t+1}, ..., u_{t+k}, the known inputs of the steps to come, as for `run_filter`. A
+      method of the model, given as `simulate_observation`, sees them too.
 
     `key` is one that nothing else was given: `jax.random.fold_in(key, 1)` of the run's own key is
     a key that the run has used.
@@ -68,24 +73,35 @@ def forecast(
         "a function of a key and states", **given(simulate_observation=simulate_observation)
     )
     simulate = mapped_draw(filter.model, simulate_observation) if simulate_observation else None
+    require_place_for(inputs, filter.model)
+    if inputs is not None:
+        inputs = steps_of_inputs(inputs, num_steps, "forecast")
+    options = (num_steps, simulate)
     return with_floats_traced(
-        lambda filter: _forecast(key, filter, mixture, num_steps, simulate), filter
+        lambda filter: _forecast(key, filter, mixture, inputs, options), filter
     )
 
 
 @jit_on_wide_vectors
-def _forecast(key, filter, mixture, num_steps, simulate_observation):
-    def advance(mixture: ParticleMixture, key: Array) -> tuple[ParticleMixture, Any]:
+def _forecast(key, filter, mixture, inputs, options):
+    num_steps, simulate_observation = options
+
+    def advance(
+        mixture: ParticleMixture, step: tuple[Array, PyTree]
+    ) -> tuple[ParticleMixture, Any]:
+        key, now = step
         key_step, key_observation = jax.random.split(key)
-        mixture, _ = filter._predict(key_step, mixture)
+        mixture, _ = filter.with_inputs(now)._predict(key_step, mixture)
         observations = None
         if simulate_observation is not None:
+            simulate = give_inputs(simulate_observation, filter.model, now)
             with saying("in simulate_observation, which is called with a key and the particles"):
-                observations = simulate_observation(key_observation, mixture.particles)
+                observations = simulate(key_observation, mixture.particles)
             _check_simulated(observations, mixture.num_particles)
         return mixture, (mixture, observations)
 
-    _, (mixtures, observations) = jax.lax.scan(advance, mixture, jax.random.split(key, num_steps))
+    steps = (jax.random.split(key, num_steps), inputs)
+    _, (mixtures, observations) = jax.lax.scan(advance, mixture, steps)
     return Forecast(mixtures, observations)
 
 

@@ -21,7 +21,8 @@ from mpfjax.checks import (
 from mpfjax.filter import Filter, Start, split_keys
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped, require
-from mpfjax.observations import as_arrays, present_steps
+from mpfjax.models.inputs import with_inputs
+from mpfjax.observations import as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.floats import as_inexact
 from mpfjax.operations.generator import split
@@ -54,6 +55,7 @@ def smoothed_sums(
     lag: int | None = None,
     method: str = "exact",
     num_draws: int = 2,
+    inputs: PyTree = None,
     missing: str = "error",
 ) -> SmoothedSums:
     """E[Σ_t h(x_{t-1}, x_t) | y], online: PaRIS, in memory that does not grow with t.
@@ -74,7 +76,7 @@ def smoothed_sums(
       the ancestor and goes on by steps of independent Metropolis-Hastings, O(N), and is as exact.
     - `num_draws`: how many particles J are drawn for each particle. With one, few different ones
       of long ago are left, as in a genealogy; two are enough.
-    - `observations`, `missing`: as in `run_filter`.
+    - `observations`, `inputs`, `missing`: as in `run_filter`.
 
     Raises `ValueError` for a model without `log_transition`, values that are not one a particle,
     and as `run_filter` does; a RuntimeError where no particle can have moved to the next. Use it
@@ -89,35 +91,32 @@ def smoothed_sums(
         check_whole(0, lag=lag)
     check_one_of(("exact", "mcmc"), method=method)
     check_whole(num_draws=num_draws)
-    present = present_steps(observations, missing, filter.model)
-    observations = as_arrays(observations)
-    length = jax.tree.leaves(observations)[0].shape[0]
+    series = as_series(observations, inputs, missing, filter.model)
     if lag is not None:
-        lag = min(lag, length - 1)
+        lag = min(lag, series.length - 1)
     options = (mapped(filter.model, function), lag, method, num_draws)
-    sums = with_floats_traced(
-        lambda filter: _smooth(key, filter, observations, present, options), filter
-    )
+    sums = with_floats_traced(lambda filter: _smooth(key, filter, series, options), filter)
     return SmoothedSums(sums.sums, sums.terms, checked(sums.run))
 
 
 @jit_on_wide_vectors
-def _smooth(key, filter, observations, present, options):
+def _smooth(key, filter, series, options):
     function, lag, method, num_draws = options
     # The first two are those of `run_filter`.
     key_initial, key_steps, key_backward = split_keys(key, 3)
-    length = jax.tree.leaves(observations)[0].shape[0]
+    length = series.length
     initial = filter._init(Start(key_initial))
     num_kept = 1 if lag is None else lag + 1
     shapes = _shapes(function, initial.particles)
     kept = jax.tree.map(lambda leaf: jnp.zeros((num_kept, *leaf.shape), leaf.dtype), shapes)
     settled = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:], leaf.dtype), shapes)
 
-    def advance(carry: tuple[ParticleMixture, PyTree, PyTree], inputs: PyTree) -> Any:
+    def advance(carry: tuple[ParticleMixture, PyTree, PyTree], step: PyTree) -> Any:
         mixture, kept, settled = carry
-        t, step_key, draw_key, observation, is_present = inputs
-        moved, info = step_or_predict(filter, step_key, mixture, observation, is_present)
-        indices = _draw_pasts(draw_key, filter.model, mixture, moved, method, num_draws)
+        t, step_key, draw_key, now = step
+        moved, info = step_or_predict(filter, step_key, mixture, now)
+        model = with_inputs(filter.model, now.inputs)
+        indices = _draw_pasts(draw_key, model, mixture, moved, method, num_draws)
         values = _values(function, mixture.particles, moved.particles, indices)
         kept = jax.tree.map(lambda leaf: _mean_of_pasts(leaf, indices), kept)
         if lag is None:
@@ -133,8 +132,8 @@ def _smooth(key, filter, observations, present, options):
         return (moved, kept, settled), (sums, oldest, report_of(info))
 
     keys = jax.random.split(key_steps, length), jax.random.split(key_backward, length)
-    inputs = (jnp.arange(length, dtype=jnp.int32), *keys, observations, present)
-    carry, outputs = jax.lax.scan(advance, (initial, kept, settled), inputs)
+    steps = (jnp.arange(length, dtype=jnp.int32), *keys, series)
+    carry, outputs = jax.lax.scan(advance, (initial, kept, settled), steps)
     final, kept, _ = carry
     sums, oldest, reports = outputs
     terms = None

@@ -12,6 +12,8 @@ from mpfjax.checks import check_key, check_one_of, check_whole, given
 from mpfjax.filter import split_keys
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
+from mpfjax.models.inputs import with_inputs
+from mpfjax.observations import require_place_for, steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.generator import uniform
 from mpfjax.operations.indexing import take
@@ -29,6 +31,7 @@ def sample_trajectories(
     component: int | None = None,
     method: str = "exact",
     num_steps: int | None = None,
+    inputs: PyTree = None,
 ) -> PyTree:
     """Draw trajectories x_0, ..., x_t from their smoothing distribution p(x_0, ..., x_t | y).
 
@@ -46,6 +49,7 @@ def sample_trajectories(
       Metropolis-Hastings with proposals by W_s, O(1) for a trajectory and step, and is as exact
       as N grows.
     - `num_steps`: of "mcmc"; None is one.
+    - `inputs`: u_1, ..., u_t, the known inputs that the run had.
 
     Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
     that is not there or dead, and for `num_steps` with "exact"; a RuntimeError where no particle
@@ -61,6 +65,7 @@ def sample_trajectories(
     if method == "exact" and num_steps is not None:
         raise ValueError(f"num_steps: {num_steps} does nothing with method 'exact'")
     stacked = mixtures_of(mixtures)
+    inputs = _inputs_between(inputs, model, stacked, isinstance(mixtures, FilterRun))
     if component is not None:
         check_whole(0, component=component)
         _check_component(stacked, component)
@@ -68,7 +73,20 @@ def sample_trajectories(
         num_steps = 0
     elif num_steps is None:
         num_steps = 1
-    return _sample(key, model, stacked, num_trajectories, component, num_steps)
+    return _sample(key, model, stacked, inputs, num_trajectories, component, num_steps)
+
+
+def _inputs_between(
+    inputs: PyTree, model: Any, mixtures: ParticleMixture, with_initial: bool
+) -> PyTree:
+    """The inputs of the steps from each of the mixtures to the next."""
+    if inputs is None:
+        return None
+    require_place_for(inputs, model)
+    num_mixtures = mixtures.log_weights.shape[0]
+    if with_initial:
+        return steps_of_inputs(inputs, num_mixtures - 1, "run")
+    return jax.tree.map(lambda leaf: leaf[1:], steps_of_inputs(inputs, num_mixtures, "mixtures"))
 
 
 def _check_component(mixtures: ParticleMixture, component: int) -> None:
@@ -82,7 +100,7 @@ def _check_component(mixtures: ParticleMixture, component: int) -> None:
 
 
 @jit_on_wide_vectors
-def _sample(key, model, mixtures, num_trajectories, component, num_steps):
+def _sample(key, model, mixtures, inputs, num_trajectories, component, num_steps):
     key_final, key_steps, key_proposed = split_keys(key, 3)
     final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
     log_weights = final.log_weights
@@ -91,14 +109,15 @@ def _sample(key, model, mixtures, num_trajectories, component, num_steps):
     last = draw(uniform(key_final, (num_trajectories,), log_weights.dtype), log_weights)
     states = jax.tree.map(lambda leaf: take(leaf, last), final.particles)
 
-    def back(carry: tuple[PyTree, Array], inputs: Any) -> tuple[tuple[PyTree, Array], PyTree]:
+    def back(carry: tuple[PyTree, Array], step: Any) -> tuple[tuple[PyTree, Array], PyTree]:
         next_states, next_indices = carry
-        step_key, earlier, ancestors, proposed = inputs
+        step_key, earlier, ancestors, proposed, now = step
+        moved_by = with_inputs(model, now)
         if proposed is None:
-            indices = draw_exactly(step_key, model, next_states, earlier)[:, 0]
+            indices = draw_exactly(step_key, moved_by, next_states, earlier)[:, 0]
         else:
             start = take(ancestors, next_indices)
-            indices = walk(step_key, model, next_states, earlier, start, proposed)[-1]
+            indices = walk(step_key, moved_by, next_states, earlier, start, proposed)[-1]
         states = jax.tree.map(lambda leaf: take(leaf, indices), earlier.particles)
         return (states, indices), states
 
@@ -109,8 +128,9 @@ def _sample(key, model, mixtures, num_trajectories, component, num_steps):
         # All times in one go, since proposals do not depend on the states after them.
         keys = jax.random.split(key_proposed, num_earlier)
         proposed = jax.vmap(propose, (0, 0, None, None))(keys, earlier, num_steps, num_trajectories)
-    inputs = jax.random.split(key_steps, num_earlier), earlier, ancestors, proposed
-    _, past = jax.lax.scan(back, (states, last), inputs, reverse=True)
+    keys = jax.random.split(key_steps, num_earlier)
+    steps = (keys, earlier, ancestors, proposed, inputs)
+    _, past = jax.lax.scan(back, (states, last), steps, reverse=True)
     return jax.tree.map(
         lambda before, end: jnp.concatenate([jnp.moveaxis(before, 0, 1), end[:, None]], axis=1),
         past,

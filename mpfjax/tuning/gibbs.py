@@ -22,7 +22,7 @@ from mpfjax.checks import (
 )
 from mpfjax.filter import Filter, sample_initial
 from mpfjax.models.base import require
-from mpfjax.observations import as_arrays, present_steps
+from mpfjax.observations import Series, as_arrays, present_steps
 from mpfjax.running.scan import scan_filter
 from mpfjax.smoothing.conditional import check_conditional, draw_trajectory, renew
 from mpfjax.tuning.chains import (
@@ -208,7 +208,7 @@ class _Sampler(eqx.Module):
         filter = self.problem.at(reals)
         run = scan_filter(key_run, filter, self.joint.observations, self.joint.present, None)
         nothing = ~jnp.all(jnp.isfinite(run.log_likelihood_increments))
-        drawn = draw_trajectory(key_back, filter.model, run, self.backward)
+        drawn = draw_trajectory(key_back, filter.model, run, None, self.backward)
         return eqx.error_if(drawn, nothing, BROKEN)
 
     def step(
@@ -223,7 +223,9 @@ class _Sampler(eqx.Module):
             accepted = jnp.ones(())
         filter = self.problem.at(reals)
         observations, present = self.joint.observations, self.joint.present
-        found = renew(key_trajectory, filter, observations, present, trajectory, self.backward)
+        found = renew(
+            key_trajectory, filter, Series(observations, present), trajectory, self.backward
+        )
         broken = ~jnp.all(found.run.log_likelihood_increments < jnp.inf) | ~jnp.all(found.possible)
         changes = [
             jnp.any((new != old).reshape(new.shape[0], -1), axis=1)
