@@ -21,6 +21,7 @@ from mpfjax.checks import (
     to_array,
 )
 from mpfjax.models.base import model_name, require
+from mpfjax.models.inputs import has_attribute
 from mpfjax.models.noise import NOISES, draw_noise, independent_normal
 from mpfjax.operations.matrices import cholesky, solve_lower
 
@@ -163,7 +164,7 @@ class GaussNewtonProposal(AbstractProposal):
         for method in ("transition_mean", "observation_mean"):
             require(self.model, method, "GaussNewtonProposal")
         for matrix in ("transition_covariance", "observation_covariance"):
-            if not hasattr(self.model, matrix):
+            if not has_attribute(self.model, matrix):
                 raise ValueError(
                     f"model: {model_name(self.model)} has no {matrix},"
                     " which GaussNewtonProposal needs"

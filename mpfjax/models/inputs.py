@@ -14,6 +14,14 @@ def takes_inputs(model: Any) -> bool:
     return hasattr(model, "with_inputs") or hasattr(model, "inputs")
 
 
+def has_attribute(model: Any, name: str) -> bool:
+    """Whether the model has it; a property may need inputs, which are not there before a run."""
+    try:
+        return hasattr(model, name)
+    except Exception:
+        return True
+
+
 def with_inputs(model: Any, inputs: PyTree) -> Any:
     """The model with u_t, or as it is where there is none, or no place for it."""
     if inputs is None or not takes_inputs(model):

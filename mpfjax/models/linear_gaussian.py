@@ -1,6 +1,7 @@
 """The linear-Gaussian model, whose filtering distribution the Kalman filter gives exactly."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from mpfjax.operations.matrices import row_sums, solve_lower
 _IN_TIME = ("A", "Q", "H", "R", "B", "inputs")
 
 
-def _if_given(name: str) -> Any:
+def _if_given(name: str) -> Callable[[Any], Array | None]:
     """A converter of an argument that may be None."""
     return lambda value: None if value is None else to_array(name)(value)
 
