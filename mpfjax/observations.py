@@ -160,8 +160,8 @@ def _length(leaves: list[Any], tree: PyTree, name: str) -> int:
     """t, the length of the leading axis that all leaves share; a `ValueError` without one."""
     if not leaves:
         raise ValueError(f"{name}: there are none")
-    lengths = {leaf.shape[0] if leaf.ndim else None for leaf in leaves}
-    if len(lengths) > 1 or None in lengths:
+    lengths = {leaf.shape[0] for leaf in leaves if leaf.ndim}
+    if len(lengths) != 1 or not all(leaf.ndim for leaf in leaves):
         shapes = [leaf.shape for leaf in leaves]
         is_list = isinstance(tree, list | tuple)
         hint = f"; a list is so many arrays, jnp.asarray({name}) is one" if is_list else ""

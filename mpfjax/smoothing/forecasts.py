@@ -21,7 +21,7 @@ from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped_draw
 from mpfjax.moves.sharing import give_inputs
-from mpfjax.observations import require_place_for, steps_of_inputs
+from mpfjax.observations import steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 
@@ -73,9 +73,7 @@ def forecast(
         "a function of a key and states", **given(simulate_observation=simulate_observation)
     )
     simulate = mapped_draw(filter.model, simulate_observation) if simulate_observation else None
-    require_place_for(inputs, filter.model)
-    if inputs is not None:
-        inputs = steps_of_inputs(inputs, num_steps, "forecast")
+    inputs = steps_of_inputs(inputs, num_steps, filter.model, "forecast")
     options = (num_steps, simulate)
     return with_floats_traced(
         lambda filter: _forecast(key, filter, mixture, inputs, options), filter

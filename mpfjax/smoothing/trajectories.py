@@ -13,7 +13,7 @@ from mpfjax.filter import split_keys
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
 from mpfjax.models.inputs import with_inputs
-from mpfjax.observations import require_place_for, steps_of_inputs
+from mpfjax.observations import steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.generator import uniform
 from mpfjax.operations.indexing import take
@@ -80,13 +80,11 @@ def _inputs_between(
     inputs: PyTree, model: Any, mixtures: ParticleMixture, with_initial: bool
 ) -> PyTree:
     """The inputs of the steps from each of the mixtures to the next."""
-    if inputs is None:
-        return None
-    require_place_for(inputs, model)
     num_mixtures = mixtures.log_weights.shape[0]
     if with_initial:
-        return steps_of_inputs(inputs, num_mixtures - 1, "run")
-    return jax.tree.map(lambda leaf: leaf[1:], steps_of_inputs(inputs, num_mixtures, "mixtures"))
+        return steps_of_inputs(inputs, num_mixtures - 1, model, "run")
+    inputs = steps_of_inputs(inputs, num_mixtures, model, "mixtures")
+    return jax.tree.map(lambda leaf: leaf[1:], inputs)
 
 
 def _check_component(mixtures: ParticleMixture, component: int) -> None:

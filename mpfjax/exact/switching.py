@@ -1,0 +1,151 @@
+"""The sum over all sequences of regimes, for switching models."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mpfjax.checks import check_type
+from mpfjax.models.switching import SwitchingLinearGaussianModel
+from mpfjax.operations.logarithms import log_sum_exp
+
+
+class SwitchingFilterRun(eqx.Module):
+    """The filtering and the smoothing distribution of a switching model, with K regimes."""
+
+    regime_probabilities: Float[Array, "t k"]
+    """P(z_s | y_1..y_s)."""
+    means: Float[Array, "t d"]
+    """E[x_s | y_1..y_s]."""
+    covariances: Float[Array, "t d d"]
+    """Cov[x_s | y_1..y_s]."""
+    smoothed_regime_probabilities: Float[Array, "t1 k"]
+    """P(z_s | y_1..y_t), from s = 0 on."""
+    smoothed_means: Float[Array, "t1 d"]
+    """E[x_s | y_1..y_t], from s = 0 on."""
+    smoothed_covariances: Float[Array, "t1 d d"]
+    """Cov[x_s | y_1..y_t], from s = 0 on."""
+    log_likelihood_increments: Float[Array, " t"]
+    log_marginal_likelihood: Float[Array, ""]
+
+
+_MOST_SEQUENCES = 2**20
+
+
+def switching_filter(model: Any, observations: Float[Array, "t ..."]) -> SwitchingFilterRun:
+    """All K^(t+1) sequences of regimes z_0, ..., z_t, and a Kalman smoother for each.
+
+    `model` is a `SwitchingLinearGaussianModel`. The sum over sequences is the exact answer, and no
+    recursion has one: the number of Gaussians grows K-fold with every step. An entry of the
+    observations that is NaN is missing. Differentiable. Raises `ValueError` for another model, for
+    observations that are not (t, p), and for more than a million sequences. Use it as the truth
+    for a short series.
+    """
+    check_type(SwitchingLinearGaussianModel, "a SwitchingLinearGaussianModel", model=model)
+    num_rows, k = model.H.shape[-2], model.num_regimes
+    if observations.ndim != 2 or observations.shape[1] != num_rows:
+        raise ValueError(f"observations: shape {observations.shape} is not (t, {num_rows})")
+    length = observations.shape[0]
+    if k ** (length + 1) > _MOST_SEQUENCES:
+        raise ValueError(
+            f"observations: {length} steps of {k} regimes are {k}^{length + 1} sequences, more than"
+            f" {_MOST_SEQUENCES}"
+        )
+    return _enumerated(model, observations)
+
+
+@eqx.filter_jit
+def _enumerated(
+    model: SwitchingLinearGaussianModel, observations: Float[Array, "t p"]
+) -> SwitchingFilterRun:
+    k, length = model.num_regimes, observations.shape[0]
+    places = np.indices((k,) * (length + 1), np.int32).reshape(length + 1, -1).T
+    sequences = jnp.asarray(places)
+    log_prior = model.log_initial(sequences[:, 0])
+    for s in range(length):
+        log_prior = log_prior + model.log_transition(sequences[:, s + 1], sequences[:, s])
+    given = jax.vmap(lambda sequence: _kalman_smoother(model, sequence, observations))(sequences)
+    filtered, smoothed, log_densities = given
+    log_weights = log_prior[:, None] + jnp.cumsum(log_densities, axis=1)
+    log_evidence = jax.vmap(log_sum_exp)(log_weights.T)
+    weights = jnp.exp(log_weights - log_evidence[None])
+    is_regime = jax.nn.one_hot(sequences, k, dtype=weights.dtype)
+    means, covariances = _mixed(weights, *filtered)
+    final = jnp.broadcast_to(weights[:, -1:], (len(places), length + 1))
+    smoothed_means, smoothed_covariances = _mixed(final, *smoothed)
+    increments = jnp.diff(log_evidence, prepend=jnp.zeros(1, log_evidence.dtype))
+    return SwitchingFilterRun(
+        regime_probabilities=jnp.einsum("st,stk->tk", weights, is_regime[:, 1:]),
+        means=means,
+        covariances=covariances,
+        smoothed_regime_probabilities=jnp.einsum("st,stk->tk", final, is_regime),
+        smoothed_means=smoothed_means,
+        smoothed_covariances=smoothed_covariances,
+        log_likelihood_increments=increments,
+        log_marginal_likelihood=log_evidence[-1],
+    )
+
+
+def _mixed(
+    weights: Float[Array, "s t"], means: Float[Array, "s t d"], covariances: Float[Array, "s t d d"]
+) -> tuple[Float[Array, "t d"], Float[Array, "t d d"]]:
+    """The moments of a mixture of Gaussians at each time."""
+    mean = jnp.einsum("st,std->td", weights, means)
+    centred = means - mean[None]
+    squares = covariances + centred[..., :, None] * centred[..., None, :]
+    return mean, jnp.einsum("st,stde->tde", weights, squares)
+
+
+def _kalman_smoother(
+    model: SwitchingLinearGaussianModel, sequence: Array, observations: Float[Array, "t p"]
+) -> tuple[tuple[Array, Array], tuple[Array, Array], Float[Array, " t"]]:
+    """Filtered and smoothed moments, and log p(y_s | y_1..y_{s-1}), given the regimes."""
+    d = model.m0.shape[-1]
+    row = lambda part, shape: jnp.broadcast_to(part, (1, *shape))[0]  # noqa: E731
+    mean, covariance = (
+        row(part, shape)
+        for part, shape in zip(model.initial_moments(sequence[:1]), ((d,), (d, d)), strict=True)
+    )
+    moments, expected, log_densities, matrices = [(mean, covariance)], [], [], []
+    for s, observation in enumerate(observations):
+        regime = sequence[s + 1 : s + 2]
+        matrix, offset, noise = model.dynamics(regime, regime)
+        matrix, offset, noise = row(matrix, (d, d)), row(offset, (d,)), row(noise, (d, d))
+        mean, covariance = matrix @ mean + offset, matrix @ covariance @ matrix.T + noise
+        matrices.append(matrix)
+        expected.append((mean, covariance))
+        p = observation.shape[0]
+        seen, offset, noise = model.emission(regime)
+        present = ~jnp.isnan(observation)
+        here = present.astype(mean.dtype)
+        seen = here[:, None] * row(seen, (p, d))
+        missed = jnp.where(present, observation - seen @ mean - row(offset, (p,)), 0.0)
+        alone = jnp.diag(1 - here)
+        spread = (
+            seen @ covariance @ seen.T + here[:, None] * here[None] * row(noise, (p, p)) + alone
+        )
+        gain = jnp.linalg.solve(spread, seen @ covariance).T
+        log_densities.append(
+            -0.5 * missed @ jnp.linalg.solve(spread, missed)
+            - 0.5 * jnp.linalg.slogdet(spread)[1]
+            - 0.5 * jnp.sum(here) * jnp.log(2 * jnp.pi)
+        )
+        mean = mean + gain @ missed
+        covariance = covariance - gain @ spread @ gain.T
+        moments.append((mean, covariance))
+    smoothed = [(mean, covariance)]
+    for s in reversed(range(len(observations))):
+        (mean, covariance), (next_mean, next_covariance) = moments[s], smoothed[-1]
+        back = jnp.linalg.solve(expected[s][1], matrices[s] @ covariance).T
+        mean = mean + back @ (next_mean - expected[s][0])
+        covariance = covariance + back @ (next_covariance - expected[s][1]) @ back.T
+        smoothed.append((mean, covariance))
+    return _stacked(moments[1:]), _stacked(smoothed[::-1]), jnp.stack(log_densities)
+
+
+def _stacked(moments: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    means, covariances = zip(*moments, strict=True)
+    return jnp.stack(means), jnp.stack(covariances)
