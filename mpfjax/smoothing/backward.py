@@ -42,10 +42,12 @@ def draw_exactly(
     mixture: ParticleMixture,
     num_draws: int = 1,
     needed: Bool[Array, " k"] | None = None,
+    checked: bool = True,
 ) -> Int[Array, "k draws"]:
     """Indices for each of the next states by W^i D(next | x^i), O(N) for a state.
 
-    An error at run time where a state that is `needed` cannot have come from any particle.
+    An error at run time where a state that is `needed` cannot have come from any particle; any
+    index there where that is not `checked`.
     """
     n = mixture.num_particles
 
@@ -71,6 +73,8 @@ def draw_exactly(
         indices, largest = jax.vmap(draw_some)(inputs)
     else:
         indices, largest = jax.lax.map(draw_some, inputs, batch_size=together)
+    if not checked:
+        return indices
     return _with_a_past(indices, largest, needed)
 
 

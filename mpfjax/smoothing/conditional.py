@@ -34,7 +34,7 @@ from mpfjax.operations.matrices import draw_columns
 from mpfjax.running.scan import FilterRun, checked, scan
 from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.history import mixtures_of
-from mpfjax.smoothing.trajectories import sample_trajectories
+from mpfjax.smoothing.trajectories import draw_trajectories
 
 _IMPOSSIBLE = "trajectory: its density beside the observations is zero or NaN"
 
@@ -145,8 +145,12 @@ def renew(
     series: Series,
     trajectory: PyTree,
     backward: bool,
+    checked: bool = True,
 ) -> ConditionalRun:
-    """`conditional_filter` under the caller's jit, unchecked."""
+    """`conditional_filter` under the caller's jit, its arguments unchecked.
+
+    Where the backward sampling is not `checked` either, look at `is_possible` of the trajectory.
+    """
     key_slot, key_initial, key_run, key_back = split(key, 4)
     n = filter.num_particles
     first_slot = jnp.clip(jnp.floor(uniform(key_slot, ()) * n).astype(jnp.int32), 0, n - 1)
@@ -158,7 +162,7 @@ def renew(
     log_weights = jax.vmap(at)(run.collected.log_weights, reference)
     later = (log_weights > -jnp.inf) & ~run.degenerate
     slots = jnp.concatenate([first_slot[None], reference])
-    drawn = draw_trajectory(key_back, filter.model, run, series.inputs, backward)
+    drawn = draw_trajectory(key_back, filter.model, run, series.inputs, backward, checked)
     possible = _possible(filter.model, trajectory, series.inputs, later)
     return ConditionalRun(drawn, run, slots, possible)
 
@@ -195,12 +199,20 @@ def draw_trajectory(
     run: FilterRun,
     inputs: PyTree,
     backward: bool,
+    checked: bool = True,
 ) -> PyTree:
     """One trajectory of a run, by backward sampling or the genealogy: leaves (t + 1, ...)."""
+    mixtures = mixtures_of(run)
     if not backward:
-        return _of_the_genealogy(key, mixtures_of(run))
-    drawn = sample_trajectories(key, model, run, 1, inputs=inputs)
+        return _of_the_genealogy(key, mixtures)
+    drawn = draw_trajectories(key, model, mixtures, inputs, 1, checked=checked)
     return jax.tree.map(lambda leaf: leaf[0], drawn)
+
+
+def is_possible(model: Any, trajectory: PyTree, inputs: PyTree) -> Bool[Array, ""]:
+    """Whether the model gives a trajectory a density above zero, as far as it knows it."""
+    length = jax.tree.leaves(trajectory)[0].shape[0] - 1
+    return jnp.all(_possible(model, trajectory, inputs, jnp.ones(length, bool)))
 
 
 def _of_the_genealogy(key: Key[Array, ""], mixtures: ParticleMixture) -> PyTree:

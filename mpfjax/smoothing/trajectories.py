@@ -73,7 +73,9 @@ def sample_trajectories(
         num_steps = 0
     elif num_steps is None:
         num_steps = 1
-    return _sample(key, model, stacked, inputs, num_trajectories, component, num_steps)
+    return draw_trajectories(
+        key, model, stacked, inputs, num_trajectories, component, num_steps
+    )
 
 
 def _inputs_between(
@@ -98,7 +100,13 @@ def _check_component(mixtures: ParticleMixture, component: int) -> None:
 
 
 @jit_on_wide_vectors
-def _sample(key, model, mixtures, inputs, num_trajectories, component, num_steps):
+def draw_trajectories(
+    key, model, mixtures, inputs, num_trajectories, component=None, num_steps=0, checked=True
+):
+    """`sample_trajectories` without its checks of arguments; `checked` as for `draw_exactly`.
+
+    `inputs` are those of the steps between mixtures.
+    """
     key_final, key_steps, key_proposed = split_keys(key, 3)
     final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
     log_weights = final.log_weights
@@ -112,7 +120,9 @@ def _sample(key, model, mixtures, inputs, num_trajectories, component, num_steps
         step_key, earlier, ancestors, proposed, now = step
         moved_by = with_inputs(model, now)
         if proposed is None:
-            indices = draw_exactly(step_key, moved_by, next_states, earlier)[:, 0]
+            indices = draw_exactly(
+                step_key, moved_by, next_states, earlier, checked=checked
+            )[:, 0]
         else:
             start = take(ancestors, next_indices)
             indices = walk(step_key, moved_by, next_states, earlier, start, proposed)[-1]

@@ -5,6 +5,8 @@ from mpfjax.tuning.climb import TuningRun as TuningRun
 from mpfjax.tuning.climb import fit as fit
 from mpfjax.tuning.climb import maximise as maximise
 from mpfjax.tuning.curvature import standard_errors as standard_errors
+from mpfjax.tuning.densities import LogDensity as LogDensity
+from mpfjax.tuning.densities import log_density as log_density
 from mpfjax.tuning.gibbs import GibbsPosterior as GibbsPosterior
 from mpfjax.tuning.gibbs import particle_gibbs as particle_gibbs
 from mpfjax.tuning.inference_data import to_inference_data as to_inference_data

@@ -230,10 +230,9 @@ class Climb:
                 "path": jax.tree.map(rows, start.reals), "values": by_step, "deviations": by_step,
             }  # fmt: skip
 
-        found = file.load(like)
-        if found is None:
+        if not file.path.exists():
             return start
-        notes, arrays = found
+        notes, arrays = file.load(like)
         return State(
             step=notes["step"],
             reals=arrays["reals"],

@@ -42,13 +42,11 @@ class Checkpoint:
         notes |= {"caller": self.caller, "identity": dict(self.identity(step)), "step": int(step)}
         write_arrays(self.path, arrays_of(state) | {_NOTES: np.array(json.dumps(notes))})
 
-    def load(self, like: Callable[[Notes], PyTree]) -> tuple[Notes, PyTree] | None:
-        """The notes and the state, which looks `like` what the notes say; None without a file.
+    def load(self, like: Callable[[Notes], PyTree]) -> tuple[Notes, PyTree]:
+        """The notes and the state, which looks `like` what the notes say.
 
         Raises `ValueError` for the file of another run, or for half of one.
         """
-        if not self.path.exists():
-            return None
         arrays = load_arrays(self.path)
         notes = self._notes(arrays)
         found, own = notes["identity"], dict(self.identity(notes["step"]))

@@ -1,7 +1,8 @@
 """The posterior of parameters and states together, by particle Gibbs."""
 
+import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import equinox as eqx
@@ -20,41 +21,49 @@ from mpfjax.checks import (
     saying,
     shown,
 )
-from mpfjax.filter import Filter, sample_initial
+from mpfjax.filter import Filter, Start, sample_initial
 from mpfjax.models.base import require
-from mpfjax.observations import Series, as_arrays, present_steps
-from mpfjax.running.scan import scan_filter
-from mpfjax.smoothing.conditional import check_conditional, draw_trajectory, renew
+from mpfjax.observations import Series, as_series
+from mpfjax.running.scan import scan
+from mpfjax.running.storage import fingerprint
+from mpfjax.smoothing.conditional import check_conditional, draw_trajectory, is_possible, renew
 from mpfjax.tuning.chains import (
-    BROKEN,
-    Prior,
-    checked_deviations,
-    checked_prior,
-    constrained,
-    is_broken,
-    take_steps,
-    walk,
+    AbstractKernel,
+    Plan,
+    Run,
+    Step,
+    as_checkpoint,
+    chosen,
 )
+from mpfjax.tuning.checkpoints import check_checkpoint
+from mpfjax.tuning.densities import LogPrior, Prior, is_invalid, number_or_zero
 from mpfjax.tuning.problem import Parameters, Problem, Reals, pose_filter
+from mpfjax.tuning.starts import SamplePrior, Starts, constrained
 from mpfjax.tuning.transforms import AbstractTransform
+from mpfjax.tuning.walks import RandomWalk, accepts, checked_deviations
 
 Draw = Callable[[Key[Array, ""], PyTree, PyTree, Any], Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
 class GibbsPosterior:
-    """The chains of `particle_gibbs`, without their starts."""
+    """The chains of `particle_gibbs`, after their burn-in."""
 
     parameters: dict[str, np.ndarray]
-    """by name, on their own scale: shape (chains, steps, ...)."""
+    """by name, on their own scale: shape (chains, draws, ...)."""
     trajectories: PyTree
-    """x_0, ..., x_t of every step, leaves (chains, steps, t + 1, ...), or what `collect` made."""
-    accepted: Float[np.ndarray, "chains steps"]
-    """the share of Metropolis steps that moved; 1 where the parameters are drawn."""
-    renewed: Bool[np.ndarray, "chains steps times"]
-    """which states of the trajectory changed in each step."""
-    stopped: str | None
+    """x_0, ..., x_t of every draw, leaves (chains, draws, t + 1, ...), or what `collect` made."""
+    accepted: Float[np.ndarray, "chains draws"]
+    """the share of these steps' Metropolis steps that moved; 1 where the parameters are drawn."""
+    renewed: Bool[np.ndarray, "chains draws times"]
+    """which states of the trajectory changed in these steps."""
+    stopped: str | None = None
     """why they ended before `num_steps`, or None."""
+    num_invalid: dict[str, np.ndarray] = field(default_factory=dict)
+    """how often in each chain, in all its steps, the `log_prior` or `log_joint` of a proposal, the
+    numbers of `draw`, or densities in the `conditional_filter` were NaN or +inf."""
+    proposal_covariance: Float[np.ndarray, "d d"] | None = None
+    """of the random walk after burn-in, in unconstrained numbers, in the order of their names."""
 
     @property
     def acceptance_rate(self) -> float:
@@ -74,15 +83,22 @@ def particle_gibbs(
     num_steps: int,
     *,
     draw: Draw | None = None,
-    log_prior: Callable[[dict[str, Array]], Float[Array, ""]] | None = None,
+    log_prior: LogPrior | None = None,
+    sample_prior: SamplePrior | None = None,
     proposal_deviations: float | Mapping[str, Any] = 0.1,
     num_metropolis_steps: int = 5,
+    burn_in: int = 0,
+    adapt: bool = True,
+    thinning: int = 1,
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
     num_chains: int = 1,
     backward: bool = True,
     collect: Callable[[PyTree], PyTree] | None = None,
     missing: str = "error",
+    checkpoint: str | os.PathLike[str] | None = None,
+    checkpoint_every: int = 1000,
+    checkpoint_name: str | None = None,
     progress: bool = True,
 ) -> GibbsPosterior:
     """Sample p(θ, x_0, ..., x_t | y_1..y_t), parameters and trajectory in turn.
@@ -102,17 +118,24 @@ def particle_gibbs(
       `metropolis_hastings`. The model then needs `log_transition` and `log_initial`.
     - `proposal_deviations`: of the Metropolis steps' random walk, as for `metropolis_hastings`.
       `num_metropolis_steps`: how many of them there are for one new trajectory; they cost little.
-    - `num_chains`: all start at the filter's own parameters, each at a trajectory of its own, and
-      run under one vmap. Drop their first steps.
+    - `num_chains`, `sample_prior`, `burn_in`, `adapt`, `thinning`: as for `metropolis_hastings`.
+      Each chain starts at a trajectory of its own. The random walk learns its scale too, since
+      the density given a trajectory has no noise: it aims at accepting 44% of the Metropolis
+      steps for one number, 23% for several. With `draw` nothing is learned.
     - `backward`: as for `conditional_filter`.
-    - `collect`: a function of one trajectory, for what to keep of it; None keeps all.
+    - `collect`: a function of one trajectory, for what to keep of it, such as
+      `lambda trajectory: trajectory[-1]`, or `lambda trajectory: None`; None keeps all.
+    - `checkpoint`, `checkpoint_every`, `checkpoint_name`: as for `metropolis_hastings`. The file
+      holds what is kept of the trajectories too.
     - `observations`: one sequence. `parameters`, `transforms`, `missing`: as for `fit`. Parameters
       are usually the model's; those of a proposal have no posterior.
 
-    At a NaN or +inf the chains end with a warning, the steps so far, and the step in `stopped`.
-    Raises `ValueError` for both or none of `draw` and `log_prior`, a draw of other names or shapes
-    than the parameters, a list of sequences, and what `conditional_filter` and `fit` do;
-    `RuntimeError` where the start has no likelihood.
+    A proposal whose density is NaN or +inf is rejected, and where the conditional filter meets one,
+    the whole step is; `num_invalid` counts them, with a warning. Ctrl-C returns the
+    draws so far with a warning, if there are any. Raises `ValueError` for both or none of `draw`
+    and `log_prior`, a draw of other names or shapes than the parameters, a list of sequences, a
+    checkpoint of other chains, and what `conditional_filter` and `fit` do; `RuntimeError` where
+    the start, or a hundred draws of the prior, have no likelihood.
 
     Use it where the trajectory makes the parameters' distribution simple, or long sequences make
     `metropolis_hastings` reject nearly all. If θ and the trajectory fix each other, as a small
@@ -120,14 +143,15 @@ def particle_gibbs(
     """
     check_key(key)
     check_type(Filter, "a filter", filter=filter)
-    check_whole(
-        num_steps=num_steps, num_chains=num_chains, num_metropolis_steps=num_metropolis_steps
-    )
+    check_whole(num_chains=num_chains, num_metropolis_steps=num_metropolis_steps)
+    plan = Plan(num_steps, burn_in, thinning, adapt)
     check_flag(backward=backward, progress=progress)
     check_callable("a function of a trajectory", **given(collect=collect))
     what = "a function of a key, a trajectory, observations and a model"
     check_callable(what, **given(draw=draw))
     check_callable("a function of the parameters by name", **given(log_prior=log_prior))
+    check_callable("a function of a key", **given(sample_prior=sample_prior))
+    check_checkpoint(checkpoint, checkpoint_every, checkpoint_name)
     if (draw is None) == (log_prior is None):
         raise ValueError(
             f"draw, log_prior: {shown(draw)} and {shown(log_prior)}; exactly one must be given"
@@ -138,39 +162,46 @@ def particle_gibbs(
             "observations: a list is several sequences, and this takes one;"
             " jnp.asarray(observations) is one of numbers"
         )
-    present = present_steps(observations, missing, filter.model)
-    observations = as_arrays(observations)
-    joint = LogJoint(observations, present)
+    joint = LogJoint(as_series(observations, None, missing, filter.model))
     problem = pose_filter(filter, joint, parameters, transforms)
-    start = problem.start()
-    prior, deviations = None, {}
+    deviations = checked_deviations(proposal_deviations, problem.start())
+    key_start, key_steps = jax.random.split(key)
+    starts = Starts(key_start, problem, num_chains, sample_prior, deviations)
+    prior = None
     if log_prior is not None:
         for density in ("log_transition", "log_initial"):
             require(filter.model, density, "particle_gibbs with log_prior")
-        deviations = checked_deviations(proposal_deviations, start)
-        prior = checked_prior(log_prior, problem, start, "at the start")
-    sampler = _Sampler(problem, joint, prior, deviations, draw, num_metropolis_steps, backward)
+        prior = starts.checked(log_prior)
+    kernel = _Kernel(problem, joint, prior, draw, collect, int(num_metropolis_steps), backward)
     if draw is not None:
-        _check_draw(sampler, start)
-    key_start, key_steps = jax.random.split(key)
-    try:
-        states = _starts(sampler, jax.random.split(key_start, num_chains), start)
-    except RuntimeError as error:
-        if not is_broken(error):
-            raise
-        raise RuntimeError(f"particle_gibbs: {BROKEN} at the start") from error
-    advance = eqx.Partial(_advance, sampler, collect)
-    (reals, kept, accepted, renewed), stopped = take_steps(
-        "particle_gibbs", advance, states, key_steps, num_steps, num_chains, progress
+        _check_draw(kernel, problem.start())
+    settings = {
+        "observations": fingerprint(joint), "missing": missing, "backward": bool(backward),
+        "num_metropolis_steps": int(num_metropolis_steps),
+    }  # fmt: skip
+    settings |= starts.settings | plan.settings | {"key": key}
+    code = {
+        "draw": draw, "log_prior": log_prior, "sample_prior": sample_prior, "collect": collect
+    }  # fmt: skip
+    file = as_checkpoint(checkpoint, "particle_gibbs", checkpoint_name, settings, code)
+    run = Run("particle_gibbs", kernel, starts, key_steps, plan, file)
+    outcome = run.sample(checkpoint_every, progress)
+    reals, kept, accepted, renewed = outcome.draws
+    return GibbsPosterior(
+        parameters=constrained(problem, reals),
+        trajectories=kept,
+        accepted=accepted,
+        renewed=renewed,
+        num_invalid=outcome.num_invalid,
+        proposal_covariance=outcome.proposal_covariance,
+        stopped=outcome.stopped,
     )
-    return GibbsPosterior(constrained(problem, reals), kept, accepted, renewed, stopped)
 
 
 class LogJoint(eqx.Module):
     """log p(x_0, ..., x_t, y_1, ..., y_t | θ) of a trajectory and the observations there are."""
 
-    observations: PyTree
-    present: Bool[Array, " t"] | None
+    series: Series
 
     def __call__(self, trajectory: PyTree, filter: Filter) -> Float[Array, ""]:
         """With the parameters of the filter's model."""
@@ -184,63 +215,92 @@ class LogJoint(eqx.Module):
             one = jax.tree.map(lambda leaf: leaf[None], state)
             return model.log_likelihood(observation, one)[0]
 
-        seen = jax.vmap(log_likelihood)(self.observations, after)
-        if self.present is not None:
-            seen = jnp.where(self.present, seen, 0.0)
+        seen = jax.vmap(log_likelihood)(self.series.observations, after)
+        if self.series.present is not None:
+            seen = jnp.where(self.series.present, seen, 0.0)
         steps = jnp.sum(model.log_transition(after, before))
         return model.log_initial(start)[0] + steps + jnp.sum(seen)
 
 
-class _Sampler(eqx.Module):
+class _Pair(eqx.Module):
+    """Where a chain is."""
+
+    reals: Reals
+    trajectory: PyTree
+
+
+class _Kernel(AbstractKernel):
     """One step of a chain: the parameters, then the trajectory."""
 
     problem: Problem
     joint: LogJoint
     prior: Prior | None
-    deviations: Reals
     draw: Draw | None
+    collect: Callable[[PyTree], PyTree] | None
     num_metropolis_steps: int = eqx.field(static=True)
     backward: bool = eqx.field(static=True)
 
-    def start(self, key: Key[Array, ""], reals: Reals) -> PyTree:
-        """A trajectory of an ordinary run."""
+    @property
+    def learns_scale(self) -> bool:
+        """The density given a trajectory has no noise."""
+        return self.draw is None
+
+    def start(self, key: Key[Array, ""], reals: Reals) -> tuple[_Pair, Bool[Array, ""]]:
+        """A trajectory of an ordinary run, and whether there is one."""
         key_run, key_back = jax.random.split(key)
         filter = self.problem.at(reals)
-        run = scan_filter(key_run, filter, self.joint.observations, self.joint.present, None)
-        nothing = ~jnp.all(jnp.isfinite(run.log_likelihood_increments))
-        drawn = draw_trajectory(key_back, filter.model, run, None, self.backward)
-        return eqx.error_if(drawn, nothing, BROKEN)
-
-    def step(
-        self, key: Key[Array, ""], reals: Reals, trajectory: PyTree
-    ) -> tuple[Reals, PyTree, Float[Array, ""], Bool[Array, " times"]]:
-        """The next pair, the share of Metropolis steps that moved, and which states changed."""
-        key_parameters, key_trajectory = jax.random.split(key)
-        if self.draw is None:
-            reals, accepted = self._metropolis(key_parameters, reals, trajectory)
-        else:
-            reals = self.drawn(key_parameters, reals, trajectory)
-            accepted = jnp.ones(())
-        filter = self.problem.at(reals)
-        observations, present = self.joint.observations, self.joint.present
-        found = renew(
-            key_trajectory, filter, Series(observations, present), trajectory, self.backward
+        series = self.joint.series
+        run = scan(Start(key_run), filter, series, None)
+        drawn = draw_trajectory(
+            key_back, filter.model, run, series.inputs, self.backward, checked=False
         )
-        broken = ~jnp.all(found.run.log_likelihood_increments < jnp.inf) | ~jnp.all(found.possible)
+        fine = jnp.all(jnp.isfinite(run.log_likelihood_increments))
+        if self.prior is not None:
+            fine &= jnp.isfinite(self.prior(reals))
+        return _Pair(reals, drawn), fine & is_possible(filter.model, drawn, series.inputs)
+
+    def step(self, key: Key[Array, ""], state: _Pair, walk: RandomWalk) -> Step:
+        """The next pair."""
+        key_parameters, key_trajectory = jax.random.split(key)
+        move = self._metropolis if self.draw is None else self._gibbs
+        reals, accepted, invalid = move(key_parameters, state.reals, state.trajectory, walk)
+        filter, before = self.problem.at(reals), state.trajectory
+        series = self.joint.series
+        found = renew(key_trajectory, filter, series, before, self.backward, checked=False)
+        broken = jnp.any(is_invalid(found.run.log_likelihood_increments))
+        broken |= ~jnp.all(found.possible) | ~is_possible(
+            filter.model, found.trajectory, series.inputs
+        )
+        pair = chosen(~broken, _Pair(reals, found.trajectory), state)
+        invalid["conditional_filter"] = broken
         changes = [
             jnp.any((new != old).reshape(new.shape[0], -1), axis=1)
             for new, old in zip(
-                jax.tree.leaves(found.trajectory), jax.tree.leaves(trajectory), strict=True
+                jax.tree.leaves(pair.trajectory), jax.tree.leaves(before), strict=True
             )
         ]
-        renewed = jnp.any(jnp.stack(changes), axis=0)
-        return eqx.error_if((reals, found.trajectory, accepted, renewed), broken, BROKEN)
+        kept = pair.trajectory
+        if self.collect is not None:
+            with saying("in collect, which is called with a trajectory"):
+                kept = self.collect(kept)
+        report = (pair.reals, kept, accepted, jnp.any(jnp.stack(changes), axis=0))
+        return Step(pair, report, accepted, invalid)
+
+    def _gibbs(
+        self, key: Key[Array, ""], reals: Reals, trajectory: PyTree, walk: RandomWalk
+    ) -> tuple[Reals, Float[Array, ""], dict[str, Array]]:
+        """The user's draw, unless it is no number."""
+        del walk
+        drawn = self.drawn(key, reals, trajectory)
+        fine = jnp.all(jnp.stack([jnp.all(jnp.isfinite(u)) for u in drawn.values()]))
+        return chosen(fine, drawn, reals), jnp.ones(()), {"draw": ~fine}
 
     def drawn(self, key: Key[Array, ""], reals: Reals, trajectory: PyTree) -> Reals:
         """The user's draw, in unconstrained numbers."""
         filter = self.problem.at(reals)
         with saying("in draw, which is called with a key, trajectory, observations and model"):
-            drawn = cast(Draw, self.draw)(key, trajectory, self.joint.observations, filter.model)
+            observations = self.joint.series.observations
+            drawn = cast(Draw, self.draw)(key, trajectory, observations, filter.model)
         if not isinstance(drawn, Mapping) or set(drawn) != set(reals):
             names = sorted(drawn) if isinstance(drawn, Mapping) else shown(drawn)
             raise ValueError(f"draw: it gave {names}, no values by the names {sorted(reals)}")
@@ -255,63 +315,43 @@ class _Sampler(eqx.Module):
         return moved
 
     def _metropolis(
-        self, key: Key[Array, ""], reals: Reals, trajectory: PyTree
-    ) -> tuple[Reals, Float[Array, ""]]:
-        """Steps of a random walk on the parameters given the trajectory."""
+        self, key: Key[Array, ""], reals: Reals, trajectory: PyTree, walk: RandomWalk
+    ) -> tuple[Reals, Float[Array, ""], dict[str, Array]]:
+        """Steps of the random walk on the parameters given the trajectory."""
         prior = cast(Prior, self.prior)
 
-        def log_density(reals: Reals) -> Float[Array, ""]:
-            log_prior = prior(reals)
+        def log_density(reals: Reals) -> tuple[Array, dict[str, Array]]:
+            log_prior, log_joint = prior(reals), self.joint(trajectory, self.problem.at(reals))
+            has_prior = (log_prior > -jnp.inf) & (log_prior < jnp.inf)
             # Where the prior is zero, the likelihood may not even be defined.
-            log_joint = self.joint(trajectory, self.problem.at(reals))
-            density = log_prior + jnp.where(log_prior == -jnp.inf, 0.0, log_joint)
-            return eqx.error_if(density, ~(density < jnp.inf), BROKEN)
+            density = jnp.where(has_prior, log_prior + number_or_zero(log_joint), -jnp.inf)
+            invalid = {
+                "log_prior": is_invalid(log_prior),
+                "log_joint": has_prior & is_invalid(log_joint),
+            }
+            return density, invalid
 
-        def move(
-            place: tuple[Reals, Array], key: Key[Array, ""]
-        ) -> tuple[tuple[Reals, Array], Array]:
+        def move(place: tuple[Reals, Array], key: Key[Array, ""]) -> tuple[tuple, tuple]:
             reals, current = place
             key_walk, key_accept = jax.random.split(key)
-            proposed = walk(key_walk, reals, self.deviations)
-            new = log_density(proposed)
-            accepted = jnp.log(jax.random.uniform(key_accept, (), new.dtype)) < new - current
-            choose = lambda after, before: jnp.where(accepted, after, before)  # noqa: E731
-            return jax.tree.map(choose, (proposed, new), place), accepted
+            proposed = walk.propose(key_walk, reals)
+            new, invalid = log_density(proposed)
+            accepted = accepts(key_accept, new - current)
+            return chosen(accepted, (proposed, new), place), (accepted, invalid)
 
         keys = jax.random.split(key, self.num_metropolis_steps)
-        (reals, _), accepted = jax.lax.scan(move, (reals, log_density(reals)), keys)
-        return reals, jnp.mean(accepted.astype(jnp.result_type(float)))
+        place = (reals, log_density(reals)[0])
+        (reals, _), (accepted, invalid) = jax.lax.scan(move, place, keys)
+        counts = jax.tree.map(lambda some: jnp.sum(some, dtype=jnp.int32), invalid)
+        return reals, jnp.mean(accepted.astype(jnp.result_type(float))), counts
 
 
-def _check_draw(sampler: _Sampler, start: Reals) -> None:
+def _check_draw(kernel: _Kernel, start: Reals) -> None:
     """Raise a `ValueError` for a draw of other names or shapes, before anything compiles."""
-    length = jax.tree.leaves(sampler.joint.observations)[0].shape[0] + 1
-    key, model = jax.random.key(0), sampler.problem.at(start).model
+    length = kernel.joint.series.length + 1
+    key, model = jax.random.key(0), kernel.problem.at(start).model
     states = jax.eval_shape(lambda key: sample_initial(key, model, 1), key)
     trajectory = jax.tree.map(
         lambda state: jax.ShapeDtypeStruct((length, *state.shape[1:]), state.dtype), states
     )
-    jax.eval_shape(lambda *arguments: sampler.drawn(*arguments), key, start, trajectory)
-
-
-@eqx.filter_jit
-def _starts(sampler: _Sampler, keys: Key[Array, " chains"], start: Reals) -> tuple[Reals, PyTree]:
-    """The filter's own parameters, and a trajectory, for each chain."""
-    reals = jax.tree.map(lambda u: jnp.broadcast_to(u, (keys.shape[0], *u.shape)), start)
-    return reals, jax.vmap(sampler.start)(keys, reals)
-
-
-@eqx.filter_jit
-def _advance(
-    sampler: _Sampler,
-    collect: Callable[[PyTree], PyTree] | None,
-    keys: Key[Array, " chains"],
-    states: tuple[Reals, PyTree],
-) -> tuple[tuple[Reals, PyTree], PyTree]:
-    """One step of all chains, and what is kept of it."""
-    reals, trajectories, accepted, renewed = jax.vmap(sampler.step)(keys, *states)
-    kept = trajectories
-    if collect is not None:
-        with saying("in collect, which is called with a trajectory"):
-            kept = jax.vmap(collect)(trajectories)
-    return (reals, trajectories), (reals, kept, accepted, renewed)
+    jax.eval_shape(lambda *arguments: kernel.drawn(*arguments), key, start, trajectory)

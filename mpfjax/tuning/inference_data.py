@@ -12,14 +12,16 @@ from jaxtyping import PyTree
 from mpfjax.checks import shown
 from mpfjax.tuning.gibbs import GibbsPosterior
 from mpfjax.tuning.metropolis import Posterior
+from mpfjax.tuning.sequential import SequentialPosterior
 
 _NEEDED = (
-    "what metropolis_hastings or particle_gibbs returns, nor trajectories, leaves"
+    "what metropolis_hastings, particle_gibbs or smc2 returns, nor trajectories, leaves"
     " (trajectories, times, ...)"
 )
+Chains = Posterior | GibbsPosterior | SequentialPosterior
 
 
-def to_inference_data(result: Posterior | GibbsPosterior | PyTree) -> Any:
+def to_inference_data(result: Chains | PyTree) -> Any:
     """A posterior as ArviZ's own type, for its diagnostics and plots.
 
     It is an `InferenceData` with ArviZ before 1, and a `DataTree` of xarray from 1 on.
@@ -30,12 +32,15 @@ def to_inference_data(result: Posterior | GibbsPosterior | PyTree) -> Any:
       dimension `time`; for states that are several arrays, `state_` and the name of each. What
       `collect` made of trajectories is called so too. `sample_stats` has `acceptance_rate`, and
       `renewed`, which states changed in a step.
+    - of `smc2`: `posterior` has as many draws of its weighted samples as there are samples, of
+      equal weight (systematic resampling), in an order without meaning, as one chain. Samples of
+      large weight are there several times, which ArviZ's effective sample size does not know:
+      take `effective_sample_sizes`.
     - of trajectories, as `sample_trajectories` draws them: `posterior` has them as `state`, as
       draws of one chain. They are independent given the run.
 
-    Raises `ImportError` where arviz is missing, `ValueError` for anything else; the samples of
-    `smc2` have weights, which ArviZ does not know. Use it for effective sample sizes and R-hat:
-    `arviz.summary(to_inference_data(chains))`.
+    Raises `ImportError` where arviz is missing, `ValueError` for anything else. Use it for
+    effective sample sizes and R-hat: `arviz.summary(to_inference_data(chains))`.
     """
     arviz = _arviz()
     if isinstance(result, Posterior):
@@ -57,6 +62,10 @@ def to_inference_data(result: Posterior | GibbsPosterior | PyTree) -> Any:
         stats = {"acceptance_rate": result.accepted, "renewed": result.renewed}
         dims = times | {"renewed": ["time"]}
         return _convert(arviz, result.parameters | states, stats, dims)
+    if isinstance(result, SequentialPosterior):
+        draws = _of_equal_weight(result.weights)
+        posterior = {name: values[draws][None] for name, values in result.parameters.items()}
+        return _convert(arviz, posterior, {}, {})
     leaves = jax.tree.leaves(result)
     if not leaves or not all(map(_is_stack, leaves)):
         raise ValueError(f"result: {shown(result)} is not {_NEEDED}")
@@ -65,6 +74,18 @@ def to_inference_data(result: Posterior | GibbsPosterior | PyTree) -> Any:
         raise ValueError(f"result: leaves of shapes {shapes} are not {_NEEDED}")
     states = {name: leaf[None] for name, leaf in _states(result).items()}
     return _convert(arviz, states, {}, {name: ["time"] for name in states})
+
+
+def _of_equal_weight(weights: np.ndarray) -> np.ndarray:
+    """Indices of samples by systematic resampling, the same in every call.
+
+    In their own order, copies would stand side by side and look like a chain that sticks.
+    """
+    num = len(weights)
+    cumulative = np.cumsum(weights, dtype=float)
+    quantiles = (np.arange(num) + 0.5) / num * cumulative[-1]
+    indices = np.minimum(np.searchsorted(cumulative, quantiles, side="right"), num - 1)
+    return np.random.default_rng(0).permutation(indices)
 
 
 def _is_stack(leaf: Any) -> bool:

@@ -45,6 +45,10 @@ class Problem(eqx.Module):
         """The filter or model as it is."""
         return jax.tree.unflatten(self.structure, self.leaves)
 
+    def with_structure(self, structure: Any) -> "Problem":
+        """The same leaves in a tree with other static fields."""
+        return Problem(self.leaves, self.transforms, self.objective, self.tuned, structure)
+
     def start(self) -> Reals:
         """The parameters as they are; raises `ValueError` for one that cannot be tuned."""
         reals = {}

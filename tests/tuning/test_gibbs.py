@@ -92,12 +92,14 @@ class Fragile(ScalarLinear):
         return jnp.where(self.a > 0.9, jnp.nan, honest)
 
 
-def test_a_nan_ends_the_chains_with_what_they_have():
+def test_a_nan_is_rejected_and_counted():
     filter = mpfjax.particle_filter(Fragile(a=0.5), 10)
-    with pytest.warns(UserWarning, match="was NaN or inf at step"):
+    with pytest.warns(UserWarning, match=r"zero density: conditional_filter \d+ times$"):
         run = sample(200, filter=filter)
-    assert run.stopped.endswith(f"at step {run.accepted.shape[1]}")
+    assert run.stopped is None
+    assert run.parameters["a"].shape == (2, 200)
     assert (run.parameters["a"] <= 0.9).all()
+    assert (run.num_invalid["conditional_filter"] > 0).all()
     with pytest.raises(RuntimeError, match="was NaN or inf"):
         sample(filter=mpfjax.particle_filter(Fragile(a=0.95), 10))
 

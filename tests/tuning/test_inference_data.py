@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.tuning import GibbsPosterior, Posterior, to_inference_data
+from mpfjax.tuning import GibbsPosterior, Posterior, SequentialPosterior, to_inference_data
 
 RNG = np.random.default_rng(0)
 CHAINS = Posterior(
@@ -53,6 +53,25 @@ def test_of_particle_gibbs(arviz):
     np.testing.assert_array_equal(posterior["time"], np.arange(6))
     np.testing.assert_array_equal(data["sample_stats"]["renewed"], GIBBS.renewed)
     np.testing.assert_array_equal(data["sample_stats"]["acceptance_rate"], GIBBS.accepted)
+
+
+def test_of_smc2_samples_count_as_often_as_they_weigh(arviz):
+    weights = np.array([0.5, 0.0, 0.25, 0.25])
+    one = {"a": np.arange(4.0), "b": np.arange(8.0).reshape(4, 2)}
+    cloud = SequentialPosterior(
+        parameters={name: np.repeat(values, 50, axis=0) for name, values in one.items()},
+        log_weights=np.log(np.repeat(weights, 50) / 50, where=np.repeat(weights, 50) > 0,
+                           out=np.full(200, -np.inf)),
+        log_likelihood_increments=np.zeros(1), effective_sample_sizes=np.zeros(1),
+        acceptance_rates=np.zeros(1), num_particles=np.ones(1, int),
+        num_invalid={},
+    )  # fmt: skip
+    posterior = to_inference_data(cloud)["posterior"]
+    drawn = posterior["a"].values
+    assert drawn.shape == (1, 200)
+    np.testing.assert_array_equal(np.bincount(drawn[0].astype(int), minlength=4), 200 * weights)
+    assert posterior["b"].shape == (1, 200, 2)
+    assert float(arviz.ess(posterior["a"].values)) > 50
 
 
 @pytest.mark.usefixtures("arviz")

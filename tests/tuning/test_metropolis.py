@@ -1,7 +1,5 @@
 """Particle marginal Metropolis-Hastings against the exact posterior, and what it refuses."""
 
-import sys
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,7 +10,7 @@ from jax.scipy.stats import norm
 import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.tuning import Interval, Positive, metropolis_hastings
-from tests.user_models import ScalarLinear
+from tests.user_models import ScalarLinear, nothing_traced
 
 OBSERVATIONS = jnp.array([1.5, 0.2, -0.4, 0.8, 1.9, 1.1, 0.3, -0.9, 0.4, 1.2])
 A = {"a": lambda filter: filter.model.a}
@@ -81,14 +79,27 @@ class Fragile(ScalarLinear):
         return jnp.where(self.a > 0.9, jnp.nan, honest)
 
 
-def test_a_nan_ends_the_chains_with_what_they_have():
+def test_a_nan_is_rejected_and_counted():
     filter = mpfjax.particle_filter(Fragile(a=0.5), 12)
-    with pytest.warns(UserWarning, match="was NaN or inf at step"):
+    with pytest.warns(UserWarning, match=r"zero density: log_marginal_likelihood \d+ times$"):
         run = sample(200, filter=filter, num_chains=4)
-    steps = run.accepted.shape[1]
-    assert run.stopped.endswith(f"at step {steps}")
-    assert run.parameters["a"].shape == (4, steps)
+    assert run.stopped is None
+    assert run.parameters["a"].shape == (4, 200)
     assert (run.parameters["a"] <= 0.9).all()
+    assert run.accepted.any(axis=1).all()
+    assert (run.num_invalid["log_marginal_likelihood"] > 0).all()
+    assert not run.num_invalid["log_prior"].any()
+
+
+def test_a_prior_that_is_nan_outside_its_support_is_zero_there():
+    def sided(parameters):
+        return jnp.log(0.9 - parameters["a"])
+
+    filter = mpfjax.particle_filter(Fragile(a=0.5), 12)
+    with pytest.warns(UserWarning, match=r"zero density: log_prior \d+ times$"):
+        run = sample(60, filter=filter, num_chains=4, log_prior=sided)
+    assert (run.parameters["a"] <= 0.9).all()
+    assert not run.num_invalid["log_marginal_likelihood"].any()
 
 
 def test_what_the_prior_rules_out_is_never_reached():
@@ -152,10 +163,11 @@ def test_wrong_types_are_refused_by_name(options, named):
         sample(**options)
 
 
-def test_without_blackjax_it_says_how_to_get_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "blackjax", None)
-    with pytest.raises(ImportError, match=r"mpfjax\[mcmc\]"):
-        sample()
+def test_calls_share_one_program():
+    """Of any length, burn-in and thinning."""
+    sample(3)
+    with nothing_traced():
+        sample(40, burn_in=7, thinning=3, key=jax.random.key(5))
 
 
 @pytest.mark.thorough

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.tuning import Positive, smc2
+from mpfjax.tuning import Positive, observing, smc2
 from tests.tuning.exact_posteriors import (
     DEVIATION_OF_A,
     DEVIATION_OF_LOG_SIGMA,
@@ -99,6 +99,26 @@ class TestPosterior:
             np.testing.assert_array_equal(np.isfinite(run.acceptance_rates), below)
             assert run.mean("a") == pytest.approx(run.weights @ run.parameters["a"], abs=1e-5)
 
+    @pytest.mark.thorough
+    def test_where_the_particles_double_it_is_the_exact_one(self):
+        """From five, after every move, to twenty."""
+        options = {"ess_threshold": 0.9, "max_particles": 20, "acceptance_threshold": 1.0}
+        filter = mpfjax.particle_filter(ScalarLinear(), 5)
+        keys = jax.random.split(jax.random.key(4), NUM_RUNS)
+        runs = [sample(240, key=key, filter=filter, **options) for key in keys]
+        assert_posterior(runs, [run.parameters["a"] for run in runs], posterior_of_a())
+        assert all(run.num_particles[-1] == 20 for run in runs)
+
+    @pytest.mark.thorough
+    def test_of_further_observations_it_is_the_exact_one(self):
+        runs = [
+            sample(240, key=key, observations=OBSERVATIONS[:3])
+            .extend(OBSERVATIONS[3:4], progress=False)
+            .extend(OBSERVATIONS[4:], progress=False)
+            for key in jax.random.split(jax.random.key(5), NUM_RUNS)
+        ]
+        assert_posterior(runs, [run.parameters["a"] for run in runs], posterior_of_a())
+
 
 def test_one_step_and_no_observation_at_all():
     """Without observations the samples are those of the prior."""
@@ -126,10 +146,111 @@ def test_likelihoods_that_are_none_are_an_error(value, named):
         sample(filter=mpfjax.particle_filter(Faulty(r=value), 10))
 
 
+ROWS = ("log_likelihood_increments", "effective_sample_sizes", "acceptance_rates", "num_particles")
+
+
+def assert_same_rows(one, other, length=None):
+    for name in ROWS:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name)[:length])
+
+
+def assert_same_samples(one, other):
+    assert_same_rows(one, other)
+    np.testing.assert_array_equal(one.parameters["a"], other.parameters["a"])
+    np.testing.assert_array_equal(one.log_weights, other.log_weights)
+
+
+def test_further_observations_give_what_all_at_once_give():
+    """Two at a time, with a missing one among them; to the bit, and the first stays as it is."""
+    whole = sample()
+    grown = first = sample(observations=OBSERVATIONS[:2])
+    for t in range(2, len(OBSERVATIONS), 2):
+        grown = grown.extend(OBSERVATIONS[t : t + 2], progress=False)
+    assert grown.parameters["a"].shape == (60,)
+    assert_same_samples(grown, whole)
+    assert len(first.log_likelihood_increments) == 2
+    np.testing.assert_array_equal(
+        first.extend(OBSERVATIONS[2:], progress=False).parameters["a"], whole.parameters["a"]
+    )
+    with pytest.raises(ValueError, match=r"observations: .* are not like those before"):
+        first.extend(jnp.zeros((2, 3)))
+
+
+def interrupt_at(monkeypatch, step):
+    """Ctrl-C at an observation."""
+    real = observing.extended
+
+    def interrupted(sampler, key, samples, t):
+        if int(t) == step:
+            raise KeyboardInterrupt
+        return real(sampler, key, samples, t)
+
+    monkeypatch.setattr(observing, "extended", interrupted)
+
+
+def test_interrupted_and_resumed_the_samples_are_those_of_one_run(tmp_path, monkeypatch):
+    """Also to observations that were not there before, and where N has doubled meanwhile."""
+    options = {"max_particles": 20, "acceptance_threshold": 1.0}
+    kept = options | {"checkpoint": tmp_path / "samples.npz", "checkpoint_every": 3}
+    whole = sample(**options)
+    assert set(whole.num_particles) == {10, 20}
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 5)
+        with pytest.warns(UserWarning, match="interrupted at step 5 of 8"):
+            part = sample(**kept)
+    assert part.stopped == "interrupted at step 5 of 8"
+    assert_same_rows(part, whole, 5)
+    assert_same_samples(part.extend(OBSERVATIONS[5:], progress=False), whole)
+    shorter = kept | {"observations": OBSERVATIONS[:6], "checkpoint": tmp_path / "6.npz"}
+    sample(**shorter)
+    assert_same_samples(sample(**shorter | {"observations": OBSERVATIONS}), whole)
+    assert_same_samples(sample(**kept), whole)
+    with pytest.raises(ValueError, match=r"is of another smc2: observations is"):
+        sample(**kept, observations=OBSERVATIONS.at[0].add(1.0))
+    with pytest.raises(ValueError, match=r"is of another smc2: num_moves is 5 there and 2 here"):
+        sample(**kept | {"num_moves": 2})
+
+
+class Fragile(ScalarLinear):
+    """A likelihood that breaks where a is above 0.5, from observations above 1.8 on."""
+
+    def log_likelihood(self, observation, states):
+        honest = super().log_likelihood(observation, states)
+        return jnp.where((self.a > 0.5) & (observation > 1.8), jnp.nan, honest)
+
+
+def test_a_nan_costs_its_sample_alone():
+    """The weight of such a θ is zero; nothing else is lost, and they are counted."""
+    filter = mpfjax.particle_filter(Fragile(), 10)
+    with pytest.warns(UserWarning, match=r"zero density: log_marginal_likelihood \d+ times$"):
+        run = sample(filter=filter, ess_threshold=0.0)
+    dropped = run.parameters["a"] > 0.5
+    assert run.num_invalid == {"log_prior": 0, "log_marginal_likelihood": dropped.sum()}
+    assert 0 < dropped.sum() < 60
+    assert (run.weights[dropped] == 0).all()
+    assert (run.weights[~dropped] > 0).all()
+    assert np.isfinite(run.log_marginal_likelihood)
+    with pytest.warns(UserWarning, match="zero density"):
+        moved = sample(filter=filter, ess_threshold=1.0)
+    assert (moved.parameters["a"] <= 0.5).all()
+
+
+def test_where_nobody_is_left_the_posterior_before_that_is():
+    filter = mpfjax.particle_filter(Fragile(), 10)
+    with pytest.warns(UserWarning, match="no sample has any likelihood at step 4"):
+        run = sample(filter=filter, sample_prior=lambda key: {"a": 0.7 + 0 * sample_a(key)["a"]})
+    assert run.stopped == "no sample has any likelihood at step 4; it was NaN or +inf in 60"
+    assert run.weights.sum() == pytest.approx(1.0, abs=1e-4)
+    assert len(run.log_likelihood_increments) == 4
+
+
 @pytest.mark.usefixtures("as_installed")
 @pytest.mark.parametrize(
     ("options", "named"),
     [
+        ({"max_particles": 0}, "max_particles: 0"),
+        ({"acceptance_threshold": 2}, "acceptance_threshold: 2"),
+        ({"checkpoint": ""}, "checkpoint: ''"),
         ({"key": 0}, "key: 0 is no typed key"),
         ({"filter": 3}, "filter: 3 is not a filter"),
         ({"filter": mpfjax.gaussian_particle_filter(ScalarLinear(), 10)}, "filter: an approx"),

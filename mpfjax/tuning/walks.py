@@ -1,0 +1,117 @@
+"""Gaussian random walks in unconstrained numbers, and how they learn their covariance."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from mpfjax.checks import shown
+from mpfjax.operations.matrices import cholesky
+from mpfjax.tuning.problem import Reals
+
+# The best scale of a random walk in d dimensions is this over sqrt(d), times the target's own
+# deviations (Gelman, Roberts and Gilks 1996).
+_BEST_SCALE = 2.38
+_LEARNING_EXPONENT = 0.6
+
+
+class RandomWalk(eqx.Module):
+    """u + F z, z standard normal, with F Fᵀ from the covariance of a posterior.
+
+    The numbers of u stand in the order of their names.
+    """
+
+    factor: Float[Array, "d d"]
+    mean: Float[Array, " d"]
+    covariance: Float[Array, "d d"]
+    log_scale: Float[Array, ""]
+
+    def propose(self, key: Key[Array, ""], reals: Reals) -> Reals:
+        """A Gaussian step from u."""
+        names = sorted(reals)
+        noise = {
+            name: jax.random.normal(key, reals[name].shape, reals[name].dtype)
+            for name, key in zip(names, jax.random.split(key, len(names)), strict=True)
+        }
+        u, unravel = ravel_pytree(reals)
+        return unravel(u + jnp.matmul(self.factor, ravel_pytree(noise)[0], precision="highest"))
+
+    def adapted(
+        self,
+        points: Float[Array, "chains d"],
+        step: Int[Array, ""],
+        acceptance: Float[Array, ""] | None,
+    ) -> "RandomWalk":
+        """The walk after one more point of each chain.
+
+        Adaptive Metropolis (Haario, Saksman and Tamminen 2001) in the stochastic approximation of
+        Andrieu and Thoms (2008, algorithm 4), with gains (step + 2)^-0.6. The scale follows the
+        acceptance, where that is given; noise in a likelihood would drive it to zero.
+        """
+        gain = (jnp.asarray(step, points.dtype) + 2.0) ** -_LEARNING_EXPONENT
+        centred = points - self.mean[None]
+        mean = self.mean + gain * jnp.mean(centred, axis=0)
+        spread = jnp.matmul(centred.T, centred, precision="highest") / points.shape[0]
+        covariance = self.covariance + gain * (spread - self.covariance)
+        log_scale = self.log_scale
+        if acceptance is not None:
+            log_scale = log_scale + gain * (acceptance - best_acceptance(points.shape[1]))
+        factor = jnp.exp(log_scale) * factor_of(covariance)
+        return RandomWalk(factor, mean, covariance, log_scale)
+
+
+def random_walk(deviations: Reals, starts: Reals) -> RandomWalk:
+    """The walk with these deviations, and with the mean of the chains' starts."""
+    scales, _ = ravel_pytree(deviations)
+    points = jax.vmap(lambda reals: ravel_pytree(reals)[0])(starts)
+    covariance = jnp.diag(scales**2) / _squared_scale(len(scales))
+    nothing = jnp.zeros((), scales.dtype)
+    return RandomWalk(jnp.diag(scales), jnp.mean(points, axis=0), covariance, nothing)
+
+
+def factor_of(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """F of the best random walk on a target of this covariance."""
+    return cholesky(covariance[None])[0] * math.sqrt(_squared_scale(len(covariance)))
+
+
+def best_acceptance(dimension: int) -> float:
+    """The share of steps that the best random walk accepts: .44 in one dimension, .234 in many."""
+    return 0.44 if dimension == 1 else 0.234
+
+
+def accepts(key: Key[Array, ""], gain: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether a Metropolis step that gains so much log density is taken; at NaN it is not."""
+    return jnp.log(jax.random.uniform(key, (), gain.dtype)) < gain
+
+
+def checked_deviations(given: float | Mapping[str, Any], start: Reals) -> Reals:
+    """The deviation of each unconstrained number; a `ValueError` for what is none."""
+    by_name = given if isinstance(given, Mapping) else dict.fromkeys(start, given)
+    if set(by_name) != set(start):
+        raise ValueError(f"proposal_deviations: those of {sorted(by_name)}, not of {sorted(start)}")
+    deviations = {}
+    for name, u in start.items():
+        try:
+            value = np.asarray(by_name[name], float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"proposal_deviations: {shown(by_name[name])} of {name} is no number"
+            ) from error
+        if not (np.isfinite(value).all() and (value > 0).all()):
+            raise ValueError(f"proposal_deviations: {value} of {name} is not positive")
+        if value.shape not in ((), u.shape):
+            raise ValueError(
+                f"proposal_deviations: shape {value.shape} of {name} is neither () nor {u.shape}"
+            )
+        deviations[name] = jnp.broadcast_to(jnp.asarray(value, u.dtype), u.shape)
+    return deviations
+
+
+def _squared_scale(dimension: int) -> float:
+    return _BEST_SCALE**2 / dimension
