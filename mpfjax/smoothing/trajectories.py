@@ -73,9 +73,7 @@ def sample_trajectories(
         num_steps = 0
     elif num_steps is None:
         num_steps = 1
-    return draw_trajectories(
-        key, model, stacked, inputs, num_trajectories, component, num_steps
-    )
+    return draw_trajectories(key, model, stacked, inputs, num_trajectories, component, num_steps)
 
 
 def _inputs_between(
@@ -120,9 +118,7 @@ def draw_trajectories(
         step_key, earlier, ancestors, proposed, now = step
         moved_by = with_inputs(model, now)
         if proposed is None:
-            indices = draw_exactly(
-                step_key, moved_by, next_states, earlier, checked=checked
-            )[:, 0]
+            indices = draw_exactly(step_key, moved_by, next_states, earlier, checked=checked)[:, 0]
         else:
             start = take(ancestors, next_indices)
             indices = walk(step_key, moved_by, next_states, earlier, start, proposed)[-1]

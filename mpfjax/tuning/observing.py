@@ -81,7 +81,7 @@ class Observed:
 def _with_all_present(series: Series) -> Series:
     if series.present is not None:
         return series
-    return Series(series.observations, np.ones(series.length, bool), series.inputs)
+    return Series(series.observations, jnp.ones(series.length, bool), series.inputs)
 
 
 def _kind(series: Series) -> str:
