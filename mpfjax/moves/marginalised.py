@@ -22,6 +22,7 @@ from mpfjax.models.conditionally_linear import (
     AbstractConditionallyLinearModel,
     is_mixed,
     latent_from_noise,
+    latent_rows,
     log_latent_density,
     predicted,
     require_marginalised,
@@ -188,7 +189,7 @@ def log_latent_transition(
 def _own_noise_dimension(model: AbstractConditionallyLinearModel, state: MarginalisedState) -> int:
     """k of the model itself; in the mixed form that of z_t."""
     if is_mixed(model):
-        return state.latent.shape[1]
+        return latent_rows(model, state.latent).shape[0]
     return cast(HasTransitionNoise, model).noise_dimension
 
 

@@ -1,0 +1,106 @@
+"""The mixed form, z_t that depends on x_{t-1}, against the Kalman filter of the whole state."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax.exact import kalman_filter
+from tests.marking import thorough
+
+# The whole state (z, x) is linear: z_t = f z + A x + v, x_t = F x + B z + w.
+SLOPE, COUPLING = 0.7, np.array([[0.5, -0.3]])
+MATRIX, PUSH = np.array([[0.9, 0.3], [-0.2, 0.8]]), np.array([0.2, -0.1])
+OWN, NOISE, SHARED = (
+    np.array([[0.3]]),
+    np.array([[0.4, 0.1], [0.1, 0.3]]),
+    np.array([[0.15], [-0.1]]),
+)
+SEEN, ERROR = np.array([[0.5, 1.0, 0.2]]), np.array([[0.3]])
+OBSERVATIONS = jnp.array([[0.5], [1.2], [-0.4], [-1.0], [0.8]])
+NUM_RUNS, NUM_PARTICLES = 1000, 40
+
+
+class Mixed(mpfjax.AbstractConditionallyLinearModel):
+    """z is seen through y as well, beside x."""
+
+    is_correlated: bool = True
+
+    def sample_initial(self, key, num_particles):
+        return jax.random.normal(key, (num_particles, 1))
+
+    def initial_moments(self, latent):
+        return jnp.zeros(2), jnp.eye(2)
+
+    def latent_dynamics(self, previous_latent):
+        parts = (SLOPE * previous_latent, jnp.array(COUPLING), jnp.array(OWN))
+        return (*parts, jnp.array(SHARED)) if self.is_correlated else parts
+
+    def dynamics(self, latent, previous_latent):
+        return jnp.array(MATRIX), previous_latent * PUSH[None], jnp.array(NOISE)
+
+    def emission(self, latent):
+        return jnp.array(SEEN[:, 1:]), SEEN[0, 0] * latent, jnp.array(ERROR)
+
+
+def whole(is_correlated):
+    shared = SHARED if is_correlated else 0 * SHARED
+    return mpfjax.LinearGaussianModel(
+        A=np.block([[np.array([[SLOPE]]), COUPLING], [PUSH[:, None], MATRIX]]),
+        Q=np.block([[OWN, shared.T], [shared, NOISE]]),
+        H=SEEN, R=ERROR, m0=np.zeros(3), P0=np.eye(3),
+    )  # fmt: skip
+
+
+def moments(mixture):
+    state = mixture.mean()
+    return jnp.concatenate([state.latent, state.mean]), state.covariance
+
+
+@pytest.mark.parametrize(
+    ("is_correlated", "noise"),
+    [(True, "independent"), *thorough([(False, "independent"), (True, "rqmc")])],
+)
+def test_evidence_and_moments_are_those_of_the_kalman_filter(is_correlated, noise):
+    filter = mpfjax.particle_filter(Mixed(is_correlated), NUM_PARTICLES, noise=noise)
+    keys = jax.random.split(jax.random.key(4), NUM_RUNS)
+    run = jax.tree.map(np.asarray, mpfjax.monte_carlo(keys, filter, OBSERVATIONS, moments))
+    exact = kalman_filter(whole(is_correlated), OBSERVATIONS)
+    log_evidence = np.cumsum(np.asarray(exact.log_likelihood_increments))
+    ratios = np.exp(np.cumsum(run.log_likelihood_increments, axis=1) - log_evidence)
+    means, covariances = run.collected
+    second = covariances + means[..., 1:, None] * means[..., None, 1:]
+    mean = np.asarray(exact.means)
+    expected = np.asarray(exact.covariances)[:, 1:, 1:] + mean[:, 1:, None] * mean[:, None, 1:]
+    for found, truth in (
+        (ratios, np.ones(len(OBSERVATIONS))),
+        (ratios[..., None] * means, mean),
+        (ratios[..., None, None] * second, expected),
+    ):
+        error = found.std(axis=0) / np.sqrt(NUM_RUNS)
+        assert (error < 0.05).all()
+        z = (found.mean(axis=0) - truth) / error
+        assert np.abs(z).max() < 4, f"standard errors away: {z}"
+
+
+class WithoutS(Mixed):
+    def latent_dynamics(self, previous_latent):
+        return SLOPE * previous_latent, jnp.array(COUPLING)
+
+
+class Whole(Mixed):
+    def sample_initial(self, key, num_particles):
+        return jnp.zeros(num_particles, jnp.int32)
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (WithoutS(), "latent_dynamics returned"),
+        (Whole(), "has latent_dynamics, so that its latent must be one array"),
+    ],
+)
+def test_other_parts_are_named(model, message):
+    with pytest.raises(ValueError, match=message):
+        mpfjax.run_filter(jax.random.key(0), mpfjax.particle_filter(model, 4), OBSERVATIONS)
