@@ -193,7 +193,7 @@ def draw_errors_by_size(
             index = names.index(name)
             sizes = np.array(sorted(by_size))
             mean = np.array([by_size[size].mean() for size in sizes])
-            error = np.array([by_size[size].std() / len(by_size[size]) ** 0.5 for size in sizes])
+            error = np.array([standard_error(by_size[size]) for size in sizes])
             # Shifted a little, so that bars of equal heights stay apart.
             shift = 1 + 0.012 * (index - (len(names) - 1) / 2)
             axis.errorbar(
@@ -301,6 +301,13 @@ def draw_climbs(
     return figure
 
 
+def standard_error(values: np.ndarray) -> np.ndarray:
+    """That of the mean over the leading axis; NaN, which draws nothing, where there is one run."""
+    if len(values) < 2:
+        return np.full(values.shape[1:], np.nan)
+    return np.asarray(values.std(axis=0, ddof=1) / np.sqrt(len(values)))
+
+
 def draw_overlaps(panels: Sequence[tuple[str, Mapping[str, np.ndarray], int]]) -> Figure:
     """A panel for each sequence: its name, overlaps by kind, (runs, t), and their first frame.
 
@@ -311,8 +318,7 @@ def draw_overlaps(panels: Sequence[tuple[str, Mapping[str, np.ndarray], int]]) -
     for axis, (title, curves, first) in zip(axes, panels, strict=True):
         for index, (name, values) in enumerate(curves.items()):
             frames = first + np.arange(values.shape[1])
-            mean = values.mean(axis=0)
-            error = values.std(axis=0) / np.sqrt(len(values))
+            mean, error = values.mean(axis=0), standard_error(values)
             axis.plot(frames, mean, label=name, lw=1.4, color=COLOURS[index])
             axis.fill_between(frames, mean - error, mean + error, color=COLOURS[index], alpha=0.2)
         axis.set(ylabel="overlap", ylim=(0, 1))

@@ -137,7 +137,9 @@ def measure(
         "exact": task.exact.tolist(),
         "finite_runs": int(np.isfinite(scores).all(axis=1).sum()),
         "bias": (scores.mean(axis=0) - task.exact).tolist() if is_finite else None,
-        "standard_error": (scores.std(axis=0) / np.sqrt(num_runs)).tolist() if is_finite else None,
+        "standard_error": (scores.std(axis=0, ddof=1) / np.sqrt(num_runs)).tolist()
+        if is_finite
+        else None,
         "deviation": scores.std(axis=0).tolist() if is_finite else None,
         "milliseconds": 1000 * score_time / num_runs,
         "cost_in_runs": score_time / run_time,

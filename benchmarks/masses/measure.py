@@ -49,7 +49,7 @@ def summary(found: np.ndarray, logs: np.ndarray, known: np.ndarray) -> dict[str,
     rmse, runs = float(np.sqrt(squares.mean())), len(logs)
     return {
         "mass_rmse": rmse,
-        "mass_rmse_error": float(squares.std() / np.sqrt(runs) / max(2 * rmse, 1e-12)),
+        "mass_rmse_error": float(squares.std(ddof=1) / np.sqrt(runs) / max(2 * rmse, 1e-12)),
         "largest_mass": float(np.median(found.max(axis=1))),
         "log_z_sd": float(logs.std(ddof=1)),
         "log_z_sd_error": float(logs.std(ddof=1) / np.sqrt(2 * (runs - 1))),

@@ -127,7 +127,7 @@ def _entry(
         "particles": num_particles,
         "rms_error": float(np.sqrt(np.mean(errors**2))),
         "bias": float(errors.mean()),
-        "bias_error": float(errors.std() / np.sqrt(len(errors))),
+        "bias_error": float(errors.std(ddof=1) / np.sqrt(len(errors))),
         "seconds": float(np.median(seconds)),
     }
 

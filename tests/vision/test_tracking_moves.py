@@ -333,6 +333,22 @@ def test_the_marginals_are_those_of_all_assignments(loops, bound):
     assert np.mean(gaps) < bound / 5
 
 
+def test_how_far_off_the_marginals_are_is_as_said():
+    """The worst case of the docstring, and no worse one among two by two with log odds up to 5."""
+    compute = jax.jit(jax.vmap(marginals))
+    worst = np.array([[4.94, 4.3], [4.35, 4.26]])
+    grid = np.array(list(itertools.product([-1.0, 2.0, 4.0, 5.0], repeat=4))).reshape(-1, 2, 2)
+    problems = np.concatenate([worst[None], grid])
+    found = np.asarray(compute(jnp.asarray(problems)))
+    exact = np.array([brute_force(np.exp(log_odds)) for log_odds in problems])
+    assert found[0, 0, 0] == pytest.approx(0.88, abs=0.005)
+    assert exact[0, 0, 0] == pytest.approx(0.63, abs=0.005)
+    gaps = np.abs(found - exact)
+    assert 0.2 < gaps.max() < 0.3
+    surer = np.abs(found - 0.5) > np.abs(exact - 0.5)
+    assert surer[gaps > 0.05].all()
+
+
 def test_doubts_weigh_a_detection_by_its_marginal():
     """Prediction and likelihood with the floor have the odds (1 - p) : p of the two, by hand."""
     mixture, frame = tracked()

@@ -172,8 +172,11 @@ def marginals(log_odds: Float[Array, "m d"]) -> Float[Array, "m d"]:
 
     An assignment has the weight Π exp(log_odds) over its pairs; a row or column in none counts 1.
     The marginals of that joint distribution by messages from rows to columns and back (loopy belief
-    propagation, Williams and Lau 2014): exact where the possible pairs form no loop, and otherwise
-    off by a few hundredths, mostly towards more certainty.
+    propagation, Williams and Lau 2014): exact where the possible pairs form no loop. Otherwise they
+    are too sure. With log odds up to 5, as the defaults of `Assign` allow, that is .02 in the mean
+    over random problems of up to six by six, and up to .3 where two rows and two columns all go
+    together: for log odds of 5, 4.3, 4.3 and 4.3 it gives .88, and the marginal is .63. With log
+    odds without a bound it is up to a half.
     """
     odds = jnp.exp(log_odds)
 
