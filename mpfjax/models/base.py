@@ -82,6 +82,18 @@ class AbstractStateSpaceModel(eqx.Module):
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
         """log L(y_t | x_t) of every particle, up to a constant shared by all of them."""
 
+    def simulate(
+        self, key: Key[Array, ""], num_steps: int, *, inputs: PyTree = None
+    ) -> tuple[PyTree, PyTree]:
+        """Draw x_0, ..., x_t, leaves (t + 1, ...), and y_1, ..., y_t, leaves (t, ...).
+
+        The model defines `sample_observation(key, states)`, y given each of n states; it raises
+        `ValueError` otherwise. `inputs` are as for `run_filter`. Use it where truth is wanted.
+        """
+        from mpfjax.models.simulation import simulate
+
+        return simulate(key, self, num_steps, inputs)
+
 
 @runtime_checkable
 class HasTransitionDensity(Protocol):
@@ -318,6 +330,8 @@ class _PerParticleModel(AbstractStateSpaceModel):
         model = self.__dict__.get("model")
         if name in _BATCHED and hasattr(model, name):
             return jax.vmap(getattr(model, name))
+        if name == "sample_observation" and hasattr(model, name):
+            return _DrawnForEach(getattr(model, name))
         if name in _SHARED and hasattr(model, name):
             return getattr(model, name)
         raise AttributeError(f"{type(model).__name__} (per_particle) has no attribute {name!r}")
@@ -347,8 +361,7 @@ class _DrawnForEach:
     draw: Callable[..., Any]
 
     def __call__(self, key: Key[Array, ""], states: PyTree) -> PyTree:
-        num_particles = jax.tree.leaves(states)[0].shape[0]
-        return jax.vmap(self.draw)(split(key, num_particles), states)
+        return jax.vmap(self.draw)(split(key, len(jax.tree.leaves(states)[0])), states)
 
 
 def mapped_draw(model: Any, draw: Any) -> Any:
@@ -368,12 +381,12 @@ def per_particle(model: Any) -> AbstractStateSpaceModel:
     `log_likelihood(observation, state)`, each for one particle. It may also have, for one particle,
     `log_transition(state, previous_state)`, `log_initial(state)`, `with_history(state,
     previous_state)`, `transition_from_noise(noise, state)` with noise (k,) (also in place of
-    `sample_transition`), `transition_mean(state)` and `observation_mean(state)`, and, for all
-    particles, `noise_dimension`, `transition_covariance`, `observation_covariance` and
-    `prepare_observation(observation)`. Known inputs u_t are set as its `inputs` where it has an
-    attribute of this name, or handed to its `with_inputs(inputs)`. Use it for a first version of a
-    model: with a key for each particle, draws take four to five times as long as those of a batched
-    model.
+    `sample_transition`), `sample_observation(key, state)`, `transition_mean(state)` and
+    `observation_mean(state)`, and, for all particles, `noise_dimension`, `transition_covariance`,
+    `observation_covariance` and `prepare_observation(observation)`. Known inputs u_t are set as its
+    `inputs` where it has an attribute of this name, or handed to its `with_inputs(inputs)`. Use it
+    for a first version of a model: with a key for each particle, draws take four to five times as
+    long as those of a batched model.
 
     Raises `ValueError` where one of the three methods is missing.
     """

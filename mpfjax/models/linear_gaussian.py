@@ -122,6 +122,13 @@ class LinearGaussianModel(AbstractStateSpaceModel):
             )
         return _log_normal(observation[None] - self.observation_mean(states), self.R)
 
+    def sample_observation(
+        self, key: Key[Array, ""], states: Float[Array, "n d"]
+    ) -> Float[Array, "n p"]:
+        """y_t ~ N(H x_t, R) of every state."""
+        noise = normal(key, (len(states), self.R.shape[0]), self.R.dtype)
+        return self.observation_mean(states) + noise @ jnp.linalg.cholesky(self.R).T
+
     def log_transition(
         self, states: Float[Array, "n d"], previous_states: Float[Array, "n d"]
     ) -> Float[Array, " n"]:

@@ -153,11 +153,29 @@ class MultiObjectModel(AbstractStateSpaceModel):
         # the objects' is.
         if name == "log_transition" and hasattr(self.object_model, name):
             return self._log_transition
+        if name == "sample_observation" and hasattr(self.object_model, name):
+            return self._sample_observation
         if name == "transition_from_noise" and is_made_of_noise(self.object_model):
             return self._transition_from_noise
         if name == "noise_dimension" and is_made_of_noise(self.object_model):
             return self.num_objects * self._object_noise_dimension
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+    def simulate(
+        self, key: Key[Array, ""], num_steps: int, *, inputs: PyTree = None
+    ) -> tuple[PyTree, PyTree]:
+        """As of any model; a `ValueError` where there is an interaction, whose ψ nobody draws."""
+        if self.interaction is not None:
+            raise ValueError("interaction: a model with one gives weights, and cannot be simulated")
+        return super().simulate(key, num_steps, inputs=inputs)
+
+    def _sample_observation(self, key: Key[Array, ""], states: PyTree) -> PyTree:
+        """What is seen of every object, leaves (n, J, ...)."""
+        if self.shared_observation:
+            raise ValueError("shared_observation: how several objects make one is not known")
+        keys = split(key, self.num_objects)
+        draw = lambda key, states, j: self.object_at(j).sample_observation(key, states)  # pyright: ignore  # noqa: E731
+        return jax.vmap(draw, in_axes=(0, 1, 0), out_axes=1)(keys, states, self._indices)
 
     @property
     def _object_noise_dimension(self) -> int:

@@ -15,7 +15,7 @@ from mpfjax.checks import (
 )
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.noise import stratified_uniform
-from mpfjax.operations.generator import uniform
+from mpfjax.operations.generator import normal, uniform
 
 
 class QuadraticModel(AbstractStateSpaceModel):
@@ -84,6 +84,12 @@ class QuadraticModel(AbstractStateSpaceModel):
         if jnp.ndim(observation) != 0:
             raise ValueError(f"observation: shape {jnp.shape(observation)} is not that of a scalar")
         return _log_normal(observation - states**2, self.sigma_y)
+
+    def sample_observation(
+        self, key: Key[Array, ""], states: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """y_t ~ N(x_t², σ_y²) of every state."""
+        return states**2 + self.sigma_y * normal(key, states.shape, states.dtype)
 
     def log_transition(
         self, states: Float[Array, " n"], previous_states: Float[Array, " n"]
