@@ -228,12 +228,13 @@ RUN = {
     "run_filter": (
         mpfjax.run_filter,
         {"key": KEY, "filter": FILTER, "observations": np.ones(2, np.float32),
-         "collect": nothing, "missing": "error"},
+         "collect": nothing, "missing": "error", "progress": False},
     ),
     "monte_carlo": (
         mpfjax.monte_carlo,
         {"keys": KEY[None], "filter": FILTER, "observations": np.ones(2, np.float32),
-         "collect": nothing, "missing": "error", "devices": None, "slots": None},
+         "collect": nothing, "missing": "error", "devices": None, "slots": None,
+         "progress": False},
     ),
     "run_islands": (
         mpfjax.run_islands,

@@ -38,7 +38,8 @@ FLOORS = {
         "generator", "sobol", "hilbert", "sorting", "compiling",
     ),
     "running": (
-        "storage", "processes", "devices", "threads", "scan", "run", "islands", "studies",
+        "storage", "processes", "devices", "threads", "progress", "scan", "run", "islands",
+        "studies",
     ),
 }  # fmt: skip
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")

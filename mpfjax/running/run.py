@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.checks import check_key, check_whole, given
+from mpfjax.checks import check_flag, check_key, check_whole, given
 from mpfjax.filter import Filter, Start, sample_initial, split_keys
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import choose_devices, over_devices
+from mpfjax.running.progress import shown_progress
 from mpfjax.running.scan import FilterRun, check_run, checked, scan
 from mpfjax.running.threads import num_processors, over_threads
 
@@ -31,6 +32,7 @@ def run_filter(
     *,
     inputs: PyTree = None,
     missing: str = "error",
+    progress: bool = False,
 ) -> FilterRun:
     """Run a filter over observations y_1..y_t in one scan.
 
@@ -46,6 +48,9 @@ def run_filter(
       NaN or an infinity. "skip" treats such steps as missing and only predicts. A model with
       `handles_missing = True` gets the NaN; with "skip", only a step of nothing but NaN is
       missing.
+    - `progress`: show a bar of the steps. The run is then another program, which calls the host up
+      to a hundred times and is not found in a cache of programs. Within the caller's own jit there
+      is no bar.
 
     Raises `ValueError` before anything compiles: for an argument of another kind, no observations,
     leaves of different lengths, complex numbers, numbers that JAX's type cannot hold, or inputs of
@@ -54,9 +59,12 @@ def run_filter(
     """
     check_key(key)
     check_run(filter, collect)
+    check_flag(progress=progress)
     series = as_series(observations, inputs, missing, filter.model)
-    run = lambda filter: _run(key, filter, series, collect)  # noqa: E731
-    return checked(with_floats_traced(run, filter))
+    with shown_progress(progress, series.length, (key, filter, series)) as bar:
+        bars = () if bar is None else (bar,)
+        run = lambda filter: _run(key, filter, series, collect, *bars)  # noqa: E731
+        return checked(with_floats_traced(run, filter))
 
 
 def monte_carlo(
@@ -69,6 +77,7 @@ def monte_carlo(
     missing: str = "error",
     devices: int | Sequence[Any] | None = None,
     slots: int | None = None,
+    progress: bool = False,
 ) -> FilterRun:
     """Run a filter once for each key, all on the same observations and inputs, under `vmap`.
 
@@ -92,6 +101,7 @@ def monte_carlo(
     """
     check_key(keys, "keys", batch=True)
     check_run(filter, collect)
+    check_flag(progress=progress)
     check_whole(**given(slots=slots))
     series = as_series(observations, inputs, missing, filter.model)
 
@@ -99,17 +109,20 @@ def monte_carlo(
         starts = Start(keys)
         if slots is not None:
             starts, filter = _in_slots(keys, filter, slots)
-        arguments = (filter, series, collect)
+        arguments = (filter, series, collect, *bars)
         leave_to_caller = devices is None and is_traced((starts, arguments))
         chosen = None if leave_to_caller else choose_devices(devices)
         return over_devices(_run_each, _run_on_threads, starts, arguments, chosen)
 
-    return checked(with_floats_traced(run, filter))
+    num_steps = keys.shape[0] * series.length
+    with shown_progress(progress, num_steps, (keys, filter, series)) as bar:
+        bars = () if bar is None else (bar,)
+        return checked(with_floats_traced(run, filter))
 
 
 @jit_on_wide_vectors
-def _run(key, filter, series, collect):
-    return scan(Start(key), filter, series, collect)
+def _run(key, filter, series, collect, bar=None):
+    return scan(Start(key), filter, series, collect, bar)
 
 
 def _in_slots(keys: Key[Array, " seeds"], filter: Filter, slots: int) -> tuple[Start, Filter]:
@@ -140,10 +153,11 @@ def _sample_each(keys, model, num_particles, slots, noise):
     return jax.vmap(sample)(keys)
 
 
-def _run_each(starts, filter, series, collect):
-    run_together = jax.vmap(lambda start: scan(start, filter, series, collect))
+def _run_each(starts, filter, series, collect, bar=None):
     num_runs = starts.key.shape[0]
     size = _group_size(num_runs, filter)
+    bar = None if bar is None else bar._replace(num_runs=size)
+    run_together = jax.vmap(lambda start: scan(start, filter, series, collect, bar))
     if size == num_runs:
         return run_together(starts)
     in_groups = jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), starts)
@@ -163,13 +177,13 @@ def _group_size(num_runs: int, filter: Filter) -> int:
 _run_all = jit_on_wide_vectors(_run_each)
 
 
-def _run_on_threads(starts, filter, series, collect):
+def _run_on_threads(starts, filter, series, collect, *bars):
     """All runs on one device; on a CPU, several threads share them."""
     num_runs = starts.key.shape[0]
     num_worth_it = num_runs * filter.num_particles // _WORTH_A_THREAD
     num_threads = min(num_processors(), num_runs, num_worth_it)
     keeps_all = collect is None  # threads would hold two copies of it for a while
-    arguments = (filter, series, collect)
+    arguments = (filter, series, collect, *bars)
     leave_to_caller = is_traced((starts, arguments)) or jax.default_backend() != "cpu"
     if num_threads < 2 or keeps_all or leave_to_caller:
         return _run_all(starts, *arguments)

@@ -16,6 +16,7 @@ from mpfjax.filter import BROKEN_DENSITY, Filter, Start, StepInfo, split_keys
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Series
 from mpfjax.operations.across_islands import num_islands
+from mpfjax.running.progress import Bar, advance_bar
 
 
 class FilterRun(eqx.Module):
@@ -51,19 +52,23 @@ def scan(
     filter: Filter,
     series: Series,
     collect: Callable[[ParticleMixture], PyTree] | None,
+    bar: Bar | None = None,
 ) -> FilterRun:
     key_initial, key_steps = split_keys(start.key, 2)
 
     def advance(
-        mixture: ParticleMixture, step: tuple[Array, Series]
+        mixture: ParticleMixture, step: tuple[Array, Series, Array | None]
     ) -> tuple[ParticleMixture, PyTree]:
-        step_key, now = step
+        step_key, now, number = step
         mixture, info = step_or_predict(filter, step_key, mixture, now)
         with saying("in collect, which is called with the mixture after each step"):
             kept = mixture if collect is None else collect(mixture)
+        if bar is not None and number is not None:
+            advance_bar(bar, number, series.length)
         return mixture, (kept, report_of(info))
 
-    steps = (jax.random.split(key_steps, series.length), series)
+    numbers = None if bar is None else jnp.arange(series.length, dtype=jnp.int32)
+    steps = (jax.random.split(key_steps, series.length), series, numbers)
     initial = _share_of_islands(filter._init(start._replace(key=key_initial)))
     final, outputs = jax.lax.scan(advance, initial, steps)
     return run_of(initial, final, *outputs)
