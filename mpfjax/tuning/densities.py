@@ -87,7 +87,7 @@ class LogDensity(eqx.Module):
         """The parameters by name, on their own scale."""
         return {name: self.problem.transforms[name].constrain(u) for name, u in reals.items()}
 
-    def unconstrain(self, parameters: Mapping[str, Array]) -> Reals:
+    def unconstrain(self, parameters: Mapping[str, Any]) -> Reals:
         """u of parameters by name."""
         return {
             name: transform.unconstrain(jnp.asarray(parameters[name]))

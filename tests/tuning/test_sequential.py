@@ -211,6 +211,21 @@ def test_interrupted_and_resumed_the_samples_are_those_of_one_run(tmp_path, monk
         sample(**kept | {"num_moves": 2})
 
 
+def test_where_particles_double_weights_change_by_the_ratio_of_likelihoods():
+    """And the mean of these ratios joins the evidence."""
+    run, state = sample(acceptance_threshold=1.0, max_particles=20)._goes_on
+    steps = jnp.asarray(len(OBSERVATIONS), jnp.int32)
+    found = observing.exchanged(run.sampler.with_particles(20), run.key, state.samples, steps)
+    before, after = state.samples, found.samples
+    ratios = after.particles.log_evidence - before.particles.log_evidence
+    assert np.ptp(ratios) > 0.1
+    np.testing.assert_allclose(
+        after.log_weights + found.increment, before.log_weights + ratios, atol=1e-4
+    )
+    assert after.particles.mixture.log_weights.shape == (60, 20)
+    np.testing.assert_array_equal(after.particles.reals["a"], before.particles.reals["a"])
+
+
 class Fragile(ScalarLinear):
     """A likelihood that breaks where a is above 0.5, from observations above 1.8 on."""
 
