@@ -7,6 +7,8 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "_ext"))
 
+from sphinx.application import Sphinx  # noqa: E402
+
 import mpfjax  # noqa: E402
 
 project = "mpfjax"
@@ -68,3 +70,14 @@ def _copy_notebooks() -> None:
 
 
 _copy_notebooks()
+
+
+def _keep_outputs_apart(app: Sphinx) -> None:
+    """The notebooks' pictures wait beside the doctrees, and not beside the site."""
+    outputs = Path(app.doctreedir).parent / "outputs"
+    app.env.mystnb_config = app.env.mystnb_config.copy(output_folder=str(outputs))
+
+
+def setup(app: Sphinx) -> None:
+    """After MyST-NB has made its settings."""
+    app.connect("builder-inited", _keep_outputs_apart, priority=900)

@@ -37,6 +37,24 @@ def test_the_citation_agrees_with_the_package():
     assert fields["license"] == PYPROJECT["project"]["license"]
 
 
+def test_what_errors_say_to_install_is_among_the_extras():
+    """mpfjax itself is on no registry: a hint that names it installs nothing, or something else."""
+    known = {
+        re.split(r"[>=<;]", asked)[0].strip()
+        for extra in PYPROJECT["project"]["optional-dependencies"].values()
+        for asked in extra
+    }
+    hints = [
+        (path.name, hint)
+        for path in sorted((ROOT / "mpfjax").rglob("*.py"))
+        for hint in re.findall(r"pip install (.+?)['\"]*\)?(?: from error)?$",
+                               path.read_text(encoding="utf-8"), re.MULTILINE)
+    ]  # fmt: skip
+    assert len(hints) >= 6
+    for name, hint in hints:
+        assert {package.strip("'\"") for package in hint.split()} <= known, (name, hint)
+
+
 def test_type_checkers_are_told_that_there_are_types():
     assert (ROOT / "mpfjax" / "py.typed").is_file()
     assert "py.typed" in PYPROJECT["tool"]["setuptools"]["package-data"]["mpfjax"]

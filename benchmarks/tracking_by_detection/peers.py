@@ -81,7 +81,7 @@ def peers() -> list[Peer]:
     """Those that are installed; what is missing is said on the error stream."""
     found: list[Peer] = []
     for bring, hint in (
-        (_of_trackers, 'pip install "mpfjax[peers]"'),
+        (_of_trackers, "pip install trackers filterpy trackeval"),
         (_of_norfair, "pip install --no-deps norfair, and filterpy"),
     ):
         try:

@@ -186,7 +186,5 @@ def _trackeval_metrics() -> ModuleType:
     try:
         from trackeval import metrics
     except ImportError as error:
-        raise ImportError(
-            'trackeval is needed to score tracks: pip install "mpfjax[trackeval]"'
-        ) from error
+        raise ImportError("trackeval is needed to score tracks: pip install trackeval") from error
     return metrics

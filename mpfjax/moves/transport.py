@@ -21,9 +21,7 @@ def require_ott() -> None:
     try:
         import ott  # noqa: F401
     except ImportError as error:
-        raise ImportError(
-            "gradient='ot' needs ott-jax: python -m pip install 'mpfjax[ot]'"
-        ) from error
+        raise ImportError("gradient='ot' needs ott-jax: pip install ott-jax") from error
 
 
 def transport(

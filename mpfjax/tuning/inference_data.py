@@ -128,4 +128,4 @@ def _arviz() -> ModuleType:
     try:
         return importlib.import_module("arviz")
     except ImportError as error:
-        raise ImportError('to_inference_data needs arviz: pip install "mpfjax[arviz]"') from error
+        raise ImportError("to_inference_data needs arviz: pip install arviz") from error

@@ -279,6 +279,6 @@ def _cv2() -> ModuleType:
         import cv2
     except ImportError as error:
         raise ImportError(
-            'OpenCV is needed to detect what moves: pip install "mpfjax[video]"'
+            "OpenCV is needed to detect what moves: pip install opencv-python-headless"
         ) from error
     return cv2

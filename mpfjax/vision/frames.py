@@ -343,7 +343,7 @@ def _imageio() -> ModuleType:
         import imageio.v3 as imageio
     except ImportError as error:
         raise ImportError(
-            'imageio is needed to read and write video: pip install "mpfjax[video]"'
+            'imageio is needed to read and write video: pip install "imageio[ffmpeg]"'
         ) from error
     return imageio
 
@@ -352,5 +352,5 @@ def _av() -> ModuleType:
     try:
         import av
     except ImportError as error:
-        raise ImportError('av is needed to read video: pip install "mpfjax[video]"') from error
+        raise ImportError("av is needed to read video: pip install av") from error
     return av

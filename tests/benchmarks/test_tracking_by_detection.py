@@ -81,7 +81,7 @@ def test_what_is_not_installed_is_said_with_how_to_get_it(monkeypatch, capsys):
     assert peers() == []
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2
-    assert 'pip install "mpfjax[peers]"' in lines[0]
+    assert "pip install trackers filterpy trackeval" in lines[0]
     assert "norfair" in lines[1]
 
 
