@@ -29,6 +29,7 @@ from mpfjax.models import RandomWalkWithJumps as RandomWalkWithJumps
 from mpfjax.models import SwitchingLinearGaussianModel as SwitchingLinearGaussianModel
 from mpfjax.models import WalkWithVelocity as WalkWithVelocity
 from mpfjax.models import per_particle as per_particle
+from mpfjax.moves import AbstractMetropolis as AbstractMetropolis
 from mpfjax.moves import AbstractMove as AbstractMove
 from mpfjax.moves import AbstractPropagation as AbstractPropagation
 from mpfjax.moves import AbstractRegrouping as AbstractRegrouping
@@ -40,6 +41,7 @@ from mpfjax.moves import GaussianRegeneration as GaussianRegeneration
 from mpfjax.moves import GroupBy as GroupBy
 from mpfjax.moves import KMeans as KMeans
 from mpfjax.moves import Merge as Merge
+from mpfjax.moves import MetropolisAdjustedLangevin as MetropolisAdjustedLangevin
 from mpfjax.moves import Partitioned as Partitioned
 from mpfjax.moves import Pool as Pool
 from mpfjax.moves import Predict as Predict
@@ -52,6 +54,7 @@ from mpfjax.moves import PropagateMarginalised as PropagateMarginalised
 from mpfjax.moves import PropagateRegimes as PropagateRegimes
 from mpfjax.moves import Prune as Prune
 from mpfjax.moves import RandomPartition as RandomPartition
+from mpfjax.moves import RandomWalkMetropolis as RandomWalkMetropolis
 from mpfjax.moves import RegimeProposal as RegimeProposal
 from mpfjax.moves import Resample as Resample
 from mpfjax.moves import ResampleAhead as ResampleAhead

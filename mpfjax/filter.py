@@ -31,6 +31,7 @@ from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvena
 from mpfjax.moves.every import Every
 from mpfjax.moves.exchange import Exchange
 from mpfjax.moves.lineages import LINEAGE, evidence_variance, mass_variances
+from mpfjax.moves.parents import runner
 from mpfjax.moves.sharing import give_inputs, tie, untie
 from mpfjax.observations import (
     checked_inputs,
@@ -138,6 +139,7 @@ class Filter(eqx.Module):
         names = [name for move in held for name in _own_memory(move)]
         if len(set(names)) < len(names):
             raise ValueError(f"moves: two of them would share one memory, of {sorted(names)}")
+        runner(moves)
         self.model = model
         self._moves = tie(moves, model)
         self._initial_moves = tie(initial_moves, model)
@@ -242,18 +244,20 @@ class Filter(eqx.Module):
         mixture = _own_ancestors(mixture)
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
+        run = runner(self._moves)
         for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
             if isinstance(move, AbstractMove):
                 resampled |= move.would_resample(mixture, observation)
-            if isinstance(move, Every):
-                mixture = move(move_key, mixture, observation, self._forgetting)
+            after = (self._forgetting,) if isinstance(move, Every) else ()
+            moved = run(move, move_key, mixture, observation, *after)
+            if after:
+                mixture = moved
                 continue
-            moved = move(move_key, mixture, observation)
             if not isinstance(move, _KEEP_MASS):
                 moved, log_growth = _normalise(moved, mixture.log_weights)
                 increment += log_growth
             mixture = self._forgetting(moved)
-        return mixture, _report(mixture, increment, resampled)
+        return mixture.replace(parents=None), _report(mixture, increment, resampled)
 
     def _forgetting(self, mixture: ParticleMixture) -> ParticleMixture:
         """The mixture without any memory of components that have died."""

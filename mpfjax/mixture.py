@@ -54,6 +54,8 @@ class ParticleMixture(eqx.Module):
     - `memory`: what moves with a memory carry from step to step, by the move's name.
     - `usable_slots`: how many slots a move may fill, the first ones; None is all of them. Only
       `monte_carlo(..., slots=...)` sets it.
+    - `parents`: within a step, x_{t-1} of each particle after the propagation, where a move of the
+      chain asks for it (`AbstractMove.needs_parents`). Elsewhere it is None.
     - `log_scale`: within a step, the logarithm of a common factor of all weights. It is kept apart
       from ℓ, which rounding would destroy if a log-likelihood of a million were added. After a
       step it is None, which stands for zero.
@@ -70,6 +72,7 @@ class ParticleMixture(eqx.Module):
     memory: dict[str, PyTree] = eqx.field(default_factory=dict)
     usable_slots: Int[Array, ""] | None = None
     log_scale: Float[Array, ""] | None = None
+    parents: PyTree = None
 
     @property
     def num_particles(self) -> int:

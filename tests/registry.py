@@ -24,6 +24,7 @@ from mpfjax import (
     GroupBy,
     KMeans,
     Merge,
+    MetropolisAdjustedLangevin,
     MultiObjectModel,
     Partitioned,
     Pool,
@@ -31,6 +32,7 @@ from mpfjax import (
     Propagate,
     PropagateInStages,
     RandomPartition,
+    RandomWalkMetropolis,
     Resample,
     Split,
     Weigh,
@@ -119,6 +121,26 @@ def _chain(
         m,
         initial_moves=[KMeans(3, reseed=True)],
     )
+
+
+def _metropolis(m: int) -> Callable[..., Filter]:
+    """A likelihood in two stages, with a Metropolis move of each kind after it is resampled by."""
+
+    def make(model):
+        moves = [
+            Predict(model),
+            Weigh(model, 0.3),
+            Resample("stratified"),
+            RandomWalkMetropolis(model, 2, exponent=0.3),
+            Weigh(model, 0.7),
+            Resample(ess_threshold=0.9),
+            MetropolisAdjustedLangevin(model),
+            KMeans(2),
+        ]
+        initial = [KMeans(3, reseed=True)] if m > 1 else []
+        return Filter(model, moves, NUM_PARTICLES, m, initial_moves=initial)
+
+    return make
 
 
 def _in_stages(m: int) -> Callable[..., Filter]:
@@ -226,6 +248,11 @@ CHAINS: dict[str, Callable[..., Filter]] = {
         for name, chain in _of_components(MANY_COMPONENTS).items()
         if name in OTHERWISE_OF_MANY
     },
+    "metropolis": _metropolis(1),
+    "mixture with metropolis": _metropolis(NUM_COMPONENTS),
+    "every second step a random walk": lambda model: _chain(
+        Resample(), then=[Every(2, [RandomWalkMetropolis(model)])]
+    )(model),
     "mpf shared by variance": _mpf(allocation="variance"),
     "regrouped every second step": _mpf(regroup_every=2),
     "resampled every second step": _chain(Every(2, [Resample("stratified"), KMeans(2)])),

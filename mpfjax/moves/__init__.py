@@ -17,6 +17,9 @@ from mpfjax.moves.kmeans import KMeans as KMeans
 from mpfjax.moves.lookahead import ResampleAhead as ResampleAhead
 from mpfjax.moves.marginalised import PropagateMarginalised as PropagateMarginalised
 from mpfjax.moves.merge import Merge as Merge
+from mpfjax.moves.metropolis import AbstractMetropolis as AbstractMetropolis
+from mpfjax.moves.metropolis import MetropolisAdjustedLangevin as MetropolisAdjustedLangevin
+from mpfjax.moves.metropolis import RandomWalkMetropolis as RandomWalkMetropolis
 from mpfjax.moves.partitioned import Partitioned as Partitioned
 from mpfjax.moves.pool import Pool as Pool
 from mpfjax.moves.propagation import Predict as Predict

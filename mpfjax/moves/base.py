@@ -29,6 +29,14 @@ class AbstractMove(eqx.Module):
         """Whether the move may change the weights by what was observed; a filter needs one."""
         return True
 
+    @property
+    def needs_parents(self) -> bool:
+        """Whether the move looks at `mixture.parents`, x_{t-1} of each particle that has x_t.
+
+        A filter keeps them for the step where one of its moves does. Else they cost nothing.
+        """
+        return False
+
     @abc.abstractmethod
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree

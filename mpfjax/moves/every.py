@@ -51,6 +51,11 @@ class Every(AbstractMove):
         return any(move.weighs for move in self.moves)
 
     @property
+    def needs_parents(self) -> bool:
+        """Whether any of the moves does."""
+        return any(move.needs_parents for move in self.moves)
+
+    @property
     def name(self) -> str:
         """Under which the number of the step is kept."""
         return f"every {self.num_steps}: {', '.join(type(move).__name__ for move in self.moves)}"

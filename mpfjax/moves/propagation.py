@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_one_of, check_type, saying
+from mpfjax.checks import check_inner_share, check_one_of, check_type, saying
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -25,6 +25,7 @@ from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.operations.gradients import add_gradient
+from mpfjax.operations.logarithms import finite_max
 from mpfjax.proposals import AbstractProposal
 
 
@@ -158,20 +159,30 @@ class Predict(AbstractPropagation):
 class Weigh(AbstractPropagation):
     """Multiply the weights by L(y_t | x_t): the second half of a bootstrap `Propagate`.
 
-    Use it after `Predict` and what a chain does to the prediction.
+    `exponent` is β where the factor is L^β: the likelihood comes in by stages, with other moves in
+    between. The exponents of a chain's `Weigh` add up to 1. Raises `ValueError` for one not in
+    (0, 1]. Use it after `Predict` and what a chain does to the prediction.
     """
 
     model: AbstractStateSpaceModel
+    exponent: float = eqx.field(static=True, default=1.0)
 
     def __check_init__(self) -> None:
         _check_whole_states(self.model, "Weigh")
+        if self.exponent != 1:
+            check_inner_share(exponent=self.exponent)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
         """Weigh every particle by y_t."""
         del key
-        return _weigh(self.model, mixture, observation)
+        if self.exponent == 1:
+            return _weigh(self.model, mixture, observation)
+        log_factors = likelihoods(self.model, observation, mixture.particles)
+        # A common constant of any size would drown the differences.
+        common = finite_max(jnp.where(mixture.occupied, log_factors, -jnp.inf))
+        return mixture.weighed(self.exponent * (log_factors - common), self.exponent * common[None])
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """The mixture as it is: there is nothing to weigh by."""

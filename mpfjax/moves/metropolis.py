@@ -1,0 +1,232 @@
+"""Metropolis moves: x_t moves on under its own target, and the weights stay as they are."""
+
+import abc
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key, PyTree
+
+from mpfjax.checks import check_inner_share, check_one_of, check_whole
+from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
+from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.moves.base import AbstractRejuvenation
+from mpfjax.moves.propagation import likelihoods, log_transition
+from mpfjax.operations.generator import normal, split, uniform
+from mpfjax.operations.gradients import add_gradient, without_gradient
+
+
+class _Target(NamedTuple):
+    """The target of every particle: D(x_t | x_{t-1}) L(y_t | x_t)^β, given its parent."""
+
+    model: Any
+    parents: PyTree
+    observation: PyTree
+    exponent: float
+
+    def __call__(self, states: PyTree) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """log D and log L, apart: a constant of any size in L would drown the differences of D."""
+        log_likelihood = likelihoods(self.model, self.observation, states)
+        return log_transition(self.model, states, self.parents), log_likelihood
+
+    def ratio(self, new: tuple[Array, Array], old: tuple[Array, Array]) -> Float[Array, " n"]:
+        """log π(x') - log π(x)."""
+        return (new[0] - old[0]) + self.exponent * (new[1] - old[1])
+
+
+class AbstractMetropolis(AbstractRejuvenation):
+    """Steps of Metropolis and Hastings for every particle, given its parent x_{t-1}.
+
+    The move of a resample-move filter (Gilks and Berzuini 2001): after x_t was drawn and weighed,
+    and resampled if need be, each x_t takes `num_steps` steps of a Markov chain that leaves
+    D(x_t | x_{t-1}) L(y_t | x_t)^β as it is. So the weights stay, Ẑ stays unbiased, and offspring
+    of one particle become different. It all happens within the particle, so that components keep
+    their mass and their particles.
+
+    Nothing is tuned on the particles that move, since that would not be exact: the length of a
+    step is s times the spread of the dynamics, with log s uniform from that of `least_step` to 0,
+    drawn anew each time. The spread is that of fresh draws from D(. | x_{t-1}). Parts of the state
+    that are whole numbers stay.
+    """
+
+    model: eqx.AbstractVar[AbstractStateSpaceModel]
+    num_steps: eqx.AbstractVar[int]
+    least_step: eqx.AbstractVar[float]
+    exponent: eqx.AbstractVar[float]
+    gradient: eqx.AbstractVar[str]
+
+    def __check_init__(self) -> None:
+        who = type(self).__name__
+        check_model(self.model, who)
+        refuse_marginalised(self.model, who)
+        require(self.model, "log_transition", who)
+        check_whole(num_steps=self.num_steps)
+        check_inner_share(least_step=self.least_step)
+        if self.exponent != 1:
+            check_inner_share(exponent=self.exponent)
+        check_one_of(("none", "stop"), gradient=self.gradient)
+
+    @property
+    def needs_parents(self) -> bool:
+        """True: the target of x_t is given x_{t-1}."""
+        return True
+
+    @abc.abstractmethod
+    def propose(
+        self, key: Key[Array, ""], length: Float[Array, " n"], states: PyTree, target: _Target
+    ) -> tuple[PyTree, Float[Array, " n"]]:
+        """A proposal for every particle, and log q(x | x') - log q(x' | x)."""
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Move every particle."""
+        if mixture.parents is None:
+            raise ValueError(
+                f"moves: {type(self).__name__} comes before any propagation: there is no x_t yet"
+            )
+        target = _Target(self.model, mixture.parents, observation, self.exponent)
+        states, n = mixture.particles, mixture.num_particles
+        if self.gradient == "stop":
+            states = without_gradient(states)
+        first = densities = target(states)
+        dtype = densities[1].dtype
+        for step_key in split(key, self.num_steps):
+            key_length, key_proposal, key_taken = split(step_key, 3)
+            length = self.least_step ** uniform(key_length, (n,), dtype)
+            proposed, log_ratio = self.propose(key_proposal, length, states, target)
+            those = target(proposed)
+            log_ratio += target.ratio(those, densities)
+            taken = jnp.log(uniform(key_taken, (n,), dtype)) < log_ratio  # of a NaN: not taken
+            states = _where(taken, proposed, states)
+            densities = _where(taken, those, densities)
+        log_weights = mixture.log_weights
+        if self.gradient == "stop":
+            states = without_gradient(states)
+            moved = jnp.where(mixture.occupied, target.ratio(target(states), first), 0.0)
+            log_weights = add_gradient(log_weights, moved.astype(log_weights.dtype))
+        return mixture.replace(particles=states, log_weights=log_weights)
+
+
+class RandomWalkMetropolis(AbstractMetropolis):
+    """Metropolis steps by a random walk: x' = x + s (a - b) / √2 with a, b ~ D(. | x_{t-1}).
+
+    The difference of two draws from the dynamics is symmetric and has twice their covariance, so
+    every particle walks in the units and along the correlations of its own dynamics, as in
+    differential evolution (ter Braak 2006), but exactly. See `AbstractMetropolis`.
+
+    - `model`: with `log_transition`.
+    - `num_steps`: how many steps each particle takes.
+    - `least_step`: the smallest s.
+    - `exponent`: β, for a likelihood that comes in by stages, as `Weigh(model, exponent)` does.
+    - `gradient`: what a derivative sees: "none" the draws that were taken, "stop" the density of
+      the state after the move, as with `gradient` of `Propagate`.
+
+    Each step takes two draws of the dynamics, and one evaluation of D and L. Raises `ValueError`
+    for a model without `log_transition`, no steps, a least step or an exponent out of range. Use it
+    after a resampling that leaves few distinct particles.
+    """
+
+    model: AbstractStateSpaceModel
+    num_steps: int = eqx.field(static=True, default=1)
+    least_step: float = eqx.field(static=True, default=0.02)
+    exponent: float = eqx.field(static=True, default=1.0)
+    gradient: str = eqx.field(static=True, default="none")
+
+    def propose(
+        self, key: Key[Array, ""], length: Float[Array, " n"], states: PyTree, target: _Target
+    ) -> tuple[PyTree, Float[Array, " n"]]:
+        """x + s (a - b) / √2, which is as likely as the way back."""
+        first, second = _two_draws(key, self.model, target.parents)
+
+        def walk(state: Array, a: Array, b: Array) -> Array:
+            return state + _rows(length, state) * (a - b) / jnp.sqrt(2).astype(state.dtype)
+
+        return _on_floats(walk, states, first, second), jnp.zeros_like(length)
+
+
+class MetropolisAdjustedLangevin(AbstractMetropolis):
+    """Metropolis steps along the gradient: x' = x + s²/2 C ∇ log π(x) + s C^½ ξ, ξ ~ N(0, I).
+
+    MALA (Roberts and Tweedie 1996) for π = D L^β, the gradient by JAX. C is diagonal: the variances
+    of the dynamics, from pairs of fresh draws for all parents. See `AbstractMetropolis`; arguments
+    and errors are those of `RandomWalkMetropolis`. Each step takes two draws of the dynamics, two
+    gradients and an evaluation of D and L. Use it in more than a few dimensions, where D and L are
+    smooth.
+    """
+
+    model: AbstractStateSpaceModel
+    num_steps: int = eqx.field(static=True, default=1)
+    least_step: float = eqx.field(static=True, default=0.02)
+    exponent: float = eqx.field(static=True, default=1.0)
+    gradient: str = eqx.field(static=True, default="none")
+
+    def propose(
+        self, key: Key[Array, ""], length: Float[Array, " n"], states: PyTree, target: _Target
+    ) -> tuple[PyTree, Float[Array, " n"]]:
+        """A step of the Langevin diffusion, and how much likelier the way back is."""
+        key_spread, key_noise = split(key, 2)
+        first, second = _two_draws(key_spread, self.model, target.parents)
+        deviations = _on_floats(_deviation, first, second)
+        floats, rest = eqx.partition(states, eqx.is_inexact_array)
+
+        def drift(floats: PyTree) -> PyTree:
+            """s/2 C^½ ∇ log π, in the units of the noise."""
+
+            def total(floats: PyTree) -> Float[Array, ""]:
+                log_dynamics, log_likelihood = target(eqx.combine(floats, rest))
+                return jnp.sum(log_dynamics) + target.exponent * jnp.sum(log_likelihood)
+
+            half = lambda slope, unit: 0.5 * _rows(length, slope) * unit * slope  # noqa: E731
+            return _on_floats(half, jax.grad(total)(floats), deviations)
+
+        leaves, structure = jax.tree.flatten(floats)
+        keys = split(key_noise, len(leaves))
+        drawn = [
+            normal(key, leaf.shape, leaf.dtype) for key, leaf in zip(keys, leaves, strict=True)
+        ]
+        noise, forth = jax.tree.unflatten(structure, drawn), drift(floats)
+        go = lambda x, unit, a, b: x + _rows(length, x) * unit * (a + b)  # noqa: E731
+        proposed = _on_floats(go, floats, deviations, forth, noise)
+        back = drift(proposed)
+        # The way back is made of the noise that leads from x' to x.
+        log_ratio = _sum_of_rows(
+            lambda a, b, xi: 0.5 * (xi**2 - (a + b + xi) ** 2), forth, back, noise
+        )
+        return eqx.combine(proposed, rest), log_ratio.astype(length.dtype)
+
+
+def _two_draws(key: Key[Array, ""], model: Any, parents: PyTree) -> tuple[PyTree, PyTree]:
+    first, second = split(key, 2)
+    draw = lambda key: without_gradient(model.sample_transition(key, parents))  # noqa: E731
+    return draw(first), draw(second)
+
+
+def _deviation(first: Array, second: Array) -> Array:
+    """The standard deviation of the dynamics in every entry of the state, over all particles."""
+    return jnp.sqrt(0.5 * jnp.mean((first - second) ** 2, axis=0, keepdims=True))
+
+
+def _on_floats(function: Any, states: PyTree, *others: PyTree) -> PyTree:
+    """The function of the leaves that are floating point; the first tree's others stay."""
+
+    def of_leaf(leaf: Any, *rest: Any) -> Any:
+        return function(leaf, *rest) if eqx.is_inexact_array(leaf) else leaf
+
+    return jax.tree.map(of_leaf, states, *others)
+
+
+def _sum_of_rows(function: Any, *trees: PyTree) -> Float[Array, " n"]:
+    values = jax.tree.leaves(jax.tree.map(function, *trees))
+    return sum(jnp.sum(value.reshape(value.shape[0], -1), axis=1) for value in values)  # pyright: ignore[reportReturnType]
+
+
+def _where(taken: Bool[Array, " n"], new: PyTree, old: PyTree) -> PyTree:
+    return jax.tree.map(lambda a, b: jnp.where(_rows(taken, a), a, b), new, old)
+
+
+def _rows(per_particle: Array, values: Array) -> Array:
+    row = per_particle.reshape(-1, *[1] * (values.ndim - 1))
+    return row if row.dtype == bool else row.astype(values.dtype)

@@ -1,0 +1,64 @@
+"""x_{t-1} of every particle, for the moves after the propagation that need it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Key
+
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractMove, AbstractPropagation, AbstractRegrouping
+from mpfjax.moves.clusters import PropagateInClusters
+from mpfjax.moves.every import Every
+from mpfjax.moves.exchange import Exchange
+from mpfjax.moves.gaussian import GaussianRegeneration
+from mpfjax.moves.independent import PropagateIndependently
+from mpfjax.operations.indexing import take
+
+# After these a particle has no one parent, or one on another island.
+_NO_PARENT = (PropagateInClusters, PropagateIndependently, Exchange)
+
+
+def runner(moves: tuple[Any, ...]) -> Callable[..., ParticleMixture]:
+    """What runs one of the moves, and keeps `mixture.parents` only where one of them needs them.
+
+    Raises `ValueError` where the parents would not be known.
+    """
+    if not any(_needs_parents(move) for move in moves):
+        return lambda move, *arguments: move(*arguments)
+    propagated = False
+    for move in moves:
+        propagated |= isinstance(move, AbstractPropagation)
+        if isinstance(move, _NO_PARENT) or (propagated and isinstance(move, GaussianRegeneration)):
+            raise ValueError(
+                f"moves: {type(move).__name__} leaves no particle one parent x_(t-1), which another"
+                " move needs"
+            )
+        inner = move.moves if isinstance(move, Every) and _needs_parents(move) else ()
+        if not all(_needs_parents(m) or isinstance(m, AbstractRegrouping) for m in inner):
+            raise ValueError(
+                "moves: an Every with a move that needs x_(t-1) may only regroup beside it"
+            )
+    return _run_with_parents
+
+
+def _needs_parents(move: Any) -> bool:
+    return isinstance(move, AbstractMove) and move.needs_parents
+
+
+def _run_with_parents(
+    move: Any, key: Key[Array, ""], mixture: ParticleMixture, *arguments: Any
+) -> ParticleMixture:
+    """The move, and the parents of the particles in their new places."""
+    before = mixture.parents
+    if before is None and isinstance(move, AbstractPropagation):
+        before = mixture.particles
+    # The places that this move alone takes the particles from.
+    own = jnp.arange(mixture.num_particles, dtype=jnp.int32)
+    moved = move(key, mixture.replace(ancestor_indices=own), *arguments)
+    places = moved.ancestor_indices
+    return moved.replace(
+        parents=jax.tree.map(lambda leaf: take(leaf, places), before),
+        ancestor_indices=take(mixture.ancestor_indices, places),
+    )
