@@ -33,12 +33,7 @@ from mpfjax.moves.exchange import Exchange
 from mpfjax.moves.lineages import LINEAGE, evidence_variance, mass_variances
 from mpfjax.moves.parents import runner
 from mpfjax.moves.sharing import give_inputs, tie, untie
-from mpfjax.observations import (
-    checked_inputs,
-    checked_observation,
-    one_input,
-    one_observation,
-)
+from mpfjax.observations import Fault, faults_of, one_input, one_observation, raise_faults
 from mpfjax.operations.across_islands import excess_over_islands, island_index, num_islands
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.floats import default_float
@@ -214,9 +209,10 @@ class Filter(eqx.Module):
         check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
         observation = one_observation(observation)
         inputs = one_input(inputs, self.model)
-        return with_floats_traced(
-            lambda filter: _checked_step(filter, key, mixture, observation, inputs), self
+        *moved, faults = with_floats_traced(
+            lambda filter: _step_and_faults(filter, key, mixture, observation, inputs), self
         )
+        return raise_faults(tuple(moved), faults)
 
     def predict(
         self, key: Key[Array, ""], mixture: ParticleMixture, *, inputs: PyTree = None
@@ -229,9 +225,10 @@ class Filter(eqx.Module):
         check_key(key)
         check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
         inputs = one_input(inputs, self.model)
-        return with_floats_traced(
-            lambda filter: _checked_predict(filter, key, mixture, inputs), self
+        *moved, faults = with_floats_traced(
+            lambda filter: _predict_and_faults(filter, key, mixture, inputs), self
         )
+        return raise_faults(tuple(moved), faults)
 
     def _step(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -281,17 +278,27 @@ class Filter(eqx.Module):
         return mixture, _report(mixture, increment, jnp.zeros(self.num_components, bool))
 
 
-@jit_on_wide_vectors
-def _checked_step(filter, key, mixture, observation, inputs):
-    observation = checked_observation(observation, filter.model)
-    moved, info = filter.with_inputs(checked_inputs(inputs))._step(key, mixture, observation)
-    broken = ~(info.log_likelihood_increment < jnp.inf)
-    return eqx.error_if((moved, info), broken, BROKEN_DENSITY)
+def step_and_faults(
+    filter: Filter,
+    key: Key[Array, ""],
+    mixture: ParticleMixture,
+    observation: PyTree,
+    inputs: PyTree = None,
+) -> tuple[ParticleMixture, StepInfo, tuple[Fault, ...]]:
+    """A step within a program, with what `raise_faults` has to be given where that has ended."""
+    faults = faults_of(filter.model, observation, inputs)
+    moved, info = filter.with_inputs(inputs)._step(key, mixture, observation)
+    broken = Fault(~(info.log_likelihood_increment < jnp.inf), BROKEN_DENSITY)
+    return moved, info, (*faults, broken)
+
+
+_step_and_faults = jit_on_wide_vectors(step_and_faults)
 
 
 @jit_on_wide_vectors
-def _checked_predict(filter, key, mixture, inputs):
-    return filter.with_inputs(checked_inputs(inputs))._predict(key, mixture)
+def _predict_and_faults(filter, key, mixture, inputs):
+    moved, info = filter.with_inputs(inputs)._predict(key, mixture)
+    return moved, info, faults_of(filter.model, None, inputs)
 
 
 def sample_initial(

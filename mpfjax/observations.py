@@ -106,18 +106,42 @@ def one_observation(observation: PyTree) -> PyTree:
     return as_arrays(observation, "observation")
 
 
-def checked_observation(observation: PyTree, model: Any) -> PyTree:
-    """y_t; an error at run time if it holds a number that the model does not take."""
+class Fault(eqx.Module):
+    """Whether a program came upon something for which `raise_faults` is to raise, and what."""
+
+    found: Bool[Array, "*runs"]
+    message: str = eqx.field(static=True)
+
+
+def faults_of(model: Any, observation: PyTree, inputs: PyTree) -> tuple[Fault, ...]:
+    """Whether y_t or u_t holds a number that the model does not take."""
     takes_nan = getattr(model, "handles_missing", False)
     what = "infinite" if takes_nan else "NaN or infinite"
+    faults = []
+    for tree, may_be_nan, message in (
+        (observation, takes_nan, f"observation: {what}; use predict to skip it"),
+        (inputs, False, "inputs: NaN or infinite"),
+    ):
+        inexact = [leaf for leaf in jax.tree.leaves(tree) if _is_inexact(leaf)]
+        if inexact:
+            usable = [jnp.all(part) for part in _usable(jnp, inexact, may_be_nan)]
+            faults.append(Fault(~jnp.all(jnp.stack(usable)), message))
+    return tuple(faults)
 
-    def check(leaf: Array) -> Array:
-        if not _is_inexact(leaf):
-            return leaf
-        (usable,) = _usable(jnp, [leaf], takes_nan)
-        return eqx.error_if(leaf, ~jnp.all(usable), f"observation: {what}; use predict to skip it")
 
-    return jax.tree.map(check, observation)
+def raise_faults(value: PyTree, faults: tuple[Fault, ...]) -> PyTree:
+    """`value`, or a RuntimeError for the first of the faults that was found in any run.
+
+    A program that raises by itself calls back into Python, and no program that does is kept for the
+    next process. So it returns its faults, and they are looked at where it has ended; under the
+    caller's own jit the error is raised while that runs.
+    """
+    for fault in faults:
+        if isinstance(fault.found, Tracer):
+            value = eqx.error_if(value, fault.found, fault.message)
+        elif np.any(fault.found):
+            eqx.error_if(fault.found, fault.found, fault.message)
+    return value
 
 
 def check_series(observations: PyTree, missing: str) -> list[Any]:

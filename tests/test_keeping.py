@@ -2,12 +2,18 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
+import mpfjax
 from mpfjax import keep_programs
+from mpfjax.filter import step_and_faults
+from mpfjax.vision import drawn
+from mpfjax.vision.recipes import objects_filters
 
 CONFIG: Any = jax.config
 SETTINGS = [
@@ -58,3 +64,31 @@ def test_a_folder_that_cannot_be_made_is_an_error(settings, tmp_path):
     with pytest.raises(OSError, match="file"):
         keep_programs(tmp_path / "file" / "folder")
     assert CONFIG.jax_compilation_cache_dir == settings["jax_compilation_cache_dir"]
+
+
+@pytest.mark.parametrize(
+    "transformed", [lambda step: step, eqx.filter_jit], ids=["own", "caller's"]
+)
+def test_a_step_raises_of_what_it_saw_and_its_program_calls_nothing_back(transformed):
+    """No program with a call back into Python is kept for the next process."""
+    filter = mpfjax.particle_filter(mpfjax.QuadraticModel(), 8)
+    key, mixture = jax.random.key(0), filter.init(jax.random.key(0))
+    program = eqx.filter_jit(step_and_faults).lower(filter, key, mixture, jnp.ones(()))
+    assert "callback" not in program.as_text()
+    step = transformed(lambda observation: filter.step(key, mixture, observation))
+    moved, _ = step(jnp.ones(()))
+    assert moved.num_particles == 8
+    with pytest.raises(RuntimeError, match="observation: NaN or infinite; use predict to skip it"):
+        jax.block_until_ready(step(jnp.full((), jnp.nan)))
+    with pytest.raises(RuntimeError, match="observation: NaN or infinite"):
+        jax.block_until_ready(jax.vmap(step)(jnp.array([1.0, jnp.inf])))
+
+
+@pytest.mark.thorough
+def test_nor_does_the_program_that_follows_drawn_boxes():
+    frame = np.zeros((40, 50, 3), np.uint8)
+    filter = objects_filters(frame, np.array([[5.0, 5, 10, 20]]))["mpf"]
+    key = jax.random.key(0)
+    mixture = drawn._begin(filter, key)
+    program = drawn._advance.lower(filter, key, mixture, jnp.asarray(frame), 1)
+    assert "callback" not in program.as_text()

@@ -31,13 +31,10 @@ from mpfjax.vision.histograms import (
     bhattacharyya,
     integral_histogram,
     normalise,
-    num_pixels,
 )
+from mpfjax.vision.references import LARGEST_NARROW, SURROUND, reference_histograms
 
 PAPER_VARIANCES = (2.5, 1.5, 0.05, 0.05)
-_SURROUND = 2.0
-# A box of more pixels cannot be counted in 16 bits.
-_LARGEST_NARROW = 2**16 - 1
 
 
 class BoxState(eqx.Module):
@@ -248,14 +245,14 @@ class ColourModel(AbstractBoxModel):
         check_share(switch_probability=switch_probability)
         check_not_negative(contrast=contrast)
         places = jnp.asarray(centred(boxes), float)
-        references, weights = _references(frame, colours, places, num_parts, weigh_colours)
+        references, weights = reference_histograms(frame, colours, places, num_parts, weigh_colours)
         if share_reference:
             references = jnp.broadcast_to(references.mean(0, keepdims=True), references.shape)
             size = places[:, 2:].mean(0, keepdims=True)
             places = places.at[:, 2:].set(jnp.broadcast_to(size, (len(boxes), 2)))
         steps = jnp.broadcast_to(jnp.asarray(deviations, float), (len(boxes), 4))
         # Room for boxes to grow to twice the area of the largest reference.
-        room = 2 * np.prod(boxes[:, 2:], axis=1).max() * (_SURROUND if contrast > 0 else 1)
+        room = 2 * np.prod(boxes[:, 2:], axis=1).max() * (SURROUND if contrast > 0 else 1)
         return cls(
             reference_boxes=places,
             references=references,
@@ -266,7 +263,7 @@ class ColourModel(AbstractBoxModel):
             colours=colours,
             switch_probability=switch_probability,
             contrast=contrast,
-            wide_counts=bool(room > _LARGEST_NARROW),
+            wide_counts=bool(room > LARGEST_NARROW),
         )
 
     def log_likelihood(
@@ -287,7 +284,7 @@ class ColourModel(AbstractBoxModel):
         counts = observation.counts(boxes, num_parts)
         if self.contrast == 0:
             return counts, None
-        wide = boxes * jnp.array([[1.0, 1.0, _SURROUND, 1.0]], boxes.dtype)
+        wide = boxes * jnp.array([[1.0, 1.0, SURROUND, 1.0]], boxes.dtype)
         return counts, observation.counts(wide, num_parts) - counts
 
     def contrasted(
@@ -371,25 +368,3 @@ def _for_each(dynamics: AbstractDynamics, num_boxes: int) -> AbstractDynamics:
     if rows != {num_boxes}:
         raise ValueError(f"dynamics: parameters for {rows} boxes, not for {num_boxes}")
     return dynamics
-
-
-def _references(
-    frame: UInt8[np.ndarray, "h w 3"],
-    colours: AbstractColours,
-    places: Float[Array, "k 4"],
-    num_parts: int,
-    weigh_colours: bool,
-) -> tuple[Float[Array, "k parts channels bins"], Float[Array, "k parts channels bins"]]:
-    """The normalised histograms of the reference boxes, and the weights of their colours."""
-    around = places * jnp.array([[1.0, 1.0, _SURROUND, _SURROUND]], places.dtype)
-    largest = jnp.max(num_pixels(around if weigh_colours else places, *frame.shape[:2]))
-    table = integral_histogram(jnp.asarray(frame), colours, bool(largest > _LARGEST_NARROW))
-    counts = table.counts(places, num_parts)
-    if not weigh_colours:
-        return normalise(counts), jnp.ones_like(counts)
-    ring = table.counts(around)[:, 0, None] - jnp.sum(counts, axis=1, keepdims=True)
-    inside, outside = normalise(counts), normalise(ring)
-    share = inside + outside
-    # A colour that is neither in the box nor around it says nothing about the box.
-    weights = jnp.where(share > 0, inside / jnp.where(share > 0, share, 1.0), 0.5)
-    return normalise(counts, weights), weights

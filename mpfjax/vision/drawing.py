@@ -9,11 +9,12 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, UInt8
 
-# Okabe and Ito's palette, in the order of use; people with colour blindness can tell it apart.
+# Okabe and Ito's palette, in the order of use; people with colour blindness can tell it apart. In
+# place of black, which numbers on a dark plate cannot have, there is a light green.
 PALETTE = np.array(
     [
         [230, 159, 0], [86, 180, 233], [240, 228, 66], [204, 121, 167], [0, 114, 178],
-        [213, 94, 0], [0, 158, 115], [255, 255, 255], [153, 153, 153], [20, 20, 20],
+        [213, 94, 0], [0, 158, 115], [255, 255, 255], [153, 153, 153], [170, 255, 195],
     ],
     dtype=float,
 )  # fmt: skip

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
 from mpfjax.checks import check_key, check_type, to_rows
-from mpfjax.filter import Filter
+from mpfjax.filter import Filter, step_and_faults
 from mpfjax.mixture import ParticleMixture
+from mpfjax.observations import Fault, raise_faults
 from mpfjax.vision.frames import of_one_kind
 from mpfjax.vision.object_moves import best_components
 from mpfjax.vision.recipes import objects_filters
@@ -52,21 +53,29 @@ def _followed(stills: Iterator[np.ndarray], boxes: np.ndarray, key: Array) -> It
     if first is None:
         return
     filter = objects_filters(first, boxes)["mpf"]
-    mixture = filter.init(key)
+    mixture = _begin(filter, key)
     for t, still in enumerate(itertools.chain([first], stills)):
         step_key = jax.random.fold_in(key, t)
-        mixture, tracks = _advance(filter, step_key, mixture, jnp.asarray(still), len(boxes))
-        yield jax.device_get(tracks)
+        mixture, tracks, faults = _advance(
+            filter, step_key, mixture, jnp.asarray(still), len(boxes)
+        )
+        yield jax.device_get(raise_faults(tracks, faults))
+
+
+@eqx.filter_jit
+def _begin(filter: Filter, key: Array) -> ParticleMixture:
+    return filter.init(key)
 
 
 @eqx.filter_jit
 def _advance(
     filter: Filter, key: Array, mixture: ParticleMixture, frame: Array, num_objects: int
-) -> tuple[ParticleMixture, Tracks]:
-    mixture, _ = filter.step(key, mixture, frame)
+) -> tuple[ParticleMixture, Tracks, tuple[Fault, ...]]:
+    mixture, _, faults = step_and_faults(filter, key, mixture, frame)
     model: Any = filter.model
     best, held = best_components(mixture, num_objects)
     means = mixture.component_averages(model.boxes(mixture.particles))
     identities = jnp.where(held, jnp.arange(1, num_objects + 1, dtype=jnp.int32), 0)
     unseen = jnp.zeros(num_objects, jnp.int32)
-    return mixture, Tracks(means[best], identities, held, unseen, jnp.zeros((), bool))
+    tracks = Tracks(means[best], identities, held, unseen, jnp.zeros((), bool))
+    return mixture, tracks, faults

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
 from mpfjax.checks import check_flag, check_key, check_type, check_whole
-from mpfjax.filter import Filter
+from mpfjax.filter import Filter, step_and_faults
+from mpfjax.observations import one_observation, raise_faults
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import drawing
 from mpfjax.vision.object_moves import component_references
@@ -53,20 +54,24 @@ def _follow(filter: Filter, keys: Array, frames: Iterable[np.ndarray]) -> Iterat
     mixtures = jax.vmap(filter.init)(keys)
     for t, frame in enumerate(frames):
         step = jnp.asarray(t)  # an array: a new Python number would compile again
-        mixtures, snapshot = _advance(filter, keys, step, mixtures, jnp.asarray(frame))
-        yield jax.tree.map(np.asarray, snapshot)
+        mixtures, snapshot, faults = _advance(
+            filter, keys, step, mixtures, jnp.asarray(one_observation(frame))
+        )
+        yield jax.tree.map(np.asarray, raise_faults(snapshot, faults))
 
 
 @eqx.filter_jit
 def _advance(filter, keys, t, mixtures, frame):
     def step(key, mixture):
-        mixture, _ = filter.step(jax.random.fold_in(key, t), mixture, frame)
+        step_key = jax.random.fold_in(key, t)
+        mixture, _, faults = step_and_faults(filter, step_key, mixture, frame)
         places = filter.model.boxes(mixture.particles)
         labels = jnp.where(mixture.occupied, mixture.component_indicators, -1)
         means = mixture.component_averages(places)
         carried = hasattr(mixture.particles, "reference")
         references = component_references(mixture) if carried else None
-        return mixture, Snapshot(means, mixture.active, places[:, :2], labels, references)
+        snapshot = Snapshot(means, mixture.active, places[:, :2], labels, references)
+        return mixture, snapshot, faults
 
     # The frame is not mapped over, so its histogram is built once for all runs.
     return jax.vmap(step)(keys, mixtures)
@@ -108,17 +113,19 @@ def annotate(
     frame: UInt8[np.ndarray, "h w 3"],
     snapshot: Snapshot,
     zoom: int = 1,
-    crop: tuple[slice, slice] = (slice(None), slice(None)),
+    crop: slice | tuple[slice, slice] = (slice(None), slice(None)),
 ) -> UInt8[np.ndarray, "zh zw 3"]:
     """A frame, cropped and enlarged, with the particles and mean boxes of the first run.
 
-    Both are drawn in the colour of their component. `crop` is of rows and columns; `zoom` is how
-    many pixels a pixel becomes, each way. Raises `ValueError` for a zoom that is not a whole
-    number from 1 on.
+    Both are drawn in the colour of their component. `crop` is of rows and columns, or of rows
+    alone, as slices count: from the end where they are negative. `zoom` is how many pixels a pixel
+    becomes, each way. Raises `ValueError` for a zoom that is not a whole number from 1 on, and for
+    a crop that is no slices of step one or leaves no pixel.
     """
     check_whole(zoom=zoom)
-    canvas = frame[crop].repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
-    corner = np.array([crop[1].start or 0, crop[0].start or 0], float)
+    rows, columns = _within(frame, crop)
+    canvas = frame[rows, columns].repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
+    corner = np.array([columns.start, rows.start], float)
     labels, palette = snapshot.labels[0], drawing.PALETTE
     for m in np.flatnonzero(snapshot.active[0]):
         box = box_files.top_left(snapshot.means[0][m][None])[0] - [*corner, 0, 0]
@@ -127,3 +134,21 @@ def annotate(
     points = zoom * (snapshot.points[0][filled] - corner)
     drawing.draw_points(canvas, points, palette[labels[filled] % len(palette)], 0.9 * zoom)
     return np.clip(canvas, 0, 255).astype(np.uint8)
+
+
+def _within(frame: np.ndarray, crop: Any) -> tuple[slice, slice]:
+    """The rows and columns of a crop, counted from the frame's top-left corner."""
+    check_type((slice, tuple), "a slice of rows, or one of rows and one of columns", crop=crop)
+    parts = (crop, slice(None)) if isinstance(crop, slice) else crop
+    if len(parts) != 2 or not all(isinstance(part, slice) for part in parts):
+        raise ValueError(f"crop: {crop} is not one slice of rows and one of columns")
+    found = []
+    for part, length in zip(parts, frame.shape[:2], strict=True):
+        try:
+            start, stop, step = part.indices(length)
+        except TypeError as error:
+            raise ValueError(f"crop: {part} does not count pixels ({error})") from error
+        if step != 1 or stop <= start:
+            raise ValueError(f"crop: {part} of {length} is no stretch of pixels")
+        found.append(slice(start, stop))
+    return found[0], found[1]

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mpfjax.vision.snapshots import Snapshot, track_rows
+from mpfjax.vision.drawing import PALETTE, with_tracks
+from mpfjax.vision.snapshots import Snapshot, annotate, track_rows
 
 
 def snapshots(references=True):
@@ -36,3 +37,51 @@ def test_or_a_hypothesis_about_one_of_the_given_boxes():
 def test_without_references_there_is_no_such_track():
     with pytest.raises(ValueError, match="by_reference: the snapshots"):
         track_rows(snapshots(references=False), by_reference=True)
+
+
+def drawn_on_dark():
+    """A dark frame, and a snapshot of one box and one particle near its lower right corner."""
+    snapshot = Snapshot(
+        means=np.array([[[80.0, 50, 20, 12]]]),
+        active=np.ones((1, 1), bool),
+        points=np.array([[[80.0, 50.0]]]),
+        labels=np.zeros((1, 1), int),
+    )
+    return np.full((60, 100, 3), 30, np.uint8), snapshot
+
+
+@pytest.mark.parametrize("zoom", [1, 2])
+@pytest.mark.parametrize(
+    ("crop", "rows", "columns"),
+    [
+        (slice(-30, None), slice(30, 60), slice(0, 100)),
+        ((slice(-30, None), slice(-40, -5)), slice(30, 60), slice(60, 95)),
+        ((slice(30, None), slice(None)), slice(30, 60), slice(0, 100)),
+        ((slice(None), slice(40, 1000)), slice(0, 60), slice(40, 100)),
+    ],
+)
+def test_a_crop_counts_as_slices_do(crop, rows, columns, zoom):
+    """What is drawn is where it is in the whole frame."""
+    frame, snapshot = drawn_on_dark()
+    whole, part = annotate(frame, snapshot, zoom), annotate(frame, snapshot, zoom, crop)
+    enlarged = [slice(zoom * one.start, zoom * one.stop) for one in (rows, columns)]
+    np.testing.assert_array_equal(part, whole[enlarged[0], enlarged[1]])
+    assert (part != 30).any()
+
+
+@pytest.mark.parametrize(
+    "crop",
+    [None, 3, slice(5, 5), slice(None, None, 2), slice(0.5, 9), (slice(None),), (slice(None), 4)],
+)
+def test_a_crop_that_is_none_is_named(as_installed, crop):
+    with pytest.raises(ValueError, match=r"^crop: "):
+        annotate(*drawn_on_dark(), crop=crop)
+
+
+def test_every_id_can_be_read_on_dark():
+    """On the plate behind a number a colour needs some light: the tenth was nearly black."""
+    dark = np.full((60, 60, 3), 15, np.uint8)
+    for id in range(2 * len(PALETTE)):
+        drawn = with_tracks(dark, np.array([[1.0, id, 20, 25, 20, 20]]))
+        assert drawn[:24].max() > 120
+        assert drawn[26:].max() > 120
