@@ -38,6 +38,15 @@ def check_whole(least: int = 1, /, **arguments: Any) -> None:
             raise ValueError(f"{name}: {shown(value)} is more than {_MOST}, the most there can be")
 
 
+def check_numbered(what: str, number: int, /, **arguments: Any) -> None:
+    """So many things can be numbered in 32 bits; the arguments are what there are too many of."""
+    if number > _MOST:
+        named = ", ".join(f"{name}: {shown(value)}" for name, value in arguments.items())
+        raise ValueError(
+            f"{named} would need {what} {number}, more than {_MOST}, the most there are"
+        )
+
+
 def check_positive(**arguments: Any) -> None:
     """Each argument is a finite number above zero."""
     for name, value in arguments.items():

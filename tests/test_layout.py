@@ -35,7 +35,7 @@ FLOORS = {
     "operations": (
         "floats", "gradients", "platforms", "stored", "indexing", "prefix_sums", "logarithms",
         "segments", "runs", "choices", "matrices", "stacks", "gaussians", "across_islands",
-        "generator", "sobol", "hilbert", "sorting", "compiling",
+        "generator", "positions", "sobol", "hilbert", "sorting", "compiling",
     ),
     "running": (
         "storage", "processes", "devices", "threads", "progress", "scan", "run", "islands",

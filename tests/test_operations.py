@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mpfjax.operations import positions
 from mpfjax.operations.choices import cond_if_any
 from mpfjax.operations.floats import default_float
 from mpfjax.operations.indexing import count_places, take
@@ -75,6 +76,55 @@ def test_sums_never_fall_and_zeros_add_nothing(n, how):
     assert (np.diff(line) >= 0).all()
     assert (np.diff(line)[np.asarray(values) == 0] == 0).all()
     np.testing.assert_allclose(total, np.asarray(values).sum(axis=1, dtype=float), rtol=1e-5)
+
+
+@pytest.mark.parametrize("form", [positions._blocked, positions._scanned])
+def test_sums_in_two_parts_are_exact(form):
+    """Of multiples of 2^-24 far from each other in size, whose sums float32 could not hold."""
+    rows = np.exp(RNG.normal(scale=5, size=(5, 3100)))
+    rows *= 2000 / rows.sum(axis=1, keepdims=True)
+    rows[RNG.random(rows.shape) < 0.3] = 0
+    rows[0] = 0
+    rows[1, 100] = 3000
+    whole = np.floor(rows)
+    parts = np.round((rows - whole) * 2**24)
+    both = (jnp.asarray(whole, jnp.float32), jnp.asarray(parts, jnp.float32))
+    before, total = jax.vmap(form)(*both)
+    exact = np.cumsum(whole + parts / 2**24, axis=1)
+    values = np.asarray(before.whole, float) + np.asarray(before.fraction, float)
+    np.testing.assert_array_equal(values, exact - (whole + parts / 2**24))
+    sums = np.asarray(total.whole, float) + np.asarray(total.fraction, float)
+    np.testing.assert_array_equal(sums[:, 0], exact[:, -1])
+
+
+def test_the_last_position_before_each_point():
+    places = np.sort(np.round(RNG.random(300) ** 2 * 64 * 2**12) / 2**12)
+    points = np.append(RNG.random(500) * 64, places)
+    parts = lambda values: positions.as_positions(jnp.asarray(values, jnp.float32))  # noqa: E731
+    found = positions.last_before(parts(places), parts(points), 64)
+    points = points.astype(np.float32)
+    np.testing.assert_array_equal(found, np.searchsorted(places, points, "right") - 1)
+
+
+def test_random_positions_fill_lines_of_any_length_evenly():
+    lengths = jnp.asarray(np.repeat([1, 3, 10**6, 2**30 + 1], 10_000), jnp.int32)
+    drawn = jax.jit(positions.random_positions)(jax.random.key(0), lengths)
+    shares = (np.asarray(drawn.whole) + np.asarray(drawn.fraction, float)) / np.asarray(lengths)
+    for values in (shares, np.asarray(drawn.fraction)):
+        found = np.sort(values.reshape(4, -1), axis=1)
+        gaps = np.abs(found - np.linspace(0, 1, 10_000)[None]).max(axis=1)
+        assert (gaps < 0.02).all()  # Kolmogorov and Smirnov's statistic, of one in a thousand
+
+
+def test_too_many_slots_to_number_are_refused_by_name():
+    values = jax.ShapeDtypeStruct((600, 2**22), jnp.float32)
+    indices = jax.ShapeDtypeStruct((600, 2**22), jnp.int32)
+    for refused in (
+        lambda: jax.eval_shape(jax.vmap(take), values, indices),
+        lambda: jax.eval_shape(jax.vmap(lambda row: count_places(row, 2**22)), indices),
+    ):
+        with pytest.raises(ValueError, match="num_particles: 4194304, runs_at_once: 600"):
+            refused()
 
 
 def test_exponentials_are_never_subnormal():
@@ -439,6 +489,13 @@ def test_draw_columns_finds_the_column_of_each_quantile(columns):
     assert (target <= upto[rows, drawn] + 1e-4).all()
     assert (target >= upto[rows, drawn] - weights[rows, drawn] - 1e-4).all()
     assert (weights[rows, drawn] > 0).all()
+
+
+def test_draw_columns_by_two_quantiles_tells_any_number_of_columns_apart():
+    """Blocks of 64 by the first, columns in a block by the second."""
+    first, second = jnp.array([0.0, 0.5, 0.9999]), jnp.array([0.999, 0.5, 0.0])
+    drawn = draw_columns(first, jnp.ones((3, 4096)), second)
+    np.testing.assert_array_equal(drawn, [63, 32 * 64 + 32, 63 * 64])
 
 
 def test_draw_columns_at_the_ends():

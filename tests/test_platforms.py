@@ -8,6 +8,7 @@ from jax import export
 
 import mpfjax
 from mpfjax.operations.platforms import default_forms
+from mpfjax.operations.positions import exact_sum_before
 from mpfjax.operations.prefix_sums import count_upto, sum_before
 from mpfjax.operations.stored import stored
 from mpfjax.running.scan import scan_filter
@@ -19,6 +20,7 @@ OBSERVATIONS = jnp.array([1.5, 1.0, 0.4])
 VALUES = jnp.abs(jnp.sin(jnp.arange(200.0)))
 FORMS = {
     "sum_before": lambda: sum_before(VALUES),
+    "exact_sum_before": lambda: exact_sum_before(VALUES),
     "count_upto": lambda: count_upto((VALUES > 0.5).astype(jnp.int32), 200),
     "stored": lambda: stored(jnp.arange(200, dtype=jnp.int32), 200),
     "normal": lambda: mpfjax.normal(jax.random.key(0), (200,)),

@@ -14,13 +14,15 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation, AbstractResampling
+from mpfjax.moves.lines import side_by_side
 from mpfjax.moves.propagation import Predict, Propagate, Weigh, log_transition
 from mpfjax.moves.resampling import Resample
+from mpfjax.moves.resampling_schemes import random_points
 from mpfjax.moves.slots import Slots, place_slots
-from mpfjax.moves.standing import standing_order
 from mpfjax.operations.generator import split, uniform
 from mpfjax.operations.indexing import take
-from mpfjax.operations.segments import order_by_segment, spread
+from mpfjax.operations.positions import Positions, last_before, random_positions
+from mpfjax.operations.segments import spread
 
 REFERENCE = "reference"  # the name of its slot and time in a mixture's memory
 CONDITIONAL_SCHEMES = ("multinomial", "stratified", "systematic")
@@ -133,42 +135,33 @@ class ConditionalResample(AbstractResampling):
     ) -> tuple[Int[Array, " n"], Int[Array, ""]]:
         """Each slot's parent, and the slot of the reference's offspring."""
         key_reference, key_points = split(key, 2)
-        before = mixture.memory[REFERENCE]["slot"]
-        order, counts = self._line(mixture)
-        place = jnp.argmax(order == before).astype(jnp.int32)
-        firsts = jnp.cumsum(counts) - counts
-        own = mixture.component_indicators[before]
-        weights = take(mixture.component_weights, order)
-        standing = take(mixture.component_indicators, order)
-        dtype = weights.dtype
-        stretches = weights * spread(targets, standing).astype(dtype)
-        ends = jnp.cumsum(stretches)
-        share = uniform(key_reference, (), dtype)
+        reference = mixture.memory[REFERENCE]["slot"]
+        own, n = mixture.component_indicators[reference], mixture.num_particles
+        # Who has a place at all stands in line, since the reference's weight may underflow.
+        line = side_by_side(mixture, mixture.occupied, self.move.sort_by, without_gaps=True)
+        place = jnp.argmax(line.order == reference).astype(jnp.int32)
+        stretches = line.expected(targets)
+        before, _ = line.positions(stretches, targets, slots)
         first, number = slots.firsts[own], targets[own]
         if self.move.scheme == "multinomial":
-            point = first.astype(dtype) + share * number.astype(dtype)
+            point = random_positions(key_reference, number[None])
+            point = Positions(first + point.whole[0], point.fraction[0])
         else:
-            point = ends[place] - (1 - share) * stretches[place]
-        slot = jnp.clip(jnp.floor(point).astype(jnp.int32), first, first + number - 1)
-        points = self._points(key_points, point - jnp.floor(point), own, targets, slots)
-        parents = jnp.searchsorted(ends, points, side="right").astype(jnp.int32)
+            share = uniform(key_reference, (), stretches.dtype)
+            point = Positions(before.whole[place], before.fraction[place])
+            point = point.moved_by(share * stretches[place])
+        slot = jnp.clip(point.whole, first, first + number - 1)
+        points = self._points(key_points, point.fraction, own, targets, slots)
+        parents = last_before(before, points, n)
+        firsts = jnp.cumsum(line.counts) - line.counts
         lowest = spread(firsts, slots.components)
-        parents = jnp.clip(parents, lowest, lowest + spread(counts, slots.components) - 1)
+        parents = jnp.clip(parents, lowest, lowest + spread(line.counts, slots.components) - 1)
         parents = parents.at[slot].set(place)
         if self.move.ess_threshold < 1.0:
             unmoved = lowest + slots.ranks
             parents = jnp.where(spread(due, slots.components), parents, unmoved)
             slot = jnp.where(due[own], slot, first + place - firsts[own])
-        return take(order, jnp.clip(parents, 0, mixture.num_particles - 1)), slot
-
-    def _line(self, mixture: ParticleMixture) -> tuple[Int[Array, " n"], Int[Array, " m"]]:
-        """The particles component by component, empty slots last, and how many each has."""
-        m = mixture.num_components
-        labels = jnp.where(mixture.occupied, mixture.component_indicators, m)
-        if self.move.sort_by is None:
-            return order_by_segment(labels, m)
-        order = standing_order(mixture, labels, self.move.sort_by)
-        return order, mixture.component_counts
+        return line.particles_at(jnp.clip(parents, 0, n - 1)), slot
 
     def _points(
         self,
@@ -177,17 +170,16 @@ class ConditionalResample(AbstractResampling):
         own: Int[Array, ""],
         targets: Int[Array, " m"],
         slots: Slots,
-    ) -> Float[Array, " n"]:
+    ) -> Positions:
         """One point for each slot, on the line of all components."""
         n, m, dtype = slots.components.shape[0], targets.shape[0], shift.dtype
+        own_slots = jnp.arange(n, dtype=jnp.int32)
         if self.move.scheme == "systematic":
             shifts = put(uniform(key, (m,), dtype), shift, own)
-            return jnp.arange(n).astype(dtype) + spread(shifts, slots.components)
+            return Positions(own_slots, spread(shifts, slots.components))
         if self.move.scheme == "stratified":
-            return jnp.arange(n).astype(dtype) + uniform(key, (n,), dtype)
-        lengths = spread(targets, slots.components).astype(dtype)
-        firsts = spread(slots.firsts, slots.components).astype(dtype)
-        return firsts + lengths * uniform(key, (n,), dtype)
+            return Positions(own_slots, uniform(key, (n,), dtype))
+        return random_points(key, slots, targets)
 
 
 def at(values: Array, place: Int[Array, ""]) -> Array:

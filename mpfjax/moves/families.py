@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_type, check_whole
+from mpfjax.checks import check_numbered, check_type, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.conditionally_linear import AbstractConditionallyLinearModel
@@ -54,6 +54,7 @@ class PropagateFamilies(AbstractPropagation):
     ) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
         n, k = mixture.num_particles, self.num_draws
+        check_numbered("draws up to", n * k, num_particles=n, num_draws=k)
         families, shares = self._drawn(key, mixture, observation)
         log_weights = families.log_weights.reshape(n, k)
         largest = jnp.max(log_weights, axis=1, keepdims=True)

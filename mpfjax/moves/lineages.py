@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mpfjax.checks import check_numbered
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import segment_sum
@@ -37,6 +38,7 @@ class Lineage(eqx.Module):
     ) -> Float[Array, "labels n"]:
         """The weight of the descendants of each particle of x_0, by the particles' labels."""
         n = weights.shape[0]
+        check_numbered("families by label up to", num_labels * n, num_particles=n)
         families = labels * n + self.first_ancestors
         return segment_sum(weights, families, num_labels * n).reshape(num_labels, n)
 

@@ -17,6 +17,17 @@ from mpfjax.moves.standing import SortBy, standing_order
 from mpfjax.operations.choices import cond_if_any
 from mpfjax.operations.indexing import take
 from mpfjax.operations.logarithms import exp, finite_or_zero, log_or_nothing
+from mpfjax.operations.positions import (
+    Positions,
+    as_positions,
+    exact_sum_before,
+    growths,
+    in_slots,
+    needs_two_parts,
+    scales,
+    unit_shift,
+)
+from mpfjax.operations.prefix_sums import sum_before
 from mpfjax.operations.runs import Runs, runs_of, whole
 from mpfjax.operations.segments import order_by_segment, segment_counts, spread
 from mpfjax.operations.stored import stored
@@ -50,6 +61,18 @@ class AsTheyStand(NamedTuple):
     def sums(self, values: Float[Array, " p"]) -> Float[Array, " 1"]:
         """The sum over all places."""
         return jnp.sum(values, keepdims=True)
+
+    def positions(
+        self, values: Float[Array, " p"], lengths: Int[Array, " 1"], slots: Slots
+    ) -> tuple[Positions, Bool[Array, " p"]]:
+        """Where each stretch begins, in slots, and which are not after the last one.
+
+        The values are the stretches, and sum to the length but for rounding.
+        """
+        if not needs_two_parts(values.shape[0], values.dtype):
+            return _sums_in_one_float(values)
+        firsts, lasts = jnp.zeros(1, jnp.int32), jnp.full(1, values.shape[0] - 1, jnp.int32)
+        return _sums_in_two_parts(self, values, lengths, slots.firsts, (firsts, lasts))
 
     def num_slots(self, targets: Int[Array, " 1"], num_particles: int) -> Int[Array, ""]:
         """How many slots there are to fill."""
@@ -116,6 +139,18 @@ class SideBySide(NamedTuple):
         """The sum over each component's places."""
         return self.runs.sums(values)
 
+    def positions(
+        self, values: Float[Array, " p"], lengths: Int[Array, " m"], slots: Slots
+    ) -> tuple[Positions, Bool[Array, " p"]]:
+        """Where each stretch begins, in slots, and which are not after the last one.
+
+        The values are the stretches, and sum to each component's length but for rounding.
+        """
+        if not needs_two_parts(values.shape[0], values.dtype):
+            return _sums_in_one_float(values)
+        extents = self._extents(jnp.ones_like(self.is_drawn))
+        return _sums_in_two_parts(self, values, lengths, slots.firsts, extents)
+
     def num_slots(self, targets: Int[Array, " m"], num_particles: int) -> Int[Array, ""]:
         """How many slots there are to fill; the last ones may stay empty."""
         del targets
@@ -146,6 +181,41 @@ class SideBySide(NamedTuple):
         firsts, lasts = self.runs.extents(mask)
         num_places = self.order.shape[0]
         return stored(firsts, num_places), stored(lasts, num_places)
+
+
+def _sums_in_one_float(values: Float[Array, " p"]) -> tuple[Positions, Bool[Array, " p"]]:
+    """The sums over all places, those of earlier components among them."""
+    before, total = sum_before(values)
+    return as_positions(before), before < total
+
+
+def _sums_in_two_parts(
+    line: AsTheyStand | SideBySide,
+    values: Float[Array, " p"],
+    lengths: Int[Array, " m"],
+    first_slots: Int[Array, " m"],
+    extents: tuple[Int[Array, " m"], Int[Array, " m"]],
+) -> tuple[Positions, Bool[Array, " p"]]:
+    """The same from each component's own first slot, so that none has the rounding of others."""
+    num_places = values.shape[0]
+    firsts, lasts = extents
+    shift = unit_shift(lengths, lasts - firsts + 1)
+    scale = scales(line.sums(values), lengths << shift, num_places)
+    before, total = exact_sum_before(values * line.of_places(stored(scale)))
+    starts, nexts = before.at(firsts), before.at(jnp.minimum(lasts + 1, num_places - 1))
+    is_end = lasts == num_places - 1
+    ends = Positions(*(jnp.where(is_end, *pair) for pair in zip(total, nexts, strict=True)))
+    growth = growths(ends.after(starts), lengths << shift)
+    starts = Positions(*map(line.of_places, starts))
+    within = in_slots(before.after(starts), line.of_places(growth), line.of_places(shift))
+    is_inside = (before.whole < total.whole) | (before.fraction < total.fraction)
+    positions = Positions(within.whole + line.of_places(first_slots), within.fraction)
+    # A place after a component's last weight is at its end to the bit.
+    ends = Positions(*map(line.of_places, ends))
+    is_after = (before.whole == ends.whole) & (before.fraction == ends.fraction)
+    end = line.of_places(first_slots + lengths)
+    whole = jnp.where(is_after, end, positions.whole)
+    return Positions(whole, jnp.where(is_after, 0.0, positions.fraction)), is_inside
 
 
 def as_they_are(mixture: ParticleMixture) -> AsTheyStand:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import (
     check_callable,
+    check_numbered,
     check_one_of,
     check_positive,
     check_share,
@@ -27,7 +28,7 @@ from mpfjax.moves.transport import require_ott, transport
 from mpfjax.operations.gradients import add_gradient
 from mpfjax.operations.indexing import take
 from mpfjax.operations.logarithms import scaled_exp
-from mpfjax.operations.prefix_sums import count_starts, sum_before
+from mpfjax.operations.prefix_sums import count_starts
 from mpfjax.operations.segments import segment_log_sum_exp, spread
 from mpfjax.operations.stored import stored
 
@@ -208,11 +209,11 @@ class Resample(AbstractResampling):
             targets = jnp.where(due, targets, num_particles)
         slots = place_slots(targets, num_particles)
         expected = line.expected(targets)
-        before, total = sum_before(expected)
+        before, is_inside = line.positions(expected, targets, slots)
         starts = SCHEMES[self.scheme](key, expected, before, targets, slots, line)
         # Rounding must not give a slot to particles after the last weight.
         num_slots = line.num_slots(targets, num_particles)
-        starts = jnp.where(before < total, jnp.minimum(starts, num_slots), num_slots)
+        starts = jnp.where(is_inside, jnp.minimum(starts, num_slots), num_slots)
         parents = line.places_of(count_starts(starts, num_particles), slots)
         if not all_are_due:
             unmoved = line.places_by_rank(slots.ranks, slots)
@@ -257,7 +258,8 @@ class Resample(AbstractResampling):
         self, redrawn: ParticleMixture, mixture: ParticleMixture, drawn: "_Drawn"
     ) -> ParticleMixture:
         """The particles at the barycentres of the plan from the weights to equal ones."""
-        slots, line = drawn.slots, drawn.line
+        slots, line, n = drawn.slots, drawn.line, mixture.num_particles
+        check_numbered("entries of a transport plan up to", n * n, num_particles=n)
         # Where a component changes its number of slots, its particles repeat or are skipped.
         counts, shares = line.counts, jnp.maximum(drawn.targets, 1)
         stretched = slots.ranks * spread(counts, slots.components)

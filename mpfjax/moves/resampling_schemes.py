@@ -2,8 +2,8 @@
 
 A scheme returns the first slot of every particle's offspring. Each particle has a stretch of the
 line, as long as its expected number of offspring k_m w_i.
-The scheme knows where each stretch begins, and places one point in the share of each slot. To add
-a scheme, write such a function and name it in `SCHEMES`.
+The scheme knows where each stretch begins, `before`, in whole slots and a fraction, and places one
+point in the share of each slot. To add a scheme, write such a function and name it in `SCHEMES`.
 """
 
 from collections.abc import Callable
@@ -14,10 +14,11 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from mpfjax.moves.lines import Stretches
 from mpfjax.moves.slots import Slots, place_slots
 from mpfjax.operations.generator import uniform
-from mpfjax.operations.indexing import take
-from mpfjax.operations.prefix_sums import sum_before
+from mpfjax.operations.indexing import count_places, take
+from mpfjax.operations.positions import Positions, last_before, random_positions
+from mpfjax.operations.prefix_sums import count_upto
 from mpfjax.operations.segments import spread
-from mpfjax.operations.stored import stored, to_int
+from mpfjax.operations.stored import stored, whole_blocks
 
 
 def systematic(key, expected, before, targets, slots, line):
@@ -27,31 +28,28 @@ def systematic(key, expected, before, targets, slots, line):
 
 def stratified(key, expected, before, targets, slots, line):
     shift = uniform(key, slots.components.shape, expected.dtype)
-    slot = jnp.clip(before.astype(jnp.int32), 0, shift.shape[0] - 1)
+    slot = jnp.clip(before.whole, 0, shift.shape[0] - 1)
     return _points_before(before, take(shift, slot))
 
 
-def _points_before(before: Float[Array, " p"], shift: Float[Array, " #p"]) -> Int[Array, " p"]:
+def _points_before(before: Positions, shift: Float[Array, " #p"]) -> Int[Array, " p"]:
     """How many of the points s + shift, one in each slot s, come before a particle's stretch."""
-    whole = jnp.floor(before)
-    return to_int(whole, before.shape[-1]) + (shift < before - whole).astype(jnp.int32)
+    return before.whole + (shift < before.fraction).astype(jnp.int32)
 
 
 def multinomial(key, expected, before, targets, slots, line):
-    points = sorted_points(key, slots, targets, expected.dtype)
-    return _sorted_points_before(before, points)
+    return _random_points_before(key, before, slots, targets)
 
 
 def residual(key, expected, before, targets, slots, line):
     # In floating point, k times a weight of 1 / k may be a little less than 1; it must count as 1.
     whole = jnp.floor(expected * (1 + 16 * jnp.finfo(expected.dtype).eps))
-    certain, _ = sum_before(whole)
+    copies = whole.astype(jnp.int32)
+    certain = count_upto(copies, 2 * expected.shape[0]) - copies
     left = jnp.maximum(targets - line.sums(whole).astype(jnp.int32), 0)
     rest = place_slots(left, slots.components.shape[0])
-    points = sorted_points(key, rest, left, expected.dtype)
-    rests_before, _ = sum_before(jnp.maximum(expected - whole, 0.0))
-    drawn = _sorted_points_before(rests_before, points)
-    return certain.astype(jnp.int32) + drawn
+    rests_before, _ = line.positions(jnp.maximum(expected - whole, 0.0), left, rest)
+    return certain + _random_points_before(key, rests_before, rest, left)
 
 
 def ssp(key, expected, before, targets, slots, line):
@@ -103,24 +101,24 @@ def _settle(
     return is_up & (ranks < places.counts)
 
 
-def _sorted_points_before(
-    before: Float[Array, " p"], points: Float[Array, " n"]
+def _random_points_before(
+    key: Key[Array, ""], before: Positions, slots: Slots, targets: Int[Array, " m"]
 ) -> Int[Array, " p"]:
-    """How many of the points come before a particle's stretch."""
-    return jnp.searchsorted(points, before, side="left").astype(jnp.int32)
+    """How many of independent points on the components' slots come before a particle's stretch."""
+    num_places, num_slots = before.whole.shape[0], slots.components.shape[0]
+    points = random_points(key, slots, targets)
+    parents = jnp.maximum(last_before(before, points, num_slots), 0)
+    # The points of empty slots are on nobody's stretch.
+    places = jnp.where(slots.filled, parents, num_places)
+    offspring = count_places(places, whole_blocks(num_places + 1))[:num_places]
+    return count_upto(offspring, num_slots) - offspring
 
 
-def sorted_points(
-    key: Key[Array, ""], slots: Slots, targets: Int[Array, " m"], dtype: jnp.dtype
-) -> Float[Array, " n"]:
-    """Independent uniform points on each component's stretch of slots, in ascending order."""
-    shares = uniform(key, slots.components.shape, dtype)
-    firsts = spread(slots.firsts, slots.components).astype(dtype)
-    lengths = spread(targets, slots.components).astype(dtype)
-    # Rounding must not move the last point into the next component.
-    before_end = jnp.nextafter(firsts + lengths, jnp.zeros_like(firsts))
-    points = jnp.minimum(firsts + lengths * shares, before_end)
-    return jnp.sort(jnp.where(slots.filled, points, jnp.inf))
+def random_points(key: Key[Array, ""], slots: Slots, targets: Int[Array, " m"]) -> Positions:
+    """For each slot an independent uniform point on its component's stretch of slots."""
+    lengths = jnp.maximum(spread(targets, slots.components), 1)
+    points = random_positions(key, lengths)
+    return Positions(points.whole + spread(slots.firsts, slots.components), points.fraction)
 
 
 SCHEMES: dict[str, Callable[..., Int[Array, " n"]]] = {

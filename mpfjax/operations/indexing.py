@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Int, Shaped, UInt32
 
+from mpfjax.checks import check_numbered
 from mpfjax.operations.gradients import without_gradient
 from mpfjax.operations.stored import stored
 
@@ -47,6 +48,8 @@ def _take_of_each(
         return jax.vmap(_gathered, (0, None))(values, indices), True
     shape, indices = indices.shape, indices.astype(jnp.int32)
     if has_values:
+        n = values.shape[1]
+        check_numbered("slots up to", axis_size * n, num_particles=n, runs_at_once=axis_size)
         firsts = values.shape[1] * jnp.arange(axis_size, dtype=jnp.int32)
         indices = indices + firsts.reshape(-1, *[1] * (len(shape) - 1))
         values = values.reshape(-1, *values.shape[2:])
@@ -83,6 +86,10 @@ def inverse_permutation(places: Int[Array, " n"]) -> Int[Array, " n"]:
 
 
 def _on_one_line(rows: Int[Array, "k n"], num_places: int) -> UInt32[Array, " k*n"]:
+    check_numbered(
+        "places up to", rows.shape[0] * num_places, num_particles=rows.shape[1],
+        runs_at_once=rows.shape[0],
+    )  # fmt: skip
     firsts = num_places * jnp.arange(rows.shape[0], dtype=jnp.int32)
     return from_the_start((rows + firsts[:, None]).reshape(-1))
 

@@ -23,12 +23,17 @@ def row_sums(values: Float[Array, "n d"]) -> Float[Array, " n"]:
     return total
 
 
-def draw_columns(uniform: Float[Array, " k"], weights: Float[Array, "k n"]) -> Int[Array, " k"]:
+def draw_columns(
+    uniform: Float[Array, " k"],
+    weights: Float[Array, "k n"],
+    within: Float[Array, " k"] | None = None,
+) -> Int[Array, " k"]:
     """The column of each row that holds the given quantile, in [0, 1), of the row's weights.
 
     A column of weight zero is not drawn, unless the whole row is zero: then the last column is.
     The search has two levels, blocks of columns and columns in a block, and takes one pass over
-    the table.
+    the table. `within` is a second quantile, of a block's weights: in float32, one has too few
+    bits to tell a hundred thousand columns apart.
     """
     # In both levels, rounding may put the target on either side of a border, or past the end.
     num_rows, num_columns = weights.shape
@@ -42,7 +47,10 @@ def draw_columns(uniform: Float[Array, " k"], weights: Float[Array, "k n"]) -> I
     block = _first_above(target, upto, sums)
     rows = jnp.arange(num_rows, dtype=jnp.int32)
     chosen = blocks[rows, block]
-    rest = target - (upto[rows, block] - sums[rows, block])
+    if within is None:
+        rest = target - (upto[rows, block] - sums[rows, block])
+    else:
+        rest = within * sums[rows, block]
     column = _first_above(rest, jnp.cumsum(chosen, axis=1), chosen)
     return jnp.minimum(block * size + column, num_columns - 1)
 

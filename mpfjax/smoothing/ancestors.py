@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
+from mpfjax.checks import check_numbered
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.indexing import count_places, take
 from mpfjax.running.scan import FilterRun
@@ -42,6 +43,8 @@ def trace_ancestors(mixtures: FilterRun | ParticleMixture) -> Genealogy:
 def _trace(mixtures: ParticleMixture) -> Genealogy:
     final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
     n, m = final.num_particles, final.num_components
+
+    check_numbered("ancestors by component up to", (m + 1) * n, num_particles=n)
 
     def back(indices: Array, ancestors: Array) -> tuple[Array, Array]:
         return take(ancestors, indices), indices

@@ -4,6 +4,7 @@ The index of x_s given x_{s+1} has the probabilities W_s^i D(x_{s+1} | x_s^i), W
 of the mixture at s. Component indicators have no part in it, since the weights are joint.
 """
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -14,10 +15,19 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import check_log_density
 from mpfjax.models.inputs import with_inputs
-from mpfjax.operations.generator import uniform
+from mpfjax.operations.generator import split, uniform
 from mpfjax.operations.indexing import take
 from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.matrices import draw_columns
+from mpfjax.operations.positions import (
+    exact_sum_before,
+    growths,
+    in_slots,
+    last_before,
+    needs_two_parts,
+    random_positions,
+    scales,
+)
 from mpfjax.operations.prefix_sums import sum_before
 
 # How many densities are held at once: rows of states are taken together up to this.
@@ -25,14 +35,26 @@ MOST_DENSITIES = 2**22
 _NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the step before"
 
 
-def draw(uniforms: Float[Array, "*shape"], log_weights: Float[Array, " n"]) -> Int[Array, "*shape"]:
+def draw(
+    key: Key[Array, ""], shape: tuple[int, ...], log_weights: Float[Array, " n"]
+) -> Int[Array, "..."]:
     """Indices by their weights, by the inverse of the cumulative weights."""
+    n, dtype = log_weights.shape[0], log_weights.dtype
     weights = exp(log_weights - finite_or_zero(jnp.max(log_weights)))
-    before, total = sum_before(weights)
-    indices = jnp.searchsorted(before, uniforms * total, side="right").astype(jnp.int32) - 1
+    if needs_two_parts(n, dtype):
+        length = jnp.full(1, n, jnp.int32)
+        scale = scales(jnp.sum(weights, keepdims=True), length, n)
+        before, total = exact_sum_before(weights * scale)
+        before = in_slots(before, growths(total, length), jnp.zeros(1, jnp.int32))
+        points = random_positions(key, jnp.full(math.prod(shape), n, jnp.int32))
+        indices = last_before(before, points, n).reshape(shape)
+    else:
+        before, total = sum_before(weights)
+        target = uniform(key, shape, dtype) * total
+        indices = jnp.searchsorted(before, target, side="right").astype(jnp.int32) - 1
     # Rounding must not lead past the last particle of positive weight.
-    places = jnp.arange(len(weights), dtype=jnp.int32)
-    return jnp.minimum(indices, jnp.max(jnp.where(weights > 0, places, 0)))
+    place = jnp.arange(n, dtype=jnp.int32)
+    return jnp.minimum(indices, jnp.max(jnp.where(weights > 0, place, 0)))
 
 
 def draw_exactly(
@@ -58,17 +80,19 @@ def draw_exactly(
         return jnp.where(mixture.occupied, mixture.log_weights + log_density, -jnp.inf)
 
     def draw_some(inputs: tuple[Array, PyTree]) -> tuple[Array, Array]:
-        quantiles, state = inputs
+        (quantiles, *within), state = inputs
         log_weights = log_weights_of(state)
         largest = jnp.max(log_weights)
         weights = exp(log_weights - finite_or_zero(largest))
         rows = jnp.broadcast_to(weights, (num_draws, n))
-        return draw_columns(quantiles, rows), largest
+        return draw_columns(quantiles, rows, *within), largest
 
     num_states = jax.tree.leaves(next_states)[0].shape[0]
-    quantiles = uniform(key, (num_states, num_draws), mixture.log_weights.dtype)
+    dtype = mixture.log_weights.dtype
+    keys = split(key, 2) if needs_two_parts(n, dtype) else [key]
+    quantiles = [uniform(key, (num_states, num_draws), dtype) for key in keys]
     together = max(1, min(num_states, MOST_DENSITIES // n))
-    inputs = (quantiles, next_states)
+    inputs = (jnp.stack(quantiles, axis=1), next_states)
     if together == num_states:
         indices, largest = jax.vmap(draw_some)(inputs)
     else:
@@ -82,8 +106,7 @@ def propose(
     key: Key[Array, ""], mixture: ParticleMixture, num_steps: int, num_states: int
 ) -> Int[Array, "steps k"]:
     """What `walk` proposes: indices by the weights alone, so that all can be drawn beforehand."""
-    dtype = mixture.log_weights.dtype
-    return draw(uniform(key, (num_steps, num_states), dtype), mixture.log_weights)
+    return draw(key, (num_steps, num_states), mixture.log_weights)
 
 
 def walk(

@@ -29,10 +29,8 @@ from mpfjax.moves.resampling import Resample
 from mpfjax.observations import Series, as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.generator import split, uniform
-from mpfjax.operations.logarithms import softmax
-from mpfjax.operations.matrices import draw_columns
 from mpfjax.running.scan import FilterRun, checked, scan
-from mpfjax.smoothing.backward import log_transitions
+from mpfjax.smoothing.backward import draw, log_transitions
 from mpfjax.smoothing.history import mixtures_of
 from mpfjax.smoothing.trajectories import draw_trajectories
 
@@ -218,8 +216,7 @@ def is_possible(model: Any, trajectory: PyTree, inputs: PyTree) -> Bool[Array, "
 def _of_the_genealogy(key: Key[Array, ""], mixtures: ParticleMixture) -> PyTree:
     """A particle of the last mixture by its weight, and its ancestors."""
     last = jax.tree.map(lambda leaf: leaf[-1], mixtures)
-    weights = softmax(last.log_weights)
-    end = draw_columns(uniform(key, (1,), weights.dtype), weights[None])[0]
+    end = draw(key, (1,), last.log_weights)[0]
 
     def back(index: Array, ancestors: Array) -> tuple[Array, Array]:
         return at(ancestors, index), index

@@ -15,7 +15,6 @@ from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
 from mpfjax.models.inputs import with_inputs
 from mpfjax.observations import steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors
-from mpfjax.operations.generator import uniform
 from mpfjax.operations.indexing import take
 from mpfjax.running.scan import FilterRun
 from mpfjax.smoothing.backward import draw, draw_exactly, propose, walk
@@ -110,7 +109,7 @@ def draw_trajectories(
     log_weights = final.log_weights
     if component is not None:
         log_weights = jnp.where(final.component_indicators == component, log_weights, -jnp.inf)
-    last = draw(uniform(key_final, (num_trajectories,), log_weights.dtype), log_weights)
+    last = draw(key_final, (num_trajectories,), log_weights)
     states = jax.tree.map(lambda leaf: take(leaf, last), final.particles)
 
     def back(carry: tuple[PyTree, Array], step: Any) -> tuple[tuple[PyTree, Array], PyTree]:

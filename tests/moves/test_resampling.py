@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from mpfjax import Resample
-from mpfjax.moves.resampling_schemes import sorted_points
+from mpfjax.moves.resampling_schemes import random_points
 from mpfjax.moves.slots import place_slots
+from mpfjax.operations import positions
 from tests.examples import make_mixture
 from tests.marking import quick_of, thorough
 
@@ -323,16 +324,19 @@ def test_soft_resampling_draws_from_the_softened_weights_and_weighs_by_the_ratio
     np.testing.assert_allclose(np.exp(moved.log_weights)[ours], expected[ours], rtol=1e-4)
 
 
-def test_points_stay_within_their_components_stretch_of_slots():
-    """The largest uniform numbers round up onto the border, which is the next component's.
-
-    One resampling in 320 then gave a slot to another component's particle, multinomial or residual;
-    the numbers of these three seeds are such.
-    """
-    targets = jnp.full(4, 25_000, jnp.int32)
-    slots = place_slots(targets, 100_000)
-    draw = jax.jit(lambda key: sorted_points(key, slots, targets, jnp.dtype("float32")))
-    borders = np.asarray(slots.firsts) + 25_000
-    for seed in (44, 118, 249):
-        points = np.asarray(draw(jax.random.key(seed))).reshape(4, -1)
-        assert (points < borders[:, None]).all(), seed
+@pytest.mark.parametrize("word", [0, 2**32 - 1])
+def test_points_stay_within_their_components_stretch_of_slots(word):
+    """The largest uniform numbers round up onto the border, which is the next component's."""
+    targets = jnp.asarray([1, 25_000, 2**20, 74_999], jnp.int32)
+    slots = place_slots(targets, 2**20 + 100_000)
+    ends = np.asarray(slots.firsts) + np.asarray(targets)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(positions, "bits", lambda key, shape: jnp.full(shape, word, jnp.uint32))
+        ends_of_unit = {0: 0.0, 2**32 - 1: NEARLY_ONE}
+        patch.setattr(positions, "uniform", lambda key, shape: jnp.full(shape, ends_of_unit[word]))
+        points = jax.jit(lambda key: random_points(key, slots, targets))(jax.random.key(0))
+    own = np.asarray(slots.components)
+    assert (points.whole >= np.asarray(slots.firsts)[own]).all()
+    assert (points.whole < ends[own]).all()
+    assert (points.fraction >= 0).all()
+    assert (points.fraction < 1).all()
