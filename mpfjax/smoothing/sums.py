@@ -21,6 +21,7 @@ from mpfjax.checks import (
 from mpfjax.filter import Filter, Start, split_keys
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped, require
+from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.inputs import with_inputs
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
@@ -85,6 +86,7 @@ def smoothed_sums(
     """
     check_key(key)
     check_type(Filter, "a Filter", filter=filter)
+    refuse_marginalised(filter.model, "smoothed_sums")
     require(filter.model, "log_transition", "smoothed_sums")
     check_callable("a function of two states", function=function)
     if lag is not None:

@@ -12,13 +12,15 @@ from mpfjax.checks import check_key, check_one_of, check_whole, given
 from mpfjax.filter import split_keys
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
+from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
 from mpfjax.models.inputs import with_inputs
-from mpfjax.observations import steps_of_inputs
+from mpfjax.observations import as_arrays, steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.indexing import take
 from mpfjax.running.scan import FilterRun
 from mpfjax.smoothing.backward import draw, draw_exactly, propose, walk
 from mpfjax.smoothing.history import mixtures_of
+from mpfjax.smoothing.marginalised import check_marginalised, sample_marginalised
 
 
 def sample_trajectories(
@@ -31,6 +33,7 @@ def sample_trajectories(
     method: str = "exact",
     num_steps: int | None = None,
     inputs: PyTree = None,
+    observations: PyTree = None,
 ) -> PyTree:
     """Draw trajectories x_0, ..., x_t from their smoothing distribution p(x_0, ..., x_t | y).
 
@@ -49,6 +52,10 @@ def sample_trajectories(
       as N grows.
     - `num_steps`: of "mcmc"; None is one.
     - `inputs`: u_1, ..., u_t, the known inputs that the run had.
+    - `observations`: y_1..y_t, which a conditionally linear model needs and no other takes.
+      Backward sampling is then that of Lindsten, Bunch, Särkkä, Schön and Godsill (2016): latents
+      are drawn, and the result is a `MarginalisedState` of them with the mean and the covariance of
+      each x_s given these and y_1..y_t. It needs a whole run, with x_0, and method "exact".
 
     Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
     that is not there or dead, and for `num_steps` with "exact"; a RuntimeError where no particle
@@ -57,7 +64,8 @@ def sample_trajectories(
     """
     check_key(key)
     check_model(model, "sample_trajectories")
-    require(model, "log_transition", "sample_trajectories")
+    if not is_mixed(model):
+        require(model, "log_transition", "sample_trajectories")
     check_whole(num_trajectories=num_trajectories)
     check_one_of(("exact", "mcmc"), method=method)
     check_whole(**given(num_steps=num_steps))
@@ -68,6 +76,12 @@ def sample_trajectories(
     if component is not None:
         check_whole(0, component=component)
         _check_component(stacked, component)
+    if is_marginalised(model) or observations is not None:
+        check_marginalised(model, stacked, observations, method)
+        observations = as_arrays(observations)
+        return sample_marginalised(
+            key, model, stacked, observations, inputs, num_trajectories, component
+        )
     if method == "exact":
         num_steps = 0
     elif num_steps is None:

@@ -383,3 +383,29 @@ def test_derivatives_of_the_evidence_are_unbiased(kind):
         error = values.std() / np.sqrt(len(keys))
         assert error < 0.3 * abs(float(expected))
         assert abs(values.mean() - float(expected)) < 4 * error
+
+
+class Pushed(OnePath):
+    """A push that is known moves x."""
+
+    inputs: jax.Array | None = None
+
+    def dynamics(self, latent, previous_latent):
+        return self.linear.A, self.inputs, self.linear.Q
+
+
+def test_inputs_reach_the_dynamics():
+    pushes = jnp.array([[0.5, 0.0], [0.0, -1.0], [0.3, 0.2], [0.0, 0.0]])
+    filter = mpfjax.particle_filter(Pushed(LINEAR), 4)
+    run = mpfjax.run_filter(KEY, filter, SERIES, lambda m: m.mean().mean, inputs=pushes)
+    # The pushes' own path is taken off what is observed, and put back on what is found.
+    offsets, offset = [], np.zeros(2)
+    for push in np.asarray(pushes):
+        offset = np.asarray(LINEAR.A) @ offset + push
+        offsets.append(offset)
+    offsets = np.array(offsets, np.float32)
+    exact = kalman_filter(LINEAR, SERIES - offsets @ np.asarray(LINEAR.H).T)
+    np.testing.assert_allclose(run.collected, exact.means + offsets, atol=1e-5)
+    np.testing.assert_allclose(
+        run.log_marginal_likelihood, exact.log_marginal_likelihood, rtol=1e-5
+    )

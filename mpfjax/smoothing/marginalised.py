@@ -1,0 +1,240 @@
+"""Rao-Blackwellised backward sampling: latents from the end on, and moments of x given all y.
+
+Lindsten, Bunch, Särkkä, Schön and Godsill (2016). What the future says of x_s, given its latents,
+is exp(-x Ω x / 2 + λ x) up to a factor. The index of z_s given the future has the probabilities
+
+    W_s^i p(z_{s+1} | z_s^i) ∫ N(x; m_i, P_i) exp(-x Ω x / 2 + λ x) dx,
+
+with m_i and P_i the prediction of x_{s+1} by particle i.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.mixture import MarginalisedState, ParticleMixture
+from mpfjax.models.conditionally_linear import (
+    decorrelated,
+    dynamics_of,
+    emission_of,
+    gaussian_of,
+    is_marginalised,
+    is_mixed,
+    latent_dynamics_of,
+    latent_rows,
+    observation_rows,
+    predicted,
+    predicted_gaussian,
+    updated,
+    with_moments,
+)
+from mpfjax.models.inputs import with_inputs
+from mpfjax.moves.marginalised import log_latent_transition
+from mpfjax.operations.compiling import jit_on_wide_vectors
+from mpfjax.operations.gaussians import Gaussian, Linear, without_missing
+from mpfjax.operations.generator import split, uniform
+from mpfjax.operations.indexing import take
+from mpfjax.operations.matrices import draw_columns
+from mpfjax.operations.stacks import (
+    applied,
+    cholesky,
+    particles_first,
+    product,
+    sandwiched,
+    solve_lower,
+    symmetric,
+    transposed,
+)
+from mpfjax.smoothing.backward import MOST_DENSITIES, draw
+
+_NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the step before"
+
+
+class Information(NamedTuple):
+    """What is said of x, exp(-x Ω x / 2 + λ x), the trajectories last."""
+
+    precision: Float[Array, "d d #n"]
+    vector: Float[Array, "d #n"]
+
+
+def check_marginalised(
+    model: Any, mixtures: ParticleMixture, observations: Any, method: str
+) -> None:
+    """Raise a `ValueError` for what backward sampling of latents cannot do."""
+    if not is_marginalised(model):
+        raise ValueError("observations: only a conditionally linear model needs them")
+    if observations is None:
+        raise ValueError("observations: there are none, and a conditionally linear model needs y")
+    if method != "exact":
+        raise ValueError(f"method: {method!r} is not there for a conditionally linear model")
+    lengths = {jnp.shape(leaf)[0] for leaf in jax.tree.leaves(observations)}
+    num_times = mixtures.log_weights.shape[0]
+    if lengths != {num_times - 1}:
+        raise ValueError(
+            f"observations: {sorted(lengths)} steps are not {num_times - 1}, those of mixtures from"
+            " x_0 on; take the whole run of run_filter(..., collect=None)"
+        )
+
+
+@jit_on_wide_vectors
+def sample_marginalised(key, model, mixtures, observations, inputs, num_trajectories, component):
+    """Latents z_0, ..., z_t given y_1..y_t, and the moments of x_0, ..., x_t given both.
+
+    `mixtures` are those of x_0, ..., x_t; `inputs` are those of the steps between them.
+    """
+    key_last, key_steps = split(key, 2)
+    final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
+    log_weights, length = final.log_weights, mixtures.log_weights.shape[0] - 1
+    if component is not None:
+        log_weights = jnp.where(final.component_indicators == component, log_weights, -jnp.inf)
+    last = draw(uniform(key_last, (num_trajectories,), log_weights.dtype), log_weights)
+    end = jax.tree.map(lambda leaf: take(leaf, last), final.particles)
+
+    def back(carry: tuple[PyTree, Information], step: Any) -> tuple[Any, Any]:
+        latent, future = carry
+        step_key, earlier, observation, now = step
+        moved_by = with_inputs(model, now)
+        future = _joined(future, _seen(moved_by, observation, latent, future))
+        indices = _indices(step_key, moved_by, latent, future, earlier)
+        before = jax.tree.map(lambda leaf: take(leaf, indices), earlier.particles)
+        future = _before(moved_by, latent, before, future)
+        return (before.latent, future), (before.latent, future)
+
+    def forth(state: MarginalisedState, step: Any) -> tuple[Any, Any]:
+        latent, observation, now = step
+        moved_by = with_inputs(model, now)
+        state, _ = updated(moved_by, observation, predicted(moved_by, latent, state))
+        return state, state
+
+    nothing = _nothing(end.mean)
+    earlier = jax.tree.map(lambda leaf: leaf[:-1], mixtures)
+    steps = (jax.random.split(key_steps, length), earlier, observations, inputs)
+    _, (latents, futures) = jax.lax.scan(back, (end.latent, nothing), steps, reverse=True)
+    start = with_moments(model, jax.tree.map(lambda leaf: leaf[0], latents))
+    following = jax.tree.map(
+        lambda rows, row: jnp.concatenate([rows[1:], row[None]]), latents, end.latent
+    )
+    _, later = jax.lax.scan(forth, start, (following, observations, inputs))
+    filtered = jax.tree.map(lambda row, rows: jnp.concatenate([row[None], rows]), start, later)
+    futures = jax.tree.map(lambda rows, row: jnp.concatenate([rows, row[None]]), futures, nothing)
+    return jax.tree.map(
+        lambda leaf: jnp.moveaxis(leaf, 0, 1), jax.vmap(_smoothed)(filtered, futures)
+    )
+
+
+def _nothing(mean: Float[Array, "n d"]) -> Information:
+    n, d = mean.shape
+    return Information(jnp.zeros((d, d, n), mean.dtype), jnp.zeros((d, n), mean.dtype))
+
+
+def _joined(one: Information, other: Information) -> Information:
+    return Information(one.precision + other.precision, one.vector + other.vector)
+
+
+def _told(target: Float[Array, "p #n"], seen: Linear) -> Information:
+    """What y = H x + c + N(0, R) says of x."""
+    target, seen, _ = without_missing(target, seen)
+    factor = cholesky(seen.noise, floor=True)
+    rows = solve_lower(factor, seen.matrix)
+    white = solve_lower(factor, (target - seen.offset)[:, None])[:, 0]
+    return Information(product(transposed(rows), rows), applied(transposed(rows), white))
+
+
+def _seen(model: Any, observation: PyTree, latent: PyTree, like: Information) -> Information:
+    """What y_s says of x_s."""
+    d, n = like.vector.shape
+    state = MarginalisedState(
+        latent, jnp.zeros((n, d), like.vector.dtype), jnp.zeros((n, d, d), like.vector.dtype)
+    )
+    seen = emission_of(model, latent, state)
+    if seen is None:
+        return Information(jnp.zeros_like(like.precision), jnp.zeros_like(like.vector))
+    return _told(observation_rows(model, observation, seen, like.vector.dtype), seen)
+
+
+def _before(
+    model: Any, latent: PyTree, before: MarginalisedState, future: Information
+) -> Information:
+    """What z_{s+1} and all that comes after say of x_s, given z_s."""
+    dynamics = dynamics_of(model, latent, before)
+    told = Information(jnp.zeros_like(future.precision), jnp.zeros_like(future.vector))
+    if is_mixed(model):
+        mixed, shared = latent_dynamics_of(model, before)
+        rows = latent_rows(model, latent)
+        told = _told(rows, mixed)
+        dynamics = decorrelated(dynamics, mixed, shared, rows)
+    matrix, offset, noise = dynamics
+    precision, vector = future
+    vector = vector - applied(precision, offset)
+    root = cholesky(noise)
+    half = solve_lower(_one_plus(precision, root), transposed(product(precision, root)))
+    white = solve_lower(_one_plus(precision, root), applied(transposed(root), vector)[:, None])[
+        :, 0
+    ]
+    precision = precision - product(transposed(half), half)
+    vector = vector - applied(transposed(half), white)
+    back = transposed(matrix)
+    return _joined(told, Information(sandwiched(back, precision), applied(back, vector)))
+
+
+def _one_plus(
+    precision: Float[Array, "d d #n"], root: Float[Array, "d d #n"]
+) -> Float[Array, "d d #n"]:
+    """The factor of I + Γᵀ Ω Γ."""
+    d = precision.shape[0]
+    identity = jnp.eye(d, dtype=precision.dtype)[:, :, None]
+    return cholesky(identity + sandwiched(transposed(root), precision), floor=True)
+
+
+def _log_overlap(law: Gaussian, future: Information) -> Float[Array, " n"]:
+    """log ∫ N(x; m, P) exp(-x Ω x / 2 + λ x) dx of each particle."""
+    precision, vector = future
+    root = cholesky(law.covariance)
+    factor = _one_plus(precision, root)
+    pulled = applied(precision, law.mean)
+    white = solve_lower(factor, applied(transposed(root), vector - pulled)[:, None])[:, 0]
+    at_mean = applied(law.mean[None], vector - 0.5 * pulled)[0]
+    log_volume = sum(jnp.log(factor[j, j]) for j in range(factor.shape[0]))
+    return at_mean + 0.5 * applied(white[None], white)[0] - log_volume
+
+
+def _indices(
+    key: Key[Array, ""], model: Any, latent: PyTree, future: Information, earlier: ParticleMixture
+) -> Array:
+    """Which particle of s each trajectory comes from."""
+    n = earlier.log_weights.shape[0]
+
+    def of_one(inputs: Any) -> tuple[Array, Array]:
+        share, own, precision, vector = inputs
+        copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), own)
+        law = predicted_gaussian(model, copies, earlier.particles)
+        one = Information(precision[:, :, None], vector[:, None])
+        log_density = log_latent_transition(model, copies, earlier.particles)
+        log_density = log_density + _log_overlap(law, one)
+        log_weights = jnp.where(earlier.occupied, earlier.log_weights + log_density, -jnp.inf)
+        largest = jnp.max(log_weights)
+        weights = jnp.exp(log_weights - jnp.where(jnp.isfinite(largest), largest, 0.0))
+        return draw_columns(share[None], weights[None])[0], largest
+
+    num_states = jax.tree.leaves(latent)[0].shape[0]
+    shares = uniform(key, (num_states,), earlier.log_weights.dtype)
+    precision, vector = jnp.moveaxis(future.precision, -1, 0), future.vector.T
+    together = max(1, min(num_states, MOST_DENSITIES // (16 * n)))
+    inputs = (shares, latent, precision, vector)
+    indices, largest = jax.lax.map(of_one, inputs, batch_size=together)
+    return eqx.error_if(indices, jnp.any(~(largest > -jnp.inf)), _NO_PAST)
+
+
+def _smoothed(state: MarginalisedState, future: Information) -> MarginalisedState:
+    """The moments of x_s given y_1..y_s, and what the future says of it."""
+    n, law = state.mean.shape[0], gaussian_of(state)
+    root = cholesky(law.covariance)
+    factor = _one_plus(future.precision, root)
+    half = solve_lower(factor, transposed(root))
+    covariance = symmetric(product(transposed(half), half))
+    pull = future.vector - applied(future.precision, law.mean)
+    mean = law.mean + applied(covariance, pull)
+    return MarginalisedState(state.latent, particles_first(mean, n), particles_first(covariance, n))
