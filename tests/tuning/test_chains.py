@@ -10,6 +10,7 @@ import mpfjax
 from mpfjax.tuning import chains as chains_of
 from mpfjax.tuning import metropolis_hastings, particle_gibbs
 from mpfjax.tuning.walks import random_walk
+from tests.marking import quick_of
 from tests.tuning.exact_posteriors import OBSERVATIONS, A, log_prior_of_a, posterior_of_a
 from tests.tuning.test_gibbs import assert_moments, draw_a
 from tests.tuning.test_sequential import sample_a
@@ -93,6 +94,7 @@ class TestLearning:
         )
 
 
+@pytest.mark.thorough
 def test_chains_start_at_draws_of_the_prior_so_that_r_hat_sees_where_they_are():
     """Before they meet it is large, and after burn-in it is one."""
     arviz = pytest.importorskip("arviz")
@@ -149,7 +151,7 @@ def assert_same_draws(one, other):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize("name", quick_of(SAMPLERS, ["metropolis_hastings"]))
 class TestResuming:
     def test_interrupted_anywhere_the_draws_are_those_of_one_run(self, name, tmp_path, monkeypatch):
         """In the burn-in, where nothing is lost, and after it, where the draws so far come back."""
@@ -188,6 +190,7 @@ class TestResuming:
                 sampler(4, **options | other)
 
 
+@pytest.mark.thorough
 def test_a_start_without_a_likelihood_is_drawn_again():
     def half(parameters):
         return jnp.where(parameters["a"] > 0, correlated(parameters), -jnp.inf)

@@ -160,6 +160,7 @@ def assert_same_samples(one, other):
     np.testing.assert_array_equal(one.log_weights, other.log_weights)
 
 
+@pytest.mark.thorough
 def test_further_observations_give_what_all_at_once_give():
     """Two at a time, with a missing one among them; to the bit, and the first stays as it is."""
     whole = sample()
