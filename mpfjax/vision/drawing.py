@@ -4,10 +4,11 @@ Every function draws in place on a float frame with values in [0, 255], and clip
 the frame's border. Coordinates are in pixels, the centre of the first pixel at (0.5, 0.5).
 """
 
+import functools
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 # Okabe and Ito's palette, in the order of use; people with colour blindness can tell it apart. In
 # place of black, which numbers on a dark plate cannot have, there is a light green.
@@ -96,9 +97,7 @@ def draw_number(
     size: int = 2,
 ) -> None:
     """Write a number with its top-left corner at (x, y), `size` pixels a dot, on a dark plate."""
-    rows = [" ".join(f"{int(_DIGITS[int(d)][i]):03b}" for d in str(number)) for i in range(5)]
-    dots = np.array([[character == "1" for character in row] for row in rows])
-    plate = np.pad(np.kron(dots, np.ones((size, size), bool)), 2)
+    plate = _plate(number, size)
     x, y = round(corner[0]), round(corner[1])
     window = _window(frame, x, y, x + plate.shape[1], y + plate.shape[0])
     if window is None:
@@ -107,6 +106,16 @@ def draw_number(
     plate = plate[lines[:, 0].astype(int) - y][:, columns[0].astype(int) - x]
     _blend(part, np.full(plate.shape, 0.6), np.zeros(3))
     _blend(part, plate.astype(float), colour)
+
+
+@functools.lru_cache(maxsize=4096)
+def _plate(number: int, size: int) -> Bool[np.ndarray, "height width"]:
+    """Where a number's digits are on its plate: an id comes again in every frame."""
+    rows = [" ".join(f"{int(_DIGITS[int(d)][i]):03b}" for d in str(number)) for i in range(5)]
+    dots = np.array([[character == "1" for character in row] for row in rows])
+    plate = np.pad(np.kron(dots, np.ones((size, size), bool)), 2)
+    plate.setflags(write=False)
+    return plate
 
 
 def with_tracks(
@@ -130,8 +139,9 @@ def with_tracks(
             columns, lines = np.clip([x0, x1], 0, width), np.clip([y0, y1], 0, height)
             canvas[lines[0] : lines[1], columns[0] : columns[1]] = colour
         size = 1 + thickness
-        above = max(top - 5 * size - 4, 0)
-        label = canvas[above : above + 5 * size + 4, max(left, 0) : max(left, 0) + 60 * size]
+        above, start = max(top - 5 * size - 4, 0), max(left, 0)
+        tall, wide = _plate(int(id), size).shape
+        label = canvas[above : above + tall, start : start + wide]
         if label.size:
             drawn = label.astype(float)
             draw_number(drawn, int(id), (0, 0), colour, size)
