@@ -90,7 +90,7 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
     log_weights, length = final.log_weights, mixtures.log_weights.shape[0] - 1
     if component is not None:
         log_weights = jnp.where(final.component_indicators == component, log_weights, -jnp.inf)
-    last = draw(uniform(key_last, (num_trajectories,), log_weights.dtype), log_weights)
+    last = draw(key_last, (num_trajectories,), log_weights)
     end = jax.tree.map(lambda leaf: take(leaf, last), final.particles)
 
     def back(carry: tuple[PyTree, Information], step: Any) -> tuple[Any, Any]:
