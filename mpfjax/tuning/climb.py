@@ -60,6 +60,7 @@ def fit(
     transforms: Mapping[str, AbstractTransform] | None = None,
     num_seeds: int = 8,
     common_random_numbers: bool = False,
+    inputs: PyTree = None,
     missing: str = "error",
     patience: int | None = None,
     tolerance: float = 0.0,
@@ -88,7 +89,7 @@ def fit(
     - `num_seeds`: the number of runs in each step, under one vmap. `common_random_numbers` takes
       the same seeds in every step: there is no noise between steps, but the error of those seeds
       stays.
-    - `missing`: as for `run_filter`.
+    - `inputs`, `missing`: as for `run_filter`; of several sequences, a list of inputs.
     - `patience`: a number of steps. The climb ends when the mean of the last so many steps is not
       more than `tolerance` nats above the mean of as many steps before them.
     - `curvature_seeds`: the seeds for `standard_errors` at the end, in whole batches of
@@ -117,7 +118,7 @@ def fit(
         checkpoint, checkpoint_every, checkpoint_name, progress,
     )  # fmt: skip
     check_whole(0, curvature_seeds=curvature_seeds)
-    problem = pose_evidence(filter, observations, parameters, transforms, missing)
+    problem = pose_evidence(filter, observations, parameters, transforms, missing, inputs)
     warn_of_bias("fit", problem)
 
     observed = fingerprint(problem.objective)

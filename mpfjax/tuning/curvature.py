@@ -43,6 +43,7 @@ def standard_errors(
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
     num_seeds: int = 100,
+    inputs: PyTree = None,
     missing: str = "error",
 ) -> dict[str, np.ndarray] | None:
     """Standard errors of a filter's parameters where they maximise the likelihood.
@@ -66,7 +67,7 @@ def standard_errors(
     """
     check_key(key)
     check_whole(1, num_seeds=num_seeds)
-    problem = pose_evidence(filter, observations, parameters, transforms, missing)
+    problem = pose_evidence(filter, observations, parameters, transforms, missing, inputs)
     warn_of_bias("standard_errors", problem)
     batches = [jax.random.split(key, num_seeds)]
     return errors_at(problem, problem.start(), batches, "num_seeds")

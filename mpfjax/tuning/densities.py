@@ -106,6 +106,7 @@ def log_density(
     log_prior: LogPrior,
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
+    inputs: PyTree = None,
     missing: str = "error",
 ) -> LogDensity:
     """The posterior's log density in unconstrained numbers, for samplers of other libraries.
@@ -127,7 +128,7 @@ def log_density(
     """
     check_type(Filter, "a filter", filter=filter)
     check_callable("a function of the parameters by name", log_prior=log_prior)
-    problem = pose_evidence(filter, observations, parameters, transforms, missing)
+    problem = pose_evidence(filter, observations, parameters, transforms, missing, inputs)
     check_exact(filter, "likelihood")
     return LogDensity(problem, checked_prior(log_prior, problem, problem.start(), "at the start"))
 

@@ -23,9 +23,11 @@ from mpfjax.checks import (
 )
 from mpfjax.filter import Filter, Start, sample_initial
 from mpfjax.models.base import require
+from mpfjax.models.inputs import with_inputs
 from mpfjax.observations import Series, as_series
 from mpfjax.running.scan import scan
 from mpfjax.running.storage import fingerprint
+from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.conditional import check_conditional, draw_trajectory, is_possible, renew
 from mpfjax.tuning.chains import (
     AbstractKernel,
@@ -95,6 +97,7 @@ def particle_gibbs(
     num_chains: int = 1,
     backward: bool = True,
     collect: Callable[[PyTree], PyTree] | None = None,
+    inputs: PyTree = None,
     missing: str = "error",
     checkpoint: str | os.PathLike[str] | None = None,
     checkpoint_every: int = 1000,
@@ -127,8 +130,8 @@ def particle_gibbs(
       `lambda trajectory: trajectory[-1]`, or `lambda trajectory: None`; None keeps all.
     - `checkpoint`, `checkpoint_every`, `checkpoint_name`: as for `metropolis_hastings`. The file
       holds what is kept of the trajectories too.
-    - `observations`: one sequence. `parameters`, `transforms`, `missing`: as for `fit`. Parameters
-      are usually the model's; those of a proposal have no posterior.
+    - `observations`: one sequence. `parameters`, `transforms`, `inputs`, `missing`: as for `fit`.
+      Parameters are usually the model's; those of a proposal have no posterior.
 
     A proposal whose density is NaN or +inf is rejected, and where the conditional filter meets one,
     the whole step is; `num_invalid` counts them, with a warning. Ctrl-C returns the
@@ -162,7 +165,7 @@ def particle_gibbs(
             "observations: a list is several sequences, and this takes one;"
             " jnp.asarray(observations) is one of numbers"
         )
-    joint = LogJoint(as_series(observations, None, missing, filter.model))
+    joint = LogJoint(as_series(observations, inputs, missing, filter.model))
     problem = pose_filter(filter, joint, parameters, transforms)
     deviations = checked_deviations(proposal_deviations, problem.start())
     key_start, key_steps = jax.random.split(key)
@@ -206,19 +209,19 @@ class LogJoint(eqx.Module):
     def __call__(self, trajectory: PyTree, filter: Filter) -> Float[Array, ""]:
         """With the parameters of the filter's model."""
         model: Any = filter.model
-        start, before, after = (
+        start, after = (
             jax.tree.map(lambda leaf, cut=cut: leaf[cut], trajectory)
-            for cut in (slice(0, 1), slice(None, -1), slice(1, None))
+            for cut in (slice(0, 1), slice(1, None))
         )
 
-        def log_likelihood(observation: PyTree, state: PyTree) -> Float[Array, ""]:
+        def log_likelihood(observation: PyTree, inputs: PyTree, state: PyTree) -> Float[Array, ""]:
             one = jax.tree.map(lambda leaf: leaf[None], state)
-            return model.log_likelihood(observation, one)[0]
+            return with_inputs(model, inputs).log_likelihood(observation, one)[0]
 
-        seen = jax.vmap(log_likelihood)(self.series.observations, after)
+        seen = jax.vmap(log_likelihood)(self.series.observations, self.series.inputs, after)
         if self.series.present is not None:
             seen = jnp.where(self.series.present, seen, 0.0)
-        steps = jnp.sum(model.log_transition(after, before))
+        steps = jnp.sum(log_transitions(model, trajectory, self.series.inputs))
         return model.log_initial(start)[0] + steps + jnp.sum(seen)
 
 

@@ -69,6 +69,7 @@ def metropolis_hastings(
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
     num_chains: int = 1,
+    inputs: PyTree = None,
     missing: str = "error",
     checkpoint: str | os.PathLike[str] | None = None,
     checkpoint_every: int = 1000,
@@ -109,7 +110,7 @@ def metropolis_hastings(
       to the bit as without the interruption; with a larger `num_steps`, further. All other
       arguments must be the same; functions are compared by their code, or by `checkpoint_name` as
       in `fit`.
-    - `observations`, `parameters`, `transforms`, `missing`: as for `fit`.
+    - `observations`, `parameters`, `transforms`, `inputs`, `missing`: as for `fit`.
 
     A proposal with a prior or likelihood that is NaN or +inf is rejected, and counted in
     `num_invalid`, with a warning. Ctrl-C returns the draws so far with a warning, if there are any.
@@ -130,7 +131,7 @@ def metropolis_hastings(
     check_flag(progress=progress)
     check_checkpoint(checkpoint, checkpoint_every, checkpoint_name)
     check_exact(filter, "chain")
-    problem = pose_evidence(filter, observations, parameters, transforms, missing)
+    problem = pose_evidence(filter, observations, parameters, transforms, missing, inputs)
     deviations = checked_deviations(proposal_deviations, problem.start())
     key_start, key_steps = jax.random.split(key)
     starts = Starts(key_start, problem, num_chains, sample_prior, deviations)

@@ -33,14 +33,14 @@ class Observed:
     model: Any
 
     @classmethod
-    def checked(cls, observations: PyTree, missing: str, model: Any) -> "Observed":
+    def checked(cls, observations: PyTree, inputs: PyTree, missing: str, model: Any) -> "Observed":
         """A `ValueError` for what is no sequence."""
         if isinstance(observations, list):
             raise ValueError(
                 "observations: a list is several sequences, and this takes one;"
                 " jnp.asarray(observations) is one of numbers"
             )
-        series = as_series(observations, None, missing, model)
+        series = as_series(observations, inputs, missing, model)
         return cls(jax.tree.map(np.asarray, series), missing, model)
 
     @property
@@ -52,9 +52,9 @@ class Observed:
         """Those up to a step."""
         return replace(self, series=jax.tree.map(lambda leaf: leaf[:length], self.series))
 
-    def followed_by(self, observations: PyTree) -> "Observed":
+    def followed_by(self, observations: PyTree, inputs: PyTree) -> "Observed":
         """These and those; a `ValueError` where the two do not fit."""
-        new = Observed.checked(observations, self.missing, self.model).series
+        new = Observed.checked(observations, inputs, self.missing, self.model).series
         before, after = self.series, new
         if (before.present is None) != (after.present is None):
             before, after = _with_all_present(before), _with_all_present(after)
@@ -62,6 +62,8 @@ class Observed:
             raise ValueError(
                 f"observations: {_kind(after)} are not like those before, {_kind(before)}"
             )
+        if (before.inputs is None) != (after.inputs is None):
+            raise ValueError("inputs: there must be some for all observations, or for none")
         join = lambda *leaves: np.concatenate(leaves)  # noqa: E731
         return replace(self, series=jax.tree.map(join, before, after))
 
@@ -180,9 +182,9 @@ class CloudRun:
     doubling: Doubling
     file: SamplesFile | None
 
-    def with_observations(self, step: int, observations: PyTree) -> "CloudRun":
+    def with_observations(self, step: int, observations: PyTree, inputs: PyTree) -> "CloudRun":
         """The same with those that follow the first few."""
-        observed = self.observed.first(step).followed_by(observations)
+        observed = self.observed.first(step).followed_by(observations, inputs)
         held = self.sampler.run.series.length
         # Room for as many again, so that observations that come one by one share a program.
         capacity = held if observed.length <= held else max(observed.length, 2 * held)

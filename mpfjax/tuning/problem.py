@@ -13,13 +13,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_type, shown
-from mpfjax.filter import Filter
+from mpfjax.filter import Filter, Start
 from mpfjax.moves.clusters import PropagateInClusters
 from mpfjax.moves.independent import PropagateIndependently
 from mpfjax.moves.resampling import Resample
-from mpfjax.observations import as_arrays, present_steps
+from mpfjax.observations import Series, as_series
 from mpfjax.proposals import AbstractProposal
-from mpfjax.running.scan import scan_filter
+from mpfjax.running.scan import scan
 from mpfjax.tuning.transforms import AbstractTransform, Unconstrained
 
 _DECLARED = "eqx.field(converter=jnp.asarray)"
@@ -82,18 +82,17 @@ class Problem(eqx.Module):
 class LogEvidence(eqx.Module):
     """log Ẑ of a filter with one seed, summed over sequences of observations."""
 
-    groups: list[tuple[PyTree, Array | None]]
-    """sequences of one shape, stacked: observations, and which steps have one."""
+    groups: list[tuple[PyTree, Array | None, PyTree]]
+    """sequences of one shape, stacked: observations, which steps have one, and inputs."""
 
     def __call__(self, key: Key[Array, ""], filter: Filter) -> Float[Array, ""]:
         """One run for each sequence."""
         total = 0.0
-        for g, (observations, present) in enumerate(self.groups):
+        for g, (observations, present, inputs) in enumerate(self.groups):
             num_sequences = jax.tree.leaves(observations)[0].shape[0]
             keys = jax.random.split(jax.random.fold_in(key, g), num_sequences)
-            run = lambda key, y, here: scan_filter(key, filter, y, here, _nothing)  # noqa: E731
-            axes = (0, 0, None if present is None else 0)
-            runs = jax.vmap(run, in_axes=axes)(keys, observations, present)
+            run = lambda key, series: scan(Start(key), filter, series, _nothing)  # noqa: E731
+            runs = jax.vmap(run)(keys, Series(observations, present, inputs))
             total += jnp.sum(runs.log_marginal_likelihood)
         return jnp.asarray(total)
 
@@ -153,10 +152,11 @@ def pose_evidence(
     parameters: Parameters,
     transforms: Mapping[str, AbstractTransform] | None,
     missing: str,
+    inputs: PyTree = None,
 ) -> Problem:
     """The problem of the log marginal likelihood; without `parameters`, in those of the model."""
     check_type(Filter, "a filter", filter=filter)
-    objective = LogEvidence(_groups(observations, missing, filter.model))
+    objective = LogEvidence(_groups(observations, inputs, missing, filter.model))
     return pose_filter(filter, objective, parameters, transforms)
 
 
@@ -328,27 +328,34 @@ def _chosen(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[st
     return {name + jax.tree_util.keystr(path): place.index for path, place in found}
 
 
-def _groups(observations: PyTree, missing: str, model: Any) -> list[tuple[PyTree, Array | None]]:
-    sequences = observations if isinstance(observations, list) else [observations]
+def _groups(
+    observations: PyTree, inputs: PyTree, missing: str, model: Any
+) -> list[tuple[PyTree, Array | None, PyTree]]:
+    several = isinstance(observations, list)
+    sequences = observations if several else [observations]
+    given = inputs if several and inputs is not None else [inputs] * len(sequences)
+    if not isinstance(given, list) or len(given) != len(sequences):
+        raise ValueError(f"inputs: there must be a list of {len(sequences)}, as of observations")
     if not sequences:
         raise ValueError("observations: there are no sequences")
-    by_shape: dict[Any, list[tuple[PyTree, Any]]] = {}
-    for sequence in sequences:
-        present = present_steps(sequence, missing, model)
-        sequence = as_arrays(sequence)
-        shapes = jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf).name), sequence)
-        by_shape.setdefault(str(shapes), []).append((sequence, present))
+    by_shape: dict[Any, list[Series]] = {}
+    for sequence, own in zip(sequences, given, strict=True):
+        series = as_series(sequence, own, missing, model)
+        kind = lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf).name)  # noqa: E731
+        shapes = jax.tree.map(kind, (series.observations, series.inputs))
+        by_shape.setdefault(str(shapes), []).append(series)
     return [_stacked(group) for group in by_shape.values()]
 
 
-def _stacked(group: list[tuple[PyTree, Any]]) -> tuple[PyTree, Array | None]:
-    sequences, present = zip(*group, strict=True)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *sequences)
-    if all(here is None for here in present):
-        return stacked, None
-    length = jax.tree.leaves(stacked)[0].shape[1]
-    full = jnp.ones(length, bool)
-    return stacked, jnp.stack([full if here is None else here for here in present])
+def _stacked(group: list[Series]) -> tuple[PyTree, Array | None, PyTree]:
+    stack = lambda *leaves: jnp.stack(leaves)  # noqa: E731
+    stacked = jax.tree.map(stack, *[series.observations for series in group])
+    inputs = jax.tree.map(stack, *[series.inputs for series in group])
+    if all(series.present is None for series in group):
+        return stacked, None, inputs
+    full = jnp.ones(group[0].length, bool)
+    present = [full if series.present is None else series.present for series in group]
+    return stacked, jnp.stack(present), inputs
 
 
 def _nothing(mixture: Any) -> None:

@@ -66,11 +66,14 @@ class SequentialPosterior:
         """E[θ | y_1..y_t] of one parameter, estimated."""
         return np.asarray(np.einsum("n,n...->...", self.weights, self.parameters[name]))
 
-    def extend(self, observations: PyTree, *, progress: bool = True) -> "SequentialPosterior":
+    def extend(
+        self, observations: PyTree, *, inputs: PyTree = None, progress: bool = True
+    ) -> "SequentialPosterior":
         """The posterior after further observations: the one of all observations at once.
 
         - `observations`: those that come next, with a leading axis t. Of a posterior that was
           stopped, those after its last increment.
+        - `inputs`: theirs.
 
         This posterior stays as it is. Raises `ValueError` for observations of other shapes or
         types, and what `smc2` does. Use it as observations come in.
@@ -79,7 +82,7 @@ class SequentialPosterior:
         if self._goes_on is None:
             raise ValueError("extend: this posterior has no filters to go on with; smc2 gives them")
         run, state = self._goes_on
-        return _posterior(run.with_observations(state.step, observations), state, progress)
+        return _posterior(run.with_observations(state.step, observations, inputs), state, progress)
 
 
 def smc2(
@@ -97,6 +100,7 @@ def smc2(
     acceptance_threshold: float = 0.2,
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
+    inputs: PyTree = None,
     missing: str = "error",
     checkpoint: str | os.PathLike[str] | None = None,
     checkpoint_every: int = 10,
@@ -131,7 +135,7 @@ def smc2(
       it, the same to the bit; also to more observations than those that it has seen.
       `checkpoint_name`: as for `metropolis_hastings`.
     - `observations`: one sequence; `SequentialPosterior.extend` takes those that come later.
-      `parameters`, `transforms`, `missing`: as for `fit`.
+      `parameters`, `transforms`, `inputs`, `missing`: as for `fit`.
 
     A θ whose likelihood is NaN or +inf gets the weight zero, a proposal with such a prior or
     likelihood is rejected, and `num_invalid` counts them, with a warning. Ctrl-C, and an
@@ -160,7 +164,7 @@ def smc2(
             f"num_samples: {num_samples} is no multiple of num_moves + 1, {num_moves + 1}, as"
             " waste_free needs"
         )
-    observed = Observed.checked(observations, missing, filter.model)
+    observed = Observed.checked(observations, inputs, missing, filter.model)
     run = observed.filter_of(observed.length)
     problem = pose_filter(filter, run, parameters, transforms)
     key_prior, key_filters, key_steps = jax.random.split(key, 3)
