@@ -1,6 +1,6 @@
 """A filter: a chain of moves on a particle mixture, one step at a time."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -28,7 +28,7 @@ from mpfjax.models.base import (
 from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.noise import NOISES, draw_noise
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
-from mpfjax.moves.every import Every
+from mpfjax.moves.every import Every, with_inner
 from mpfjax.moves.exchange import Exchange
 from mpfjax.moves.lineages import LINEAGE, evidence_variance, mass_variances
 from mpfjax.moves.parents import runner
@@ -123,14 +123,14 @@ class Filter(eqx.Module):
                 f"moves: {names} never weigh the particles by what is observed, and log Ẑ would be"
                 " 0; Propagate does, or Weigh after Predict"
             )
-        for move in _with_inner(moves):
+        for move in with_inner(moves):
             per_component = getattr(move, "particles_per_component", None)
             if per_component is not None and per_component * num_components > num_particles:
                 raise ValueError(
                     f"particles_per_component: {per_component} for each of {num_components}"
                     f" components needs more than num_particles, {num_particles}"
                 )
-        held = [move for move in _with_inner(moves) if isinstance(move, AbstractMove)]
+        held = [move for move in with_inner(moves) if isinstance(move, AbstractMove)]
         names = [name for move in held for name in _own_memory(move)]
         if len(set(names)) < len(names):
             raise ValueError(f"moves: two of them would share one memory, of {sorted(names)}")
@@ -371,14 +371,6 @@ def split_keys(key: Key[Array, ""], num: int) -> list[Key[Array, ""]]:
     same draws.
     """
     return list(split(key, num))
-
-
-def _with_inner(moves: Iterable[Any]) -> Iterator[Any]:
-    """The moves, and after each those that it runs from time to time."""
-    for move in moves:
-        yield move
-        if isinstance(move, Every):
-            yield from _with_inner(move.moves)
 
 
 def _own_memory(move: AbstractMove) -> list[str]:

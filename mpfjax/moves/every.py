@@ -1,6 +1,6 @@
 """Every: other moves, at every k-th step only."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -139,3 +139,11 @@ def _as_inner_moves(moves: Any) -> tuple[AbstractMove, ...]:
                 " into the chain itself, since without it the state would not move"
             )
     return moves
+
+
+def with_inner(moves: Iterable[Any]) -> Iterator[Any]:
+    """The moves, and after each those that it runs from time to time."""
+    for move in moves:
+        yield move
+        if isinstance(move, Every):
+            yield from with_inner(move.moves)
