@@ -167,9 +167,7 @@ def stratified_uniform(key: Key[Array, ""], num_points: int) -> Float[Array, " n
     Use it for draws of equal weight, such as x_0.
     """
     cells = jnp.arange(num_points).astype(jnp.result_type(float))
-    shares = (cells + uniform(key, (num_points,))) / num_points
-    # In the last cell, rounding may reach the end.
-    return jnp.minimum(shares, np.nextafter(np.ones((), shares.dtype), np.zeros((), shares.dtype)))
+    return (cells + uniform(key, (num_points,))) / num_points
 
 
 def noise_dtype(states: PyTree) -> jnp.dtype:
