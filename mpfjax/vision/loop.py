@@ -16,7 +16,7 @@ from mpfjax.vision.boxes import top_left
 from mpfjax.vision.detections import Detections
 from mpfjax.vision.detectors import LEAST_ROOM, AbstractDetector, Found, Once, Sieve, as_detector
 from mpfjax.vision.frames import of_one_kind
-from mpfjax.vision.tracker import LONGEST_GUESS, ObjectTracker, Tracks
+from mpfjax.vision.tracker import ObjectTracker, Tracks
 
 
 def track(
@@ -176,7 +176,7 @@ def make_tracker(
 def online_rows(number: int, tracks: Tracks) -> Float[np.ndarray, "k 6"]:
     """Rows (frame, id, x, y, w, h) of the objects that are believed in when the frame comes.
 
-    Those that are confirmed and were detected in the last frames, `Tracks.shown`.
+    Those that `Tracks.shown` says.
     """
     return _rows(number, tracks, tracks.shown)
 
@@ -189,7 +189,11 @@ def offline_rows(kept: Iterable[Tracks], first: int = 1) -> Float[np.ndarray, "r
         believed |= set(np.asarray(tracks.identities)[np.asarray(tracks.confirmed)].tolist())
     chosen = np.array(sorted(believed - {0}))
     rows = [
-        _rows(number, tracks, np.isin(tracks.identities, chosen) & (tracks.unseen <= LONGEST_GUESS))
+        _rows(
+            number,
+            tracks,
+            np.isin(tracks.identities, chosen) & (tracks.shown | ~np.asarray(tracks.confirmed)),
+        )
         for number, tracks in enumerate(kept, first)
     ]
     return np.concatenate([np.zeros((0, 6)), *rows])

@@ -20,6 +20,7 @@ from mpfjax.vision.histograms import integral_histogram
 from mpfjax.vision.sampled_histograms import SampledBoxes, SampledHistogram
 from mpfjax.vision.tracking.assignment import Assign
 from mpfjax.vision.tracking.births import Found, ShareMass
+from mpfjax.vision.tracking.camera import FollowCamera
 from mpfjax.vision.tracking.chain import check_chain
 from mpfjax.vision.tracking.colours import LearnColours
 from mpfjax.vision.tracking.contact import ShareDetections
@@ -27,11 +28,10 @@ from mpfjax.vision.tracking.deaths import Bury
 from mpfjax.vision.tracking.memory import LIVES, Lives, frames_unseen, mean_boxes
 from mpfjax.vision.tracking.model import DetectedObjectModel, ObjectState, Pixels
 from mpfjax.vision.tracking.motion import PropagateObjects
+from mpfjax.vision.tracking.noise import LearnNoise
 from mpfjax.vision.tracking.observation import TrackedFrame
 from mpfjax.vision.tracking.scores import RankScores
 
-# A box that no detection has borne out for more frames than this is a guess.
-LONGEST_GUESS = 3
 # A box of so many pixels cannot be counted in 16 bits.
 _LARGEST_NARROW = 2**16
 
@@ -44,8 +44,7 @@ class Tracks(NamedTuple):
     - `confirmed`: (m,), whether detections have borne it out often enough to be believed.
     - `unseen`: (m,), for how many frames none has; 0 while it is hidden by another one.
     - `full`: whether a detection that would have founded a component found no room.
-
-    A box that is confirmed and was seen within the last three frames is worth showing: `shown`.
+    - `shown`: (m,), which are confirmed, and were seen a moment ago or are hidden: worth showing.
     """
 
     boxes: Float[Array, "m 4"]
@@ -53,11 +52,7 @@ class Tracks(NamedTuple):
     confirmed: Bool[Array, " m"]
     unseen: Int[Array, " m"]
     full: Bool[Array, ""]
-
-    @property
-    def shown(self) -> Bool[Array | np.ndarray, " m"]:
-        """Which are confirmed, and were seen in this frame or in one of the three before."""
-        return self.confirmed & (self.unseen <= LONGEST_GUESS)
+    shown: Bool[Array, " m"]
 
     @property
     def corner_boxes(self) -> Float[Array, "m 4"]:
@@ -71,22 +66,25 @@ class ObjectTracker(eqx.Module):
     A step is a chain of moves on a `ParticleMixture`, each with a memory of its own:
 
     - `RankScores`: which detections are strong, by the scores seen so far;
+    - `FollowCamera`: what all objects move in common;
     - `Assign`: at most one detection for each component, at the least total cost;
-    - `ShareDetections`: one for two, where a component hides another;
     - a rejuvenation, of the GM-MPF (Lin et al. 2012) or of the MPF (Vermaak et al. 2003);
-    - `PropagateObjects`: draw x_t and weigh it by the component's detection, exactly;
+    - `PropagateObjects`: each hypothesis a frame on, by Kalman's filter, and weighed;
     - `Bury`: end what no detection bears out, or has left the frame;
     - `Found`: a component for each strong detection that no component explains;
+    - `LearnNoise`: how far the detector errs, how objects move and grow;
     - `LearnColours`: of objects that stand alone;
     - `ShareMass`: the same for every object.
 
-    Lengths are in boxes, so that nothing depends on the size of a frame or of the objects. All but
-    `PropagateObjects` and the resampling is outside the exact recursion (`approximate`). Use it to
-    track an unknown and changing number of objects, with any detector.
+    Lengths are in boxes, so that nothing depends on the size of a frame or of the objects, and what
+    is learned in the first second serves from then on. Particles carry Gaussian moments: they are
+    rival hypotheses of whose a detection is. All but `PropagateObjects` and the resampling is
+    outside the exact recursion (`approximate`). Use it to track an unknown and changing number of
+    objects, with any detector.
 
     - `max_objects`: M; `particles_per_object`: P.
-    - `frames_per_second`: of the video, 25 where it is None. Above 25, objects move less in a
-      frame, and wait for more frames; from 7 to 25 the same settings hold.
+    - `frames_per_second`: of the video: an object is waited for for a second, and shown for a tenth
+      of one after its last detection. None takes 25.
     - `rejuvenation`: `Resample(particles_per_component=P)` for an MPF, or
       `GaussianRegeneration(P, where=lambda states: (states.place, states.velocity))`, by default
       with stratified noise.
@@ -116,7 +114,7 @@ class ObjectTracker(eqx.Module):
     def __init__(
         self,
         max_objects: int = 24,
-        particles_per_object: int = 64,
+        particles_per_object: int = 16,
         *,
         frames_per_second: float | None = None,
         rejuvenation: AbstractRejuvenation | None = None,
@@ -151,15 +149,20 @@ class ObjectTracker(eqx.Module):
             _check_rejuvenation(rejuvenation, particles_per_object)
             rate = 25.0 if frames_per_second is None else frames_per_second
             model = object_model(rate, sigma)
-            patience = round(20 * max(rate / 25, 1.0))
+            assign = Assign(model)
             moves = (
                 RankScores(strong_score=strong_score, weak_score=weak_score),
-                Assign(model),
-                ShareDetections(model, longest=round(7 * max(rate / 25, 1.0))),
+                FollowCamera(assign),
+                assign,
                 rejuvenation,
                 PropagateObjects(model),
-                Bury(patience=patience),
+                Bury(
+                    patience=max(round(rate), 8),
+                    longest_guess=max(round(0.1 * rate), 1),
+                    longest_unsure=max(round(0.3 * rate), 1),
+                ),
                 Found(model, particles_per_object),
+                LearnNoise(model),
                 LearnColours(colours),
                 ShareMass(),
             )
@@ -181,7 +184,7 @@ class ObjectTracker(eqx.Module):
         for move in self.moves:
             memory |= move.initial_memory(m)
         return ParticleMixture(
-            particles=ObjectState(jnp.zeros((n, 4)), jnp.zeros((n, 2)), jnp.zeros(n, jnp.int32)),
+            particles=ObjectState.nowhere(n),
             log_weights=jnp.full(n, -jnp.inf, default_float()),
             component_indicators=jnp.zeros(n, jnp.int32),
             ancestor_indices=jnp.arange(n, dtype=jnp.int32),
@@ -217,6 +220,7 @@ class ObjectTracker(eqx.Module):
             confirmed=lives.confirmed,
             unseen=frames_unseen(state),
             full=lives.full,
+            shown=lives.shown,
         )
 
     def look(
@@ -253,21 +257,15 @@ class ObjectTracker(eqx.Module):
 def object_model(
     frames_per_second: float = 25.0, sigma: float | None = None
 ) -> DetectedObjectModel:
-    """The tracker's model of people and of what moves like them, at a frame rate.
+    """What is expected of objects before anything is learned, at a frame rate.
 
-    Chosen at 7 and 25 frames a second together, on pedestrians and on players who turn at will.
-    Above 25, noise shrinks as that of a path with random accelerations does. Raises `ValueError`
-    for a rate or σ that is not positive.
+    At fewer frames a second newborn objects may move further in a frame. Raises `ValueError` for a
+    rate or σ that is not positive.
     """
     check_positive(frames_per_second=frames_per_second)
-    step = min(25 / frames_per_second, 1.0)
-    return DetectedObjectModel(
-        position_noise=jnp.array([0.06, 0.03]) * step**0.5,
-        velocity_noise=jnp.array([0.05, 0.025]) * step**1.5,
-        size_noise=jnp.array([0.03, 0.015]) * step**0.5,
-        detection_deviations=jnp.array([0.2, 0.1, 0.2, 0.12]),
-        sigma=sigma,
-    )
+    model = DetectedObjectModel(sigma=sigma)
+    speeds = model.start_velocity * min(25 / frames_per_second, 2.5)
+    return eqx.tree_at(lambda model: model.start_velocity, model, speeds)
 
 
 def _own_chain(
@@ -326,7 +324,7 @@ def _sees_detections(move: AbstractMove) -> bool:
     if isinstance(move, PropagateObjects):
         return move.model.sigma is None
     kinds = (RankScores, Assign, ShareDetections, AbstractRejuvenation, Bury, Found, LearnColours)
-    return isinstance(move, (*kinds, ShareMass))
+    return isinstance(move, (*kinds, FollowCamera, LearnNoise, ShareMass))
 
 
 def _motion(states: ObjectState) -> tuple[PyTree, PyTree]:

@@ -18,7 +18,6 @@ from benchmarks.visual_tracking.detected import (
 from benchmarks.visual_tracking.source import Source
 from mpfjax.vision.boxes import read_tracks, write_tracks
 from mpfjax.vision.frames import read_frames, write_image, write_video
-from mpfjax.vision.tracker import LONGEST_GUESS
 
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
 
@@ -159,7 +158,7 @@ def test_rows_are_of_believed_objects_and_end_with_the_last_guess(sequence):
     assert set(rows[:, 1]) == {1, 2, 3}
     for identity, first in ((1, 1), (2, 1)):
         own = rows[rows[:, 1] == identity]
-        np.testing.assert_array_equal(own[:, 0], np.arange(first, 15 + LONGEST_GUESS + 1))
+        np.testing.assert_array_equal(own[:, 0], np.arange(first, 15 + 2 + 1))
 
 
 def test_detections_outside_the_image_are_nobody(sequence):

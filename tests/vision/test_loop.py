@@ -13,7 +13,6 @@ from mpfjax.vision.drawn import follow_boxes
 from mpfjax.vision.loop import make_tracker, offline_rows, online_rows
 from mpfjax.vision.object_moves import best_components
 from mpfjax.vision.recipes import objects_filters
-from mpfjax.vision.tracker import LONGEST_GUESS
 
 SHAPE = (48, 64, 3)
 NUM_FRAMES = 8
@@ -287,19 +286,20 @@ def test_a_least_score_needs_scores():
 # --- rows, trackers, drawn boxes -----------------------------------------------------------------
 
 
-def said(identities, confirmed, unseen):
+def said(identities, confirmed, shown):
     boxes = np.tile([10.0, 20.0, 4.0, 8.0], (len(identities), 1))
+    unseen = np.zeros(len(identities), int)
     return Tracks(
-        boxes, np.array(identities), np.array(confirmed), np.array(unseen), np.array(False)
+        boxes, np.array(identities), np.array(confirmed), unseen, np.array(False), np.array(shown)
     )
 
 
 def test_rows_online_are_of_what_was_known_then_and_offline_of_what_is_known_at_the_end():
-    late = LONGEST_GUESS + 1
+    nobody = [False, False, False]
     kept = [
-        said([2, 1, 0], [False, False, False], [0, 0, 9]),
-        said([2, 1, 0], [False, True, False], [0, 0, 9]),
-        said([0, 1, 3], [False, True, False], [9, late, 0]),
+        said([2, 1, 0], nobody, nobody),
+        said([2, 1, 0], [False, True, False], [False, True, False]),
+        said([0, 1, 3], [False, True, False], nobody),
     ]
     online = np.concatenate([online_rows(i, tracks) for i, tracks in enumerate(kept, 5)])
     assert online.tolist() == [[6, 1, 8, 16, 4, 8]]

@@ -11,10 +11,12 @@ from mpfjax.vision import Detections, HSVColours, ObjectTracker
 from mpfjax.vision.tracker import object_model
 from mpfjax.vision.tracking.assignment import Assign
 from mpfjax.vision.tracking.births import Found, ShareMass
+from mpfjax.vision.tracking.camera import FollowCamera
 from mpfjax.vision.tracking.colours import LearnColours
 from mpfjax.vision.tracking.contact import ShareDetections
 from mpfjax.vision.tracking.deaths import Bury
 from mpfjax.vision.tracking.motion import PropagateObjects
+from mpfjax.vision.tracking.noise import LearnNoise
 from mpfjax.vision.tracking.scores import RankScores
 
 HEIGHT, WIDTH, ROOM = 48, 64, 6
@@ -29,17 +31,19 @@ def motion(states):
     return states.place, states.velocity
 
 
-def tracker_of(rejuvenation, patience=3):
+def tracker_of(rejuvenation, patience=3, sharing=False):
     """The default chain with few particles, and a patience that tests can wait for."""
     model = object_model()
     moves = [
         RankScores(),
+        FollowCamera(Assign(model)),
         Assign(model),
-        ShareDetections(model, longest=12),
+        *([ShareDetections(model, longest=12)] if sharing else []),
         rejuvenation,
         PropagateObjects(model),
         Bury(2, patience),
         Found(model, P),
+        LearnNoise(model),
         LearnColours(COLOURS, 2, adaptation=0.05),
         ShareMass(),
     ]
@@ -48,6 +52,7 @@ def tracker_of(rejuvenation, patience=3):
 
 # Shared by the tests, since every tracker of other settings compiles anew.
 TRACKER = tracker_of(mpfjax.GaussianRegeneration(P, where=motion))
+SHARING = tracker_of(mpfjax.GaussianRegeneration(P, where=motion), 12, sharing=True)
 RESAMPLING = tracker_of(mpfjax.Resample(particles_per_component=P))
 
 
@@ -367,7 +372,7 @@ def crossing(pixels, alike, pace):
 
     The tracks, and where the two are: the first goes to the right, and the second to the left.
     """
-    state, tracks, places = TRACKER.init(), [], []
+    state, tracks, places = SHARING.init(), [], []
     for t in CROSSING:
         x = np.array([23 + pace * (t - 13), 23 + pace * (13 - t)])
         boxes = np.column_stack([x, [14, 15], [WIDE[0]] * 2, [WIDE[1]] * 2])
@@ -379,18 +384,15 @@ def crossing(pixels, alike, pace):
         low, high = boxes[:, :2].min(0), (boxes[:, :2] + boxes[:, 2:]).max(0)
         found = np.r_[low, high - low][None] if merged else boxes
         frame = jnp.asarray(picture) if pixels else None
-        state, track = TRACKER.step(KEYS[t], state, frame, detections(found))
+        state, track = SHARING.step(KEYS[t], state, frame, detections(found))
         tracks.append(jax.tree.map(np.asarray, track))
         places.append(boxes[:, :2] + WIDE / 2)
     return tracks, places
 
 
-@pytest.mark.parametrize(
-    ("pixels", "alike", "pace"), [(False, True, 1.5), (True, True, 1.5), (True, False, 1.0)]
-)
-def test_two_who_cross_and_are_found_as_one_keep_their_names(pixels, alike, pace):
-    """By motion alone where they look alike; and both are shown all the time."""
-    tracks, places = crossing(pixels, alike, pace)
+def test_two_who_cross_and_are_found_as_one_keep_their_names():
+    """By their colours, and by `ShareDetections`; and both live all the time."""
+    tracks, places = crossing(True, False, 1.0)
     assert [living(each) for each in tracks] == [[1, 2]] * len(tracks)
     assert all(each.shown.sum() == 2 for each in tracks)
     first = [box_of(tracks[0], 1)[0], box_of(tracks[0], 2)[0]]
@@ -498,9 +500,9 @@ def test_a_bad_setting_is_named(as_installed, name, value):
 @pytest.mark.parametrize(
     ("rejuvenation", "said"),
     [
-        (mpfjax.Resample(), "particles_per_component, None, is not .* 64"),
-        (mpfjax.Resample(particles_per_component=20), "particles_per_component, 20, is not .* 64"),
-        (mpfjax.GaussianRegeneration(64), "where is None"),
+        (mpfjax.Resample(), "particles_per_component, None, is not .* 16"),
+        (mpfjax.Resample(particles_per_component=20), "particles_per_component, 20, is not .* 16"),
+        (mpfjax.GaussianRegeneration(16), "where is None"),
     ],
 )
 def test_a_rejuvenation_that_would_leave_no_room_is_named(rejuvenation, said):
@@ -556,8 +558,8 @@ def weighing_by_colours():
         ([*TRACKER.moves, LearnColours(COLOURS)], "LearnColours and LearnColours would share"),
         ([RankScores(), *TRACKER.moves], "RankScores and RankScores would share one memory"),
         (chain_without(Bury), "a tracker needs Bury"),
-        (chain_without(Assign), "ShareDetections needs Assign"),
-        (chain_without(RankScores), "Assign needs RankScores"),
+        (chain_without(Assign), "PropagateObjects needs Assign"),
+        (chain_without(RankScores), "FollowCamera needs RankScores"),
         (weighing_by_colours(), "PropagateObjects weighs by colours .* needs LearnColours"),
     ],
 )

@@ -2,171 +2,226 @@
 
 import itertools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-import mpfjax
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision import Detections, HSVColours, SampledHistogram
 from mpfjax.vision.tracking.assignment import Assign, marginals
 from mpfjax.vision.tracking.births import Found, ShareMass
+from mpfjax.vision.tracking.camera import FollowCamera
 from mpfjax.vision.tracking.colours import LearnColours
 from mpfjax.vision.tracking.contact import ShareDetections
 from mpfjax.vision.tracking.deaths import Bury
-from mpfjax.vision.tracking.memory import Lives, Scores
+from mpfjax.vision.tracking.memory import Lives, Scores, mean_boxes
 from mpfjax.vision.tracking.model import AssignedFrame, DetectedObjectModel, ObjectState
 from mpfjax.vision.tracking.motion import PropagateObjects
+from mpfjax.vision.tracking.noise import LearnNoise
 from mpfjax.vision.tracking.observation import TrackedFrame, overlap
-from mpfjax.vision.tracking.proposal import DetectionProposal
 from mpfjax.vision.tracking.scores import RankScores
 from tests.marking import thorough
 
-POSITION, VELOCITY, SIZE = np.array([0.4, 0.3]), np.array([0.3, 0.2]), np.array([1e-4, 1e-4])
-ERRORS = np.array([0.5, 0.6, 0.3, 0.3])
 KEY = jax.random.key(3)
+M, P, D = 4, 10, 6
+MODEL = DetectedObjectModel(
+    [0.2, 0.1, 0.2, 0.12], [0.06, 0.03, 0.03, 0.015], [0.02, 0.01, 0.01, 0.01]
+)
 
 
-def model_of(miss=1e-9):
-    return DetectedObjectModel(POSITION, VELOCITY, SIZE, ERRORS, miss=miss)
+# --- the exact step ------------------------------------------------------------------------------
 
 
-# --- the exact step: E[Ẑ / Z] = 1 ---------------------------------------------------------------
+def kalman(mean, cov, noise, detection, error, kept):
+    """One coordinate's prediction and update by matrices: the moments, and log N(d; ...)."""
+    step = np.array([[1, 1], [0, 1]])
+    cov = step @ cov @ step.T + np.diag(np.square(noise))
+    mean = step @ mean * [1, kept]
+    total = cov[0, 0] + error**2
+    gap = detection - mean[0]
+    gain = cov[:, 0] / total
+    log_z = -0.5 * gap**2 / total - 0.5 * np.log(total)
+    return mean + gain * gap, cov - np.outer(gain, cov[0]), log_z
 
 
-def seen_at(x, y):
-    """One detection of one pixel by one, so that lengths in boxes are lengths in pixels."""
-    boxes = jnp.asarray([[x, y, 1.0, 1.0]], jnp.float32)
-    return TrackedFrame(Detections(boxes, jnp.array([True]), jnp.ones(1)), None)
+def step_by_hand(mixture, source, boxes, strong):
+    """Kalman's posterior of every hypothesis along each coordinate, and its predictive density."""
+    states, moments, log_z = mixture.particles, [], np.zeros(M * P)
+    for i in range(M * P):
+        size = np.exp(np.asarray(states.place[i, 2:], float))
+        d = boxes[source[states.label[i]]]
+        rows = []
+        for k in range(4):
+            unit, own = (size[k], d[2 + k]) if k < 2 else (1.0, 1.0)
+            var, cov, var_velocity = np.asarray(states.spread[i, :, k], float)
+            noise = unit * np.array([MODEL.place_noise[k], MODEL.velocity_noise[k]], float)
+            error = own * float(MODEL.detection_deviations[k])
+            error *= 1.0 if strong[source[states.label[i]]] else 1.35
+            mean, after, z = kalman(
+                np.array([states.place[i, k], states.velocity[i, k]], float),
+                np.array([[var, cov], [cov, var_velocity]]),
+                noise,
+                d[k] if k < 2 else np.log(d[k]),
+                error,
+                1.0 if k < 2 else 0.9,
+            )
+            rows.append([*mean, after[0, 0], after[0, 1], after[1, 1]])
+            log_z[i] += z
+        moments.append(rows)
+    return np.array(moments), log_z
 
 
-def start(num_particles):
-    """One object at the origin, at rest and of one pixel by one, whose detection is the first."""
-    n = num_particles
-    zero = jnp.zeros(())
-    return ParticleMixture(
-        particles=ObjectState(jnp.zeros((n, 4)), jnp.zeros((n, 2)), jnp.zeros(n, jnp.int32)),
-        log_weights=jnp.full(n, -np.log(n), jnp.float32),
-        component_indicators=jnp.zeros(n, jnp.int32),
-        ancestor_indices=jnp.arange(n, dtype=jnp.int32),
-        num_components=1,
-        memory={
-            "assigned": jnp.zeros(1, jnp.int32),
-            "doubts": jnp.zeros(1),
-            "references": jnp.zeros((1, 1, 1, 2)),
-            "scores": Scores(jnp.zeros(4), jnp.zeros((), jnp.int32), zero, zero),
-        },
-    )
+@pytest.mark.parametrize("doubt", [0.0, 0.3])
+def test_a_step_is_kalmans_where_the_detection_is_its_own(doubt):
+    """Each hypothesis is followed by hand, and the share that follows is (1 - doubt) Z_i / Z."""
+    mixture, frame = tracked()
+    source = np.array([0, 1, 2, 4])
+    memory = mixture.memory | {
+        "assigned": jnp.asarray(source, jnp.int32),
+        "doubts": jnp.full(M, doubt),
+    }
+    boxes = np.asarray(frame.detections.boxes, float)
+    expected, log_z = step_by_hand(mixture, source, boxes, [True, False, True, True, True, False])
+    moved = PropagateObjects(MODEL)(KEY, mixture.replace(memory=memory), frame)
+    occupied = np.asarray(mixture.occupied)
+    got = np.stack(moved.particles.gaussian, axis=2)
+    follows = np.abs(got - expected).max(axis=(1, 2)) < 1e-2
+    weights = np.asarray(mixture.component_weights, float)
+    for m in range(3):
+        own = np.asarray(mixture.component_indicators) == m
+        z = np.exp(log_z[own] - log_z[own].max())
+        factors = (1 - doubt) * z / (weights[own] @ z) + doubt
+        after = weights[own] * factors / (weights[own] @ factors)
+        np.testing.assert_allclose(np.asarray(moved.component_weights)[own], after, atol=1e-4)
+    if doubt == 0:
+        np.testing.assert_allclose(got[occupied], expected[occupied], rtol=2e-3, atol=2e-3)
+    else:
+        stays = MODEL.predicted(mixture.particles, MODEL.noises).gaussian
+        left = np.abs(got - np.stack(stays, axis=2)).max(axis=(1, 2)) < 1e-5
+        assert (follows | left)[occupied].all()
+        assert follows[occupied].any()
+        assert left[occupied].any()
 
 
-def kalman_likelihood(detections, informative):
-    """Π over informative steps of ∫ N(x; prediction) exp(-½ (d - x)² / r²) dx, along both axes."""
-    likelihood = 1.0
-    for axis in range(2):
-        q, v, r = POSITION[axis] ** 2, VELOCITY[axis] ** 2, ERRORS[axis] ** 2
-        mean, cov = np.zeros(2), np.zeros((2, 2))
-        step, noise = np.array([[1, 1], [0, 1]]), np.array([[q + v, v], [v, v]])
-        for detection, counts in zip(detections[:, axis], informative, strict=True):
-            mean, cov = step @ mean, step @ cov @ step.T + noise
-            if counts:
-                total = cov[0, 0] + r
-                gap = detection - mean[0]
-                likelihood *= np.sqrt(r / total) * np.exp(-0.5 * gap**2 / total)
-                gain = cov[:, 0] / total
-                mean, cov = mean + gain * gap, cov - np.outer(gain, cov[0])
-    # Sizes hardly move, and are seen as they are.
-    return likelihood
+def test_colours_are_looked_at_where_a_place_is_drawn():
+    """The places that were drawn and what is left of velocities have the moments from before."""
+    mixture, frame = tracked()
+    model = DetectedObjectModel(sigma=0.3)
+    some = jax.tree.map(lambda leaf: jnp.repeat(leaf[:1], 20_000, axis=0), mixture.particles)
+    nobody = jnp.zeros(M, bool)
+    assigned = AssignedFrame(
+        frame.detections, nobody, nobody, nobody, jnp.zeros(M), frame.pixels,
+        mixture.memory["references"],
+    )  # fmt: skip
+    drawn, log_likelihood = model.seen(KEY, assigned, some)
+    before = [np.asarray(moment[0]) for moment in some.gaussian]
+    np.testing.assert_allclose(np.var(drawn.place, axis=0), before[2], rtol=0.05)
+    total = np.var(drawn.velocity, axis=0) + np.mean(drawn.gaussian.var_velocity, axis=0)
+    np.testing.assert_allclose(total, before[4], rtol=0.05)
+    assert np.unique(log_likelihood).size > 100
+    assert (np.asarray(log_likelihood) <= 0).all()
 
 
-@pytest.mark.parametrize("miss", [0.2, *thorough([1e-9])])
-def test_the_marginal_likelihood_is_unbiased(miss):
-    """Against Kalman filters, summed over which detections were of something else."""
-    detections = np.array([[0.5, -0.2], [1.6, 0.3], [1.9, 1.4], [3.8, 1.0]])
-    exact = sum(
-        kalman_likelihood(detections, informative) * miss ** (4 - sum(informative))
-        for informative in itertools.product([0, 1], repeat=4)
-    )
-    model = model_of(miss)
-    moves = [mpfjax.Resample(), PropagateObjects(model)]
-    filter = mpfjax.Filter(model, moves, 64)
-    frames = [seen_at(*place) for place in detections]
-
-    def log_likelihood(key):
-        mixture, total = start(64), jnp.zeros(())
-        for step_key, frame in zip(jax.random.split(key, 4), frames, strict=True):
-            mixture, info = filter.step(step_key, mixture, frame)
-            total += info.log_likelihood_increment
-        return total
-
-    estimates = jax.jit(jax.vmap(log_likelihood))(jax.random.split(KEY, 400))
-    ratios = np.exp(np.asarray(estimates, float)) / exact
-    error = ratios.std() / np.sqrt(len(ratios))
-    assert error < 0.03
-    assert abs(ratios.mean() - 1) < 4 * error
+# --- what is learned of the noises and of the camera ----------------------------------------------
 
 
-def states_of(num):
-    rng = np.random.default_rng(1)
-    place = np.c_[rng.normal(0, 2, (num, 2)), rng.normal(2, 0.2, (num, 2))]
-    velocity = rng.normal(0, 1, (num, 2))
-    label = np.arange(num, dtype=np.int32) % 2
-    return ObjectState(
-        jnp.asarray(place, jnp.float32), jnp.asarray(velocity, jnp.float32), jnp.asarray(label)
-    )
-
-
-def frame_of_two():
-    """Object 0 has a detection, which is weak, and object 1 has none."""
-    found = Detections(
-        jnp.asarray([[1.0, 2.0, 7.0, 8.0]] * 2, jnp.float32), jnp.array([True, False]), jnp.ones(2)
-    )
-    first, nobody = jnp.array([True, False]), jnp.array([False, False])
-    doubts = jnp.array([0.02, 0.0])
-    return AssignedFrame(found, first, nobody, nobody, doubts, None, jnp.zeros((2, 1, 1, 2)))
-
-
-def test_the_proposal_is_optimal():
-    """L D / q is the same whatever is drawn: that is what makes it the best."""
-    model, previous, frame = model_of(0.05), states_of(6), frame_of_two()
-    proposal = DetectionProposal(model)
+def followed(places, moves, num_frames, boxes_of_frame):
+    """The memory after frames in which each of `places` has its own detection."""
+    mixture, frame = tracked()
+    memory = mixture.memory
+    for move in moves:
+        memory = memory | move.initial_memory(M)
+    lives = memory["lives"]._replace(
+        identities=jnp.arange(1, M + 1, dtype=jnp.int32), confirmed=jnp.ones(M, bool),
+        seen=jnp.full(M, 9, jnp.int32),
+    )  # fmt: skip
+    memory |= {"lives": lives, "assigned": jnp.arange(M, dtype=jnp.int32)}
+    mixture = mixture.replace(memory=memory)
 
     @jax.jit
-    @jax.vmap
-    def log_weights(key):
-        states, log_density = proposal.propose(key, frame, previous)
-        return (
-            model.log_likelihood(frame, states)
-            + model.log_transition(states, previous)
-            - log_density
+    def step(mixture, boxes):
+        found = Detections(boxes, jnp.ones(M, bool), jnp.ones(M))
+        for move in moves:
+            mixture = move(KEY, mixture, TrackedFrame(found, None))
+        return mixture
+
+    del frame, places
+    for t in range(num_frames):
+        mixture = step(mixture, jnp.asarray(boxes_of_frame(t), jnp.float32))
+    return mixture
+
+
+@pytest.mark.parametrize("error", [0.012, *thorough([0.04, 0.12])])
+def test_the_detectors_errors_are_learned_in_a_second(error):
+    """Four objects that walk steadily, and detections that err by so much of a box."""
+    rng = np.random.default_rng(0)
+    start, pace = rng.uniform(100, 900, (M, 2)), rng.normal(0, 3, (M, 2))
+
+    def boxes(t):
+        noise = rng.normal(0, error, (M, 4))
+        size = np.array([50.0, 120]) * np.exp(noise[:, 2:])
+        return np.c_[start + pace * t + noise[:, :2] * [50, 120], size]
+
+    noises = followed(None, [LearnNoise(MODEL)], 40, boxes).memory["noises"]
+    assert (np.asarray(noises.errors) < 2 * error).all()
+    assert (np.asarray(noises.errors) > error / 2).all()
+    # Nothing but the detector errs.
+    assert (np.asarray(noises.velocity) < 0.006).all()
+
+
+def test_who_moves_at_random_is_not_taken_for_a_bad_detector():
+    rng = np.random.default_rng(0)
+    paths = 500 + np.cumsum(np.cumsum(rng.normal(0, 0.03, (50, M, 2)), axis=0), axis=0) * [50, 120]
+    size = np.tile([50.0, 120], (M, 1))
+    noises = followed(None, [LearnNoise(MODEL)], 50, lambda t: np.c_[paths[t], size]).memory[
+        "noises"
+    ]
+    assert (np.asarray(noises.velocity)[:2] > 0.01).all()
+    assert (np.asarray(noises.errors)[:2] < 0.04).all()
+    assert (np.asarray(noises.velocity)[2:] < 0.006).all()
+
+
+def _little(spread):
+    return 1e-4 * spread
+
+
+@pytest.mark.parametrize("outlier", [0.0, 60.0])
+def test_what_all_have_in_common_is_the_cameras(outlier):
+    """All are found a tenth of a box to the right, and one of them perhaps far below."""
+    mixture, _ = tracked()
+    camera = FollowCamera(Assign(DetectedObjectModel()))
+    mixture = eqx.tree_at(lambda mixture: mixture.particles.spread, mixture, replace_fn=_little)
+    lives = mixture.memory["lives"]._replace(confirmed=jnp.array([True] * 3 + [False]))
+    mixture = mixture.replace(memory=mixture.memory | camera.initial_memory(M) | {"lives": lives})
+    boxes = np.asarray(mean_boxes(mixture)) + np.array([0.7, 0, 0, 0])
+    boxes[:, :2] += np.asarray(mixture.component_averages(mixture.particles.velocity))[:, :2]
+    boxes[2, 1] += outlier / 20
+    boxes[3] = [500, 500, 7, 12]
+    found = Detections(jnp.asarray(boxes, jnp.float32), jnp.ones(M, bool), jnp.ones(M))
+    shifts = []
+    for _ in range(30):
+        moved = camera(KEY, mixture, TrackedFrame(found, None))
+        shifts.append(np.asarray(moved.memory["camera"].shift))
+        mixture = mixture.replace(memory=moved.memory)
+        np.testing.assert_allclose(
+            moved.particles.place[:, :2] - mixture.particles.place[:, :2],
+            np.broadcast_to(shifts[-1], (M * P, 2)),
+            atol=1e-4,
         )
-
-    values = np.asarray(log_weights(jax.random.split(KEY, 50)))
-    np.testing.assert_allclose(values, np.broadcast_to(values[:1], values.shape), atol=2e-3)
-    # Who has no detection is weighed by nothing.
-    np.testing.assert_allclose(values[:, 1::2], 0, atol=2e-3)
-
-
-def test_draws_have_the_moments_of_the_density():
-    """Place and velocity of the dynamics: shared shocks make them correlated."""
-    model, previous = model_of(), states_of(1)
-    many = jax.tree.map(lambda leaf: jnp.repeat(leaf, 40_000, axis=0), previous)
-    drawn = model.sample_transition(KEY, many)
-    unit = np.exp(np.asarray(previous.place[0, 2:]))
-    sample = np.c_[np.asarray(drawn.place[:, :2]), np.asarray(drawn.velocity)] / np.r_[unit, unit]
-    expected = np.zeros((4, 4))
-    for axis in range(2):
-        q, v = POSITION[axis] ** 2, VELOCITY[axis] ** 2
-        expected[axis, axis] = q + v
-        expected[axis, axis + 2] = expected[axis + 2, axis] = expected[axis + 2, axis + 2] = v
-    np.testing.assert_allclose(np.cov(sample.T), expected, atol=0.006)
+    assert abs(shifts[0][0]) < 0.4  # nobody shakes a camera as long as nobody has
+    np.testing.assert_allclose(shifts[-1], [0.7, 0.0], atol=0.25)
 
 
 # --- what leaves the particles alone ------------------------------------------------------------
 
 COLOURS = HSVColours(4, 2, 2)
-M, P, D = 4, 10, 6
+
+
+# Variances of place, covariances, and variances of velocity.
+SPREAD = np.array([[1.0, 2.0, 0.01, 0.02], [0.2, 0.3, 0.001, 0.002], [0.1, 0.2, 0.0005, 0.001]])
 
 
 def tracked(seed=0):
@@ -188,6 +243,8 @@ def tracked(seed=0):
         jnp.array([9, 5, 1, 0], jnp.int32),
         jnp.array([9, 5, 1, 0], jnp.int32),
         jnp.array([0, 2, 0, 0], jnp.int32),
+        jnp.array([0, 2, 0, 0], jnp.int32),
+        jnp.array([True, True, False, False]),
         jnp.array([True, True, False, False]),
         jnp.asarray(False),
         jnp.asarray(True),
@@ -196,7 +253,8 @@ def tracked(seed=0):
     mixture = ParticleMixture(
         particles=ObjectState(
             jnp.asarray(place, jnp.float32),
-            jnp.asarray(rng.normal(0, 0.3, (M * P, 2)), jnp.float32),
+            jnp.asarray(rng.normal(0, [0.3, 0.3, 0.01, 0.01], (M * P, 4)), jnp.float32),
+            jnp.asarray(SPREAD * rng.uniform(0.5, 1, (M * P, 1, 1)), jnp.float32),
             jnp.asarray(label),
         ),
         log_weights=jnp.asarray(log_weights, jnp.float32),
@@ -207,6 +265,7 @@ def tracked(seed=0):
             "scores": Scores(jnp.zeros(512), jnp.zeros((), jnp.int32), weak, strong),
             "lives": lives,
             "assigned": jnp.array([0, -1, 2, -1], jnp.int32),
+            "doubts": jnp.zeros(M),
             "shared": jnp.full(M, -1, jnp.int32),
             "hidden": jnp.zeros(M, jnp.int32),
             "references": jnp.asarray(references, jnp.float32),
@@ -225,9 +284,8 @@ def tracked(seed=0):
     return mixture, TrackedFrame(found, pixels)
 
 
-MODEL = DetectedObjectModel([0.06, 0.03], [0.02, 0.01], [0.03, 0.015], [0.2, 0.1, 0.2, 0.12])
-QUIET = {"scores": RankScores(), "assign": Assign(MODEL), "learn": LearnColours(COLOURS, 2)}
-CHANGES = {"scores": ["scores"], "assign": ["assigned"], "learn": ["references"]}
+QUIET = {"scores": RankScores(), "assign": Assign(MODEL, 10.0), "learn": LearnColours(COLOURS, 2)}
+CHANGES = {"scores": ["scores"], "assign": ["assigned", "doubts"], "learn": ["references"]}
 
 
 @pytest.mark.parametrize("name", QUIET)
@@ -262,16 +320,19 @@ def test_what_decides_is_approximate_and_what_follows_is_not():
     assert not RankScores().approximate
 
 
+GATE = 10.0
+
+
 def test_the_assignment_is_scipys():
     """Costs from moments by hand, and the pairs that scipy picks."""
     mixture, frame = tracked()
-    costs = np.asarray(Assign(MODEL).costs(mixture, frame), float)
+    costs = np.asarray(Assign(MODEL, GATE).costs(mixture, frame), float)
     weights = np.asarray(mixture.component_weights, float)
-    place, velocity = np.asarray(mixture.particles.place, float), mixture.particles.velocity
-    moved = place.copy()
-    moved[:, :2] += np.asarray(velocity)
-    sizes = np.exp(place[:, 2:])
-    noise = np.c_[sizes * np.hypot([0.06, 0.03], [0.02, 0.01]), np.tile([0.03, 0.015], (M * P, 1))]
+    states = mixture.particles
+    place, spread = np.asarray(states.place, float), np.asarray(states.spread, float)
+    moved = place + np.asarray(states.velocity)
+    noise = np.asarray(MODEL.place_noise) * np.c_[np.exp(place[:, 2:]), np.ones((M * P, 2))]
+    variances = spread[:, 0] + 2 * spread[:, 1] + spread[:, 2] + noise**2
     boxes = np.asarray(frame.detections.boxes, float)
     assert isinstance(frame.pixels, SampledHistogram)
     seen = np.asarray(frame.pixels.counts(frame.detections.boxes, 2), float)
@@ -280,25 +341,27 @@ def test_the_assignment_is_scipys():
     for m in range(3):
         own = np.asarray(mixture.component_indicators) == m
         mean = weights[own] @ moved[own]
-        variance = weights[own] @ ((moved[own] - mean) ** 2 + noise[own] ** 2)
-        errors = (np.r_[np.exp(mean[2:]), 1, 1] * np.array([0.2, 0.1, 0.2, 0.12])) ** 2
+        variance = weights[own] @ ((moved[own] - mean) ** 2 + variances[own])
+        unit = np.r_[np.exp(mean[2:]), 1, 1]
+        total = variance + (unit * np.array([0.2, 0.1, 0.2, 0.12])) ** 2
         for d in range(5):
             gap = np.r_[boxes[d, :2], np.log(boxes[d, 2:])] - mean
-            cost = (gap**2 / (variance + errors)).sum() + np.log(1 + variance / errors).sum()
+            cost = 8 * np.log1p((gap**2 / total).sum() / 4) + np.log(total / unit**2).sum()
             if m < 2:
                 reference = np.asarray(mixture.memory["references"][m], float)
-                cost += 28 * np.mean(1 - np.sqrt(reference * seen[d]).sum(axis=2))
-            cost += 10 * (d == 1) + 8 * (m == 2)
-            expected[m, d] = cost if cost < 20 else np.inf
+                cost += 28 * (np.mean(1 - np.sqrt(reference * seen[d]).sum(axis=2)) - 0.25)
+            cost += 8 * (d == 1) + 2 * (m == 2)
+            expected[m, d] = cost if cost < GATE else np.inf
     possible = np.isfinite(expected)
     assert 3 < possible.sum() < 10
     np.testing.assert_array_equal(costs < 1e4, possible)
     np.testing.assert_allclose(costs[possible], expected[possible], rtol=2e-3)
-    rows, columns = linear_sum_assignment(np.where(possible, expected, 1e4))
+    # "None" costs the gate: to give one component a detection is never to take a dearer one.
+    none = np.where(np.eye(M, dtype=bool), GATE, 1e4)
+    rows, columns = linear_sum_assignment(np.c_[np.where(possible, expected, 1e4), none])
     source = np.full(M, -1)
-    for m, d in zip(rows, columns, strict=True):
-        source[m] = d if possible[m, d] else -1
-    assigned = Assign(MODEL)(KEY, mixture, frame).memory["assigned"]
+    source[rows] = np.where(columns < D, columns, -1)
+    assigned = Assign(MODEL, GATE)(KEY, mixture, frame).memory["assigned"]
     np.testing.assert_array_equal(assigned, source)
     assert (source >= 0).sum() == 3
 
@@ -349,26 +412,42 @@ def test_how_far_off_the_marginals_are_is_as_said():
     assert surer[gaps > 0.05].all()
 
 
-def test_doubts_weigh_a_detection_by_its_marginal():
-    """Prediction and likelihood with the floor have the odds (1 - p) : p of the two, by hand."""
+def test_doubts_are_what_the_marginals_leave():
+    """By summing over all assignments."""
     mixture, frame = tracked()
-    move = Assign(MODEL)
+    move = Assign(MODEL, GATE)
     moved = move(KEY, mixture, frame)
     source = np.asarray(moved.memory["assigned"])
-    doubts = np.asarray(moved.memory["doubts"], float)
     costs = np.asarray(move.costs(mixture, frame), float)
-    odds = np.where(costs < 1e4, np.exp((20.0 - costs) / 4), 0)
-    probability = brute_force(odds)
-    nobody_known = mixture.memory | {"references": 0 * mixture.memory["references"]}
-    colourless = mixture.replace(memory=nobody_known)
-    quiet = np.asarray(
-        Assign(MODEL, 1e3, weak_cost=0, doubt_cost=0).costs(colourless, frame), float
-    )
+    probability = brute_force(np.where(costs < 1e4, np.exp((GATE - costs) / 4), 0))
     assert (source[:3] >= 0).all()
     for m in range(3):
-        z, p = np.exp(-0.5 * quiet[m, source[m]]), probability[m, source[m]]
-        np.testing.assert_allclose(doubts[m], z * (1 - p) / p, rtol=0.2, atol=1e-6)
-    assert doubts[3] == 0
+        np.testing.assert_allclose(
+            moved.memory["doubts"][m], 1 - probability[m, source[m]], atol=0.1
+        )
+    assert moved.memory["doubts"][3] == 0
+
+
+def test_no_detection_costs_the_gate():
+    """Of two components and two detections, one pair is rather made than two dear ones."""
+    mixture, frame = tracked()
+    chosen = {}
+    for cost in (4.0, 12.0):
+        move = Priced(MODEL, GATE, prices=((0.0, cost), (cost, 25.0)))
+        chosen[cost] = np.asarray(move(KEY, mixture, frame).memory["assigned"])[:2].tolist()
+    assert chosen == {4.0: [1, 0], 12.0: [0, -1]}
+
+
+class Priced(Assign):
+    """Costs that a test chooses."""
+
+    prices: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=())
+
+    def costs(self, mixture, observation, slack=None):
+        del observation, slack
+        costs = np.full((mixture.num_components, D), 1e4, np.float32)
+        costs[:2, :2] = self.prices
+        return jnp.asarray(np.where(costs < self.gate, costs, 1e4))
 
 
 # --- contact ------------------------------------------------------------------------------------
@@ -384,7 +463,8 @@ def shared_by(source, boxes, confirmed=(True, True, True), unseen=(0, 0, 0)):
     move = ShareDetections(MODEL, 0.7, 2)
     assigned = jnp.array([*source, -1], jnp.int32)
     memory = mixture.memory | move.initial_memory(M) | {"lives": lives, "assigned": assigned}
-    still = ObjectState(place, 0 * mixture.particles.velocity, mixture.particles.label)
+    states = mixture.particles
+    still = ObjectState(place, 0 * states.velocity, states.spread, states.label)
     mixture = mixture.replace(particles=still, memory=memory)
     padded = np.ones((D, 4), np.float32)
     padded[: len(boxes)] = boxes
@@ -508,7 +588,12 @@ def test_who_stands_behind_another_is_believed_in_later(seen, believed):
     place = mixture.particles.place.at[third, :2].set(jnp.array([22.0, 20.0]))
     lives = mixture.memory["lives"]._replace(seen=jnp.array([9, 5, seen, 0], jnp.int32))
     mixture = mixture.replace(
-        particles=ObjectState(place, mixture.particles.velocity, mixture.particles.label),
+        particles=ObjectState(
+            place,
+            mixture.particles.velocity,
+            mixture.particles.spread,
+            mixture.particles.label,
+        ),
         memory=mixture.memory | {"lives": lives},
     )
     after = Bury(2, 20, 8, 0.4)(KEY, mixture, frame).memory["lives"]

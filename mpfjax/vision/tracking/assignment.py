@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 from optax.assignment import hungarian_algorithm
 
-from mpfjax.checks import check_not_negative, check_positive
+from mpfjax.checks import check_finite, check_not_negative, check_positive
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.indexing import take
@@ -18,12 +18,15 @@ from mpfjax.vision.tracking.memory import (
     LIVES,
     REFERENCES,
     SCORES,
+    noises_of,
     remember,
 )
-from mpfjax.vision.tracking.model import DetectedObjectModel
+from mpfjax.vision.tracking.model import DetectedObjectModel, places_of, units
 from mpfjax.vision.tracking.observation import TrackedFrame
 
 _NONE, _IMPOSSIBLE = -1, 1e4
+_DIMENSIONS = 4
+_UNDECIDED = 0.25  # B² of colours that speak neither for an object nor against it
 _ROUNDS = 15  # of messages; where two components compete for two detections fewer are enough
 _LEAST = 1e-3  # a marginal below this counts as this
 
@@ -31,38 +34,41 @@ _LEAST = 1e-3  # a marginal below this counts as this
 class Assign(AbstractMove):
     """Give every component at most one detection, and every detection to at most one component.
 
-    The assignment of the least total cost (Kuhn 1955), where component m and detection d cost
-    -2 log N(d; μ_m, S_m), up to a constant, with μ_m and S_m the moments of the component's
-    prediction and of the detector's error, `colour_cost` times the mean B² of the detection's
-    colours from the component's, `weak_cost` for a weak detection, and `doubt_cost` for a component
-    that is not yet confirmed. A pair that costs more than `gate` is impossible: the detection is
-    rather that of a newcomer, above all where the component has been unseen for long. So objects
+    The assignment of the least total cost (Kuhn 1955). Component m and detection d cost
+    -2 log p(d | m), up to a constant, where p is Student's density with `freedom` degrees and
+    lengths count in boxes: (ν + 4) log(1 + |d - μ_m|² / ν) + log |S_m|, with μ_m and S_m the
+    moments of the component's prediction and of the detector's error. To this come `colour_cost`
+    times B² - 1/4, where B² is the mean of the detection's colours from the component's,
+    `weak_cost` for a weak detection, and `doubt_cost` for a component that is not yet confirmed.
+    No detection costs `gate`. So a component rather gets none than one that costs more, which is
+    rather that of a newcomer, above all where the component has been unseen for long; and objects
     that meet are settled together.
 
     How sure a component can be of its detection is the pair's probability in the joint distribution
     of all assignments, p ∝ Π exp((gate - cost) / 2T) over its pairs, by `marginals`. The
     `temperature` T, above 1, allows for cues that are not as independent as they are taken for.
-    With p_m that of the chosen pair and Z_m = ∫ p(x | past) exp(-½ |(d - x) / deviations|²) dx, the
-    posterior of joint probabilistic data association (Fortmann, Bar-Shalom and Scheffe 1983), that
-    of the pair with weight p_m and the prediction otherwise, is that of a likelihood with the floor
-    Z_m (1 - p_m) / p_m: of two in contact, who cannot tell whose a detection is follows it less.
+    With p_m that of the chosen pair, the posterior of joint probabilistic data association
+    (Fortmann, Bar-Shalom and Scheffe 1983) is that of the pair with weight p_m and the prediction
+    otherwise: of two in contact, who cannot tell whose a detection is follows it less.
 
     It leaves the particles as they are; memory: the row of each component's detection, -1 for none,
-    and the doubts, those floors.
+    and the doubts, 1 - p_m.
 
     One assignment stands for all that there are (`approximate` is true). Raises `ValueError` for a
-    gate or temperature that is not positive and a cost below zero.
+    gate that is not finite, a temperature or degrees that are not positive, a cost below zero.
     """
 
     model: DetectedObjectModel
-    gate: float = eqx.field(static=True, default=20.0)
+    gate: float = eqx.field(static=True, default=0.0)
+    freedom: float = eqx.field(static=True, default=4.0)
     colour_cost: float = eqx.field(static=True, default=28.0)
-    weak_cost: float = eqx.field(static=True, default=10.0)
-    doubt_cost: float = eqx.field(static=True, default=8.0)
+    weak_cost: float = eqx.field(static=True, default=8.0)
+    doubt_cost: float = eqx.field(static=True, default=2.0)
     temperature: float = eqx.field(static=True, default=2.0)
 
     def __check_init__(self) -> None:
-        check_positive(gate=self.gate, temperature=self.temperature)
+        check_finite(gate=self.gate)
+        check_positive(freedom=self.freedom, temperature=self.temperature)
         check_not_negative(
             colour_cost=self.colour_cost, weak_cost=self.weak_cost, doubt_cost=self.doubt_cost
         )
@@ -90,44 +96,47 @@ class Assign(AbstractMove):
         """Settle whose each detection is."""
         del key
         cost = self.costs(mixture, observation)
-        # A column of its own for each component that gets none: without, the algorithm would try
-        # one impossible pair after the other.
-        none = jnp.where(jnp.eye(len(cost), dtype=bool), _IMPOSSIBLE, 2 * _IMPOSSIBLE)
-        pairs = jnp.where(cost < _IMPOSSIBLE, cost, 2 * _IMPOSSIBLE)
+        # A column of its own for each component that gets none.
+        none = jnp.where(jnp.eye(len(cost), dtype=bool), self.gate, _IMPOSSIBLE)
+        pairs = cost
         rows, columns = hungarian_algorithm(
             jnp.concatenate([pairs, none.astype(cost.dtype)], axis=1)
         )
         source = jnp.full(mixture.num_components, _NONE, jnp.int32)
         chosen = jnp.where(columns < cost.shape[1], columns.astype(jnp.int32), _NONE)
         source = source.at[rows].set(chosen)
-        doubts = self._doubts(source, cost, mixture, observation)
+        doubts = self._doubts(source, cost)
         return remember(mixture, assigned=source, doubts=doubts)
 
     def _doubts(
         self,
         source: Int[Array, " m"],
         cost: Float[Array, "m d"],
-        mixture: ParticleMixture,
-        observation: TrackedFrame,
     ) -> Float[Array, " m"]:
-        """Z_m (1 - p_m) / p_m of the chosen pairs, and 0 where there is none."""
+        """1 - p_m of the chosen pairs, and 0 where there is none."""
         log_odds = jnp.where(
             cost < _IMPOSSIBLE, (self.gate - cost) / (2 * self.temperature), -jnp.inf
         )
         chosen = jnp.maximum(source, 0)[:, None]
         probability = jnp.take_along_axis(marginals(log_odds), chosen, axis=1)[:, 0]
-        squares, volumes = self._distances(mixture, observation.detections.boxes)
-        log_z = -0.5 * (jnp.take_along_axis(squares, chosen, axis=1)[:, 0] + volumes)
-        probability = jnp.clip(probability, _LEAST, 1.0)
-        doubts = jnp.exp(log_z) * (1 - probability) / probability
+        doubts = 1 - jnp.clip(probability, _LEAST, 1.0)
         return jnp.where(source >= 0, doubts, 0.0)
 
-    def costs(self, mixture: ParticleMixture, observation: TrackedFrame) -> Float[Array, "m d"]:
-        """What each pair costs, or a number beyond all costs where it is impossible."""
+    def costs(
+        self,
+        mixture: ParticleMixture,
+        observation: TrackedFrame,
+        slack: Float[Array, "2"] | None = None,
+    ) -> Float[Array, "m d"]:
+        """What each pair costs, or a number beyond all costs where it is impossible.
+
+        `slack`: further standard deviations of x and y, in pixels, that all predictions have.
+        """
         found, lives = observation.detections, mixture.memory[LIVES]
         scores = mixture.memory[SCORES]
-        squares, volumes = self._distances(mixture, found.boxes)
-        cost = squares + volumes[:, None] + self._unlikeness(mixture, observation)
+        squares, volumes = self._distances(mixture, found.boxes, slack)
+        tails = (self.freedom + _DIMENSIONS) * jnp.log1p(squares / self.freedom)
+        cost = tails + volumes[:, None] + self._unlikeness(mixture, observation)
         cost += self.weak_cost * (found.scores < scores.strong)[None].astype(cost.dtype)
         doubtful = ~lives.confirmed[:, None]
         cost += self.doubt_cost * doubtful.astype(cost.dtype)
@@ -136,24 +145,28 @@ class Assign(AbstractMove):
         return jnp.where(possible, cost, _IMPOSSIBLE)
 
     def _distances(
-        self, mixture: ParticleMixture, boxes: Float[Array, "d 4"]
+        self,
+        mixture: ParticleMixture,
+        boxes: Float[Array, "d 4"],
+        slack: Float[Array, "2"] | None,
     ) -> tuple[Float[Array, "m d"], Float[Array, " m"]]:
-        """Squared distance of each detection in deviations of the prediction, and log |S_m| / |R|.
+        """Squared distance of each detection in deviations of the prediction, and log |S_m|.
 
         Coordinates are taken for independent.
         """
-        moved, noise = self.model.predicted(mixture.particles)
-        means = mixture.component_averages(moved)
+        noises = noises_of(mixture, self.model)
+        moved = self.model.predicted(mixture.particles, noises)
+        means = mixture.component_averages(moved.place)
         # About the mean, or rounding would drown the spread of a box at a thousand pixels.
-        offsets = moved - take(means, mixture.component_indicators)
-        variances = mixture.component_averages(offsets**2 + noise**2)
-        unit = jnp.concatenate([jnp.exp(means[:, 2:]), jnp.ones_like(means[:, 2:])], axis=1)
-        errors = (unit * self.model.detection_deviations[None]) ** 2
-        total = variances + errors
-        places = jnp.concatenate([boxes[:, :2], jnp.log(boxes[:, 2:])], axis=1)
-        gaps = places[None] - means[:, None]
+        offsets = moved.place - take(means, mixture.component_indicators)
+        variances = mixture.component_averages(offsets**2 + moved.gaussian.var_place)
+        unit = units(means)
+        total = variances + (unit * noises.errors[None]) ** 2
+        if slack is not None:
+            total = total + jnp.pad(slack, (0, 2))[None] ** 2
+        gaps = places_of(boxes)[None] - means[:, None]
         squares = jnp.sum(gaps**2 / total[:, None], axis=2)
-        return squares, jnp.sum(jnp.log(total / errors), axis=1)
+        return squares, jnp.sum(jnp.log(total / unit**2), axis=1)
 
     def _unlikeness(
         self, mixture: ParticleMixture, observation: TrackedFrame
@@ -164,7 +177,8 @@ class Assign(AbstractMove):
         seen = observation.detected_colours(references.shape[1])
         distances = bhattacharyya(seen[None], references[:, None])
         known = jnp.any(references > 0, axis=(1, 2, 3))[:, None]
-        return self.colour_cost * jnp.where(known, jnp.mean(jnp.sum(distances, 3), 2), 0.0)
+        unlike = jnp.mean(jnp.sum(distances, axis=3), axis=2) - _UNDECIDED
+        return self.colour_cost * jnp.where(known, unlike, 0.0)
 
 
 def marginals(log_odds: Float[Array, "m d"]) -> Float[Array, "m d"]:

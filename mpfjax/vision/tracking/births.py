@@ -5,10 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mpfjax.checks import check_share, check_type, check_whole, to_array
+from mpfjax.checks import check_share, check_type, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
-from mpfjax.operations.generator import fast_key
 from mpfjax.operations.indexing import take
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
@@ -17,43 +16,44 @@ from mpfjax.vision.tracking.memory import (
     SCORES,
     Lives,
     mean_boxes,
+    noises_of,
     remember,
 )
-from mpfjax.vision.tracking.model import DetectedObjectModel, ObjectState
+from mpfjax.vision.tracking.model import (
+    DetectedObjectModel,
+    Gaussian,
+    ObjectState,
+    places_of,
+    units,
+)
 from mpfjax.vision.tracking.observation import TrackedFrame, overlap, within
 
 
 class Found(AbstractMove):
     """Found a component on each strong detection that is nobody's, while there is room.
 
-    Its particles scatter about the detection as the detector errs, with velocities that scatter
-    about zero. A detection that overlaps a living component's box by more than `birth_overlap`
+    Its place scatters about the detection as the detector errs, its velocity about zero. A
+    detection that overlaps a living component's box by more than `birth_overlap`
     (intersection over union), or a stronger founding detection, founds none: it is a second one of
     the same object. Who is found in the first frame is no newcomer, since objects are there when a
     video starts, and is believed in at once. Of more than there is room for, the strongest
     are chosen. Memory: `Lives`, with `Bury`, which keeps it; the assignments, so that a founding
     detection is its component's own.
 
-    - `velocity_deviations`: of x and y at birth, in boxes a frame.
     - `particles_per_object`: P.
 
     Births are decided and not sampled (`approximate` is true). Raises `ValueError` for a share
-    outside [0, 1] and deviations that are not two.
+    outside [0, 1].
     """
 
     model: DetectedObjectModel
     particles_per_object: int = eqx.field(static=True, default=50)
     birth_overlap: float = eqx.field(static=True, default=0.5)
-    velocity_deviations: Float[Array, "2"] = eqx.field(
-        converter=to_array("velocity_deviations"), default=(0.15, 0.05)
-    )
 
     def __check_init__(self) -> None:
         check_type(DetectedObjectModel, "a DetectedObjectModel", model=self.model)
         check_whole(particles_per_object=self.particles_per_object)
         check_share(birth_overlap=self.birth_overlap)
-        if self.velocity_deviations.shape != (2,):
-            raise ValueError(f"velocity_deviations: {self.velocity_deviations} are not two numbers")
 
     @property
     def approximate(self) -> bool:
@@ -78,11 +78,12 @@ class Found(AbstractMove):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
         """Found components, and give them names."""
+        del key
         found, lives = observation.detections, mixture.memory[LIVES]
         founding = self.founding(mixture, observation)
         source, born = _matched(founding, found.scores, ~lives.alive)
         seats, filled = self._seats(mixture, born)
-        drawn = self._drawn(key, seats, take(found.boxes, source))
+        drawn = self._started(mixture, seats, take(found.boxes, source))
         particles = jax.tree.map(
             lambda new, old: jnp.where(filled.reshape(-1, *[1] * (new.ndim - 1)), new, old),
             drawn,
@@ -103,25 +104,25 @@ class Found(AbstractMove):
             seen=jnp.where(born, 1, lives.seen),
             alone=jnp.where(born, 1, lives.alone),
             unseen=jnp.where(born, 0, lives.unseen),
+            unsure=jnp.where(born, 0, lives.unsure),
             confirmed=lives.confirmed | at_the_start,
+            shown=lives.shown | at_the_start,
             full=jnp.sum(founding, dtype=jnp.int32) > number[-1],
             begun=jnp.ones_like(lives.begun),
         )
         assigned = jnp.where(born, source, mixture.memory[ASSIGNED])
         return remember(mixture, lives=lives, assigned=assigned)
 
-    def _drawn(
-        self, key: Key[Array, ""], seats: Int[Array, " n"], boxes: Float[Array, "m 4"]
+    def _started(
+        self, mixture: ParticleMixture, seats: Int[Array, " n"], boxes: Float[Array, "m 4"]
     ) -> ObjectState:
-        """Particles for every slot about the founding detection of its component."""
-        key_place, key_velocity = jax.random.split(fast_key(key))
-        places = jnp.concatenate([boxes[:, :2], jnp.log(boxes[:, 2:])], axis=1)
-        unit = jnp.concatenate([boxes[:, 2:], jnp.ones_like(boxes[:, 2:])], axis=1)
-        deviations = take(unit * self.model.detection_deviations[None], seats)
-        speeds = take(boxes[:, 2:] * self.velocity_deviations[None], seats)
-        place = take(places, seats) + deviations * jax.random.normal(key_place, deviations.shape)
-        velocity = speeds * jax.random.normal(key_velocity, speeds.shape)
-        return ObjectState(place, velocity, seats)
+        """Hypotheses for every slot about the founding detection of its component."""
+        places = places_of(boxes)
+        unit, still = units(places), jnp.zeros_like(places)
+        errors = noises_of(mixture, self.model).errors[None]
+        speeds = self.model.start_velocity[None]
+        moments = Gaussian(places, still, (unit * errors) ** 2, still, (unit * speeds) ** 2)
+        return ObjectState.of(Gaussian(*(take(moment, seats) for moment in moments)), seats)
 
     def _seats(
         self, mixture: ParticleMixture, born: Bool[Array, " m"]

@@ -5,20 +5,24 @@ from collections.abc import Sequence
 from mpfjax.moves.base import AbstractMove
 from mpfjax.vision.tracking.assignment import Assign
 from mpfjax.vision.tracking.births import Found
+from mpfjax.vision.tracking.camera import FollowCamera
 from mpfjax.vision.tracking.colours import LearnColours
 from mpfjax.vision.tracking.contact import ShareDetections
 from mpfjax.vision.tracking.deaths import Bury
 from mpfjax.vision.tracking.memory import ASSIGNED, DOUBTS, EXTENT, LIVES, REFERENCES, SCORES
 from mpfjax.vision.tracking.motion import PropagateObjects
+from mpfjax.vision.tracking.noise import LearnNoise
 
 # What each kind of move reads of the memory of others, and whose memory each is.
 _READS = {
     Assign: {SCORES, LIVES},
     ShareDetections: {ASSIGNED, LIVES},
     PropagateObjects: {ASSIGNED, DOUBTS, SCORES},
-    Bury: {ASSIGNED},
+    Bury: {ASSIGNED, SCORES},
     Found: {ASSIGNED, LIVES, SCORES, EXTENT},
     LearnColours: {ASSIGNED, LIVES},
+    FollowCamera: {LIVES, SCORES},
+    LearnNoise: {ASSIGNED, LIVES, SCORES},
 }
 _KEPT_BY = {
     SCORES: "RankScores",

@@ -14,11 +14,11 @@ from mpfjax.vision.tracking.memory import (
     LIVES,
     SHARED,
     Lives,
-    boxes_of,
+    noises_of,
     remember,
     shared_detections,
 )
-from mpfjax.vision.tracking.model import DetectedObjectModel
+from mpfjax.vision.tracking.model import DetectedObjectModel, boxes_of
 from mpfjax.vision.tracking.observation import TrackedFrame, covered
 
 
@@ -78,7 +78,8 @@ class ShareDetections(AbstractMove):
         del key
         source, lives = mixture.memory[ASSIGNED], mixture.memory[LIVES]
         detected = source >= 0
-        predicted = boxes_of(mixture.component_averages(self.model.predicted(mixture.particles)[0]))
+        moved = self.model.predicted(mixture.particles, noises_of(mixture, self.model))
+        predicted = boxes_of(mixture.component_averages(moved.place))
         own = take(observation.detections.boxes, jnp.maximum(source, 0))
         hides = (lives.confirmed & detected)[None] & ~jnp.eye(len(source), dtype=bool)
         shares = jnp.where(hides, covered(predicted, own), 0.0)

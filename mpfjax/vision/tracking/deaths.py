@@ -2,16 +2,19 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Key, PyTree
+from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import check_positive, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
+from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import spread
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
     EXTENT,
+    HIDDEN,
     LIVES,
+    SCORES,
     Lives,
     mean_boxes,
     remember,
@@ -25,13 +28,15 @@ class Bury(AbstractMove):
 
     A component dies where no detection has been assigned to it for more than `patience` frames in a
     row, for more than none while it is not confirmed; where its centre has left the frame; and
-    where all its particles have zero likelihood. It is confirmed once detections have borne it out
-    in `confirmation` frames in which it stood alone, or in `confirmation_in_contact` of whatever
+    where all its particles have zero likelihood. It is confirmed once strong detections have borne
+    it out in `confirmation` frames in which it stood alone, or in `confirmation_in_contact` of any
     kind. It does not stand alone where older, confirmed components cover more than the share
     `contact` of its box: what is found between or before two objects is often a second detection of
     one of them. Frames in which another hides it (`ShareDetections`) do not count as without a
     detection. Where there are no pixels, the frame reaches as far as all detections so far.
-    Memory: `Lives`, with `Found`, and that extent.
+    A component is shown while it is confirmed, for at most `longest_guess` frames without a
+    detection and `longest_unsure` without a strong one. Memory: `Lives`, with `Found`, and that
+    extent.
 
     Deaths are decided and not sampled (`approximate` is true). Raises `ValueError` for a number of
     frames that is not whole, or below 1, and a share that is not positive.
@@ -41,6 +46,8 @@ class Bury(AbstractMove):
     patience: int = eqx.field(static=True, default=20)
     confirmation_in_contact: int = eqx.field(static=True, default=4)
     contact: float = eqx.field(static=True, default=0.4)
+    longest_guess: int = eqx.field(static=True, default=2)
+    longest_unsure: int = eqx.field(static=True, default=8)
 
     def __check_init__(self) -> None:
         check_whole(
@@ -48,6 +55,7 @@ class Bury(AbstractMove):
             patience=self.patience,
             confirmation_in_contact=self.confirmation_in_contact,
         )
+        check_whole(0, longest_guess=self.longest_guess, longest_unsure=self.longest_unsure)
         check_positive(contact=self.contact)
 
     @property
@@ -68,7 +76,9 @@ class Bury(AbstractMove):
             seen=jnp.where(dead, 0, lives.seen),
             alone=jnp.where(dead, 0, lives.alone),
             unseen=jnp.where(dead, 0, lives.unseen),
+            unsure=jnp.where(dead, 0, lives.unsure),
             confirmed=lives.confirmed & ~dead,
+            shown=lives.shown & ~dead,
         )
         return memory | {LIVES: kept}
 
@@ -78,11 +88,14 @@ class Bury(AbstractMove):
         """Count the frame, and end who is gone."""
         del key
         lives: Lives = mixture.memory[LIVES]
-        borne_out = mixture.memory[ASSIGNED] >= 0
-        seen = lives.seen + borne_out.astype(jnp.int32)
+        source, scores = mixture.memory[ASSIGNED], observation.detections.scores
+        borne_out = source >= 0
+        strong = borne_out & (take(scores, jnp.maximum(source, 0)) >= mixture.memory[SCORES].strong)
+        seen = lives.seen + strong.astype(jnp.int32)
         missed = ~borne_out & (shared_detections(mixture) < 0)
         unseen = jnp.where(borne_out, 0, lives.unseen + missed.astype(jnp.int32))
-        alone = lives.alone + (borne_out & ~self._in_contact(mixture)).astype(jnp.int32)
+        unsure = jnp.where(strong, 0, lives.unsure + (missed | borne_out).astype(jnp.int32))
+        alone = lives.alone + (strong & ~self._in_contact(mixture)).astype(jnp.int32)
         often = (alone >= self.confirmation) | (seen >= self.confirmation_in_contact)
         confirmed = lives.alive & (lives.confirmed | often)
         patience = jnp.where(confirmed, self.patience, 0)
@@ -91,8 +104,20 @@ class Bury(AbstractMove):
         stays &= within(mean_boxes(mixture), extent)
         dies = ~spread(stays, mixture.component_indicators)
         log_weights = jnp.where(dies, -jnp.inf, mixture.log_weights)
-        lives = lives._replace(seen=seen, alone=alone, unseen=unseen, confirmed=confirmed)
+        guesses = unseen + jnp.where(shared_detections(mixture) < 0, self._hidden(mixture), 0)
+        recent = (guesses <= self.longest_guess) & (unsure <= self.longest_unsure)
+        lives = lives._replace(
+            seen=seen,
+            alone=alone,
+            unseen=unseen,
+            unsure=unsure,
+            confirmed=confirmed,
+            shown=confirmed & stays & recent,
+        )
         return remember(mixture.replace(log_weights=log_weights), lives=lives, extent=extent)
+
+    def _hidden(self, mixture: ParticleMixture) -> Int[Array, " m"]:
+        return mixture.memory.get(HIDDEN, jnp.zeros(mixture.num_components, jnp.int32))
 
     def _in_contact(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
         """Whether older components that are believed in cover much of each component's box."""

@@ -6,9 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.mixture import ParticleMixture
+from mpfjax.vision.tracking.model import DetectedObjectModel, Noises, boxes_of
 
 SCORES, ASSIGNED, LIVES, REFERENCES = "scores", "assigned", "lives", "references"
 EXTENT, SHARED, HIDDEN, DOUBTS = "extent", "shared", "hidden", "doubts"
+CAMERA, NOISES, RIVALS = "camera", "noises", "rivals"
 
 
 class Scores(NamedTuple):
@@ -20,13 +22,25 @@ class Scores(NamedTuple):
     strong: Float[Array, ""]
 
 
+class Camera(NamedTuple):
+    """Of `FollowCamera`: the shift of all objects in this frame, and how far shifts usually go.
+
+    - `shift`: in pixels; `deviations`: in boxes.
+    """
+
+    shift: Float[Array, "2"]
+    deviations: Float[Array, "2"]
+
+
 class Lives(NamedTuple):
     """Of `Bury` and `Found`: who each component is, and how well it is borne out.
 
     - `identities`: 0 for a dead component; `last_identity`: the highest ever given.
-    - `seen`, `unseen`: in how many frames a detection bore it out, and for how many none has;
-      `alone`: in how many of the first it stood alone.
+    - `seen`: in how many frames a strong detection bore it out; `alone`: in how many of these it
+      stood alone.
+    - `unseen`, `unsure`: for how many frames no detection, and no strong one, has.
     - `confirmed`: whether it was borne out often enough to be believed.
+    - `shown`: whether it is worth showing.
     - `full`: whether there was no room for a component in the last frame.
     - `begun`: whether there was a frame before.
     """
@@ -36,7 +50,9 @@ class Lives(NamedTuple):
     seen: Int[Array, " m"]
     alone: Int[Array, " m"]
     unseen: Int[Array, " m"]
+    unsure: Int[Array, " m"]
     confirmed: Bool[Array, " m"]
+    shown: Bool[Array, " m"]
     full: Bool[Array, ""]
     begun: Bool[Array, ""]
 
@@ -45,7 +61,9 @@ class Lives(NamedTuple):
         """Nobody lives yet."""
         nobody = jnp.zeros(num_components, jnp.int32)
         zero = jnp.zeros((), jnp.int32)
-        return cls(nobody, zero, nobody, nobody, nobody, nobody > 0, zero > 0, zero > 0)
+        return cls(
+            nobody, zero, nobody, nobody, nobody, nobody, nobody > 0, nobody > 0, zero > 0, zero > 0
+        )
 
     @property
     def alive(self) -> Bool[Array, " m"]:
@@ -56,11 +74,6 @@ class Lives(NamedTuple):
 def mean_boxes(mixture: ParticleMixture) -> Float[Array, "m 4"]:
     """The box of each component, centre and size in pixels: the mean place of its particles."""
     return boxes_of(mixture.component_averages(mixture.particles.place))
-
-
-def boxes_of(places: Float[Array, "m 4"]) -> Float[Array, "m 4"]:
-    """Centre and size in pixels, of places (x, y, log w, log h)."""
-    return jnp.concatenate([places[:, :2], jnp.exp(places[:, 2:])], axis=1)
 
 
 def frames_unseen(mixture: ParticleMixture) -> Int[Array, " m"]:
@@ -74,6 +87,11 @@ def shared_detections(mixture: ParticleMixture) -> Int[Array, " m"]:
     """The row of the detection that each component shares; -1 for all where no move shares any."""
     nobody = jnp.full(mixture.num_components, -1, jnp.int32)
     return mixture.memory.get(SHARED, nobody)
+
+
+def noises_of(mixture: ParticleMixture, model: DetectedObjectModel) -> Noises:
+    """What was learned of the noises; the model's own where no move learns any."""
+    return mixture.memory.get(NOISES, model.noises)
 
 
 def remember(mixture: ParticleMixture, **memory: Any) -> ParticleMixture:

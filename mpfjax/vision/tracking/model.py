@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mpfjax.checks import check_positive, check_positive_array, check_shape, given, to_array
-from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.checks import check_positive, check_positive_array, given, to_array
 from mpfjax.operations.indexing import take
 from mpfjax.operations.matrices import row_sums
 from mpfjax.vision.detections import Detections
@@ -17,26 +16,108 @@ from mpfjax.vision.sampled_histograms import SampledBoxes, SampledHistogram
 
 # So many times the deviations of a size say nothing of it.
 _NOTHING = 10.0
+# A size that grows in one frame grows less in the next: by so much of the share per frame.
+_GROWTH_KEPT = 0.9
 
 Pixels = IntegralHistogram | SampledHistogram | SampledBoxes
 
 
-class ObjectState(eqx.Module):
-    """Where an object is, how large, how fast, and which object it is.
+class Gaussian(NamedTuple):
+    """Place and velocity along each of the four coordinates, which are independent of each other.
 
-    - `place`: (x, y, log w, log h), the centre and the size in pixels.
-    - `velocity`: of the centre, in pixels a frame.
+    - `place`, `velocity`: the means; (x, y) in pixels, (log w, log h), and their change in a frame.
+    - `var_place`, `cov`, `var_velocity`: the entries of the covariance of place and velocity.
+    """
+
+    place: Float[Array, "*n 4"]
+    velocity: Float[Array, "*n 4"]
+    var_place: Float[Array, "*n 4"]
+    cov: Float[Array, "*n 4"]
+    var_velocity: Float[Array, "*n 4"]
+
+    def predicted(
+        self, place_noise: Float[Array, "*n 4"], velocity_noise: Float[Array, "*n 4"]
+    ) -> "Gaussian":
+        """A frame later: x += v + noise, v += noise, and the growth of a size decays."""
+        kept = jnp.array([1.0, 1.0, _GROWTH_KEPT, _GROWTH_KEPT], self.place.dtype)
+        kept = kept.reshape((1,) * (self.place.ndim - 1) + (4,))
+        return Gaussian(
+            self.place + self.velocity,
+            kept * self.velocity,
+            self.var_place + 2 * self.cov + self.var_velocity + place_noise**2,
+            self.cov + self.var_velocity,
+            self.var_velocity + velocity_noise**2,
+        )
+
+    def updated(
+        self, detected: Float[Array, "*n 4"], errors: Float[Array, "*n 4"]
+    ) -> tuple["Gaussian", Float[Array, "*n 4"], Float[Array, "*n 4"]]:
+        """Kalman's update by a detection: the posterior, the innovations and their variances."""
+        variance = self.var_place + errors**2
+        gap = detected - self.place
+        gain, gain_velocity = self.var_place / variance, self.cov / variance
+        posterior = Gaussian(
+            self.place + gain * gap,
+            self.velocity + gain_velocity * gap,
+            self.var_place * (1 - gain),
+            self.cov * (1 - gain),
+            jnp.maximum(self.var_velocity - gain_velocity * self.cov, 0.0),
+        )
+        return posterior, gap, variance
+
+
+class ObjectState(eqx.Module):
+    """A hypothesis of where an object is, how large, how fast, and which object it is.
+
+    Given what the detections are of, all is linear and Gaussian, so that a particle carries the
+    moments of its place and velocity, and not a draw of them (Rao-Blackwellisation, Doucet et al.
+    2000).
+
+    - `place`: (x, y, log w, log h), the mean of centre and size in pixels.
+    - `velocity`: the mean of their change in a frame.
+    - `spread`: (n, 3, 4), var place, cov, and var velocity along each coordinate.
     - `label`: the object, by the number of its component.
     """
 
     place: Float[Array, "*n 4"]
-    velocity: Float[Array, "*n 2"]
+    velocity: Float[Array, "*n 4"]
+    spread: Float[Array, "*n 3 4"]
     label: Int[Array, "*n"]
+
+    @classmethod
+    def of(cls, gaussian: Gaussian, label: Int[Array, " n"]) -> "ObjectState":
+        """The hypotheses with these moments."""
+        spread = jnp.stack([gaussian.var_place, gaussian.cov, gaussian.var_velocity], axis=1)
+        return cls(gaussian.place, gaussian.velocity, spread, label)
+
+    @classmethod
+    def nowhere(cls, num: int) -> "ObjectState":
+        """Boxes of one pixel about the origin: objects are founded later, by detections."""
+        zero = jnp.zeros((num, 4))
+        return cls(zero, zero, jnp.zeros((num, 3, 4)), jnp.zeros(num, jnp.int32))
+
+    @property
+    def gaussian(self) -> Gaussian:
+        """The moments."""
+        var_place, cov, var_velocity = jnp.moveaxis(self.spread, -2, 0)
+        return Gaussian(self.place, self.velocity, var_place, cov, var_velocity)
 
     @property
     def boxes(self) -> Float[Array, "*n 4"]:
         """Centre and size in pixels."""
-        return jnp.concatenate([self.place[..., :2], jnp.exp(self.place[..., 2:])], axis=-1)
+        return boxes_of(self.place)
+
+
+class Noises(NamedTuple):
+    """Standard deviations along (x, y, log w, log h), lengths in boxes.
+
+    - `errors`: of a strong detection.
+    - `place`, `velocity`: of what is added to an object's place and velocity in a frame.
+    """
+
+    errors: Float[Array, "4"]
+    place: Float[Array, "4"]
+    velocity: Float[Array, "4"]
 
 
 class AssignedFrame(NamedTuple):
@@ -45,8 +126,7 @@ class AssignedFrame(NamedTuple):
     - `detections`: a row for each object, its own detection, valid where it has one.
     - `weak`: (m,), which of them are weak ones; `merged`: which stand for others as well, whom the
       object hides; `borrowed`: which are those of another object, which hides this one.
-    - `doubts`: (m,), the floor of each object's likelihood beside the model's own: what speaks for
-      its detection being another's.
+    - `doubts`: (m,), the probability that an object's detection is not its own.
     - `pixels`: the colours of the frame; None where nobody looks at them.
     - `references`: (m, parts, channels, bins), the histograms that each object is known by, all
       zero where it has none; None where nobody learns any.
@@ -61,131 +141,73 @@ class AssignedFrame(NamedTuple):
     references: Float[Array, "m parts channels bins"] | None
 
 
-class DetectedObjectModel(AbstractStateSpaceModel):
+class DetectedObjectModel(eqx.Module):
     """Boxes with inertia, seen by a detector, and by their colours where that is asked for.
 
-    With the box (w, h) of the frame before as the unit of x and y, the centre moves by its velocity
-    and an acceleration, x_t = x_{t-1} + v_t + w σ_x ε, v_t = v_{t-1} + w σ_v ε', and log w and
-    log h diffuse. L(y | x) = (miss + exp(-½ |(d - x) / deviations|²)) exp(-B² / 2σ²): d is the
-    object's own detection, whose size is the unit of the first two differences, `miss` the floor
-    for a detection of something else, and B² the mean squared Bhattacharyya distance of the box's
-    bands from their references. Where an object has no detection the first factor is one and where
-    it has no reference the second; two cues, taken for independent, as by Pérez, Vermaak and Blake
-    (2004).
+    x_t = x_{t-1} + v_{t-1} + σ_x ε and v_t = v_{t-1} + σ_v ε' along each of x, y, log w and log h,
+    where the box (w, h) of the frame before is the unit of x and y; the velocities of log w and
+    log h decay. A detection is d = x + σ_d ε''. Given whose each is, this is Kalman's filter.
+    L(y | x) has the factor exp(-B² / 2σ²) as well where σ is given: B² is the mean squared
+    Bhattacharyya distance of the box's bands from their references (Pérez, Vermaak and Blake 2004).
 
-    - `position_noise`, `velocity_noise`: σ_x and σ_v of x and y, in boxes a frame.
-    - `size_noise`: of log w and log h in a frame.
-    - `detection_deviations`: of (x, y, log w, log h); `weak_error` times as much for a weak one,
-      `merged_error` times for one that stands for two, and `borrowed_error` times in the place for
-      one of another object, which says nothing of the size.
-    - `miss`: against 1 where detection and box agree; a frame's doubts come on top of it.
-    - `sigma`: σ, None where the particles are not weighed by colours.
+    The noises here are priors: `LearnNoise` fits them to the recording.
+
+    - `detection_deviations`, `place_noise`, `velocity_noise`: σ_d, σ_x and σ_v; `weak_error` times
+      σ_d for a weak detection, `merged_error` times for one that stands for two, and
+      `borrowed_error` times in the place for one of another object, which says nothing of the size.
+    - `start_velocity`: the deviations of an object's velocity when it is first detected.
+    - `sigma`: σ, None where hypotheses are not weighed by colours.
 
     Raises `ValueError` for a number that is not positive. Use it in an `ObjectTracker`.
     """
 
-    position_noise: Float[Array, "2"] = eqx.field(converter=to_array("position_noise"))
-    velocity_noise: Float[Array, "2"] = eqx.field(converter=to_array("velocity_noise"))
-    size_noise: Float[Array, "2"] = eqx.field(converter=to_array("size_noise"))
-    detection_deviations: Float[Array, "4"] = eqx.field(converter=to_array("detection_deviations"))
+    detection_deviations: Float[Array, "4"] = eqx.field(
+        converter=to_array("detection_deviations"), default=(0.03, 0.03, 0.04, 0.04)
+    )
+    place_noise: Float[Array, "4"] = eqx.field(
+        converter=to_array("place_noise"), default=(0.02, 0.015, 0.03, 0.02)
+    )
+    velocity_noise: Float[Array, "4"] = eqx.field(
+        converter=to_array("velocity_noise"), default=(0.01, 0.006, 0.003, 0.003)
+    )
+    start_velocity: Float[Array, "4"] = eqx.field(
+        converter=to_array("start_velocity"), default=(0.1, 0.05, 0.05, 0.03)
+    )
     weak_error: float = eqx.field(static=True, default=1.35)
     merged_error: float = eqx.field(static=True, default=2.0)
     borrowed_error: float = eqx.field(static=True, default=3.0)
-    miss: float = eqx.field(static=True, default=1e-4)
     sigma: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
-        lengths = {"position_noise": 2, "velocity_noise": 2, "size_noise": 2}
-        for name, length in (lengths | {"detection_deviations": 4}).items():
+        for name in ("detection_deviations", "place_noise", "velocity_noise", "start_velocity"):
             value = getattr(self, name)
-            if value.shape != (length,):
-                raise ValueError(f"{name}: {value} are not {length} numbers")
+            if value.shape != (4,):
+                raise ValueError(f"{name}: {value} are not 4 numbers")
             check_positive_array(**{name: value})
         check_positive(
-            miss=self.miss,
             weak_error=self.weak_error,
             merged_error=self.merged_error,
             borrowed_error=self.borrowed_error,
             **given(sigma=self.sigma),
         )
 
-    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> ObjectState:
-        """Boxes of one pixel about the origin: objects are founded later, by detections."""
-        del key
-        return ObjectState(
-            jnp.zeros((num_particles, 4)),
-            jnp.zeros((num_particles, 2)),
-            jnp.zeros(num_particles, jnp.int32),
-        )
-
-    def sample_transition(self, key: Key[Array, ""], states: ObjectState) -> ObjectState:
-        """x_t: the place first, then the velocity that goes with it."""
-        key_place, key_velocity = jax.random.split(key)
-        n, dtype = states.place.shape[0], states.place.dtype
-        place = jax.random.normal(key_place, (n, 4), dtype)
-        velocity = jax.random.normal(key_velocity, (n, 2), dtype)
-        return self.transition_from_noise(jnp.concatenate([place, velocity], axis=1), states)
-
     @property
-    def noise_dimension(self) -> int:
-        """Four numbers for the place, and two for the velocity."""
-        return 6
+    def noises(self) -> Noises:
+        """The noises before anything is learned."""
+        return Noises(self.detection_deviations, self.place_noise, self.velocity_noise)
 
-    def transition_from_noise(self, noise: Float[Array, "n 6"], states: ObjectState) -> ObjectState:
-        """The same, made of standard normal noise."""
-        check_shape("n 6", noise=noise)
-        mean, deviations = self.predicted(states)
-        return self.with_velocity(noise[:, 4:], states, mean + deviations * noise[:, :4])
-
-    def log_transition(
-        self, states: ObjectState, previous_states: ObjectState
-    ) -> Float[Array, " n"]:
-        """log D of place and velocity."""
-        mean, deviations = self.predicted(previous_states)
-        log_place = log_normal(states.place, mean, deviations)
-        return log_place + self.log_velocity(states, previous_states)
-
-    def predicted(self, states: ObjectState) -> tuple[Float[Array, "n 4"], Float[Array, "n 4"]]:
-        """Mean and deviations of the next place, given the state."""
-        moved = states.place.at[:, :2].add(states.velocity)
-        shocks = jnp.sqrt(self.position_noise**2 + self.velocity_noise**2)
-        centre = jnp.exp(states.place[:, 2:]) * shocks[None]
-        size = jnp.broadcast_to(self.size_noise[None], centre.shape)
-        return moved, jnp.concatenate([centre, size], axis=1)
-
-    def with_velocity(
-        self, noise: Float[Array, "n 2"], previous: ObjectState, place: Float[Array, "n 4"]
-    ) -> ObjectState:
-        """The state in a new place, its velocity made of noise, given the place."""
-        mean, deviations = self._velocity_given(previous, place)
-        return ObjectState(place, mean + deviations * noise, previous.label)
-
-    def log_velocity(self, states: ObjectState, previous: ObjectState) -> Float[Array, " n"]:
-        """The log density of `with_velocity`."""
-        mean, deviations = self._velocity_given(previous, states.place)
-        return log_normal(states.velocity, mean, deviations)
-
-    def _velocity_given(
-        self, previous: ObjectState, place: Float[Array, "n 4"]
-    ) -> tuple[Float[Array, "n 2"], Float[Array, "n 2"]]:
-        """Moments of v_t given x_t: of two Gaussian shocks, one of which is in both."""
-        shared, own = self.velocity_noise**2, self.position_noise**2
-        shock = place[:, :2] - previous.place[:, :2] - previous.velocity
-        mean = previous.velocity + (shared / (shared + own))[None] * shock
-        unit = jnp.exp(previous.place[:, 2:])
-        return mean, unit * jnp.sqrt(shared * own / (shared + own))[None]
+    def predicted(self, states: ObjectState, noises: Noises) -> ObjectState:
+        """The hypotheses a frame later."""
+        unit = units(states.place)
+        moved = states.gaussian.predicted(unit * noises.place[None], unit * noises.velocity[None])
+        return ObjectState.of(moved, states.label)
 
     def detection_of(
-        self, observation: AssignedFrame, states: ObjectState
+        self, observation: AssignedFrame, states: ObjectState, noises: Noises
     ) -> tuple[Float[Array, "n 4"], Float[Array, "n 4"]]:
-        """The place of each state's own detection, and its deviations there; infinite for none."""
-        found = observation.detections
-        places = jnp.concatenate([found.boxes[:, :2], jnp.log(found.boxes[:, 2:])], axis=1)
-        unit = jnp.concatenate([found.boxes[:, 2:], jnp.ones_like(found.boxes[:, 2:])], axis=1)
-        unit = unit * self._errors(observation)
-        deviations = jnp.where(
-            found.valid[:, None], unit * self.detection_deviations[None], jnp.inf
-        )
+        """The place of each state's own detection, and its deviations there."""
+        places = places_of(observation.detections.boxes)
+        deviations = units(places) * noises.errors[None] * self._errors(observation)
         return take(places, states.label), take(deviations, states.label)
 
     def _errors(self, observation: AssignedFrame) -> Float[Array, "m 4"]:
@@ -195,20 +217,44 @@ class DetectedObjectModel(AbstractStateSpaceModel):
         errors = errors * jnp.where(observation.merged[:, None], self.merged_error, 1.0)
         return errors * jnp.where(observation.borrowed[:, None], borrowed[None], 1.0)
 
-    def log_likelihood(self, observation: AssignedFrame, states: ObjectState) -> Float[Array, " n"]:
-        """log (miss + exp(-½ ...)) where there is a detection, and -B² / 2σ²."""
-        places, deviations = self.detection_of(observation, states)
-        gaps = (places - states.place) / deviations
-        floor = self.miss + take(observation.doubts, states.label)
-        log_detected = jnp.log(floor + jnp.exp(-0.5 * jnp.sum(gaps**2, axis=1)))
-        detected = take(observation.detections.valid, states.label)
-        log_detected = jnp.where(detected, log_detected, 0.0)
+    def seen(
+        self, key: Key[Array, ""], observation: AssignedFrame, states: ObjectState
+    ) -> tuple[ObjectState, Float[Array, " n"]]:
+        """Places drawn where they are looked at, and the log-likelihood -B² / 2σ² of their colours.
+
+        A velocity keeps its distribution given the place that was drawn.
+        """
         references = observation.references
         if observation.pixels is None or references is None or self.sigma is None:
-            return log_detected
-        references = take(references, states.label)
-        unlike = unlikeness(observation.pixels, states.boxes, references)
-        return log_detected - 0.5 * unlike / self.sigma**2
+            return states, jnp.zeros(states.label.shape, states.place.dtype)
+        g = states.gaussian
+        noise = jax.random.normal(key, g.place.shape, g.place.dtype)
+        place = g.place + jnp.sqrt(g.var_place) * noise
+        posterior, _, _ = g.updated(place, jnp.zeros_like(place) + 1e-6)
+        drawn = ObjectState.of(posterior._replace(place=place), states.label)
+        unlike = unlikeness(observation.pixels, drawn.boxes, take(references, states.label))
+        return drawn, -0.5 * unlike / self.sigma**2
+
+
+def log_normal(gaps: Float[Array, "n 4"], variances: Float[Array, "n 4"]) -> Float[Array, " n"]:
+    """The log density of independent normals, up to a constant."""
+    return row_sums(-0.5 * gaps**2 / variances - 0.5 * jnp.log(variances))
+
+
+def boxes_of(places: Float[Array, "*m 4"]) -> Float[Array, "*m 4"]:
+    """Centre and size in pixels, of places (x, y, log w, log h)."""
+    return jnp.concatenate([places[..., :2], jnp.exp(places[..., 2:])], axis=-1)
+
+
+def places_of(boxes: Float[Array, "*m 4"]) -> Float[Array, "*m 4"]:
+    """(x, y, log w, log h) of boxes by centre and size."""
+    return jnp.concatenate([boxes[..., :2], jnp.log(boxes[..., 2:])], axis=-1)
+
+
+def units(places: Float[Array, "*m 4"]) -> Float[Array, "*m 4"]:
+    """What lengths are counted in along each coordinate: (w, h, 1, 1)."""
+    sizes = jnp.exp(places[..., 2:])
+    return jnp.concatenate([sizes, jnp.ones_like(sizes)], axis=-1)
 
 
 def unlikeness(
@@ -220,11 +266,3 @@ def unlikeness(
     histograms = normalise(pixels.counts(boxes, references.shape[1]))
     distances = jnp.mean(jnp.sum(bhattacharyya(histograms, references), axis=2), axis=1)
     return jnp.where(jnp.any(references > 0, axis=(1, 2, 3)), distances, 0.0)
-
-
-def log_normal(
-    values: Float[Array, "n d"], mean: Float[Array, "n d"], deviations: Float[Array, "n d"]
-) -> Float[Array, " n"]:
-    """The log density of each row under independent normals."""
-    gaps = (values - mean) / deviations
-    return row_sums(-0.5 * gaps**2 - jnp.log(deviations) - 0.5 * jnp.log(2 * jnp.pi))

@@ -1,25 +1,44 @@
 """The objects' own step: propagate every component and weigh it by its detection and colours."""
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Key
+from jaxtyping import Array, Float, Key
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
-from mpfjax.moves.propagation import Propagate
+from mpfjax.operations.indexing import take
 from mpfjax.vision.tracking.assignment import own_detections
 from mpfjax.vision.tracking.contact import in_front
-from mpfjax.vision.tracking.memory import ASSIGNED, DOUBTS, REFERENCES, SCORES, shared_detections
-from mpfjax.vision.tracking.model import AssignedFrame, DetectedObjectModel
+from mpfjax.vision.tracking.memory import (
+    ASSIGNED,
+    DOUBTS,
+    REFERENCES,
+    SCORES,
+    noises_of,
+    shared_detections,
+)
+from mpfjax.vision.tracking.model import (
+    AssignedFrame,
+    DetectedObjectModel,
+    ObjectState,
+    log_normal,
+)
 from mpfjax.vision.tracking.observation import TrackedFrame
-from mpfjax.vision.tracking.proposal import DetectionProposal
+
+# Of two hypotheses in one component, none is taken for more than e^30 times as likely.
+_FARTHEST = 30.0
 
 
 class PropagateObjects(AbstractPropagation):
-    """`Propagate` every component, by the detection that is its own or shared and its colours.
+    """Propagate every hypothesis, and weigh it by the detection that is its component's own.
 
-    Given the assignments and the references, this is the exact step of the filter: draws from the
-    `DetectionProposal`, weights L D / q. Components share no weights here: what they say of each
-    other's mass, `ShareMass` takes away again.
+    A hypothesis is that the detection is its object's own, with the probability 1 - doubt, or
+    another's. Of each it has the exact Gaussian posterior, Kalman's update or the prediction, so
+    that one of the two is drawn by its posterior probability; the weight is the sum
+    (1 - doubt) Z_i / Z + doubt, where Z_i is the predictive density of the detection and Z its mean
+    in the component. Who is hidden follows the detection that it shares, less surely. With σ,
+    places are drawn and weighed by their colours as well. Components share no weights here: what
+    they say of each other's mass, `ShareMass` takes away again.
     """
 
     model: DetectedObjectModel
@@ -27,7 +46,7 @@ class PropagateObjects(AbstractPropagation):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
-        """Draw x_t and weigh it."""
+        """Predict, draw what the detection is of, and weigh it."""
         source, shared = mixture.memory[ASSIGNED], shared_detections(mixture)
         borrowed = shared >= 0
         own = own_detections(jnp.where(borrowed, shared, source), observation.detections)
@@ -40,9 +59,39 @@ class PropagateObjects(AbstractPropagation):
             pixels=observation.pixels,
             references=mixture.memory.get(REFERENCES),
         )
-        propagate = Propagate(self.model, DetectionProposal(self.model))
-        return propagate(key, mixture, seen)
+        key_which, key_place = jax.random.split(key)
+        noises = noises_of(mixture, self.model)
+        moved = self.model.predicted(mixture.particles, noises)
+        places, errors = self.model.detection_of(seen, moved, noises)
+        updated, gaps, variances = moved.gaussian.updated(places, errors)
+        followed, log_factors = self._odds(log_normal(gaps, variances), mixture, seen)
+        follows = jax.random.uniform(key_which, followed.shape, followed.dtype) < followed
+        states = jax.tree.map(
+            lambda new, old: jnp.where(follows.reshape(-1, *[1] * (new.ndim - 1)), new, old),
+            ObjectState.of(updated, moved.label),
+            moved,
+        )
+        states, log_colours = self.model.seen(key_place, seen, states)
+        return mixture.replace(particles=states).weighed(log_factors, log_colours)
+
+    def _odds(
+        self, log_z: Float[Array, " n"], mixture: ParticleMixture, seen: AssignedFrame
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """The probability that each hypothesis follows the detection, and its log weight."""
+        labels = mixture.component_indicators
+        log_z = jnp.where(mixture.occupied, log_z, 0.0)
+        offsets = log_z - take(mixture.component_averages(log_z), labels)
+        ratios = jnp.exp(jnp.clip(offsets, -_FARTHEST, _FARTHEST))
+        means = take(mixture.component_averages(ratios), labels)
+        doubts = take(seen.doubts, labels).astype(ratios.dtype)
+        follows = (1 - doubts) * ratios / jnp.where(means > 0, means, 1.0)
+        factors = follows + doubts
+        detected = take(seen.detections.valid, labels) & (factors > 0)
+        factors = jnp.where(detected, factors, 1.0)
+        return jnp.where(detected, follows / factors, 0.0), jnp.log(factors)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """Draw x_t from the dynamics alone."""
-        return Propagate(self.model).predict(key, mixture)
+        """Move every hypothesis by the dynamics alone."""
+        del key
+        moved = self.model.predicted(mixture.particles, noises_of(mixture, self.model))
+        return mixture.replace(particles=moved)

@@ -1,0 +1,113 @@
+"""The motion that all objects have in common: the camera's."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from mpfjax.checks import check_positive, check_share
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractMove
+from mpfjax.operations.indexing import take
+from mpfjax.vision.tracking.assignment import Assign
+from mpfjax.vision.tracking.memory import CAMERA, LIVES, SCORES, Camera, noises_of, remember
+from mpfjax.vision.tracking.model import ObjectState, places_of, units
+from mpfjax.vision.tracking.observation import TrackedFrame
+
+_ROUNDS = 5
+
+
+class FollowCamera(AbstractMove):
+    """Move every component by what the innovations of all objects have in common.
+
+    A camera that shakes or turns shifts all objects at once, by no velocity of theirs. Confirmed
+    components and strong detections that prefer each other, by the costs of `assign`, give
+    innovations e_m with variances S_m. With e_m = c + noise, c ~ N(0, σ_c²), and heavy tails for
+    those who move on their own, the posterior mean of the shift c is found by weighted least
+    squares, with Student's weights of `freedom` degrees. σ_c, in median boxes, is learned with a
+    forgetting of `rate`: before a still camera it becomes nothing.
+
+    It leaves the weights as they are; memory: the last shift, and σ_c. What objects have in common
+    is taken for the camera's (`approximate` is true). Raises `ValueError` for freedom that is not
+    positive and a rate outside [0, 1].
+    """
+
+    assign: Assign
+    freedom: float = eqx.field(static=True, default=4.0)
+    rate: float = eqx.field(static=True, default=0.03)
+
+    def __check_init__(self) -> None:
+        check_positive(freedom=self.freedom)
+        check_share(rate=self.rate)
+
+    @property
+    def approximate(self) -> bool:
+        """True: what is common is taken for the camera's."""
+        return True
+
+    def initial_memory(self, num_components: int) -> dict[str, Camera]:
+        """A camera that stands nearly still."""
+        del num_components
+        return {CAMERA: Camera(jnp.zeros(2), jnp.full(2, 0.02))}
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
+    ) -> ParticleMixture:
+        """Find the shift, and move everybody by it."""
+        del key
+        camera: Camera = mixture.memory[CAMERA]
+        model, noises = self.assign.model, noises_of(mixture, self.assign.model)
+        moved = model.predicted(mixture.particles, noises)
+        means = mixture.component_averages(moved.place)
+        confirmed = mixture.memory[LIVES].confirmed
+        number = jnp.maximum(jnp.sum(confirmed), 1)
+        sizes = jnp.where(confirmed[:, None], jnp.exp(means[:, 2:]), jnp.inf)
+        box = jnp.sort(sizes, axis=0)[(number - 1) // 2]
+        box = jnp.where(jnp.isfinite(box), box, 1.0)
+        cost = self.assign.costs(mixture, observation, slack=2 * camera.deviations * box)
+        strong = observation.detections.scores >= mixture.memory[SCORES].strong
+        cost = jnp.where(confirmed[:, None] & strong[None], cost, jnp.inf)
+        paired, partner = _mutual(cost, self.assign.gate)
+        gaps = take(places_of(observation.detections.boxes), partner)[:, :2] - means[:, :2]
+        spread = mixture.component_averages(moved.spread[:, 0, :2])
+        variances = spread + (units(means) * noises.errors[None])[:, :2] ** 2
+        prior = (camera.deviations * box) ** 2
+        shift, posterior = self._common(gaps, variances, paired, prior)
+        squares = jnp.clip((shift**2 + posterior) / box**2, 1e-6, 0.25)
+        squares = (1 - self.rate) * camera.deviations**2 + self.rate * squares
+        learned = jnp.where(jnp.any(paired), jnp.sqrt(squares), camera.deviations)
+        particles = mixture.particles
+        place = particles.place.at[:, :2].add(shift[None].astype(particles.place.dtype))
+        moved = ObjectState(place, particles.velocity, particles.spread, particles.label)
+        return remember(mixture.replace(particles=moved), camera=Camera(shift, learned))
+
+    def _common(
+        self,
+        gaps: Float[Array, "m 2"],
+        variances: Float[Array, "m 2"],
+        paired: Bool[Array, " m"],
+        prior: Float[Array, "2"],
+    ) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+        """The posterior mean and variance of what the gaps of the pairs have in common."""
+        variances = jnp.where(paired[:, None], variances, 1.0)
+        gaps = jnp.where(paired[:, None], gaps, 0.0)
+
+        def weights(shift: Float[Array, "2"]) -> Float[Array, "m 2"]:
+            squares = (gaps - shift[None]) ** 2 / variances
+            trust = (self.freedom + 1) / (self.freedom + squares) / variances
+            return jnp.where(paired[:, None], trust, 0.0)
+
+        def improve(_: Int[Array, ""], shift: Float[Array, "2"]) -> Float[Array, "2"]:
+            trust = weights(shift)
+            return jnp.sum(trust * gaps, axis=0) / (jnp.sum(trust, axis=0) + 1 / prior)
+
+        shift = jax.lax.fori_loop(0, _ROUNDS, improve, jnp.zeros_like(prior))
+        return shift, 1 / (jnp.sum(weights(shift), axis=0) + 1 / prior)
+
+
+def _mutual(cost: Float[Array, "m d"], gate: float) -> tuple[Bool[Array, " m"], Int[Array, " m"]]:
+    """Which rows are in a pair whose row and column have no cheaper one, and its column."""
+    partner = jnp.argmin(cost, axis=1).astype(jnp.int32)
+    cheapest = jnp.min(cost, axis=1)
+    column = take(jnp.argmin(cost, axis=0).astype(jnp.int32), partner)
+    return (cheapest < gate) & (column == jnp.arange(len(cost))), partner

@@ -1,0 +1,171 @@
+"""How far the detector errs and how much objects move, learned from the recording itself."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from mpfjax.checks import check_positive, check_whole
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractMove
+from mpfjax.operations.indexing import take
+from mpfjax.vision.tracking.contact import in_front
+from mpfjax.vision.tracking.memory import (
+    ASSIGNED,
+    CAMERA,
+    LIVES,
+    NOISES,
+    RIVALS,
+    SCORES,
+    Lives,
+    remember,
+)
+from mpfjax.vision.tracking.model import (
+    DetectedObjectModel,
+    Gaussian,
+    Noises,
+    places_of,
+    units,
+)
+from mpfjax.vision.tracking.observation import TrackedFrame
+
+# Rival deviations of detections, of places and of velocities, in boxes: all that real ones have.
+_ERRORS = (0.01, 0.02, 0.04, 0.08, 0.16)
+_PLACES = (0.005, 0.015, 0.045)
+_VELOCITIES = (0.001, 0.005, 0.025)
+_GRID = np.array([(r, q, v) for r in _ERRORS for q in _PLACES for v in _VELOCITIES]).T
+# How far off the priors may be, in logarithms.
+_DOUBTS = (0.7, 0.7, 0.9)
+
+
+class Rivals(NamedTuple):
+    """Of `LearnNoise`: what each rival says of each object, and what speaks for it.
+
+    - `owners`: the identities of the objects; `moments`: (m, L, 4) each.
+    - `evidence`: (L, 4), log-likelihoods of late, of all objects together.
+    """
+
+    owners: Int[Array, " m"]
+    moments: Gaussian
+    evidence: Float[Array, "rivals 4"]
+
+
+class LearnNoise(AbstractMove):
+    """Fit the detector's errors and the objects' noises to the innovations, all objects together.
+
+    L rival triples (σ_d, σ_x, σ_v) stand for each coordinate. Under each, Kalman's filter follows
+    each object; what it says of the object's next detection, the predictive density of its
+    innovation, is evidence for the triple, which is forgotten within `memory` frames. Innovations
+    have heavy tails, so that the density is Student's with `freedom` degrees. The noises that
+    `Assign`, `PropagateObjects` and `Found` take are exp E[log σ] under the posterior of the
+    triples, whose prior is log-normal about the model's noises. Among the multiple-model filters
+    it is Magill's (1965), with one model for all objects. Objects teach once they have had
+    `first` strong detections, and only by strong ones that are theirs alone.
+
+    It leaves the particles as they are; memory: `Noises` and `Rivals`. The model changes with the
+    data (`approximate` is true). Raises `ValueError` for numbers that are not positive.
+    """
+
+    model: DetectedObjectModel
+    memory: float = eqx.field(static=True, default=20.0)
+    freedom: float = eqx.field(static=True, default=4.0)
+    first: int = eqx.field(static=True, default=3)
+
+    def __check_init__(self) -> None:
+        check_positive(memory=self.memory, freedom=self.freedom)
+        check_whole(first=self.first)
+
+    @property
+    def approximate(self) -> bool:
+        """True: what is seen changes what is expected."""
+        return True
+
+    def initial_memory(self, num_components: int) -> dict[str, Noises | Rivals]:
+        """The model's noises, and nobody followed."""
+        m, rivals = num_components, _GRID.shape[1]
+        zero = jnp.zeros((m, rivals, 4))
+        moments = Gaussian(zero, zero, zero, zero, zero)
+        nobody = jnp.zeros(m, jnp.int32)
+        return {
+            NOISES: self.model.noises,
+            RIVALS: Rivals(nobody, moments, jnp.zeros((rivals, 4))),
+        }
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
+    ) -> ParticleMixture:
+        """Follow every object under every rival, and weigh the rivals."""
+        del key
+        lives: Lives = mixture.memory[LIVES]
+        source, found = mixture.memory[ASSIGNED], observation.detections
+        detected = lives.alive & (source >= 0)
+        rows = jnp.maximum(source, 0)
+        places = places_of(take(found.boxes, rows))
+        rivals: Rivals = mixture.memory[RIVALS]
+        known = rivals.owners == lives.identities
+        alone = detected & known & ~in_front(mixture)
+        strong = take(found.scores, rows) >= mixture.memory[SCORES].strong
+        teaches = alone & strong & lives.confirmed & (lives.seen >= self.first)
+
+        errors, place_noise, velocity_noise = self._rivals(places.dtype)
+        moments = rivals.moments
+        if CAMERA in mixture.memory:
+            shift = jnp.pad(mixture.memory[CAMERA].shift, (0, 2))
+            moments = moments._replace(place=moments.place + shift[None, None])
+        unit = units(moments.place)
+        moments = moments.predicted(unit * place_noise, unit * velocity_noise)
+        unit = units(moments.place)
+        seen = jnp.broadcast_to(places[:, None], moments.place.shape)
+        posterior, gap, variance = moments.updated(seen, unit * errors)
+        evidence = self._log_density(gap, variance, unit)
+        evidence = jnp.sum(jnp.where(teaches[:, None, None], evidence, 0.0), axis=0)
+        kept = jnp.exp(jnp.asarray(-1 / self.memory, evidence.dtype))
+        # Two innovations of one object are not as independent as the filters take them for.
+        evidence = kept * rivals.evidence + 0.5 * evidence
+
+        moments = _where((detected & known)[:, None, None], posterior, moments)
+        moments = _where((detected & ~known)[:, None, None], self._started(places), moments)
+        owners = jnp.where(detected | known, lives.identities, 0)
+        noises = self._noises(evidence)
+        return remember(mixture, noises=noises, rivals=Rivals(owners, moments, evidence))
+
+    def _log_density(
+        self,
+        gap: Float[Array, "m rivals 4"],
+        variance: Float[Array, "m rivals 4"],
+        unit: Float[Array, "m rivals 4"],
+    ) -> Float[Array, "m rivals 4"]:
+        """Student's, up to a constant, of innovations in boxes."""
+        power = 0.5 * (self.freedom + 1)
+        tails = power * jnp.log1p(gap**2 / variance / self.freedom)
+        return -tails - 0.5 * jnp.log(variance / unit**2)
+
+    def _rivals(self, dtype: jnp.dtype) -> Float[Array, "3 1 rivals 4"]:
+        rivals = jnp.asarray(_GRID, dtype)[:, None, :, None]
+        return jnp.broadcast_to(rivals, (3, 1, _GRID.shape[1], 4))
+
+    def _started(self, places: Float[Array, "m 4"]) -> Gaussian:
+        """Where an object may be at its first detection, under every rival."""
+        errors = self._rivals(places.dtype)[0]
+        shape = (len(places), errors.shape[1], 4)
+        unit = units(places)[:, None]
+        still = jnp.zeros(shape, places.dtype)
+        speeds = jnp.broadcast_to((unit * self.model.start_velocity[None, None]) ** 2, shape)
+        place = jnp.broadcast_to(places[:, None], shape)
+        return Gaussian(place, still, (unit * errors) ** 2, still, speeds)
+
+    def _noises(self, evidence: Float[Array, "rivals 4"]) -> Noises:
+        """The geometric mean of each noise under the posterior of the rivals."""
+        grid = jnp.log(self._rivals(evidence.dtype)[:, 0])
+        prior = jnp.log(jnp.stack(self.model.noises)).astype(evidence.dtype)
+        doubts = jnp.asarray(_DOUBTS, evidence.dtype)[:, None, None]
+        log_prior = -0.5 * jnp.sum(((grid - prior[:, None]) / doubts) ** 2, axis=0)
+        weights = jax.nn.softmax(evidence + log_prior, axis=0)
+        return Noises(*jnp.exp(jnp.sum(weights[None] * grid, axis=1)))
+
+
+def _where(chosen: Bool[Array, "m 1 1"], a: Gaussian, b: Gaussian) -> Gaussian:
+    return Gaussian(*(jnp.where(chosen, x, y) for x, y in zip(a, b, strict=True)))
