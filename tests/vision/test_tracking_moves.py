@@ -349,7 +349,7 @@ def test_the_assignment_is_scipys():
             cost = 8 * np.log1p((gap**2 / total).sum() / 4) + np.log(total / unit**2).sum()
             if m < 2:
                 reference = np.asarray(mixture.memory["references"][m], float)
-                cost += 28 * (np.mean(1 - np.sqrt(reference * seen[d]).sum(axis=2)) - 0.25)
+                cost += 14 * (np.mean(1 - np.sqrt(reference * seen[d]).sum(axis=2)) - 0.25)
             cost += 8 * (d == 1) + 2 * (m == 2)
             expected[m, d] = cost if cost < GATE else np.inf
     possible = np.isfinite(expected)

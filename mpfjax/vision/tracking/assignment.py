@@ -61,7 +61,7 @@ class Assign(AbstractMove):
     model: DetectedObjectModel
     gate: float = eqx.field(static=True, default=0.0)
     freedom: float = eqx.field(static=True, default=4.0)
-    colour_cost: float = eqx.field(static=True, default=28.0)
+    colour_cost: float = eqx.field(static=True, default=14.0)
     weak_cost: float = eqx.field(static=True, default=8.0)
     doubt_cost: float = eqx.field(static=True, default=2.0)
     temperature: float = eqx.field(static=True, default=2.0)
