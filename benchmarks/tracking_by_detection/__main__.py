@@ -4,7 +4,9 @@
     python -m benchmarks.tracking_by_detection --scene football
 
 Each DIR is a sequence: img/ (or img1/), gt.txt (or gt/gt.txt) and one or more files of detections,
-det*.txt (or det/det.txt). On each file run the two filters of `mpfjax.vision.track`, means over
+det*.txt (or det/det.txt). Without images ours see the detections alone, as the others always do. An
+ignore.txt is taken as `read_truth` does, and of several sequences the means are printed. On each
+file run the two filters of `mpfjax.vision.track`, means over
 seeds, and the peers that are installed: the SORT-like trackers of the packages `trackers` and
 `norfair`, with their defaults, with what their documentation advises, and then all of them, ours
 as well, with the same minimal score, that below which weaker detections are left out. It is the
@@ -57,10 +59,12 @@ class Sequence(NamedTuple):
     first: int
     last: int
     frames_per_second: float | None
-    source: Path | np.ndarray
+    source: Path | np.ndarray | None
 
-    def stills(self) -> Iterator[np.ndarray]:
-        """The frames."""
+    def stills(self) -> Iterator[np.ndarray] | None:
+        """The frames, or None where there are detections alone."""
+        if self.source is None:
+            return None
         if isinstance(self.source, np.ndarray):
             return iter(self.source[self.first - 1 : self.last])
         return frames.read_frames(self.source, self.first, self.last)
@@ -109,17 +113,21 @@ def open_sequences(options: argparse.Namespace) -> list[Sequence]:
         held = frames.num_images(folder)
         truth_path = _first_file(folder, "gt.txt", "gt/gt.txt")
         files = sorted(folder.glob("det*.txt")) + sorted(folder.glob("det/det*.txt"))
-        if held < first or truth_path is None or not files:
+        if 0 < held < first or truth_path is None or not files:
             raise ValueError(
                 f"DIR: {folder} holds {held} images, {len(files)} files det*.txt and"
-                f" {'a' if truth_path else 'no'} gt.txt; all three are needed"
+                f" {'a' if truth_path else 'no'} gt.txt; the files are needed, and frame {first}"
             )
-        end = min(last or held, held)
-        truth = read_truth(truth_path).between(first, end)
+        whole = read_truth(truth_path)
         rate = options.fps or frames.frame_rate(folder)
         for path in files:
-            rows = _between(box_files.read_detections(path), first, end)
-            found.append(Sequence(folder.name, path.name, rows, truth, first, end, rate, folder))
+            rows = box_files.read_detections(path)
+            # Without pixels a recording ends with what was detected or labelled last.
+            count = held or int(max(rows[:, 0].max(), whole.objects[:, 0].max()))
+            end = max(min(last or count, count), first)
+            source = folder if held else None
+            rows, truth = _between(rows, first, end), whole.between(first, end)
+            found.append(Sequence(folder.name, path.name, rows, truth, first, end, rate, source))
     return found
 
 
@@ -145,6 +153,8 @@ def run(options: argparse.Namespace) -> None:
             results.append(_result(name, sequence, list(runs)))
             write_json(options.out / "tracking_by_detection.json", {"rows": results})
     print(table(results))
+    if len(sequences) > 1:
+        print(means(results, len(sequences)))
     print(f"written to {options.out}")
 
 
@@ -175,9 +185,10 @@ def _ours(
     rows = Rows(sequence.rows, sequence.first)
     tracker = make_tracker(filter, rows.most_objects(), sequence.frames_per_second)
     for number in range(options.seed, options.seed + options.seeds):
-        clock = Clock("read", "track")
+        clock, stills = Clock("read", "track"), sequence.stills()
         tracked = track(
-            clock.over("read", sequence.stills()), rows, tracker, key=jax.random.key(number),
+            None if stills is None else clock.over("read", stills), rows, tracker,
+            key=jax.random.key(number),
             first=sequence.first, min_score=least, use_colours=not options.no_colour,
         )  # fmt: skip
         kept, compiling = [], 0.0
@@ -257,6 +268,21 @@ def table(results: list[dict[str, Any]]) -> str:
     ]
     header = ["tracker", "sequence", "detections", "HOTA", "MOTA", "IDF1", "switches", "frames/s"]
     return format_table(header, lines)
+
+
+def means(results: list[dict[str, Any]], num_sequences: int) -> str:
+    """The mean of each tracker's scores over all sequences, as text, the best HOTA first."""
+    by_name: dict[str, list[dict[str, Any]]] = {}
+    for row in results:
+        by_name.setdefault(row["tracker"], []).append(row)
+    lines = []
+    for name, rows in by_name.items():
+        if len(rows) == num_sequences:
+            mean = {score: float(np.mean([row[score] for row in rows])) for score in SCORES}
+            lines.append((mean, [name, *(f"{mean[score]:.3f}" for score in SCORES[:3])]))
+            lines[-1][1].append(f"{mean['id_switches']:.1f}")
+    lines.sort(key=lambda line: -line[0]["HOTA"])
+    return format_table(["mean of", "HOTA", "MOTA", "IDF1", "switches"], [row for _, row in lines])
 
 
 def _scores(rows: np.ndarray) -> np.ndarray | None:

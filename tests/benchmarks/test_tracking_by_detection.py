@@ -150,7 +150,7 @@ def test_a_folder_or_a_scene_is_needed_and_not_both(arguments, capsys):
 
 @pytest.mark.parametrize(
     ("message", "missing"),
-    [("and no gt.txt", "gt.txt"), ("0 files det", "det"), ("0 images", "img1")],
+    [("and no gt.txt", "gt.txt"), ("0 files det", "det")],
 )
 def test_what_a_sequence_lacks_is_said(sequence, tmp_path, capsys, message, missing):
     for part in ("gt.txt", "det", "img1"):
@@ -160,3 +160,26 @@ def test_what_a_sequence_lacks_is_said(sequence, tmp_path, capsys, message, miss
     assert message in capsys.readouterr().err
     assert benchmark.main([str(tmp_path / "gone"), "--out", str(tmp_path / "out")]) == 2
     assert "gone is not a folder" in capsys.readouterr().err
+
+
+def test_a_sequence_without_images_is_tracked_by_its_detections(sequence, tmp_path):
+    for part in ("gt.txt", "det"):
+        (tmp_path / part).symlink_to(sequence / part)
+    options = benchmark.parse_arguments([str(tmp_path), "--frames", "2:"])
+    (opened,) = benchmark.open_sequences(options)
+    assert opened.stills() is None
+    assert opened.first == 2
+    assert opened.last == int(max(opened.rows[:, 0].max(), opened.truth.objects[:, 0].max()))
+
+
+def test_means_are_of_those_that_ran_on_all_sequences():
+    scores = {"HOTA": 0.5, "MOTA": 0.5, "IDF1": 0.5, "id_switches": 2}
+    rows = [{"tracker": "a", **scores}, {"tracker": "b", **scores}]
+    rows.append({"tracker": "b", **scores, "HOTA": 0.7})
+    assert benchmark.means(rows, 2).splitlines()[-1].split() == [
+        "b",
+        "0.600",
+        "0.500",
+        "0.500",
+        "2.0",
+    ]
