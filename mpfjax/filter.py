@@ -32,6 +32,7 @@ from mpfjax.moves.every import Every, with_inner
 from mpfjax.moves.exchange import Exchange
 from mpfjax.moves.lineages import LINEAGE, evidence_variance, mass_variances
 from mpfjax.moves.parents import runner
+from mpfjax.moves.results import check_result, check_weighed
 from mpfjax.moves.sharing import give_inputs, tie, untie
 from mpfjax.observations import Fault, faults_of, one_input, one_observation, raise_faults
 from mpfjax.operations.across_islands import excess_over_islands, island_index, num_islands
@@ -115,14 +116,7 @@ class Filter(eqx.Module):
         moves = _as_moves(moves, "moves")
         initial_moves = _as_moves(initial_moves, "initial_moves")
         _check_sizes(num_particles, num_components)
-        if not moves:
-            raise ValueError("moves: a filter needs at least one")
-        if not any(getattr(move, "weighs", True) for move in moves):
-            names = ", ".join(type(move).__name__ for move in moves)
-            raise ValueError(
-                f"moves: {names} never weigh the particles by what is observed, and log Ẑ would be"
-                " 0; Propagate does, or Weigh after Predict"
-            )
+        check_weighed(moves)
         for move in with_inner(moves):
             per_component = getattr(move, "particles_per_component", None)
             if per_component is not None and per_component * num_components > num_particles:
@@ -247,6 +241,7 @@ class Filter(eqx.Module):
                 resampled |= move.would_resample(mixture, observation)
             after = (self._forgetting,) if isinstance(move, Every) else ()
             moved = run(move, move_key, mixture, observation, *after)
+            moved = check_result(moved, mixture, move)
             if after:
                 mixture = moved
                 continue
@@ -273,7 +268,8 @@ class Filter(eqx.Module):
         for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
             if not isinstance(move, AbstractMove):
                 raise ValueError(f"moves: {move!r} does not define predict, for a missing y_t")
-            mixture = self._forgetting(move.predict(move_key, mixture))
+            moved = move.predict(move_key, mixture)
+            mixture = self._forgetting(check_result(moved, mixture, move))
         increment = jnp.zeros((), mixture.log_weights.dtype)
         return mixture, _report(mixture, increment, jnp.zeros(self.num_components, bool))
 

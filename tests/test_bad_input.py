@@ -51,6 +51,44 @@ def test_no_moves():
 
 
 @pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda mixture: None, "None, no ParticleMixture"),
+        (lambda mixture: (mixture, 0.0), "no ParticleMixture"),
+        (lambda mixture: mixture.replace(particles={"x": mixture.particles}), "another structure"),
+        (
+            lambda mixture: mixture.replace(particles=mixture.particles[:5]),
+            r"float32\[5\], and was",
+        ),
+        (
+            lambda mixture: mixture.replace(log_weights=mixture.log_weights.astype(jnp.float16)),
+            "log_weights of float16",
+        ),
+    ],
+)
+def test_a_move_that_returns_no_such_mixture(change, named):
+    def custom(key, mixture, observation):
+        return change(mixture)
+
+    class Custom(mpfjax.AbstractMove):
+        def __call__(self, key, mixture, observation):
+            return mixture
+
+        def predict(self, key, mixture):
+            return change(mixture)
+
+    model = mpfjax.QuadraticModel()
+    filter = Filter(model, [custom], 10)
+    with pytest.raises(ValueError, match=f"(?s)moves: custom returned .*{named}"):
+        filter.step(KEY, filter.init(KEY), jnp.zeros(()))
+    with pytest.raises(ValueError, match=f"(?s)moves: custom returned .*{named}"):
+        mpfjax.run_filter(KEY, filter, jnp.zeros(2))
+    filter = Filter(model, [Custom()], 10)
+    with pytest.raises(ValueError, match=f"(?s)moves: Custom returned .*{named}"):
+        filter.predict(KEY, filter.init(KEY))
+
+
+@pytest.mark.parametrize(
     "moves",
     [
         [Resample()],

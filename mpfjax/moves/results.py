@@ -1,0 +1,43 @@
+"""What a filter asks of its moves: that one weighs, and that each returns a mixture."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mpfjax.checks import shown
+from mpfjax.mixture import ParticleMixture
+
+
+def check_result(moved: Any, mixture: ParticleMixture, move: Any) -> ParticleMixture:
+    """What a move returned; a `ValueError` unless it is a mixture of the same shapes and types."""
+    who = f"moves: {getattr(move, '__name__', type(move).__name__)} returned"
+    if not isinstance(moved, ParticleMixture):
+        raise ValueError(f"{who} {shown(moved)}, no ParticleMixture")
+    names = ("particles", "log_weights", "component_indicators")
+    for name, new, old in ((n, getattr(moved, n), getattr(mixture, n)) for n in names):
+        structures = jax.tree.structure(new), jax.tree.structure(old)
+        if structures[0] != structures[1]:
+            raise ValueError(
+                f"{who} {name} of another structure, {structures[0]}, than it was given,"
+                f" {structures[1]}"
+            )
+        for own, given in zip(jax.tree.leaves(new), jax.tree.leaves(old), strict=True):
+            own_kind, kind = (
+                f"{jnp.result_type(leaf)}{list(jnp.shape(leaf))}" for leaf in (own, given)
+            )
+            if own_kind != kind:
+                raise ValueError(f"{who} {name} of {own_kind}, and was given {kind}")
+    return moved
+
+
+def check_weighed(moves: tuple[Any, ...]) -> None:
+    """Raise a `ValueError` for no moves, and where none of them weighs by what is observed."""
+    if not moves:
+        raise ValueError("moves: a filter needs at least one")
+    if not any(getattr(move, "weighs", True) for move in moves):
+        names = ", ".join(type(move).__name__ for move in moves)
+        raise ValueError(
+            f"moves: {names} never weigh the particles by what is observed, and log Ẑ would be 0;"
+            " Propagate does, or Weigh after Predict"
+        )
