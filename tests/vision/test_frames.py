@@ -77,7 +77,7 @@ TURNS = {
 }
 
 
-@pytest.mark.parametrize(("turn", "turned"), TURNS.items(), ids=str)
+@pytest.mark.parametrize(("turn", "turned"), TURNS.items(), ids=[str(turn) for turn in TURNS])
 def test_a_video_is_turned_and_mirrored_as_its_file_says(tmp_path, turn, turned):
     still = shades(1)[0].copy()
     still[:8, :24] = (220, 30, 30)
