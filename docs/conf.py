@@ -23,6 +23,9 @@ nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(?!mpfjax\.).*"),
     ("py:class", r"mpfjax\..*\.Abstract(BoxModel|RandomWalk)"),
+    # What public classes hold or pass on, and users neither make nor read.
+    ("py:class", r"mpfjax\..*\._\w+"),
+    ("py:class", r"mpfjax\.tuning\.(observing|problem|densities)\.\w+"),
 ]
 
 html_theme = "furo"

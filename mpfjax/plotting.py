@@ -302,7 +302,10 @@ def draw_climbs(
 
 
 def standard_error(values: np.ndarray) -> np.ndarray:
-    """That of the mean over the leading axis; NaN, which draws nothing, where there is one run."""
+    """The standard error of the mean over the leading axis, of runs: s / √n, with n - 1 in s².
+
+    NaN, which draws nothing, where there is one run. Use it for the bands of a figure.
+    """
     if len(values) < 2:
         return np.full(values.shape[1:], np.nan)
     return np.asarray(values.std(axis=0, ddof=1) / np.sqrt(len(values)))
