@@ -31,7 +31,8 @@ JOINT = mpfjax.MultiObjectModel(MODEL, 2, shared_observation=True)
 FILTER = mpfjax.particle_filter(MODEL, 4)
 MIXTURE = FILTER.init(KEY)
 HISTORY = mpfjax.run_filter(KEY, FILTER, np.ones(2, np.float32))
-TRACED = mpfjax.smoothing.with_first_ancestors(FILTER).init(KEY)
+INDEPENDENT = mpfjax.particle_filter(MODEL, 4, scheme="multinomial")
+TRACED = mpfjax.smoothing.with_first_ancestors(INDEPENDENT).init(KEY)
 EYE = np.eye(1)
 SWITCHING = mpfjax.SwitchingLinearGaussianModel(EYE, EYE, EYE, EYE, EYE, np.zeros(1), EYE)
 
@@ -271,7 +272,7 @@ RUN = {
          "missing": "error"},
     ),
     "trace_ancestors": (mpfjax.smoothing.trace_ancestors, {"mixtures": HISTORY}),
-    "with_first_ancestors": (mpfjax.smoothing.with_first_ancestors, {"filter": FILTER}),
+    "with_first_ancestors": (mpfjax.smoothing.with_first_ancestors, {"filter": INDEPENDENT}),
     "mixture_weight_errors": (mpfjax.smoothing.mixture_weight_errors, {"run": TRACED}),
     "log_marginal_likelihood_variance": (
         mpfjax.smoothing.log_marginal_likelihood_variance, {"run": TRACED}

@@ -18,7 +18,8 @@ from mpfjax.smoothing import (
     with_first_ancestors,
 )
 
-SCHEMES = ("multinomial", "systematic", "ssp")
+# The only one for which a single run tells.
+SCHEMES = ("multinomial",)
 
 
 def _nothing(mixture: mpfjax.ParticleMixture) -> None:

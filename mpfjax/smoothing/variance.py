@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
@@ -23,6 +24,12 @@ from mpfjax.moves.regimes import PropagateRegimes
 from mpfjax.moves.resampling import Resample
 from mpfjax.running.scan import FilterRun
 
+# What the estimates hold for. Draws that are more even vary less than they say, or more.
+_INDEPENDENT = {
+    "scheme": "multinomial",
+    "noise": "independent",
+    "initial_noise": "independent",
+}
 # After these a particle has no one ancestor, or one on another island.
 _NO_LINEAGE = (PropagateIndependently, PropagateInClusters, PropagateRegimes, Exchange)
 
@@ -50,9 +57,10 @@ def with_first_ancestors(filter: Filter) -> Filter:
 
     Draws and weights are the same to the bit. A step takes O(N) more memory and time, and the
     runs can be given to `log_marginal_likelihood_variance` and `mixture_weight_errors`. `StepInfo`
-    then has both errors at every step. Raises `ValueError` for what is no filter, and for a filter
-    whose particles have no single ancestors or whose Ẑ is not unbiased: one with an approximate
-    move, `PropagateIndependently`, `PropagateInClusters` or `Exchange`.
+    then has both errors at every step. Raises `ValueError` for what is no filter, for a filter
+    whose particles have no single ancestors or whose Ẑ is not unbiased (one with an approximate
+    move, `PropagateIndependently`, `PropagateInClusters` or `Exchange`), and for draws that are not
+    independent: a scheme other than "multinomial", or a noise other than "independent".
     """
     check_type(Filter, "a Filter", filter=filter)
     for move in filter.moves:
@@ -62,6 +70,7 @@ def with_first_ancestors(filter: Filter) -> Filter:
                 f"filter: {type(move).__name__}, one of its moves, is approximate or leaves a"
                 " particle without one ancestor; the variance of log Ẑ is not known from one run"
             )
+    _require_independent_draws(filter)
     if any(isinstance(move, _KeepFirstAncestors) for move in filter.initial_moves):
         return filter
     return Filter(
@@ -72,6 +81,19 @@ def with_first_ancestors(filter: Filter) -> Filter:
         [*filter.initial_moves, _KeepFirstAncestors()],
         filter.initial_noise,
     )
+
+
+def _require_independent_draws(filter: Filter) -> None:
+    """Raise a `ValueError` for draws that are more even than what the formulae are made of."""
+    draws = lambda node: hasattr(node, "scheme") or hasattr(node, "noise")  # noqa: E731
+    for part in [filter, *jax.tree.leaves(filter.moves, is_leaf=draws)]:
+        for option, known in _INDEPENDENT.items():
+            chosen = getattr(part, option, known)
+            if chosen != known:
+                raise ValueError(
+                    f"filter: {option} of {type(part).__name__} is {chosen!r}; the variance of"
+                    f" log Ẑ is known from one run for {known!r} alone"
+                )
 
 
 def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[Array, ""]:

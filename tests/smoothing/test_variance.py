@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax import Filter, KMeans, Propagate, Resample
+from mpfjax import Every, Filter, KMeans, Propagate, Resample
 from mpfjax.exact import kalman_filter
 from mpfjax.smoothing import (
     log_marginal_likelihood_variance,
@@ -222,8 +222,23 @@ class TestBadInput:
         with pytest.raises(ValueError, match="filter: "):
             with_first_ancestors(filter)
 
+    @pytest.mark.parametrize(
+        "filter",
+        [
+            mpfjax.particle_filter(ONE, 20),
+            mpfjax.particle_filter(ONE, 20, scheme="ssp"),
+            mpfjax.particle_filter(ONE, 20, scheme="multinomial", noise="rqmc"),
+            mpfjax.auxiliary_particle_filter(ONE, 20, lambda seen, states: 0 * states[:, 0]),
+            mpfjax.distributed_partitioned_sampling(OBJECTS, 20, reassembly="evidence"),
+            Filter(ONE, [Every(2, [Resample("stratified")]), Propagate(ONE)], 20),
+        ],
+    )
+    def test_filters_whose_draws_are_not_independent(self, filter):
+        with pytest.raises(ValueError, match=r"filter: (scheme|noise|initial_noise) of \w+ is '"):
+            with_first_ancestors(filter)
+
     def test_runs_without_first_ancestors(self):
-        filter = mpfjax.particle_filter(SQUARE, 20)
+        filter = mpfjax.particle_filter(SQUARE, 20, **DRAWS)
         plain = mpfjax.run_filter(jax.random.key(0), filter, SQUARES)
         keys = jax.random.split(jax.random.key(0), 2)
         several = mpfjax.monte_carlo(keys, with_first_ancestors(filter), SQUARES)
