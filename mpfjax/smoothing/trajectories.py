@@ -19,6 +19,7 @@ from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.indexing import take
 from mpfjax.running.scan import FilterRun
 from mpfjax.smoothing.backward import draw, draw_exactly, propose, walk
+from mpfjax.smoothing.distinct import warn_of_few
 from mpfjax.smoothing.history import mixtures_of
 from mpfjax.smoothing.marginalised import check_marginalised, sample_marginalised
 
@@ -59,8 +60,10 @@ def sample_trajectories(
 
     Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
     that is not there or dead, and for `num_steps` with "exact"; a RuntimeError where no particle
-    can have moved to the next. Use it where estimates of the past are wanted: the genealogy of the
-    particles (`trace_ancestors`) is exact as well, but has few distinct states of long ago.
+    can have moved to the next. A RuntimeWarning names the share of distinct trajectories where at
+    some time it is below a tenth, since the backward weights degenerate. Use it where estimates of
+    the past are wanted: the genealogy of the particles (`trace_ancestors`) is exact as well, but
+    has few distinct states of long ago.
     """
     check_key(key)
     check_model(model, "sample_trajectories")
@@ -79,14 +82,19 @@ def sample_trajectories(
     if is_marginalised(model) or observations is not None:
         check_marginalised(model, stacked, observations, method)
         observations = as_arrays(observations)
-        return sample_marginalised(
+        drawn = sample_marginalised(
             key, model, stacked, observations, inputs, num_trajectories, component
         )
+        latents = stacked.particles.latent
+        warn_of_few(drawn.latent, latents, stacked.log_weights, "sample_trajectories")
+        return drawn
     if method == "exact":
         num_steps = 0
     elif num_steps is None:
         num_steps = 1
-    return draw_trajectories(key, model, stacked, inputs, num_trajectories, component, num_steps)
+    drawn = draw_trajectories(key, model, stacked, inputs, num_trajectories, component, num_steps)
+    warn_of_few(drawn, stacked.particles, stacked.log_weights, "sample_trajectories")
+    return drawn
 
 
 def _inputs_between(
