@@ -26,6 +26,7 @@ from mpfjax.models.base import (
     starts_from_noise,
 )
 from mpfjax.models.conditionally_linear import with_moments
+from mpfjax.models.inputs import saying_that_none_were_given
 from mpfjax.models.noise import NOISES, draw_noise
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
 from mpfjax.moves.every import Every, with_inner
@@ -166,7 +167,9 @@ class Filter(eqx.Module):
         keys = split_keys(start.key, 1 + len(self._initial_moves))
         particles = start.particles
         if particles is None:
-            particles = sample_initial(keys[0], self.model, self.num_particles, self.initial_noise)
+            with saying_that_none_were_given(self.model):
+                size, noise = self.num_particles, self.initial_noise
+                particles = sample_initial(keys[0], self.model, size, noise)
         memory = {}
         for move in self.moves:
             if isinstance(move, AbstractMove):
@@ -240,7 +243,8 @@ class Filter(eqx.Module):
             if isinstance(move, AbstractMove):
                 resampled |= move.would_resample(mixture, observation)
             after = (self._forgetting,) if isinstance(move, Every) else ()
-            moved = run(move, move_key, mixture, observation, *after)
+            with saying_that_none_were_given(self.model):
+                moved = run(move, move_key, mixture, observation, *after)
             moved = check_result(moved, mixture, move)
             if after:
                 mixture = moved
@@ -268,7 +272,8 @@ class Filter(eqx.Module):
         for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
             if not isinstance(move, AbstractMove):
                 raise ValueError(f"moves: {move!r} does not define predict, for a missing y_t")
-            moved = move.predict(move_key, mixture)
+            with saying_that_none_were_given(self.model):
+                moved = move.predict(move_key, mixture)
             mixture = self._forgetting(check_result(moved, mixture, move))
         increment = jnp.zeros((), mixture.log_weights.dtype)
         return mixture, _report(mixture, increment, jnp.zeros(self.num_components, bool))

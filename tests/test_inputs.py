@@ -15,7 +15,8 @@ import pytest
 from jax.scipy.stats import norm
 
 import mpfjax
-from mpfjax.exact import grid_filter, kalman_filter
+from mpfjax.exact import grid_filter, kalman_filter, kalman_smoother
+from mpfjax.smoothing import sample_trajectories, smoothed_sums
 from tests.marking import thorough
 
 TIMES = np.cumsum([0.3, 1.7, 0.2, 0.2, 2.5, 0.6]).astype(np.float32)
@@ -143,6 +144,11 @@ class TestReferences:
         np.testing.assert_allclose(run.log_marginal_likelihood, log_z, atol=1e-5)
         np.testing.assert_allclose(run.means[:, 0], filtered, atol=1e-5)
 
+    def test_kalman_smoother_with_controls_and_matrices_by_time(self):
+        model, inputs = in_matrices()
+        run = kalman_smoother(model, OBSERVATIONS[:, None], inputs=inputs)
+        np.testing.assert_allclose(run.means[:, 0], truth()[2], atol=1e-5)
+
     def test_grid_filter(self):
         grid = jnp.linspace(-4.0, 5.0, 700)
         run = grid_filter(Driven(), OBSERVATIONS, grid, inputs=INPUTS)
@@ -169,6 +175,43 @@ def test_evidence_and_means_are_unbiased(name):
     for estimates, expected in ((ratios, 1.0), (ratios * run.collected[:, -1], filtered[-1])):
         standard_error = np.std(estimates) / np.sqrt(NUM_RUNS)
         assert abs(np.mean(estimates) - expected) < 4 * standard_error
+
+
+@pytest.mark.parametrize(
+    "method", thorough(["trajectories", "trajectories by mcmc", "sums", "sums by mcmc"])
+)
+def test_smoothed_means_are_those_of_the_kalman_smoother(method):
+    """Of every time, within 4 standard errors over the runs."""
+    model, inputs = in_matrices()
+    expected = kalman_smoother(model, OBSERVATIONS[:, None], inputs=inputs).means[:, 0]
+    filter, name = mpfjax.particle_filter(Driven(), 300), "exact"
+    given = jax.tree.map(jnp.asarray, INPUTS)
+    if method.endswith("mcmc"):
+        name = "mcmc"
+
+    def by_trajectories(key):
+        of_run, of_paths = jax.random.split(key)
+        run = mpfjax.run_filter(of_run, filter, OBSERVATIONS, inputs=given)
+        options = {} if name == "exact" else {"num_steps": 30}
+        paths = sample_trajectories(
+            of_paths, filter.model, run, 300, method=name, inputs=given, **options
+        )
+        return paths.mean(axis=0)
+
+    def by_sums(key):
+        # With a lag of the whole series, each term is smoothed by all observations.
+        found = smoothed_sums(
+            key, filter, OBSERVATIONS, lambda before, after: jnp.stack([before, after], axis=1),
+            lag=LENGTH, method=name, num_draws=2 if name == "exact" else 30, inputs=given,
+        )  # fmt: skip
+        return jnp.concatenate([found.terms[:1, 0], found.terms[:, 1]])
+
+    one = by_sums if method.startswith("sums") else by_trajectories
+    keys = jax.random.split(jax.random.key(8), 120)
+    means = np.asarray(jax.lax.map(one, keys))
+    errors = means.std(axis=0) / np.sqrt(len(keys))
+    assert (errors < 0.01).all()
+    assert (np.abs(means.mean(axis=0) - np.asarray(expected)) < 4 * errors).all()
 
 
 def built_in(dt=0.5, u=1.0):
@@ -371,6 +414,28 @@ class TestRunners:
         mixture = self.FILTER.init(self.KEY)
         with pytest.raises(RuntimeError, match="inputs: NaN or infinite"):
             self.FILTER.step(self.KEY, mixture, OBSERVATIONS[0], inputs=built_in(u=np.nan))
+
+    @pytest.mark.parametrize(
+        "model", [Driven(), *thorough([mpfjax.per_particle(DrivenOfOne())])], ids=["all", "one"]
+    )
+    def test_an_error_where_none_were_given_says_so(self, model):
+        """The model fails on None, by whatever error; models that do without are not refused."""
+        filter = mpfjax.particle_filter(model, 32)
+        mixture = filter.init(self.KEY)
+        for run in (
+            lambda: self.run(filter=filter, inputs=None),
+            lambda: filter.step(self.KEY, mixture, OBSERVATIONS[0]),
+            lambda: mpfjax.forecast(self.KEY, filter, mixture, 2),
+        ):
+            with pytest.raises(TypeError) as caught:
+                run()
+            (note,) = [note for note in caught.value.__notes__ if "inputs" in note]
+            assert "inputs: there are none, so Driven" in note
+        if isinstance(model, Driven):
+            past = self.run(collect=None)
+            with pytest.raises(TypeError) as caught:
+                sample_trajectories(self.KEY, model, past, 5)
+            assert "inputs: there are none" in caught.value.__notes__[-1]
 
     def test_a_model_without_a_place_is_named(self):
         filter = mpfjax.particle_filter(mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0), 4)

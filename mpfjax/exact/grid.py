@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PyTree
 
 from mpfjax.checks import real_arrays
 from mpfjax.models.base import require
-from mpfjax.models.inputs import with_inputs
+from mpfjax.models.inputs import saying_that_none_were_given, with_inputs
 from mpfjax.observations import as_arrays, steps_of_inputs
 from mpfjax.operations.logarithms import log_sum_exp
 
@@ -74,7 +74,8 @@ def grid_filter(
         log_initial = real_arrays("g", log_initial=log_initial)
     length = jax.tree.leaves(observations)[0].shape[0]
     inputs = steps_of_inputs(inputs, length, model)
-    return _grid_filter(model, observations, grid, log_initial, state_shape, inputs)
+    with saying_that_none_were_given(model):
+        return _grid_filter(model, observations, grid, log_initial, state_shape, inputs)
 
 
 @eqx.filter_jit

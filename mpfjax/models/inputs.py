@@ -1,6 +1,8 @@
 """Known inputs u_t, and the models that have a place for them."""
 
+import contextlib
 import copy
+from collections.abc import Iterator
 from typing import Any
 
 from jaxtyping import PyTree
@@ -37,3 +39,26 @@ def replaced(model: Any, **fields: Any) -> Any:
     for name, value in fields.items():
         object.__setattr__(changed, name, value)
     return changed
+
+
+@contextlib.contextmanager
+def saying_that_none_were_given(model: Any) -> Iterator[None]:
+    """Add to an error about None that the model's field `inputs` is None.
+
+    A model may do without inputs. So whether it needs them is known only where it fails.
+    """
+    try:
+        yield
+    except Exception as error:
+        while not hasattr(model, "inputs"):  # of one particle, or of one object
+            model = getattr(model, "model", getattr(model, "object_model", error))
+            if model is error:
+                raise
+        note = (
+            f"mpfjax: inputs: there are none, so {type(model).__name__}.inputs is None; give"
+            " u_1, ..., u_t by inputs=... (x_0 has no input)"
+        )
+        said = getattr(error, "__notes__", [])
+        if model.inputs is None and "None" in str(error) and note not in said:
+            error.add_note(note)
+        raise

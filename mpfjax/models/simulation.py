@@ -8,7 +8,7 @@ from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import as_numbers, check_key, check_whole, shown
 from mpfjax.models.base import check_moved, check_states, model_name, require
-from mpfjax.models.inputs import takes_inputs, with_inputs
+from mpfjax.models.inputs import saying_that_none_were_given, takes_inputs, with_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 
@@ -28,7 +28,8 @@ def simulate(
                 f"inputs: the leading axis of a leaf of shape {leaf.shape} is not num_steps,"
                 f" {num_steps}"
             )
-    return with_floats_traced(lambda model: _simulate(key, model, num_steps, inputs), model)
+    with saying_that_none_were_given(model):
+        return with_floats_traced(lambda model: _simulate(key, model, num_steps, inputs), model)
 
 
 @jit_on_wide_vectors

@@ -13,7 +13,7 @@ from mpfjax.filter import split_keys
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
-from mpfjax.models.inputs import with_inputs
+from mpfjax.models.inputs import saying_that_none_were_given, with_inputs
 from mpfjax.observations import as_arrays, steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.indexing import take
@@ -92,7 +92,9 @@ def sample_trajectories(
         num_steps = 0
     elif num_steps is None:
         num_steps = 1
-    drawn = draw_trajectories(key, model, stacked, inputs, num_trajectories, component, num_steps)
+    options = (num_trajectories, component, num_steps)
+    with saying_that_none_were_given(model):
+        drawn = draw_trajectories(key, model, stacked, inputs, *options)
     warn_of_few(drawn, stacked.particles, stacked.log_weights, "sample_trajectories")
     return drawn
 
