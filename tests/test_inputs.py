@@ -268,7 +268,7 @@ EVERYWHERE = {
         lambda joint: mpfjax.clustered_particle_filter(joint, 32, start="together")
     ),
 }  # fmt: skip
-QUICK = ("guided mpf rqmc", "look-ahead", "clusters")
+QUICK = ("guided mpf rqmc", "clusters")
 
 
 @pytest.mark.parametrize(
@@ -301,7 +301,9 @@ class Drawn(mpfjax.AbstractStateSpaceModel):
         return norm.logpdf(observation, states - self.inputs, 1.0)
 
 
-@pytest.mark.parametrize(("per_object", "shared"), [(True, True), (True, False), (False, False)])
+@pytest.mark.parametrize(
+    ("per_object", "shared"), [(True, False), *thorough([(True, True), (False, False)])]
+)
 def test_objects_have_one_input_or_their_own(per_object, shared):
     shift = jnp.array([1.0, 2.0, 3.0]) if per_object else jnp.array(1.0)
     model = mpfjax.MultiObjectModel(

@@ -175,8 +175,9 @@ def expected(name, shift=0.0):
 KINDS = FLOATS | WHOLE | NO_NUMBERS | BEYOND
 CASES = [(name, kind) for name in TAKEN | RUN for kind in KINDS]
 # One of each kind, and of what runs a filter those that share its program.
-QUICK = [(name, kind) for name in TAKEN for kind in (">f4", "u1", "complex", "masked", *BEYOND)]
-QUICK += [(name, kind) for name in ("run_filter", "step") for kind in (">f4", *NO_NUMBERS)]
+QUICK = [(name, kind) for name in TAKEN for kind in ("u1", "masked")]
+QUICK += [("crps", kind) for kind in (">f4", "complex", *BEYOND)]
+QUICK += [(name, kind) for name in ("run_filter", "step") for kind in (">f4", "timedelta")]
 
 
 @pytest.mark.parametrize(("name", "kind"), quick_of(CASES, QUICK))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import mpfjax
+from tests.marking import thorough
 from tests.user_models import TrickyQuadraticModel, nothing_traced
 
 FILTER = mpfjax.particle_filter(TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0), 8)
@@ -35,7 +36,7 @@ def test_a_run_is_the_same_with_a_bar_that_ends_at_its_last_step(capsys):
     assert last_count(capsys.readouterr()) == ("130", "130")
 
 
-@pytest.mark.parametrize("num_particles", [8, 1000])
+@pytest.mark.parametrize("num_particles", [8, *thorough([1000])])
 def test_many_runs_count_together(capsys, num_particles):
     """Under one vmap, and shared by threads."""
     filter = mpfjax.particle_filter(FILTER.model, num_particles)

@@ -43,7 +43,7 @@ class Watch(AbstractRejuvenation):
         return {"parents": jnp.zeros((64, 2))}
 
 
-@pytest.mark.parametrize("move", [RandomWalkMetropolis, MetropolisAdjustedLangevin])
+@pytest.mark.parametrize("move", [RandomWalkMetropolis, *thorough([MetropolisAdjustedLangevin])])
 def test_a_move_leaves_the_target_as_it_is(move):
     """Of exact draws from p(x_1 | x_0, y_1), many steps later: the mean and the covariance."""
     n = 4000
@@ -79,6 +79,7 @@ def test_parents_follow_their_particles():
     assert len(np.unique(after.ancestor_indices)) > 3
 
 
+@pytest.mark.thorough
 def test_stages_halve_the_error_where_the_likelihood_is_narrow():
     """In four dimensions, log Ẑ of 200 particles against Kalman's; times are in `benchmarks`."""
     eye = jnp.eye(4)
