@@ -27,7 +27,9 @@ pytestmark = [
 ]
 
 NUM_FRAMES = 7
-FIELDS = ["frames", "objects", "seconds", "frames_per_second", "peak_memory_mb"]
+FIELDS = [
+    "frames", "objects", "frames_without_room", "seconds", "frames_per_second", "peak_memory_mb"
+]  # fmt: skip
 SCORES = ["HOTA", "MOTA", "IDF1"]
 SMALL = ("--max-objects", 3)
 

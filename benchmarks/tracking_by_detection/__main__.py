@@ -42,6 +42,7 @@ from mpfjax.vision import boxes as box_files
 from mpfjax.vision import frames
 from mpfjax.vision.detectors import Rows
 from mpfjax.vision.loop import make_tracker, online_rows, track
+from mpfjax.vision.sequences import detection_files, last_frame, read_sequence_info
 from mpfjax.vision.truth import Truth, read_truth
 
 OURS = {"gm_mpf": "GM-MPF", "mpf": "MPF"}
@@ -60,6 +61,7 @@ class Sequence(NamedTuple):
     last: int
     frames_per_second: float | None
     source: Path | np.ndarray | None
+    frame_size: tuple[int, int] | None = None
 
     def stills(self) -> Iterator[np.ndarray] | None:
         """The frames, or None where there are detections alone."""
@@ -112,22 +114,23 @@ def open_sequences(options: argparse.Namespace) -> list[Sequence]:
             raise ValueError(f"DIR: {folder} is not a folder")
         held = frames.num_images(folder)
         truth_path = _first_file(folder, "gt.txt", "gt/gt.txt")
-        files = sorted(folder.glob("det*.txt")) + sorted(folder.glob("det/det*.txt"))
+        files = detection_files(folder)
         if 0 < held < first or truth_path is None or not files:
             raise ValueError(
                 f"DIR: {folder} holds {held} images, {len(files)} files det*.txt and"
                 f" {'a' if truth_path else 'no'} gt.txt; the files are needed, and frame {first}"
             )
         whole = read_truth(truth_path)
-        rate = options.fps or frames.frame_rate(folder)
+        info = read_sequence_info(folder)
         for path in files:
             rows = box_files.read_detections(path)
-            # Without pixels a recording ends with what was detected or labelled last.
-            count = held or int(max(rows[:, 0].max(), whole.objects[:, 0].max()))
+            count = held or last_frame(info, rows, whole.objects)
             end = max(min(last or count, count), first)
             source = folder if held else None
             rows, truth = _between(rows, first, end), whole.between(first, end)
-            found.append(Sequence(folder.name, path.name, rows, truth, first, end, rate, source))
+            rate = options.fps or info.frame_rate
+            where = (first, end, rate, source, info.size)
+            found.append(Sequence(folder.name, path.name, rows, truth, *where))
     return found
 
 
@@ -182,7 +185,7 @@ def _ours(
     options: argparse.Namespace, sequence: Sequence, filter: str, least: float | None
 ) -> Iterator[Run]:
     """A run for each seed; compiling, in the first frame, is not timed."""
-    rows = Rows(sequence.rows, sequence.first)
+    rows = Rows(sequence.rows, sequence.first, sequence.last)
     tracker = make_tracker(filter, rows.most_objects(), sequence.frames_per_second)
     for number in range(options.seed, options.seed + options.seeds):
         clock, stills = Clock("read", "track"), sequence.stills()
@@ -190,6 +193,7 @@ def _ours(
             None if stills is None else clock.over("read", stills), rows, tracker,
             key=jax.random.key(number),
             first=sequence.first, min_score=least, use_colours=not options.no_colour,
+            frame_size=sequence.frame_size,
         )  # fmt: skip
         kept, compiling = [], 0.0
         bar = tqdm(total=sequence.last - sequence.first + 1, desc=OURS[filter], disable=None)

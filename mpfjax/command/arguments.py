@@ -11,30 +11,46 @@ from mpfjax.command.scoring import find_truth
 from mpfjax.console import finite, positive, refuse_overwriting, seed, whole
 from mpfjax.vision import boxes as box_files
 from mpfjax.vision import frames
+from mpfjax.vision.sequences import (
+    SequenceInfo,
+    detection_files,
+    last_frame,
+    read_sequence_info,
+    sequence_of,
+)
 from mpfjax.vision.truth import Truth
 
 DESCRIPTION = """\
 Track objects in a video or a folder of images. What to track comes from one of three: detections
-in a file, whatever moves before a still camera, or boxes drawn in the first frame.
+in a file, whatever moves before a still camera, or boxes drawn in the first frame. A file of
+detections alone, or a folder with such a file and no images, is tracked without pixels.
 """
 EXAMPLES = """\
 examples:
   mpfjax track match.mp4 --detections match.txt --out tracks
+  mpfjax track match.txt --fps 25 --out tracks
   mpfjax track street/ --detect --out tracks
   mpfjax track street/ --box 120,80,30,70 --box 200,90,28,66 --out tracks
 """
 
+SOURCE = "a video, a folder of images, or detections: a file of them, or a folder with det.txt"
 TRACKS, VIDEO, SUMMARY = OUTPUTS = ("tracks.txt", "tracking.mp4", "summary.json")
+
+
+_TEXT = (".txt", ".csv")
 
 
 class Source(NamedTuple):
     """The frames to track in, and what is known of them beforehand."""
 
     path: Path
+    has_pixels: bool
+    rows: np.ndarray | None  # detections; None where they are yet to be found
     first: int  # the number of the first frame
     last: int | None  # None where only reading on will tell
     num_frames: int | None
     frames_per_second: float | None
+    frame_size: tuple[int, int] | None  # None where only the frames tell
     truth: Truth | None
 
 
@@ -51,9 +67,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    track.add_argument("source", type=Path, metavar="SOURCE", help="a video, or a folder of images")
+    track.add_argument("source", type=Path, metavar="SOURCE", help=SOURCE)
     track.add_argument("--out", type=Path, required=True, metavar="DIR", help="where results go")
-    what = track.add_mutually_exclusive_group(required=True)
+    what = track.add_mutually_exclusive_group()
     what.add_argument(
         "--detections", type=Path, metavar="FILE", help="MOTChallenge rows, with scores if any"
     )
@@ -86,6 +102,8 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         help="write an object's first frames too, from before it was believed in",
     )
     options = parser.parse_args(arguments)
+    if not (options.detections or options.detect or options.box) and _has_pixels(options.source):
+        track.error("one of the arguments --detections --detect --box is required")
     if options.box is not None:
         for name in ("filter", "max_objects", "min_score", "no_colour", "offline"):
             if getattr(options, name):
@@ -98,36 +116,74 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
 def open_source(options: argparse.Namespace) -> Source:
     """Where the frames are, or a `ValueError` that names what is wrong."""
     first, last = frames.parse_range(options.frames, "--frames")
-    path = options.source
+    path, has_pixels = options.source, _has_pixels(options.source)
     if not path.exists():
         raise ValueError(f"SOURCE: {path} is neither a video nor a folder of images")
-    written = [name for name in OUTPUTS if not (options.no_video and name == VIDEO)]
+    detections = options.detections if has_pixels else _detections_alone(options)
+    written = [name for name in OUTPUTS if name != VIDEO or (has_pixels and not options.no_video)]
     refuse_overwriting(
         options.out,
         written,
-        {"SOURCE": path, "--detections": options.detections, "--truth": options.truth},
+        {"SOURCE": path, "--detections": detections, "--truth": options.truth},
     )
-    num_frames = None
-    if path.is_dir():
-        held = frames.num_images(path)
-        if held < first:
-            raise ValueError(f"SOURCE: {path} holds {held} images, and no frame {first}")
-        num_frames = min(last or held, held) - first + 1
+    rows = None if detections is None else _read_detections(options, detections)
+    folder, info, num_frames = path, SequenceInfo(), None
+    if not has_pixels:
+        folder = path if path.is_dir() else sequence_of(path) or path
+        info = read_sequence_info(folder)
+    truth = find_truth(folder, options.truth, first, last)
+    if not has_pixels:
+        known = (rows, None if truth is None else truth.objects)
+        end = last_frame(info, *(found for found in known if found is not None))
+        num_frames = _num_frames(path, end, "frames", first, last)
+        last = first + num_frames - 1
+    elif path.is_dir():
+        num_frames = _num_frames(path, frames.num_images(path), "images", first, last)
     elif last is not None:
         num_frames = last - first + 1
-    rate = options.fps or frames.frame_rate(path)
-    truth = find_truth(path, options.truth, first, last)
-    return Source(path, first, last, num_frames, rate, truth)
+    if rows is not None and options.frames is not None and last is not None:
+        rows = rows[rows[:, 0] <= last]
+    rate = options.fps or (frames.frame_rate(path) if has_pixels else info.frame_rate)
+    return Source(path, has_pixels, rows, first, last, num_frames, rate, info.size, truth)
 
 
-def read_detections(options: argparse.Namespace, source: Source) -> np.ndarray:
-    """The rows of the file of detections, without those after the frames that were asked for."""
-    if not options.detections.is_file():
-        raise ValueError(f"--detections: {options.detections} is not a file")
-    rows = box_files.read_detections(options.detections)
+def _has_pixels(path: Path) -> bool:
+    """Whether there are frames to see, and not detections alone."""
+    if path.is_dir():
+        return frames.num_images(path) > 0 or not detection_files(path)
+    return path.suffix.lower() not in _TEXT
+
+
+def _detections_alone(options: argparse.Namespace) -> Path:
+    """The file of detections where there are no pixels: that of the folder, or the source."""
+    path = options.source
+    for name in ("detect", "box"):
+        if getattr(options, name):
+            raise ValueError(f"--{name}: {path} holds no images to look at")
+    if path.is_file():
+        if options.detections is not None:
+            raise ValueError(f"--detections: not allowed where SOURCE, {path}, is such a file")
+        return path
+    files = detection_files(path)
+    files = [file for file in files if file.name == "det.txt"] or files
+    if options.detections is None and len(files) > 1:
+        raise ValueError(f"SOURCE: {path} holds {len(files)} files of detections; name one of them")
+    return options.detections or files[0]
+
+
+def _num_frames(path: Path, held: int, what: str, first: int, last: int | None) -> int:
+    if held < first:
+        raise ValueError(f"SOURCE: {path} holds {held} {what}, and no frame {first}")
+    return min(last or held, held) - first + 1
+
+
+def _read_detections(options: argparse.Namespace, path: Path) -> np.ndarray:
+    if not path.is_file():
+        raise ValueError(f"--detections: {path} is not a file")
+    rows = box_files.read_detections(path)
     if options.min_score is not None and rows.shape[1] < 7:
-        raise ValueError(f"--min-score: {options.detections} has no scores")
-    return rows if source.last is None else rows[rows[:, 0] <= source.last]
+        raise ValueError(f"--min-score: {path} has no scores")
+    return rows
 
 
 def read_boxes(options: argparse.Namespace, still: np.ndarray) -> np.ndarray:

@@ -16,7 +16,6 @@ from mpfjax.command.arguments import (
     Source,
     open_source,
     read_boxes,
-    read_detections,
 )
 from mpfjax.command.scoring import SCORES, scores_of
 from mpfjax.console import Clock, format_table, peak_memory, write_json
@@ -39,6 +38,7 @@ class Results:
         self.rows: list[np.ndarray] = []
         self.kept: list[Tracks] = []  # for --offline alone
         self.num_frames = 0
+        self.without_room = 0  # frames with more objects than there is room for
         self.drawn: np.ndarray | None = None  # the boxes of --box
 
     def add(self, tracks: Tracks) -> np.ndarray:
@@ -48,6 +48,7 @@ class Results:
         if self.options.offline:
             self.kept.append(tracks)
         self.num_frames += 1
+        self.without_room += bool(tracks.full)
         if self.num_frames == 1:
             self.compiling = self._working()
         return rows
@@ -69,6 +70,7 @@ class Results:
         summary = {
             "frames": n,
             "objects": len(np.unique(rows[:, 1])),
+            "frames_without_room": self.without_room,
             "seconds": {part: round(seconds, 3) for part, seconds in clock.seconds.items()},
             "frames_per_second": round(rate, 2),
             "peak_memory_mb": round(peak_memory(), 1),
@@ -81,10 +83,7 @@ def run(options: argparse.Namespace) -> None:
     """Track, and leave behind what was done, also where it ends before the frames do."""
     source = open_source(options)
     results = Results(options, source)
-    still = next(frames.read_frames(source.path, source.first, source.first), None)
-    if still is None:
-        raise ValueError(f"SOURCE: {source.path} has no frame {source.first}")
-    start = _start(results, still)
+    start = _start(results, _first_still(source) if source.has_pixels else None)
     options.out.mkdir(parents=True, exist_ok=True)
     try:
         _track(results, start)
@@ -98,25 +97,32 @@ def run(options: argparse.Namespace) -> None:
             print(f"written to {options.out}")
 
 
-# What makes tracks of stills that are seen once, one after the other.
-Start = Callable[[Iterable[np.ndarray], Clock], Iterator[Tracks]]
+def _first_still(source: Source) -> np.ndarray:
+    still = next(frames.read_frames(source.path, source.first, source.first), None)
+    if still is None:
+        raise ValueError(f"SOURCE: {source.path} has no frame {source.first}")
+    return still
 
 
-def _start(results: Results, still: np.ndarray) -> Start:
+# What makes tracks of stills that are seen once, one after the other, or without any.
+Start = Callable[[Iterable[np.ndarray] | None, Clock], Iterator[Tracks]]
+
+
+def _start(results: Results, still: np.ndarray | None) -> Start:
     """The tracker that was asked for; everything that can be wrong with it is found here."""
     options, source = results.options, results.source
     key = jax.random.key(options.seed)
-    if options.box is not None:
+    if options.box is not None and still is not None:
         boxes = results.drawn = read_boxes(options, still)
-        return lambda stills, clock: follow_boxes(stills, boxes, key=key)
-    rows = None if options.detect else Rows(read_detections(options, source), source.first)
+        return lambda stills, clock: follow_boxes(stills or (), boxes, key=key)
+    rows = None if source.rows is None else Rows(source.rows, source.first, source.last)
     room = LEAST_ROOM if rows is None else rows.most_objects()
     tracker = make_tracker(
         options.filter or "gm_mpf", options.max_objects or room, source.frames_per_second
     )
     detector = BackgroundSubtraction() if options.detect else None
 
-    def tracks(stills: Iterable[np.ndarray], clock: Clock) -> Iterator[Tracks]:
+    def tracks(stills: Iterable[np.ndarray] | None, clock: Clock) -> Iterator[Tracks]:
         return track(
             stills,
             rows if detector is None else _timed(detector.detect, clock),
@@ -125,6 +131,7 @@ def _start(results: Results, still: np.ndarray) -> Start:
             first=source.first,
             min_score=options.min_score,
             use_colours=not options.no_colour,
+            frame_size=source.frame_size,
         )
 
     return tracks
@@ -150,13 +157,14 @@ def _track(results: Results, start: Start) -> None:
             yield still
 
     video = contextlib.nullcontext(None)
-    if not options.no_video:
+    if source.has_pixels and not options.no_video:
         rate = source.frames_per_second or 10.0
         video = frames.open_video(options.out / VIDEO, rate)
     bar = tqdm(total=source.num_frames, desc="Tracking", unit="frame", disable=None)
     with contextlib.ExitStack() as opened, video as append, bar:
         file = None
-        for tracks in clock.over("track", start(watched(), clock)):
+        stills = watched() if source.has_pixels else None
+        for tracks in clock.over("track", start(stills, clock)):
             rows = results.add(tracks)
             with clock.of("write"):
                 if file is None:

@@ -84,13 +84,17 @@ def read_detections(path: str | Path) -> Float[np.ndarray, "rows columns"]:
 
     The id, -1 in such files, means nothing. Without scores, in files of six columns, there are six
     columns here as well. Raises `ValueError` naming the file and the line where one does not parse,
-    holds a number that is not finite, or has a score where others have none, and where the file
-    holds no detection at all.
+    holds a number that is not finite, lies in a frame before 1, or has a score where others have
+    none, and where the file holds no detection at all.
     """
     check_type((str, Path), "a path", path=path)
     rows: list[list[float]] = []
     for number, line in numbered_lines(path):
         row = _parse_detection(path, number, line)
+        if row[0] < 1:
+            raise ValueError(
+                f"{path}, line {number}: lies in frame {row[0]:.0f}, and frames count from 1"
+            )
         if rows and len(row) != len(rows[0]):
             raise ValueError(f"{path}, line {number}: has a score, or none, unlike those before it")
         rows.append(row)

@@ -13,7 +13,7 @@ from mpfjax.checks import check_finite, check_whole, given, saying, shown, to_ro
 # MOTChallenge's columns: frame, id, x, y, w, h, and the score, where there is one.
 _BOX, _SCORE = slice(2, 6), 6
 # A tracker made for rows of detections has room for so many objects, and for no more than that.
-LEAST_ROOM, MOST_ROOM = 24, 128
+LEAST_ROOM, MOST_ROOM = 24, 1024
 
 
 class Found(NamedTuple):
@@ -62,10 +62,15 @@ def as_detector(detections: Any, first: int = 1) -> AbstractDetector:
 
 
 class Rows(AbstractDetector):
-    """Rows (frame, id, x, y, w, h, score) as MOTChallenge files have them; the id is not read."""
+    """Rows (frame, id, x, y, w, h, score) as MOTChallenge files have them; the id is not read.
 
-    def __init__(self, rows: Float[np.ndarray, "r columns"], first: int = 1) -> None:
-        check_whole(0, first=first)
+    Frames count from 1. Without pixels `last` is the last frame, by default that of the last row.
+    """
+
+    def __init__(
+        self, rows: Float[np.ndarray, "r columns"], first: int = 1, last: int | None = None
+    ) -> None:
+        check_whole(0, first=first, **given(last=last))
         if rows.ndim != 2 or not (rows.size == 0 or 6 <= rows.shape[1] <= 10):
             raise ValueError(
                 f"detections: shape {rows.shape} is not that of rows frame,id,x,y,w,h and,"
@@ -73,13 +78,19 @@ class Rows(AbstractDetector):
             )
         rows = to_rows(rows.shape[1], "detections", rows) if rows.size else np.zeros((0, 7))
         bad = ~np.isfinite(rows[:, : _SCORE + 1]).all(axis=1) | (rows[:, 0] % 1 != 0)
-        for row in rows[bad][:1]:
+        for number in np.flatnonzero(bad)[:1]:
             raise ValueError(
-                f"detections: {shown(row)} is not finite, or its frame is no whole number"
+                f"detections: row {number}, {shown(rows[number])}, is not finite, or its frame is"
+                " no whole number"
+            )
+        for number in np.flatnonzero(rows[:, 0] < 1)[:1]:
+            raise ValueError(
+                f"detections: row {number} lies in frame {rows[number, 0]:.0f}, and frames count"
+                " from 1"
             )
         self.first = first
         self.frames = rows[:, 0].astype(int)
-        self.last = int(self.frames.max(initial=0))
+        self.last = int(self.frames.max(initial=0)) if last is None else last
         order = np.argsort(self.frames, kind="stable")
         self._rows, self._sorted = rows[order], self.frames[order]
 
@@ -93,12 +104,10 @@ class Rows(AbstractDetector):
         return Found(rows[:, _BOX], scores)
 
     def warn_of_the_rest(self, last: int) -> None:
-        """Warn of rows after the last frame, and of rows before the first that may be."""
-        late, early = int(np.sum(self.frames > last)), int(np.sum(self.frames < 1))
+        """Warn of rows after the last frame."""
+        late = int(np.sum(self.frames > last))
         if late:
             _warn(f"detections: {late} lie in frames after the last, {last}, and were left out")
-        if early:
-            _warn(f"detections: {early} lie in frames before 1, the first, and were left out")
 
     def most_objects(self) -> int:
         """Half as many again as are detected in all but the fullest frames."""
@@ -145,12 +154,13 @@ class Sieve:
 
     Detections that are too weak are left out silently; those of no area, and those wholly outside
     the frame, with a warning. Raises `ValueError` for what is not finite, for scores that do not
-    fit, and where there are none to compare with `min_score`.
+    fit, and where there are none to compare with `min_score`. `frame_size` is height and width,
+    where there are no pixels to tell them.
     """
 
-    def __init__(self, min_score: float | None) -> None:
+    def __init__(self, min_score: float | None, frame_size: tuple[int, int] | None = None) -> None:
         check_finite(**given(min_score=min_score))
-        self.min_score = min_score
+        self.min_score, self.frame_size = min_score, frame_size
         self.once = Once()
 
     def __call__(self, found: Found, number: int, frame: np.ndarray | None) -> Found:
@@ -167,8 +177,9 @@ class Sieve:
         if flat.any():
             self.once.warn("flat", f"detections: frame {number} has boxes of no area; left out")
         keep &= ~flat
-        if frame is not None:
-            height, width = frame.shape[:2]
+        frame_size = self.frame_size if frame is None else frame.shape[:2]
+        if frame_size is not None:
+            height, width = frame_size
             far = boxes[:, :2] + boxes[:, 2:]
             inside = (far > 0).all(axis=1) & (boxes[:, 0] < width) & (boxes[:, 1] < height)
             if np.any(keep & ~inside):

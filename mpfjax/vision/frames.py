@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mpfjax.checks import check_positive, check_shape, check_type, check_whole, given
+from mpfjax.vision.sequences import read_sequence_info
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp")
 # Where sequences keep their images; MOTChallenge's have the second.
@@ -77,7 +78,7 @@ def frame_rate(path: str | Path) -> float | None:
     check_type((str, Path), "a path", path=path)
     path = Path(path)
     if path.is_dir():
-        return _rate_of_folder(path)
+        return read_sequence_info(path, path.parent).frame_rate
     if path.suffix.lower() == ".gif":
         with _naming(path, "a video"):
             rate = _imageio().immeta(path, plugin="pillow").get("fps")
@@ -190,15 +191,6 @@ def _even(frame: np.ndarray) -> np.ndarray:
     """Pad to an even height and width, which the pixel format of an MP4 needs."""
     height, width, _ = frame.shape
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-
-
-def _rate_of_folder(folder: Path) -> float | None:
-    for place in (folder, folder.parent):
-        if (place / "seqinfo.ini").is_file():
-            text = (place / "seqinfo.ini").read_text(encoding="utf-8", errors="replace")
-            found = re.search(r"^frameRate\s*=\s*(\d+(?:\.\d+)?)\s*$", text, re.MULTILINE)
-            return float(found[1]) or None if found else None
-    return None
 
 
 def _image_paths(folder: Path) -> list[Path]:

@@ -29,6 +29,7 @@ def track(
     min_score: float | None = None,
     max_detections: int | None = None,
     use_colours: bool = True,
+    frame_size: tuple[int, int] | None = None,
 ) -> Iterator[Tracks]:
     """Track what a detector finds in a video: yields the `Tracks` of each frame as it comes.
 
@@ -51,6 +52,7 @@ def track(
     - `max_detections`: room in a frame, of which the strongest are kept; None takes twice the
       tracker's objects.
     - `use_colours`: with False the tracker sees no pixels, and only the detector does.
+    - `frame_size`: height and width, to tell what lies outside where there are no frames.
 
     The tracks of each frame are NumPy arrays. Boxes of no area or outside the frame are left out
     with a warning, as are detections in frames that do not come; there is a warning too where
@@ -62,9 +64,12 @@ def track(
         check_type(Iterable, "frames one after the other, or None", frames=frames)
     check_flag(use_colours=use_colours)
     check_whole(first=first, **given(max_detections=max_detections))
+    if frame_size is not None:
+        height, width = frame_size
+        check_whole(**{"frame_size's height": height, "frame_size's width": width})
     if frames is None and callable(detections):
         raise ValueError("detections: a detector has nothing to look at where frames is None")
-    detector, sieve = as_detector(detections, first), Sieve(min_score)
+    detector, sieve = as_detector(detections, first), Sieve(min_score, frame_size)
     if tracker is None:
         tracker = ObjectTracker(detector.most_objects())
     check_type(ObjectTracker, "an ObjectTracker", tracker=tracker)
@@ -142,6 +147,7 @@ def _observed(
         try:
             found = detector.find(number, None)
         except StopIteration:
+            detector.warn_of_the_rest(number - 1)
             return
         yield number, None, found
 

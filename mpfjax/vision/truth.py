@@ -1,6 +1,5 @@
 """The ground truth of a sequence: what is to be found, and what counts for nothing."""
 
-import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +9,7 @@ from jaxtyping import Float
 from mpfjax.checks import check_type, shown
 from mpfjax.metrics.tracking_scores import IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT
 from mpfjax.vision.boxes import numbered_lines, parse_track
+from mpfjax.vision.sequences import read_sequence_info
 
 # MOTChallenge's classes: 1 are pedestrians, and who tracks one of these is not to blame. Rows of
 # the others (vehicles, occluders) only stand in the way when boxes are matched.
@@ -127,10 +127,4 @@ def _ignore_file(path: Path) -> Float[np.ndarray, "r 6"]:
 def _name_of(truth: Path) -> str:
     """The name in the `seqinfo.ini` of the sequence, or that of its folder."""
     folder = truth.parent.parent if truth.parent.name == "gt" else truth.parent
-    info = folder / "seqinfo.ini"
-    if info.is_file():
-        text = info.read_text(encoding="utf-8", errors="replace")
-        found = re.search(r"^name\s*=\s*(\S+)\s*$", text, re.MULTILINE)
-        if found:
-            return found[1]
-    return folder.resolve().name
+    return read_sequence_info(folder).name or folder.resolve().name

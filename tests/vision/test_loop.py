@@ -2,12 +2,13 @@
 
 import itertools
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
 
 from mpfjax.metrics import multi_object_scores
-from mpfjax.vision import ObjectTracker, Tracks, football_scene, track
+from mpfjax.vision import Detections, ObjectTracker, Tracks, football_scene, track
 from mpfjax.vision.detectors import LEAST_ROOM, MOST_ROOM, Rows
 from mpfjax.vision.drawn import follow_boxes
 from mpfjax.vision.loop import make_tracker, offline_rows, online_rows
@@ -317,7 +318,20 @@ def test_room_is_made_for_what_a_file_holds():
     assert Rows(crowd).most_objects() == 64
     burst = np.concatenate([crowd, np.tile(crowd[:1], (2000, 1))])
     assert Rows(burst).most_objects() == 64
-    assert Rows(np.tile(crowd, (10, 1))).most_objects() == MOST_ROOM
+    assert Rows(np.tile(crowd, (10, 1))).most_objects() == 600
+    assert Rows(np.tile(crowd, (50, 1))).most_objects() == MOST_ROOM
+
+
+def test_the_second_frame_is_tracked_by_the_program_of_the_first():
+    """A number of another kind in the state would compile all of it anew."""
+    before, found = TRACKER.init(), Detections.from_boxes(np.ones((1, 4)), 6)
+    after, _ = eqx.filter_eval_shape(TRACKER.step, jax.random.key(0), before, None, found)
+    kinds = [
+        jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type), state)
+        for state in (before, after)
+    ]
+    assert jax.tree.leaves(kinds[0]) == jax.tree.leaves(kinds[1])
+    assert jax.tree.structure(before) == jax.tree.structure(after)
 
 
 def test_trackers_are_made_by_the_name_of_their_filter():

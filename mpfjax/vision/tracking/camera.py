@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from mpfjax.checks import check_positive, check_share
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
+from mpfjax.operations.floats import default_float
 from mpfjax.operations.indexing import take
 from mpfjax.vision.tracking.assignment import Assign
 from mpfjax.vision.tracking.memory import CAMERA, LIVES, SCORES, Camera, noises_of, remember
@@ -48,7 +49,7 @@ class FollowCamera(AbstractMove):
     def initial_memory(self, num_components: int) -> dict[str, Camera]:
         """A camera that stands nearly still."""
         del num_components
-        return {CAMERA: Camera(jnp.zeros(2), jnp.full(2, 0.02))}
+        return {CAMERA: Camera(jnp.zeros(2), jnp.full(2, 0.02, default_float()))}
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
