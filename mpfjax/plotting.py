@@ -302,10 +302,7 @@ def draw_climbs(
 
 
 def standard_error(values: np.ndarray) -> np.ndarray:
-    """The standard error of the mean over the leading axis, of runs: s / √n, with n - 1 in s².
-
-    NaN, which draws nothing, where there is one run. Use it for the bands of a figure.
-    """
+    """s / √n of runs, (n, ...), with n - 1 in s²; NaN, which draws nothing, where n is 1."""
     if len(values) < 2:
         return np.full(values.shape[1:], np.nan)
     return np.asarray(values.std(axis=0, ddof=1) / np.sqrt(len(values)))
