@@ -134,5 +134,5 @@ def test_input_without_a_score(tracks, truth, frames, message):
 
 def test_a_missing_trackeval_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "trackeval", None)
-    with pytest.raises(ImportError, match=r"mpfjax\[trackeval\]"):
+    with pytest.raises(ImportError, match="pip install trackeval"):
         multi_object_scores(TRUTH, TRUTH)

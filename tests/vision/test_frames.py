@@ -209,14 +209,14 @@ def test_another_ending_is_named(tmp_path):
 
 def test_a_missing_imageio_says_how_to_install_it(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio.v3", None)
-    with pytest.raises(ImportError, match=r'pip install "mpfjax\[video\]"'):
+    with pytest.raises(ImportError, match=r'pip install "imageio\[ffmpeg\]"'):
         next(read_frames(folder))
 
 
 def test_a_missing_pyav_says_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     (tmp_path / "video.mp4").write_bytes(b"a video")
-    with pytest.raises(ImportError, match=r'pip install "mpfjax\[video\]"'):
+    with pytest.raises(ImportError, match="pip install av"):
         next(read_frames(tmp_path / "video.mp4"))
 
 
