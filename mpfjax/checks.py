@@ -31,7 +31,9 @@ def check_whole(least: int = 1, /, **arguments: Any) -> None:
     It fits into 32 bits, which indices have.
     """
     for name, value in arguments.items():
-        is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        # numpy counts a duration among its integers.
+        is_whole = isinstance(value, int | np.integer)
+        is_whole = is_whole and not isinstance(value, bool | np.timedelta64)
         if not is_whole or value < least:
             raise ValueError(f"{name}: {shown(value)} is not a whole number of at least {least}")
         if value > _MOST:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
+from mpfjax.observations import Series
 from mpfjax.running.devices import over_devices
 from mpfjax.running.islands import _run_block, _run_on_one
 
@@ -66,7 +67,7 @@ def islands(devices=None):
 def compiled_islands(num_particles):
     """The program of islands on all devices, a line an instruction."""
     keys = jax.random.split(jax.random.key(1), NUM_ISLANDS)
-    arguments = (islands_filter(num_particles), observations(), None, of_components)
+    arguments = (islands_filter(num_particles), Series(observations()), of_components)
     run = jax.jit(
         lambda keys: over_devices(_run_block, _run_on_one, keys, arguments, jax.devices())
     )

@@ -139,7 +139,15 @@ BUILT = {
         {"transition_matrix": EYE, "F": EYE, "Q": EYE, "H": EYE, "R": EYE, "m0": np.zeros(1),
          "P0": EYE, "b": None, "c": np.zeros(1), "initial_probabilities": np.ones(1)},
     ),
-    "Weigh": (mpfjax.Weigh, {"model": MODEL}),
+    "Weigh": (mpfjax.Weigh, {"model": MODEL, "exponent": 0.5}),
+    **{
+        move.__name__: (
+            move,
+            {"model": MODEL, "num_steps": 2, "least_step": 0.1, "exponent": 0.5,
+             "gradient": "none"},
+        )
+        for move in (mpfjax.RandomWalkMetropolis, mpfjax.MetropolisAdjustedLangevin)
+    },
     "PropagateFamilies": (
         mpfjax.PropagateFamilies, {"propagate": mpfjax.Propagate(MODEL), "num_draws": 2}
     ),

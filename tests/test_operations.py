@@ -81,9 +81,10 @@ def test_sums_never_fall_and_zeros_add_nothing(n, how):
 @pytest.mark.parametrize("form", [positions._blocked, positions._scanned])
 def test_sums_in_two_parts_are_exact(form):
     """Of multiples of 2^-24 far from each other in size, whose sums float32 could not hold."""
-    rows = np.exp(RNG.normal(scale=5, size=(5, 3100)))
+    rng = np.random.default_rng(7)
+    rows = np.exp(rng.normal(scale=5, size=(5, 3100)))
     rows *= 2000 / rows.sum(axis=1, keepdims=True)
-    rows[RNG.random(rows.shape) < 0.3] = 0
+    rows[rng.random(rows.shape) < 0.3] = 0
     rows[0] = 0
     rows[1, 100] = 3000
     whole = np.floor(rows)
@@ -98,8 +99,9 @@ def test_sums_in_two_parts_are_exact(form):
 
 
 def test_the_last_position_before_each_point():
-    places = np.sort(np.round(RNG.random(300) ** 2 * 64 * 2**12) / 2**12)
-    points = np.append(RNG.random(500) * 64, places)
+    rng = np.random.default_rng(7)
+    places = np.sort(np.round(rng.random(300) ** 2 * 64 * 2**12) / 2**12)
+    points = np.append(rng.random(500) * 64, places)
     parts = lambda values: positions.as_positions(jnp.asarray(values, jnp.float32))  # noqa: E731
     found = positions.last_before(parts(places), parts(points), 64)
     points = points.astype(np.float32)

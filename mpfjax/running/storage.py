@@ -5,6 +5,7 @@ import hashlib
 import json
 import math
 import os
+import platform
 import re
 import secrets
 import zipfile
@@ -140,7 +141,9 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     # Writers that shared a name would write into each other's file, and take it from each other.
-    partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")
+    ours = f"{platform.node()}-{os.getpid()}"
+    partial = path.with_name(f"{path.name}.{ours}-{secrets.token_hex(8)}.partial")
+    _remove_what_the_killed_left(path)
     try:
         with open(partial, "xb") as file:
             write(file)
@@ -154,6 +157,27 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
             fault = f"{error.strerror or error}; nothing that was written before is lost"
             raise OSError(error.errno, fault, str(path)) from error
         raise
+
+
+def _remove_what_the_killed_left(path: Path) -> None:
+    """Remove what processes of this machine that no longer run were writing to the path."""
+    if os.name != "posix":
+        return
+    name = re.compile(rf"{re.escape(f'{path.name}.{platform.node()}')}-(\d+)-[0-9a-f]+\.partial")
+    for other in path.parent.iterdir():
+        found = name.fullmatch(other.name)
+        if found is not None and not _is_running(int(found[1])):
+            other.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> None:
