@@ -17,6 +17,8 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 _LONGEST = 200
+# Python counts a truth value among its integers, and numpy a duration.
+_NO_NUMBERS = (bool, np.timedelta64)
 _MOST = 2**31 - 1
 
 
@@ -31,9 +33,7 @@ def check_whole(least: int = 1, /, **arguments: Any) -> None:
     It fits into 32 bits, which indices have.
     """
     for name, value in arguments.items():
-        # numpy counts a duration among its integers.
-        is_whole = isinstance(value, int | np.integer)
-        is_whole = is_whole and not isinstance(value, bool | np.timedelta64)
+        is_whole = isinstance(value, int | np.integer) and not isinstance(value, _NO_NUMBERS)
         if not is_whole or value < least:
             raise ValueError(f"{name}: {shown(value)} is not a whole number of at least {least}")
         if value > _MOST:
@@ -345,4 +345,4 @@ def shown(value: Any) -> str:
 
 def _is_number(value: Any) -> bool:
     numbers = (int, float, np.integer, np.floating)
-    return isinstance(value, numbers) and not isinstance(value, bool)
+    return isinstance(value, numbers) and not isinstance(value, _NO_NUMBERS)

@@ -27,7 +27,7 @@ def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
     available = jax.devices()
     if devices is None:
         chosen = _default_devices(available)
-    elif isinstance(devices, int | np.integer) and not isinstance(devices, bool):
+    elif isinstance(devices, int | np.integer) and not isinstance(devices, bool | np.timedelta64):
         if not 1 <= devices <= len(available):
             raise ValueError(f"devices: {devices} asked for, and there are {len(available)}")
         chosen = available[: int(devices)]
