@@ -7,8 +7,8 @@ None goes through `given`, which leaves out None: `check_positive(**given(max_di
 
 import contextlib
 import math
-from collections.abc import Callable, Collection, Iterator
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Iterator
+from typing import Any, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -103,6 +103,12 @@ def check_callable(what: str, /, **arguments: Any) -> None:
     for name, value in arguments.items():
         if isinstance(value, type) or not callable(value):
             raise ValueError(f"{name}: {shown(value)} is not {what}")
+
+
+def is_series(value: Any) -> TypeGuard[Iterable[Any]]:
+    """Whether it is an iterable of several things: no text, no mapping, no array."""
+    single = str | bytes | dict | np.ndarray | jax.Array
+    return isinstance(value, Iterable) and not isinstance(value, single)
 
 
 def check_type(kind: type | tuple[type, ...], what: str, /, **arguments: Any) -> None:

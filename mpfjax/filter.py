@@ -4,9 +4,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import (
@@ -15,6 +13,7 @@ from mpfjax.checks import (
     check_one_of,
     check_type,
     check_whole,
+    is_series,
     shown,
 )
 from mpfjax.mixture import ParticleMixture, single_component
@@ -380,7 +379,7 @@ def _own_memory(move: AbstractMove) -> list[str]:
 
 def _as_moves(moves: Any, name: str) -> tuple[Any, ...]:
     """The moves as a tuple; a `ValueError` for what is none, or a single one without its list."""
-    if not isinstance(moves, Iterable) or isinstance(moves, str | dict | jax.Array | np.ndarray):
+    if not is_series(moves):
         raise ValueError(f"{name}: {shown(moves)} is not a list of moves")
     moves = tuple(moves)
     for move in moves:

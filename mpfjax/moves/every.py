@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
-from mpfjax.checks import check_whole, shown
+from mpfjax.checks import check_whole, is_series, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
 from mpfjax.operations.generator import split
@@ -127,7 +127,7 @@ class Every(AbstractMove):
 
 
 def _as_inner_moves(moves: Any) -> tuple[AbstractMove, ...]:
-    if not isinstance(moves, Iterable):
+    if not is_series(moves):
         raise ValueError(f"moves: {shown(moves)} is not a list of moves")
     moves = tuple(moves)
     if not moves:

@@ -1,7 +1,7 @@
 """Runs dealt to devices, of this process or of all."""
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +13,7 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, PyTree
 
+from mpfjax.checks import is_series
 from mpfjax.operations.across_islands import DEVICE_AXIS
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors
 
@@ -32,7 +33,7 @@ def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
             raise ValueError(f"devices: {devices} asked for, and there are {len(available)}")
         chosen = available[: int(devices)]
     else:
-        chosen = list(devices) if isinstance(devices, Iterable) and not _is_array(devices) else []
+        chosen = list(devices) if is_series(devices) else []
         if not chosen or not all(isinstance(device, jax.Device) for device in chosen):
             raise ValueError(f"devices: {devices} is not a number or some of jax.devices()")
         if len(set(chosen)) < len(chosen):
@@ -105,10 +106,6 @@ def _spread(run, inputs, arguments, mesh):
         check_vma=False,
     )
     return mapped(inputs, arrays)
-
-
-def _is_array(value: Any) -> bool:
-    return isinstance(value, jax.Array | np.ndarray)
 
 
 def _default_devices(available: list[Any]) -> list[Any]:

@@ -2,13 +2,14 @@
 
 import abc
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.checks import check_finite, check_whole, given, saying, shown, to_rows
+from mpfjax.checks import check_finite, check_whole, given, is_series, saying, shown, to_rows
 
 # MOTChallenge's columns: frame, id, x, y, w, h, and the score, where there is one.
 _BOX, _SCORE = slice(2, 6), 6
@@ -49,11 +50,11 @@ def as_detector(detections: Any, first: int = 1) -> AbstractDetector:
     """
     if isinstance(detections, AbstractDetector):
         return detections
-    if isinstance(detections, np.ndarray):
-        return Rows(detections, first)
+    if isinstance(detections, np.ndarray | jax.Array):
+        return Rows(np.asarray(detections), first)
     if callable(detections) and not isinstance(detections, type):
         return _Called(detections)
-    if isinstance(detections, Iterable) and not isinstance(detections, str | bytes | dict):
+    if is_series(detections):
         return _Streamed(iter(detections))
     raise ValueError(
         f"detections: {shown(detections)} is neither a detector to call with a frame, nor an array"

@@ -9,7 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt8
 
-from mpfjax.checks import check_flag, check_positive, check_type, check_whole, given, shown
+from mpfjax.checks import (
+    check_flag,
+    check_positive,
+    check_type,
+    check_whole,
+    given,
+    is_series,
+    shown,
+)
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractRejuvenation
 from mpfjax.moves.gaussian import GaussianRegeneration
@@ -272,7 +280,8 @@ def _own_chain(
     moves: Iterable[AbstractMove], particles_per_object: int, **settings: Any
 ) -> tuple[AbstractMove, ...]:
     """The user's moves, or a `ValueError` for settings that they have and for moves that fail."""
-    check_type(Iterable, "a sequence of moves", moves=moves)
+    if not is_series(moves):
+        raise ValueError(f"moves: {shown(moves)} is not a sequence of moves")
     for name, value in given(**settings).items():
         raise ValueError(
             f"{name}: {shown(value)} is given beside moves, which have settings of their own"
