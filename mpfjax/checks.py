@@ -84,6 +84,13 @@ def check_inner_share(**arguments: Any) -> None:
             raise ValueError(f"{name}: {shown(value)} is not a number in (0, 1)")
 
 
+def check_exponent(**arguments: Any) -> None:
+    """Each argument is a number in (0, 1], as the power of a likelihood that comes in by stages."""
+    for name, value in arguments.items():
+        if not (_is_number(value) and 0 < value <= 1):
+            raise ValueError(f"{name}: {shown(value)} is not a number in (0, 1]")
+
+
 def check_one_of(choices: Collection[str], /, **arguments: Any) -> None:
     """Each argument is one of some strings."""
     for name, value in arguments.items():

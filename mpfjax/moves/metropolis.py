@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import check_inner_share, check_one_of, check_whole
+from mpfjax.checks import check_exponent, check_inner_share, check_one_of, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
@@ -64,8 +64,7 @@ class AbstractMetropolis(AbstractRejuvenation):
         require(self.model, "log_transition", who)
         check_whole(num_steps=self.num_steps)
         check_inner_share(least_step=self.least_step)
-        if self.exponent != 1:
-            check_inner_share(exponent=self.exponent)
+        check_exponent(exponent=self.exponent)
         check_one_of(("none", "stop"), gradient=self.gradient)
 
     @property

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_inner_share, check_one_of, check_type, saying
+from mpfjax.checks import check_exponent, check_one_of, check_type, saying
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -169,8 +169,7 @@ class Weigh(AbstractPropagation):
 
     def __check_init__(self) -> None:
         _check_whole_states(self.model, "Weigh")
-        if self.exponent != 1:
-            check_inner_share(exponent=self.exponent)
+        check_exponent(exponent=self.exponent)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
