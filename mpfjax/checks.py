@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 _LONGEST = 200
 # Python counts a truth value among its integers, and numpy a duration; JAX has no long doubles.
-_NO_NUMBERS = (bool, np.timedelta64, np.longdouble)
+_NO_NUMBERS: tuple[type, ...] = (bool, np.timedelta64, np.longdouble)
 _MOST = 2**31 - 1
 
 
