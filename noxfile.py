@@ -24,7 +24,7 @@ CORE = (
     "tests/models",
     "tests/smoothing",
     "tests/moves",
-    "--ignore=tests/moves/test_transport.py",
+    "--ignore=tests/moves/test_optimal_transport.py",
     "tests/test_bad_input.py",
     "tests/test_chains.py",
     "tests/test_checks.py",
@@ -38,7 +38,7 @@ CORE = (
     "tests/test_packaging.py",
     "tests/test_proposals.py",
     "tests/test_storage.py",
-    "tests/tuning/test_climb.py",
+    "tests/tuning/test_optimisation.py",
     "tests/tuning/test_transforms.py",
 )
 TELL = (

@@ -24,7 +24,7 @@ import mpfjax
 from mpfjax.console import exit_status, format_table, whole, write_json
 from mpfjax.operations.compiling import wide_vectors
 from mpfjax.vision import RGBColours
-from mpfjax.vision.histograms import integral_histogram
+from mpfjax.vision.colour.histograms import integral_histogram
 
 COLOURS = RGBColours(30)
 MEAN_SIDE, SPREAD_OF_SIDES = 40.0, 5.0

@@ -106,11 +106,11 @@ def by_stages(
     model: mpfjax.LinearGaussianModel, move: Callable[..., Any], steps: int, size: int
 ) -> mpfjax.Filter:
     """A filter whose likelihood comes in by powers, with moves in between."""
-    moves = [mpfjax.Resample(), mpfjax.Predict(model), mpfjax.Weigh(model, EXPONENTS[0])]
+    moves = [mpfjax.Resample(), mpfjax.Predict(model), mpfjax.Reweight(model, EXPONENTS[0])]
     for before, after in pairwise(EXPONENTS):
         moves += [
             mpfjax.Resample(), move(model, steps, exponent=before),
-            mpfjax.Weigh(model, after - before),
+            mpfjax.Reweight(model, after - before),
         ]  # fmt: skip
     return mpfjax.Filter(model, moves, size)
 

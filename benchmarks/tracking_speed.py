@@ -25,9 +25,9 @@ import numpy as np
 
 import mpfjax
 from mpfjax.console import Clock, exit_status, format_table, peak_memory, whole, write_json
-from mpfjax.vision.detection import BackgroundSubtraction
-from mpfjax.vision.detectors import LEAST_ROOM
-from mpfjax.vision.loop import make_tracker, track
+from mpfjax.vision.tracking.adapters import LEAST_ROOM
+from mpfjax.vision.tracking.background import BackgroundSubtraction
+from mpfjax.vision.tracking.track import make_tracker, track
 
 ROWS, COLUMNS = 3, 8
 NUM_OBJECTS = ROWS * COLUMNS

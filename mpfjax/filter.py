@@ -27,10 +27,10 @@ from mpfjax.models.base import (
 from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.inputs import saying_that_none_were_given
 from mpfjax.models.noise import NOISES, draw_noise
-from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
+from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractResampling
+from mpfjax.moves.eve_indices import EVE_INDICES, evidence_variance, mass_variances
 from mpfjax.moves.every import Every, with_inner
-from mpfjax.moves.exchange import Exchange
-from mpfjax.moves.lineages import LINEAGE, evidence_variance, mass_variances
+from mpfjax.moves.island_interaction import IslandInteraction
 from mpfjax.moves.parents import runner
 from mpfjax.moves.results import check_result, check_weighed
 from mpfjax.moves.sharing import give_inputs, tie, untie
@@ -63,7 +63,7 @@ class StepInfo(eqx.Module):
 
 
 # Moves that do not change the total mass; there is nothing to normalise after them.
-_KEEP_MASS = (AbstractRegrouping, AbstractRejuvenation, Exchange)
+_KEEP_MASS = (AbstractRegrouping, AbstractResampling, IslandInteraction)
 BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
 
@@ -344,7 +344,7 @@ def _report(
     degenerate = increment == -jnp.inf
     of_evidence = of_masses = None
     # Families on several islands would have to be brought together.
-    if LINEAGE in mixture.memory and num_islands() == 1:
+    if EVE_INDICES in mixture.memory and num_islands() == 1:
         variance = jnp.where(degenerate, jnp.inf, evidence_variance(mixture))
         of_evidence = jnp.sqrt(jnp.maximum(variance, 0.0))
         of_masses = jnp.sqrt(jnp.maximum(mass_variances(mixture), 0.0))

@@ -11,22 +11,22 @@ from mpfjax.models.base import AbstractStateSpaceModel, mapped
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import AbstractMove
-from mpfjax.moves.clusters import PropagateInClusters
 from mpfjax.moves.every import Every
-from mpfjax.moves.families import propagation
-from mpfjax.moves.features import Scale
-from mpfjax.moves.gaussian import GaussianRegeneration
-from mpfjax.moves.independent import PropagateIndependently
-from mpfjax.moves.kmeans import KMeans
-from mpfjax.moves.lookahead import ResampleAhead, propagating_proposal, resampling
-from mpfjax.moves.merge import Merge
-from mpfjax.moves.partitioned import Partitioned, check_orders
-from mpfjax.moves.pool import Pool
-from mpfjax.moves.propagation import Predict, Propagate, Weigh
-from mpfjax.moves.random_partition import RandomPartition
-from mpfjax.moves.resampling import Resample
-from mpfjax.moves.split import Split
-from mpfjax.moves.standing import HILBERT, SortBy
+from mpfjax.moves.objects.clusters import PropagateInClusters
+from mpfjax.moves.objects.independent import PropagateIndependently
+from mpfjax.moves.objects.partitioned import Partitioned, check_orders
+from mpfjax.moves.propagation.nested import propagation
+from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
+from mpfjax.moves.regrouping.features import Scale
+from mpfjax.moves.regrouping.kmeans import KMeans
+from mpfjax.moves.regrouping.merge import Merge
+from mpfjax.moves.regrouping.pool import Pool
+from mpfjax.moves.regrouping.random_partition import RandomPartition
+from mpfjax.moves.regrouping.split import Split
+from mpfjax.moves.resampling.auxiliary import AuxiliaryResample, propagating_proposal, resampling
+from mpfjax.moves.resampling.gaussian import GaussianRegeneration
+from mpfjax.moves.resampling.ordering import HILBERT, SortBy
+from mpfjax.moves.resampling.resample import Resample
 from mpfjax.proposals import AbstractProposal
 
 # Components that were right a few steps before need no more iterations of K-means.
@@ -50,7 +50,7 @@ def particle_filter(
     Vermaak et al. (2003), section 3, with one component; bootstrap unless a proposal is given.
     Use it for a filtering distribution with one mode; of several modes it loses all but one.
     `gradient` is that of `Resample`. "stop" is also that of `Propagate`: take it for tuning.
-    `num_draws` is that of `PropagateFamilies`, how many x_t each particle draws to keep one.
+    `num_draws` is that of `PropagateNested`, how many x_t each particle draws to keep one.
     `noise` is that of `Propagate`. With "rqmc", particles stand along a Hilbert curve of their
     state unless `sort_by` says otherwise, and the filter is sequential quasi-Monte Carlo (Gerber
     and Chopin 2015).
@@ -82,7 +82,7 @@ def auxiliary_particle_filter(
 
     Pitt and Shephard (1999). `lookahead` is a function (y_t, states) -> log ν of each particle, or
     a proposal with `log_normaliser`, which then also draws x_t unless there is another `proposal`.
-    Ẑ is unbiased whatever it is; see `ResampleAhead`. With
+    Ẑ is unbiased whatever it is; see `AuxiliaryResample`. With
     `GaussNewtonProposal(model, 1, inflation=1.0)` for a `LinearGaussianModel` the filter is fully
     adapted: ν is p(y_t | x_{t-1}), x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are
     equal. `noise` and `num_draws` are those of `particle_filter`. Use it where the likelihood is
@@ -94,7 +94,7 @@ def auxiliary_particle_filter(
     return Filter(
         model,
         moves=[
-            ResampleAhead(resample, lookahead),
+            AuxiliaryResample(resample, lookahead),
             propagation(model, proposal, gradient, noise, num_draws),
         ],
         num_particles=num_particles,
@@ -350,7 +350,7 @@ def _gaussian_moves(
         return [redraw, Propagate(model, proposal, noise=noise)]
     if proposal is not None:
         raise ValueError(f"importance: {importance!r} draws from no proposal, but one was given")
-    return [redraw, Predict(model, noise=noise), redraw, Weigh(model)]
+    return [redraw, Predict(model, noise=noise), redraw, Reweight(model)]
 
 
 def _standing(sort_by: SortBy | None, noise: str) -> SortBy | None:

@@ -296,7 +296,9 @@ def draw_climbs(
         ticks = [tick for tick in (0.03, 0.05, 0.1, 0.2, 0.5) if sigmas[0] <= tick <= sigmas[-1]]
         one.set_ticks(ticks, labels=[str(tick) for tick in ticks])
     axis.minorticks_off()
-    axis.set_title("log marginal likelihood below its maximum, and climbs to it", fontsize=10)
+    axis.set_title(
+        "log marginal likelihood below its maximum, and optimisations to it", fontsize=10
+    )
     axis.legend(fontsize=8, loc="lower left")
     return figure
 

@@ -228,7 +228,7 @@ class GaussNewtonProposal(AbstractProposal):
         Laplace's approximation of log ∫ L D dx_t: log L + log D at the mean, and the volume
         (2π)^(d/2) |Λ|^(-1/2) around it. It is exact where h is linear, as in a
         `LinearGaussianModel`. It does not depend on the inflation. Use it as the look-ahead of
-        `ResampleAhead`.
+        `AuxiliaryResample`.
         """
         prior_means = self.model.transition_mean(previous_states)
         means, factors = self._fit(observation, prior_means)

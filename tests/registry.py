@@ -1,6 +1,6 @@
 """Every move and every chain of moves, by name: what is listed here inherits the contracts.
 
-`REGROUPINGS` and `REJUVENATIONS` are held to the contracts of their kind by
+`REGROUPINGS` and `WITHIN_COMPONENTS` are held to the contracts of their kind by
 `tests/moves/test_contracts.py`, `CHAINS` to those of filters by `tests/test_chains.py`. A new
 move or filter is one new line below; the tests then find it.
 """
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import mpfjax
 from mpfjax import (
     AbstractRegrouping,
-    AbstractRejuvenation,
+    AbstractResampling,
     Every,
     Exclusion,
     Filter,
@@ -30,12 +30,12 @@ from mpfjax import (
     Pool,
     Predict,
     Propagate,
-    PropagateInStages,
+    PropagateTempered,
     RandomPartition,
     RandomWalkMetropolis,
     Resample,
+    Reweight,
     Split,
-    Weigh,
 )
 
 NUM_PARTICLES = 48
@@ -80,7 +80,7 @@ REGROUPINGS: dict[str, AbstractRegrouping] = {
     "grouped by a label": GroupBy(lambda states: (states[:, 0] > 0).astype(jnp.int32)),
 }
 
-REJUVENATIONS: dict[str, AbstractRejuvenation] = {
+WITHIN_COMPONENTS: dict[str, AbstractResampling] = {
     "systematic": Resample(),
     "stratified": Resample("stratified"),
     "multinomial": Resample("multinomial"),
@@ -129,10 +129,10 @@ def _metropolis(m: int) -> Callable[..., Filter]:
     def make(model):
         moves = [
             Predict(model),
-            Weigh(model, 0.3),
+            Reweight(model, 0.3),
             Resample("stratified"),
             RandomWalkMetropolis(model, 2, exponent=0.3),
-            Weigh(model, 0.7),
+            Reweight(model, 0.7),
             Resample(ess_threshold=0.9),
             MetropolisAdjustedLangevin(model),
             KMeans(2),
@@ -146,7 +146,7 @@ def _metropolis(m: int) -> Callable[..., Filter]:
 def _in_stages(m: int) -> Callable[..., Filter]:
     return lambda model: Filter(
         model,
-        [Resample(), PropagateInStages(model, exponents=(0.1, 0.4, 1.0)), KMeans()],
+        [Resample(), PropagateTempered(model, exponents=(0.1, 0.4, 1.0)), KMeans()],
         NUM_PARTICLES,
         m,
         initial_moves=[KMeans(3, reseed=True)],
@@ -265,7 +265,7 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "mpf rqmc of families": _mpf(noise="rqmc", num_draws=3),
     "mixture in stages": _in_stages(NUM_COMPONENTS),
     "predict and weigh": lambda model: Filter(
-        model, [Resample(), Predict(model), Weigh(model)], NUM_PARTICLES
+        model, [Resample(), Predict(model), Reweight(model)], NUM_PARTICLES
     ),
     "joint pf": _joint(_pf()),
     "ps": _joint(lambda joint: mpfjax.partitioned_sampling(joint, NUM_PARTICLES, (1, 0))),

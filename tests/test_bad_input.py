@@ -94,8 +94,8 @@ def test_a_move_that_returns_no_such_mixture(change, named):
         [Resample()],
         [mpfjax.Predict(MODEL)],
         [Resample(), mpfjax.Predict(MODEL), KMeans(), mpfjax.Prune()],
-        [mpfjax.Every(2, [Resample(), Merge()]), mpfjax.Exclusion(), mpfjax.Exchange()],
-        [mpfjax.ResampleAhead(Resample(), lambda observation, states: -states)],
+        [mpfjax.Every(2, [Resample(), Merge()]), mpfjax.Exclusion(), mpfjax.IslandInteraction()],
+        [mpfjax.AuxiliaryResample(Resample(), lambda observation, states: -states)],
     ],
 )
 def test_a_chain_that_never_sees_an_observation(moves):

@@ -12,9 +12,9 @@ from mpfjax import command
 from mpfjax.command import loop as command_loop
 from mpfjax.command.scoring import find_truth, scores_of
 from mpfjax.metrics import multi_object_scores
-from mpfjax.vision import frames as frame_files
-from mpfjax.vision.boxes import read_tracks, write_tracks
-from mpfjax.vision.frames import read_frames, write_image, write_video
+from mpfjax.vision.files import frames as frame_files
+from mpfjax.vision.files.boxes import read_tracks, write_tracks
+from mpfjax.vision.files.frames import read_frames, write_image, write_video
 from tests.examples import two_walkers
 
 pytest.importorskip(

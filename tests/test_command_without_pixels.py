@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mpfjax import command
-from mpfjax.vision.boxes import read_tracks, write_tracks
-from mpfjax.vision.detectors import Rows
-from mpfjax.vision.loop import make_tracker, online_rows, track
+from mpfjax.vision.files.boxes import read_tracks, write_tracks
+from mpfjax.vision.tracking.adapters import Rows
+from mpfjax.vision.tracking.track import make_tracker, online_rows, track
 from tests.examples import two_walkers
 
 pytestmark = pytest.mark.usefixtures("as_installed")

@@ -142,9 +142,9 @@ def island_chains():
     seeded, regroup = [mpfjax.KMeans(2, reseed=True)], mpfjax.KMeans(2)
     return {
         "pf": mpfjax.Filter(MODEL, [resample, propagate], 12),
-        "pf, exchange": mpfjax.Filter(MODEL, [mpfjax.Exchange(), adaptive, propagate], 12),
+        "pf, exchange": mpfjax.Filter(MODEL, [mpfjax.IslandInteraction(), adaptive, propagate], 12),
         "mixture, exchange": mpfjax.Filter(
-            MODEL, [resample, propagate, mpfjax.Exchange(0.9), regroup], 12, 2, seeded
+            MODEL, [resample, propagate, mpfjax.IslandInteraction(0.9), regroup], 12, 2, seeded
         ),
     }
 
@@ -197,7 +197,7 @@ class TestIslands:
         def mass(mixture):
             return mixture.log_mass
 
-        for before in ([], [mpfjax.Exchange(1.0)]):
+        for before in ([], [mpfjax.IslandInteraction(1.0)]):
             filter = mpfjax.Filter(model, [*before, mpfjax.Resample(), propagate], 8)
             run = mpfjax.run_islands(jax.random.key(6), filter, OBSERVATIONS, mass, num_islands=8)
             assert np.isfinite(run.log_marginal_likelihood)
@@ -265,7 +265,7 @@ class TestExchange:
         states, labels = rng.normal(size=g * n), rng.integers(0, 3, g * n)
         whole = make_mixture(states, log_weights.ravel(), labels, 3)
         islands = jax.tree.map(lambda leaf: leaf.reshape(g, n, *leaf.shape[1:]), whole)
-        move = mpfjax.Exchange(threshold)
+        move = mpfjax.IslandInteraction(threshold)
         return islands, on_islands(lambda part: move(jax.random.key(0), part), islands)
 
     def test_evens_the_masses_and_keeps_every_particle(self):
@@ -288,15 +288,15 @@ class TestExchange:
 
     def test_outside_islands_does_nothing(self):
         mixture = make_mixture(np.zeros(5), np.zeros(5), np.zeros(5), 1)
-        assert mpfjax.Exchange()(jax.random.key(0), mixture) is mixture
+        assert mpfjax.IslandInteraction()(jax.random.key(0), mixture) is mixture
 
     @pytest.mark.parametrize("threshold", [-0.1, 1.1])
     def test_bad_thresholds(self, threshold):
         with pytest.raises(ValueError, match="threshold: "):
-            mpfjax.Exchange(threshold)
+            mpfjax.IslandInteraction(threshold)
 
     def test_slots_that_cannot_be_dealt_evenly(self):
-        filter = mpfjax.Filter(MODEL, [mpfjax.Exchange(), mpfjax.Propagate(MODEL)], 13)
+        filter = mpfjax.Filter(MODEL, [mpfjax.IslandInteraction(), mpfjax.Propagate(MODEL)], 13)
         with pytest.raises(ValueError, match=r"num_particles: 13 of an island .* 2 islands"):
             mpfjax.run_islands(jax.random.key(0), filter, OBSERVATIONS, num_islands=2)
 
@@ -457,7 +457,12 @@ def test_a_constant_moves_the_evidence_of_islands_and_nothing_else(num_component
 
     def run(constant, taken_off):
         model = TrickyQuadraticModel(0.3, 0.5, constant=constant, taken_off=taken_off)
-        moves = [mpfjax.Exchange(0.9), mpfjax.Resample(), mpfjax.Propagate(model), mpfjax.KMeans(2)]
+        moves = [
+            mpfjax.IslandInteraction(0.9),
+            mpfjax.Resample(),
+            mpfjax.Propagate(model),
+            mpfjax.KMeans(2),
+        ]
         filter = mpfjax.Filter(model, moves, 32, num_components, [mpfjax.KMeans(2, reseed=True)])
         return mpfjax.run_islands(
             jax.random.key(1), filter, jnp.array([1.5, 1.0, 0.4]), num_islands=4

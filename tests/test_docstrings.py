@@ -12,7 +12,7 @@ PUBLIC = {
     if not name.startswith("_") and (inspect.isclass(value) or inspect.isfunction(value))
 }
 # Records of results and bases whose methods carry the description may do with one line.
-BRIEF = {"StepInfo", "FilterRun", "AbstractProposal", "AbstractRejuvenation", "AbstractPropagation"}
+BRIEF = {"StepInfo", "FilterRun", "AbstractProposal", "AbstractResampling", "AbstractPropagation"}
 
 
 def is_method(value):

@@ -12,7 +12,7 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.resampling import GRADIENTS
+from mpfjax.moves.resampling.resample import GRADIENTS
 from tests.examples import example_mixtures
 from tests.marking import quick_of, thorough
 from tests.user_models import BLINDED, ScalarLinear
@@ -148,7 +148,7 @@ def test_propagation_with_stopped_gradients_is_the_same_to_the_bit(kind):
         "partitioned": lambda gradient: mpfjax.Partitioned(joint, gradient=gradient),
     }[kind]
     model, observation = (joint, TWO[0]) if kind == "partitioned" else (MODEL, ONE[0])
-    moves = [make("none"), mpfjax.Weigh(model)]
+    moves = [make("none"), mpfjax.Reweight(model)]
     mixture = mpfjax.Filter(model, moves, NUM_PARTICLES).init(jax.random.key(6))
     moved = [
         eqx.filter_jit(make(gradient))(jax.random.key(7), mixture, observation)
@@ -163,7 +163,7 @@ def test_steps_without_an_observation_keep_the_score_unbiased():
     def log_evidence(model, key):
         resample = mpfjax.Resample("multinomial", 0.5, gradient="stop")
         moves = [resample, mpfjax.Predict(model, "stop")]
-        filter = mpfjax.Filter(model, [*moves, mpfjax.Weigh(model)], NUM_PARTICLES)
+        filter = mpfjax.Filter(model, [*moves, mpfjax.Reweight(model)], NUM_PARTICLES)
         run = mpfjax.run_filter(key, filter, observations, nothing, missing="skip")
         return run.log_marginal_likelihood
 

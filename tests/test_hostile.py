@@ -94,8 +94,8 @@ BUILT = {
          "allocation": "equal", "share_by": None, "sort_by": None, "gradient": "none",
          "softness": 0.5, "regularisation": 0.5},
     ),
-    "ResampleAhead": (
-        mpfjax.ResampleAhead,
+    "AuxiliaryResample": (
+        mpfjax.AuxiliaryResample,
         {"resample": mpfjax.Resample(), "lookahead": mpfjax.GaussNewtonProposal(MODEL)},
     ),
     "GaussianRegeneration": (
@@ -121,7 +121,7 @@ BUILT = {
     ),
     "Every": (mpfjax.Every, {"num_steps": 2, "moves": [mpfjax.KMeans(1)]}),
     "Prune": (mpfjax.Prune, {"least_share": 1e-3}),
-    "Exchange": (mpfjax.Exchange, {"threshold": 0.5}),
+    "IslandInteraction": (mpfjax.IslandInteraction, {"threshold": 0.5}),
     "Propagate": (
         mpfjax.Propagate, {"model": MODEL, "proposal": None, "gradient": "none", "noise": "rqmc"}
     ),
@@ -139,7 +139,7 @@ BUILT = {
         {"transition_matrix": EYE, "F": EYE, "Q": EYE, "H": EYE, "R": EYE, "m0": np.zeros(1),
          "P0": EYE, "b": None, "c": np.zeros(1), "initial_probabilities": np.ones(1)},
     ),
-    "Weigh": (mpfjax.Weigh, {"model": MODEL, "exponent": 0.5}),
+    "Reweight": (mpfjax.Reweight, {"model": MODEL, "exponent": 0.5}),
     **{
         move.__name__: (
             move,
@@ -148,11 +148,11 @@ BUILT = {
         )
         for move in (mpfjax.RandomWalkMetropolis, mpfjax.MetropolisAdjustedLangevin)
     },
-    "PropagateFamilies": (
-        mpfjax.PropagateFamilies, {"propagate": mpfjax.Propagate(MODEL), "num_draws": 2}
+    "PropagateNested": (
+        mpfjax.PropagateNested, {"propagate": mpfjax.Propagate(MODEL), "num_draws": 2}
     ),
-    "PropagateInStages": (
-        mpfjax.PropagateInStages,
+    "PropagateTempered": (
+        mpfjax.PropagateTempered,
         {"model": MODEL, "resample": None, "exponents": (0.1, 1.0), "num_moves": 1,
          "least_step": 0.05},
     ),

@@ -253,9 +253,9 @@ EVERYWHERE = {
     "look-ahead": lambda inputs: mpfjax.auxiliary_particle_filter(
         (model := Driven(inputs=inputs)), 32, look_ahead(model)
     ),
-    "families": own_chain(lambda model: mpfjax.PropagateFamilies(mpfjax.Propagate(model), 2)),
-    "stages": own_chain(lambda model: mpfjax.PropagateInStages(model)),
-    "predict and weigh": own_chain(mpfjax.Predict, mpfjax.Weigh),
+    "families": own_chain(lambda model: mpfjax.PropagateNested(mpfjax.Propagate(model), 2)),
+    "stages": own_chain(lambda model: mpfjax.PropagateTempered(model)),
+    "predict and weigh": own_chain(mpfjax.Predict, mpfjax.Reweight),
     "a proposal with a model of its own": own_chain(
         lambda model: mpfjax.Propagate(
             model, mpfjax.GaussNewtonProposal(Driven(jnp.array(0.5), inputs=model.inputs))

@@ -12,8 +12,8 @@ from jax.experimental.compilation_cache import compilation_cache
 import mpfjax
 from mpfjax import keep_programs
 from mpfjax.filter import step_and_faults
-from mpfjax.vision import drawn
-from mpfjax.vision.recipes import objects_filters
+from mpfjax.vision.boxes import follow_boxes as drawn
+from mpfjax.vision.boxes.recipes import objects_filters
 
 CONFIG: Any = jax.config
 SETTINGS = [

@@ -7,7 +7,7 @@ import pytest
 
 from mpfjax import plotting
 from mpfjax.mixture import flatten_states, single_component
-from mpfjax.moves.features import Features
+from mpfjax.moves.regrouping.features import Features
 from tests.examples import example_mixtures, log_masses, make_mixture
 
 MIXTURES = example_mixtures()

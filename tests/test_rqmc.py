@@ -10,7 +10,7 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
-from mpfjax.vision.colour_model import ColourModel
+from mpfjax.vision.boxes.colour_model import ColourModel
 from tests.examples import make_mixture
 from tests.user_models import DRIFT_AS_LINEAR_GAUSSIAN, Drift
 

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Array
 
 import mpfjax
-from mpfjax.vision.colour_model import BoxState, ColourModel
-from mpfjax.vision.colours import HSVColours
+from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
+from mpfjax.vision.colour.bins import HSVColours
 
 NAMES = {"pf": "PF", "gpf": "GPF", "mpf": "MPF", "gm_mpf": "GM-MPF"}
 MOMENTUM = 0.5

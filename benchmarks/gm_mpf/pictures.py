@@ -9,7 +9,7 @@ from benchmarks.gm_mpf.filters import NAMES
 from benchmarks.gm_mpf.runs import Step, errors_by_size
 from benchmarks.gm_mpf.targets import Targets
 from mpfjax import plotting
-from mpfjax.vision import drawing
+from mpfjax.vision.files import drawing
 
 
 def draw_migration(found: dict[str, dict[int, Step]], size: int, targets: Targets) -> Any:

@@ -14,8 +14,8 @@ from benchmarks.gm_mpf.filters import NAMES, make_filter, make_model
 from benchmarks.gm_mpf.targets import Targets
 from mpfjax.metrics.coverage import REACH
 from mpfjax.mixture import ParticleMixture
-from mpfjax.vision import boxes as box_files
-from mpfjax.vision.colour_model import ColourModel
+from mpfjax.vision.boxes.colour_model import ColourModel
+from mpfjax.vision.files import boxes as box_files
 
 LAST_FRAMES, LEAST_SHARE = 10, 0.1
 

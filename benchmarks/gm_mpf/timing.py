@@ -14,8 +14,8 @@ from benchmarks.gm_mpf import sizes
 from benchmarks.gm_mpf.filters import NAMES, make_filter, make_model, motion
 from benchmarks.gm_mpf.targets import Targets
 from mpfjax.mixture import ParticleMixture
-from mpfjax.vision import boxes as box_files
-from mpfjax.vision.histograms import integral_histogram
+from mpfjax.vision.colour.histograms import integral_histogram
+from mpfjax.vision.files import boxes as box_files
 
 
 def time_filters(

@@ -62,11 +62,13 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--models", nargs="+", choices=list(MODELS), help="a; default: all")
     parser.add_argument("--filters", nargs="+", choices=FILTERS, help="a; default: all")
     parser.add_argument("--starts", type=whole(), help="b: random starts; default: 20")
-    parser.add_argument("--steps", type=whole(), help=f"b: of each climb; default: {CLIMB_STEPS}")
+    parser.add_argument(
+        "--steps", type=whole(), help=f"b: of each optimisation; default: {CLIMB_STEPS}"
+    )
     parser.add_argument("--sequences", nargs="+", choices=SEQUENCES, help="c; default: all")
     parser.add_argument("--label-runs", type=whole(2), help="c: seeds of each filter; default: 6")
     parser.add_argument(
-        "--label-steps", type=whole(), help=f"c: of each climb; default: {LABEL_STEPS}"
+        "--label-steps", type=whole(), help=f"c: of each optimisation; default: {LABEL_STEPS}"
     )
     parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--out", default="results/likelihood_tuning", metavar="DIR")

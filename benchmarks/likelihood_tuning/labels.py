@@ -226,7 +226,7 @@ def judge(
     frames, truth = jnp.asarray(labelled.frames[half:]), labelled.boxes[half:]
     keys = jax.random.split(key_runs, options.label_runs)
     builders = filters_of(seen.boxes[-1, :, 2:].mean(axis=0))
-    climb = {
+    optimisation = {
         "lambda": [float(first.lambda_), float(run.model.lambda_)],
         "bandwidth": [float(first.bandwidth), float(run.model.bandwidth)],
         "label_log_posterior": run.history["value"].round(4).tolist(),
@@ -249,7 +249,7 @@ def judge(
         entry["overlap_by_frame"] = {
             kind: values.mean(axis=0).round(4).tolist() for kind, values in curves.items()
         }
-        entries.append(entry | climb)
+        entries.append(entry | optimisation)
     return entries, curves, half + 1
 
 

@@ -54,13 +54,13 @@ def exact_maximum() -> Maximum:
 
 
 def run_starts(options: argparse.Namespace, settings: dict[str, Any], out: Path) -> None:
-    """Climb from every start, and compare with the exact maximum."""
+    """Optimisation from every start, and compare with the exact maximum."""
     maximum = exact_maximum()
     rng = np.random.default_rng(options.seed)
     starts = np.exp(rng.uniform(*np.log(STARTS), size=(options.starts, 2)))
     results: list[dict[str, Any]] = []
     paths = []
-    for start, run in climbs(starts, options):
+    for start, run in optimisations(starts, options):
         results.append(compare(start, run, maximum))
         paths.append(np.stack([run.history["sigma_x"], run.history["sigma_y"]], axis=1))
         content = {
@@ -73,21 +73,21 @@ def run_starts(options: argparse.Namespace, settings: dict[str, Any], out: Path)
     print(as_start_table(results, maximum))
     levels = surface()
     figure = plotting.draw_climbs(*levels, paths, np.exp(maximum.point))
-    figure.savefig(out / "climbs.png", dpi=150)
+    figure.savefig(out / "optimisations.png", dpi=150)
 
 
-def climbs(
+def optimisations(
     starts: np.ndarray, options: argparse.Namespace
 ) -> Iterator[tuple[np.ndarray, TuningRun]]:
-    """The climb from each start, with seeds of its own."""
+    """The optimisation from each start, with seeds of its own."""
     for k, start in enumerate(tqdm(starts, disable=not sys.stderr.isatty(), unit="start")):
         yield (
             start,
-            climb(jax.random.fold_in(jax.random.key(options.seed), k), start, options.steps),
+            optimisation(jax.random.fold_in(jax.random.key(options.seed), k), start, options.steps),
         )
 
 
-def climb(key: Array, start: np.ndarray, num_steps: int) -> TuningRun:
+def optimisation(key: Array, start: np.ndarray, num_steps: int) -> TuningRun:
     """The guided mixture particle filter's likelihood, climbed from one start."""
     model = mpfjax.QuadraticModel(float(start[0]), float(start[1]), LOW, HIGH)
     filter = mpfjax.mixture_particle_filter(
@@ -113,7 +113,7 @@ def climb(key: Array, start: np.ndarray, num_steps: int) -> TuningRun:
 
 
 def compare(start: np.ndarray, run: TuningRun, maximum: Maximum) -> dict[str, Any]:
-    """Where a climb ended, and its standard errors, relative to the exact ones."""
+    """Where an optimisation ended, and its standard errors, relative to the exact ones."""
     end = np.array([run.parameters["sigma_x"], run.parameters["sigma_y"]], float)
     errors = None
     if run.standard_errors is not None:

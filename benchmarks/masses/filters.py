@@ -37,7 +37,7 @@ def _in_stages(scene: Scene, num_particles: int) -> mpfjax.Filter:
     """The mixture filter with a propagation in stages in place of its own."""
     plain = _mixture()(scene, num_particles)
     moves = [
-        mpfjax.PropagateInStages(scene.model) if isinstance(move, mpfjax.Propagate) else move
+        mpfjax.PropagateTempered(scene.model) if isinstance(move, mpfjax.Propagate) else move
         for move in plain.moves
     ]
     return mpfjax.Filter(

@@ -11,9 +11,9 @@ from jaxtyping import Array, PyTree
 
 from mpfjax import RandomWalk
 from mpfjax.vision import football_scene
-from mpfjax.vision.boxes import boxes_of_frame
-from mpfjax.vision.colour_model import ColourModel
-from mpfjax.vision.colours import RGBColours
+from mpfjax.vision.boxes.colour_model import ColourModel
+from mpfjax.vision.colour.bins import RGBColours
+from mpfjax.vision.files.boxes import boxes_of_frame
 
 _DEVIATIONS = np.array([3.0, 2.0, 0.03, 0.03])
 _SIGMA = 0.5

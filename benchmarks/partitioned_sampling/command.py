@@ -16,7 +16,7 @@ from benchmarks.partitioned_sampling.study import filters, num_rows, study
 from benchmarks.partitioned_sampling.tables import Measured, content_of, measure_row
 from benchmarks.partitioned_sampling.text import print_tables
 from mpfjax.console import write_json
-from mpfjax.vision.frames import parse_range
+from mpfjax.vision.files.frames import parse_range
 
 
 def run(options: argparse.Namespace) -> None:

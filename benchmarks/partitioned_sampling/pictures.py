@@ -14,7 +14,7 @@ from benchmarks.partitioned_sampling.study import Order, Row
 from benchmarks.partitioned_sampling.tables import label
 from benchmarks.partitioned_sampling.text import TITLES
 from mpfjax import plotting
-from mpfjax.vision import drawing, frames
+from mpfjax.vision.files import drawing, frames
 
 ANIMATION_RATE, MOST_DRAWN = 5.0, 100  # frames a second, particles
 

@@ -20,9 +20,9 @@ from benchmarks.partitioned_sampling.posterior import (
 )
 from mpfjax import vision
 from mpfjax.metrics import effective_dynamics, uniqueness
-from mpfjax.vision import boxes as box_files
-from mpfjax.vision.distracter import NoPath
-from mpfjax.vision.joint_colour import PAPER_DEVIATIONS
+from mpfjax.vision.boxes.joint_colour import PAPER_DEVIATIONS
+from mpfjax.vision.files import boxes as box_files
+from mpfjax.vision.scenes.distracter import NoPath
 
 PAPER_WIDTH = 360  # the frames in which a step deviates by two pixels
 MOST_TRIED = 100  # keys, before there are too few scenes

@@ -18,7 +18,7 @@ NUM_ISLANDS, ISLAND_STEPS = 8, 20
 def run_as_islands(num_particles: int, repeats: int) -> dict[str, Any]:
     """One particle filter on so many particles, its islands exchanging when they have to."""
     model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
-    moves = [mpfjax.Exchange(), mpfjax.Resample(), mpfjax.Propagate(model)]
+    moves = [mpfjax.IslandInteraction(), mpfjax.Resample(), mpfjax.Propagate(model)]
     filter = mpfjax.Filter(model, moves, num_particles // NUM_ISLANDS)
     observations = (2 * jnp.sin(2 * jnp.pi * jnp.arange(1.0, ISLAND_STEPS + 1) / 100)) ** 2
 

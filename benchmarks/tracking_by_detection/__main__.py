@@ -38,12 +38,12 @@ from mpfjax.console import (
     write_json,
 )
 from mpfjax.metrics import multi_object_scores
-from mpfjax.vision import boxes as box_files
-from mpfjax.vision import frames
-from mpfjax.vision.detectors import Rows
-from mpfjax.vision.loop import make_tracker, online_rows, track
-from mpfjax.vision.sequences import detection_files, last_frame, read_sequence_info
-from mpfjax.vision.truth import Truth, read_truth
+from mpfjax.vision.files import boxes as box_files
+from mpfjax.vision.files import frames
+from mpfjax.vision.files.sequences import detection_files, last_frame, read_sequence_info
+from mpfjax.vision.files.truth import Truth, read_truth
+from mpfjax.vision.tracking.adapters import Rows
+from mpfjax.vision.tracking.track import make_tracker, online_rows, track
 
 OURS = {"gm_mpf": "GM-MPF", "mpf": "MPF"}
 SCORES = ("HOTA", "MOTA", "IDF1", "id_switches")

@@ -33,15 +33,15 @@ from benchmarks.visual_tracking.pictures import NAMES, write_contact_sheet, writ
 from benchmarks.visual_tracking.scores import score, table, tracking_scores
 from benchmarks.visual_tracking.source import Source, open_source
 from mpfjax.console import exit_status, seed, whole, write_json
-from mpfjax.vision import boxes as box_files
-from mpfjax.vision.recipes import (
+from mpfjax.vision.boxes.recipes import (
     MAX_COMPONENTS,
     PARTICLES_PER_COMPONENT,
     PARTICLES_PER_HYPOTHESIS,
     PRESETS,
-    room_for,
+    most_components,
 )
-from mpfjax.vision.snapshots import Snapshot, follow, track_rows
+from mpfjax.vision.boxes.snapshots import Snapshot, follow, track_rows
+from mpfjax.vision.files import boxes as box_files
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -171,7 +171,7 @@ def track(
 def _write_scores(options, source: Source, num_frames: int, results) -> None:
     components, particles = MAX_COMPONENTS, PARTICLES_PER_COMPONENT
     if options.preset == "objects" and not options.detect:
-        components, particles = room_for(len(source.boxes)), PARTICLES_PER_HYPOTHESIS
+        components, particles = most_components(len(source.boxes)), PARTICLES_PER_HYPOTHESIS
     settings = {
         "source": source.name,
         "preset": options.preset,

@@ -20,7 +20,7 @@ from mpfjax.vision import (
     Tracks,
     offline_rows,
 )
-from mpfjax.vision.snapshots import Snapshot
+from mpfjax.vision.boxes.snapshots import Snapshot
 
 MAX_DETECTIONS = 32
 
@@ -48,7 +48,7 @@ def make_trackers() -> dict[str, ObjectTracker]:
     """The same tracker with resampling and with Gaussian regeneration."""
     gaussian = ObjectTracker()
     resample = mpfjax.Resample(particles_per_component=gaussian.particles_per_object)
-    return {"mpf": ObjectTracker(rejuvenation=resample), "gm_mpf": gaussian}
+    return {"mpf": ObjectTracker(resampling=resample), "gm_mpf": gaussian}
 
 
 def track_detected(

@@ -7,9 +7,9 @@ import numpy as np
 
 from benchmarks.visual_tracking.source import Source
 from mpfjax.plotting import draw_contact_sheet
-from mpfjax.vision import boxes as box_files
-from mpfjax.vision import frames
-from mpfjax.vision.snapshots import Snapshot, annotate
+from mpfjax.vision.boxes.snapshots import Snapshot, annotate
+from mpfjax.vision.files import boxes as box_files
+from mpfjax.vision.files import frames
 
 NAMES = {
     "pf": "Particle filter",

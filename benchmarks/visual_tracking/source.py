@@ -9,9 +9,10 @@ import numpy as np
 
 from mpfjax.console import refuse_overwriting
 from mpfjax.metrics.coverage import covers
-from mpfjax.vision import boxes as box_files
-from mpfjax.vision import football_scene, frames, read_truth
-from mpfjax.vision.recipes import MAX_COMPONENTS
+from mpfjax.vision import football_scene, read_truth
+from mpfjax.vision.boxes.recipes import MAX_COMPONENTS
+from mpfjax.vision.files import boxes as box_files
+from mpfjax.vision.files import frames
 
 
 class Source(NamedTuple):

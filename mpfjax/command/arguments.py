@@ -9,16 +9,16 @@ import numpy as np
 
 from mpfjax.command.scoring import find_truth
 from mpfjax.console import finite, positive, refuse_overwriting, seed, whole
-from mpfjax.vision import boxes as box_files
-from mpfjax.vision import frames
-from mpfjax.vision.sequences import (
+from mpfjax.vision.files import boxes as box_files
+from mpfjax.vision.files import frames
+from mpfjax.vision.files.sequences import (
     SequenceInfo,
     detection_files,
     last_frame,
     read_sequence_info,
     sequence_of,
 )
-from mpfjax.vision.truth import Truth
+from mpfjax.vision.files.truth import Truth
 
 DESCRIPTION = """\
 Track objects in a video or a folder of images. What to track comes from one of three: detections

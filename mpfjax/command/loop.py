@@ -19,13 +19,13 @@ from mpfjax.command.arguments import (
 )
 from mpfjax.command.scoring import SCORES, scores_of
 from mpfjax.console import Clock, format_table, peak_memory, write_json
-from mpfjax.vision import boxes as box_files
-from mpfjax.vision import drawing, frames
-from mpfjax.vision.detection import BackgroundSubtraction
-from mpfjax.vision.detectors import LEAST_ROOM, Rows
-from mpfjax.vision.drawn import follow_boxes
-from mpfjax.vision.loop import make_tracker, offline_rows, online_rows, track
-from mpfjax.vision.tracker import Tracks
+from mpfjax.vision.boxes.follow_boxes import follow_boxes
+from mpfjax.vision.files import boxes as box_files
+from mpfjax.vision.files import drawing, frames
+from mpfjax.vision.tracking.adapters import LEAST_ROOM, Rows
+from mpfjax.vision.tracking.background import BackgroundSubtraction
+from mpfjax.vision.tracking.track import make_tracker, offline_rows, online_rows, track
+from mpfjax.vision.tracking.tracker import Tracks
 
 
 class Results:

@@ -14,7 +14,7 @@ class AbstractMove(eqx.Module):
     """A step of a filter, `(key, mixture, observation) -> mixture`.
 
     A move is of one of three kinds, and its kind is its contract. An `AbstractRegrouping` does not
-    change the distribution. An `AbstractRejuvenation` does not change the mass of any component.
+    change the distribution. An `AbstractResampling` does not change the mass of any component.
     An `AbstractPropagation` takes the particles from t-1 to t. A move is `approximate` if it is
     not part of the exact recursion; the marginal likelihood is then no longer unbiased.
     """
@@ -98,7 +98,7 @@ class AbstractRegrouping(AbstractMove):
         return mixture.replace(component_indicators=indicators, memory=memory)
 
 
-class AbstractRejuvenation(AbstractMove):
+class AbstractResampling(AbstractMove):
     """A move that redraws the particles within each component and keeps the component's mass."""
 
     @property
@@ -107,8 +107,8 @@ class AbstractRejuvenation(AbstractMove):
         return False
 
 
-class AbstractResampling(AbstractRejuvenation):
-    """A rejuvenation that draws the particles of some components, those that are due."""
+class AbstractAdaptiveResampling(AbstractResampling):
+    """A resampling that draws the particles of some components, those that are due."""
 
     @abc.abstractmethod
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractPropagation, AbstractResampling
-from mpfjax.moves.lines import side_by_side
-from mpfjax.moves.propagation import Predict, Propagate, Weigh, log_transition
-from mpfjax.moves.resampling import Resample
-from mpfjax.moves.resampling_schemes import random_points
-from mpfjax.moves.slots import Slots, place_slots
+from mpfjax.moves.base import AbstractAdaptiveResampling, AbstractPropagation
+from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight, log_transition
+from mpfjax.moves.resampling.allocation import Slots, place_slots
+from mpfjax.moves.resampling.layout import side_by_side
+from mpfjax.moves.resampling.resample import Resample
+from mpfjax.moves.resampling.schemes import random_points
 from mpfjax.operations.generator import split, uniform
 from mpfjax.operations.indexing import take
 from mpfjax.operations.positions import Positions, last_before, random_positions
@@ -56,7 +56,7 @@ class ConditionalPropagation(AbstractPropagation):
         if isinstance(move, Predict):
             return self.predict(key, mixture)
         if move.proposal is None:
-            return Weigh(move.model)(key, self.predict(key, mixture), observation)
+            return Reweight(move.model)(key, self.predict(key, mixture), observation)
         proposal, previous = move.proposal, mixture.particles
         states, log_density = proposal.propose(key, observation, previous)
         moved = self._with_reference(mixture.replace(particles=states))
@@ -66,7 +66,7 @@ class ConditionalPropagation(AbstractPropagation):
         log_own = density.log_density(observation, own(moved.particles), own(previous))
         log_density = put(log_density, log_own[0], slot)
         log_ratio = log_transition(move.model, moved.particles, previous) - log_density
-        return Weigh(move.model)(key, moved, observation).weighed(log_ratio)
+        return Reweight(move.model)(key, moved, observation).weighed(log_ratio)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) around x*_t, and leave the weights."""
@@ -81,7 +81,7 @@ class ConditionalPropagation(AbstractPropagation):
         return mixture.replace(particles=particles, memory=memory)
 
 
-class ConditionalResample(AbstractResampling):
+class ConditionalResample(AbstractAdaptiveResampling):
     """Resample within components, given that the reference has an offspring.
 
     It is the law of `Resample`'s ancestor indices, given that a slot of the reference's component,

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import check_whole, is_series, shown
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractRejuvenation
+from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractResampling
 from mpfjax.operations.generator import split
 
 _MOST_STEPS = 2**31 - 1  # that int32 counts
@@ -26,7 +26,7 @@ class Every(AbstractMove):
     nothing. A missing observation is no step, since nothing is regrouped or resampled there.
 
     - `num_steps`: k, from 1 on.
-    - `moves`: regrouping and rejuvenating moves, in order.
+    - `moves`: regrouping and resampling moves, in order.
 
     Raises `ValueError` for k < 1, no moves, and a move of another kind: without a propagation at
     every step the state would not move. Use it where regrouping is a large part of the time.
@@ -133,9 +133,9 @@ def _as_inner_moves(moves: Any) -> tuple[AbstractMove, ...]:
     if not moves:
         raise ValueError("moves: there must be at least one to run at every k-th step")
     for move in moves:
-        if not isinstance(move, AbstractRegrouping | AbstractRejuvenation | Every):
+        if not isinstance(move, AbstractRegrouping | AbstractResampling | Every):
             raise ValueError(
-                f"moves: {shown(move)} neither regroups nor rejuvenates; a propagation belongs"
+                f"moves: {shown(move)} neither regroups nor resamples; a propagation belongs"
                 " into the chain itself, since without it the state would not move"
             )
     return moves

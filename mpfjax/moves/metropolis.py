@@ -12,8 +12,8 @@ from mpfjax.checks import check_exponent, check_inner_share, check_one_of, check
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
-from mpfjax.moves.base import AbstractRejuvenation
-from mpfjax.moves.propagation import likelihoods, log_transition
+from mpfjax.moves.base import AbstractResampling
+from mpfjax.moves.propagation.propagate import likelihoods, log_transition
 from mpfjax.operations.generator import normal, split, uniform
 from mpfjax.operations.gradients import add_gradient, without_gradient
 
@@ -36,7 +36,7 @@ class _Target(NamedTuple):
         return (new[0] - old[0]) + self.exponent * (new[1] - old[1])
 
 
-class AbstractMetropolis(AbstractRejuvenation):
+class AbstractMetropolis(AbstractResampling):
     """Steps of Metropolis and Hastings for every particle, given its parent x_{t-1}.
 
     The move of a resample-move filter (Gilks and Berzuini 2001): after x_t was drawn and weighed,
@@ -119,7 +119,7 @@ class RandomWalkMetropolis(AbstractMetropolis):
     - `model`: with `log_transition`.
     - `num_steps`: how many steps each particle takes.
     - `least_step`: the smallest s.
-    - `exponent`: β, for a likelihood that comes in by stages, as `Weigh(model, exponent)` does.
+    - `exponent`: β, for a likelihood that comes in by stages, as `Reweight(model, exponent)` does.
     - `gradient`: what a derivative sees: "none" the draws that were taken, "stop" the density of
       the state after the move, as with `gradient` of `Propagate`.
 

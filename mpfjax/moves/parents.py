@@ -9,15 +9,15 @@ from jaxtyping import Array, Key
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractPropagation, AbstractRegrouping
-from mpfjax.moves.clusters import PropagateInClusters
 from mpfjax.moves.every import Every
-from mpfjax.moves.exchange import Exchange
-from mpfjax.moves.gaussian import GaussianRegeneration
-from mpfjax.moves.independent import PropagateIndependently
+from mpfjax.moves.island_interaction import IslandInteraction
+from mpfjax.moves.objects.clusters import PropagateInClusters
+from mpfjax.moves.objects.independent import PropagateIndependently
+from mpfjax.moves.resampling.gaussian import GaussianRegeneration
 from mpfjax.operations.indexing import take
 
 # After these a particle has no one parent, or one on another island.
-_NO_PARENT = (PropagateInClusters, PropagateIndependently, Exchange)
+_NO_PARENT = (PropagateInClusters, PropagateIndependently, IslandInteraction)
 
 
 def runner(moves: tuple[Any, ...]) -> Callable[..., ParticleMixture]:

@@ -39,5 +39,5 @@ def check_weighed(moves: tuple[Any, ...]) -> None:
         names = ", ".join(type(move).__name__ for move in moves)
         raise ValueError(
             f"moves: {names} never weigh the particles by what is observed, and log Ẑ would be 0;"
-            " Propagate does, or Weigh after Predict"
+            " Propagate does, or Reweight after Predict"
         )

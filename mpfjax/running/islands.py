@@ -38,7 +38,7 @@ def run_islands(
     unbiased, so is this one.
 
     - `filter`: that of one island; N and M are those of one island. A plain particle filter makes
-      islands of particles. With an `Exchange` among the moves, their masses stay even.
+      islands of particles. With an `IslandInteraction` among the moves, their masses stay even.
     - `num_islands`: G. The result depends on the key and on G, not on the devices. With another
       number of devices it differs by rounding; where rounding changes a draw, it differs like
       another run.

@@ -23,9 +23,9 @@ from mpfjax.moves.conditional import (
     put,
 )
 from mpfjax.moves.every import Every
-from mpfjax.moves.exchange import Exchange
-from mpfjax.moves.propagation import Predict, Propagate, Weigh
-from mpfjax.moves.resampling import Resample
+from mpfjax.moves.island_interaction import IslandInteraction
+from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
+from mpfjax.moves.resampling.resample import Resample
 from mpfjax.observations import Series, as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.generator import split, uniform
@@ -93,7 +93,7 @@ def conditional_filter(
     `sample_transition` must draw particles independently of each other.
 
     Raises `ValueError` for a filter that is no chain of regrouping moves, `Resample` (systematic,
-    stratified or multinomial), `Propagate`, `Predict` and `Weigh`; a proposal without
+    stratified or multinomial), `Propagate`, `Predict` and `Reweight`; a proposal without
     `log_density`; noise that is not independent; a model without `log_transition`, unless
     `backward` is false; a trajectory of other shapes or types than the model's states, or of
     density zero (RuntimeError within jit). Use it in a Gibbs sampler of your own;
@@ -254,10 +254,12 @@ def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
             _check_resample(move)
         elif isinstance(move, Every) and all(isinstance(m, AbstractRegrouping) for m in move.moves):
             continue
-        elif not isinstance(move, AbstractRegrouping | Propagate | Predict | Weigh | Exchange):
+        elif not isinstance(
+            move, AbstractRegrouping | Propagate | Predict | Reweight | IslandInteraction
+        ):
             raise ValueError(
                 f"filter: {type(move).__name__} cannot keep a trajectory, as {needed_by} does;"
-                " regrouping moves, Resample, Propagate, Predict and Weigh can"
+                " regrouping moves, Resample, Propagate, Predict and Reweight can"
             )
     proposal = getattr(advances[0], "proposal", None)
     if proposal is not None:

@@ -32,7 +32,7 @@ from mpfjax.models.conditionally_linear import (
     with_moments,
 )
 from mpfjax.models.inputs import with_inputs
-from mpfjax.moves.marginalised import log_latent_transition
+from mpfjax.moves.propagation.marginalised import log_latent_transition
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.gaussians import Gaussian, Linear, without_missing
 from mpfjax.operations.generator import split, uniform

@@ -10,18 +10,18 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 from mpfjax.checks import check_type, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractRegrouping, AbstractRejuvenation
-from mpfjax.moves.clusters import PropagateInClusters
-from mpfjax.moves.exchange import Exchange
-from mpfjax.moves.independent import PropagateIndependently
-from mpfjax.moves.lineages import (
-    LINEAGE,
+from mpfjax.moves.base import AbstractRegrouping, AbstractResampling
+from mpfjax.moves.eve_indices import (
+    EVE_INDICES,
     evidence_variance,
     mass_variances,
-    with_new_lineage,
+    with_new_eve_indices,
 )
-from mpfjax.moves.regimes import PropagateRegimes
-from mpfjax.moves.resampling import Resample
+from mpfjax.moves.island_interaction import IslandInteraction
+from mpfjax.moves.objects.clusters import PropagateInClusters
+from mpfjax.moves.objects.independent import PropagateIndependently
+from mpfjax.moves.propagation.regimes import PropagateRegimes
+from mpfjax.moves.resampling.resample import Resample
 from mpfjax.running.scan import FilterRun
 
 # What the estimates hold for. Draws that are more even vary less than they say, or more.
@@ -31,18 +31,18 @@ _INDEPENDENT = {
     "initial_noise": "independent",
 }
 # After these a particle has no one ancestor, or one on another island.
-_NO_LINEAGE = (PropagateIndependently, PropagateInClusters, PropagateRegimes, Exchange)
+_NO_EVE_INDICES = (PropagateIndependently, PropagateInClusters, PropagateRegimes, IslandInteraction)
 
 
 class _KeepFirstAncestors(AbstractRegrouping):
-    """Puts a `Lineage` into the mixture of x_0, which `Resample` then keeps up to date."""
+    """Puts a `EveIndices` into the mixture of x_0, which `Resample` then keeps up to date."""
 
     def regroup(
         self, key: Key[Array, ""], mixture: ParticleMixture
     ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
         """The same indicators, and a memory with every particle its own first ancestor."""
         del key
-        return mixture.component_indicators, with_new_lineage(mixture).memory
+        return mixture.component_indicators, with_new_eve_indices(mixture).memory
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
@@ -59,13 +59,13 @@ def with_first_ancestors(filter: Filter) -> Filter:
     runs can be given to `log_marginal_likelihood_variance` and `mixture_weight_errors`. `StepInfo`
     then has both errors at every step. Raises `ValueError` for what is no filter, for a filter
     whose particles have no single ancestors or whose Ẑ is not unbiased (one with an approximate
-    move, `PropagateIndependently`, `PropagateInClusters` or `Exchange`), and for draws that are not
+    move, `PropagateIndependently`, `PropagateInClusters` or `IslandInteraction`), and for draws that are not
     independent: a scheme other than "multinomial", or a noise other than "independent".
     """
     check_type(Filter, "a Filter", filter=filter)
     for move in filter.moves:
-        redraws = isinstance(move, AbstractRejuvenation) and not isinstance(move, Resample)
-        if getattr(move, "approximate", True) or redraws or isinstance(move, _NO_LINEAGE):
+        redraws = isinstance(move, AbstractResampling) and not isinstance(move, Resample)
+        if getattr(move, "approximate", True) or redraws or isinstance(move, _NO_EVE_INDICES):
             raise ValueError(
                 f"filter: {type(move).__name__}, one of its moves, is approximate or leaves a"
                 " particle without one ancestor; the variance of log Ẑ is not known from one run"
@@ -181,13 +181,13 @@ def _with_lineage(run: Any) -> ParticleMixture:
     mixture: Any = run.final if isinstance(run, FilterRun) else run
     if not isinstance(mixture, ParticleMixture):
         raise ValueError(f"run: {shown(run)} is no FilterRun, nor a mixture")
-    if LINEAGE not in mixture.memory:
+    if EVE_INDICES not in mixture.memory:
         raise ValueError("run: its filter keeps no first ancestors; run with_first_ancestors of it")
     if mixture.log_weights.ndim != 1:
         raise ValueError(
             f"run: weights of shape {mixture.log_weights.shape} are not those of one run, (n,);"
             " jax.vmap over the leading axis of several runs"
         )
-    if mixture.memory[LINEAGE].first_ancestors.ndim != 1:
+    if mixture.memory[EVE_INDICES].indices.ndim != 1:
         raise ValueError("run: islands have no first ancestors in common")
     return mixture

@@ -1,9 +1,5 @@
 """Tuning of a filter's parameters by gradients, and their posterior."""
 
-from mpfjax.tuning.climb import Maximisation as Maximisation
-from mpfjax.tuning.climb import TuningRun as TuningRun
-from mpfjax.tuning.climb import fit as fit
-from mpfjax.tuning.climb import maximise as maximise
 from mpfjax.tuning.curvature import standard_errors as standard_errors
 from mpfjax.tuning.densities import LogDensity as LogDensity
 from mpfjax.tuning.densities import log_density as log_density
@@ -15,6 +11,10 @@ from mpfjax.tuning.labels import label_log_posteriors as label_log_posteriors
 from mpfjax.tuning.labels import transition_candidates as transition_candidates
 from mpfjax.tuning.metropolis import Posterior as Posterior
 from mpfjax.tuning.metropolis import metropolis_hastings as metropolis_hastings
+from mpfjax.tuning.optimisation import Maximisation as Maximisation
+from mpfjax.tuning.optimisation import TuningRun as TuningRun
+from mpfjax.tuning.optimisation import fit as fit
+from mpfjax.tuning.optimisation import maximise as maximise
 from mpfjax.tuning.sequential import SequentialPosterior as SequentialPosterior
 from mpfjax.tuning.sequential import smc2 as smc2
 from mpfjax.tuning.transforms import AbstractTransform as AbstractTransform

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_type, shown
 from mpfjax.filter import Filter, Start
-from mpfjax.moves.clusters import PropagateInClusters
-from mpfjax.moves.independent import PropagateIndependently
-from mpfjax.moves.resampling import Resample
+from mpfjax.moves.objects.clusters import PropagateInClusters
+from mpfjax.moves.objects.independent import PropagateIndependently
+from mpfjax.moves.resampling.resample import Resample
 from mpfjax.observations import Series, as_series
 from mpfjax.proposals import AbstractProposal
 from mpfjax.running.scan import scan

@@ -20,10 +20,10 @@ from mpfjax.checks import (
 )
 from mpfjax.filter import Filter
 from mpfjax.tuning.checkpoints import check_checkpoint, identity_of
-from mpfjax.tuning.cloud import Sampler
 from mpfjax.tuning.densities import LogPrior, check_exact, checked_prior
-from mpfjax.tuning.observing import CloudRun, Doubling, Observed, SamplesFile, State
+from mpfjax.tuning.parameter_particles import Sampler
 from mpfjax.tuning.problem import Parameters, pose_filter
+from mpfjax.tuning.smc2_run import Doubling, Observed, SamplesFile, Smc2Run, State
 from mpfjax.tuning.starts import SamplePrior, constrained, drawn
 from mpfjax.tuning.transforms import AbstractTransform
 
@@ -49,7 +49,7 @@ class SequentialPosterior:
     and of proposals that were rejected."""
     stopped: str | None = None
     """why it ended before the last observation, or None."""
-    _goes_on: tuple[CloudRun, State] | None = field(default=None, repr=False, compare=False)
+    _goes_on: tuple[Smc2Run, State] | None = field(default=None, repr=False, compare=False)
     """what `extend` starts from."""
 
     @property
@@ -185,12 +185,12 @@ def smc2(
         identity = identity_of(checkpoint_name, settings, code)
         file = SamplesFile(Path(checkpoint), int(checkpoint_every), identity)
     doubling = Doubling(max_particles, float(acceptance_threshold))
-    run = CloudRun(sampler, observed, key_steps, float(ess_threshold), doubling, file)
+    run = Smc2Run(sampler, observed, key_steps, float(ess_threshold), doubling, file)
     keys = jax.random.split(key_filters, num_samples)
     return _posterior(run, run.loaded(keys, reals) or run.started(keys, reals), progress)
 
 
-def _posterior(run: CloudRun, state: State, progress: bool) -> SequentialPosterior:
+def _posterior(run: Smc2Run, state: State, progress: bool) -> SequentialPosterior:
     """The posterior after all observations, from where the state is."""
     state, stopped = run.go(state, progress)
     reals = jax.tree.map(np.asarray, state.samples.particles.reals)

@@ -16,8 +16,8 @@ from benchmarks.visual_tracking.detected import (
     track_detected,
 )
 from benchmarks.visual_tracking.source import Source
-from mpfjax.vision.boxes import read_tracks, write_tracks
-from mpfjax.vision.frames import read_frames, write_image, write_video
+from mpfjax.vision.files.boxes import read_tracks, write_tracks
+from mpfjax.vision.files.frames import read_frames, write_image, write_video
 
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
 

@@ -11,7 +11,7 @@ from benchmarks.gm_mpf import sizes
 from benchmarks.gm_mpf.filters import make_model
 from benchmarks.gm_mpf.runs import Collect, Step, held, study
 from mpfjax.mixture import ParticleMixture
-from mpfjax.vision.colour_model import BoxState
+from mpfjax.vision.boxes.colour_model import BoxState
 
 FILTERS = ["pf", "gm_mpf"]
 FRAMES = 4

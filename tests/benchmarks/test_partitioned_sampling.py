@@ -31,7 +31,7 @@ from mpfjax.vision import (
     joint_colour_model,
     write_tracks,
 )
-from mpfjax.vision.frames import read_frames, write_image
+from mpfjax.vision.files.frames import read_frames, write_image
 
 NUM_RUNS = 2
 FIELDS = ["scene", "lambda", "method", "order", "success", "recovery", "precision", "recall",
@@ -307,7 +307,7 @@ def sequence(tmp_path_factory):
 
 @pytest.mark.thorough
 def test_a_sequence_makes_table_3_for_the_first_id(sequence, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("mpfjax.vision.joint_colour.HSVColours", lambda: HSVColours(4, 2, 2))
+    monkeypatch.setattr("mpfjax.vision.boxes.joint_colour.HSVColours", lambda: HSVColours(4, 2, 2))
     assert run("--sequence", sequence, "--ids", 2, 1, "--frames", "2:6", "--runs", NUM_RUNS,
                "--particles", 24, "--methods", "joint", "--out", tmp_path) == 0  # fmt: skip
     content = content_in(tmp_path)

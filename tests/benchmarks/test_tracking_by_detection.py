@@ -9,8 +9,8 @@ import pytest
 from benchmarks.tracking_by_detection import __main__ as benchmark
 from benchmarks.tracking_by_detection import football
 from benchmarks.tracking_by_detection.peers import Peer, peers
-from mpfjax.vision.boxes import write_tracks
-from mpfjax.vision.frames import write_image
+from mpfjax.vision.files.boxes import write_tracks
+from mpfjax.vision.files.frames import write_image
 from tests.examples import two_walkers
 
 pytest.importorskip("imageio", reason="reading frames needs the extra 'video', which 'test' brings")

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import tracking_speed
 from benchmarks.tracking_speed import NUM_OBJECTS, SMALL, WAYS, Street, Way
-from mpfjax.vision.detection import BackgroundSubtraction
+from mpfjax.vision.tracking.background import BackgroundSubtraction
 
 
 def test_objects_stay_in_the_frame_and_apart_and_move():

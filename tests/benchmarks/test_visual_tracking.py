@@ -8,9 +8,9 @@ import pytest
 
 from benchmarks.visual_tracking import __main__ as visual_tracking
 from mpfjax.metrics.coverage import coverage
-from mpfjax.vision.boxes import read_tracks, write_tracks
-from mpfjax.vision.frames import read_frames, write_image, write_video
-from mpfjax.vision.scenes import football_scene
+from mpfjax.vision.files.boxes import read_tracks, write_tracks
+from mpfjax.vision.files.frames import read_frames, write_image, write_video
+from mpfjax.vision.scenes.football import football_scene
 from tests.marking import thorough
 
 pytest.importorskip("imageio", reason="reading and writing frames needs the extra 'video'")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mpfjax import QuadraticModel, Resample, mixture_particle_filter
-from mpfjax.moves.slots import LEAST_SHARE
+from mpfjax.moves.resampling.allocation import LEAST_SHARE
 from tests.examples import make_mixture
 from tests.marking import thorough
 

@@ -12,7 +12,7 @@ import pytest
 import mpfjax
 from mpfjax import MultiObjectModel, PairwiseRepulsion, PropagateInClusters
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.contact import connected
+from mpfjax.moves.objects.coupling import connected
 from tests.examples import stack, walker
 
 KEY = jax.random.key(0)

@@ -11,7 +11,7 @@ import pytest
 from mpfjax import Resample
 from tests.examples import example_mixtures, log_masses, make_mixture
 from tests.marking import quick_of, thorough
-from tests.registry import REGROUPINGS, REJUVENATIONS
+from tests.registry import REGROUPINGS, WITHIN_COMPONENTS
 
 # On either side of the number of components up to which they are worked on as rows.
 FEW = ("ordinary", "dead components", "masses 200 nats apart")
@@ -39,10 +39,12 @@ NUM_DRAWS = 4000
 
 over_mixtures = pytest.mark.parametrize("mixture", MIXTURES.values(), ids=MIXTURES)
 over_regroupings = pytest.mark.parametrize("name", REGROUPINGS)
-over_rejuvenations = pytest.mark.parametrize("name", quick_of(REJUVENATIONS, QUICK_REJUVENATIONS))
+over_moves_within_components = pytest.mark.parametrize(
+    "name", quick_of(WITHIN_COMPONENTS, QUICK_REJUVENATIONS)
+)
 RESAMPLINGS = [
     name
-    for name, move in REJUVENATIONS.items()
+    for name, move in WITHIN_COMPONENTS.items()
     if isinstance(move, Resample) and not move.approximate
 ]
 over_resamplings = pytest.mark.parametrize("name", quick_of(RESAMPLINGS, QUICK_REJUVENATIONS))
@@ -56,7 +58,7 @@ def compiled(name):
 @cache
 def redraw(name):
     """The move, compiled for many keys at once and one mixture."""
-    move = REJUVENATIONS[name]
+    move = WITHIN_COMPONENTS[name]
     return eqx.filter_jit(jax.vmap(lambda key, mixture: move(key, mixture), in_axes=(0, None)))
 
 
@@ -102,8 +104,8 @@ def test_regrouping_leaves_a_mixture_whose_summaries_are_finite(name, mixture):
 
 
 @pytest.mark.parametrize("example", quick_of(MIXTURES, QUICK_MIXTURES))
-@over_rejuvenations
-class TestRejuvenation:
+@over_moves_within_components
+class TestWithinComponents:
     def test_leaves_each_components_mass_unchanged(self, name, example):
         before, after = log_masses(MIXTURES[example]), draws(name, example)
         for draw in range(0, NUM_DRAWS, 400):
@@ -123,13 +125,13 @@ class TestRejuvenation:
         filled = after.log_weights > -np.inf
         parents = after.ancestor_indices[filled]
         assert np.asarray(before.occupied)[parents].all()
-        is_soft = getattr(REJUVENATIONS[name], "gradient", None) == "soft"  # draws from all
+        is_soft = getattr(WITHIN_COMPONENTS[name], "gradient", None) == "soft"  # draws from all
         if all_due(name, before) and not is_soft:
             assert not weightless[parents].any()
 
     def test_fills_the_slots_that_it_should(self, name, example):
         after, before = draws(name, example), MIXTURES[example]
-        number = REJUVENATIONS[name].particles_per_component
+        number = WITHIN_COMPONENTS[name].particles_per_component
         counts = np.asarray(before.component_counts)
         filled = (after.log_weights > -np.inf).sum(axis=1)
         if number is not None:
@@ -177,7 +179,7 @@ class TestResampling:
 
 def move_due(name, mixture):
     """Which components the move redraws."""
-    move = REJUVENATIONS[name]
+    move = WITHIN_COMPONENTS[name]
     return np.asarray(move.is_due(mixture) if isinstance(move, Resample) else mixture.active)
 
 
@@ -199,7 +201,7 @@ def new_counts(after, num_components):
 def test_resampling_works_with_any_pytree_of_particles(name):
     mixture = MIXTURES["ordinary"]
     leaves = {"box": mixture.particles, "age": (jnp.arange(40), jnp.zeros((40, 2, 3)))}
-    move = REJUVENATIONS[name]
+    move = WITHIN_COMPONENTS[name]
     if move.sort_by is not None:
         move = Resample(move.scheme, sort_by=lambda states: states["box"][:, 0])
     after = move(jax.random.key(2), mixture.replace(particles=leaves))

@@ -12,9 +12,9 @@ import pytest
 import mpfjax
 from mpfjax import Resample
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.lines import side_by_side
-from mpfjax.moves.resampling_schemes import SCHEMES as SCHEMES_BY_NAME
-from mpfjax.moves.slots import place_slots
+from mpfjax.moves.resampling.allocation import place_slots
+from mpfjax.moves.resampling.layout import side_by_side
+from mpfjax.moves.resampling.schemes import SCHEMES as SCHEMES_BY_NAME
 from mpfjax.operations import positions
 from mpfjax.smoothing.backward import draw
 from tests.examples import make_mixture

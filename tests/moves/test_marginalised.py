@@ -13,14 +13,14 @@ from mpfjax import (
     Filter,
     GroupBy,
     KMeans,
-    PropagateFamilies,
     PropagateMarginalised,
+    PropagateNested,
     PropagateRegimes,
     RegimeProposal,
     Resample,
 )
 from mpfjax.exact import kalman_filter, switching_filter
-from mpfjax.moves.regimes import children
+from mpfjax.moves.propagation.regimes import children
 from tests.marking import thorough
 from tests.switching import (
     MODEL,
@@ -282,7 +282,7 @@ def test_parts_of_other_shapes_are_named(part, message):
 def test_misuse_is_named():
     with pytest.raises(ValueError, match="observation: shape"):
         mpfjax.run_filter(KEY, ONE, SERIES[:, :1])
-    for make in (mpfjax.Propagate, mpfjax.Predict, mpfjax.Weigh, mpfjax.PropagateInStages):
+    for make in (mpfjax.Propagate, mpfjax.Predict, mpfjax.Reweight, mpfjax.PropagateTempered):
         with pytest.raises(ValueError, match=r"model: .* is conditionally linear"):
             make(MODEL)
     with pytest.raises(ValueError, match=r"model: .* conditionally linear"):
@@ -294,7 +294,7 @@ def test_misuse_is_named():
     with pytest.raises(ValueError, match="transition_from_noise"):
         PropagateMarginalised(OnePath(LINEAR), noise="rqmc")
     with pytest.raises(ValueError, match="propagate:"):
-        PropagateFamilies(PropagateMarginalised(MODEL, gradient="stop"))
+        PropagateNested(PropagateMarginalised(MODEL, gradient="stop"))
 
 
 def test_with_the_optimal_proposal_all_weights_are_equal():

@@ -9,18 +9,18 @@ import pytest
 import mpfjax
 from mpfjax import (
     Every,
-    Exchange,
     Filter,
+    IslandInteraction,
     KMeans,
     MetropolisAdjustedLangevin,
     Predict,
     Propagate,
     RandomWalkMetropolis,
     Resample,
-    Weigh,
+    Reweight,
 )
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.base import AbstractRejuvenation
+from mpfjax.moves.base import AbstractResampling
 from tests.marking import thorough
 from tests.user_models import ScalarLinear
 
@@ -31,7 +31,7 @@ MODEL = mpfjax.LinearGaussianModel(
 OBSERVATIONS = jnp.array([[1.0, 0.5], [2.0, -1.0]])
 
 
-class Watch(AbstractRejuvenation):
+class Watch(AbstractResampling):
     """Puts the parents where the test finds them; moves nothing."""
 
     needs_parents = property(lambda self: True)
@@ -86,8 +86,8 @@ def test_stages_halve_the_error_where_the_likelihood_is_narrow():
     model = mpfjax.LinearGaussianModel(0.9 * eye, eye, eye, 0.01 * eye, jnp.zeros(4), eye)
     observations = jax.random.normal(jax.random.key(1), (5, 4))
     truth = kalman_filter(model, observations).log_marginal_likelihood
-    moves = [Resample(), Predict(model), Weigh(model, 0.05), Resample()]
-    moves += [RandomWalkMetropolis(model, 3, exponent=0.05), Weigh(model, 0.95)]
+    moves = [Resample(), Predict(model), Reweight(model, 0.05), Resample()]
+    moves += [RandomWalkMetropolis(model, 3, exponent=0.05), Reweight(model, 0.95)]
     keys = jax.random.split(jax.random.key(2), 64)
     errors = [
         mpfjax.monte_carlo(keys, filter, observations, lambda m: None).log_marginal_likelihood
@@ -128,8 +128,8 @@ def test_the_score_passes_through_the_move(move):
 class TestArguments:
     def test_chains_without_one_parent_are_named(self):
         move = RandomWalkMetropolis(MODEL)
-        with pytest.raises(ValueError, match="Exchange leaves no particle one parent"):
-            Filter(MODEL, [Exchange(), Propagate(MODEL), move], 8)
+        with pytest.raises(ValueError, match="IslandInteraction leaves no particle one parent"):
+            Filter(MODEL, [IslandInteraction(), Propagate(MODEL), move], 8)
         with pytest.raises(ValueError, match="may only regroup beside it"):
             Filter(MODEL, [Propagate(MODEL), Every(2, [Resample(), move])], 8)
         with pytest.raises(ValueError, match="comes before any propagation"):
@@ -148,4 +148,4 @@ class TestArguments:
         with pytest.raises(ValueError, match=message):
             MetropolisAdjustedLangevin(MODEL, **option)
         with pytest.raises(ValueError, match="exponent: 2"):
-            Weigh(MODEL, 2.0)
+            Reweight(MODEL, 2.0)

@@ -13,7 +13,7 @@ import pytest
 import mpfjax
 from mpfjax import MultiObjectModel, PairwiseRepulsion, Partitioned
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.partitioned import circular_orders
+from mpfjax.moves.objects.partitioned import circular_orders
 from tests.examples import make_mixture, stack, walker
 from tests.marking import thorough
 from tests.user_models import TrickyQuadraticModel, nothing_traced

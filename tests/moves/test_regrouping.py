@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from mpfjax import Filter, KMeans, Merge, Pool, QuadraticModel, RandomPartition, Split
-from mpfjax.moves.features import summarise, summarise_about
-from mpfjax.moves.kmeans import farthest_first
-from mpfjax.moves.merge import lowest_connected
-from mpfjax.moves.split import free_labels
+from mpfjax.moves.regrouping.features import summarise, summarise_about
+from mpfjax.moves.regrouping.kmeans import farthest_first
+from mpfjax.moves.regrouping.merge import lowest_connected
+from mpfjax.moves.regrouping.split import free_labels
 from tests.examples import make_mixture
 
 KEY = jax.random.key(0)

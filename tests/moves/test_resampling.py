@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mpfjax import Resample
-from mpfjax.moves.resampling_schemes import random_points
-from mpfjax.moves.slots import place_slots
+from mpfjax.moves.resampling.allocation import place_slots
+from mpfjax.moves.resampling.schemes import random_points
 from mpfjax.operations import positions
 from tests.examples import make_mixture
 from tests.marking import quick_of, thorough
@@ -29,7 +29,7 @@ def offspring(mixture, moved):
 
 
 def assert_sound(mixture, moved):
-    """No slot fed from a particle of zero weight, no border crossed, no mass moved."""
+    """No slot fed from a particle of zero weight, no border recombined, no mass moved."""
     weights = np.exp(np.asarray(mixture.log_component_weights))
     filled = np.asarray(moved.occupied)
     parents = np.asarray(moved.ancestor_indices)[filled]

@@ -40,7 +40,7 @@ CASES = {
     "many components, sorted, of fixed number": (
         chain(
             Resample("stratified", particles_per_component=2, sort_by=lambda x: -x),
-            mpfjax.Predict(QUADRATIC), mpfjax.Weigh(QUADRATIC), RandomPartition(4), n=11, m=5,
+            mpfjax.Predict(QUADRATIC), mpfjax.Reweight(QUADRATIC), RandomPartition(4), n=11, m=5,
         ),
         False,
     ),
@@ -232,7 +232,7 @@ class TestBadInput:
                 "proposal: WithoutDensity defines no log_density",
             ),
             (
-                lambda: Filter(Walled(), [mpfjax.Weigh(Walled())], 6),
+                lambda: Filter(Walled(), [mpfjax.Reweight(Walled())], 6),
                 "filter: .*one Propagate or Predict",
             ),
             (

@@ -106,43 +106,47 @@ class TestMaximise:
     def parabola(self, key, model):
         return -((model.lambda_ - 3.0) ** 2)
 
-    def climb(self, num_steps=60, **options):
+    def optimisation(self, num_steps=60, **options):
         options = {"parameters": {"lambda": lambda m: m.lambda_}, "progress": False} | options
         return maximise(
             jax.random.key(0), self.parabola, Unnormalised(), optax.sgd(0.1), num_steps, **options
         )
 
     def test_a_function_is_an_objective(self):
-        run = self.climb()
+        run = self.optimisation()
         assert run.parameters["lambda"] == pytest.approx(3.0, abs=1e-3)
         np.testing.assert_allclose(run.history["lambda"][:2], [1.0, 1.4], rtol=1e-5)
         assert run.value == pytest.approx(0.0, abs=1e-4)
 
     def test_it_goes_on_from_a_checkpoint(self, tmp_path):
-        whole = self.climb(6)
-        self.climb(3, checkpoint=tmp_path / "climb.npz")
-        resumed = self.climb(6, checkpoint=tmp_path / "climb.npz")
+        whole = self.optimisation(6)
+        self.optimisation(3, checkpoint=tmp_path / "optimisation.npz")
+        resumed = self.optimisation(6, checkpoint=tmp_path / "optimisation.npz")
         assert resumed.parameters["lambda"] == whole.parameters["lambda"]
 
     @pytest.mark.parametrize("wrap", [lambda function: function, eqx.filter_jit])
     def test_a_checkpoint_of_another_objective_is_refused(self, tmp_path, wrap):
-        def climb(num_steps, aim, **options):
+        def optimisation(num_steps, aim, **options):
             data = jnp.array([aim, 0.0])
             return maximise(
                 jax.random.key(0), wrap(lambda key, model: -((model.lambda_ - data[0]) ** 2)),
                 Unnormalised(), optax.sgd(0.1), num_steps,
                 parameters={"lambda": lambda m: m.lambda_}, progress=False,
-                checkpoint=tmp_path / "climb.npz", **options,
+                checkpoint=tmp_path / "optimisation.npz", **options,
             )  # fmt: skip
 
-        climb(2, 3.0)
-        assert climb(3, 3.0).history["lambda"].shape == (3,)
+        optimisation(2, 3.0)
+        assert optimisation(3, 3.0).history["lambda"].shape == (3,)
         with pytest.raises(ValueError, match=r"is of another maximise: objective.*\.data is float"):
-            climb(3, 4.0)
+            optimisation(3, 4.0)
 
     def test_one_that_ended_is_returned_as_it_ended(self, tmp_path):
-        first = self.climb(60, checkpoint=tmp_path / "climb.npz", patience=2, tolerance=1e-3)
-        again = self.climb(90, checkpoint=tmp_path / "climb.npz", patience=2, tolerance=1e-3)
+        first = self.optimisation(
+            60, checkpoint=tmp_path / "optimisation.npz", patience=2, tolerance=1e-3
+        )
+        again = self.optimisation(
+            90, checkpoint=tmp_path / "optimisation.npz", patience=2, tolerance=1e-3
+        )
         assert "2 steps gained" in first.stopped
         assert again.stopped == first.stopped
         np.testing.assert_array_equal(again.history["lambda"], first.history["lambda"])
@@ -166,7 +170,7 @@ class TestMaximise:
 
     def test_a_parameter_without_effect_is_named(self):
         with pytest.raises(ValueError, match="value does not depend on c"):
-            self.climb(parameters=None)
+            self.optimisation(parameters=None)
 
     def test_a_break_is_said_to_be_its_own(self):
         with pytest.raises(RuntimeError, match="maximise: the value was nan at the start"):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.tuning import Positive, observing, smc2
+from mpfjax.tuning import Positive, smc2
+from mpfjax.tuning import smc2_run as observing
 from tests.tuning.exact_posteriors import (
     DEVIATION_OF_A,
     DEVIATION_OF_LOG_SIGMA,

@@ -185,8 +185,8 @@ TABLE = {
         {},
         {"colour_model": "kind", "anchor": "share", "hidden_distance": "positive"},
     ),
-    "LearnLooks": (
-        late(vision.LearnLooks, model="learned"),
+    "AdaptAppearance": (
+        late(vision.AdaptAppearance, model="learned"),
         {},
         {"model": "kind", "rate": "share"},
     ),
@@ -194,7 +194,7 @@ TABLE = {
     "ObjectTracker": (
         vision.ObjectTracker,
         {},
-        {"max_objects": "count", "particles_per_object": "count", "rejuvenation": "kind?",
+        {"max_objects": "count", "particles_per_object": "count", "resampling": "kind?",
          "colours": "kind?", "sigma": "positive?", "frames_per_second": "positive?",
          "exact_colours": "flag", "moves": "kind?"},
     ),

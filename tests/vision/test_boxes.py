@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mpfjax.vision.boxes import (
+from mpfjax.vision.files.boxes import (
     boxes_of_frame,
     centred,
     check_boxes,

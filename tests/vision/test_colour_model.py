@@ -7,9 +7,9 @@ import pytest
 
 import mpfjax
 from mpfjax import Autoregression, RandomWalk, WalkWithVelocity
-from mpfjax.vision.colour_model import BoxState, ColourModel
-from mpfjax.vision.colours import HSVColours, RGBColours
-from mpfjax.vision.histograms import integral_histogram
+from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
+from mpfjax.vision.colour.bins import HSVColours, RGBColours
+from mpfjax.vision.colour.histograms import integral_histogram
 
 BOXES = np.array([[10.0, 10, 12, 20], [50, 20, 16, 24]])
 DEVIATIONS = np.array([2.0, 1.0, 0.1, 0.05])

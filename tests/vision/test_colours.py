@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from matplotlib.colors import rgb_to_hsv
 
-from mpfjax.vision.colours import HSVColours, RGBColours, hue_saturation_value
-from mpfjax.vision.histograms import integral_histogram
+from mpfjax.vision.colour.bins import HSVColours, RGBColours, hue_saturation_value
+from mpfjax.vision.colour.histograms import integral_histogram
 
 
 @pytest.fixture(scope="module")

@@ -149,7 +149,7 @@ def test_coloured_noise():
     ],
 )
 def test_what_leaves_no_scene_is_named(monkeypatch, name, value):
-    monkeypatch.setattr("mpfjax.vision.distracter._TRIES", 1000)
+    monkeypatch.setattr("mpfjax.vision.scenes.distracter._TRIES", 1000)
     with pytest.raises(ValueError, match=f"^{name}"):
         distracter_scene(jax.random.key(0), **{name: value})
 

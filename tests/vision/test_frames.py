@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image as pillow
 
-from mpfjax.vision.frames import frame_rate, num_images, read_frames, write_image, write_video
+from mpfjax.vision.files.frames import frame_rate, num_images, read_frames, write_image, write_video
 
 
 def shades(num, height=32, width=48):

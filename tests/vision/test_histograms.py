@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.vision.colours import RGBColours
-from mpfjax.vision.histograms import bhattacharyya, integral_histogram, normalise
+from mpfjax.vision.colour.bins import RGBColours
+from mpfjax.vision.colour.histograms import bhattacharyya, integral_histogram, normalise
 
 HEIGHT, WIDTH = 41, 67
 

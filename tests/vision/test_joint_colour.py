@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.vision.colour_model import ColourModel
-from mpfjax.vision.colours import HSVColours, RGBColours
-from mpfjax.vision.joint_colour import joint_colour_model, object_boxes, with_lambda
+from mpfjax.vision.boxes.colour_model import ColourModel
+from mpfjax.vision.boxes.joint_colour import joint_colour_model, object_boxes, with_lambda
+from mpfjax.vision.colour.bins import HSVColours, RGBColours
 
 KEY = jax.random.key(0)
 COLOURS = HSVColours(4, 2, 2)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mpfjax import Autoregression, RandomWalk, WalkWithVelocity
-from mpfjax.vision.boxes import centred
-from mpfjax.vision.colour_model import ColourModel
-from mpfjax.vision.labels import boxes_around, labelled_states
+from mpfjax.vision.boxes.colour_model import ColourModel
+from mpfjax.vision.boxes.labels import boxes_around, labelled_states
+from mpfjax.vision.files.boxes import centred
 
 FRAME = np.full((40, 60, 3), 90, np.uint8)
 BOXES = np.array([[10.0, 8, 12, 16], [35, 12, 12, 20]])

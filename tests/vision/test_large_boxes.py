@@ -14,7 +14,7 @@ from mpfjax.vision import (
     integral_histogram,
     joint_colour_model,
 )
-from mpfjax.vision.histograms import normalise
+from mpfjax.vision.colour.histograms import normalise
 from tests.marking import thorough
 
 HEIGHT, WIDTH, BINS = 600, 620, 4

@@ -7,11 +7,11 @@ import pytest
 
 from mpfjax.mixture import single_component
 from mpfjax.vision import (
+    AdaptAppearance,
     BoxState,
     ColourModel,
     LearnedBoxState,
     LearnedColourModel,
-    LearnLooks,
     RGBColours,
 )
 
@@ -46,14 +46,14 @@ def squared(first, second):
 
 
 def by_hand(anchor, hidden, rate):
-    """log L and the new looks of the first particle, which stands where box 0 was."""
+    """log L and the new appearance of the first particle, which stands where box 0 was."""
     first, now = counted(FIRST, 10, 15, 10, 20), counted(NOW, 10, 16, 10, 20)
-    # Its looks are already those of the other box.
-    looks = counted(FIRST, 25, 17.5, 10, 15)
-    distance = anchor * squared(first, now) + (1 - anchor) * squared(looks, now)
+    # Its appearance are already those of the other box.
+    appearance = counted(FIRST, 25, 17.5, 10, 15)
+    distance = anchor * squared(first, now) + (1 - anchor) * squared(appearance, now)
     seen, unseen = np.exp(-0.5 * distance / 0.25), np.exp(-0.5 * hidden / 0.25)
     share = rate * seen / (seen + unseen)
-    return np.log(seen + unseen), looks + share * (now - looks)
+    return np.log(seen + unseen), appearance + share * (now - appearance)
 
 
 @pytest.mark.parametrize(("anchor", "hidden", "rate"), [(0.3, 0.4, 0.5), (0.0, 1.0, 1.0)])
@@ -61,14 +61,14 @@ def test_the_likelihood_and_what_is_learned_by_hand(anchor, hidden, rate):
     inner = colour_model()
     model = LearnedColourModel(inner, anchor=anchor, hidden_distance=hidden)
     states = states_of(inner)
-    looks = states.looks.at[0].set(inner.references[1])
-    states = LearnedBoxState(states.box, states.reference, None, looks)
+    appearance = states.appearance.at[0].set(inner.references[1])
+    states = LearnedBoxState(states.box, states.reference, None, appearance)
     log_likelihood, learned = by_hand(anchor, hidden, rate)
     frame = jnp.asarray(NOW)
     np.testing.assert_allclose(model.log_likelihood(frame, states)[0], log_likelihood, atol=1e-4)
     mixture = single_component(states)
-    moved = LearnLooks(model, rate)(jax.random.key(0), mixture, frame)
-    np.testing.assert_allclose(moved.particles.looks[0, 0], learned, atol=1e-4)
+    moved = AdaptAppearance(model, rate)(jax.random.key(0), mixture, frame)
+    np.testing.assert_allclose(moved.particles.appearance[0, 0], learned, atol=1e-4)
     np.testing.assert_array_equal(moved.log_weights, mixture.log_weights)
     np.testing.assert_array_equal(moved.particles.box, states.box)
 
@@ -87,11 +87,11 @@ def test_outside_the_frame_nothing_is_learned_and_the_object_is_hidden():
     model = LearnedColourModel(inner, hidden_distance=0.1)
     states, frame = states_of(inner, xs=(-500.0, np.nan, 10.0)), jnp.asarray(NOW)
     learned = model.learned(frame, states, 1.0)
-    np.testing.assert_array_equal(learned.looks[:2], states.looks[:2])
-    assert not np.allclose(learned.looks[2], states.looks[2])
+    np.testing.assert_array_equal(learned.appearance[:2], states.appearance[:2])
+    assert not np.allclose(learned.appearance[2], states.appearance[2])
     hidden = -0.5 * 0.1 / 0.5**2
     assert model.log_likelihood(frame, states)[0] == pytest.approx(hidden, abs=0.01)
 
 
 def test_it_says_that_it_is_approximate():
-    assert LearnLooks(LearnedColourModel(colour_model())).approximate
+    assert AdaptAppearance(LearnedColourModel(colour_model())).approximate

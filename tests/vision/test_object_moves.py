@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.vision.colour_model import BoxState
-from mpfjax.vision.object_moves import ObjectExclusion, PruneHypotheses
+from mpfjax.vision.boxes.colour_model import BoxState
+from mpfjax.vision.boxes.object_moves import ObjectExclusion, PruneHypotheses
 
 # Component, reference, x, mass: object 0 has two hypotheses, object 1 has one near the first.
 ROWS = [(0, 0, 0.0, 0.2), (0, 0, 2.0, 0.2), (1, 0, 50.0, 0.1), (2, 1, 4.0, 0.3), (2, 1, 6.0, 0.2)]

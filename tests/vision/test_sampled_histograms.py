@@ -12,8 +12,8 @@ from mpfjax.vision import (
     bhattacharyya,
     integral_histogram,
 )
-from mpfjax.vision.histograms import normalise
-from mpfjax.vision.sampled_histograms import SampledBoxes
+from mpfjax.vision.colour.histograms import normalise
+from mpfjax.vision.colour.sampled_histograms import SampledBoxes
 from tests.marking import thorough
 
 RNG = np.random.default_rng(0)

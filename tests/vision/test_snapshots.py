@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mpfjax.vision.drawing import PALETTE, with_tracks
-from mpfjax.vision.snapshots import Snapshot, annotate, track_rows
+from mpfjax.vision.boxes.snapshots import Snapshot, annotate, track_rows
+from mpfjax.vision.files.drawing import PALETTE, with_tracks
 
 
 def snapshots(references=True):

@@ -8,10 +8,10 @@ import pytest
 from jax.test_util import check_grads
 
 import mpfjax
-from mpfjax.vision.colour_model import BoxState, ColourModel
-from mpfjax.vision.colours import RGBColours
-from mpfjax.vision.histograms import integral_histogram
-from mpfjax.vision.soft_histograms import SoftColourModel, soft_histograms
+from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
+from mpfjax.vision.boxes.soft_histograms import SoftColourModel, soft_histograms
+from mpfjax.vision.colour.bins import RGBColours
+from mpfjax.vision.colour.histograms import integral_histogram
 
 HEIGHT, WIDTH = 40, 60
 BOXES = np.array([[10.0, 8, 12, 16], [35, 12, 12, 20]])

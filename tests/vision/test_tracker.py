@@ -8,16 +8,16 @@ import pytest
 
 import mpfjax
 from mpfjax.vision import Detections, HSVColours, ObjectTracker
-from mpfjax.vision.tracker import object_model
+from mpfjax.vision.tracking.appearance import LearnAppearance
 from mpfjax.vision.tracking.assignment import Assign
-from mpfjax.vision.tracking.births import Found, ShareMass
+from mpfjax.vision.tracking.births import Births, ShareMass
 from mpfjax.vision.tracking.camera import FollowCamera
-from mpfjax.vision.tracking.colours import LearnColours
-from mpfjax.vision.tracking.contact import ShareDetections
-from mpfjax.vision.tracking.deaths import Bury
+from mpfjax.vision.tracking.deaths import Deaths
 from mpfjax.vision.tracking.motion import PropagateObjects
 from mpfjax.vision.tracking.noise import LearnNoise
+from mpfjax.vision.tracking.occlusion import ShareDetections
 from mpfjax.vision.tracking.scores import RankScores
+from mpfjax.vision.tracking.tracker import object_model
 
 HEIGHT, WIDTH, ROOM = 48, 64, 6
 M, P = 4, 24
@@ -31,7 +31,7 @@ def motion(states):
     return states.place, states.velocity
 
 
-def tracker_of(rejuvenation, patience=3, sharing=False):
+def tracker_of(resampling, patience=3, sharing=False):
     """The default chain with few particles, and a patience that tests can wait for."""
     model = object_model()
     moves = [
@@ -39,12 +39,12 @@ def tracker_of(rejuvenation, patience=3, sharing=False):
         FollowCamera(Assign(model)),
         Assign(model),
         *([ShareDetections(model, longest=12)] if sharing else []),
-        rejuvenation,
+        resampling,
         PropagateObjects(model),
-        Bury(2, patience),
-        Found(model, P),
+        Deaths(2, patience),
+        Births(model, P),
         LearnNoise(model),
-        LearnColours(COLOURS, 2, adaptation=0.05),
+        LearnAppearance(COLOURS, 2, adaptation=0.05),
         ShareMass(),
     ]
     return ObjectTracker(M, P, colours=COLOURS, moves=moves)
@@ -145,10 +145,10 @@ def test_who_is_found_first_but_later_is_a_newcomer():
     assert [believed(each) for each in tracks] == [[], [], [], [1]]
 
 
-@pytest.mark.parametrize("rejuvenation", ["gaussian", "resample"])
-def test_components_are_born_confirmed_and_keep_their_identities(rejuvenation):
+@pytest.mark.parametrize("resampling", ["gaussian", "resample"])
+def test_components_are_born_confirmed_and_keep_their_identities(resampling):
     """Two walk from the first frame on, a third comes later; every mean box stays on its own."""
-    chosen = TRACKER if rejuvenation == "gaussian" else RESAMPLING
+    chosen = TRACKER if resampling == "gaussian" else RESAMPLING
 
     def corners(t):
         late = (30, 3) if t >= 5 else None
@@ -238,11 +238,11 @@ def test_a_first_frame_full_of_people_is_a_full_house():
         assert len(living(tracks)) == M
 
 
-@pytest.mark.parametrize("rejuvenation", ["gaussian", "resample"])
-def test_nothing_leaks_over_many_random_frames(rejuvenation):
+@pytest.mark.parametrize("resampling", ["gaussian", "resample"])
+def test_nothing_leaks_over_many_random_frames(resampling):
     """Detections that come, go, jump, overlap, and lie outside; every frame is checked."""
     rng = np.random.default_rng(1)
-    chosen = TRACKER if rejuvenation == "gaussian" else RESAMPLING
+    chosen = TRACKER if resampling == "gaussian" else RESAMPLING
     state, ever, gone = chosen.init(), set(), set()
     for t in range(120):
         k = rng.integers(0, ROOM + 3)
@@ -498,16 +498,16 @@ def test_a_bad_setting_is_named(as_installed, name, value):
 
 
 @pytest.mark.parametrize(
-    ("rejuvenation", "said"),
+    ("resampling", "said"),
     [
         (mpfjax.Resample(), "particles_per_component, None, is not .* 16"),
         (mpfjax.Resample(particles_per_component=20), "particles_per_component, 20, is not .* 16"),
         (mpfjax.GaussianRegeneration(16), "where is None"),
     ],
 )
-def test_a_rejuvenation_that_would_leave_no_room_is_named(rejuvenation, said):
-    with pytest.raises(ValueError, match=f"^rejuvenation: .*{said}"):
-        ObjectTracker(rejuvenation=rejuvenation)
+def test_a_rejuvenation_that_would_leave_no_room_is_named(resampling, said):
+    with pytest.raises(ValueError, match=f"^resampling: .*{said}"):
+        ObjectTracker(resampling=resampling)
 
 
 def chain_without(*kinds):
@@ -516,7 +516,7 @@ def chain_without(*kinds):
 
 @pytest.mark.parametrize("sees", [True, False])
 def test_a_chain_that_learns_no_colours_runs_with_pixels_and_without(sees):
-    tracker = ObjectTracker(M, P, moves=chain_without(LearnColours))
+    tracker = ObjectTracker(M, P, moves=chain_without(LearnAppearance))
     pixels = np.zeros((40, 60, 3), np.uint8) if sees else None
     found = Detections.from_boxes(np.array([[5.0, 5, 10, 20]]), 8)
     state, _ = eqx.filter_eval_shape(tracker.step, KEYS[0], tracker.init(), pixels, found)
@@ -525,7 +525,7 @@ def test_a_chain_that_learns_no_colours_runs_with_pixels_and_without(sees):
 
 def test_the_bins_are_those_that_the_chain_learns(as_installed):
     assert ObjectTracker(M, P, moves=TRACKER.moves).colours == COLOURS
-    with pytest.raises(ValueError, match=r"^colours: .* are not those of LearnColours"):
+    with pytest.raises(ValueError, match=r"^colours: .* are not those of LearnAppearance"):
         ObjectTracker(M, P, moves=TRACKER.moves, colours=HSVColours(4, 2, 3))
 
 
@@ -536,7 +536,7 @@ def test_the_bins_are_those_that_the_chain_learns(as_installed):
         ("strong_score", 0.5),
         ("weak_score", 0.1),
         ("frames_per_second", 25.0),
-        ("rejuvenation", mpfjax.Resample(particles_per_component=P)),
+        ("resampling", mpfjax.Resample(particles_per_component=P)),
     ],
 )
 def test_a_setting_that_a_chain_of_moves_has_itself_is_refused_beside_it(name, value):
@@ -548,19 +548,22 @@ def weighing_by_colours():
     model = object_model(sigma=0.3)
     return [
         PropagateObjects(model) if isinstance(move, PropagateObjects) else move
-        for move in chain_without(LearnColours)
+        for move in chain_without(LearnAppearance)
     ]
 
 
 @pytest.mark.parametrize(
     ("moves", "said"),
     [
-        ([*TRACKER.moves, LearnColours(COLOURS)], "LearnColours and LearnColours would share"),
+        (
+            [*TRACKER.moves, LearnAppearance(COLOURS)],
+            "LearnAppearance and LearnAppearance would share",
+        ),
         ([RankScores(), *TRACKER.moves], "RankScores and RankScores would share one memory"),
-        (chain_without(Bury), "a tracker needs Bury"),
+        (chain_without(Deaths), "a tracker needs Deaths"),
         (chain_without(Assign), "PropagateObjects needs Assign"),
         (chain_without(RankScores), "FollowCamera needs RankScores"),
-        (weighing_by_colours(), "PropagateObjects weighs by colours .* needs LearnColours"),
+        (weighing_by_colours(), "PropagateObjects weighs by colours .* needs LearnAppearance"),
     ],
 )
 def test_a_chain_that_cannot_run_is_refused(moves, said):

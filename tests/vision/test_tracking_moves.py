@@ -11,17 +11,17 @@ from scipy.optimize import linear_sum_assignment
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision import Detections, HSVColours, SampledHistogram
+from mpfjax.vision.tracking.appearance import LearnAppearance
 from mpfjax.vision.tracking.assignment import Assign, marginals
-from mpfjax.vision.tracking.births import Found, ShareMass
+from mpfjax.vision.tracking.births import Births, ShareMass
 from mpfjax.vision.tracking.camera import FollowCamera
-from mpfjax.vision.tracking.colours import LearnColours
-from mpfjax.vision.tracking.contact import ShareDetections
-from mpfjax.vision.tracking.deaths import Bury
+from mpfjax.vision.tracking.deaths import Deaths
 from mpfjax.vision.tracking.memory import Lives, Scores, mean_boxes
 from mpfjax.vision.tracking.model import AssignedFrame, DetectedObjectModel, ObjectState
 from mpfjax.vision.tracking.motion import PropagateObjects
 from mpfjax.vision.tracking.noise import LearnNoise
 from mpfjax.vision.tracking.observation import TrackedFrame, overlap
+from mpfjax.vision.tracking.occlusion import ShareDetections
 from mpfjax.vision.tracking.scores import RankScores
 from tests.marking import thorough
 
@@ -284,7 +284,11 @@ def tracked(seed=0):
     return mixture, TrackedFrame(found, pixels)
 
 
-QUIET = {"scores": RankScores(), "assign": Assign(MODEL, 10.0), "learn": LearnColours(COLOURS, 2)}
+QUIET = {
+    "scores": RankScores(),
+    "assign": Assign(MODEL, 10.0),
+    "learn": LearnAppearance(COLOURS, 2),
+}
 CHANGES = {"scores": ["scores"], "assign": ["assigned", "doubts"], "learn": ["references"]}
 
 
@@ -310,9 +314,9 @@ def test_what_decides_is_approximate_and_what_follows_is_not():
     approximate = [
         Assign(MODEL),
         ShareDetections(MODEL),
-        Bury(),
-        Found(MODEL, P),
-        LearnColours(COLOURS),
+        Deaths(),
+        Births(MODEL, P),
+        LearnAppearance(COLOURS),
         ShareMass(),
     ]
     assert all(move.approximate for move in approximate)
@@ -547,7 +551,7 @@ def test_given_thresholds_are_kept():
 def test_who_founds_is_strong_and_nobodys_and_no_double():
     """Detection 3 is a double of a component's, 1 is weak, 0 and 2 are taken; 4 founds."""
     mixture, frame = tracked()
-    move = Found(MODEL, P, 0.4)
+    move = Births(MODEL, P, 0.4)
     np.testing.assert_array_equal(move.founding(mixture, frame), [0, 0, 0, 0, 1, 0])
     moved = move(KEY, mixture, frame)
     lives = moved.memory["lives"]
@@ -572,11 +576,11 @@ def test_who_founds_is_strong_and_nobodys_and_no_double():
 
 def test_who_is_gone_is_emptied():
     mixture, frame = tracked()
-    moved = Bury(2, 2)(KEY, mixture, frame)
+    moved = Deaths(2, 2)(KEY, mixture, frame)
     # The second has been unseen for a third frame; the third is confirmed by its second.
     np.testing.assert_array_equal(moved.active, [True, False, True, False])
     np.testing.assert_array_equal(moved.memory["lives"].confirmed, [True, True, True, False])
-    kept = Bury(2, 3)(KEY, mixture, frame)
+    kept = Deaths(2, 3)(KEY, mixture, frame)
     np.testing.assert_array_equal(kept.log_weights, mixture.log_weights)
 
 
@@ -596,11 +600,11 @@ def test_who_stands_behind_another_is_believed_in_later(seen, believed):
         ),
         memory=mixture.memory | {"lives": lives},
     )
-    after = Bury(2, 20, 8, 0.4)(KEY, mixture, frame).memory["lives"]
+    after = Deaths(2, 20, 8, 0.4)(KEY, mixture, frame).memory["lives"]
     np.testing.assert_array_equal(after.confirmed, [True, True, believed, False])
     np.testing.assert_array_equal(after.alone[2], 1)
     # To nobody it is a rival where others do not count as contact.
-    apart = Bury(2, 20, 8, 3.0)(KEY, mixture, frame).memory["lives"]
+    apart = Deaths(2, 20, 8, 3.0)(KEY, mixture, frame).memory["lives"]
     np.testing.assert_array_equal(apart.confirmed, [True, True, True, False])
 
 
@@ -613,7 +617,7 @@ def test_masses_are_shared_and_weights_within_components_kept():
 
 def test_overlap_is_that_of_the_metrics():
     from mpfjax.metrics.tracking_scores import overlap as counted
-    from mpfjax.vision.boxes import top_left
+    from mpfjax.vision.files.boxes import top_left
 
     rng = np.random.default_rng(4)
     a, b = rng.uniform(1, 20, (2, 7, 4))

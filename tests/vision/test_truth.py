@@ -8,7 +8,7 @@ import pytest
 
 from mpfjax.metrics import multi_object_scores, remove_ignored
 from mpfjax.vision import read_tracks, read_truth
-from mpfjax.vision.boxes import write_tracks
+from mpfjax.vision.files.boxes import write_tracks
 
 NUM_FRAMES = 25
 SCORES = ("HOTA", "DetA", "AssA", "MOTA", "MOTP", "IDF1", "id_switches", "false_positives")

@@ -10,8 +10,8 @@ from mpfjax.checks import check_finite, check_not_negative, check_positive
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.indexing import take
-from mpfjax.vision.detections import Detections
-from mpfjax.vision.histograms import bhattacharyya
+from mpfjax.vision.colour.histograms import bhattacharyya
+from mpfjax.vision.tracking.detections import Detections
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
     DOUBTS,

@@ -29,7 +29,7 @@ from mpfjax.vision.tracking.model import (
 from mpfjax.vision.tracking.observation import TrackedFrame, overlap, within
 
 
-class Found(AbstractMove):
+class Births(AbstractMove):
     """Found a component on each strong detection that is nobody's, while there is room.
 
     Its place scatters about the detection as the detector errs, its velocity about zero. A
@@ -37,7 +37,7 @@ class Found(AbstractMove):
     (intersection over union), or a stronger founding detection, founds none: it is a second one of
     the same object. Who is found in the first frame is no newcomer, since objects are there when a
     video starts, and is believed in at once. Of more than there is room for, the strongest
-    are chosen. Memory: `Lives`, with `Bury`, which keeps it; the assignments, so that a founding
+    are chosen. Memory: `Lives`, with `Deaths`, which keeps it; the assignments, so that a founding
     detection is its component's own.
 
     - `particles_per_object`: P.

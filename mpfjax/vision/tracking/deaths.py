@@ -23,7 +23,7 @@ from mpfjax.vision.tracking.memory import (
 from mpfjax.vision.tracking.observation import TrackedFrame, covered, within
 
 
-class Bury(AbstractMove):
+class Deaths(AbstractMove):
     """Count in how many frames each component was borne out, and empty those that are gone.
 
     A component dies where no detection has been assigned to it for more than `patience` frames in a
@@ -35,7 +35,7 @@ class Bury(AbstractMove):
     one of them. Frames in which another hides it (`ShareDetections`) do not count as without a
     detection. Where there are no pixels, the frame reaches as far as all detections so far.
     A component is shown while it is confirmed, for at most `longest_guess` frames without a
-    detection and `longest_unsure` without a strong one. Memory: `Lives`, with `Found`, and that
+    detection and `longest_unsure` without a strong one. Memory: `Lives`, with `Births`, and that
     extent.
 
     Deaths are decided and not sampled (`approximate` is true). Raises `ValueError` for a number of

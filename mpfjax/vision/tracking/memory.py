@@ -33,7 +33,7 @@ class Camera(NamedTuple):
 
 
 class Lives(NamedTuple):
-    """Of `Bury` and `Found`: who each component is, and how well it is borne out.
+    """Of `Deaths` and `Births`: who each component is, and how well it is borne out.
 
     - `identities`: 0 for a dead component; `last_identity`: the highest ever given.
     - `seen`: in how many frames a strong detection bore it out; `alone`: in how many of these it

@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from mpfjax.checks import check_positive, check_positive_array, given, to_array
 from mpfjax.operations.indexing import take
 from mpfjax.operations.matrices import row_sums
-from mpfjax.vision.detections import Detections
-from mpfjax.vision.histograms import IntegralHistogram, bhattacharyya, normalise
-from mpfjax.vision.sampled_histograms import SampledBoxes, SampledHistogram
+from mpfjax.vision.colour.histograms import IntegralHistogram, bhattacharyya, normalise
+from mpfjax.vision.colour.sampled_histograms import SampledBoxes, SampledHistogram
+from mpfjax.vision.tracking.detections import Detections
 
 # So many times the deviations of a size say nothing of it.
 _NOTHING = 10.0

@@ -8,7 +8,6 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.operations.indexing import take
 from mpfjax.vision.tracking.assignment import own_detections
-from mpfjax.vision.tracking.contact import in_front
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
     DOUBTS,
@@ -24,6 +23,7 @@ from mpfjax.vision.tracking.model import (
     log_normal,
 )
 from mpfjax.vision.tracking.observation import TrackedFrame
+from mpfjax.vision.tracking.occlusion import in_front
 
 # Of two hypotheses in one component, none is taken for more than e^30 times as likely.
 _FARTHEST = 30.0

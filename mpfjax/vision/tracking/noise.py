@@ -12,7 +12,6 @@ from mpfjax.checks import check_positive, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.indexing import take
-from mpfjax.vision.tracking.contact import in_front
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
     CAMERA,
@@ -31,6 +30,7 @@ from mpfjax.vision.tracking.model import (
     units,
 )
 from mpfjax.vision.tracking.observation import TrackedFrame
+from mpfjax.vision.tracking.occlusion import in_front
 
 # Rival deviations of detections, of places and of velocities, in boxes: all that real ones have.
 _ERRORS = (0.01, 0.02, 0.04, 0.08, 0.16)
@@ -60,7 +60,7 @@ class LearnNoise(AbstractMove):
     each object; what it says of the object's next detection, the predictive density of its
     innovation, is evidence for the triple, which is forgotten within `memory` frames. Innovations
     have heavy tails, so that the density is Student's with `freedom` degrees. The noises that
-    `Assign`, `PropagateObjects` and `Found` take are exp E[log σ] under the posterior of the
+    `Assign`, `PropagateObjects` and `Births` take are exp E[log σ] under the posterior of the
     triples, whose prior is log-normal about the model's noises. Among the multiple-model filters
     it is Magill's (1965), with one model for all objects. Objects teach once they have had
     `first` strong detections, and only by strong ones that are theirs alone.

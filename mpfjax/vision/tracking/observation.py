@@ -5,9 +5,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.vision.detections import Detections
-from mpfjax.vision.histograms import normalise
-from mpfjax.vision.sampled_histograms import SampledBoxes
+from mpfjax.vision.colour.histograms import normalise
+from mpfjax.vision.colour.sampled_histograms import SampledBoxes
+from mpfjax.vision.tracking.detections import Detections
 from mpfjax.vision.tracking.model import Pixels
 
 

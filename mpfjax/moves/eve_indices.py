@@ -1,0 +1,134 @@
+"""Eve indices: which particle of x_0 each particle descends from, and what that says of errors.
+
+A filter keeps them only if a `EveIndices` was put into the mixture's memory of x_0. Then `Resample`
+brings it up to date, wherever it stands in a chain or within a move.
+`mpfjax.smoothing.log_marginal_likelihood_variance` has the equations.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mpfjax.checks import check_numbered
+from mpfjax.mixture import ParticleMixture
+from mpfjax.operations.indexing import take
+from mpfjax.operations.segments import segment_sum
+
+EVE_INDICES = "eve_indices"
+
+
+class EveIndices(eqx.Module):
+    """What the errors of log Ẑ and of the masses need of the past, O(N + M²) numbers.
+
+    - `indices`: (n,), the slot in x_0 that each particle descends from.
+    - `groups`: (n,), the component in which each particle was last resampled.
+    - `log_pair_factors`: (m, m), the logarithm of the factor by which a pair of particles without
+      a common first ancestor counts, by their groups. Of the pairs of k independent draws,
+      (k - 1) / k are different draws. So a pair's factor grows by k / (k - 1) whenever the
+      component that both are in is resampled.
+    """
+
+    indices: Int[Array, " n"]
+    groups: Int[Array, " n"]
+    log_pair_factors: Float[Array, "m m"]
+
+    def family_masses(
+        self, weights: Float[Array, " n"], labels: Int[Array, " n"], num_labels: int
+    ) -> Float[Array, "labels n"]:
+        """The weight of the descendants of each particle of x_0, by the particles' labels."""
+        n = weights.shape[0]
+        check_numbered("families by label up to", num_labels * n, num_particles=n)
+        families = labels * n + self.indices
+        return segment_sum(weights, families, num_labels * n).reshape(num_labels, n)
+
+
+def with_new_eve_indices(mixture: ParticleMixture) -> ParticleMixture:
+    """The mixture of x_0, every particle its own first ancestor."""
+    n, m = mixture.num_particles, mixture.num_components
+    eve = EveIndices(
+        indices=jnp.arange(n, dtype=jnp.int32),
+        groups=jnp.zeros(n, jnp.int32),
+        log_pair_factors=jnp.zeros((m, m), mixture.log_weights.dtype),
+    )
+    return mixture.replace(memory=mixture.memory | {EVE_INDICES: eve})
+
+
+def with_offspring(
+    resampled: ParticleMixture,
+    before: ParticleMixture,
+    parents: Int[Array, " n"],
+    num_drawn: Int[Array, " m"],
+    due: Bool[Array, " m"],
+) -> ParticleMixture:
+    """The resampled mixture with the eve of its particles, if one is kept."""
+    if EVE_INDICES not in before.memory:
+        return resampled
+    eve: EveIndices = before.memory[EVE_INDICES]
+    log_factors, groups = eve.log_pair_factors, eve.groups
+    if before.num_components > 1:
+        # Where nothing is drawn, the groups stay as they are, and nothing is averaged.
+        any_due = jnp.any(due)
+        log_factors = jnp.where(any_due, _by_components(eve, before), log_factors)
+        groups = jnp.where(any_due, resampled.component_indicators, take(groups, parents))
+    k = num_drawn.astype(log_factors.dtype)
+    # A component of one particle has no pair to count.
+    grown = jnp.where(due & (k > 1), -jnp.log1p(-1 / jnp.maximum(k, 2)), 0.0)
+    eve = EveIndices(take(eve.indices, parents), groups, log_factors + jnp.diag(grown))
+    return resampled.replace(memory=resampled.memory | {EVE_INDICES: eve})
+
+
+def evidence_variance(mixture: ParticleMixture) -> Float[Array, ""]:
+    """The variance of log Ẑ, from the weight of each family. It may be negative."""
+    eve: EveIndices = mixture.memory[EVE_INDICES]
+    families = eve.family_masses(mixture.weights, eve.groups, mixture.num_components)
+    relative = _variance(families, mixture)
+    return relative + relative**2 / 2
+
+
+def mass_variances(mixture: ParticleMixture) -> Float[Array, " m"]:
+    """The variance of each mixture weight, from the share of each family that is in it."""
+    eve: EveIndices = mixture.memory[EVE_INDICES]
+    m, masses = mixture.num_components, mixture.mixture_weights
+    pairs = mixture.component_indicators * m + eve.groups
+    families = eve.family_masses(mixture.weights, pairs, m * m).reshape(m, m, -1)
+    # The families' part in a component, less what it would be were all families alike.
+    excess = families - masses[:, None, None] * jnp.sum(families, axis=0)[None]
+    return jax.vmap(_variance, (0, None))(excess, mixture)
+
+
+def _variance(families: Float[Array, "m n"], mixture: ParticleMixture) -> Float[Array, ""]:
+    """(Σ s)² - N / (N - 1) Σ s_i s_j Π k_m / (k_m - 1), over the pairs of different families."""
+    eve: EveIndices = mixture.memory[EVE_INDICES]
+    totals = jnp.sum(families, axis=1)
+    of_different = totals[:, None] * totals[None] - families @ families.T
+    num_drawn = jnp.asarray(mixture.num_usable_slots, families.dtype)
+    log_factors = eve.log_pair_factors - jnp.log1p(-1 / jnp.maximum(num_drawn, 2))
+    # The sums with factors of one, and what the factors add, which are close to one.
+    of_same = jnp.sum(jnp.sum(families, axis=0) ** 2)
+    return of_same - jnp.sum(of_different * jnp.expm1(log_factors))
+
+
+def _by_components(eve: EveIndices, mixture: ParticleMixture) -> Float[Array, "m m"]:
+    """The pair factors by component: the average over the pairs, by group, that are in two.
+
+    Only pairs without a common first ancestor count. The others would have been in the same
+    component more often, and the factors would come out too large.
+    """
+    m = mixture.num_components
+    pairs = mixture.component_indicators * m + eve.groups
+    masses = eve.family_masses(mixture.weights, pairs, m * m)
+    totals = jnp.sum(masses, axis=1).reshape(m, m)
+    masses = masses.reshape(m, m, -1)
+    largest = jnp.max(eve.log_pair_factors)
+    factors = jnp.exp(eve.log_pair_factors - largest)
+
+    def of_different(factors: Float[Array, "m m"]) -> Float[Array, "m m"]:
+        of_same = jnp.einsum("cge,gh,dhe->cd", masses, factors, masses, optimize=True)
+        return totals @ factors @ totals.T - of_same
+
+    mass = of_different(jnp.ones_like(factors))
+    # Where hardly a pair is left, rounding is all that there is.
+    found = mass > 1e-4 * jnp.sum(totals, axis=1)[:, None] * jnp.sum(totals, axis=1)[None]
+    averages = jnp.where(found, of_different(factors) / jnp.where(found, mass, 1.0), 1.0)
+    return jnp.log(jnp.clip(averages, jnp.min(factors), 1.0)) + largest

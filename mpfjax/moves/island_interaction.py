@@ -1,0 +1,79 @@
+"""IslandInteraction of particles between islands whose masses have drifted apart."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Key, PyTree
+
+from mpfjax.checks import check_share
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractMove
+from mpfjax.operations.across_islands import deal_to_islands, num_islands, over_islands
+from mpfjax.operations.logarithms import softmax
+
+
+class IslandInteraction(AbstractMove):
+    """Deal every island's particles to all islands, where their masses have drifted apart.
+
+    It is for `run_islands`; elsewhere there is one island, and it does nothing. An island resamples
+    within itself and keeps its mass. So in time a few islands hold all the mass, and the others
+    work for nothing. The effective number of islands is (Σ π_g)² / Σ π_g², with π_g the mass of
+    island g. Where it falls below `threshold` times the number of islands G, particle i of every
+    island goes to island i mod G, with its joint weight, component label and ancestor. All
+    islands then hold nearly the same mass. Exact: the whole mixture has the same particles, in
+    other places (Whiteley, Lee and Heine 2016, say when islands should interact).
+
+    - `threshold`: in [0, 1]; 0 never exchanges.
+
+    No other move sends particles between devices. This one sends all of them at once, but only in
+    the steps that need it. Put it before `Resample`, which then spreads the heavy particles over
+    the slots of all islands. In a mixture, put it before the moves that regroup, since components
+    of the same label become one. Raises `ValueError` for a threshold out of range, and where G
+    does not divide the number of slots of an island.
+    """
+
+    threshold: float = eqx.field(static=True, default=0.5)
+
+    def __check_init__(self) -> None:
+        check_share(threshold=self.threshold)
+
+    @property
+    def weighs(self) -> bool:
+        """False: the observation changes no weight."""
+        return False
+
+    def is_due(self, mixture: ParticleMixture) -> Bool[Array, ""]:
+        """Whether the masses of the islands are uneven enough, the same for each."""
+        log_masses = over_islands(mixture.log_mass)
+        return 1 / jnp.sum(softmax(log_masses) ** 2) < self.threshold * num_islands()
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+    ) -> ParticleMixture:
+        """Deal the particles where that is due."""
+        del key, observation
+        if num_islands() == 1:
+            return mixture
+        if mixture.num_particles % num_islands():
+            raise ValueError(
+                f"num_particles: {mixture.num_particles} of an island cannot be dealt evenly to"
+                f" {num_islands()} islands, as IslandInteraction does"
+            )
+        slots = (
+            mixture.particles,
+            mixture.log_weights,
+            mixture.component_indicators,
+            mixture.ancestor_indices,
+        )
+        particles, log_weights, components, ancestors = jax.lax.cond(
+            self.is_due(mixture),
+            lambda slots: jax.tree.map(deal_to_islands, slots),
+            lambda slots: slots,
+            slots,
+        )
+        return mixture.replace(
+            particles=particles,
+            log_weights=log_weights,
+            component_indicators=components,
+            ancestor_indices=ancestors,
+        )

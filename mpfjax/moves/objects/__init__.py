@@ -1,0 +1,1 @@
+"""Moves on the joint state of several objects."""

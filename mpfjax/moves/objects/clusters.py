@@ -1,0 +1,250 @@
+"""Clusters of objects: particle filters of their own that merge where objects meet."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key, PyTree
+
+from mpfjax.checks import check_one_of, check_whole, given
+from mpfjax.mixture import ParticleMixture, single_component
+from mpfjax.models.base import require
+from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
+from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.objects.coupling import connected, coupled, together
+from mpfjax.moves.objects.recombination import recombined, rotated, scores
+from mpfjax.moves.resampling.allocation import require_equal_rows
+from mpfjax.moves.resampling.resample import Resample
+from mpfjax.moves.resampling.schemes import SCHEMES
+from mpfjax.operations.floats import default_float
+from mpfjax.operations.generator import split
+from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import finite_max
+
+STARTS = ("apart", "together")
+
+
+class PropagateInClusters(AbstractPropagation):
+    """Propagate, weigh and resample clusters of objects, which merge where objects meet.
+
+    Each object belongs to one cluster. A cluster has N rows, and a row holds a state of each of
+    its objects. The joint distribution is the product of the clusters' distributions. At the
+    start every object is a cluster of its own. One step, from rows of equal weight:
+
+    1. *Predict.* Object j's point x^{jl} is drawn by its dynamics from row l, and L_j evaluated.
+    2. *Merge.* Clusters become one where log ψ ≠ 0 between any points of two of their objects,
+       directly or through others. Row l of the new cluster is row l of each.
+    3. *An object alone* is resampled by its likelihood. The mean likelihood is its factor of Ẑ.
+    4. *Objects in a cluster cross between rows.* Object j's N points are a draw of
+       q_j(x) = N⁻¹ Σ_r f_j(x | row r), the deterministic mixture of Owen and Zhou (2000), and
+       serve every row r with the weight
+
+           b_rjl = L_j(x^{jl}) f_j(x^{jl} | row r) / Σ_r' f_j(x^{jl} | row r').
+
+       The update of row r is Σ b_r1l b_r2m ... ψ(x^{1l}, x^{2m}) ... over all combinations of
+       points. First, N rows are drawn with probability ∝ Π_j Σ_l b_rjl. Then each row draws a
+       point for one object after the other, ∝ b times ψ with the points that it has already, and
+       its weight is multiplied by Σ_l b ψ / Σ_l b. Different rows start with different objects.
+       Last, the weighted rows are resampled. The factor of Ẑ is the mean score times the mean
+       weight.
+    5. The rows of every cluster are shifted, in a circle, by a random number of places.
+
+    Why it is unbiased. Given the rows, the points of different objects are independent. Each
+    object's weighted points are an unbiased estimate of its prediction under any row. So the sum
+    over combinations is an unbiased estimate of the cluster's update. Given the past, clusters
+    are independent, so the expectation of their product is the product of the exact updates.
+    Where ψ is 1 for all combinations of points of two clusters, that product is the joint update.
+    After step 5 all pairs of rows of two clusters are equally likely to stand side by side, so a
+    merged cluster is an unbiased estimate of the product. Whether two clusters merge depends on
+    the points alone, not on which rows stand side by side.
+
+    In partitioned sampling, the evidence of one object removes hypotheses about another, in any
+    order. Here it does not, and no object goes first in all rows.
+
+    - `start`: every object "apart", or all "together" in one cluster, as for an x_0 under which
+      the objects are not independent.
+    - `split_after`: None never splits a cluster, which is exact. With a number s, objects that had
+      no contact for s steps, directly or through others, go into separate clusters. The filter
+      goes on with the product of their marginals: an approximation (`approximate` is true).
+    - `scheme`: of resampling, as in `Resample`.
+
+    Cost: J x N likelihoods a step, J(J-1) N² / 2 potentials to find contact, and 2 N² J
+    transition densities and J² N² potentials where there is a cluster of several.
+
+    Particle i holds row i of every cluster. The move needs particles of equal weight, as x_0 has
+    and as it returns them. A row has no single ancestor, so every particle is named as its own
+    ancestor. `memory["clusters"]["labels"]`, (J,), holds the first object of each object's
+    cluster.
+
+    Clusters need `log_transition` of the object model. A model whose state holds more than x_t,
+    such as x_{t-1}, also needs `with_history(states, previous_states)`: the states with their past
+    taken from the previous states.
+
+    Raises `ValueError` for a mixture of several components, a model of one object, a model
+    without `log_transition` where it is needed, and an unknown `start` or scheme, or
+    `split_after` below 1.
+    """
+
+    model: MultiObjectModel
+    start: str = eqx.field(static=True, default="apart")
+    split_after: int | None = eqx.field(static=True, default=None)
+    scheme: str = eqx.field(static=True, default="systematic")
+
+    def __check_init__(self) -> None:
+        require_multi_object(self.model, "PropagateInClusters")
+        check_one_of(SCHEMES, scheme=self.scheme)
+        check_one_of(STARTS, start=self.start)
+        check_whole(**given(split_after=self.split_after))
+        if self._may_be_joint:
+            require(self.model.object_model, "log_transition", "PropagateInClusters")
+
+    @property
+    def approximate(self) -> bool:
+        """Whether clusters are split again."""
+        return self.split_after is not None
+
+    @property
+    def _may_be_joint(self) -> bool:
+        """Whether there can ever be a cluster of several objects."""
+        joins = self.model.interaction is not None or self.start == "together"
+        return joins and self.model.num_objects > 1
+
+    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
+        """The clusters' labels, and for how many steps each two objects had no contact."""
+        del num_components
+        num_objects = self.model.num_objects
+        labels = jnp.arange(num_objects, dtype=jnp.int32)
+        if self.start == "together":
+            labels = jnp.zeros_like(labels)
+        steps_apart = jnp.zeros((num_objects, num_objects), jnp.int32)
+        return {"clusters": {"labels": labels, "steps_apart": steps_apart}}
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Merge the clusters that meet, then make one step of every cluster's filter."""
+        require_equal_rows(mixture, "PropagateInClusters")
+        num_objects = self.model.num_objects
+        # The objects' keys are those of the joint draw, so that one object is a plain filter.
+        keys = split(key, 2 * num_objects + 2)
+        keys_objects, keys_rows = keys[:num_objects], keys[num_objects : 2 * num_objects]
+        key_inside, key_shift = keys[2 * num_objects :]
+        seen = self.model.prepare_observation(observation)
+        particles, memory = mixture.particles, mixture.memory["clusters"]
+
+        def move(key: Key[Array, ""], states: PyTree, j: Int[Array, ""]) -> tuple:
+            points = self.model.sample_object_transition(key, states, j)
+            log_likelihood = self.model.object_log_likelihood(seen, points, j)
+            return points, log_likelihood.astype(default_float())
+
+        points, log_likelihoods = jax.vmap(move, in_axes=(0, 1, 0), out_axes=(1, 0))(
+            keys_objects, particles, jnp.arange(num_objects, dtype=jnp.int32)
+        )
+        common = jax.vmap(finite_max)(log_likelihoods)
+        log_likelihoods = log_likelihoods - common[:, None]
+        if self._may_be_joint:
+            memory = self._regrouped(points, memory)
+            particles, log_growth = self._updated(
+                (keys_rows, key_inside), particles, points, log_likelihoods, memory["labels"]
+            )
+        else:
+            rows, log_growth = self._resampled(keys_rows, memory["labels"], log_likelihoods)
+            particles = _rows_of_each(points, rows)
+        particles = _shifted(key_shift, particles, memory["labels"])
+        moved = mixture.replace(
+            particles=particles, memory=mixture.memory | {"clusters": memory}
+        ).weighed(log_growth[None], jnp.sum(common)[None])
+        return jax.lax.cond(
+            log_growth == -jnp.inf, lambda: self._unweighted(key, mixture), lambda: moved
+        )
+
+    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """Draw x_t ~ D(. | x_{t-1}) of all objects; the clusters stay."""
+        return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
+
+    def _unweighted(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        nothing = jnp.full((1,), -jnp.inf, mixture.log_weights.dtype)
+        return self.predict(key, mixture).weighed(nothing)
+
+    def _updated(
+        self,
+        keys: tuple,
+        particles: PyTree,
+        points: PyTree,
+        log_likelihoods: Float[Array, "objects n"],
+        labels: Int[Array, " objects"],
+    ) -> tuple[PyTree, Float[Array, ""]]:
+        """The clusters' new rows, of equal weight, and log of their factors of Ẑ."""
+        keys_rows, key_inside = keys
+        key_cross, key_last = split(key_inside, 2)
+        together_with = together(labels)
+        alone = jnp.sum(together_with, axis=1) == 1
+        log_totals, log_sums = scores(self.model, particles, points, log_likelihoods, alone)
+        log_scores = jnp.sum(jnp.where(together_with[:, :, None], log_sums[None], 0.0), axis=1)
+        rows, log_growth = self._resampled(keys_rows, labels, log_scores)
+
+        def cross() -> tuple[PyTree, Float[Array, ""]]:
+            chosen, log_weights = recombined(
+                self.model,
+                key_cross,
+                particles,
+                points,
+                rows,
+                log_likelihoods - log_totals,
+                log_sums,
+                together_with,
+            )
+            keys_last = split(key_last, len(labels))
+            last, log_gain = self._resampled(keys_last, labels, log_weights)
+            # Rounding could still redraw equal weights.
+            unmoved = jnp.arange(last.shape[1], dtype=last.dtype)
+            last = jnp.where(alone[:, None], unmoved[None], last)
+            return _rows_of_each(chosen, last), log_gain
+
+        def stay() -> tuple[PyTree, Float[Array, ""]]:
+            return _rows_of_each(points, rows), jnp.zeros((), default_float())
+
+        particles, log_gain = jax.lax.cond(jnp.all(alone), stay, cross)
+        return particles, log_growth + log_gain
+
+    def _regrouped(self, points: PyTree, memory: dict[str, Array]) -> dict[str, Array]:
+        """The clusters of the objects whose predicted points are given."""
+        meets = coupled(self.model, points, memory["labels"], self.split_after is not None)
+        links, steps_apart = together(memory["labels"]), memory["steps_apart"]
+        if self.split_after is not None:
+            steps_apart = jnp.where(meets, 0, steps_apart + 1)
+            links = links & (steps_apart < self.split_after)
+        return {"labels": connected(links | meets), "steps_apart": steps_apart}
+
+    def _resampled(
+        self,
+        keys: Key[Array, " objects"],
+        labels: Int[Array, " objects"],
+        log_weights: Float[Array, "objects n"],
+    ) -> tuple[Int[Array, "objects n"], Float[Array, ""]]:
+        """Each object's rows drawn anew, alike in a cluster, and log Π of the mean weights."""
+        resample = Resample(self.scheme)
+
+        def draw(key: Key[Array, ""], log_weights: Float[Array, " n"]) -> tuple:
+            cloud = single_component(log_weights).weighed(log_weights)
+            return resample(key, cloud).ancestor_indices, cloud.log_mass
+
+        rows, log_growths = jax.vmap(draw)(take(keys, labels), log_weights)
+        is_first = labels == jnp.arange(len(labels), dtype=labels.dtype)
+        return rows, jnp.sum(jnp.where(is_first, log_growths, 0.0))
+
+
+def _rows_of_each(particles: PyTree, rows: Int[Array, "objects n"]) -> PyTree:
+    """Every object's states from rows of its own."""
+    gather = jax.vmap(take, in_axes=(1, 0), out_axes=1)
+    return jax.tree.map(lambda leaf: gather(leaf, rows), particles)
+
+
+def _shifted(key: Key[Array, ""], particles: PyTree, labels: Int[Array, " objects"]) -> PyTree:
+    """The rows of every cluster turned by a random number of places.
+
+    Row i is then a draw of the product of the clouds: any two rows of two clusters meet in it
+    with the same probability.
+    """
+    places = jnp.arange(jax.tree.leaves(particles)[0].shape[0], dtype=jnp.int32)
+    keys = take(split(key, len(labels)), labels)
+    return _rows_of_each(particles, jax.vmap(rotated, in_axes=(0, None))(keys, places))

@@ -1,0 +1,93 @@
+"""Exclusion: components push each other away, so that no two slide onto one object."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.checks import check_positive
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.regrouping.features import Features, Scale, summarise
+
+
+class AbstractExclusion(AbstractPropagation):
+    """Weights that fall by `strength` times how near a particle is to the means of others.
+
+    Nearness to one mean μ is exp(-|x - μ|² / (2 radius²)): 1 there, and next to nothing from
+    three times the radius on. No exact recursion has this; `approximate` is true.
+    """
+
+    strength: eqx.AbstractVar[float]
+    radius: eqx.AbstractVar[float]
+
+    @property
+    def approximate(self) -> bool:
+        """True: it makes components interact, on top of the model."""
+        return True
+
+    @property
+    def weighs(self) -> bool:
+        """False: the observation changes no weight."""
+        return False
+
+    def nearness(self, squared_distances: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
+        """exp(-d² / (2 radius²)), of squared distances to a mean."""
+        return jnp.exp(-squared_distances / (2 * self.radius**2))
+
+
+class Exclusion(AbstractExclusion):
+    """Lower the weights of particles near the predicted means of the other components.
+
+    log-weight_i -= strength · Σ_{m ≠ c_i} exp(-|x_i - μ_m|² / (2 radius²)), summed over living
+    components, with μ_m the plain mean of the propagated particles of component m: the mean of
+    its prediction when every step resamples. Distances are in units of `scale`.
+
+    This is NOT part of the exact recursion of any paper here. Components interact as objects do in
+    a Markov random field, but through their means instead of their states. The filtering
+    distribution is then not that of the model, and the marginal likelihood is biased
+    (`approximate` is true). Use it after `Propagate`, where each component stands for an object,
+    objects cannot share a place, and several components would otherwise end on one look-alike.
+    Never use it where components are hypotheses about ONE object.
+
+    Raises `ValueError` for a strength or radius that is not positive.
+    """
+
+    strength: float = eqx.field(static=True)
+    radius: float = eqx.field(static=True)
+    features: Features
+
+    def __init__(
+        self,
+        strength: float = 10.0,
+        radius: float = 0.5,
+        *,
+        features: Callable[[PyTree], Array] | None = None,
+        scale: Scale = 1.0,
+    ) -> None:
+        check_positive(strength=strength, radius=radius)
+        self.strength = strength
+        self.radius = radius
+        self.features = Features(features, scale)
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Reweight down every particle by the other components' nearness."""
+        del key, observation
+        if mixture.num_components == 1:
+            return mixture
+        return mixture.weighed(-self.strength * self._nearness_to_others(mixture))
+
+    def _nearness_to_others(self, mixture: ParticleMixture) -> Float[Array, " n"]:
+        features = self.features(mixture)
+        own = mixture.component_indicators
+        groups = summarise(
+            features, mixture.occupied.astype(features.dtype), own, mixture.num_components
+        )
+        total = jnp.zeros(mixture.num_particles, features.dtype)
+        for m in range(mixture.num_components):
+            square = jnp.sum((features - groups.means[m][None]) ** 2, axis=1)
+            total += jnp.where((own != m) & groups.alive[m], self.nearness(square), 0.0)
+        return total

@@ -1,0 +1,264 @@
+"""Partitioned sampling: one object after the other, with weighted resampling in between."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from mpfjax.checks import check_one_of, shown
+from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import require
+from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
+from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.propagation.propagate import predict
+from mpfjax.moves.resampling.resample import Resample
+from mpfjax.operations.generator import split
+from mpfjax.operations.gradients import add_gradient, without_gradient
+from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import log_sum_exp
+from mpfjax.operations.segments import spread
+
+REASSEMBLIES = ("evidence", "prior")
+
+
+class Partitioned(AbstractPropagation):
+    """Propagate one object after the other, resampling after each but the last.
+
+    Smith and Gatica-Perez (2004), section 3: object j moves by its dynamics, the particles are
+    resampled by importance weights ρ_i in proportion to a weight function g, and weights are
+    divided by ρ_i. Here g is what the object adds to the target: its own likelihood, and its
+    potentials ψ with the objects that have moved before it. Each g is multiplied into the joint
+    weights. Resampling in proportion to the weights, with equal shares for the offspring, then
+    does the division. After the last object the weights hold L(y_t | x_t) D / q of the whole
+    joint state, and Ẑ is unbiased in every order. Everything happens within components.
+
+    - `orders`: which object moves when, counted from 0. One order for all components; one order
+      for each component; "circular", where component c starts with object c, then c + 1, and so
+      on round; or "random", a new order for each component at every step. None is 0, ..., J-1.
+    - `scheme`, `ess_threshold`: of the resampling after each object, as in `Resample`.
+    - `reassembly`: what masses the components have afterwards (section 4 and eq. 5). "evidence"
+      multiplies each mass by the component's evidence, eq. 4 of Vermaak et al. (2003). "prior" is
+      the paper's: each component returns to the mass that it had before, and only the total grows
+      by the evidence. The marginal likelihood is then biased (`approximate` is true), but one
+      step of bad luck loses no component. With one component both are the same.
+
+    - `gradient`: of the resampling after each object, as in `Resample`. With "stop" the objects'
+      draws are constants too, and derivatives pass through their densities, as in `Propagate`.
+
+    A component dies if an object leaves it without weight. The others share its slots and, with
+    "prior", its mass. If all weight is lost, the particles move by their dynamics alone.
+
+    Raises `ValueError` for an order that is no permutation of the objects, a number of orders
+    other than one or the number of components, an unknown scheme, reassembly or gradient, and
+    "stop" with an object model that has no `log_transition`.
+    """
+
+    model: MultiObjectModel
+    orders: Int[Array, "orders objects"] | None
+    rule: str | None = eqx.field(static=True)
+    resample: Resample
+    reassembly: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        model: MultiObjectModel,
+        orders: str | Sequence[int] | Sequence[Sequence[int]] | Array | np.ndarray | None = None,
+        *,
+        scheme: str = "systematic",
+        ess_threshold: float = 1.0,
+        reassembly: str = "evidence",
+        gradient: str = "none",
+    ) -> None:
+        check_one_of(REASSEMBLIES, reassembly=reassembly)
+        require_multi_object(model, "Partitioned")
+        if isinstance(orders, str):
+            if orders not in ("circular", "random"):
+                raise ValueError(f"orders: {orders!r} is neither 'circular' nor 'random'")
+            self.rule, self.orders = orders, None
+        else:
+            self.rule, self.orders = None, check_orders(orders, model.num_objects)
+        self.model = model
+        self.resample = Resample(scheme, ess_threshold, gradient=gradient)
+        if self._stops_draws:
+            require(model.object_model, "log_transition", "gradient='stop'")
+        self.reassembly = reassembly
+
+    @property
+    def approximate(self) -> bool:
+        """Whether components return to the mass that they had before."""
+        return self.reassembly == "prior"
+
+    @property
+    def _stops_draws(self) -> bool:
+        return self.resample.gradient == "stop"
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Propagate and weigh the objects of every particle in its component's order."""
+        num_objects = self.model.num_objects
+        mixture = mixture.replace(log_scale=jnp.zeros((), mixture.log_weights.dtype))
+        # The objects' keys are those of the joint draw, so that one object is a plain filter.
+        keys = split(key, 2 * num_objects + 1)
+        orders = self._orders(keys[-1], mixture.num_components)
+        seen = self.model.prepare_observation(observation)
+
+        def stage(carry: tuple, inputs: tuple) -> tuple[tuple, None]:
+            mixture, broken = carry
+            rank, key_object, key_resample = inputs
+            redrawn = lambda: self.resample(key_resample, mixture)  # noqa: E731
+            mixture = jax.lax.cond(rank > 0, redrawn, lambda: mixture)
+            mixture, fault = self._advance(key_object, mixture, seen, orders, rank)
+            return (mixture, broken | fault), None
+
+        ranks = jnp.arange(num_objects, dtype=jnp.int32)
+        inputs = (ranks, keys[:num_objects], keys[num_objects : 2 * num_objects])
+        (moved, broken), _ = jax.lax.scan(stage, (mixture, jnp.zeros((), bool)), inputs)
+        if self.reassembly == "prior" and mixture.num_components > 1:
+            moved = _with_masses_of(mixture, moved)
+        # Resampling may have lost a NaN, or left nothing of the particles but empty slots.
+        moved = moved.replace(log_weights=jnp.where(broken, jnp.nan, moved.log_weights))
+        lost = ~broken & ~jnp.any(moved.log_weights > -jnp.inf)
+        return self._unweighted_where(lost, key, mixture, moved)
+
+    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """Draw x_t ~ D(. | x_{t-1}) of all objects and leave the weights."""
+        return predict(key, self.model, mixture, "stop" if self._stops_draws else "none")
+
+    def _unweighted_where(
+        self,
+        lost: Bool[Array, ""],
+        key: Key[Array, ""],
+        mixture: ParticleMixture,
+        moved: ParticleMixture,
+    ) -> ParticleMixture:
+        """The prediction without weights where every particle is lost, `moved` elsewhere.
+
+        It is a loop of at most one turn: under `vmap`, a `cond` would always draw the prediction.
+        """
+        move, before, after = without_gradient((self, mixture, moved))
+
+        def predict(carry: tuple[Array, ParticleMixture]) -> tuple[Array, ParticleMixture]:
+            nothing = jnp.full_like(before.log_weights, -jnp.inf)
+            predicted = move.predict(key, before).replace(log_weights=nothing)
+            return jnp.zeros_like(carry[0]), predicted
+
+        _, predicted = jax.lax.while_loop(lambda carry: carry[0], predict, (lost, after))
+        return jax.tree.map(
+            lambda otherwise, usually: jnp.where(lost, otherwise, usually), predicted, moved
+        )
+
+    def _advance(
+        self,
+        key: Key[Array, ""],
+        mixture: ParticleMixture,
+        seen: PyTree,
+        orders: Int[Array, "m objects"],
+        rank: Int[Array, ""],
+    ) -> tuple[ParticleMixture, Bool[Array, ""]]:
+        """Move each particle's object of this rank; also whether a density was broken."""
+        model, particles = self.model, mixture.particles
+        objects = _of_particles(orders[:, rank], mixture)
+        previous = model.object_states(particles, objects)
+        states = model.sample_object_transition(key, previous, objects)
+        if self._stops_draws:
+            states = jax.lax.stop_gradient(states)
+        log_factors = model.object_log_likelihood(seen, states, objects)
+        log_factors = log_factors.astype(mixture.log_weights.dtype)
+        if self._stops_draws:
+            log_density = model.object_log_transition(states, previous, objects)
+            log_factors = add_gradient(log_factors, log_density.astype(log_factors.dtype))
+        moved = mixture.weighed(log_factors)
+        if model.interaction is not None and model.num_objects > 1:
+            moved = moved.weighed(self._log_potentials(states, mixture, orders, rank))
+        moved = moved.replace(particles=model.replace_object(particles, objects, states))
+        return moved, jnp.any(~(moved.log_weights < jnp.inf))
+
+    def _log_potentials(
+        self,
+        states: PyTree,
+        mixture: ParticleMixture,
+        orders: Int[Array, "m objects"],
+        rank: Int[Array, ""],
+    ) -> Float[Array, " n"]:
+        """Σ log ψ of the object of this rank with those that moved before it."""
+        interaction, dtype = self.model.interaction, mixture.log_weights.dtype
+        assert interaction is not None
+        ranks = jnp.arange(self.model.num_objects - 1, dtype=jnp.int32)
+        has_moved = ranks < rank
+        # Ranks still to come are replaced by the first: an object must not meet itself, since
+        # a potential may have no gradient there.
+        partners = orders[:, jnp.where(has_moved, ranks, 0)]
+
+        def potential(partner: Int[Array, " m"]) -> Float[Array, " n"]:
+            others = self.model.object_states(mixture.particles, _of_particles(partner, mixture))
+            return interaction(states, others)
+
+        values = jax.vmap(potential, in_axes=1)(partners).astype(dtype)
+        return jnp.sum(jnp.where(has_moved[:, None], values, 0.0), axis=0)
+
+    def _orders(self, key: Key[Array, ""], num_components: int) -> Int[Array, "m objects"]:
+        """The order of each component."""
+        num_objects = self.model.num_objects
+        if self.rule == "random":
+            keys = split(key, num_components)
+            shuffle = lambda key: jax.random.permutation(key, num_objects)  # noqa: E731
+            return jax.vmap(shuffle)(keys).astype(jnp.int32)
+        if self.rule == "circular":
+            return jnp.asarray(circular_orders(num_components, num_objects))
+        assert self.orders is not None
+        if self.orders.shape[0] not in (1, num_components):
+            raise ValueError(
+                f"orders: {self.orders.shape[0]} of them, for {num_components} components"
+            )
+        return jnp.broadcast_to(self.orders, (num_components, num_objects))
+
+
+def circular_orders(num_orders: int, num_objects: int) -> Int[np.ndarray, "orders objects"]:
+    """The circular shifts c, c+1, ..., c-1 of 0, ..., J-1, for c = 0, 1, ...; after J, again."""
+    shifts = np.arange(num_orders)[:, None] + np.arange(num_objects)[None]
+    return (shifts % num_objects).astype(np.int32)
+
+
+def check_orders(orders: Any, num_objects: int, name: str = "orders") -> Int[Array, "c objects"]:
+    """One order a row; raises `ValueError` for one that is no permutation of the objects."""
+    if orders is None:
+        orders = range(num_objects)
+    if isinstance(orders, Tracer):
+        return jnp.atleast_2d(orders).astype(jnp.int32)
+    try:
+        table = np.atleast_2d(np.asarray(orders))
+        permutations = table.ndim == 2 and np.issubdtype(table.dtype, np.integer) and table.size
+        permutations = permutations and bool(
+            (np.sort(table, axis=1) == np.arange(num_objects)[None]).all()
+        )
+    except (TypeError, ValueError):  # rows of different lengths, or no numbers
+        permutations = False
+    if not permutations:
+        raise ValueError(
+            f"{name}: {shown(orders)} is no permutation of the objects 0 to {num_objects - 1}"
+        )
+    return jnp.asarray(table, jnp.int32)
+
+
+def _of_particles(objects: Int[Array, " m"], mixture: ParticleMixture) -> Int[Array, "*n"]:
+    """The object of each particle's component; one for all where there is one component."""
+    if mixture.num_components == 1:
+        return objects[0]
+    return take(objects, mixture.component_indicators)
+
+
+def _with_masses_of(before: ParticleMixture, after: ParticleMixture) -> ParticleMixture:
+    """The total mass of `after`, parted among its living components as in `before`."""
+    masses = after.log_mixture_weights
+    alive = masses > -jnp.inf
+    prior = jnp.where(alive, before.log_mixture_weights, 0.0)
+    log_total = log_sum_exp(jnp.where(alive, prior, -jnp.inf))
+    shift = prior - jnp.where(alive, masses, 0.0) + log_sum_exp(after.log_weights) - log_total
+    log_shift = spread(jnp.where(alive, shift, 0.0), after.component_indicators)
+    return after.replace(log_weights=after.log_weights + log_shift)

@@ -1,0 +1,1 @@
+"""Moves that take particles from t-1 to t."""

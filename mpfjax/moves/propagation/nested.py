@@ -1,0 +1,130 @@
+"""Propagation of families: each particle draws several x_t, and one of them is kept."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.checks import check_numbered, check_type, check_whole
+from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.conditionally_linear import AbstractConditionallyLinearModel
+from mpfjax.models.noise import draw_family_noise, noise_dtype
+from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.propagation.marginalised import PropagateMarginalised
+from mpfjax.moves.propagation.propagate import Propagate
+from mpfjax.operations.generator import split, uniform
+from mpfjax.operations.indexing import take
+from mpfjax.proposals import AbstractProposal
+
+
+class PropagateNested(AbstractPropagation):
+    """Draw K of x_t for each particle, and keep one by its weight.
+
+    With the factors g_ik = L D / q of the K draws x_t^ik of particle i, the particle is weighed by
+    their mean, (1 / K) Σ_k g_ik, and keeps draw k with the probability g_ik / Σ_j g_ij. So it is a
+    filter of K N particles of which N are drawn again, one for each parent, in proportion to their
+    weights: Ẑ is that of K N particles, and unbiased. The model is evaluated K N times, but only N
+    particles are resampled, sorted and regrouped.
+
+    - `propagate`: the `Propagate`, or `PropagateMarginalised`, that draws. With its noise "rqmc" or
+      "stratified" the draws of a family fill K strata of the first dimension of the noise, and one
+      more dimension of the same point set says which of them is kept. So what is kept is spread
+      over slot and noise as well.
+    - `num_draws`: K.
+
+    Raises `ValueError` for K < 1, and for gradient "stop", which knows nothing of the draw that was
+    kept. Use it where the likelihood is narrow and cheap, with four to sixteen draws.
+    """
+
+    propagate: Propagate | PropagateMarginalised
+    num_draws: int = eqx.field(static=True, default=4)
+
+    def __check_init__(self) -> None:
+        kinds = (Propagate, PropagateMarginalised)
+        check_type(kinds, "a Propagate, nor a PropagateMarginalised", propagate=self.propagate)
+        check_whole(num_draws=self.num_draws)
+        if self.propagate.gradient == "stop":
+            raise ValueError("propagate: gradient 'stop' knows nothing of the draw that is kept")
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Propagate every particle and weigh it by y_t."""
+        n, k = mixture.num_particles, self.num_draws
+        check_numbered("draws up to", n * k, num_particles=n, num_draws=k)
+        families, shares = self._drawn(key, mixture, observation)
+        log_weights = families.log_weights.reshape(n, k)
+        largest = jnp.max(log_weights, axis=1, keepdims=True)
+        largest = jnp.where(largest > -jnp.inf, largest, 0.0)
+        weights = jnp.exp(log_weights - largest)
+        upto = jnp.cumsum(jax.lax.stop_gradient(weights), axis=1)
+        shares = shares.astype(upto.dtype)
+        # The last is left out: rounding must not keep a draw that is not there.
+        kept = jnp.sum(upto[:, :-1] <= shares[:, None] * upto[:, -1:], axis=1, dtype=jnp.int32)
+        places = jnp.arange(n, dtype=jnp.int32) * k + kept
+        return mixture.replace(
+            particles=jax.tree.map(lambda leaf: take(leaf, places), families.particles),
+            log_weights=largest[:, 0] + jnp.log(jnp.sum(weights, axis=1)),
+            log_scale=families.log_scale,
+        )
+
+    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """One draw of x_t for each particle: without an observation all weigh the same."""
+        return self.propagate.predict(key, mixture)
+
+    def _drawn(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> tuple[ParticleMixture, Float[Array, " n"]]:
+        """The weighed mixture of all draws, and by which uniform number each particle keeps one."""
+        n, k, propagate = mixture.num_particles, self.num_draws, self.propagate
+        repeated = _repeated(mixture, k)
+        if propagate.noise == "independent":
+            key_draws, key_kept = split(key, 2)
+            shares = uniform(key_kept, (n,), mixture.log_weights.dtype)
+            return propagate(key_draws, repeated, observation), shares
+        shape, dtype = (n, propagate.noise_dimension(mixture)), noise_dtype(mixture.particles)
+        noise, shares = draw_family_noise(
+            propagate.noise, key, shape, k, dtype,
+            mixture.component_indicators, mixture.num_components,
+        )  # fmt: skip
+        return propagate.from_noise(noise, repeated, observation), shares
+
+
+def _repeated(mixture: ParticleMixture, num_draws: int) -> ParticleMixture:
+    """Every particle K times, side by side, with its weight shared among them."""
+    n = mixture.num_particles
+
+    def repeat(leaf: Array) -> Array:
+        shape = leaf.shape[1:]
+        rows = jnp.broadcast_to(leaf.reshape(n, 1, *shape), (n, num_draws, *shape))
+        return rows.reshape(n * num_draws, *shape)
+
+    return mixture.replace(
+        particles=jax.tree.map(repeat, mixture.particles),
+        log_weights=repeat(mixture.log_weights) - math.log(num_draws),
+        component_indicators=repeat(mixture.component_indicators),
+        ancestor_indices=repeat(mixture.ancestor_indices),
+    )
+
+
+def propagation(
+    model: AbstractStateSpaceModel,
+    proposal: AbstractProposal | None,
+    gradient: str,
+    noise: str,
+    num_draws: int,
+) -> Propagate | PropagateMarginalised | PropagateNested:
+    """How x_t is drawn: by the kind of the model, once or several times for each particle.
+
+    The gradient is the one that goes with that of resampling.
+    """
+    check_whole(num_draws=num_draws)
+    own_gradient = "stop" if gradient == "stop" else "none"
+    if isinstance(model, AbstractConditionallyLinearModel):
+        propagate = PropagateMarginalised(model, proposal, own_gradient, noise)
+    else:
+        propagate = Propagate(model, proposal, own_gradient, noise)
+    return propagate if num_draws == 1 else PropagateNested(propagate, num_draws)

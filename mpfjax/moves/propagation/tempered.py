@@ -1,0 +1,172 @@
+"""Propagation in stages: the likelihood comes in by and by, and particles move in between."""
+
+from typing import Any, NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.checks import check_inner_share, check_type, check_whole, shown
+from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import AbstractStateSpaceModel, check_model, require_noise
+from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.noise import noise_dtype
+from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.propagation.propagate import likelihoods, predict
+from mpfjax.moves.resampling.resample import Resample
+from mpfjax.operations.generator import normal, split, uniform
+from mpfjax.operations.logarithms import finite_max
+
+EXPONENTS = (1 / 64, 1 / 16, 1 / 4, 1.0)
+
+
+class TemperedParticles(NamedTuple):
+    """What is resampled between the stages: x_t, and all that it takes to draw it again."""
+
+    states: PyTree
+    parents: PyTree
+    noise: Float[Array, "n d"]
+    log_likelihoods: Float[Array, " n"]
+
+
+class PropagateTempered(AbstractPropagation):
+    """Draw x_t ~ D, then weigh it by L^β1, L^(β2-β1), ... up to L, moving particles in between.
+
+    A tempered step, as in a sequential Monte Carlo sampler (Del Moral, Doucet and Jasra 2006), for
+    the target D(x_t | x_{t-1}) L(y_t | x_t)^β with β from β_1 to 1. After each stage but the last,
+    particles are resampled within components and move: x_t = f(z, x_{t-1}) is drawn again from
+    z' = sqrt(1 - s²) z + s ξ, ξ ~ N(0, I), and taken with the probability min(1, (L' / L)^β). This
+    leaves the target as it is for any f (the preconditioned Crank-Nicolson step of Cotter and
+    others 2013), because the normal distribution of z does not change. So it needs no density of
+    the dynamics and nothing is tuned on the particles: Ẑ is unbiased, and the move is exact. The
+    step s of each particle is drawn anew each time, its logarithm uniform between those of
+    `least_step` and 1, since a fitting one is different for each β.
+
+    - `model`: with `transition_from_noise`.
+    - `resample`: the resampling between the stages; None is `Resample()`.
+    - `exponents`: β_1 < β_2 < ... < 1; the last is 1.
+    - `num_moves`: moves after each stage but the last.
+    - `least_step`: the smallest s.
+
+    A step evaluates the likelihood 1 + `num_moves` (stages - 1) times for each particle. A
+    derivative sees the draws that were taken, as with gradient "none" of `Resample`. Raises
+    `ValueError` for a model without `transition_from_noise`, for exponents that do not rise to 1,
+    for a resampling with gradient "ot", which keeps no particle as it is, and for one that sorts,
+    since no point set follows. Use it where the likelihood is much narrower than the dynamics, and
+    no proposal knows where it is.
+    """
+
+    model: AbstractStateSpaceModel
+    resample: Resample
+    exponents: tuple[float, ...] = eqx.field(static=True)
+    num_moves: int = eqx.field(static=True)
+    least_step: float = eqx.field(static=True)
+
+    def __init__(
+        self,
+        model: AbstractStateSpaceModel,
+        resample: Resample | None = None,
+        *,
+        exponents: tuple[float, ...] = EXPONENTS,
+        num_moves: int = 1,
+        least_step: float = 0.02,
+    ) -> None:
+        check_model(model, "PropagateTempered")
+        refuse_marginalised(model, "PropagateTempered")
+        require_noise(model, "PropagateTempered")
+        self.model = model
+        self.resample = Resample() if resample is None else resample
+        check_type(Resample, "a Resample", resample=self.resample)
+        if self.resample.gradient == "ot":
+            raise ValueError("resample: gradient 'ot' moves particles between the stages")
+        if self.resample.sort_by is not None:
+            raise ValueError("resample: sort_by has no use between the stages")
+        self.exponents = _rising(exponents)
+        check_whole(num_moves=num_moves)
+        self.num_moves = int(num_moves)
+        check_inner_share(least_step=least_step)
+        self.least_step = float(least_step)
+
+    @property
+    def approximate(self) -> bool:
+        """As the resampling is."""
+        return self.resample.approximate
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Propagate every particle and weigh it by y_t, stage by stage."""
+        model, n = cast(Any, self.model), mixture.num_particles
+        key_noise, key_stages = split(key, 2)
+        parents = mixture.particles
+        noise = normal(key_noise, (n, model.noise_dimension), noise_dtype(parents))
+        states = model.transition_from_noise(noise, parents)
+        log_likelihoods = likelihoods(self.model, observation, states)
+        # Resampling may lose a NaN, or a particle whose likelihood is infinite.
+        broken = jnp.any(mixture.occupied & ~(log_likelihoods < jnp.inf))
+        # A common constant of any size would drown the differences that the stages weigh.
+        common = finite_max(jnp.where(mixture.occupied, log_likelihoods, -jnp.inf))
+        log_likelihoods = log_likelihoods - common
+        travellers = TemperedParticles(states, parents, noise, log_likelihoods)
+        mixture = mixture.replace(particles=travellers)
+        mixture = mixture.weighed(self.exponents[0] * log_likelihoods)
+
+        def next_stage(
+            mixture: ParticleMixture, stage: tuple[Any, Any, Any]
+        ) -> tuple[ParticleMixture, None]:
+            key, now, later = stage
+            key_draw, *keys = split(key, 1 + self.num_moves)
+            mixture = self.resample(key_draw, mixture)
+            for key_move in keys:
+                mixture = self._moved(key_move, mixture, observation, now, common)
+            log_factors = (later - now) * mixture.particles.log_likelihoods
+            return mixture.weighed(log_factors), None
+
+        exponents = jnp.asarray(self.exponents, mixture.log_weights.dtype)
+        stages = (jax.random.split(key_stages, len(exponents) - 1), exponents[:-1], exponents[1:])
+        mixture, _ = jax.lax.scan(next_stage, mixture, stages)
+        mixture = mixture.weighed(common[None])
+        log_weights = jnp.where(broken, jnp.nan, mixture.log_weights)
+        return mixture.replace(particles=mixture.particles.states, log_weights=log_weights)
+
+    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
+        return predict(key, self.model, mixture, "none")
+
+    def _moved(
+        self,
+        key: Key[Array, ""],
+        mixture: ParticleMixture,
+        observation: PyTree,
+        exponent: Float[Array, ""],
+        common: Float[Array, ""],
+    ) -> ParticleMixture:
+        """Each particle after one step of Metropolis in its noise, its parent kept."""
+        now = mixture.particles
+        key_step, key_noise, key_taken = split(key, 3)
+        n, dtype = mixture.num_particles, now.noise.dtype
+        step = jnp.asarray(self.least_step, dtype) ** uniform(key_step, (n, 1), dtype)
+        noise = jnp.sqrt(1 - step**2) * now.noise + step * normal(key_noise, now.noise.shape, dtype)
+        states = cast(Any, self.model).transition_from_noise(noise, now.parents)
+        log_likelihoods = likelihoods(self.model, observation, states) - common
+        log_ratio = exponent * log_likelihoods - exponent * now.log_likelihoods
+        taken = jnp.log(uniform(key_taken, (n,), dtype)) < log_ratio
+        proposed = TemperedParticles(states, now.parents, noise, log_likelihoods)
+
+        def pick(new: Array, old: Array) -> Array:
+            return jnp.where(taken.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+        return mixture.replace(particles=jax.tree.map(pick, proposed, now))
+
+
+def _rising(exponents: Any) -> tuple[float, ...]:
+    """The exponents as numbers, or a `ValueError` unless they rise from above zero to one."""
+    try:
+        numbers = tuple(float(number) for number in exponents)
+    except (TypeError, ValueError):
+        numbers = ()
+    rises = all(low < high for low, high in zip((0.0, *numbers), numbers, strict=False))
+    if not numbers or not rises or numbers[-1] != 1.0:
+        raise ValueError(f"exponents: {shown(exponents)} do not rise from above 0 to 1")
+    return numbers

@@ -1,0 +1,129 @@
+"""Merge: components that overlap become one."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, Key, PyTree
+
+from mpfjax.checks import check_positive, check_whole, given
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractRegrouping
+from mpfjax.moves.regrouping.features import (
+    Features,
+    Scale,
+    relative_weights,
+    separation,
+    summarise,
+)
+from mpfjax.operations.indexing import take
+from mpfjax.operations.segments import spread_finite
+
+
+class Merge(AbstractRegrouping):
+    """Merge components that overlap, for as many steps as patience asks.
+
+    Vermaak et al. (2003), section 4, leaves the criterion open. Here two components overlap
+    when both hold:
+
+    - their means are less than `max_deviations` pooled standard deviations apart, along the line
+      that joins them (Ashman's D; at 1 two equal Gaussians share 62% of their mass, at 2 32%);
+    - their means are less than `max_distance` apart, in units of `scale`.
+
+    None leaves out a condition. `patience` is how many times in a row they must be found to overlap
+    before they merge, so that two objects which pass each other do not become one: frames, where
+    this move runs at every frame, and k frames each within `Every(k, ...)`.
+    A chain of overlapping components becomes one component, which keeps the lowest label.
+
+    Raises `ValueError` where both conditions are None, for a threshold that is not positive, or
+    for a patience below 1. Exact: a relabelling only.
+    """
+
+    max_deviations: float | None = eqx.field(static=True)
+    max_distance: float | None = eqx.field(static=True)
+    patience: int = eqx.field(static=True)
+    features: Features
+
+    def __init__(
+        self,
+        max_deviations: float | None = 1.0,
+        max_distance: float | None = None,
+        *,
+        patience: int = 1,
+        features: Callable[[PyTree], Array] | None = None,
+        scale: Scale = 1.0,
+    ) -> None:
+        if max_deviations is None and max_distance is None:
+            raise ValueError("max_deviations, max_distance: at least one must be given")
+        check_positive(**given(max_deviations=max_deviations, max_distance=max_distance))
+        check_whole(patience=patience)
+        self.max_deviations = max_deviations
+        self.max_distance = max_distance
+        self.patience = patience
+        self.features = Features(features, scale)
+
+    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
+        """How many times in a row each pair of components has overlapped, where patience counts."""
+        if self.patience == 1:
+            return {}
+        return {"overlap_durations": jnp.zeros((num_components, num_components), jnp.int32)}
+
+    def regroup(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+        """The lowest label of the chain of overlapping components that each particle is in."""
+        del key
+        overlap = self._overlap(mixture)
+        memory = mixture.memory
+        if self.patience > 1:
+            durations = jnp.where(overlap, memory["overlap_durations"] + 1, 0)
+            overlap = durations >= self.patience
+            memory = memory | {"overlap_durations": durations}
+        labels = lowest_connected(overlap)
+        return spread_finite(labels, mixture.component_indicators, len(labels)), memory
+
+    def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
+        """No pair with a dead component has overlapped yet."""
+        if self.patience == 1:
+            return memory
+        is_dead = dead[:, None] | dead[None]
+        durations = jnp.where(is_dead, 0, memory["overlap_durations"])
+        return memory | {"overlap_durations": durations}
+
+    def _overlap(self, mixture: ParticleMixture) -> Bool[Array, "m m"]:
+        groups = summarise(
+            self.features(mixture),
+            relative_weights(mixture),
+            mixture.component_indicators,
+            mixture.num_components,
+        )
+        distance, deviations = separation(
+            groups.means[:, None], groups.covariances[:, None],
+            groups.means[None], groups.covariances[None],
+        )  # fmt: skip
+        overlap = groups.alive[:, None] & groups.alive[None]
+        if self.max_deviations is not None:
+            overlap &= deviations < self.max_deviations
+        if self.max_distance is not None:
+            overlap &= distance < self.max_distance
+        return overlap
+
+
+def lowest_connected(adjacent: Bool[Array, "m m"]) -> Int[Array, " m"]:
+    """The lowest label in the connected component of each node of a symmetric graph.
+
+    Each node takes the lowest label of its neighbours, then that label's own, until none changes.
+    """
+    m = adjacent.shape[0]
+    own = jnp.arange(m, dtype=jnp.int32)
+    reach = adjacent | jnp.eye(m, dtype=bool)
+
+    def lower(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        labels, _ = state
+        lowest = jnp.min(jnp.where(reach, labels[None], m), axis=1)
+        lowest = take(lowest, lowest)
+        return lowest, jnp.any(lowest != labels)
+
+    labels, _ = jax.lax.while_loop(lambda state: state[1], lower, (own, jnp.ones((), bool)))
+    return labels

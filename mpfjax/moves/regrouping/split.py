@@ -1,0 +1,195 @@
+"""Split: a component that is spread too far becomes two."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from mpfjax.checks import check_not_negative, check_share, check_whole, given
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractRegrouping
+from mpfjax.moves.regrouping.features import (
+    Features,
+    Scale,
+    relative_weights,
+    separation,
+    summarise_about,
+    weighted_means,
+)
+from mpfjax.operations.choices import cond_if_any
+from mpfjax.operations.indexing import take
+from mpfjax.operations.matrices import row_sums
+from mpfjax.operations.segments import segment_argmax, spread_finite
+from mpfjax.operations.stored import VECTOR, stored
+
+
+class Split(AbstractRegrouping):
+    """Split a component in two where it has become too diffuse.
+
+    Vermaak et al. (2003), section 4, leaves the criterion open. Here weighted 2-means, started from
+    the two ends of the component, finds two halves. The component splits if all of these hold:
+
+    - the halves' means are more than `min_deviations` pooled standard deviations apart. The halves
+      of a Gaussian are 2.6 apart and those of a uniform distribution 3.5, so 4 splits neither;
+    - they are more than `min_distance` apart, in units of `scale`;
+    - the lighter half holds at least `min_share` of the component's mass.
+
+    The centres of the halves are found from every k-th particle, such that they are about
+    `sample_size` times M; None takes all. After resampling, copies stand side by side, so a part
+    that holds one in `sample_size` of them or more is met. What is a half, how far apart they are
+    and whether they split is then found from all particles.
+
+    The lighter half takes a free label. If there are too few free labels, the clearest splits come
+    first. Raises `ValueError` for a threshold that is negative or a share not in [0, 0.5].
+    Exact: a relabelling only.
+    """
+
+    min_deviations: float = eqx.field(static=True)
+    min_distance: float = eqx.field(static=True)
+    min_share: float = eqx.field(static=True)
+    num_iterations: int = eqx.field(static=True)
+    sample_size: int | None = eqx.field(static=True)
+    features: Features
+
+    def __init__(
+        self,
+        min_deviations: float = 4.0,
+        min_distance: float = 0.0,
+        *,
+        min_share: float = 0.05,
+        num_iterations: int = 3,
+        sample_size: int | None = 32,
+        features: Callable[[PyTree], Array] | None = None,
+        scale: Scale = 1.0,
+    ) -> None:
+        check_not_negative(min_deviations=min_deviations, min_distance=min_distance)
+        check_share(0.5, min_share=min_share)
+        check_whole(num_iterations=num_iterations, **given(sample_size=sample_size))
+        self.min_deviations = min_deviations
+        self.min_distance = min_distance
+        self.min_share = min_share
+        self.num_iterations = num_iterations
+        self.sample_size = sample_size
+        self.features = Features(features, scale)
+
+    def regroup(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+        """The lighter half of every component that is too diffuse, to a free label."""
+        del key
+        labels = cond_if_any(
+            jnp.any(~mixture.active),
+            lambda: self._split_where_diffuse(mixture),
+            lambda: mixture.component_indicators,
+        )
+        return labels, mixture.memory
+
+    def _split_where_diffuse(self, mixture: ParticleMixture) -> Int[Array, " n"]:
+        """The new labels, where at least one is free."""
+        m, size = mixture.num_components, self.sample_size
+        particles = _Particles(
+            self.features(mixture),
+            relative_weights(mixture),
+            mixture.component_indicators,
+            mixture.occupied,
+        )
+        sample = particles
+        if size is not None and mixture.num_particles > size * m:
+            sample = _sampled(particles, size * m, mixture)
+        centres = _two_means(sample, m, self.num_iterations)
+        features, weights, parent, occupied = particles
+        side, gaps = _nearer(features, centres, parent)
+        halves = summarise_about(centres, gaps, weights, parent + m * side)
+        masses = halves.masses.reshape(2, m)
+        least_mass, total = jnp.min(masses, axis=0), jnp.sum(masses, axis=0)
+        distance, deviations = separation(
+            halves.means[:m], halves.covariances[:m], halves.means[m:], halves.covariances[m:]
+        )
+        splits = (
+            (least_mass > 0)
+            & (least_mass >= self.min_share * total)
+            & (deviations > self.min_deviations)
+            & (distance > self.min_distance)
+        )
+        lighter = jnp.where(masses[1] <= masses[0], 1, 0)
+        labels = free_labels(splits, deviations, mixture.active)
+        moves = (side == spread_finite(lighter, parent, 2)) & occupied
+        return jnp.where(moves, spread_finite(labels, parent, m), parent)
+
+
+class _Particles(NamedTuple):
+    """What is seen of the particles, or of some of them."""
+
+    features: Float[Array, "s k"]
+    weights: Float[Array, " s"]
+    parent: Int[Array, " s"]
+    occupied: Bool[Array, " s"]
+
+
+def _sampled(particles: _Particles, most: int, mixture: ParticleMixture) -> _Particles:
+    """Every k-th of the usable slots, at most so many."""
+    room = mixture.num_usable_slots
+    stride = -(-room // most)
+    number = most if mixture.usable_slots is not None else -(-mixture.num_particles // stride)
+    # A whole number of vectors, or nothing that is made of the sample would run on them.
+    places = stride * jnp.arange(-(-number // VECTOR) * VECTOR, dtype=jnp.int32)
+    inside = places < room
+    places = jnp.minimum(places, mixture.num_particles - 1)
+    sample = jax.tree.map(lambda values: take(values, places), particles)
+    return sample._replace(
+        weights=jnp.where(inside, sample.weights, 0.0), occupied=sample.occupied & inside
+    )
+
+
+def _two_means(sample: _Particles, m: int, num_iterations: int) -> Float[Array, "g k"]:
+    """The centres of two halves of each component, by weighted 2-means from its two ends."""
+    features, weights, parent, _ = sample
+    _, means = weighted_means(features, weights, parent, m)
+    one_end = _farthest_members(sample, means, m)
+    centres = jnp.concatenate([one_end, _farthest_members(sample, one_end, m)])
+
+    def iterate(_: int | Int[Array, ""], centres: Float[Array, "g k"]) -> Float[Array, "g k"]:
+        side, _ = _nearer(features, centres, parent)
+        masses, means = weighted_means(features, weights, parent + m * side, 2 * m)
+        return jnp.where((masses > 0)[:, None], means, centres)
+
+    return jax.lax.fori_loop(0, num_iterations, iterate, centres)
+
+
+def free_labels(
+    wanted: Bool[Array, " m"], priority: Float[Array, " m"], active: Bool[Array, " m"]
+) -> Int[Array, " m"]:
+    """A free label for each component that wants one, by priority; its own where none is left."""
+    own = jnp.arange(active.shape[0], dtype=jnp.int32)
+    earlier = own[:, None] < own[None]
+    ties = (priority[:, None] == priority[None]) & earlier
+    goes_first = wanted[:, None] & ((priority[:, None] > priority[None]) | ties)
+    rank = jnp.sum(goes_first, axis=0, dtype=jnp.int32)
+    free_rank = jnp.cumsum((~active).astype(jnp.int32)) - 1
+    matches = ~active[None] & (rank[:, None] == free_rank[None])
+    label = jnp.max(jnp.where(matches, own[None], -1), axis=1)
+    return jnp.where(wanted & (label >= 0), label, own)
+
+
+def _nearer(
+    features: Float[Array, "n k"], centres: Float[Array, "g k"], parent: Int[Array, " n"]
+) -> tuple[Int[Array, " n"], Float[Array, "n k"]]:
+    """Which of its own component's two centres each particle is nearer to, and how far from it."""
+    m = centres.shape[0] // 2
+    to_first = features - spread_finite(centres[:m], parent)
+    to_second = features - spread_finite(centres[m:], parent)
+    is_second = row_sums(to_second**2) < row_sums(to_first**2)
+    is_second = stored(is_second.astype(jnp.int32), 2) > 0
+    return is_second.astype(jnp.int32), jnp.where(is_second[:, None], to_second, to_first)
+
+
+def _farthest_members(
+    sample: _Particles, points: Float[Array, "m k"], num_components: int
+) -> Float[Array, "m k"]:
+    """In each component, the particle farthest from the component's point."""
+    distance = row_sums((sample.features - spread_finite(points, sample.parent)) ** 2)
+    distance = jnp.where(sample.occupied, distance, -1.0)
+    return take(sample.features, segment_argmax(distance, sample.parent, num_components))

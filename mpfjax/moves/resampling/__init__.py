@@ -1,0 +1,1 @@
+"""Resampling within components: schemes, allocation of slots, ordering, optimal transport."""

@@ -1,0 +1,122 @@
+"""Resampling by a look-ahead: the auxiliary particle filter as a move."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key, PyTree
+
+from mpfjax.checks import check_callable, check_type, saying, shown
+from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import require
+from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.resampling.resample import Resample
+from mpfjax.operations.indexing import take
+from mpfjax.operations.segments import spread
+from mpfjax.proposals import AbstractProposal
+
+
+class AuxiliaryResample(AbstractMove):
+    """Resample in proportion to w_i ν(y_t, x_{t-1}^i), and divide the weights by ν again.
+
+    The auxiliary particle filter's first stage (Pitt and Shephard 1999): ν looks ahead to how well
+    y_t will be explained. Particles that will explain it have more offspring, before anything is
+    drawn at t. The distribution stays the same in expectation, whatever ν is: a particle with k
+    times the offspring has 1 / k of the weight. So Ẑ stays unbiased. The mass does not stay the
+    same, unlike that of `Resample`. Everything happens within components.
+
+    - `resample`: the `Resample` that draws; its `ess_threshold` looks at the weights times ν.
+    - `lookahead`: a function (y_t, states) -> log ν of each particle, (n,), or a proposal that has
+      `log_normaliser`, such as `GaussNewtonProposal`. The best ν is p(y_t | x_{t-1}). It must be
+      above zero for every particle that can explain y_t, and its tails no thinner than those of
+      p(y_t | x_{t-1}): a ν that is too sure of itself leaves a few particles with most of the
+      weight. Where ν is zero for all particles of a component, it is resampled by w alone.
+
+    Without an observation nothing is resampled. Raises `ValueError` for a `resample` with gradient
+    "ot", which draws nothing, and for a look-ahead that is neither function nor such a proposal.
+    Use it, with a proposal of the same kind, where the likelihood is narrow.
+    """
+
+    resample: Resample
+    lookahead: Any
+
+    def __check_init__(self) -> None:
+        check_type(Resample, "a Resample", resample=self.resample)
+        if self.resample.gradient == "ot":
+            raise ValueError("resample: gradient 'ot' draws no ancestors that could be weighed")
+        if isinstance(self.lookahead, AbstractProposal):
+            require(self.lookahead, "log_normaliser", "AuxiliaryResample", "lookahead")
+        else:
+            what = "a function of an observation and states, nor a proposal"
+            check_callable(what, lookahead=self.lookahead)
+
+    @property
+    def approximate(self) -> bool:
+        """As the resampling is."""
+        return self.resample.approximate
+
+    @property
+    def weighs(self) -> bool:
+        """False: what the look-ahead adds to the weights is taken away again."""
+        return False
+
+    @property
+    def particles_per_component(self) -> int | None:
+        """That of the resampling."""
+        return self.resample.particles_per_component
+
+    def would_resample(
+        self, mixture: ParticleMixture, observation: PyTree = None
+    ) -> Bool[Array, " m"]:
+        """Which components of `mixture` the move would resample."""
+        return self.resample.is_due(mixture.weighed(self._log_factors(mixture, observation)))
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Resample every component that is due, looking ahead to y_t."""
+        log_factors = self._log_factors(mixture, observation)
+        # Resampling may lose a NaN, or a particle whose look-ahead is infinite.
+        broken = jnp.any(mixture.occupied & ~(log_factors < jnp.inf))
+        due = self.resample.is_due(mixture.weighed(log_factors))
+        log_factors = jnp.where(spread(due, mixture.component_indicators), log_factors, 0.0)
+        own = jnp.arange(mixture.num_particles, dtype=mixture.ancestor_indices.dtype)
+        ahead = mixture.replace(ancestor_indices=own).weighed(log_factors)
+        drawn = self.resample.redraw(key, ahead, due)
+        parents = drawn.ancestor_indices
+        drawn = drawn.replace(ancestor_indices=take(mixture.ancestor_indices, parents))
+        drawn = drawn.weighed(-take(log_factors, parents))
+        return drawn.replace(log_weights=jnp.where(broken, jnp.nan, drawn.log_weights))
+
+    def _log_factors(self, mixture: ParticleMixture, observation: PyTree) -> Float[Array, " n"]:
+        """log ν of each particle, zero in a component where ν is zero throughout."""
+        look: Any = self.lookahead
+        with saying("in lookahead, which is called with an observation and the particles"):
+            look = getattr(look, "log_normaliser", look)
+            values = look(observation, mixture.particles)
+        if not isinstance(values, jax.Array | np.ndarray) or jnp.iscomplexobj(values):
+            raise ValueError(f"lookahead: it returned {shown(values)}, no real array")
+        if values.shape != (mixture.num_particles,):
+            raise ValueError(
+                f"lookahead: it returned shape {values.shape}, not one value a particle,"
+                f" ({mixture.num_particles},)"
+            )
+        log_factors = jnp.asarray(values).astype(mixture.log_weights.dtype)
+        seen = mixture.weighed(log_factors).active
+        is_seen = spread(seen, mixture.component_indicators) | ~(log_factors < jnp.inf)
+        return jnp.where(is_seen, log_factors, 0.0)
+
+
+def propagating_proposal(
+    proposal: AbstractProposal | None, lookahead: Any
+) -> AbstractProposal | None:
+    """The proposal that x_t is drawn by: that of the look-ahead, unless there is another."""
+    if proposal is None and isinstance(lookahead, AbstractProposal):
+        return lookahead
+    return proposal
+
+
+def resampling(resample: Resample, lookahead: Any) -> Resample | AuxiliaryResample:
+    """The resampling move, which looks ahead if there is a `lookahead`."""
+    return resample if lookahead is None else AuxiliaryResample(resample, lookahead)

@@ -1,0 +1,370 @@
+"""The colour tracking model of Vermaak et al. (2003), section 5.2, and Lin et al. (2012), 2."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key, UInt8
+
+from mpfjax.checks import (
+    check_flag,
+    check_not_negative,
+    check_positive,
+    check_shape,
+    check_share,
+    check_type,
+    check_whole,
+    given,
+    shown,
+    to_rows,
+)
+from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
+from mpfjax.operations.generator import fast_key
+from mpfjax.vision.colour.bins import AbstractColours, RGBColours
+from mpfjax.vision.colour.histograms import (
+    IntegralHistogram,
+    bhattacharyya,
+    integral_histogram,
+    normalise,
+)
+from mpfjax.vision.colour.references import LARGEST_NARROW, SURROUND, reference_histograms
+from mpfjax.vision.files.boxes import centred, check_boxes
+from mpfjax.vision.files.frames import check_frame
+
+PAPER_VARIANCES = (2.5, 1.5, 0.05, 0.05)
+
+
+class BoxState(eqx.Module):
+    """Where a box is, how large it is, and which reference box it is compared with.
+
+    - `box`: (x, y, s_x, s_y), the centre in pixels and the size in units of the reference box.
+    - `reference`: r, the reference box it is compared with, in [0, number of references).
+    - `previous`: what the dynamics remember of the past, if they are of second order: the box one
+    frame before, or what else their `remembered` gives.
+    """
+
+    box: Float[Array, "*n 4"]
+    reference: Int[Array, "*n"]
+    previous: Float[Array, "*n 4"] | None = None
+
+
+class AbstractBoxModel(AbstractStateSpaceModel):
+    """The motion of boxes, without a likelihood.
+
+    x_0 scatters about the reference boxes, with equally many particles for each. (x, y, s_x, s_y)
+    follow the dynamics. In each frame, r is drawn again with the switch probability, which may be
+    zero.
+    """
+
+    reference_boxes: eqx.AbstractVar[Float[Array, "k 4"]]
+    dynamics: eqx.AbstractVar[AbstractDynamics]
+    initial_deviations: eqx.AbstractVar[Float[Array, "k 4"]]
+    switch_probability: eqx.AbstractVar[float]
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> BoxState:
+        """x_0 about the reference boxes, equally many for each, at scale one."""
+        k = self.reference_boxes.shape[0]
+        key_offset, key_noise = jax.random.split(key)
+        offset = jax.random.randint(key_offset, (), 0, num_particles)
+        reference = (jnp.arange(num_particles) * k + offset) // num_particles % k
+        centre = jnp.concatenate(
+            [self.reference_boxes[:, :2], jnp.ones_like(self.reference_boxes[:, :2])], axis=1
+        )
+        noise = jax.random.normal(key_noise, (num_particles, 4), centre.dtype)
+        box = centre[reference] + self.initial_deviations[reference] * noise
+        states = BoxState(box, reference)
+        past = self.dynamics_of(states).initial_past(jax.random.fold_in(key_noise, 1), box)
+        return BoxState(box, reference, past)
+
+    def sample_transition(self, key: Key[Array, ""], states: BoxState) -> BoxState:
+        """x_t from the dynamics; with the switch probability, r is drawn again."""
+        key_noise, key_switch, key_reference = jax.random.split(fast_key(key), 3)
+        reference = states.reference
+        if self.switch_probability > 0:
+            k = self.reference_boxes.shape[0]
+            switches = jax.random.bernoulli(key_switch, self.switch_probability, reference.shape)
+            drawn = jax.random.randint(key_reference, reference.shape, 0, k, reference.dtype)
+            reference = jnp.where(switches, drawn, reference)
+        dynamics = self.dynamics_of(states)
+        box = dynamics.sample(key_noise, states.box, states.previous)
+        return BoxState(box, reference, dynamics.remembered(box, states.box, states.previous))
+
+    @property
+    def noise_dimension(self) -> int:
+        """That of the dynamics, and one for r where it may be drawn again."""
+        return self.dynamics.noise_dimension + (self.switch_probability > 0)
+
+    def transition_from_noise(self, noise: Float[Array, "n k"], states: BoxState) -> BoxState:
+        """The same, made of standard normal noise."""
+        check_shape(f"n {self.noise_dimension}", noise=noise)
+        reference = states.reference
+        if self.switch_probability > 0:
+            # Below the probability, where a share lies says which r is drawn.
+            shares = jax.scipy.special.ndtr(noise[:, -1]) / self.switch_probability
+            k = self.reference_boxes.shape[0]
+            drawn = jnp.clip(jnp.floor(k * shares), 0, k - 1).astype(reference.dtype)
+            reference = jnp.where(shares < 1, drawn, reference)
+        dynamics = self.dynamics_of(states)
+        noise = noise[:, : self.dynamics.noise_dimension]
+        box = dynamics.from_noise(noise, states.box, states.previous)
+        return BoxState(box, reference, dynamics.remembered(box, states.box, states.previous))
+
+    def log_transition(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
+        """log D(x_t | x_{t-1}) + log P(r_t | r_{t-1}), -inf where r cannot have changed."""
+        dynamics = self.dynamics_of(previous_states)
+        log_density = dynamics.log_density(
+            states.box, previous_states.box, previous_states.previous
+        )
+        return log_density + self.log_switch(states, previous_states)
+
+    def log_switch(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
+        """log P(r_t | r_{t-1}), the part of `log_transition` that is not about the box."""
+        drawn = self.switch_probability / self.reference_boxes.shape[0]
+        stays = states.reference == previous_states.reference
+        return jnp.log(
+            jnp.where(stays, 1 - self.switch_probability + drawn, drawn).astype(states.box.dtype)
+        )
+
+    def with_history(self, states: BoxState, previous_states: BoxState) -> BoxState:
+        """The states as children of the previous ones: they remember those boxes."""
+        dynamics = self.dynamics_of(previous_states)
+        past = dynamics.remembered(states.box, previous_states.box, previous_states.previous)
+        return BoxState(states.box, states.reference, past)
+
+    def dynamics_of(self, states: BoxState) -> AbstractDynamics:
+        """The dynamics of each particle's own reference."""
+        return jax.tree.map(lambda leaf: leaf[states.reference], self.dynamics)
+
+    def boxes(self, states: BoxState) -> Float[Array, "n 4"]:
+        """(x, y, s_x l_x, s_y l_y): the hypothesised boxes, centre and size in pixels."""
+        size = self.reference_boxes[states.reference, 2:]
+        return jnp.concatenate([states.box[:, :2], states.box[:, 2:] * size], axis=1)
+
+
+class ColourModel(AbstractBoxModel):
+    """Boxes that move at random and are recognised by the colours in them.
+
+    Vermaak et al. (2003), section 5.2: (x, y, s_x, s_y) follow independent Gaussian random walks,
+    and L(y | x) ∝ exp(-Σ_c B²(h^c, h_ref^c) / 2σ²) with B the Bhattacharyya distance of the
+    normalised histograms of the colours c = R, G, B in the hypothesised and in the reference box.
+    Lin et al. (2012), section 2, is the same with one `HSVColours` histogram (eqs. 1 to 3) and an
+    `Autoregression` (eq. 4). Two extensions are in neither paper, and off unless asked for:
+
+    - several references: r, the reference that a particle is compared with, is part of the state,
+      so the recursion stays exact. x_0 is spread equally over all references. r never changes, or
+      is drawn again with a small probability in every frame, for objects that change their looks;
+    - boxes cut into bands from top to bottom, whose B² are averaged, so that a shirt is not
+    confused
+      with trousers; and weights of colours: a colour counts by how much more of it is in a
+      reference box than around the box, so that grass in a box counts little.
+
+    An observation is an RGB frame, uint8 of shape (h, w, 3), or its `IntegralHistogram`. A box
+    outside the frame has no colour and the largest distance, B = 1. So has a box of more pixels
+    than can be counted, see `wide_counts`. Make a model with `from_frame`. Use it for objects that
+    keep their colours and are not surrounded by the same colours.
+
+    - `reference_boxes`: (k, 4), centre and size in pixels; x_0 scatters about them.
+    - `references`, `colour_weights`: h_ref and the weights of its colours, (k, parts, channels,
+      bins).
+    - `dynamics`: of (x, y, s_x, s_y), in pixels for x and y and in units of the reference box for
+      s_x and s_y; its parameters have a leading axis k.
+    - `initial_deviations`: of x_0, (k, 4), in the same units.
+    - `sigma`: σ, the width of the likelihood.
+    - `colours`: the bins of the histograms.
+    - `switch_probability`: the probability, in each frame, that r is drawn again from all
+    references.
+    - `contrast`: how much a box gains if the areas at its sides, half a width each, do not have the
+      reference's colours. 0 looks at the box alone, as in the paper. If a box with its sides is too
+      large to be counted, it gains nothing.
+    - `wide_counts`: count pixels in 32 bits; see `integral_histogram`. Without it, a box, or with
+      `contrast` a box with its sides, may have at most 65 535 pixels.
+    """
+
+    reference_boxes: Float[Array, "k 4"]
+    references: Float[Array, "k parts channels bins"]
+    colour_weights: Float[Array, "k parts channels bins"]
+    dynamics: AbstractDynamics
+    initial_deviations: Float[Array, "k 4"]
+    sigma: Float[Array, ""]
+    colours: AbstractColours
+    switch_probability: float = eqx.field(static=True, default=0.0)
+    contrast: float = eqx.field(static=True, default=0.0)
+    wide_counts: bool = eqx.field(static=True, default=False)
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: UInt8[np.ndarray, "h w 3"],
+        boxes: Float[np.ndarray, "k 4"],
+        *,
+        colours: AbstractColours | None = None,
+        sigma: float = 0.15,
+        deviations: Float[np.ndarray, "..."] | None = None,
+        dynamics: AbstractDynamics | None = None,
+        num_parts: int = 1,
+        weigh_colours: bool = False,
+        share_reference: bool = False,
+        switch_probability: float = 0.0,
+        contrast: float = 0.0,
+    ) -> "ColourModel":
+        """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
+
+        - `colours`: the bins of the histograms; None takes `RGBColours()`.
+        - `deviations`: of x_0 and of the random walk, (4,) or one row a box; None takes the
+          paper's, the roots of (2.5, 1.5, 0.05, 0.05).
+        - `dynamics`: instead of the random walk; one for all boxes, or with a row for each.
+        - `num_parts`: bands from top to bottom.
+        - `weigh_colours`: weight each colour by its share in the box compared with its share in the
+          surround, which has twice the width and height.
+        - `share_reference`: all particles are compared with one reference, the mean of all boxes.
+          The paper too has one B_ref for all players.
+        - `switch_probability`, `contrast`: see the class.
+
+        Raises `ValueError` naming the argument for one of another kind, for a frame that is not
+        (h, w, 3) of type uint8, for a box without area or outside the frame, for a number that is
+        not positive, and for a probability outside [0, 1].
+        """
+        check_frame(frame)
+        boxes = to_rows(4, "boxes", boxes)
+        if len(boxes) == 0:
+            raise ValueError("boxes: there are none")
+        check_boxes(boxes, *frame.shape[:2])
+        colours = RGBColours() if colours is None else colours
+        check_type(AbstractColours, "AbstractColours such as RGBColours()", colours=colours)
+        kind = "AbstractDynamics such as RandomWalk(deviations)"
+        check_type(AbstractDynamics, kind, **given(dynamics=dynamics))
+        deviations = positive_deviations(
+            np.sqrt(PAPER_VARIANCES) if deviations is None else deviations, len(boxes)
+        )
+        check_positive(sigma=sigma)
+        check_whole(num_parts=num_parts)
+        check_flag(weigh_colours=weigh_colours, share_reference=share_reference)
+        check_share(switch_probability=switch_probability)
+        check_not_negative(contrast=contrast)
+        places = jnp.asarray(centred(boxes), float)
+        references, weights = reference_histograms(frame, colours, places, num_parts, weigh_colours)
+        if share_reference:
+            references = jnp.broadcast_to(references.mean(0, keepdims=True), references.shape)
+            size = places[:, 2:].mean(0, keepdims=True)
+            places = places.at[:, 2:].set(jnp.broadcast_to(size, (len(boxes), 2)))
+        steps = jnp.broadcast_to(jnp.asarray(deviations, float), (len(boxes), 4))
+        # Room for boxes to grow to twice the area of the largest reference.
+        room = 2 * np.prod(boxes[:, 2:], axis=1).max() * (SURROUND if contrast > 0 else 1)
+        return cls(
+            reference_boxes=places,
+            references=references,
+            colour_weights=weights,
+            dynamics=_for_each(RandomWalk(steps) if dynamics is None else dynamics, len(boxes)),
+            initial_deviations=steps,
+            sigma=jnp.asarray(sigma, float),
+            colours=colours,
+            switch_probability=switch_probability,
+            contrast=contrast,
+            wide_counts=bool(room > LARGEST_NARROW),
+        )
+
+    def log_likelihood(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
+    ) -> Float[Array, " n"]:
+        """-(Σ_c B² - contrast Σ_c B²_around) / 2σ², each B² averaged over the bands."""
+        counts, sides = self.counts(observation, states)
+        weights, references = self._own(counts, states)
+        distances = self._contrasted(counts, sides, weights, references)
+        return -0.5 * distances / self.sigma**2
+
+    def counts(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
+    ) -> tuple[Float[Array, "n parts channels bins"], Float[Array, "n parts channels bins"] | None]:
+        """Pixels of each colour in each box, and at its sides if there is a `contrast`."""
+        num_parts = self.references.shape[1]
+        observation, boxes = self._counted(observation), self.boxes(states)
+        counts = observation.counts(boxes, num_parts)
+        if self.contrast == 0:
+            return counts, None
+        wide = boxes * jnp.array([[1.0, 1.0, SURROUND, 1.0]], boxes.dtype)
+        return counts, observation.counts(wide, num_parts) - counts
+
+    def contrasted(
+        self,
+        counts: Float[Array, "n parts channels bins"],
+        sides: Float[Array, "n parts channels bins"] | None,
+        states: BoxState,
+        references: Float[Array, "n parts channels bins"],
+    ) -> Float[Array, " n"]:
+        """Σ_c B² - contrast Σ_c B²_around of counted boxes, from references of their own."""
+        return self._contrasted(counts, sides, self.colour_weights[states.reference], references)
+
+    def prepare_observation(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"]
+    ) -> IntegralHistogram:
+        """The frame's integral histogram; a model of several objects builds it only once."""
+        return self._counted(observation)
+
+    def squared_distances(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
+    ) -> Float[Array, " n"]:
+        """Σ_c B² of each box from its reference, averaged over the bands: between 0 and the
+        number of channels.
+        """
+        counts = self._counted(observation).counts(self.boxes(states), self.references.shape[1])
+        return _distances(counts, *self._own(counts, states))
+
+    def _counted(self, observation: IntegralHistogram | UInt8[Array, "h w 3"]) -> IntegralHistogram:
+        if isinstance(observation, IntegralHistogram):
+            return observation
+        return integral_histogram(observation, self.colours, self.wide_counts)
+
+    def _contrasted(
+        self, counts: Array, sides: Array | None, weights: Array, references: Array
+    ) -> Float[Array, " n"]:
+        distances = _distances(counts, weights, references)
+        if sides is None:
+            return distances
+        uncounted = jnp.isnan(sides[:, 0, 0, 0])
+        around = jnp.where(uncounted, 0.0, _distances(sides, weights, references))
+        return distances - self.contrast * around
+
+    def _own(self, counts: Array, states: BoxState) -> tuple[Array, Array]:
+        """The weights and the references of the particles."""
+        weights, references = self.colour_weights, self.references
+        # With one reference, a gather of it costs more than the distance. Only under vmap, where
+        # each particle has a model of its own, the two gathers fuse.
+        if references.shape[0] > 1 or counts.shape[0] == 1:
+            weights, references = weights[states.reference], references[states.reference]
+        return weights, references
+
+
+def _distances(
+    counts: Float[Array, "n parts channels bins"],
+    weights: Float[Array, "#n parts channels bins"],
+    references: Float[Array, "#n parts channels bins"],
+) -> Float[Array, " n"]:
+    """Σ_c B² of counted colours from references, averaged over the bands."""
+    histograms = normalise(counts, weights)
+    distances = bhattacharyya(histograms, jnp.broadcast_to(references, histograms.shape))
+    return jnp.mean(jnp.sum(distances, axis=2), axis=1)
+
+
+def positive_deviations(deviations: Any, num_boxes: int) -> np.ndarray:
+    """Four positive numbers, for all boxes or a row for each, or a `ValueError`."""
+    try:
+        numbers = np.asarray(deviations, float)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    fits = numbers.shape in ((4,), (num_boxes, 4))
+    if not fits or not np.all((numbers > 0) & np.isfinite(numbers)):
+        raise ValueError(f"deviations: {shown(deviations)} are not four positive numbers a box")
+    return numbers
+
+
+def _for_each(dynamics: AbstractDynamics, num_boxes: int) -> AbstractDynamics:
+    """The dynamics with a row of parameters for each box."""
+    if dynamics.is_shared:
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_boxes, *leaf.shape)), dynamics)
+    rows = {leaf.shape[0] for leaf in jax.tree.leaves(dynamics)}
+    if rows != {num_boxes}:
+        raise ValueError(f"dynamics: parameters for {rows} boxes, not for {num_boxes}")
+    return dynamics

@@ -1,0 +1,81 @@
+"""The loop over frames for boxes drawn in the first: one track for each box, in their order."""
+
+import itertools
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key, UInt8
+
+from mpfjax.checks import check_key, check_type, to_rows
+from mpfjax.filter import Filter, step_and_faults
+from mpfjax.mixture import ParticleMixture
+from mpfjax.observations import Fault, raise_faults
+from mpfjax.vision.boxes.object_moves import best_components
+from mpfjax.vision.boxes.recipes import objects_filters
+from mpfjax.vision.files.frames import of_one_kind
+from mpfjax.vision.tracking.tracker import Tracks
+
+
+def follow_boxes(
+    frames: Iterable[UInt8[np.ndarray, "..."]],
+    boxes: Float[np.ndarray, "k 4"],
+    *,
+    key: Key[Array, ""] | None = None,
+) -> Iterator[Tracks]:
+    """Follow boxes (x, y, w, h) of the first frame by their colours: yields `Tracks`, k rows each.
+
+    Row j, with the identity j + 1, is what the recipe "objects" of `PRESETS` holds for the
+    likeliest place of box j: the mean of the heaviest of the components that stand for it. An
+    object of which no component is left has the identity 0. Nothing is detected, so that
+    `confirmed` says whether the object is held at all, and `unseen` is 0.
+
+    - `frames`: as for `track`; the boxes, top-left corner first, in pixels, lie in the first.
+    - `key`: of the random numbers; None takes `jax.random.key(0)`.
+
+    Raises `ValueError` for boxes of no area, outside the first frame or none at all, and for frames
+    as `track` does. Use it where nothing can be detected, and somebody says what to follow.
+    """
+    check_type(Iterable, "frames one after the other", frames=frames)
+    boxes = to_rows(4, "boxes", boxes)
+    if len(boxes) == 0:
+        raise ValueError("boxes: there are none")
+    key = jax.random.key(0) if key is None else key
+    check_key(key)
+    return _followed(of_one_kind(frames), boxes, key)
+
+
+def _followed(stills: Iterator[np.ndarray], boxes: np.ndarray, key: Array) -> Iterator[Tracks]:
+    first = next(stills, None)
+    if first is None:
+        return
+    filter = objects_filters(first, boxes)["mpf"]
+    mixture = _begin(filter, key)
+    for t, still in enumerate(itertools.chain([first], stills)):
+        step_key = jax.random.fold_in(key, t)
+        mixture, tracks, faults = _advance(
+            filter, step_key, mixture, jnp.asarray(still), len(boxes)
+        )
+        yield jax.device_get(raise_faults(tracks, faults))
+
+
+@eqx.filter_jit
+def _begin(filter: Filter, key: Array) -> ParticleMixture:
+    return filter.init(key)
+
+
+@eqx.filter_jit
+def _advance(
+    filter: Filter, key: Array, mixture: ParticleMixture, frame: Array, num_objects: int
+) -> tuple[ParticleMixture, Tracks, tuple[Fault, ...]]:
+    mixture, _, faults = step_and_faults(filter, key, mixture, frame)
+    model: Any = filter.model
+    best, held = best_components(mixture, num_objects)
+    means = mixture.component_averages(model.boxes(mixture.particles))
+    identities = jnp.where(held, jnp.arange(1, num_objects + 1, dtype=jnp.int32), 0)
+    unseen = jnp.zeros(num_objects, jnp.int32)
+    tracks = Tracks(means[best], identities, held, unseen, jnp.zeros((), bool), held)
+    return mixture, tracks, faults

@@ -1,0 +1,146 @@
+"""Several objects, each recognised by its colours, as in Smith and Gatica-Perez (2004)."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree, UInt8
+
+from mpfjax.checks import check_positive, check_type, check_whole, shown, to_rows
+from mpfjax.models.dynamics import Autoregression
+from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
+from mpfjax.vision.boxes.colour_model import BoxState, ColourModel, positive_deviations
+from mpfjax.vision.colour.bins import AbstractColours, HSVColours
+
+_MOMENTUM = 0.5
+PAPER_DEVIATIONS = (2.0, 2.0, 0.001, 0.001)
+
+
+def joint_colour_model(
+    frame: UInt8[np.ndarray, "h w 3"],
+    boxes: Float[np.ndarray, "objects 4"],
+    *,
+    lambda_: float = 20.0,
+    num_parts: int = 2,
+    colours: AbstractColours | None = None,
+    deviations: Sequence[float] = PAPER_DEVIATIONS,
+    templates: Mapping[int, tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "4"]]]
+    | None = None,
+    interaction: Callable[[PyTree, PyTree], Float[Array, " n"]] | None = None,
+) -> MultiObjectModel:
+    """J boxes with second-order dynamics, each recognised by the histograms of its own template.
+
+    Smith and Gatica-Perez (2004), sections 2 and 3.2: L(y | x^j) ∝ exp(-λ d²). d² is the squared
+    Bhattacharyya distance of HSV histograms, summed over the P bands into which a box is cut from
+    top to bottom, as in Pérez, Hue, Vermaak and Gangnet (2002), where λ is 20 as well. The
+    dynamics are x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + σ ω_t. Each object has a `ColourModel`,
+    which takes the mean over bands, so its σ² is 1 / (2 λ P). The paper has one scale α; here width
+    and height have a scale each. An observation is an RGB frame for all objects. Its integral
+    histogram is built once in each step, and under `monte_carlo` once for all runs.
+
+    - `boxes`: (x, y, w, h), top-left corner first, where the objects start, and where their
+      templates are in `frame`.
+    - `lambda_`: λ.
+    - `num_parts`: bands.
+    - `colours`: the bins of the histograms; None takes `HSVColours()`.
+    - `deviations`: σ of x and y in pixels and of the scales of width and height; also those of x_0.
+    - `templates`: for an object whose looks are taken from elsewhere, by its index: (frame, box).
+    - `interaction`: that of `MultiObjectModel`, between `BoxState`s.
+
+    Raises `ValueError` naming the argument for no boxes, a box of no area or outside its frame,
+    an index in `templates` that is none, and numbers that are not positive. Use it where each
+    object has colours of its own.
+    """
+    boxes = to_rows(4, "boxes", boxes)
+    sigma = _sigma(lambda_, num_parts)
+    steps = positive_deviations(deviations, 1).reshape(4)
+    momentum = Autoregression.with_momentum(_MOMENTUM, jnp.asarray(steps, float))
+    templates = {} if templates is None else templates
+    check_type(Mapping, "frames and boxes, {index: (frame, box)}", templates=templates)
+
+    def learn(frame: np.ndarray, boxes: np.ndarray) -> ColourModel:
+        return ColourModel.from_frame(
+            frame,
+            boxes,
+            colours=HSVColours() if colours is None else colours,
+            sigma=sigma,
+            deviations=steps,
+            dynamics=momentum,
+            num_parts=num_parts,
+        )
+
+    model = learn(frame, boxes)
+    for j, template in templates.items():
+        if j not in range(len(boxes)):
+            raise ValueError(f"templates: {j} is none of the {len(boxes)} objects, from 0 on")
+        if not isinstance(template, Sequence) or len(template) != 2:
+            raise ValueError(f"templates: {shown(template)}, of object {j}, is no (frame, box)")
+        other_frame, box = template
+        try:
+            looks = learn(other_frame, to_rows(4, "box", box)[:1]).references[0]
+        except ValueError as error:
+            raise ValueError(f"templates: of object {j}, {error}") from error
+        model = eqx.tree_at(lambda m: m.references, model, model.references.at[j].set(looks))
+    return MultiObjectModel(
+        _one_each(model),
+        len(boxes),
+        interaction,
+        shared_observation=True,
+        per_object=True,
+    )
+
+
+def with_lambda(model: MultiObjectModel, lambda_: float) -> MultiObjectModel:
+    """A `joint_colour_model` with another λ, whose filters compile to the same programs.
+
+    Raises `ValueError` for a λ that is not positive, and for another model. Use it to try several
+    λ.
+    """
+    _check_model(model, "with_lambda")
+    colour_model: Any = model.object_model
+    sigma = _sigma(lambda_, colour_model.references.shape[-3])
+    sigma = jnp.full_like(colour_model.sigma, sigma)
+    return eqx.tree_at(lambda m: m.object_model.sigma, model, sigma)
+
+
+def object_boxes(model: MultiObjectModel, states: BoxState) -> Float[Array, "n objects 4"]:
+    """(x, y, w, h) of every object of every particle, (x, y) the top-left corner, in pixels.
+
+    For particles of a `joint_colour_model`, whose leaves are (n, J, ...). Raises `ValueError` for
+    another model, and states of another kind or shape.
+    """
+    _check_model(model, "object_boxes")
+    check_type(BoxState, "a BoxState", states=states)
+    if jnp.shape(states.box)[1:] != (model.num_objects, 4):
+        shape = jnp.shape(states.box)
+        raise ValueError(f"states: shape {shape} of box is not (n, {model.num_objects}, 4)")
+
+    def place(colour_model: ColourModel, states: BoxState) -> Float[Array, "n 4"]:
+        boxes = colour_model.boxes(states)
+        return jnp.concatenate([boxes[:, :2] - 0.5 * boxes[:, 2:], boxes[:, 2:]], axis=1)
+
+    return eqx.filter_vmap(place, in_axes=(0, 1), out_axes=1)(model.object_model, states)
+
+
+def _check_model(model: MultiObjectModel, needed_by: str) -> None:
+    require_multi_object(model, needed_by)
+    if not isinstance(model.object_model, ColourModel):
+        raise ValueError(f"model: {type(model.object_model).__name__} is no ColourModel of objects")
+
+
+def _sigma(lambda_: float, num_parts: int) -> float:
+    """σ of exp(-(mean of d²) / 2σ²) for exp(-λ (sum of d²))."""
+    check_positive(lambda_=lambda_)
+    check_whole(num_parts=num_parts)
+    return float((2 * lambda_ * num_parts) ** -0.5)
+
+
+def _one_each(model: ColourModel) -> ColourModel:
+    """A model of k references as k models of one, side by side."""
+    num_objects = model.reference_boxes.shape[0]
+    sigma = jnp.broadcast_to(model.sigma, (num_objects,))
+    split = jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[:, None], model)
+    return eqx.tree_at(lambda m: m.sigma, split, sigma)

@@ -1,0 +1,158 @@
+"""Boxes recognised by colours that are learned on the way, and that may be hidden."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key, UInt8
+
+from mpfjax.checks import check_positive, check_share, check_type
+from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.moves.base import AbstractPropagation
+from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
+from mpfjax.vision.colour.histograms import IntegralHistogram, normalise
+
+
+class LearnedBoxState(eqx.Module):
+    """A `BoxState`, and the colours that the hypothesis has seen in its box lately.
+
+    - `box`, `reference`, `previous`: as in `BoxState`.
+    - `appearance`: the learned histograms, (n, parts, channels, bins); at first those of the reference.
+    """
+
+    box: Float[Array, "*n 4"]
+    reference: Int[Array, "*n"]
+    previous: Float[Array, "*n 4"] | None
+    appearance: Float[Array, "*n parts channels bins"]
+
+
+class LearnedColourModel(AbstractStateSpaceModel):
+    """A `ColourModel` of objects that change their appearance and that are hidden at times.
+
+    L(y | x) ∝ exp(-d / 2σ²) + exp(-d_hidden / 2σ²), where d is the squared distance of the
+    `ColourModel`, contrast included: the share `anchor` of it from the reference of the first
+    frame, and the rest from the particle's own `appearance`. The second term is of an object that
+    cannot be seen, whatever is in its box. So a hypothesis waits near the place where its object
+    vanished, and a look-alike at a distance of d_hidden or more does not draw it away. `appearance`
+    are part of the state and change only by `AdaptAppearance`; the motion is that of the
+    `ColourModel`. Observations are those of the `ColourModel`.
+
+    - `hidden_distance`: d_hidden, squared, in units of Σ_c B². People in a street scene were at .2
+      from themselves, at .5 to .7 from others and from 1 on from the background.
+
+    Raises `TypeError` for another model, `ValueError` for a share outside [0, 1] and a distance
+    that is not positive. Use it where objects hide behind others or turn round.
+    """
+
+    colour_model: ColourModel
+    anchor: float = eqx.field(static=True, default=0.2)
+    hidden_distance: float = eqx.field(static=True, default=0.6)
+
+    def __check_init__(self) -> None:
+        check_type(ColourModel, "a ColourModel", colour_model=self.colour_model)
+        check_share(anchor=self.anchor)
+        check_positive(hidden_distance=self.hidden_distance)
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> LearnedBoxState:
+        """x_0 of the `ColourModel`, with the appearance of the reference."""
+        states = self.colour_model.sample_initial(key, num_particles)
+        return _with_appearance(states, self.colour_model.references[states.reference])
+
+    def sample_transition(self, key: Key[Array, ""], states: LearnedBoxState) -> LearnedBoxState:
+        """x_t of the `ColourModel`, with the appearance that it had."""
+        return _with_appearance(
+            self.colour_model.sample_transition(key, _bare(states)), states.appearance
+        )
+
+    def boxes(self, states: LearnedBoxState) -> Float[Array, "n 4"]:
+        """The hypothesised boxes, centre and size in pixels."""
+        return self.colour_model.boxes(_bare(states))
+
+    def log_likelihood(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: LearnedBoxState
+    ) -> Float[Array, " n"]:
+        """log of the sum of the two terms, seen and hidden."""
+        log_seen, log_hidden, _ = self._seen(observation, states)
+        return jnp.logaddexp(log_seen, log_hidden)
+
+    def prepare_observation(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"]
+    ) -> IntegralHistogram:
+        """The frame's integral histogram."""
+        return self.colour_model.prepare_observation(observation)
+
+    def learned(
+        self,
+        observation: IntegralHistogram | UInt8[Array, "h w 3"],
+        states: LearnedBoxState,
+        rate: float,
+    ) -> LearnedBoxState:
+        """The states with appearance moved by rate · P(seen | x, y) towards what is in their boxes."""
+        log_seen, log_hidden, counts = self._seen(observation, states)
+        shown = normalise(counts, self.colour_model.colour_weights[states.reference])
+        # What holds no pixel, or more than can be counted, teaches nothing.
+        some = jnp.any(shown > 0, axis=(1, 2, 3)) & jnp.all(jnp.isfinite(shown), axis=(1, 2, 3))
+        share = jnp.where(some, rate * jax.nn.sigmoid(log_seen - log_hidden), 0.0)
+        share = share.astype(shown.dtype)[:, None, None, None]
+        appearance = states.appearance + share * (
+            jnp.where(share > 0, shown, states.appearance) - states.appearance
+        )
+        return LearnedBoxState(states.box, states.reference, states.previous, appearance)
+
+    def _seen(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: LearnedBoxState
+    ) -> tuple[Float[Array, " n"], Float[Array, ""], Float[Array, "n parts channels bins"]]:
+        """log of the two terms of the likelihood, and the colours in the boxes."""
+        model, bare = self.colour_model, _bare(states)
+        counts, sides = model.counts(observation, bare)
+        to_first = model.contrasted(counts, sides, bare, model.references[states.reference])
+        to_looks = model.contrasted(counts, sides, bare, states.appearance)
+        distances = self.anchor * to_first + (1 - self.anchor) * to_looks
+        log_hidden = -0.5 * self.hidden_distance / model.sigma**2
+        return -0.5 * distances / model.sigma**2, log_hidden.astype(distances.dtype), counts
+
+
+class AdaptAppearance(AbstractPropagation):
+    """Let every particle learn the colours in its box, as far as its object is likely seen.
+
+    appearance <- appearance + rate · P(seen | x, y) (h(x) - appearance), with P(seen | x, y) the share of the
+    first term in the likelihood of the `LearnedColourModel`. Rival hypotheses learn different
+    appearance, and the `anchor` of the model keeps the first frame's in the balance. The weights stay.
+
+    What is seen changes what is expected (`approximate` is true). Raises `TypeError` for another
+    model and `ValueError` for a rate outside [0, 1]. Use it after `Propagate`.
+    """
+
+    model: LearnedColourModel
+    rate: float = eqx.field(static=True, default=0.1)
+
+    def __check_init__(self) -> None:
+        check_type(LearnedColourModel, "a LearnedColourModel", model=self.model)
+        check_share(rate=self.rate)
+
+    @property
+    def approximate(self) -> bool:
+        """True: what is seen changes what is expected."""
+        return True
+
+    def __call__(
+        self,
+        key: Key[Array, ""],
+        mixture: ParticleMixture,
+        observation: IntegralHistogram | UInt8[Array, "h w 3"],
+    ) -> ParticleMixture:
+        """Learn from this frame."""
+        del key
+        return mixture.replace(
+            particles=self.model.learned(observation, mixture.particles, self.rate)
+        )
+
+
+def _bare(states: LearnedBoxState) -> BoxState:
+    return BoxState(states.box, states.reference, states.previous)
+
+
+def _with_appearance(
+    states: BoxState, appearance: Float[Array, "n parts channels bins"]
+) -> LearnedBoxState:
+    return LearnedBoxState(states.box, states.reference, states.previous, appearance)

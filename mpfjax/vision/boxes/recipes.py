@@ -1,0 +1,221 @@
+"""Recipes for tracking boxes in video by their colours: a PF and an MPF, ready to run.
+
+Each recipe takes the first frame and a box for each object. It returns two filters with the same
+model and the same particles at the start: a particle filter of 200 particles, and a mixture
+particle filter of at most 10 components of 20. "objects" has twice as many particles, and of more
+than three objects more of both, see `most_components`. `PRESETS` has the recipes by name.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from mpfjax.filter import Filter
+from mpfjax.filters import mixture_particle_filter, particle_filter
+from mpfjax.models.dynamics import AbstractDynamics
+from mpfjax.models.jumps import RandomWalkWithJumps
+from mpfjax.models.velocity import WalkWithVelocity
+from mpfjax.moves.base import AbstractMove, AbstractRegrouping
+from mpfjax.moves.objects.exclusion import Exclusion
+from mpfjax.moves.propagation.propagate import Propagate
+from mpfjax.moves.regrouping.kmeans import KMeans
+from mpfjax.moves.regrouping.merge import Merge
+from mpfjax.moves.regrouping.split import Split
+from mpfjax.moves.resampling.resample import Resample
+from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
+from mpfjax.vision.boxes.learned_colours import AdaptAppearance, LearnedBoxState, LearnedColourModel
+from mpfjax.vision.boxes.object_moves import ObjectExclusion, PruneHypotheses
+from mpfjax.vision.colour.bins import RGBColours
+from mpfjax.vision.files.boxes import check_boxes
+from mpfjax.vision.files.frames import check_frame
+
+NUM_PARTICLES, MAX_COMPONENTS, PARTICLES_PER_COMPONENT = 200, 10, 20
+HYPOTHESES, PARTICLES_PER_HYPOTHESIS = 3, 40
+
+
+def paper_filters(
+    frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
+) -> dict[str, Filter]:
+    """The model with the paper's parameters; the rest of the MPF in units of the mean box."""
+    model = ColourModel.from_frame(frame, boxes, sigma=0.15, deviations=None, share_reference=True)
+    where: dict[str, Any] = {"features": _centre, "scale": boxes[:, 2:].mean(axis=0)}
+    mixture = mixture_particle_filter(
+        model,
+        NUM_PARTICLES,
+        MAX_COMPONENTS,
+        particles_per_component=PARTICLES_PER_COMPONENT,
+        merge=Merge(None, 0.5, **where),
+        split=Split(4.0, 0.5, min_share=0.15, **where),
+        kmeans=KMeans(5, **where),
+        regroup_every=1,
+    )
+    return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
+
+
+def default_filters(
+    frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
+) -> dict[str, Filter]:
+    """The recipe that covers most on real video: any component may follow any object.
+
+    A particle is compared with one of the given boxes, and sometimes changes to another. Sometimes
+    it takes a long step. Components exclude each other. They split if they cover two places, and
+    merge only after ten frames at the same place.
+    """
+    check_frame(frame)
+    check_boxes(boxes, *frame.shape[:2])
+    size = boxes[:, 2:].mean(axis=0)
+    steps = _steps(boxes)
+    walk = _with_jumps(steps, probability=0.05)
+    model = _own_references(frame, boxes, steps, walk, switch_probability=0.05)
+    where: dict[str, Any] = {"features": _centre, "scale": size}
+    moves = [
+        Exclusion(strength=4.0, radius=0.5, **where),
+        Merge(None, 0.25, patience=10, **where),
+        Split(4.0, 0.5, min_share=0.15, **where),
+    ]
+    return _started_at_the_boxes(model, moves, size)
+
+
+def objects_filters(
+    frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
+) -> dict[str, Filter]:
+    """The recipe with the fewest strays and swaps: every component keeps to its object.
+
+    Every particle is compared only with the box that it started from, and learns how its object
+    looks and moves now. So the components of an object are rival hypotheses about it. It may be
+    hidden, and then they walk on. Only components of one object merge, a component splits where
+    hypotheses diverge, and hopeless ones are pruned. Objects exclude each other where they are
+    nearly at one place. They share the particles equally: 400, and from four objects on 120 for
+    each object.
+    """
+    check_frame(frame)
+    check_boxes(boxes, *frame.shape[:2])
+    size = boxes[:, 2:].mean(axis=0)
+    # Around their velocity people keep their way, up and down more than to the side.
+    steps = _steps(boxes) * np.array([0.3, 0.5, 1.0, 1.0])
+    walk = _walking(_with_jumps(steps, probability=0.1, times=(8.0, 6.0)), boxes)
+    model = LearnedColourModel(_own_references(frame, boxes, steps, walk))
+    apart = _apart(size)
+    learn = AdaptAppearance(model, rate=0.03)
+    num_components = most_components(len(boxes))
+    num_particles = PARTICLES_PER_HYPOTHESIS * num_components
+    mixture = Filter(
+        model,
+        moves=[
+            Resample(share_by=_object),
+            Propagate(model),
+            ObjectExclusion(strength=3.0, radius=0.35, scale=(float(size[0]), float(size[1]))),
+            learn,
+            Merge(None, 0.25, patience=10, **apart),
+            PruneHypotheses(least_share=1e-15),
+            Split(4.0, 0.5, min_share=0.05, sample_size=None, **apart),
+        ],
+        num_particles=num_particles,
+        num_components=num_components,
+        initial_moves=_one_component_a_box(size),
+    )
+    alone = Filter(model, moves=[Resample(), Propagate(model), learn], num_particles=num_particles)
+    return {"pf": alone, "mpf": mixture}
+
+
+def most_components(num_objects: int) -> int:
+    """The most components of `objects_filters`: three hypotheses about each of many objects."""
+    return max(MAX_COMPONENTS, HYPOTHESES * num_objects)
+
+
+def _own_references(
+    frame: np.ndarray,
+    boxes: np.ndarray,
+    deviations: np.ndarray,
+    dynamics: AbstractDynamics,
+    *,
+    switch_probability: float = 0.0,
+) -> ColourModel:
+    """Each box is a reference."""
+    return ColourModel.from_frame(
+        frame,
+        boxes,
+        colours=RGBColours(16),
+        sigma=0.2,
+        deviations=deviations,
+        dynamics=dynamics,
+        num_parts=8,
+        weigh_colours=True,
+        switch_probability=switch_probability,
+        contrast=0.25,
+    )
+
+
+def _steps(boxes: np.ndarray) -> np.ndarray:
+    """Deviations of the random walk: 0.4 widths, 0.08 heights of each box; sizes hardly change."""
+    still = np.full(len(boxes), 0.01)
+    return np.stack([0.4 * boxes[:, 2], 0.08 * boxes[:, 3], still, still], axis=1)
+
+
+def _with_jumps(
+    steps: np.ndarray, probability: float, times: tuple[float, float] = (6.0, 6.0)
+) -> RandomWalkWithJumps:
+    """Some steps are so many times as long, to the side and up, though sizes never jump."""
+    return RandomWalkWithJumps(steps, steps * np.array([*times, 1.0, 1.0]), probability)
+
+
+def _walking(walk: RandomWalkWithJumps, boxes: np.ndarray) -> WalkWithVelocity:
+    """Places keep their velocity, which is about a tenth of a width a frame at first."""
+    width, still = 0.1 * boxes[:, 2], np.zeros(len(boxes))
+    speeds = np.stack([width, width, still, still], axis=1)
+    return WalkWithVelocity(walk, (0.1, 0.1, 0.0, 0.0), speeds)
+
+
+def _started_at_the_boxes(
+    model: ColourModel, moves: list[AbstractMove], size: np.ndarray
+) -> dict[str, Filter]:
+    """Both filters; the mixture starts with one component for each box."""
+    mixture = Filter(
+        model,
+        moves=[
+            Resample(particles_per_component=PARTICLES_PER_COMPONENT),
+            Propagate(model),
+            *moves,
+        ],
+        num_particles=NUM_PARTICLES,
+        num_components=MAX_COMPONENTS,
+        initial_moves=_one_component_a_box(size),
+    )
+    return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
+
+
+def _one_component_a_box(size: np.ndarray) -> list[AbstractRegrouping]:
+    return [
+        KMeans(10, reseed=True, **_apart(size)),
+        Merge(None, 0.5, features=_reference),
+    ]
+
+
+def _apart(size: np.ndarray) -> dict[str, Any]:
+    """Features by which particles of different references are never near each other."""
+    return {"features": _centre_and_reference, "scale": (*size, 1e-5)}
+
+
+PRESETS = {
+    "default": default_filters,
+    "objects": objects_filters,
+    "paper": paper_filters,
+}
+
+
+def _centre(states: BoxState | LearnedBoxState) -> Array:
+    return states.box[:, :2]
+
+
+def _object(states: BoxState | LearnedBoxState) -> Array:
+    return states.reference
+
+
+def _reference(states: BoxState | LearnedBoxState) -> Array:
+    return states.reference[:, None].astype(states.box.dtype)
+
+
+def _centre_and_reference(states: BoxState | LearnedBoxState) -> Array:
+    return jnp.concatenate([_centre(states), _reference(states)], axis=1)

@@ -1,0 +1,154 @@
+"""Boxes followed through a video: what is kept of each frame, as tracks and as pictures."""
+
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key, UInt8
+
+from mpfjax.checks import check_flag, check_key, check_type, check_whole
+from mpfjax.filter import Filter, step_and_faults
+from mpfjax.observations import one_observation, raise_faults
+from mpfjax.vision.boxes.object_moves import component_references
+from mpfjax.vision.files import boxes as box_files
+from mpfjax.vision.files import drawing
+
+
+class Snapshot(NamedTuple):
+    """What is kept of one frame of several runs; of one run, the same without the leading axis.
+
+    - `means`: (runs, m, 4), the mean box of each component, centre and size in pixels.
+    - `active`: (runs, m), which components are alive.
+    - `points`: (runs, n, 2), the centres of the particles.
+    - `labels`: (runs, n), the component of each particle, -1 in an empty slot.
+    - `references`: (runs, m), which of the given boxes each component is compared with
+      (`BoxState.reference`, its mean over the component); None where particles carry none.
+    """
+
+    means: Any
+    active: Any
+    points: Any
+    labels: Any
+    references: Any = None
+
+
+def follow(
+    filter: Filter, keys: Key[Array, " runs"], frames: Iterable[UInt8[np.ndarray, "h w 3"]]
+) -> Iterator[Snapshot]:
+    """Run a filter of boxes online, once for each key, and yield a snapshot for each frame.
+
+    The filter's model has a method `boxes(states)`, as `ColourModel` does. A frame is read only
+    when the one before it is done, so frames may come from a camera. Raises `TypeError` for
+    something that is no filter, and `ValueError` for keys that are not a stack of keys. Use it with
+    the `PRESETS`, and `track_rows` to make tracks of the snapshots.
+    """
+    check_type(Filter, "a Filter", filter=filter)
+    check_key(keys, "keys", batch=True)
+    return _follow(filter, keys, frames)
+
+
+def _follow(filter: Filter, keys: Array, frames: Iterable[np.ndarray]) -> Iterator[Snapshot]:
+    mixtures = jax.vmap(filter.init)(keys)
+    for t, frame in enumerate(frames):
+        step = jnp.asarray(t)  # an array: a new Python number would compile again
+        mixtures, snapshot, faults = _advance(
+            filter, keys, step, mixtures, jnp.asarray(one_observation(frame))
+        )
+        yield jax.tree.map(np.asarray, raise_faults(snapshot, faults))
+
+
+@eqx.filter_jit
+def _advance(filter, keys, t, mixtures, frame):
+    def step(key, mixture):
+        step_key = jax.random.fold_in(key, t)
+        mixture, _, faults = step_and_faults(filter, step_key, mixture, frame)
+        places = filter.model.boxes(mixture.particles)
+        labels = jnp.where(mixture.occupied, mixture.component_indicators, -1)
+        means = mixture.component_averages(places)
+        carried = hasattr(mixture.particles, "reference")
+        references = component_references(mixture) if carried else None
+        snapshot = Snapshot(means, mixture.active, places[:, :2], labels, references)
+        return mixture, snapshot, faults
+
+    # The frame is not mapped over, so its histogram is built once for all runs.
+    return jax.vmap(step)(keys, mixtures)
+
+
+def track_rows(
+    snapshots: list[Snapshot], run: int = 0, first: int = 1, *, by_reference: bool = False
+) -> Float[np.ndarray, "rows 6"]:
+    """Rows (frame, id, x, y, w, h) of one run: an id for each life of each component.
+
+    (x, y) is the top-left corner in pixels, as `write_tracks` takes it; the first snapshot is of
+    frame `first`. With `by_reference` the id is 1 for all components of the first given box, 2 for
+    those of the second and so on: whom a row is a hypothesis about, several rows a frame. Raises
+    `ValueError` for a run or a frame that is not a whole number from 0 on, and where snapshots have
+    no references.
+    """
+    check_whole(0, run=run, first=first)
+    check_flag(by_reference=by_reference)
+    if by_reference and any(snapshot.references is None for snapshot in snapshots):
+        raise ValueError("by_reference: the snapshots are of particles without a reference")
+    rows, alive, next_id = [], {}, 1
+    for frame, snapshot in enumerate(snapshots, first):
+        for m, (mean, active) in enumerate(
+            zip(snapshot.means[run], snapshot.active[run], strict=True)
+        ):
+            if not active:
+                alive.pop(m, None)
+                continue
+            if by_reference:
+                alive[m] = 1 + int(snapshot.references[run][m])
+            elif m not in alive:
+                alive[m], next_id = next_id, next_id + 1
+            rows.append([frame, alive[m], *box_files.top_left(mean[None])[0]])
+    # Rounded as in the file, so that scores from the file are the same.
+    return np.round(np.array(rows, float).reshape(-1, 6), 3)
+
+
+def annotate(
+    frame: UInt8[np.ndarray, "h w 3"],
+    snapshot: Snapshot,
+    zoom: int = 1,
+    crop: slice | tuple[slice, slice] = (slice(None), slice(None)),
+) -> UInt8[np.ndarray, "zh zw 3"]:
+    """A frame, cropped and enlarged, with the particles and mean boxes of the first run.
+
+    Both are drawn in the colour of their component. `crop` is of rows and columns, or of rows
+    alone, as slices count: from the end where they are negative. `zoom` is how many pixels a pixel
+    becomes, each way. Raises `ValueError` for a zoom that is not a whole number from 1 on, and for
+    a crop that is no slices of step one or leaves no pixel.
+    """
+    check_whole(zoom=zoom)
+    rows, columns = _within(frame, crop)
+    canvas = frame[rows, columns].repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
+    corner = np.array([columns.start, rows.start], float)
+    labels, palette = snapshot.labels[0], drawing.PALETTE
+    for m in np.flatnonzero(snapshot.active[0]):
+        box = box_files.top_left(snapshot.means[0][m][None])[0] - [*corner, 0, 0]
+        drawing.draw_box(canvas, zoom * box, palette[m % len(palette)], thickness=2)
+    filled = labels >= 0
+    points = zoom * (snapshot.points[0][filled] - corner)
+    drawing.draw_points(canvas, points, palette[labels[filled] % len(palette)], 0.9 * zoom)
+    return np.clip(canvas, 0, 255).astype(np.uint8)
+
+
+def _within(frame: np.ndarray, crop: Any) -> tuple[slice, slice]:
+    """The rows and columns of a crop, counted from the frame's top-left corner."""
+    check_type((slice, tuple), "a slice of rows, or one of rows and one of columns", crop=crop)
+    parts = (crop, slice(None)) if isinstance(crop, slice) else crop
+    if len(parts) != 2 or not all(isinstance(part, slice) for part in parts):
+        raise ValueError(f"crop: {crop} is not one slice of rows and one of columns")
+    found = []
+    for part, length in zip(parts, frame.shape[:2], strict=True):
+        try:
+            start, stop, step = part.indices(length)
+        except TypeError as error:
+            raise ValueError(f"crop: {part} does not count pixels ({error})") from error
+        if step != 1 or stop <= start:
+            raise ValueError(f"crop: {part} of {length} is no stretch of pixels")
+        found.append(slice(start, stop))
+    return found[0], found[1]

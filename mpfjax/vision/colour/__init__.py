@@ -1,0 +1,1 @@
+"""Colour histograms of boxes: bins, sums, references."""

@@ -1,0 +1,1 @@
+"""Frames, boxes, truth and pictures: what is read and written."""

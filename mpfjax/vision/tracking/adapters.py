@@ -1,0 +1,248 @@
+"""What may be given as detections: rows of a file, boxes frame by frame, or a detector to call."""
+
+import abc
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from mpfjax.checks import check_finite, check_whole, given, is_series, saying, shown, to_rows
+
+# MOTChallenge's columns: frame, id, x, y, w, h, and the score, where there is one.
+_BOX, _SCORE = slice(2, 6), 6
+# A tracker made for rows of detections has room for so many objects, and for no more than that.
+LEAST_ROOM, MOST_ROOM = 24, 1024
+
+
+class DetectedBoxes(NamedTuple):
+    """What was detected in one frame: boxes (x, y, w, h) and a score for each, or None."""
+
+    boxes: Float[np.ndarray, "k 4"]
+    scores: Float[np.ndarray, " k"] | None
+
+
+class AbstractDetector(abc.ABC):
+    """What is detected in a frame, by its number and its pixels."""
+
+    @abc.abstractmethod
+    def find(self, number: int, frame: Any) -> DetectedBoxes:
+        """The detections of the frame of this number, whose pixels are None where there are none.
+
+        Raises `StopIteration` where there are no further frames.
+        """
+
+    def warn_of_the_rest(self, last: int) -> None:
+        """Warn of detections in frames after the last."""
+        del last
+
+    def most_objects(self) -> int:
+        """How many objects there should be room for, as far as can be told beforehand."""
+        return LEAST_ROOM
+
+
+def as_detector(detections: Any, first: int = 1) -> AbstractDetector:
+    """Wrap rows, an iterable or a callable; frames are numbered from `first` on.
+
+    Raises `ValueError` for anything else, and for rows that are not MOTChallenge's.
+    """
+    if isinstance(detections, AbstractDetector):
+        return detections
+    if isinstance(detections, np.ndarray | jax.Array):
+        return Rows(np.asarray(detections), first)
+    if callable(detections) and not isinstance(detections, type):
+        return _Called(detections)
+    if is_series(detections):
+        return _Streamed(iter(detections))
+    raise ValueError(
+        f"detections: {shown(detections)} is neither a detector to call with a frame, nor an array"
+        " of rows frame,id,x,y,w,h,score, nor the boxes of one frame after the other"
+    )
+
+
+class Rows(AbstractDetector):
+    """Rows (frame, id, x, y, w, h, score) as MOTChallenge files have them; the id is not read.
+
+    Frames count from 1. Without pixels `last` is the last frame, by default that of the last row.
+    """
+
+    def __init__(
+        self, rows: Float[np.ndarray, "r columns"], first: int = 1, last: int | None = None
+    ) -> None:
+        check_whole(0, first=first, **given(last=last))
+        if rows.ndim != 2 or not (rows.size == 0 or 6 <= rows.shape[1] <= 10):
+            raise ValueError(
+                f"detections: shape {rows.shape} is not that of rows frame,id,x,y,w,h and,"
+                " if any, a score"
+            )
+        rows = to_rows(rows.shape[1], "detections", rows) if rows.size else np.zeros((0, 7))
+        bad = ~np.isfinite(rows[:, : _SCORE + 1]).all(axis=1) | (rows[:, 0] % 1 != 0)
+        for number in np.flatnonzero(bad)[:1]:
+            raise ValueError(
+                f"detections: row {number}, {shown(rows[number])}, is not finite, or its frame is"
+                " no whole number"
+            )
+        for number in np.flatnonzero(rows[:, 0] < 1)[:1]:
+            raise ValueError(
+                f"detections: row {number} lies in frame {rows[number, 0]:.0f}, and frames count"
+                " from 1"
+            )
+        self.first = first
+        self.frames = rows[:, 0].astype(int)
+        self.last = int(self.frames.max(initial=0)) if last is None else last
+        order = np.argsort(self.frames, kind="stable")
+        self._rows, self._sorted = rows[order], self.frames[order]
+
+    def find(self, number: int, frame: Any) -> DetectedBoxes:
+        """The rows of this frame."""
+        if frame is None and number > self.last:
+            raise StopIteration
+        begin, end = np.searchsorted(self._sorted, [number, number + 1])
+        rows = self._rows[begin:end]
+        scores = rows[:, _SCORE] if rows.shape[1] > _SCORE else None
+        return DetectedBoxes(rows[:, _BOX], scores)
+
+    def warn_of_the_rest(self, last: int) -> None:
+        """Warn of rows after the last frame."""
+        late = int(np.sum(self.frames > last))
+        if late:
+            _warn(f"detections: {late} lie in frames after the last, {last}, and were left out")
+
+    def most_objects(self) -> int:
+        """Half as many again as are detected in all but the fullest frames."""
+        counts = np.unique(self.frames, return_counts=True)[1]
+        usual = float(np.quantile(counts, 0.95)) if len(counts) else 0.0
+        return int(np.clip(8 * np.ceil(1.5 * usual / 8), LEAST_ROOM, MOST_ROOM))
+
+
+class _Called(AbstractDetector):
+    """Somebody's function from a frame to its boxes, or to a pair of boxes and scores."""
+
+    def __init__(self, function: Callable[[Any], Any]) -> None:
+        self.function = function
+
+    def find(self, number: int, frame: Any) -> DetectedBoxes:
+        with saying(f"detections: raised by the detector at frame {number}"):
+            found = self.function(frame)
+        return _as_found(found, number)
+
+
+class _Streamed(AbstractDetector):
+    """The same for one frame after the other."""
+
+    def __init__(self, stream: Iterator[Any]) -> None:
+        self.stream = stream
+
+    def find(self, number: int, frame: Any) -> DetectedBoxes:
+        try:
+            found = next(self.stream)
+        except StopIteration:
+            if frame is None:
+                raise
+            raise ValueError(f"detections: end before the frames do, at frame {number}") from None
+        return _as_found(found, number)
+
+    def warn_of_the_rest(self, last: int) -> None:
+        """Warn where there are detections for one more frame."""
+        if next(self.stream, None) is not None:
+            _warn(f"detections: go on after the last frame, {last}, and were left out")
+
+
+class Sieve:
+    """Takes out what cannot be tracked, and says once of each kind that it does.
+
+    Detections that are too weak are left out silently; those of no area, and those wholly outside
+    the frame, with a warning. Raises `ValueError` for what is not finite, for scores that do not
+    fit, and where there are none to compare with `min_score`. `frame_size` is height and width,
+    where there are no pixels to tell them.
+    """
+
+    def __init__(self, min_score: float | None, frame_size: tuple[int, int] | None = None) -> None:
+        check_finite(**given(min_score=min_score))
+        self.min_score, self.frame_size = min_score, frame_size
+        self.once = Once()
+
+    def __call__(
+        self, found: DetectedBoxes, number: int, frame: np.ndarray | None
+    ) -> DetectedBoxes:
+        """The detections of a frame that can be tracked."""
+        boxes, scores = _checked(found, number)
+        keep = np.ones(len(boxes), bool)
+        if self.min_score is not None and len(boxes):
+            if scores is None:
+                raise ValueError(
+                    f"min_score: {self.min_score} is given, and detections have no scores"
+                )
+            keep &= scores >= self.min_score
+        flat = keep & ~(boxes[:, 2:] > 0).all(axis=1)
+        if flat.any():
+            self.once.warn("flat", f"detections: frame {number} has boxes of no area; left out")
+        keep &= ~flat
+        frame_size = self.frame_size if frame is None else frame.shape[:2]
+        if frame_size is not None:
+            height, width = frame_size
+            far = boxes[:, :2] + boxes[:, 2:]
+            inside = (far > 0).all(axis=1) & (boxes[:, 0] < width) & (boxes[:, 1] < height)
+            if np.any(keep & ~inside):
+                size = f"{width} x {height}"
+                self.once.warn(
+                    "outside",
+                    f"detections: frame {number} has boxes outside the frame, {size}; left out",
+                )
+            keep &= inside
+        return DetectedBoxes(boxes[keep], None if scores is None else scores[keep])
+
+
+class Once:
+    """Warns of each kind of thing the first time that it comes, and not in every frame."""
+
+    def __init__(self) -> None:
+        self.said: set[str] = set()
+
+    def warn(self, kind: str, message: str) -> None:
+        """Warn, unless of this kind before."""
+        if kind not in self.said:
+            self.said.add(kind)
+            _warn(f"{message} (here and wherever else it is so)")
+
+
+def _as_found(value: Any, number: int) -> DetectedBoxes:
+    """A pair of boxes and scores, or boxes alone."""
+    boxes, scores = value if isinstance(value, tuple) and len(value) == 2 else (value, None)
+    if boxes is None:
+        raise ValueError(
+            f"detections: frame {number}: None is no boxes; [] says that there is none"
+        )
+    rows = to_rows(4, f"detections: frame {number}", boxes)
+    return DetectedBoxes(rows, None if scores is None else _as_scores(scores, number))
+
+
+def _as_scores(scores: Any, number: int) -> np.ndarray:
+    try:
+        return np.asarray(scores, float).reshape(-1)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"detections: frame {number}: scores {shown(scores)} are no numbers"
+        ) from error
+
+
+def _checked(found: DetectedBoxes, number: int) -> DetectedBoxes:
+    if not np.isfinite(found.boxes).all():
+        raise ValueError(f"detections: frame {number}: {shown(found.boxes)} is not finite")
+    if found.scores is not None:
+        if len(found.scores) != len(found.boxes):
+            raise ValueError(
+                f"detections: frame {number}: {len(found.scores)} scores for"
+                f" {len(found.boxes)} boxes"
+            )
+        if not np.isfinite(found.scores).all():
+            raise ValueError(
+                f"detections: frame {number}: scores {shown(found.scores)} are not finite"
+            )
+    return found
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, RuntimeWarning, stacklevel=4)

@@ -1,0 +1,284 @@
+"""Moving objects found by background subtraction, which start a tracker without a drawn box."""
+
+from collections import deque
+from collections.abc import Iterable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from mpfjax.checks import (
+    check_inner_share,
+    check_not_negative,
+    check_positive,
+    check_share,
+    check_type,
+    check_whole,
+    given,
+    shown,
+)
+from mpfjax.vision.files.frames import check_frame
+
+# What OpenCV's mask holds where a pixel is foreground; a shadow has another value.
+_FOREGROUND = 255
+# How many blobs are remembered for their shape, and from how many on it counts.
+_REMEMBERED, _ENOUGH = 500, 20
+# A part of a blob may be so much narrower than one is.
+_NARROWEST = 2.4
+# The height of a blob before any was seen, as a share of the frame's.
+_UNKNOWN_HEIGHT = 0.125
+
+
+class BackgroundSubtraction:
+    """Boxes of what moves before a still camera: an adaptive Gaussian mixture for each pixel.
+
+    Lin et al. (2012), section 5, detect their targets like this; the mixture is OpenCV's MOG2
+    (Zivkovic 2004). Pixels that fit none of the background's Gaussians and are no shadow make
+    blobs, gaps in a blob's height are closed, a blob that is too wide for one is cut where its
+    outline dips, as between two heads, and what does not have the size is dropped. What too wide
+    means is learned from the video, unless it is given: people or cars, most blobs are one. Two
+    one behind the other stay one blob, and what stands still long enough becomes background.
+
+    - `history`: frames over which the background is forgotten.
+    - `threshold`: how many standard deviations from a Gaussian a pixel still belongs to it.
+    - `background_share`: share of a pixel's history, in (0, 1), that is background. Someone who
+      stands still becomes background after about log(1 / share) · history frames, or sooner in a
+      young video: (1 / share² - 1) times as many frames as came before. The larger, the sooner;
+      and ghosts, where someone stood from the first frame on, vanish by the same rule.
+    - `shadow_brightness`: darkest shadow, as a share of the background's brightness, in (0, 1);
+      None where shadows count as foreground.
+    - `warm_up`: first frames that only teach the background, at least 1, the first of all.
+    - `area`: least and most area of a box, as shares of the frame's.
+    - `aspect`: least and most height of a box, in widths; None is any shape.
+    - `largest_gap`: height of the gaps that are closed, as a share of the median height of the
+      blobs so far; of an eighth of the frame's height until there are a few.
+    - `cut_aspect`: a blob lower than this many widths may be cut; None takes the median of the
+      blobs so far, once there are a few, and 0 cuts none.
+    - `cut_depth`: how high the outline may reach between two heads, as a share of the lower one's
+      height above the blob's foot, in (0, 1).
+
+    - `most_pixels`: a larger frame is reduced to at most so many before anything is looked for, by
+      a whole number along both sides; boxes are in pixels of the frame that is given.
+
+    Defaults are tuned on people before a street camera. One object serves one video, since it
+    keeps that video's background; colours may come in any fixed order of the three channels. Use
+    it to start tracks; where the camera moves, all is foreground and nothing is found.
+
+    Raises `ValueError` for a setting outside its range, `ImportError` where OpenCV is missing.
+    """
+
+    def __init__(
+        self,
+        *,
+        history: int = 500,
+        threshold: float = 8.0,
+        background_share: float = 0.6,
+        shadow_brightness: float | None = 0.6,
+        warm_up: int = 1,
+        area: tuple[float, float] = (0.0015, 0.3),
+        aspect: tuple[float, float] | None = None,
+        largest_gap: float = 0.1,
+        cut_aspect: float | None = None,
+        cut_depth: float = 0.9,
+        most_pixels: int = 640 * 480,
+    ) -> None:
+        check_whole(history=history, warm_up=warm_up, most_pixels=most_pixels)
+        check_positive(threshold=threshold)
+        check_not_negative(**given(cut_aspect=cut_aspect))
+        check_inner_share(background_share=background_share, cut_depth=cut_depth)
+        check_inner_share(**given(shadow_brightness=shadow_brightness))
+        check_share(largest_gap=largest_gap)
+        if largest_gap == 1:
+            raise ValueError(f"largest_gap: {largest_gap} is not in [0, 1)")
+        if not 0 <= _range(area)[0] < _range(area)[1] <= 1:
+            raise ValueError(f"area: {shown(area)} is not a range within [0, 1]")
+        if aspect is not None and not 0 < _range(aspect)[0] < _range(aspect)[1] < np.inf:
+            raise ValueError(f"aspect: {shown(aspect)} is not a range of positive numbers")
+        self._cv2 = _cv2()
+        self.history = int(history)
+        self.threshold = threshold
+        self.background_share = background_share
+        self.shadow_brightness = shadow_brightness
+        self.warm_up = int(warm_up)
+        self.area = area
+        self.aspect = (0.0, np.inf) if aspect is None else aspect
+        self.largest_gap = largest_gap
+        self.cut_aspect = cut_aspect
+        self.cut_depth = cut_depth
+        self.most_pixels = int(most_pixels)
+        self._forget()
+
+    def learn(self, frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
+        """Learn the background afresh from frames of the video, all with the same weight.
+
+        A hundred, spread evenly over a long video, are enough. `detect` then finds people from its
+        first frame on, but a spot that is taken in 1 - `background_share` of these frames, by
+        someone who stands still, counts as background. Use it where the whole video is at hand.
+        Raises `ValueError` where there are no frames, and for frames as `detect` does.
+        """
+        check_type(Iterable, "frames one after the other", frames=frames)
+        self._forget()
+        for number, frame in enumerate(frames, 1):
+            self._subtract(frame, rate=1 / number)
+        if self._shape is None:
+            raise ValueError("frames: there are none to learn the background from")
+        self._frames_seen = max(self.history, self.warm_up)
+
+    def detect(self, frame: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "k 4"]:
+        """The boxes (x, y, w, h) in pixels of what moves, (x, y) the top-left corner.
+
+        Boxes lie inside the frame, ordered from left to right; there are none in the first
+        `warm_up` frames. The frame joins the background, with more weight the fewer came before.
+        Raises `ValueError` for a frame that is not (h, w, 3) of type uint8, or differs in size
+        from those before it.
+        """
+        # The schedule of OpenCV itself: the young background leans to what is new, so that who
+        # was there in the first frame leaves no ghost behind.
+        rate = 1 / min(2 * (self._frames_seen + 1), self.history)
+        foreground = self._subtract(frame, rate)
+        self._frames_seen += 1
+        if self._frames_seen <= self.warm_up:
+            return np.zeros((0, 4))
+        boxes = np.array(self._blobs(foreground), float).reshape(-1, 4)
+        boxes = boxes[self._fitting(boxes, foreground.size)]
+        boxes = boxes[np.lexsort((boxes[:, 1], boxes[:, 0]))]
+        height, width = np.asarray(frame).shape[:2]
+        scale = np.array([width / foreground.shape[1], height / foreground.shape[0]])
+        return boxes * np.concatenate([scale, scale])
+
+    def _forget(self) -> None:
+        shadows = self.shadow_brightness is not None
+        self._background = self._cv2.createBackgroundSubtractorMOG2(
+            self.history, self.threshold**2, shadows
+        )
+        self._background.setBackgroundRatio(self.background_share)
+        if self.shadow_brightness is not None:
+            self._background.setShadowThreshold(self.shadow_brightness)
+        self._frames_seen, self._shape = 0, None
+        self._aspects: deque[float] = deque(maxlen=_REMEMBERED)
+        self._heights: deque[int] = deque(maxlen=_REMEMBERED)
+
+    def _subtract(self, frame: np.ndarray, rate: float) -> np.ndarray:
+        """1 where a pixel is foreground; the frame joins the background with weight `rate`."""
+        frame = np.asarray(frame)
+        check_frame(frame)
+        # OpenCV would silently start a new background.
+        if self._shape is not None and frame.shape != self._shape:
+            raise ValueError(
+                f"frame: {_size(frame.shape)} differs from the size of the frames before it, "
+                f"{_size(self._shape)}"
+            )
+        self._shape = frame.shape
+        mask = self._background.apply(self._reduced(frame), learningRate=rate)
+        return (mask == _FOREGROUND).astype(np.uint8)
+
+    def _reduced(self, frame: np.ndarray) -> np.ndarray:
+        """The frame, or means over squares of its pixels where it has too many."""
+        height, width, _ = frame.shape
+        factor = int(np.ceil(np.sqrt(height * width / self.most_pixels)))
+        if factor == 1:
+            return np.ascontiguousarray(frame)
+        size = (max(width // factor, 1), max(height // factor, 1))
+        return self._cv2.resize(
+            np.ascontiguousarray(frame), size, interpolation=self._cv2.INTER_AREA
+        )
+
+    def _blobs(self, foreground: np.ndarray) -> list[tuple[int, int, int, int]]:
+        gap = round(self.largest_gap * self._usual_height(len(foreground)))
+        if gap > 0:
+            # Only upward and downward: who walks side by side must not be joined.
+            line = np.ones((gap + 1, 1), np.uint8)
+            foreground = self._cv2.morphologyEx(foreground, self._cv2.MORPH_CLOSE, line)
+        _, labels, found, _ = self._cv2.connectedComponentsWithStats(foreground, connectivity=8)
+        boxes = []
+        # No part of a blob can be larger than the blob.
+        large = [
+            (label, *place[:4])
+            for label, place in enumerate(found[1:].tolist(), 1)
+            if place[2] * place[3] >= self.area[0] * foreground.size
+        ]
+        # Who leaves the frame in part does not show its shape.
+        bottom, right = foreground.shape
+        whole = [
+            (w, h)
+            for _, x, y, w, h in large
+            if x > 0 and y > 0 and x + w < right and y + h < bottom
+        ]
+        self._aspects.extend(h / w for w, h in whole)
+        self._heights.extend(h for _, h in whole)
+        widest = self._cut_aspect()
+        for label, x, y, w, h in large:
+            blob = labels[y : y + h, x : x + w] == label
+            boxes += [(x + i, y + j, *size) for i, j, *size in self._cut(blob, widest)]
+        return boxes
+
+    def _cut_aspect(self) -> float:
+        """The height of one, in widths, below which a blob may be several; 0 where unknown."""
+        if self.cut_aspect is not None:
+            return self.cut_aspect
+        return float(np.median(self._aspects)) if len(self._aspects) >= _ENOUGH else 0.0
+
+    def _usual_height(self, rows: int) -> float:
+        """The median height of a blob, in pixels of the reduced frame."""
+        known = len(self._heights) >= _ENOUGH
+        return float(np.median(self._heights)) if known else _UNKNOWN_HEIGHT * rows
+
+    def _cut(self, blob: Bool[np.ndarray, "h w"], widest: float) -> list[tuple[int, int, int, int]]:
+        """The boxes of those side by side in a blob that fills its array."""
+        height, width = blob.shape
+        most = min(self.aspect[1], _NARROWEST * widest)
+        narrowest = max(int(np.ceil(height / most)), 1) if most > 0 else width
+        if height >= widest * width or width <= 2 * narrowest:
+            return [(0, 0, width, height)]
+        # How high the blob reaches in each column. It dips between two heads; the legs of one
+        # person who strides do not show.
+        outline = np.where(blob.any(axis=0), height - blob.argmax(axis=0), 0)
+        outline = np.convolve(np.pad(outline, 1, mode="edge"), np.full(3, 1 / 3), "valid")
+        left = np.maximum.accumulate(outline)
+        right = np.maximum.accumulate(outline[::-1])[::-1]
+        depths = outline / np.maximum(np.minimum(left, right), 1)
+        cut = narrowest + int(np.argmin(depths[narrowest : width - narrowest]))
+        if depths[cut] > self.cut_depth:
+            return [(0, 0, width, height)]
+        left_part = self._cut_part(blob[:, :cut], 0, widest)
+        return left_part + self._cut_part(blob[:, cut:], cut, widest)
+
+    def _cut_part(
+        self, part: np.ndarray, start: int, widest: float
+    ) -> list[tuple[int, int, int, int]]:
+        rows, columns = (np.flatnonzero(part.any(axis=axis)) for axis in (1, 0))
+        if len(rows) == 0:
+            return []
+        tight = part[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        x, y = start + int(columns[0]), int(rows[0])
+        return [(x + i, y + j, w, h) for i, j, w, h in self._cut(tight, widest)]
+
+    def _fitting(self, boxes: np.ndarray, pixels: int) -> np.ndarray:
+        width, height = boxes[:, 2], boxes[:, 3]
+        shares = width * height / pixels
+        sized = (shares >= self.area[0]) & (shares <= self.area[1])
+        return sized & (height >= self.aspect[0] * width) & (height <= self.aspect[1] * width)
+
+
+def _range(values: Any) -> np.ndarray:
+    """Two numbers, or twice NaN where they are something else, which is in no range."""
+    try:
+        numbers = np.asarray(values, float)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    return numbers if numbers.shape == (2,) else np.full(2, np.nan)
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]} x {shape[0]}"
+
+
+def _cv2() -> ModuleType:
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError(
+            "OpenCV is needed to detect what moves: pip install opencv-python-headless"
+        ) from error
+    return cv2

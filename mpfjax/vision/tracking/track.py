@@ -1,0 +1,221 @@
+"""The loop over frames: from video and detections, or detections alone, to tracks."""
+
+import functools
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Key, PyTree, UInt8
+
+from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole, given
+from mpfjax.moves.resampling.resample import Resample
+from mpfjax.operations.compiling import in_little_memory
+from mpfjax.vision.files.boxes import top_left
+from mpfjax.vision.files.frames import of_one_kind
+from mpfjax.vision.tracking.adapters import (
+    LEAST_ROOM,
+    AbstractDetector,
+    DetectedBoxes,
+    Once,
+    Sieve,
+    as_detector,
+)
+from mpfjax.vision.tracking.detections import Detections
+from mpfjax.vision.tracking.tracker import ObjectTracker, Tracks
+
+
+def track(
+    frames: Iterable[UInt8[np.ndarray, "..."]] | None,
+    detections: Any,
+    tracker: ObjectTracker | None = None,
+    *,
+    key: Key[Array, ""] | None = None,
+    first: int = 1,
+    min_score: float | None = None,
+    max_detections: int | None = None,
+    use_colours: bool = True,
+    frame_size: tuple[int, int] | None = None,
+) -> Iterator[Tracks]:
+    """Track what a detector finds in a video: yields the `Tracks` of each frame as it comes.
+
+    Nothing is held back: what is said of a frame is what was known then. Give it any detector:
+
+        track(frames, lambda frame: network(frame))        # boxes (k, 4), or (boxes, scores)
+        track(frames, read_detections("det.txt"))          # rows of a MOTChallenge file
+        track(frames, BackgroundSubtraction().detect)      # what moves before a still camera
+        track(None, rows)                                  # without pixels, for speed or radar
+
+    - `frames`: RGB images of eight bits, or grey ones, all of one size, in any iterable; None
+      where there are only detections.
+    - `detections`: a function from a frame to its boxes (x, y, w, h), top-left corner first, in
+      pixels, or to a tuple of boxes and scores; or the same for each frame, in an iterable; or an
+      array of rows (frame, id, x, y, w, h, score) whose frames count from 1.
+    - `tracker`: None takes `ObjectTracker()`, with more room where rows have more in a frame.
+    - `key`: of the random numbers; None takes `jax.random.key(0)`.
+    - `first`: the number of the first frame, by which rows are found.
+    - `min_score`: weaker detections are left out; None leaves out none.
+    - `max_detections`: room in a frame, of which the strongest are kept; None takes twice the
+      tracker's objects.
+    - `use_colours`: with False the tracker sees no pixels, and only the detector does.
+    - `frame_size`: height and width, to tell what lies outside where there are no frames.
+
+    The tracks of each frame are NumPy arrays. Boxes of no area or outside the frame are left out
+    with a warning, as are detections in frames that do not come; there is a warning too where
+    there are more detections or objects than there is room for. Raises `ValueError` naming the
+    argument for what cannot be used, at the frame where it comes; what a detector raises comes
+    through, with the number of the frame. Use it on whole videos as on cameras.
+    """
+    if frames is not None:
+        check_type(Iterable, "frames one after the other, or None", frames=frames)
+    check_flag(use_colours=use_colours)
+    check_whole(first=first, **given(max_detections=max_detections))
+    if frame_size is not None:
+        height, width = frame_size
+        check_whole(**{"frame_size's height": height, "frame_size's width": width})
+    if frames is None and callable(detections):
+        raise ValueError("detections: a detector has nothing to look at where frames is None")
+    detector, sieve = as_detector(detections, first), Sieve(min_score, frame_size)
+    if tracker is None:
+        tracker = ObjectTracker(detector.most_objects())
+    check_type(ObjectTracker, "an ObjectTracker", tracker=tracker)
+    key = jax.random.key(0) if key is None else key
+    check_key(key)
+    room = 2 * tracker.max_objects if max_detections is None else max_detections
+    stills = None if frames is None else of_one_kind(frames, first)
+    return _tracked(stills, detector, sieve, tracker, key, first, room, use_colours)
+
+
+def _tracked(
+    stills: Iterator[np.ndarray] | None,
+    detector: AbstractDetector,
+    sieve: Sieve,
+    tracker: ObjectTracker,
+    key: Key[Array, ""],
+    first: int,
+    room: int,
+    use_colours: bool,
+) -> Iterator[Tracks]:
+    state, once, advance = tracker.init(), Once(), _compiled()
+    for number, still, found in _observed(stills, detector, first):
+        found = sieve(found, number, still)
+        if len(found.boxes) > room:
+            once.warn(
+                "detections",
+                f"detections: frame {number} has {len(found.boxes)}, more than the {room} that"
+                " there is room for, max_detections; the strongest are kept",
+            )
+        observation = Detections.from_boxes(found.boxes, room, found.scores)
+        pixels = tracker.look(still, observation) if use_colours and still is not None else None
+        # An array, since a new Python number would compile anew.
+        state, tracks = advance(tracker, key, np.asarray(number), state, pixels, observation)
+        tracks = jax.device_get(tracks)
+        if tracks.full:
+            once.warn(
+                "objects",
+                f"tracker: frame {number} has more objects than the {tracker.max_objects} that"
+                " there is room for, max_objects; the strongest are kept",
+            )
+        yield tracks
+
+
+def _advance(
+    tracker: ObjectTracker,
+    key: Key[Array, ""],
+    number: Any,
+    state: PyTree,
+    pixels: Any,
+    observation: Detections,
+) -> tuple[PyTree, Tracks]:
+    """A step, with the key of the frame drawn in the same program: a call is half a millisecond."""
+    return tracker.step(jax.random.fold_in(key, number), state, pixels, observation)
+
+
+@functools.cache
+def _compiled() -> Callable[..., tuple[PyTree, Tracks]]:
+    """`_advance`; asking for its options any earlier would keep processes from joining."""
+    with_options: Any = eqx.filter_jit
+    return with_options(_advance, compiler_options=in_little_memory())
+
+
+def _observed(
+    stills: Iterator[np.ndarray] | None, detector: AbstractDetector, first: int
+) -> Iterator[tuple[int, np.ndarray | None, DetectedBoxes]]:
+    """Number, pixels and detections of each frame."""
+    number = first - 1
+    if stills is not None:
+        for number, still in enumerate(stills, first):
+            yield number, still, detector.find(number, still)
+        detector.warn_of_the_rest(number)
+        return
+    while True:
+        number += 1
+        try:
+            found = detector.find(number, None)
+        except StopIteration:
+            detector.warn_of_the_rest(number - 1)
+            return
+        yield number, None, found
+
+
+def make_tracker(
+    filter: str = "gm_mpf",
+    max_objects: int = LEAST_ROOM,
+    frames_per_second: float | None = None,
+    **settings: Any,
+) -> ObjectTracker:
+    """The tracker by the name of its filter, "gm_mpf" or "mpf", with room for so many objects.
+
+    They differ in how a component's particles are redrawn: from a Gaussian, or by resampling.
+    `settings` are the tracker's own. Raises `ValueError` for another name, and for `moves`, which
+    an `ObjectTracker` takes.
+    """
+    check_one_of(("gm_mpf", "mpf"), filter=filter)
+    if "moves" in settings:
+        raise ValueError("moves: they are in place of a filter's; give them to ObjectTracker")
+    if frames_per_second is not None:
+        settings["frames_per_second"] = frames_per_second
+    tracker = ObjectTracker(max_objects, **settings)
+    if filter == "gm_mpf":
+        return tracker
+    resample = Resample(particles_per_component=tracker.particles_per_object)
+    return ObjectTracker(max_objects, resampling=resample, **settings)
+
+
+# --- tracks as files have them -------------------------------------------------------------
+
+
+def online_rows(number: int, tracks: Tracks) -> Float[np.ndarray, "k 6"]:
+    """Rows (frame, id, x, y, w, h) of the objects that are believed in when the frame comes.
+
+    Those that `Tracks.shown` says.
+    """
+    return _rows(number, tracks, tracks.shown)
+
+
+def offline_rows(kept: Iterable[Tracks], first: int = 1) -> Float[np.ndarray, "r 6"]:
+    """Rows of every object that was believed in at some time, its first frames among them."""
+    kept = list(kept)
+    believed = {0}
+    for tracks in kept:
+        believed |= set(np.asarray(tracks.identities)[np.asarray(tracks.confirmed)].tolist())
+    chosen = np.array(sorted(believed - {0}))
+    rows = [
+        _rows(
+            number,
+            tracks,
+            np.isin(tracks.identities, chosen) & (tracks.shown | ~np.asarray(tracks.confirmed)),
+        )
+        for number, tracks in enumerate(kept, first)
+    ]
+    return np.concatenate([np.zeros((0, 6)), *rows])
+
+
+def _rows(number: int, tracks: Tracks, written: Any) -> np.ndarray:
+    written = np.flatnonzero(np.asarray(written) & (np.asarray(tracks.identities) > 0))
+    corners = top_left(np.asarray(tracks.boxes)[written])
+    ids = np.asarray(tracks.identities)[written]
+    rows = np.column_stack([np.full(len(ids), number), ids, corners])
+    # Rounded as files are, so that scores from a file are the scores.
+    return np.round(rows[np.argsort(ids, kind="stable")], 3)

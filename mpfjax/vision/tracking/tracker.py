@@ -1,0 +1,348 @@
+"""A tracker that starts and ends its components by itself, from detections: a chain of moves."""
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt8
+
+from mpfjax.checks import (
+    check_flag,
+    check_positive,
+    check_type,
+    check_whole,
+    given,
+    is_series,
+    shown,
+)
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractMove, AbstractResampling
+from mpfjax.moves.resampling.gaussian import GaussianRegeneration
+from mpfjax.operations.floats import default_float
+from mpfjax.vision.colour.bins import AbstractColours, HSVColours
+from mpfjax.vision.colour.histograms import integral_histogram
+from mpfjax.vision.colour.sampled_histograms import SampledBoxes, SampledHistogram
+from mpfjax.vision.tracking.appearance import LearnAppearance
+from mpfjax.vision.tracking.assignment import Assign
+from mpfjax.vision.tracking.births import Births, ShareMass
+from mpfjax.vision.tracking.camera import FollowCamera
+from mpfjax.vision.tracking.chain import check_chain
+from mpfjax.vision.tracking.deaths import Deaths
+from mpfjax.vision.tracking.detections import Detections
+from mpfjax.vision.tracking.memory import LIVES, Lives, frames_unseen, mean_boxes
+from mpfjax.vision.tracking.model import DetectedObjectModel, ObjectState, Pixels
+from mpfjax.vision.tracking.motion import PropagateObjects
+from mpfjax.vision.tracking.noise import LearnNoise
+from mpfjax.vision.tracking.observation import TrackedFrame
+from mpfjax.vision.tracking.occlusion import ShareDetections
+from mpfjax.vision.tracking.scores import RankScores
+
+# A box of so many pixels cannot be counted in 16 bits.
+_LARGEST_NARROW = 2**16
+
+
+class Tracks(NamedTuple):
+    """What a tracker says of one frame, a row for each of its M components.
+
+    - `boxes`: (m, 4), the mean box of each, centre and size in pixels.
+    - `identities`: (m,), a number that an object keeps for life, 0 for a dead component.
+    - `confirmed`: (m,), whether detections have borne it out often enough to be believed.
+    - `unseen`: (m,), for how many frames none has; 0 while it is hidden by another one.
+    - `full`: whether a detection that would have founded a component found no room.
+    - `shown`: (m,), which are confirmed, and were seen a moment ago or are hidden: worth showing.
+    """
+
+    boxes: Float[Array, "m 4"]
+    identities: Int[Array, " m"]
+    confirmed: Bool[Array, " m"]
+    unseen: Int[Array, " m"]
+    full: Bool[Array, ""]
+    shown: Bool[Array, " m"]
+
+    @property
+    def corner_boxes(self) -> Float[Array, "m 4"]:
+        """The boxes (x, y, w, h) with (x, y) the top-left corner, as files have them."""
+        return jnp.concatenate([self.boxes[:, :2] - self.boxes[:, 2:] / 2, self.boxes[:, 2:]], 1)
+
+
+class ObjectTracker(eqx.Module):
+    """A mixture particle filter with a component for each object, born and ended by detections.
+
+    A step is a chain of moves on a `ParticleMixture`, each with a memory of its own:
+
+    - `RankScores`: which detections are strong, by the scores seen so far;
+    - `FollowCamera`: what all objects move in common;
+    - `Assign`: at most one detection for each component, at the least total cost;
+    - a resampling, of the GM-MPF (Lin et al. 2012) or of the MPF (Vermaak et al. 2003);
+    - `PropagateObjects`: each hypothesis a frame on, by Kalman's filter, and weighed;
+    - `Deaths`: end what no detection bears out, or has left the frame;
+    - `Births`: a component for each strong detection that no component explains;
+    - `LearnNoise`: how far the detector errs, how objects move and grow;
+    - `LearnAppearance`: of objects that stand alone;
+    - `ShareMass`: the same for every object.
+
+    Lengths are in boxes, so that nothing depends on the size of a frame or of the objects, and what
+    is learned in the first second serves from then on. Particles carry Gaussian moments: they are
+    rival hypotheses of whose a detection is. All but `PropagateObjects` and the resampling is
+    outside the exact recursion (`approximate`). Use it to track an unknown and changing number of
+    objects, with any detector.
+
+    - `max_objects`: M; `particles_per_object`: P.
+    - `frames_per_second`: of the video: an object is waited for for a second, and shown for a tenth
+      of one after its last detection. None takes 25.
+    - `resampling`: `Resample(particles_per_component=P)` for an MPF, or
+      `GaussianRegeneration(P, where=lambda states: (states.place, states.velocity))`, by default
+      with stratified noise.
+    - `colours`: the bins of the histograms.
+    - `exact_colours`: count every pixel of a box by an integral histogram, at a cost that grows
+      with the frame, and not the grid of points of a `SampledHistogram`.
+    - `sigma`: weigh particles by their colours as well, as a `DetectedObjectModel` does; None, the
+      default, looks at colours only to assign detections, which costs less.
+    - `strong_score`, `weak_score`: the scores from which a detection founds a component, and from
+      which it counts at all; None takes them from the scores seen so far.
+    - `moves`: a chain of your own in place of all of these, with settings of its own; colours are
+      learned where it holds a `LearnAppearance`, by whose bins.
+
+    Raises `ValueError` for a count that is no whole number from 1 on, a rate or σ that is not
+    positive and finite, a weak score above the strong one, and a resampling that does not give
+    every component P particles or would redraw their labels. Raises `ValueError` for a setting
+    beside `moves` that they have themselves, for moves that share one memory, and for a move that
+    needs the memory of one that is not there.
+    """
+
+    moves: tuple[AbstractMove, ...]
+    colours: AbstractColours
+    max_objects: int = eqx.field(static=True)
+    particles_per_object: int = eqx.field(static=True)
+    exact_colours: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        max_objects: int = 24,
+        particles_per_object: int = 16,
+        *,
+        frames_per_second: float | None = None,
+        resampling: AbstractResampling | None = None,
+        colours: AbstractColours | None = None,
+        exact_colours: bool = False,
+        sigma: float | None = None,
+        strong_score: float | None = None,
+        weak_score: float | None = None,
+        moves: Iterable[AbstractMove] | None = None,
+    ) -> None:
+        check_whole(max_objects=max_objects, particles_per_object=particles_per_object)
+        check_positive(**given(frames_per_second=frames_per_second, sigma=sigma))
+        check_flag(exact_colours=exact_colours)
+        if moves is not None:
+            moves = _own_chain(
+                moves,
+                particles_per_object,
+                frames_per_second=frames_per_second,
+                resampling=resampling,
+                sigma=sigma,
+                strong_score=strong_score,
+                weak_score=weak_score,
+            )
+            colours = _learned_colours(moves, colours)
+        colours = HSVColours(8, 4, 6) if colours is None else colours
+        check_type(AbstractColours, "AbstractColours such as HSVColours()", colours=colours)
+        if moves is None:
+            if resampling is None:
+                resampling = GaussianRegeneration(
+                    particles_per_object, where=_motion, noise="stratified"
+                )
+            _check_resampling(resampling, particles_per_object)
+            rate = 25.0 if frames_per_second is None else frames_per_second
+            model = object_model(rate, sigma)
+            assign = Assign(model)
+            moves = (
+                RankScores(strong_score=strong_score, weak_score=weak_score),
+                FollowCamera(assign),
+                assign,
+                resampling,
+                PropagateObjects(model),
+                Deaths(
+                    patience=max(round(rate), 8),
+                    longest_guess=max(round(0.1 * rate), 1),
+                    longest_unsure=max(round(0.3 * rate), 1),
+                ),
+                Births(model, particles_per_object),
+                LearnNoise(model),
+                LearnAppearance(colours),
+                ShareMass(),
+            )
+        self.moves = tuple(moves)
+        self.colours = colours
+        self.max_objects = int(max_objects)
+        self.particles_per_object = int(particles_per_object)
+        self.exact_colours = bool(exact_colours)
+
+    @property
+    def approximate(self) -> bool:
+        """Whether any move departs from the exact recursion."""
+        return any(move.approximate for move in self.moves)
+
+    def init(self) -> ParticleMixture:
+        """Nothing tracked yet: every component dead, every slot empty."""
+        m, n = self.max_objects, self.max_objects * self.particles_per_object
+        memory = {}
+        for move in self.moves:
+            memory |= move.initial_memory(m)
+        return ParticleMixture(
+            particles=ObjectState.nowhere(n),
+            log_weights=jnp.full(n, -jnp.inf, default_float()),
+            component_indicators=jnp.zeros(n, jnp.int32),
+            ancestor_indices=jnp.arange(n, dtype=jnp.int32),
+            num_components=m,
+            memory=memory,
+        )
+
+    @eqx.filter_jit
+    def step(
+        self,
+        key: Key[Array, ""],
+        state: ParticleMixture,
+        frame: UInt8[Array, "h w 3"] | SampledBoxes | None,
+        detections: Detections,
+    ) -> tuple[ParticleMixture, Tracks]:
+        """The state after a frame and its detections, and what is tracked in it.
+
+        In place of the frame, what `look` returns of it does as well.
+
+        Where `frame` is None detections are tracked alone, without colours. Frames may have any
+        size, which should not change: each new one compiles anew, and boxes stay where they are in
+        pixels. Raises `ValueError` for a frame that is not (h, w, 3) of type uint8, and for
+        detections that are none.
+        """
+        check_type(Detections, "Detections, as from_boxes makes them", detections=detections)
+        seen = TrackedFrame(detections, self._pixels(frame))
+        for move_key, move in zip(jax.random.split(key, len(self.moves)), self.moves, strict=True):
+            state = self._forgetting(move(move_key, state, seen))
+        lives: Lives = state.memory[LIVES]
+        return state, Tracks(
+            boxes=mean_boxes(state),
+            identities=lives.identities,
+            confirmed=lives.confirmed,
+            unseen=frames_unseen(state),
+            full=lives.full,
+            shown=lives.shown,
+        )
+
+    def look(
+        self, frame: UInt8[np.ndarray, "h w 3"], detections: Detections
+    ) -> SampledBoxes | UInt8[np.ndarray, "h w 3"]:
+        """What `step` has to be given of a frame: the detections' pixels, where those are enough.
+
+        Then the time of a step does not depend on the size of the frame, nor does it compile anew
+        for another. It is the frame where particles are weighed by their colours, where colours are
+        exact, and for a chain that holds moves of other kinds than the default one's. Raises
+        `ValueError` for a frame as `step` does.
+        """
+        learned = [move.num_parts for move in self.moves if isinstance(move, LearnAppearance)]
+        if self.exact_colours or len(learned) != 1 or not all(map(_sees_detections, self.moves)):
+            return frame
+        return SampledBoxes.of(frame, np.asarray(detections.boxes), self.colours, learned[0])
+
+    def _pixels(self, frame: Any) -> Pixels | None:
+        if frame is None or isinstance(frame, SampledBoxes):
+            return frame
+        if self.exact_colours:
+            wide = frame.shape[0] * frame.shape[1] >= _LARGEST_NARROW
+            return integral_histogram(frame, self.colours, wide)
+        return SampledHistogram(frame, self.colours)
+
+    def _forgetting(self, mixture: ParticleMixture) -> ParticleMixture:
+        """The mixture, whose moves know nothing of components that have died."""
+        memory, dead = mixture.memory, ~mixture.active
+        for move in self.moves:
+            memory = move.forget(memory, dead)
+        return mixture.replace(memory=memory)
+
+
+def object_model(
+    frames_per_second: float = 25.0, sigma: float | None = None
+) -> DetectedObjectModel:
+    """What is expected of objects before anything is learned, at a frame rate.
+
+    At fewer frames a second newborn objects may move further in a frame. Raises `ValueError` for a
+    rate or σ that is not positive.
+    """
+    check_positive(frames_per_second=frames_per_second)
+    model = DetectedObjectModel(sigma=sigma)
+    speeds = model.start_velocity * min(25 / frames_per_second, 2.5)
+    return eqx.tree_at(lambda model: model.start_velocity, model, speeds)
+
+
+def _own_chain(
+    moves: Iterable[AbstractMove], particles_per_object: int, **settings: Any
+) -> tuple[AbstractMove, ...]:
+    """The user's moves, or a `ValueError` for settings that they have and for moves that fail."""
+    if not is_series(moves):
+        raise ValueError(f"moves: {shown(moves)} is not a sequence of moves")
+    for name, value in given(**settings).items():
+        raise ValueError(
+            f"{name}: {shown(value)} is given beside moves, which have settings of their own"
+        )
+    chain = tuple(moves)
+    if not chain:
+        raise ValueError(f"moves: {shown(moves)} holds none, and a tracker needs some")
+    for move in chain:
+        check_type(AbstractMove, "a sequence of moves", moves=move)
+        if isinstance(move, AbstractResampling):
+            _check_resampling(move, particles_per_object, "moves")
+    check_chain(chain)
+    return chain
+
+
+def _learned_colours(
+    moves: Iterable[AbstractMove], colours: AbstractColours | None
+) -> AbstractColours | None:
+    """The bins of the chain's `LearnAppearance`, which those that are given have to be."""
+    for move in moves:
+        if isinstance(move, LearnAppearance):
+            if colours is not None and not eqx.tree_equal(colours, move.colours):
+                raise ValueError(
+                    f"colours: {shown(colours)} are not those of LearnAppearance, {move.colours}"
+                )
+            return move.colours
+    return colours
+
+
+def _check_resampling(
+    resampling: AbstractResampling, particles_per_object: int, argument: str = "resampling"
+) -> None:
+    check_type(AbstractResampling, "a resampling move", **{argument: resampling})
+    number = getattr(resampling, "particles_per_component", None)
+    # Another number would leave no empty slots for the newborn.
+    if number != particles_per_object:
+        raise ValueError(
+            f"{argument}: its particles_per_component, {number}, is not particles_per_object,"
+            f" {particles_per_object}"
+        )
+    if isinstance(resampling, GaussianRegeneration) and resampling.where is None:
+        raise ValueError(
+            f"{argument}: where is None, but which object a particle is of is no Gaussian"
+        )
+
+
+def _sees_detections(move: AbstractMove) -> bool:
+    """Whether it looks at the colours of detections alone, or at none."""
+    if isinstance(move, PropagateObjects):
+        return move.model.sigma is None
+    kinds = (
+        RankScores,
+        Assign,
+        ShareDetections,
+        AbstractResampling,
+        Deaths,
+        Births,
+        LearnAppearance,
+    )
+    return isinstance(move, (*kinds, FollowCamera, LearnNoise, ShareMass))
+
+
+def _motion(states: ObjectState) -> tuple[PyTree, PyTree]:
+    return states.place, states.velocity

@@ -1,0 +1,405 @@
+"""The loop over frames: any detector, with pixels and without, and what may go wrong on the way."""
+
+import itertools
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+from mpfjax.metrics import multi_object_scores
+from mpfjax.vision import Detections, ObjectTracker, Tracks, football_scene, track
+from mpfjax.vision.boxes.follow_boxes import follow_boxes
+from mpfjax.vision.boxes.object_moves import best_components
+from mpfjax.vision.boxes.recipes import objects_filters
+from mpfjax.vision.tracking.adapters import LEAST_ROOM, MOST_ROOM, Rows
+from mpfjax.vision.tracking.track import make_tracker, offline_rows, online_rows
+
+SHAPE = (48, 64, 3)
+NUM_FRAMES = 8
+TRACKER = ObjectTracker(3, 10)
+
+
+def walks(num_frames=NUM_FRAMES):
+    """Rows of two boxes that walk past each other at some distance, the second the stronger."""
+    t = np.arange(num_frames)
+    one = np.column_stack([t + 1, 0 * t - 1, 20 + t, 0 * t + 5, 0 * t + 8, 0 * t + 14, 0 * t + 1])
+    two = np.column_stack([t + 1, 0 * t - 1, 44 - t, 0 * t + 28, 0 * t + 8, 0 * t + 14, 0 * t + 2])
+    return np.concatenate([one, two]).astype(float)
+
+
+def stills(num_frames=NUM_FRAMES):
+    """Noise with a red and a blue box where the rows are."""
+    frames = np.random.default_rng(0).integers(90, 130, (num_frames, *SHAPE), dtype=np.uint8)
+    for frame, _, x, y, w, h, score in walks(num_frames).astype(int):
+        frames[frame - 1, y : y + h, x : x + w] = (220, 10, 10) if score == 1 else (10, 10, 220)
+    return frames
+
+
+def by_frame(rows):
+    """Boxes and scores of each frame."""
+    for frame in range(1, int(rows[:, 0].max()) + 1):
+        here = rows[rows[:, 0] == frame]
+        yield here[:, 2:6], here[:, 6]
+
+
+def detector_of(rows):
+    found = by_frame(rows)
+    return lambda frame: next(found)
+
+
+def tracked(frames, detections, **options):
+    return list(track(frames, detections, TRACKER, **options))
+
+
+def assert_same(some, others):
+    assert len(some) == len(others)
+    for a, b in zip(some, others, strict=True):
+        for left, right in zip(a, b, strict=True):
+            np.testing.assert_array_equal(left, right)
+
+
+@pytest.fixture(scope="module")
+def with_pixels():
+    return tracked(stills(), walks())
+
+
+@pytest.fixture(scope="module")
+def without_pixels():
+    return tracked(None, walks())
+
+
+def test_each_object_keeps_one_identity_and_its_place(with_pixels, without_pixels):
+    truth = walks()
+    for run in (with_pixels, without_pixels):
+        assert len(run) == NUM_FRAMES
+        for number, tracks in enumerate(run[1:], 2):
+            rows = online_rows(number, tracks)
+            assert rows[:, 1].tolist() == [1, 2]
+            # The stronger detection founds the first component.
+            expected = truth[truth[:, 0] == number][::-1, 2:6]
+            np.testing.assert_allclose(rows[:, 2:], expected, atol=3)
+
+
+@pytest.mark.parametrize("wrap", [by_frame, detector_of], ids=["iterable", "callable"])
+def test_every_kind_of_detector_gives_the_same_tracks(wrap, with_pixels):
+    assert_same(tracked(iter(stills()), wrap(walks())), with_pixels)
+
+
+def test_boxes_alone_are_detections_of_equal_scores():
+    rows = walks()
+    boxes = [found for found, _ in by_frame(rows)]
+    assert_same(tracked(None, boxes), tracked(None, rows[:, :6]))
+
+
+def test_without_colours_the_pixels_do_not_count(without_pixels):
+    assert_same(tracked(stills(), walks(), use_colours=False), without_pixels)
+
+
+def test_grey_frames_are_frames():
+    grey = stills()[..., 0]
+    coloured = np.repeat(grey[..., None], 3, axis=3)
+    assert_same(tracked(grey, walks()), tracked(coloured, walks()))
+    assert_same(tracked(grey[..., None], walks()), tracked(coloured, walks()))
+
+
+def test_the_key_decides_and_nothing_else(without_pixels):
+    assert_same(tracked(None, walks(), key=jax.random.key(0)), without_pixels)
+    other = tracked(None, walks(), key=jax.random.key(1))
+    assert not np.array_equal(other[-1].boxes, without_pixels[-1].boxes)
+
+
+def test_a_camera_is_read_one_frame_at_a_time():
+    read = []
+
+    def camera():
+        for number in itertools.count():
+            read.append(number)
+            yield stills(1)[0]
+
+    run = track(camera(), lambda frame: np.zeros((0, 4)), TRACKER)
+    assert read == []
+    for number in range(3):
+        next(run)
+        assert read == list(range(number + 1))
+
+
+def test_frames_from_the_middle_find_their_rows():
+    rows = walks()
+    later = list(track(stills()[2:], rows, TRACKER, first=3))
+    shifted = rows - np.eye(7)[0] * 2
+    again = tracked(stills()[2:], shifted[shifted[:, 0] > 0])
+    assert len(later) == len(again) == NUM_FRAMES - 2
+    assert (later[-1].identities > 0).sum() == (again[-1].identities > 0).sum() == 2
+
+
+def test_weak_detections_are_left_out_where_a_least_score_is_given():
+    rows = walks()
+    assert_same(tracked(None, rows, min_score=1.5), tracked(None, rows[rows[:, 6] >= 1.5]))
+
+
+@pytest.mark.parametrize("num_frames", [0, 1])
+def test_few_frames_are_no_error(num_frames):
+    detections = [walks()[:1, 2:6]][:num_frames]
+    assert len(tracked(stills()[:num_frames], detections)) == num_frames
+
+
+# --- bad input -----------------------------------------------------------------------------------
+
+
+def spoiled(column, value, frame=3):
+    rows = walks()
+    rows[rows[:, 0] == frame, column] = value
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("message", "what"),
+    [
+        (r"boxes of no area", [10.0, 10, 0, 5]),
+        (r"boxes of no area", [10.0, 10, 5, -5]),
+        (r"frame 1 has boxes outside the frame, 64 x 48", [500.0, 10, 5, 5]),
+        (r"frame 1 has boxes outside the frame, 64 x 48", [10.0, -30, 5, 30]),
+    ],
+)
+def test_what_cannot_be_tracked_is_left_out_with_one_warning(message, what, with_pixels):
+    bad = np.array([[frame, -1, *what, 9.0] for frame in range(1, NUM_FRAMES + 1)])
+    with pytest.warns(RuntimeWarning, match=message) as caught:
+        run = tracked(stills(), np.concatenate([bad, walks()]))
+    assert len(caught) == 1
+    assert_same(run, with_pixels)
+
+
+def test_two_thousand_detections_leave_the_strongest():
+    weak = np.random.default_rng(0).uniform(5, 40, (2000, 7))
+    weak[:, 0], weak[:, 6] = 4, 0.1
+    # Six in that frame fill the room.
+    more = np.array([[4, -1, 10 * i, 40, 5, 5, 1] for i in range(4)], float)
+    strong = np.concatenate([walks(), more])
+    with pytest.warns(RuntimeWarning, match="frame 4 has 2006, more than the 6 that there is room"):
+        run = tracked(None, np.concatenate([weak, strong]))
+    assert_same(run, tracked(None, strong))
+
+
+def test_more_objects_than_room_are_flagged_and_the_strongest_kept():
+    places = np.stack([np.arange(6) * 10, np.full(6, 10), np.full(6, 6), np.full(6, 12)], axis=1)
+    scores = np.arange(6.0)
+    tracker = ObjectTracker(3, 10, strong_score=0.0, weak_score=0.0)
+    with pytest.warns(RuntimeWarning, match="frame 1 has more objects than the 3 .* max_objects"):
+        run = list(track(None, [(places, scores)] * 3, tracker))
+    assert run[0].full
+    np.testing.assert_allclose(np.sort(run[-1].boxes[:, 0]), [33, 43, 53], atol=3)
+
+
+def test_detections_after_the_last_frame_are_told_of():
+    with pytest.warns(RuntimeWarning, match="4 lie in frames after the last, 6"):
+        tracked(stills()[:6], walks())
+    with pytest.warns(RuntimeWarning, match="go on after the last frame, 6"):
+        tracked(stills()[:6], by_frame(walks()))
+
+
+def test_detections_that_end_too_early_are_an_error():
+    with pytest.raises(ValueError, match="detections: end before the frames do, at frame 6"):
+        tracked(stills(), itertools.islice(by_frame(walks()), 5))
+
+
+@pytest.mark.parametrize("column", [2, 4, 6])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_rows_that_are_not_finite_are_an_error_at_once(column, value):
+    with pytest.raises(ValueError, match=r"detections: .* is not finite"):
+        track(None, spoiled(column, value), TRACKER)
+
+
+@pytest.mark.parametrize(
+    ("message", "found"),
+    [
+        ("frame 1: .* not finite", [[1.0, np.nan, 3, 4]]),
+        ("frame 1: scores .* not finite", ([[1.0, 2, 3, 4]], [np.nan])),
+        ("frame 1: 2 scores for 1 boxes", ([[1.0, 2, 3, 4]], [1.0, 2.0])),
+        ("frame 1: scores 'many' are no numbers", ([[1.0, 2, 3, 4]], "many")),
+        ("frame 1: None is no boxes", None),
+        ("frame 1: shape", [[1.0, 2, 3]]),
+        ("frame 1: 'boxes'", "boxes"),
+    ],
+)
+def test_what_a_detector_finds_is_checked(message, found):
+    with pytest.raises(ValueError, match=f"detections: {message}"):
+        tracked(stills(), lambda frame: found)
+
+
+def test_an_error_of_the_detector_says_in_which_frame():
+    def fails(frame):
+        if next(numbers) == 2:
+            raise OSError("no network")
+        return np.zeros((0, 4))
+
+    numbers = itertools.count(1)
+    run = track(stills(), fails, TRACKER)
+    next(run)
+    with pytest.raises(OSError, match="no network") as caught:
+        next(run)
+    assert any("detector at frame 2" in note for note in caught.value.__notes__)
+
+
+@pytest.mark.parametrize(
+    ("message", "frames"),
+    [
+        ("frame 2 is 64 x 40, and those before it 64 x 48", [stills()[0], stills()[0][:40]]),
+        ("float64 is not uint8", [np.zeros(SHAPE)]),
+        ("not the shape", [np.zeros((4, 4, 4), np.uint8)]),
+        ("not the shape", [np.zeros(4, np.uint8)]),
+    ],
+)
+@pytest.mark.usefixtures("as_installed")
+def test_frames_that_will_not_do_are_an_error(message, frames):
+    with pytest.raises(ValueError, match=f"frames: .*{message}"):
+        tracked(frames, lambda frame: np.zeros((0, 4)))
+
+
+@pytest.mark.parametrize(
+    ("message", "arguments"),
+    [
+        ("frames: 3 is not frames", {"frames": 3}),
+        ("detections: 3 is neither", {"detections": 3}),
+        ("detections: 'det.txt' is neither", {"detections": "det.txt"}),
+        ("detections: shape", {"detections": np.zeros((3, 5))}),
+        ("nothing to look at where frames is None", {"detections": len}),
+        ("tracker: 3 is not an ObjectTracker", {"tracker": 3}),
+        ("key: ", {"key": 3}),
+        ("first: 0", {"first": 0}),
+        ("min_score: 'a'", {"min_score": "a"}),
+        ("min_score: nan", {"min_score": np.nan}),
+        ("max_detections: 0", {"max_detections": 0}),
+        ("use_colours: 1", {"use_colours": 1}),
+    ],
+)
+@pytest.mark.usefixtures("as_installed")
+def test_arguments_that_will_not_do_are_named_at_once(message, arguments):
+    with pytest.raises(ValueError, match=message):
+        track(**{"frames": None, "detections": walks(), "tracker": TRACKER} | arguments)
+
+
+def test_a_least_score_needs_scores():
+    with pytest.raises(ValueError, match=r"min_score: 0\.5 is given, and .* no scores"):
+        tracked(None, walks()[:, :6], min_score=0.5)
+
+
+# --- rows, trackers, drawn boxes -----------------------------------------------------------------
+
+
+def said(identities, confirmed, shown):
+    boxes = np.tile([10.0, 20.0, 4.0, 8.0], (len(identities), 1))
+    unseen = np.zeros(len(identities), int)
+    return Tracks(
+        boxes, np.array(identities), np.array(confirmed), unseen, np.array(False), np.array(shown)
+    )
+
+
+def test_rows_online_are_of_what_was_known_then_and_offline_of_what_is_known_at_the_end():
+    nobody = [False, False, False]
+    kept = [
+        said([2, 1, 0], nobody, nobody),
+        said([2, 1, 0], [False, True, False], [False, True, False]),
+        said([0, 1, 3], [False, True, False], nobody),
+    ]
+    online = np.concatenate([online_rows(i, tracks) for i, tracks in enumerate(kept, 5)])
+    assert online.tolist() == [[6, 1, 8, 16, 4, 8]]
+    offline = offline_rows(kept, 5)
+    assert offline[:, :2].tolist() == [[5, 1], [6, 1]]
+    assert offline_rows([]).shape == (0, 6)
+
+
+def test_room_is_made_for_what_a_file_holds():
+    rows = np.zeros((0, 7))
+    assert Rows(rows).most_objects() == LEAST_ROOM
+    crowd = np.array(
+        [[frame, -1, 1, 1, 5, 5, 1] for frame in range(1, 101) for _ in range(40)], float
+    )
+    assert Rows(crowd).most_objects() == 64
+    burst = np.concatenate([crowd, np.tile(crowd[:1], (2000, 1))])
+    assert Rows(burst).most_objects() == 64
+    assert Rows(np.tile(crowd, (10, 1))).most_objects() == 600
+    assert Rows(np.tile(crowd, (50, 1))).most_objects() == MOST_ROOM
+
+
+def test_the_second_frame_is_tracked_by_the_program_of_the_first():
+    """A number of another kind in the state would compile all of it anew."""
+    before, found = TRACKER.init(), Detections.from_boxes(np.ones((1, 4)), 6)
+    after, _ = eqx.filter_eval_shape(TRACKER.step, jax.random.key(0), before, None, found)
+    kinds = [
+        jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type), state)
+        for state in (before, after)
+    ]
+    assert jax.tree.leaves(kinds[0]) == jax.tree.leaves(kinds[1])
+    assert jax.tree.structure(before) == jax.tree.structure(after)
+
+
+def test_trackers_are_made_by_the_name_of_their_filter():
+    gaussian, resampling = make_tracker("gm_mpf", 5), make_tracker("mpf", 5, 30.0)
+    names = [[type(move).__name__ for move in one.moves] for one in (gaussian, resampling)]
+    assert "GaussianRegeneration" in names[0]
+    assert "Resample" in names[1]
+    assert gaussian.max_objects == resampling.max_objects == 5
+    with pytest.raises(ValueError, match="filter: 'pf' is not one of"):
+        make_tracker("pf")
+
+
+@pytest.mark.thorough
+def test_drawn_boxes_give_one_track_each_in_the_order_given():
+    first = walks()[walks()[:, 0] == 1][:, 2:6]
+    run = list(follow_boxes(stills()[:4], first[::-1]))
+    for number, tracks in enumerate(run, 1):
+        rows = online_rows(number, tracks)
+        assert rows[:, 1].tolist() == [1, 2]
+        expected = walks()[walks()[:, 0] == number][::-1, 2:6]
+        np.testing.assert_allclose(rows[:, 2:4], expected[:, :2], atol=9)
+
+
+@pytest.mark.thorough
+def test_of_many_boxes_each_has_a_component():
+    corners = np.stack(np.meshgrid([2.0, 18, 34, 50], [1.0, 17, 33]), axis=-1).reshape(-1, 2)
+    boxes = np.concatenate([corners, np.tile([10.0, 14.0], (12, 1))], axis=1)
+    mixture = objects_filters(stills()[0], boxes)["mpf"].init(jax.random.key(0))
+    best, held = best_components(mixture, 12)
+    assert (mixture.num_particles, mixture.num_components) == (12 * 120, 36)
+    assert held.all()
+    assert len(set(best.tolist())) == 12
+
+
+@pytest.mark.parametrize(
+    ("message", "boxes"),
+    [
+        ("boxes: there are none", []),
+        ("has no area", [[5.0, 5, 0, 5]]),
+        ("lies outside", [[500.0, 5, 5, 5]]),
+        ("not finite", [[np.nan, 5, 5, 5]]),
+    ],
+)
+@pytest.mark.usefixtures("as_installed")
+def test_drawn_boxes_that_will_not_do_are_named(message, boxes):
+    with pytest.raises(ValueError, match=message):
+        list(follow_boxes(stills(), np.array(boxes)))
+
+
+def test_no_frames_are_no_tracks_of_drawn_boxes():
+    assert list(follow_boxes([], np.ones((1, 4)))) == []
+
+
+@pytest.mark.thorough
+def test_players_who_turn_at_will_keep_their_names():
+    """One detection in ten is missing, and a third of the frames have a false one.
+
+    With speeds that hardly change, as those of pedestrians, the default tracker lost them.
+    """
+    pytest.importorskip("trackeval", reason="scoring needs the extra 'trackeval', of 'test'")
+    truth = football_scene(jax.random.key(2), 60, num_opponents=4, still_camera=True).tracks
+    rng, found = np.random.default_rng(0), []
+    for t in range(1, 61):
+        boxes = truth[truth[:, 0] == t][:, 2:]
+        boxes = boxes[rng.random(len(boxes)) > 0.1]
+        boxes[:, :2] += 0.05 * boxes[:, 2:] * rng.normal(size=(len(boxes), 2))
+        if rng.random() < 0.3:
+            boxes = np.concatenate([boxes, [[rng.uniform(0, 480), rng.uniform(60, 200), 12, 30]]])
+        found.append(boxes)
+    rows = [online_rows(t, tracks) for t, tracks in enumerate(track(None, found), 1)]
+    assert multi_object_scores(np.concatenate(rows), truth)["IDF1"] > 0.85
