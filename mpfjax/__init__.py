@@ -29,6 +29,7 @@ from mpfjax.models import RandomWalkWithJumps as RandomWalkWithJumps
 from mpfjax.models import SwitchingLinearGaussianModel as SwitchingLinearGaussianModel
 from mpfjax.models import WalkWithVelocity as WalkWithVelocity
 from mpfjax.models import per_particle as per_particle
+from mpfjax.moves import AbstractMarkovMove as AbstractMarkovMove
 from mpfjax.moves import AbstractMetropolis as AbstractMetropolis
 from mpfjax.moves import AbstractMove as AbstractMove
 from mpfjax.moves import AbstractPropagation as AbstractPropagation

@@ -27,7 +27,12 @@ from mpfjax.models.base import (
 from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.inputs import saying_that_none_were_given
 from mpfjax.models.noise import NOISES, draw_noise
-from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractResampling
+from mpfjax.moves.base import (
+    AbstractMarkovMove,
+    AbstractMove,
+    AbstractRegrouping,
+    AbstractResampling,
+)
 from mpfjax.moves.eve_indices import EVE_INDICES, evidence_variance, mass_variances
 from mpfjax.moves.every import Every, with_inner
 from mpfjax.moves.island_interaction import IslandInteraction
@@ -63,7 +68,7 @@ class StepInfo(eqx.Module):
 
 
 # Moves that do not change the total mass; there is nothing to normalise after them.
-_KEEP_MASS = (AbstractRegrouping, AbstractResampling, IslandInteraction)
+_KEEP_MASS = (AbstractRegrouping, AbstractResampling, AbstractMarkovMove, IslandInteraction)
 BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
 
@@ -136,11 +141,6 @@ class Filter(eqx.Module):
         self.num_components = int(num_components)
         check_one_of(NOISES, initial_noise=initial_noise)
         self.initial_noise = initial_noise
-
-    @property
-    def max_components(self) -> int:
-        """M, the most components; the same as `num_components`."""
-        return self.num_components
 
     @property
     def moves(self) -> tuple[Any, ...]:

@@ -81,24 +81,9 @@ class ParticleMixture(eqx.Module):
         return self.log_weights.shape[0]
 
     @property
-    def max_components(self) -> int:
-        """M, the most components; the same as `num_components`."""
-        return self.num_components
-
-    @property
     def num_usable_slots(self) -> int | Int[Array, ""]:
         """How many slots a move may fill: `usable_slots`, or N where that is None."""
         return self.num_particles if self.usable_slots is None else self.usable_slots
-
-    @property
-    def limit(self) -> Int[Array, ""] | None:
-        """The name that `usable_slots` had before."""
-        return self.usable_slots
-
-    @property
-    def room(self) -> int | Int[Array, ""]:
-        """The name that `num_usable_slots` had before."""
-        return self.num_usable_slots
 
     @property
     def occupied(self) -> Bool[Array, " n"]:

@@ -21,15 +21,12 @@ _MOST_TICKS = 6
 
 @dataclass(frozen=True)
 class ParticleHistory:
-    """The particles of one run over time, (t, n), of a scalar state; once called `Trace`."""
+    """The particles of one run over time, (t, n), of a scalar state."""
 
     positions: np.ndarray
     occupied: np.ndarray
     component_indicators: np.ndarray
     score: float
-
-
-Trace = ParticleHistory  # the name that it had before
 
 
 def draw_typical_run(
@@ -269,7 +266,7 @@ def draw_rates(
     return figure
 
 
-def draw_climbs(
+def draw_optimisations(
     sigmas_x: np.ndarray,
     sigmas_y: np.ndarray,
     log_likelihood: np.ndarray,

@@ -30,13 +30,18 @@ ORDER = (
     "command",
     "__main__",
 )
-# Inside the two folders that hold several floors.
+# Inside the folders that hold several floors: files, and folders.
 FLOORS = {
     "operations": (
         "floats", "gradients", "platforms", "stored", "indexing", "prefix_sums", "logarithms",
         "segments", "runs", "choices", "matrices", "stacks", "gaussians", "across_islands",
         "generator", "positions", "sobol", "hilbert", "sorting", "compiling",
     ),
+    "moves": (
+        "base", "eve_indices", "sharing", "results", "island_interaction", "every", "regrouping",
+        "resampling", "prune", "propagation", "metropolis", "objects", "conditional", "parents",
+    ),
+    "vision": ("files", "colour", "scenes", "tracking", "boxes"),
     "running": (
         "storage", "processes", "devices", "threads", "progress", "scan", "run", "islands",
         "studies",
@@ -67,13 +72,13 @@ def name(path):
 
 
 def assert_goes_upward_inside(path, module):
-    """Within `operations` and `running` a file imports from those listed before it."""
-    folder, own = path.parent.name, path.stem
+    """Within these folders a file imports from its own floor and from those listed before it."""
+    own = [part.removesuffix(".py") for part in path.relative_to(PACKAGE).parts]
     _, part, *rest = module.split(".")
-    if part == folder and folder in FLOORS:
-        floors = FLOORS[folder]
+    if part == own[0] and part in FLOORS and own[1] != "__init__":
+        floors = FLOORS[part]
         assert rest, f"{path} imports the folder it is in"
-        assert floors.index(rest[0]) <= floors.index(own), f"{path} imports {module} from below"
+        assert floors.index(rest[0]) <= floors.index(own[1]), f"{path} imports {module} from below"
 
 
 @pytest.mark.parametrize("path", FILES, ids=name)
@@ -106,8 +111,10 @@ def test_every_part_of_the_package_has_a_place_in_the_layout():
 
 def test_every_file_of_a_folder_of_several_floors_has_one():
     for folder, floors in FLOORS.items():
-        files = {path.stem for path in (PACKAGE / folder).glob("*.py")} - {"__init__"}
-        assert files == set(floors)
+        found = {
+            path.relative_to(PACKAGE / folder).parts[0] for path in FILES if part_of(path) == folder
+        }
+        assert {name.removesuffix(".py") for name in found} - {"__init__"} == set(floors)
 
 
 @pytest.mark.parametrize("path", FILES, ids=name)

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax import plotting
 from mpfjax.mixture import flatten_states, single_component
 from mpfjax.moves.regrouping.features import Features
 from tests.examples import example_mixtures, log_masses, make_mixture
@@ -200,15 +199,6 @@ def test_a_stack_of_mixtures_has_no_summary_of_one(summary, as_installed):
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf] * 40), MIXTURES["ordinary"])
     with pytest.raises(ValueError, match="mixture: a stack of 40 mixtures"):
         summary(stack)
-
-
-def test_names_of_before_are_still_read():
-    mixture = single_component(jnp.zeros(5), 2, jnp.array(3, jnp.int32))
-    assert mixture.room == mixture.num_usable_slots == 3
-    assert mixture.limit is mixture.usable_slots
-    assert mixture.max_components == mixture.num_components == 2
-    assert single_component(jnp.zeros(5)).room == 5
-    assert plotting.Trace is plotting.ParticleHistory
 
 
 def test_replace_does_not_ignore_an_unknown_field():

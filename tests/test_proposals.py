@@ -221,8 +221,8 @@ class TestNetworkProposal:
         """It ends above where it began, and below log Z as every bound must.
 
         The derivative of one run has heavy tails. Over few seeds the rare large ones decide the
-        optimisation, and the compiler's rounding decides them; so there are many seeds, and steps that
-        end at nothing. Both bounds are of runs that the optimisation has not seen.
+        optimisation, and the compiler's rounding decides them; so there are many seeds, and steps
+        that end at nothing. Both bounds are of runs that the optimisation has not seen.
         """
         start = self.filter(NetworkProposal.create(jax.random.key(0), 1, 1, 0.8))
         run = mpfjax.tuning.fit(

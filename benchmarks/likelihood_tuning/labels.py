@@ -99,7 +99,7 @@ def untuned_model(labelled: Labelled, template: int) -> SoftColourModel:
 
 def tune(key: Array, model: SoftColourModel, labelled: Labelled, num_steps: int) -> Maximisation:
     """λ, the bandwidth and the references, by the conditional likelihood of the labels."""
-    key_drawn, key_around, key_near, key_climb = jax.random.split(key, 4)
+    key_drawn, key_around, key_near, key_refined = jax.random.split(key, 4)
     states = labelled_states(model, labelled.boxes)
     present = jax.tree.map(lambda leaf: leaf[1:], states)
     rivals = jax.tree.map(
@@ -111,7 +111,7 @@ def tune(key: Array, model: SoftColourModel, labelled: Labelled, num_steps: int)
     frames = jnp.asarray(labelled.frames[1:])
     objective = LabelLikelihood(frames, present, rivals, min(FRAMES_A_STEP, len(frames)))
     return maximise(
-        key_climb,
+        key_refined,
         objective,
         model,
         optax.adam(optax.cosine_decay_schedule(RATE, num_steps)),

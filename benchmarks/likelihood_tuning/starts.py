@@ -72,7 +72,7 @@ def run_starts(options: argparse.Namespace, settings: dict[str, Any], out: Path)
         write_json(out / "starts.json", content)
     print(as_start_table(results, maximum))
     levels = surface()
-    figure = plotting.draw_climbs(*levels, paths, np.exp(maximum.point))
+    figure = plotting.draw_optimisations(*levels, paths, np.exp(maximum.point))
     figure.savefig(out / "optimisations.png", dpi=150)
 
 

@@ -1,5 +1,6 @@
 """The moves that filters are chains of: regrouping, resampling, propagating."""
 
+from mpfjax.moves.base import AbstractMarkovMove as AbstractMarkovMove
 from mpfjax.moves.base import AbstractMove as AbstractMove
 from mpfjax.moves.base import AbstractPropagation as AbstractPropagation
 from mpfjax.moves.base import AbstractRegrouping as AbstractRegrouping

@@ -1,4 +1,4 @@
-"""The three kinds of moves that a filter is a chain of."""
+"""The kinds of moves that a filter is a chain of."""
 
 import abc
 
@@ -13,10 +13,11 @@ from mpfjax.operations.gradients import without_gradient
 class AbstractMove(eqx.Module):
     """A step of a filter, `(key, mixture, observation) -> mixture`.
 
-    A move is of one of three kinds, and its kind is its contract. An `AbstractRegrouping` does not
-    change the distribution. An `AbstractResampling` does not change the mass of any component.
-    An `AbstractPropagation` takes the particles from t-1 to t. A move is `approximate` if it is
-    not part of the exact recursion; the marginal likelihood is then no longer unbiased.
+    The kind of a move is its contract. An `AbstractRegrouping` does not change the distribution.
+    An `AbstractResampling` does not change the mass of any component. An `AbstractPropagation`
+    takes the particles from t-1 to t. An `AbstractMarkovMove` moves x_t by a kernel that leaves
+    its distribution invariant. A move is `approximate` if it is not part of the exact recursion;
+    the marginal likelihood is then no longer unbiased.
     """
 
     @property
@@ -99,7 +100,11 @@ class AbstractRegrouping(AbstractMove):
 
 
 class AbstractResampling(AbstractMove):
-    """A move that redraws the particles within each component and keeps the component's mass."""
+    """A move that redraws the particles of each component and keeps the component's mass.
+
+    Resampling makes copies and is unbiased. Gaussian regeneration draws from a fitted density
+    instead, and is `approximate`.
+    """
 
     @property
     def weighs(self) -> bool:
@@ -108,7 +113,7 @@ class AbstractResampling(AbstractMove):
 
 
 class AbstractAdaptiveResampling(AbstractResampling):
-    """A resampling that draws the particles of some components, those that are due."""
+    """A resampling of those components that are due, such as those of low effective sample size."""
 
     @abc.abstractmethod
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
@@ -120,6 +125,19 @@ class AbstractAdaptiveResampling(AbstractResampling):
         """Those that are due."""
         del observation
         return self.is_due(mixture)
+
+
+class AbstractMarkovMove(AbstractMove):
+    """A move by a Markov kernel that leaves the distribution of each particle's x_t as it is.
+
+    The "move" of resample-move (Gilks and Berzuini 2001), called rejuvenation in the literature.
+    Weights, component indicators and ancestor indices stay, so that it is exact.
+    """
+
+    @property
+    def weighs(self) -> bool:
+        """False: the observation changes no weight."""
+        return False
 
 
 class AbstractPropagation(AbstractMove):

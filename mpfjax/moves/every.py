@@ -10,10 +10,16 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import check_whole, is_series, shown
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractMove, AbstractRegrouping, AbstractResampling
+from mpfjax.moves.base import (
+    AbstractMarkovMove,
+    AbstractMove,
+    AbstractRegrouping,
+    AbstractResampling,
+)
 from mpfjax.operations.generator import split
 
 _MOST_STEPS = 2**31 - 1  # that int32 counts
+_INNER = (AbstractRegrouping, AbstractResampling, AbstractMarkovMove)
 
 
 class Every(AbstractMove):
@@ -133,10 +139,10 @@ def _as_inner_moves(moves: Any) -> tuple[AbstractMove, ...]:
     if not moves:
         raise ValueError("moves: there must be at least one to run at every k-th step")
     for move in moves:
-        if not isinstance(move, AbstractRegrouping | AbstractResampling | Every):
+        if not isinstance(move, (*_INNER, Every)):
             raise ValueError(
-                f"moves: {shown(move)} neither regroups nor resamples; a propagation belongs"
-                " into the chain itself, since without it the state would not move"
+                f"moves: {shown(move)} neither regroups, resamples nor moves by a Markov kernel;"
+                " a propagation belongs into the chain, since without it the state would not move"
             )
     return moves
 

@@ -12,7 +12,7 @@ from mpfjax.checks import check_exponent, check_inner_share, check_one_of, check
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
-from mpfjax.moves.base import AbstractResampling
+from mpfjax.moves.base import AbstractMarkovMove
 from mpfjax.moves.propagation.propagate import likelihoods, log_transition
 from mpfjax.operations.generator import normal, split, uniform
 from mpfjax.operations.gradients import add_gradient, without_gradient
@@ -36,7 +36,7 @@ class _Target(NamedTuple):
         return (new[0] - old[0]) + self.exponent * (new[1] - old[1])
 
 
-class AbstractMetropolis(AbstractResampling):
+class AbstractMetropolis(AbstractMarkovMove):
     """Steps of Metropolis and Hastings for every particle, given its parent x_{t-1}.
 
     The move of a resample-move filter (Gilks and Berzuini 2001): after x_t was drawn and weighed,

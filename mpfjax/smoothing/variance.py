@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 from mpfjax.checks import check_type, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractRegrouping, AbstractResampling
+from mpfjax.moves.base import AbstractMarkovMove, AbstractRegrouping, AbstractResampling
 from mpfjax.moves.eve_indices import (
     EVE_INDICES,
     evidence_variance,
@@ -55,16 +55,18 @@ class _KeepFirstAncestors(AbstractRegrouping):
 def with_first_ancestors(filter: Filter) -> Filter:
     """The same filter, which also remembers the first ancestor of each particle.
 
-    Draws and weights are the same to the bit. A step takes O(N) more memory and time, and the
-    runs can be given to `log_marginal_likelihood_variance` and `mixture_weight_errors`. `StepInfo`
-    then has both errors at every step. Raises `ValueError` for what is no filter, for a filter
-    whose particles have no single ancestors or whose Ẑ is not unbiased (one with an approximate
-    move, `PropagateIndependently`, `PropagateInClusters` or `IslandInteraction`), and for draws that are not
-    independent: a scheme other than "multinomial", or a noise other than "independent".
+    Draws and weights are the same to the bit. A step takes O(N) more memory and time, and the runs
+    can be given to `log_marginal_likelihood_variance` and `mixture_weight_errors`. `StepInfo` then
+    has both errors at every step. Raises `ValueError` for what is no filter, for a filter whose
+    particles have no single ancestors or whose Ẑ is not unbiased (one with an approximate move,
+    `PropagateIndependently`, `PropagateInClusters` or `IslandInteraction`), and for draws that are
+    not independent: a scheme other than "multinomial", or a noise other than "independent".
     """
     check_type(Filter, "a Filter", filter=filter)
     for move in filter.moves:
-        redraws = isinstance(move, AbstractResampling) and not isinstance(move, Resample)
+        redraws = isinstance(move, AbstractResampling | AbstractMarkovMove) and not isinstance(
+            move, Resample
+        )
         if getattr(move, "approximate", True) or redraws or isinstance(move, _NO_EVE_INDICES):
             raise ValueError(
                 f"filter: {type(move).__name__}, one of its moves, is approximate or leaves a"

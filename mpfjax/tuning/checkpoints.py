@@ -1,4 +1,4 @@
-"""The file of an optimisation or of chains: all of their state, and a description of what it is of."""
+"""The file of an optimisation or of chains: their state, and a description of what it is of."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Whether two optimisations are the same: every number and function of an optimisation, by name, as text."""
+"""Whether two optimisations are the same: their numbers and functions by name, as text."""
 
 import functools
 import hashlib

@@ -70,13 +70,13 @@ def fit(
     checkpoint_name: str | None = None,
     progress: bool = True,
 ) -> TuningRun:
-    """Optimisation the log marginal likelihood in some of a filter's parameters.
+    """Climb the log marginal likelihood in some of a filter's parameters.
 
     Maximises the mean over seeds of log Ẑ(θ), summed over sequences, with the derivatives of the
     filter's moves. Build the filter with `gradient="stop"`: its derivatives estimate the score.
-    With the default, "none", the optimisation ends somewhere else, however many particles there are, and
-    a warning says so. For the parameters of a proposal, such as a `NetworkProposal`, "none" is
-    right, and there is no warning.
+    With the default, "none", the optimisation ends somewhere else, however many particles there
+    are, and a warning says so. For the parameters of a proposal, such as a `NetworkProposal`,
+    "none" is right, and there is no warning.
 
     - `observations`: as for `run_filter`; a list is several sequences, each run on its own.
     - `optimizer`: an optimiser of optax. It steps in the unconstrained numbers of the transforms.
@@ -90,28 +90,29 @@ def fit(
       the same seeds in every step: there is no noise between steps, but the error of those seeds
       stays.
     - `inputs`, `missing`: as for `run_filter`; of several sequences, a list of inputs.
-    - `patience`: a number of steps. The optimisation ends when the mean of the last so many steps is not
-      more than `tolerance` nats above the mean of as many steps before them.
+    - `patience`: a number of steps. The optimisation ends when the mean of the last so many steps
+      is not more than `tolerance` nats above the mean of as many steps before them.
     - `curvature_seeds`: the seeds for `standard_errors` at the end, in whole batches of
       `num_seeds`; 0 for none.
     - `checkpoint`: a .npz file, without pickles. It is written every `checkpoint_every` steps, and
-      when the optimisation ends or is interrupted. If the file exists, the optimisation goes on from it, the
-      same to the bit as without the interruption. An optimisation that has ended is returned as it ended.
-      To go on, take a larger `num_steps`, or another `patience` or `tolerance`. An optimisation that ended
-      at a number that is not finite stays there. All else must be the same: the filter and the
-      observations to the bit, the parameters, transforms, key and seeds, and the optimiser with
-      the numbers in its closures and schedules. Your own functions are compared by their code;
-      classes and functions of libraries by their names. Take a new file after you change what
-      those do. With another version of Python or optax, the file may be refused.
-    - `checkpoint_name`: what the optimisation is called, such as "adam, cosine". Its file is then told by
-      this name, and no function or optimiser is looked into; numbers and arrays are compared as
-      before. Use it for functions that change what they hold, and across versions.
+      when the optimisation ends or is interrupted. If the file exists, the optimisation goes on
+      from it, the same to the bit as without the interruption. An optimisation that has ended is
+      returned as it ended. To go on, take a larger `num_steps`, or another `patience` or
+      `tolerance`. An optimisation that ended at a number that is not finite stays there. All else
+      must be the same: the filter and the observations to the bit, the parameters, transforms, key
+      and seeds, and the optimiser with the numbers in its closures and schedules. Your own
+      functions are compared by their code; classes and functions of libraries by their names. Take
+      a new file after you change what those do. With another version of Python or optax, the file
+      may be refused.
+    - `checkpoint_name`: what the optimisation is called, such as "adam, cosine". Its file is then
+      told by this name, and no function or optimiser is looked into; numbers and arrays are
+      compared as before. Use it for functions that change what they hold, and across versions.
 
-    If the log marginal likelihood or the gradient is not finite, the optimisation ends with the last good
-    parameters, a warning, and the step in `stopped`. Raises `ValueError` for a parameter that is
-    no floating point number, is static, starts outside its domain or has no effect. Raises it for
-    a checkpoint of another fit, naming what differs, for one that is cut off or lacks an array,
-    and where `run_filter` does. Raises `RuntimeError` if the start itself is not finite.
+    If the log marginal likelihood or the gradient is not finite, the optimisation ends with the
+    last good parameters, a warning, and the step in `stopped`. Raises `ValueError` for a parameter
+    that is no floating point number, is static, starts outside its domain or has no effect. Raises
+    it for a checkpoint of another fit, naming what differs, for one that is cut off or lacks an
+    array, and where `run_filter` does. Raises `RuntimeError` if the start itself is not finite.
     """
     _check_optimisation(
         key, optimizer, num_steps, num_seeds, common_random_numbers, patience, tolerance,

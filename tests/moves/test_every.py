@@ -106,8 +106,8 @@ def test_a_label_that_dies_within_and_is_used_again_has_no_past():
         ("num_steps: 1.5", 1.5, [KMeans()]),
         ("moves: there must be at least one", 2, []),
         ("moves: .* is not a list of moves", 2, KMeans()),
-        ("moves: (?s:.*) neither regroups nor resamples", 2, [KMeans(), Propagate(MODEL)]),
-        ("moves: (?s:.*) neither regroups nor resamples", 2, [mpfjax.IslandInteraction()]),
+        ("moves: (?s:.*) neither regroups, resamples nor", 2, [KMeans(), Propagate(MODEL)]),
+        ("moves: (?s:.*) neither regroups, resamples nor", 2, [mpfjax.IslandInteraction()]),
     ],
 )
 def test_what_will_not_do_is_named(as_installed, message, num_steps, moves):

@@ -20,7 +20,7 @@ from mpfjax import (
     Reweight,
 )
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.base import AbstractResampling
+from mpfjax.moves.base import AbstractMarkovMove
 from tests.marking import thorough
 from tests.user_models import ScalarLinear
 
@@ -31,7 +31,7 @@ MODEL = mpfjax.LinearGaussianModel(
 OBSERVATIONS = jnp.array([[1.0, 0.5], [2.0, -1.0]])
 
 
-class Watch(AbstractResampling):
+class Watch(AbstractMarkovMove):
     """Puts the parents where the test finds them; moves nothing."""
 
     needs_parents = property(lambda self: True)

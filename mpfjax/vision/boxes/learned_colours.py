@@ -17,7 +17,8 @@ class LearnedBoxState(eqx.Module):
     """A `BoxState`, and the colours that the hypothesis has seen in its box lately.
 
     - `box`, `reference`, `previous`: as in `BoxState`.
-    - `appearance`: the learned histograms, (n, parts, channels, bins); at first those of the reference.
+    - `appearance`: the learned histograms, (n, parts, channels, bins); at first those of the
+      reference.
     """
 
     box: Float[Array, "*n 4"]
@@ -87,7 +88,7 @@ class LearnedColourModel(AbstractStateSpaceModel):
         states: LearnedBoxState,
         rate: float,
     ) -> LearnedBoxState:
-        """The states with appearance moved by rate · P(seen | x, y) towards what is in their boxes."""
+        """The states whose appearance moves by rate · P(seen | x, y) towards what is in the box."""
         log_seen, log_hidden, counts = self._seen(observation, states)
         shown = normalise(counts, self.colour_model.colour_weights[states.reference])
         # What holds no pixel, or more than can be counted, teaches nothing.
@@ -106,8 +107,8 @@ class LearnedColourModel(AbstractStateSpaceModel):
         model, bare = self.colour_model, _bare(states)
         counts, sides = model.counts(observation, bare)
         to_first = model.contrasted(counts, sides, bare, model.references[states.reference])
-        to_looks = model.contrasted(counts, sides, bare, states.appearance)
-        distances = self.anchor * to_first + (1 - self.anchor) * to_looks
+        to_learned = model.contrasted(counts, sides, bare, states.appearance)
+        distances = self.anchor * to_first + (1 - self.anchor) * to_learned
         log_hidden = -0.5 * self.hidden_distance / model.sigma**2
         return -0.5 * distances / model.sigma**2, log_hidden.astype(distances.dtype), counts
 
@@ -115,9 +116,10 @@ class LearnedColourModel(AbstractStateSpaceModel):
 class AdaptAppearance(AbstractPropagation):
     """Let every particle learn the colours in its box, as far as its object is likely seen.
 
-    appearance <- appearance + rate · P(seen | x, y) (h(x) - appearance), with P(seen | x, y) the share of the
-    first term in the likelihood of the `LearnedColourModel`. Rival hypotheses learn different
-    appearance, and the `anchor` of the model keeps the first frame's in the balance. The weights stay.
+    appearance <- appearance + rate · P(seen | x, y) (h(x) - appearance), with P(seen | x, y) the
+    share of the first term in the likelihood of the `LearnedColourModel`. Rival hypotheses learn
+    different appearance, and the `anchor` of the model keeps the first frame's in the balance. The
+    weights stay.
 
     What is seen changes what is expected (`approximate` is true). Raises `TypeError` for another
     model and `ValueError` for a rate outside [0, 1]. Use it after `Propagate`.
