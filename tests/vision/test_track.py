@@ -4,6 +4,7 @@ import itertools
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -52,9 +53,12 @@ def tracked(frames, detections, **options):
     return list(track(frames, detections, TRACKER, **options))
 
 
-def assert_same(some, others):
+def assert_same(some, others, same_rows=True):
+    """The same tracks, and where the same was given the same rows of it."""
     assert len(some) == len(others)
     for a, b in zip(some, others, strict=True):
+        if not same_rows:
+            a = a._replace(detections=b.detections)
         for left, right in zip(a, b, strict=True):
             np.testing.assert_array_equal(left, right)
 
@@ -135,7 +139,8 @@ def test_frames_from_the_middle_find_their_rows():
 
 def test_weak_detections_are_left_out_where_a_least_score_is_given():
     rows = walks()
-    assert_same(tracked(None, rows, min_score=1.5), tracked(None, rows[rows[:, 6] >= 1.5]))
+    strong = rows[rows[:, 6] >= 1.5]
+    assert_same(tracked(None, rows, min_score=1.5), tracked(None, strong), same_rows=False)
 
 
 @pytest.mark.parametrize("num_frames", [0, 1])
@@ -167,7 +172,7 @@ def test_what_cannot_be_tracked_is_left_out_with_one_warning(message, what, with
     with pytest.warns(RuntimeWarning, match=message) as caught:
         run = tracked(stills(), np.concatenate([bad, walks()]))
     assert len(caught) == 1
-    assert_same(run, with_pixels)
+    assert_same(run, with_pixels, same_rows=False)
 
 
 def test_two_thousand_detections_leave_the_strongest():
@@ -178,7 +183,7 @@ def test_two_thousand_detections_leave_the_strongest():
     strong = np.concatenate([walks(), more])
     with pytest.warns(RuntimeWarning, match="frame 4 has 2006, more than the 6 that there is room"):
         run = tracked(None, np.concatenate([weak, strong]))
-    assert_same(run, tracked(None, strong))
+    assert_same(run, tracked(None, strong), same_rows=False)
 
 
 def test_more_objects_than_room_are_flagged_and_the_strongest_kept():
@@ -284,6 +289,37 @@ def test_a_least_score_needs_scores():
         tracked(None, walks()[:, :6], min_score=0.5)
 
 
+# --- which detection is whose ---------------------------------------------------------------------
+
+
+def test_tracks_say_which_row_each_object_took_whatever_the_order_and_what_is_left_out():
+    rows = walks()
+    order = np.random.default_rng(0).permuted(np.tile(np.arange(3), (NUM_FRAMES, 1)), axis=1)
+    flat = [0.0, 0, 0, 5]
+    frames = [
+        np.array([*rows[rows[:, 0] == t + 1, 2:6], flat])[order[t]] for t in range(NUM_FRAMES)
+    ]
+    with pytest.warns(RuntimeWarning, match="boxes of no area"):
+        found = tracked(None, frames)
+    labels = [
+        {int(tracks.identities[m]): order[t][tracks.detections[m]] for m in range(2)}
+        for t, tracks in enumerate(found)
+    ]
+    assert all(each == labels[0] and set(each.values()) == {0, 1} for each in labels)
+    assert (found[-1].detections[found[-1].identities == 0] == -1).all()
+    gone = tracked(None, [*frames[:2], np.zeros((0, 4))])
+    assert (gone[-1].detections == -1).all()
+
+
+def test_boxes_stay_in_their_order_and_of_too_many_the_rows_are_known():
+    boxes = np.array([[0, 0, 4, 4], [9, 9, 5, 5], [20, 20, 6, 6.0]])
+    kept = Detections.from_boxes(boxes, 2, np.array([2.0, 1.0, 3.0]))
+    assert kept.rows.tolist() == [0, 2]
+    np.testing.assert_array_equal(kept.boxes[:, 0], [2, 23])
+    assert kept.rows_of(jnp.array([1, -1])).tolist() == [2, -1]
+    assert Detections.from_boxes(boxes, 4).rows.tolist() == [0, 1, 2, -1]
+
+
 # --- rows, trackers, drawn boxes -----------------------------------------------------------------
 
 
@@ -291,8 +327,9 @@ def said(identities, confirmed, shown):
     boxes = np.tile([10.0, 20.0, 4.0, 8.0], (len(identities), 1))
     unseen = np.zeros(len(identities), int)
     return Tracks(
-        boxes, np.array(identities), np.array(confirmed), unseen, np.array(False), np.array(shown)
-    )
+        boxes, np.array(identities), np.array(confirmed), unseen, np.array(False), np.array(shown),
+        np.full(len(identities), -1),
+    )  # fmt: skip
 
 
 def test_rows_online_are_of_what_was_known_then_and_offline_of_what_is_known_at_the_end():

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mpfjax.checks import check_finite, check_whole, given, is_series, saying, shown, to_rows
 
@@ -166,8 +166,8 @@ class Sieve:
 
     def __call__(
         self, found: DetectedBoxes, number: int, frame: np.ndarray | None
-    ) -> DetectedBoxes:
-        """The detections of a frame that can be tracked."""
+    ) -> tuple[DetectedBoxes, Int[np.ndarray, " k"]]:
+        """The detections of a frame that can be tracked, and their rows among all of them."""
         boxes, scores = _checked(found, number)
         keep = np.ones(len(boxes), bool)
         if self.min_score is not None and len(boxes):
@@ -192,7 +192,8 @@ class Sieve:
                     f"detections: frame {number} has boxes outside the frame, {size}; left out",
                 )
             keep &= inside
-        return DetectedBoxes(boxes[keep], None if scores is None else scores[keep])
+        kept = DetectedBoxes(boxes[keep], None if scores is None else scores[keep])
+        return kept, np.flatnonzero(keep).astype(np.int32)
 
 
 class Once:

@@ -9,6 +9,7 @@ from mpfjax.checks import check_share, check_type, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.indexing import take
+from mpfjax.vision.tracking.detections import Detections
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
     EXTENT,
@@ -72,7 +73,7 @@ class Births(AbstractMove):
         wanted &= ~jnp.any(covered & lives.alive[:, None], axis=0)
         # One that a stronger one covers is its double, even where that one founds none either.
         doubles = (overlap(found.boxes, found.boxes) > self.birth_overlap) & wanted[:, None]
-        return wanted & ~jnp.any(doubles & _stronger(found.scores), axis=0)
+        return wanted & ~jnp.any(doubles & _stronger(found), axis=0)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
@@ -81,7 +82,7 @@ class Births(AbstractMove):
         del key
         found, lives = observation.detections, mixture.memory[LIVES]
         founding = self.founding(mixture, observation)
-        source, born = _matched(founding, found.scores, ~lives.alive)
+        source, born = _matched(founding, found, ~lives.alive)
         seats, filled = self._seats(mixture, born)
         drawn = self._started(mixture, seats, take(found.boxes, source))
         particles = jax.tree.map(
@@ -158,18 +159,25 @@ class ShareMass(AbstractMove):
         return mixture.replace(log_weights=log_weights, log_scale=None)
 
 
-def _stronger(scores: Float[Array, " d"]) -> Bool[Array, "d d"]:
-    """Whether the first of a pair has the higher score, or an equal one and comes first."""
-    first = jnp.triu(jnp.ones((len(scores), len(scores)), bool), 1)
-    higher, equal = scores[:, None] > scores[None], scores[:, None] == scores[None]
-    return higher | (equal & first)
+def _ranks(found: Detections) -> Int[Array, " d"]:
+    """The place of each detection, strongest first, and of equally strong ones the largest."""
+    areas = jnp.prod(found.boxes[:, 2:], axis=1)
+    order = jnp.lexsort((-areas, -found.scores)).astype(jnp.int32)
+    return jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=jnp.int32))
+
+
+def _stronger(found: Detections) -> Bool[Array, "d d"]:
+    """Whether the first of a pair is the stronger one."""
+    ranks = _ranks(found)
+    return ranks[:, None] < ranks[None]
 
 
 def _matched(
-    wanted: Bool[Array, " d"], scores: Float[Array, " d"], free: Bool[Array, " m"]
+    wanted: Bool[Array, " d"], found: Detections, free: Bool[Array, " m"]
 ) -> tuple[Int[Array, " m"], Bool[Array, " m"]]:
     """For each free place the wanted row that it takes, strongest first, and whether it does."""
-    rows = jnp.argsort(jnp.where(wanted, -scores, jnp.inf), stable=True).astype(jnp.int32)
+    ranks = jnp.where(wanted, _ranks(found), len(wanted))
+    rows = jnp.argsort(ranks, stable=True).astype(jnp.int32)
     rank = jnp.cumsum(free, dtype=jnp.int32) - 1
     taken = free & (rank < jnp.sum(wanted, dtype=jnp.int32))
     return take(rows, jnp.clip(rank, 0, len(wanted) - 1)), taken

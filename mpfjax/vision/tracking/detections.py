@@ -5,9 +5,10 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.checks import as_numbers, check_whole, shown, to_array, to_rows
+from mpfjax.operations.indexing import take
 from mpfjax.vision.files.boxes import centred
 
 
@@ -17,11 +18,13 @@ class Detections(eqx.Module):
     - `boxes`: (d, 4), centre and size in pixels.
     - `valid`: (d,), which rows are detections.
     - `scores`: (d,), how sure the detector was of each, on any scale, higher for surer.
+    - `rows`: (d,), the row of each in what the detector gave; None counts them as they stand here.
     """
 
     boxes: Float[Array, "d 4"] = eqx.field(converter=to_array("boxes"))
     valid: Bool[Array, " d"] = eqx.field(converter=to_array("valid", floating=False))
     scores: Float[Array, " d"] = eqx.field(converter=to_array("scores"))
+    rows: Int[Array, " d"] | None = None
 
     @classmethod
     def from_boxes(
@@ -32,10 +35,10 @@ class Detections(eqx.Module):
     ) -> "Detections":
         """Boxes (x, y, w, h), top-left corner first, and a score for each, all equal where None.
 
-        Of too many, the strongest are kept, and of equally strong ones the largest. They may leave
-        the frame in part or as a whole. Raises `ValueError` for boxes that are not four finite
-        numbers each, or without area, for scores that are not one finite number for each box, and
-        for room for less than one.
+        They stay in their order. If there are too many, the strongest are kept, and of equally
+        strong ones the largest. They may leave the frame in part or as a whole. Raises
+        `ValueError` for boxes that are not four finite numbers each, or without area, for scores
+        that are not one finite number for each box, and for room for less than one.
         """
         check_whole(max_detections=max_detections)
         rows = to_rows(4, "boxes", boxes).astype(np.float32)
@@ -46,12 +49,21 @@ class Detections(eqx.Module):
             raise ValueError(f"boxes: {row.tolist()} has no area, or is not finite")
         strengths = _checked_scores(scores, len(rows))
         strongest = np.lexsort((-rows[:, 2] * rows[:, 3], -strengths))[:max_detections]
+        kept = np.sort(strongest)
         padded = np.ones((max_detections, 4), np.float32)
-        padded[: len(strongest)] = centred(rows[strongest])
+        padded[: len(kept)] = centred(rows[kept])
         padded_scores = np.zeros(max_detections, np.float32)
-        padded_scores[: len(strongest)] = strengths[strongest]
-        valid = np.arange(max_detections) < len(strongest)
-        return cls(jnp.asarray(padded), jnp.asarray(valid), jnp.asarray(padded_scores))
+        padded_scores[: len(kept)] = strengths[kept]
+        padded_rows = np.full(max_detections, -1, np.int32)
+        padded_rows[: len(kept)] = kept
+        valid = np.arange(max_detections) < len(kept)
+        return cls(*map(jnp.asarray, (padded, valid, padded_scores, padded_rows)))
+
+    def rows_of(self, indices: Int[Array, " m"]) -> Int[Array, " m"]:
+        """The rows in what the detector gave of the detections with these indices; -1 stays -1."""
+        if self.rows is None:
+            return indices
+        return jnp.where(indices >= 0, take(self.rows, jnp.maximum(indices, 0)), -1)
 
 
 def _checked_scores(scores: Any, number: int) -> np.ndarray:

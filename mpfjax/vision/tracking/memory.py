@@ -89,6 +89,12 @@ def shared_detections(mixture: ParticleMixture) -> Int[Array, " m"]:
     return mixture.memory.get(SHARED, nobody)
 
 
+def assigned_detections(mixture: ParticleMixture) -> Int[Array, " m"]:
+    """The index of the detection that each component took; -1 for all where no move assigns any."""
+    nobody = jnp.full(mixture.num_components, -1, jnp.int32)
+    return mixture.memory.get(ASSIGNED, nobody)
+
+
 def noises_of(mixture: ParticleMixture, model: DetectedObjectModel) -> Noises:
     """What was learned of the noises; the model's own where no move learns any."""
     return mixture.memory.get(NOISES, model.noises)

@@ -99,7 +99,7 @@ def _tracked(
 ) -> Iterator[Tracks]:
     state, once, advance = tracker.init(), Once(), _compiled()
     for number, still, found in _observed(stills, detector, first):
-        found = sieve(found, number, still)
+        found, kept = sieve(found, number, still)
         if len(found.boxes) > room:
             once.warn(
                 "detections",
@@ -117,7 +117,8 @@ def _tracked(
                 f"tracker: frame {number} has more objects than the {tracker.max_objects} that"
                 " there is room for, max_objects; the strongest are kept",
             )
-        yield tracks
+        taken = tracks.detections
+        yield tracks._replace(detections=np.where(taken >= 0, np.append(kept, -1)[taken], -1))
 
 
 def _advance(

@@ -32,7 +32,13 @@ from mpfjax.vision.tracking.camera import FollowCamera
 from mpfjax.vision.tracking.chain import check_chain
 from mpfjax.vision.tracking.deaths import Deaths
 from mpfjax.vision.tracking.detections import Detections
-from mpfjax.vision.tracking.memory import LIVES, Lives, frames_unseen, mean_boxes
+from mpfjax.vision.tracking.memory import (
+    LIVES,
+    Lives,
+    assigned_detections,
+    frames_unseen,
+    mean_boxes,
+)
 from mpfjax.vision.tracking.model import DetectedObjectModel, ObjectState, Pixels
 from mpfjax.vision.tracking.motion import PropagateObjects
 from mpfjax.vision.tracking.noise import LearnNoise
@@ -53,6 +59,8 @@ class Tracks(NamedTuple):
     - `unseen`: (m,), for how many frames none has; 0 while it is hidden by another one.
     - `full`: whether a detection that would have founded a component found no room.
     - `shown`: (m,), which are confirmed, and were seen a moment ago or are hidden: worth showing.
+    - `detections`: (m,), the row of the detection that each took in this frame, in what the
+      detector gave; -1 where it took none. Class labels, masks and features are found by it.
     """
 
     boxes: Float[Array, "m 4"]
@@ -61,6 +69,7 @@ class Tracks(NamedTuple):
     unseen: Int[Array, " m"]
     full: Bool[Array, ""]
     shown: Bool[Array, " m"]
+    detections: Int[Array, " m"]
 
     @property
     def corner_boxes(self) -> Float[Array, "m 4"]:
@@ -229,6 +238,7 @@ class ObjectTracker(eqx.Module):
             unseen=frames_unseen(state),
             full=lives.full,
             shown=lives.shown,
+            detections=detections.rows_of(assigned_detections(state)),
         )
 
     def look(
