@@ -25,7 +25,7 @@ nitpick_ignore_regex = [
     ("py:class", r"mpfjax\..*\.Abstract(BoxModel|RandomWalk)"),
     # What public classes hold or pass on, and users neither make nor read.
     ("py:class", r"mpfjax\..*\._\w+"),
-    ("py:class", r"mpfjax\.tuning\.(observing|problem|densities)\.\w+"),
+    ("py:class", r"mpfjax\.tuning\.(smc2_run|problem|densities)\.\w+"),
 ]
 
 html_theme = "furo"
