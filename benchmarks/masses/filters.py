@@ -51,6 +51,7 @@ FILTERS: dict[str, Make] = {
     "APF": _auxiliary(),
     "APF, rqmc": _auxiliary(noise="rqmc"),
     "MPF": _mixture(),
+    "MPF, as it comes": _mixture(regroup_every=3),
     "MPF, rqmc": _mixture(noise="rqmc"),
     "MPF, 4 draws": _mixture(num_draws=4),
     "MPF, rqmc, 4 draws": _mixture(noise="rqmc", num_draws=4),

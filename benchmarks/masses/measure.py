@@ -1,6 +1,7 @@
 """The errors of masses and of log Ẑ over runs, and the time of a step."""
 
 import time
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,14 +12,25 @@ from benchmarks.masses.scenes import Scene, masses
 
 # Runs of the filter that says what is true where nothing else does.
 REFERENCE_RUNS = 8
+# A mode with less of the mass is lost.
+LOST = 0.01
 _REPEATS = 5
 
 
-def truth(scene: Scene, num_particles: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The masses, and their standard errors: zero where a grid or symmetry tells them."""
-    if scene.exact is not None:
-        known = scene.exact[0]
-        return known, np.zeros_like(known)
+class Known(NamedTuple):
+    """What is true, and how surely: errors are zero where a grid or symmetry tells it."""
+
+    masses: np.ndarray
+    errors: np.ndarray
+    log_z: float
+    log_z_error: float
+
+
+def truth(scene: Scene, num_particles: int, seed: int) -> Known:
+    """The masses and log Z, by the plain filter of so many particles where nothing else does."""
+    if scene.exact is not None and scene.exact[1] is not None:
+        known, log_z = scene.exact
+        return Known(known, np.zeros_like(known), log_z, 0.0)
     filter = mpfjax.particle_filter(scene.model, num_particles)
     found = []
     for key in jax.random.split(jax.random.key(seed), REFERENCE_RUNS):
@@ -27,27 +39,46 @@ def truth(scene: Scene, num_particles: int, seed: int) -> tuple[np.ndarray, np.n
     # Each run counts by its Ẑ: the masses of all particles together.
     logs = np.array([float(log_z) for _, log_z in found])
     weights = np.exp(logs - logs.max())
+    log_z = float(logs.max() + np.log(weights.mean()))
+    log_z_error = float(weights.std(ddof=1) / weights.mean() / np.sqrt(len(weights)))
+    if scene.exact is not None:
+        known = scene.exact[0]
+        return Known(known, np.zeros_like(known), log_z, log_z_error)
     weights /= weights.sum()
     rows = np.stack([np.asarray(row) for row, _ in found])
     mean = weights @ rows
-    return mean, np.sqrt(np.sum((weights[:, None] * (rows - mean)) ** 2, axis=0))
+    errors = np.sqrt(np.sum((weights[:, None] * (rows - mean)) ** 2, axis=0))
+    return Known(mean, errors, log_z, log_z_error)
 
 
 def errors(
-    scene: Scene, filter: mpfjax.Filter, known: np.ndarray, seeds: int, seed: int
+    scene: Scene, filter: mpfjax.Filter, known: Known, seeds: int, seed: int
 ) -> dict[str, float]:
-    """The RMS error of the masses at the end, and the standard deviation of log Ẑ."""
+    """Those of `summary`, over runs of the filter."""
     keys = jax.random.split(jax.random.key(seed), seeds)
     run = mpfjax.monte_carlo(keys, filter, scene.observations, _nothing)
     found = np.asarray(jax.vmap(lambda mixture: masses(scene, mixture))(run.final))
-    return summary(found, np.asarray(run.log_marginal_likelihood), known)
+    return summary(found, np.asarray(run.log_marginal_likelihood), known, scene.truth)
 
 
-def summary(found: np.ndarray, logs: np.ndarray, known: np.ndarray) -> dict[str, float]:
-    """Errors of the masses (runs, regions) and spread of log Ẑ (runs,), with standard errors."""
-    squares = np.mean((found - known) ** 2, axis=1)
+def summary(found: np.ndarray, logs: np.ndarray, known: Known, region: int) -> dict[str, float]:
+    """Errors of the masses (runs, regions) and of log Ẑ (runs,), with standard errors.
+
+    `lost` is the share of runs that leave the true `region` less than a hundredth of the mass.
+    """
+    squares = np.mean((found - known.masses) ** 2, axis=1)
     rmse, runs = float(np.sqrt(squares.mean())), len(logs)
+    lost = float(np.mean(found[:, region] < LOST))
+    log_squares = (logs - known.log_z) ** 2
+    log_rmse = float(np.sqrt(log_squares.mean()))
     return {
+        "mass_of_truth": float(found[:, region].mean()),
+        "lost": lost,
+        "lost_error": float(np.sqrt(lost * (1 - lost) / runs)),
+        "log_z_rmse": log_rmse,
+        "log_z_rmse_error": float(
+            log_squares.std(ddof=1) / np.sqrt(runs) / max(2 * log_rmse, 1e-12)
+        ),
         "mass_rmse": rmse,
         "mass_rmse_error": float(squares.std(ddof=1) / np.sqrt(runs) / max(2 * rmse, 1e-12)),
         "largest_mass": float(np.median(found.max(axis=1))),

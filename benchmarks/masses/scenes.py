@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 import mpfjax
-from benchmarks.masses import bearings, corridor, look_alikes
+from benchmarks.masses import bearings, corridor, jumps, look_alikes, mirror, terrain
 from mpfjax.exact import grid_filter
 
 GRID = jnp.linspace(-5.0, 5.0, 4001)
+JUMP_GRID = jnp.linspace(-30.0, 30.0, 2401)
 
 
 class Scene(NamedTuple):
@@ -22,6 +23,7 @@ class Scene(NamedTuple):
     - `grouping`: the coordinates and units in which components are grouped.
     - `lookahead`: (y_t, states) -> log ν of each particle, for resampling ahead.
     - `exact`: the masses and log Z, where a grid or symmetry tells them; else None.
+    - `truth`: the region that the observations come from.
     """
 
     model: mpfjax.AbstractStateSpaceModel
@@ -32,6 +34,7 @@ class Scene(NamedTuple):
     grouping: dict[str, Any]
     lookahead: Callable[[PyTree, PyTree], Array]
     exact: tuple[np.ndarray, float | None] | None = None
+    truth: int = 0
 
 
 def flattened(model: Any, moved: Callable[[PyTree], PyTree]) -> Callable[[PyTree, PyTree], Array]:
@@ -70,6 +73,7 @@ def make_quadratic(num_steps: int, seed: int) -> Scene:
         grouping={},
         lookahead=flattened(model, lambda states: states),
         exact=(np.array([1 - above, above]), float(grid.log_marginal_likelihood)),
+        truth=int(path[-1] > 0),
     )  # fmt: skip
 
 
@@ -83,6 +87,56 @@ def make_bearings(num_steps: int, seed: int) -> Scene:
         max_components=4,
         grouping={"features": bearings.position, "scale": 4.0},
         lookahead=flattened(model, model.transition_mean),
+        truth=1,
+    )  # fmt: skip
+
+
+def make_mirror(num_steps: int, seed: int) -> Scene:
+    """Two halves in four dimensions, each the mirror image of the other."""
+    model = mirror.MirrorModel()
+    return Scene(
+        model, mirror.simulate(model, num_steps, seed),
+        region=lambda states: (states[:, 1] > 0).astype(jnp.int32),
+        num_regions=2,
+        max_components=4,
+        grouping={"features": lambda states: states[:, :2], "scale": 1.0},
+        lookahead=flattened(model, model.transition_mean),
+        exact=(np.array([0.5, 0.5]), None),
+        truth=1,
+    )  # fmt: skip
+
+
+def make_terrain(num_steps: int, seed: int) -> Scene:
+    """A flight over hills: many modes, one of them near the vehicle."""
+    model = terrain.make_landscape(seed + 3)
+    path, observations = terrain.simulate(model, num_steps, seed + 3)
+    place = jnp.asarray(path[-1])
+    return Scene(
+        model, observations,
+        region=lambda states: terrain.is_near(states, place),
+        num_regions=2,
+        max_components=8,
+        grouping={"scale": 1.0},
+        lookahead=flattened(model, lambda states: states + model.velocity[None]),
+        truth=1,
+    )  # fmt: skip
+
+
+def make_jumps(num_steps: int, seed: int) -> Scene:
+    """A target that jumps now and then: two sides, and which of them is settled by and by."""
+    model = jumps.JumpModel()
+    path, observations = jumps.simulate(model, num_steps, seed + 4)
+    grid = grid_filter(model, jnp.asarray(observations), JUMP_GRID)
+    above = float(grid.mass_above(0.0)[-1])
+    return Scene(
+        model, observations,
+        region=lambda states: (states > 0).astype(jnp.int32),
+        num_regions=2,
+        max_components=4,
+        grouping={"scale": 1.0},
+        lookahead=flattened(model, lambda states: states),
+        exact=(np.array([1 - above, above]), float(grid.log_marginal_likelihood)),
+        truth=int(path[-1] > 0),
     )  # fmt: skip
 
 
@@ -104,6 +158,9 @@ SCENES: dict[str, tuple[Callable[[int, int], Scene], int]] = {
     "corridor": (make_corridor, 80),
     "quadratic": (make_quadratic, 100),
     "bearings": (make_bearings, 40),
+    "mirror": (make_mirror, 40),
+    "terrain": (make_terrain, 30),
+    "jumps": (make_jumps, 40),
     "look-alikes": (make_look_alikes, 30),
 }
 

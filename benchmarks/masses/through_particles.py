@@ -17,7 +17,7 @@ import numpy as np
 import particles
 from jaxtyping import Array, PyTree
 
-from benchmarks.masses.measure import summary
+from benchmarks.masses.measure import Known, summary
 from benchmarks.masses.scenes import Scene
 
 SQMC = "SQMC of particles"
@@ -86,7 +86,7 @@ class FeynmanKac(particles.FeynmanKac):
 
 
 def errors_and_time(
-    scene: Scene, num_particles: int, known: np.ndarray, seeds: int, seed: int
+    scene: Scene, num_particles: int, known: Known, seeds: int, seed: int
 ) -> tuple[dict[str, float], float]:
     """The errors over runs, and the median milliseconds of a step."""
     model = FeynmanKac(scene)
@@ -100,11 +100,11 @@ def errors_and_time(
             continue
         seconds.append(time.perf_counter() - start)
         regions = np.asarray(model.regions(_columns(smc.X)))
-        found.append(np.bincount(regions, weights=smc.W, minlength=len(known)))
+        found.append(np.bincount(regions, weights=smc.W, minlength=scene.num_regions))
         logs.append(smc.logLt)
     steps = len(scene.observations)
     milliseconds = 1e3 * float(np.median(seconds)) / steps
-    return summary(np.array(found), np.array(logs), known), milliseconds
+    return summary(np.array(found), np.array(logs), known, scene.truth), milliseconds
 
 
 def _normal(shares: Array) -> Array:

@@ -13,6 +13,8 @@ from benchmarks.masses.filters import FILTERS
 from benchmarks.masses.scenes import SCENES, masses
 from tests.marking import thorough
 
+_LAWS = ["bearings", *thorough(["corridor", "mirror", "terrain", "jumps"])]
+
 
 def test_what_the_arrays_hear_has_no_sign():
     motion = jnp.array([[3.0, 4.0, 0.0, 0.0], [3.0, -4.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0]])
@@ -31,7 +33,7 @@ def test_the_doors_of_the_corridor_look_alike():
     assert list(np.asarray(corridor.section(model, states, jnp.float32(1.3)))) == [0, 1, 2, 3, 0]
 
 
-@pytest.mark.parametrize("name", ["bearings", *thorough(["corridor"])])
+@pytest.mark.parametrize("name", _LAWS)
 def test_noise_and_draws_have_one_law(name):
     """Of x_0 and of a step: the draws of the model and those from noise, by their moments."""
     make, _ = SCENES[name]
@@ -55,9 +57,13 @@ def test_noise_and_draws_have_one_law(name):
 
 def test_errors_are_those_of_the_numbers():
     found = np.array([[0.5, 0.5], [1.0, 0.0]])
-    entry = measure.summary(found, np.array([1.0, 3.0]), np.array([0.5, 0.5]))
+    known = measure.Known(np.array([0.5, 0.5]), np.zeros(2), 2.0, 0.0)
+    entry = measure.summary(found, np.array([1.0, 4.0]), known, 1)
     assert entry["mass_rmse"] == pytest.approx(np.sqrt(0.125))
-    assert entry["log_z_sd"] == pytest.approx(np.sqrt(2))
+    assert entry["log_z_sd"] == pytest.approx(np.sqrt(4.5))
+    assert entry["log_z_rmse"] == pytest.approx(np.sqrt(2.5))
+    assert entry["lost"] == 0.5
+    assert entry["mass_of_truth"] == 0.25
     assert entry["largest_mass"] == pytest.approx(0.75)
 
 
@@ -65,11 +71,19 @@ def test_a_reference_without_a_grid_agrees_with_one():
     """The corridor is known by symmetry; the reference filter finds the same."""
     make, _ = SCENES["corridor"]
     scene = make(5, 0)
-    known, error = measure.truth(scene, 10, 0)
-    assert (error == 0).all()
-    found, error = measure.truth(scene._replace(exact=None), 20_000, 0)
-    assert (np.abs(found - known) <= 5 * error).all()
-    assert found.sum() == pytest.approx(1.0, abs=1e-4)
+    exact = measure.truth(scene, 10, 0)
+    assert (exact.errors == 0).all()
+    found = measure.truth(scene._replace(exact=None), 20_000, 0)
+    assert (np.abs(found.masses - exact.masses) <= 5 * found.errors).all()
+    assert found.masses.sum() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_a_reference_finds_the_log_z_of_the_grid():
+    scene = SCENES["jumps"][0](3, 0)
+    exact = measure.truth(scene, 10, 0)
+    found = measure.truth(scene._replace(exact=None), 20_000, 0)
+    assert abs(found.log_z - exact.log_z) <= 4 * found.log_z_error
+    assert (np.abs(found.masses - exact.masses) <= 5 * found.errors).all()
 
 
 def test_masses_are_those_of_regions():
