@@ -28,9 +28,9 @@ class Known(NamedTuple):
 
 def truth(scene: Scene, num_particles: int, seed: int) -> Known:
     """The masses and log Z, by the plain filter of so many particles where nothing else does."""
-    if scene.exact is not None and scene.exact[1] is not None:
-        known, log_z = scene.exact
-        return Known(known, np.zeros_like(known), log_z, 0.0)
+    exactly, exact_log_z = (None, None) if scene.exact is None else scene.exact
+    if exactly is not None and exact_log_z is not None:
+        return Known(exactly, np.zeros_like(exactly), exact_log_z, 0.0)
     filter = mpfjax.particle_filter(scene.model, num_particles)
     found = []
     for key in jax.random.split(jax.random.key(seed), REFERENCE_RUNS):
@@ -41,9 +41,8 @@ def truth(scene: Scene, num_particles: int, seed: int) -> Known:
     weights = np.exp(logs - logs.max())
     log_z = float(logs.max() + np.log(weights.mean()))
     log_z_error = float(weights.std(ddof=1) / weights.mean() / np.sqrt(len(weights)))
-    if scene.exact is not None:
-        known = scene.exact[0]
-        return Known(known, np.zeros_like(known), log_z, log_z_error)
+    if exactly is not None:
+        return Known(exactly, np.zeros_like(exactly), log_z, log_z_error)
     weights /= weights.sum()
     rows = np.stack([np.asarray(row) for row, _ in found])
     mean = weights @ rows

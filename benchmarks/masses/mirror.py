@@ -44,7 +44,7 @@ class MirrorModel(mpfjax.AbstractStateSpaceModel):
 
     def initial_from_noise(self, noise: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
         """The same from standard normal numbers."""
-        return _START[None] + _SPREAD[None] * noise
+        return jnp.asarray(_START)[None] + jnp.asarray(_SPREAD)[None] * noise
 
     def transition_from_noise(
         self, noise: Float[Array, "n 2"], states: Float[Array, "n 4"]

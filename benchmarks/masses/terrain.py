@@ -80,8 +80,10 @@ def make_landscape(seed: int) -> Terrain:
     waves = (2 * np.pi / lengths * np.array([np.cos(directions), np.sin(directions)])).T
     amplitudes = lengths / np.sqrt(np.sum(lengths**2) / 2)
     phases = rng.uniform(0, 2 * np.pi, size=_NUM_WAVES)
-    arrays = (np.asarray(each, np.float32) for each in (waves, amplitudes, phases, [0.12, 0.05]))
-    return Terrain(*(jnp.asarray(each) for each in arrays))
+    numbers = lambda values: jnp.asarray(np.asarray(values, np.float32))  # noqa: E731
+    return Terrain(
+        numbers(waves), numbers(amplitudes), numbers(phases), velocity=numbers([0.12, 0.05])
+    )
 
 
 def simulate(model: Terrain, num_steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
