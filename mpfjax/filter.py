@@ -8,13 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import (
-    check_callable,
+    check_flag,
     check_key,
     check_one_of,
     check_type,
     check_whole,
-    is_series,
-    shown,
 )
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import (
@@ -36,8 +34,9 @@ from mpfjax.moves.base import (
 from mpfjax.moves.eve_indices import EVE_INDICES, evidence_variance, mass_variances
 from mpfjax.moves.every import Every, with_inner
 from mpfjax.moves.island_interaction import IslandInteraction
+from mpfjax.moves.memory import check_memory
 from mpfjax.moves.parents import runner
-from mpfjax.moves.results import check_result, check_weighed
+from mpfjax.moves.results import as_moves, check_result, check_weighed
 from mpfjax.moves.sharing import give_inputs, tie, untie
 from mpfjax.observations import Fault, faults_of, one_input, one_observation, raise_faults
 from mpfjax.operations.across_islands import excess_over_islands, island_index, num_islands
@@ -96,6 +95,8 @@ class Filter(eqx.Module):
     - `initial_moves`: regrouping of x_0, such as `KMeans(reseed=True)`.
     - `initial_noise`: what x_0 is made of where the model has `initial_from_noise`: "independent",
       as the model's own `sample_initial` draws it, "rqmc" or "stratified"; see `Propagate`.
+    - `starts_empty`: at time 0 no slot holds a particle, and all may be emptied again. Moves found
+      components, as the births of a tracker. A step without any mass has an increment of zero.
 
     Raises `ValueError` for N < 1, M < 1, N < M, no moves, moves that never see an observation, or
     fewer slots than `particles_per_component` asks for.
@@ -107,6 +108,7 @@ class Filter(eqx.Module):
     num_particles: int = eqx.field(static=True)
     num_components: int = eqx.field(static=True)
     initial_noise: str = eqx.field(static=True)
+    starts_empty: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -116,10 +118,11 @@ class Filter(eqx.Module):
         num_components: int = 1,
         initial_moves: Iterable[AbstractRegrouping] = (),
         initial_noise: str = "independent",
+        starts_empty: bool = False,
     ) -> None:
         check_model(model, "Filter")
-        moves = _as_moves(moves, "moves")
-        initial_moves = _as_moves(initial_moves, "initial_moves")
+        moves = as_moves(moves, "moves")
+        initial_moves = as_moves(initial_moves, "initial_moves")
         _check_sizes(num_particles, num_components)
         check_weighed(moves)
         for move in with_inner(moves):
@@ -129,10 +132,7 @@ class Filter(eqx.Module):
                     f"particles_per_component: {per_component} for each of {num_components}"
                     f" components needs more than num_particles, {num_particles}"
                 )
-        held = [move for move in with_inner(moves) if isinstance(move, AbstractMove)]
-        names = [name for move in held for name in _own_memory(move)]
-        if len(set(names)) < len(names):
-            raise ValueError(f"moves: two of them would share one memory, of {sorted(names)}")
+        check_memory(moves)
         runner(moves)
         self.model = model
         self._moves = tie(moves, model)
@@ -140,7 +140,9 @@ class Filter(eqx.Module):
         self.num_particles = int(num_particles)
         self.num_components = int(num_components)
         check_one_of(NOISES, initial_noise=initial_noise)
+        check_flag(starts_empty=starts_empty)
         self.initial_noise = initial_noise
+        self.starts_empty = bool(starts_empty)
 
     @property
     def moves(self) -> tuple[Any, ...]:
@@ -177,6 +179,8 @@ class Filter(eqx.Module):
         mixture = mixture.replace(memory=memory)
         for move_key, move in zip(keys[1:], self.initial_moves, strict=True):
             mixture = move(move_key, mixture)
+        if self.starts_empty:
+            mixture = mixture.replace(log_weights=jnp.full_like(mixture.log_weights, -jnp.inf))
         return mixture
 
     def with_inputs(self, inputs: PyTree) -> "Filter":
@@ -249,7 +253,7 @@ class Filter(eqx.Module):
                 mixture = moved
                 continue
             if not isinstance(move, _KEEP_MASS):
-                moved, log_growth = _normalise(moved, mixture.log_weights)
+                moved, log_growth = _normalise(moved, mixture, self.starts_empty)
                 increment += log_growth
             mixture = self._forgetting(moved)
         return mixture.replace(parents=None), _report(mixture, increment, resampled)
@@ -319,9 +323,10 @@ def sample_initial(
 
 
 def _normalise(
-    mixture: ParticleMixture, previous_log_weights: Float[Array, " n"]
+    mixture: ParticleMixture, previous: ParticleMixture, may_be_empty: bool
 ) -> tuple[ParticleMixture, Float[Array, ""]]:
-    """Remove the growth of the mass; if no mass is left, take the previous weights.
+    """Remove the growth of the mass. If no mass is left, take the previous weights or, where a
+    mixture may be empty, none.
 
     The scale is removed first, which is exact. Added to it, the sum of the weights would be lost to
     rounding.
@@ -334,8 +339,12 @@ def _normalise(
     normalised = (mixture.log_weights - log_largest) + log_share
     # A comparison with NaN is false, but NaN is not a step of zero likelihood.
     keep = has_mass | jnp.isnan(log_total)
-    log_weights = jnp.where(keep, normalised, previous_log_weights)
-    return mixture.replace(log_weights=log_weights, log_scale=None), log_scale + log_total
+    without_mass = mixture.log_weights if may_be_empty else previous.log_weights
+    log_weights = jnp.where(keep, normalised, without_mass)
+    log_growth = log_scale + log_total
+    if may_be_empty:
+        log_growth = jnp.where(keep, log_growth, 0.0)
+    return mixture.replace(log_weights=log_weights, log_scale=None), log_growth
 
 
 def _report(
@@ -371,20 +380,6 @@ def split_keys(key: Key[Array, ""], num: int) -> list[Key[Array, ""]]:
     same draws.
     """
     return list(split(key, num))
-
-
-def _own_memory(move: AbstractMove) -> list[str]:
-    return [move.name] if isinstance(move, Every) else list(move.initial_memory(1))
-
-
-def _as_moves(moves: Any, name: str) -> tuple[Any, ...]:
-    """The moves as a tuple; a `ValueError` for what is none, or a single one without its list."""
-    if not is_series(moves):
-        raise ValueError(f"{name}: {shown(moves)} is not a list of moves")
-    moves = tuple(moves)
-    for move in moves:
-        check_callable("a move, (key, mixture, observation) -> mixture", **{name: move})
-    return moves
 
 
 def _check_sizes(num_particles: int, num_components: int) -> None:

@@ -38,8 +38,9 @@ FLOORS = {
         "generator", "positions", "sobol", "hilbert", "sorting", "compiling",
     ),
     "moves": (
-        "base", "eve_indices", "sharing", "results", "island_interaction", "every", "regrouping",
-        "resampling", "prune", "propagation", "metropolis", "objects", "conditional", "parents",
+        "base", "eve_indices", "sharing", "results", "island_interaction", "every", "memory",
+        "regrouping", "resampling", "prune", "propagation", "metropolis", "objects", "conditional",
+        "parents",
     ),
     "vision": ("files", "colour", "scenes", "tracking", "boxes"),
     "running": (

@@ -56,6 +56,11 @@ class AbstractMove(eqx.Module):
         del key
         return mixture
 
+    @property
+    def reads(self) -> frozenset[str]:
+        """Names of the memory that other moves keep and this one looks at."""
+        return frozenset()
+
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
         """What the move remembers from step to step, under its own name; most remember nothing."""
         del num_components

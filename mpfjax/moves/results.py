@@ -1,12 +1,22 @@
-"""What a filter asks of its moves: that one weighs, and that each returns a mixture."""
+"""What a filter asks of its moves: that they are some, one weighs, and each returns a mixture."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from mpfjax.checks import shown
+from mpfjax.checks import check_callable, is_series, shown
 from mpfjax.mixture import ParticleMixture
+
+
+def as_moves(moves: Any, name: str) -> tuple[Any, ...]:
+    """The moves as a tuple; a `ValueError` for what is none, or a single one without its list."""
+    if not is_series(moves):
+        raise ValueError(f"{name}: {shown(moves)} is not a list of moves")
+    moves = tuple(moves)
+    for move in moves:
+        check_callable("a move, (key, mixture, observation) -> mixture", **{name: move})
+    return moves
 
 
 def check_result(moved: Any, mixture: ParticleMixture, move: Any) -> ParticleMixture:

@@ -118,7 +118,7 @@ def test_what_will_not_do_is_named(as_installed, message, num_steps, moves):
 def test_a_filter_looks_into_it():
     with pytest.raises(ValueError, match="particles_per_component: 20 for each of 3"):
         chain(Every(2, [Resample(particles_per_component=20)]))
-    with pytest.raises(ValueError, match="moves: two of them would share one memory"):
+    with pytest.raises(ValueError, match="moves: Every and Every would share one memory"):
         chain(Every(2, [KMeans(1)]), Every(2, [KMeans(2)]))
     with pytest.raises(ValueError, match="regroup_every: 0"):
         mpfjax.mixture_particle_filter(MODEL, 40, 3, regroup_every=0)

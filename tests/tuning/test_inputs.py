@@ -104,7 +104,7 @@ def test_fit_ends_where_the_likelihood_is_highest():
 
 @pytest.mark.thorough
 def test_the_score_of_the_posterior():
-    """The gradient that other libraries' samplers take, averaged over seeds, beside the exact one."""
+    """The gradient that other libraries' samplers take, over seeds, beside the exact one."""
     filter = mpfjax.particle_filter(Driven(), 200, gradient="stop")
     given = {"log_prior": log_prior, "parameters": PARAMETERS, "inputs": INPUTS}
     density = log_density(filter, OBSERVATIONS, **given)

@@ -560,10 +560,10 @@ def weighing_by_colours():
             "LearnAppearance and LearnAppearance would share",
         ),
         ([RankScores(), *TRACKER.moves], "RankScores and RankScores would share one memory"),
-        (chain_without(Deaths), "a tracker needs Deaths"),
-        (chain_without(Assign), "PropagateObjects needs Assign"),
-        (chain_without(RankScores), "FollowCamera needs RankScores"),
-        (weighing_by_colours(), "PropagateObjects weighs by colours .* needs LearnAppearance"),
+        (chain_without(Deaths), "(?s:.*) lacks Deaths"),
+        (chain_without(Assign), "PropagateObjects reads the memory '(assigned|doubts).*'"),
+        (chain_without(RankScores), "FollowCamera reads the memory 'scores'"),
+        (weighing_by_colours(), "PropagateObjects reads the memory 'references'"),
     ],
 )
 def test_a_chain_that_cannot_run_is_refused(moves, said):

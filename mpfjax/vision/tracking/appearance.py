@@ -37,6 +37,11 @@ class LearnAppearance(AbstractMove):
         check_share(adaptation=self.adaptation, contact=self.contact)
 
     @property
+    def reads(self) -> frozenset[str]:
+        """The memory that it needs of other moves."""
+        return frozenset({ASSIGNED, LIVES})
+
+    @property
     def approximate(self) -> bool:
         """True: what is seen changes what is expected."""
         return True

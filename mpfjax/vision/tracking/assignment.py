@@ -74,6 +74,11 @@ class Assign(AbstractMove):
         )
 
     @property
+    def reads(self) -> frozenset[str]:
+        """The memory that it needs of other moves."""
+        return frozenset({SCORES, LIVES})
+
+    @property
     def approximate(self) -> bool:
         """True: the likeliest assignment is taken for the only one."""
         return True

@@ -57,6 +57,11 @@ class Births(AbstractMove):
         check_share(birth_overlap=self.birth_overlap)
 
     @property
+    def reads(self) -> frozenset[str]:
+        """The memory that it needs of other moves."""
+        return frozenset({ASSIGNED, LIVES, SCORES, EXTENT})
+
+    @property
     def approximate(self) -> bool:
         """True: mass appears where a detection is."""
         return True

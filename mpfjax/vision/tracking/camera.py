@@ -42,6 +42,11 @@ class FollowCamera(AbstractMove):
         check_share(rate=self.rate)
 
     @property
+    def reads(self) -> frozenset[str]:
+        """The memory that it needs of other moves."""
+        return frozenset({LIVES, SCORES})
+
+    @property
     def approximate(self) -> bool:
         """True: what is common is taken for the camera's."""
         return True

@@ -59,6 +59,11 @@ class Deaths(AbstractMove):
         check_positive(contact=self.contact)
 
     @property
+    def reads(self) -> frozenset[str]:
+        """The memory that it needs of other moves."""
+        return frozenset({ASSIGNED, SCORES})
+
+    @property
     def approximate(self) -> bool:
         """True: a component's mass is thrown away."""
         return True

@@ -1,6 +1,6 @@
 """Objects that move with inertia, and are seen by a detector and by their colours."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mpfjax.checks import check_positive, check_positive_array, given, to_array
+from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.operations.indexing import take
 from mpfjax.operations.matrices import row_sums
 from mpfjax.vision.colour.histograms import IntegralHistogram, bhattacharyya, normalise
@@ -106,6 +107,27 @@ class ObjectState(eqx.Module):
     def boxes(self) -> Float[Array, "*n 4"]:
         """Centre and size in pixels."""
         return boxes_of(self.place)
+
+
+class NoObjectYet(AbstractStateSpaceModel):
+    """x_0 of a tracker, whose slots are all empty: detections found its components later."""
+
+    handles_missing = True  # absent detections are no error
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> ObjectState:
+        """States that no slot holds yet."""
+        del key
+        return ObjectState.nowhere(num_particles)
+
+    def sample_transition(self, key: Key[Array, ""], states: ObjectState) -> ObjectState:
+        """The same: `PropagateObjects` is what moves objects."""
+        del key
+        return states
+
+    def log_likelihood(self, observation: Any, states: ObjectState) -> Float[Array, " n"]:
+        """Zero: `PropagateObjects` is what weighs them."""
+        del observation
+        return jnp.zeros(states.label.shape)
 
 
 class Noises(NamedTuple):

@@ -43,6 +43,12 @@ class PropagateObjects(AbstractPropagation):
 
     model: DetectedObjectModel
 
+    @property
+    def reads(self) -> frozenset[str]:
+        """The memory that it needs of other moves."""
+        names = {ASSIGNED, DOUBTS, SCORES}
+        return frozenset(names if self.model.sigma is None else names | {REFERENCES})
+
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:

@@ -79,6 +79,11 @@ class LearnNoise(AbstractMove):
         check_whole(first=self.first)
 
     @property
+    def reads(self) -> frozenset[str]:
+        """The memory that it needs of other moves."""
+        return frozenset({ASSIGNED, LIVES, SCORES})
+
+    @property
     def approximate(self) -> bool:
         """True: what is seen changes what is expected."""
         return True

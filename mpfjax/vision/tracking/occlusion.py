@@ -53,6 +53,11 @@ class ShareDetections(AbstractMove):
         check_whole(0, recent=self.recent)
 
     @property
+    def reads(self) -> frozenset[str]:
+        """What it needs of other moves."""
+        return frozenset({ASSIGNED, LIVES})
+
+    @property
     def approximate(self) -> bool:
         """True: what is likely hidden is taken for hidden."""
         return True

@@ -18,10 +18,10 @@ from mpfjax.checks import (
     is_series,
     shown,
 )
+from mpfjax.filter import Filter, step_and_faults
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractResampling
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration
-from mpfjax.operations.floats import default_float
 from mpfjax.vision.colour.bins import AbstractColours, HSVColours
 from mpfjax.vision.colour.histograms import integral_histogram
 from mpfjax.vision.colour.sampled_histograms import SampledBoxes, SampledHistogram
@@ -29,7 +29,6 @@ from mpfjax.vision.tracking.appearance import LearnAppearance
 from mpfjax.vision.tracking.assignment import Assign
 from mpfjax.vision.tracking.births import Births, ShareMass
 from mpfjax.vision.tracking.camera import FollowCamera
-from mpfjax.vision.tracking.chain import check_chain
 from mpfjax.vision.tracking.deaths import Deaths
 from mpfjax.vision.tracking.detections import Detections
 from mpfjax.vision.tracking.memory import (
@@ -39,7 +38,7 @@ from mpfjax.vision.tracking.memory import (
     frames_unseen,
     mean_boxes,
 )
-from mpfjax.vision.tracking.model import DetectedObjectModel, ObjectState, Pixels
+from mpfjax.vision.tracking.model import DetectedObjectModel, NoObjectYet, ObjectState, Pixels
 from mpfjax.vision.tracking.motion import PropagateObjects
 from mpfjax.vision.tracking.noise import LearnNoise
 from mpfjax.vision.tracking.observation import TrackedFrame
@@ -71,6 +70,20 @@ class Tracks(NamedTuple):
     shown: Bool[Array, " m"]
     detections: Int[Array, " m"]
 
+    @classmethod
+    def of(cls, mixture: ParticleMixture, detections: Detections) -> "Tracks":
+        """What is tracked in a mixture, after a step with these detections."""
+        lives: Lives = mixture.memory[LIVES]
+        return cls(
+            boxes=mean_boxes(mixture),
+            identities=lives.identities,
+            confirmed=lives.confirmed,
+            unseen=frames_unseen(mixture),
+            full=lives.full,
+            shown=lives.shown,
+            detections=detections.rows_of(assigned_detections(mixture)),
+        )
+
     @property
     def corner_boxes(self) -> Float[Array, "m 4"]:
         """The boxes (x, y, w, h) with (x, y) the top-left corner, as files have them."""
@@ -80,7 +93,8 @@ class Tracks(NamedTuple):
 class ObjectTracker(eqx.Module):
     """A mixture particle filter with a component for each object, born and ended by detections.
 
-    A step is a chain of moves on a `ParticleMixture`, each with a memory of its own:
+    `filter` is that `Filter`, which starts empty; `run_filter` takes it, with `TrackedFrame`s for
+    observations. A step is a chain of moves on a `ParticleMixture`, each with a memory of its own:
 
     - `RankScores`: which detections are strong, by the scores seen so far;
     - `FollowCamera`: what all objects move in common;
@@ -122,10 +136,8 @@ class ObjectTracker(eqx.Module):
     needs the memory of one that is not there.
     """
 
-    moves: tuple[AbstractMove, ...]
+    filter: Filter
     colours: AbstractColours
-    max_objects: int = eqx.field(static=True)
-    particles_per_object: int = eqx.field(static=True)
     exact_colours: bool = eqx.field(static=True)
 
     def __init__(
@@ -183,31 +195,34 @@ class ObjectTracker(eqx.Module):
                 LearnAppearance(colours),
                 ShareMass(),
             )
-        self.moves = tuple(moves)
+        size = max_objects * particles_per_object
+        self.filter = Filter(NoObjectYet(), moves, size, max_objects, starts_empty=True)
         self.colours = colours
-        self.max_objects = int(max_objects)
-        self.particles_per_object = int(particles_per_object)
         self.exact_colours = bool(exact_colours)
+
+    @property
+    def moves(self) -> tuple[AbstractMove, ...]:
+        """The moves of one step."""
+        return self.filter.moves
+
+    @property
+    def max_objects(self) -> int:
+        """M, how many objects there is room for."""
+        return self.filter.num_components
+
+    @property
+    def particles_per_object(self) -> int:
+        """P."""
+        return self.filter.num_particles // self.filter.num_components
 
     @property
     def approximate(self) -> bool:
         """Whether any move departs from the exact recursion."""
-        return any(move.approximate for move in self.moves)
+        return self.filter.approximate
 
     def init(self) -> ParticleMixture:
         """Nothing tracked yet: every component dead, every slot empty."""
-        m, n = self.max_objects, self.max_objects * self.particles_per_object
-        memory = {}
-        for move in self.moves:
-            memory |= move.initial_memory(m)
-        return ParticleMixture(
-            particles=ObjectState.nowhere(n),
-            log_weights=jnp.full(n, -jnp.inf, default_float()),
-            component_indicators=jnp.zeros(n, jnp.int32),
-            ancestor_indices=jnp.arange(n, dtype=jnp.int32),
-            num_components=m,
-            memory=memory,
-        )
+        return self.filter.init(jax.random.key(0))
 
     @eqx.filter_jit
     def step(
@@ -228,18 +243,8 @@ class ObjectTracker(eqx.Module):
         """
         check_type(Detections, "Detections, as from_boxes makes them", detections=detections)
         seen = TrackedFrame(detections, self._pixels(frame))
-        for move_key, move in zip(jax.random.split(key, len(self.moves)), self.moves, strict=True):
-            state = self._forgetting(move(move_key, state, seen))
-        lives: Lives = state.memory[LIVES]
-        return state, Tracks(
-            boxes=mean_boxes(state),
-            identities=lives.identities,
-            confirmed=lives.confirmed,
-            unseen=frames_unseen(state),
-            full=lives.full,
-            shown=lives.shown,
-            detections=detections.rows_of(assigned_detections(state)),
-        )
+        state, _, _ = step_and_faults(self.filter, key, state, seen)
+        return state, Tracks.of(state, detections)
 
     def look(
         self, frame: UInt8[np.ndarray, "h w 3"], detections: Detections
@@ -263,13 +268,6 @@ class ObjectTracker(eqx.Module):
             wide = frame.shape[0] * frame.shape[1] >= _LARGEST_NARROW
             return integral_histogram(frame, self.colours, wide)
         return SampledHistogram(frame, self.colours)
-
-    def _forgetting(self, mixture: ParticleMixture) -> ParticleMixture:
-        """The mixture, whose moves know nothing of components that have died."""
-        memory, dead = mixture.memory, ~mixture.active
-        for move in self.moves:
-            memory = move.forget(memory, dead)
-        return mixture.replace(memory=memory)
 
 
 def object_model(
@@ -297,13 +295,12 @@ def _own_chain(
             f"{name}: {shown(value)} is given beside moves, which have settings of their own"
         )
     chain = tuple(moves)
-    if not chain:
-        raise ValueError(f"moves: {shown(moves)} holds none, and a tracker needs some")
     for move in chain:
         check_type(AbstractMove, "a sequence of moves", moves=move)
         if isinstance(move, AbstractResampling):
             _check_resampling(move, particles_per_object, "moves")
-    check_chain(chain)
+    if not any(isinstance(move, Deaths) for move in chain):
+        raise ValueError(f"moves: {shown(chain)} lacks Deaths, which says who lives")
     return chain
 
 
