@@ -15,6 +15,7 @@ from mpfjax.vision.tracking.camera import FollowCamera
 from mpfjax.vision.tracking.deaths import Deaths
 from mpfjax.vision.tracking.motion import PropagateObjects
 from mpfjax.vision.tracking.noise import LearnNoise
+from mpfjax.vision.tracking.observation import TrackedFrame
 from mpfjax.vision.tracking.occlusion import ShareDetections
 from mpfjax.vision.tracking.scores import RankScores
 from mpfjax.vision.tracking.tracker import object_model
@@ -569,3 +570,27 @@ def weighing_by_colours():
 def test_a_chain_that_cannot_run_is_refused(moves, said):
     with pytest.raises(ValueError, match=f"^moves: {said}"):
         ObjectTracker(M, P, moves=moves)
+
+
+def test_the_tracker_is_a_filter_that_starts_empty():
+    """`run_filter` tracks who comes, goes until nobody is left, and who comes again."""
+    corners = [[], [(5, 5)], [(6, 5), (40, 20)], [(7, 5), (41, 20)], [], [], [], [], [], [(30, 9)]]
+    found = [detections(boxes_at(places)) for places in corners]
+    observations = jax.tree.map(
+        lambda *leaves: jnp.stack(leaves), *(TrackedFrame(f) for f in found)
+    )
+
+    def names(mixture):
+        return mixture.memory["lives"].identities, mixture.log_mass
+
+    run = mpfjax.run_filter(KEYS[0], TRACKER.filter, observations, names)
+    state, alive = TRACKER.init(), []
+    for t, seen in enumerate(found):
+        state, tracks = TRACKER.step(KEYS[t], state, None, seen)
+        alive.append(np.asarray(tracks.identities))
+    identities, log_masses = run.collected
+    np.testing.assert_array_equal(identities, alive)
+    somebody = (np.asarray(alive) > 0).any(axis=1)
+    np.testing.assert_array_equal(somebody, [0, 1, 1, 1, 1, 1, 1, 0, 0, 1])
+    np.testing.assert_allclose(np.exp(log_masses), somebody, atol=1e-5)
+    assert np.isfinite(run.log_likelihood_increments).all()

@@ -15,7 +15,7 @@ class TrackedFrame(NamedTuple):
     """One frame: what was detected in it, and its pixels, None where nobody looks at them."""
 
     detections: Detections
-    pixels: Pixels | None
+    pixels: Pixels | None = None
 
     def detected_colours(self, num_parts: int) -> Float[Array, "d parts channels bins"]:
         """The histograms of each detection's bands; None has a colour where it holds no pixel."""
