@@ -1,6 +1,7 @@
 """The Kalman filter and smoother, for linear-Gaussian models."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,6 +14,21 @@ from mpfjax.checks import as_numbers, check_one_of, check_type
 from mpfjax.models.inputs import with_inputs
 from mpfjax.models.linear_gaussian import LinearGaussianModel
 from mpfjax.observations import steps_of_inputs
+
+
+class LinearStep(NamedTuple):
+    """x_t = F x_{t-1} + b + N(0, Q), y_t = H x_t + c + N(0, R), at one step."""
+
+    F: Float[Array, "d d"]
+    b: Float[Array, " d"]
+    Q: Float[Array, "d d"]
+    H: Float[Array, "p d"]
+    c: Float[Array, " p"]
+    R: Float[Array, "p p"]
+
+
+Moments = tuple[Float[Array, "... d"], Float[Array, "... d d"]]
+StepOf = Callable[[PyTree], LinearStep]
 
 
 class KalmanFilterRun(eqx.Module):
@@ -105,19 +121,49 @@ def _checked(
 
 @eqx.filter_jit
 def _kalman_filter(constant, observations, inputs):
-    """Means and covariances of x_1, ..., x_t, and the increments; a NaN is a missing number."""
-    identity = jnp.eye(constant.m0.shape[0], dtype=constant.m0.dtype)
+    """Means and covariances of x_1, ..., x_t, and the increments."""
+    start = constant.m0, constant.P0
+    return filtered_moments(start, lambda now: _step_of(constant, now), inputs, observations)
 
-    def advance(carry, step):
-        (mean, covariance), (observation, now) = carry, step
-        model = with_inputs(constant, now)
-        mean = _moved(model, mean)
-        covariance = model.A @ covariance @ model.A.T + model.Q
+
+@eqx.filter_jit
+def _smooth(constant, observations, inputs):
+    (means, covariances), increments = _kalman_filter(constant, observations, inputs)
+    moments = (
+        jnp.concatenate([constant.m0[None], means]),
+        jnp.concatenate([constant.P0[None], covariances]),
+    )
+    smoothed, lagged = smoothed_moments(moments, lambda now: _step_of(constant, now), inputs)
+    return KalmanSmootherRun(*smoothed, lagged, jnp.sum(increments))
+
+
+def _step_of(constant: LinearGaussianModel, now: PyTree) -> LinearStep:
+    """The model's matrices at the step whose inputs are these."""
+    model = with_inputs(constant, now)
+    nothing = jnp.zeros(model.H.shape[0], model.m0.dtype)
+    b = jnp.zeros_like(model.m0) if model.control is None else model.control
+    return LinearStep(model.A, b, model.Q, model.H, nothing, model.R)
+
+
+def filtered_moments(
+    start: Moments, step_of: StepOf, told: PyTree, observations: Float[Array, "t p"]
+) -> tuple[Moments, Float[Array, " t"]]:
+    """Means and covariances of x_1, ..., x_t, and the increments; a NaN is a missing number.
+
+    `step_of` makes each step of what is `told` of it, which has a leading axis t.
+    """
+    identity = jnp.eye(start[0].shape[0], dtype=start[0].dtype)
+
+    def advance(carry: Moments, of_step: tuple[Array, PyTree]) -> tuple[Moments, Any]:
+        (mean, covariance), (observation, now) = carry, of_step
+        step = step_of(now)
+        mean = step.F @ mean + step.b
+        covariance = step.F @ covariance @ step.F.T + step.Q
         seen = ~jnp.isnan(observation)
         # A number that is missing is one of variance one, of nothing and equal to what is expected.
-        H = jnp.where(seen[:, None], model.H, 0.0)
-        R = jnp.where(seen[:, None] & seen[None], model.R, jnp.eye(*model.R.shape, dtype=H.dtype))
-        innovation = jnp.where(seen, observation, 0.0) - H @ mean
+        H = jnp.where(seen[:, None], step.H, 0.0)
+        R = jnp.where(seen[:, None] & seen[None], step.R, jnp.eye(*step.R.shape, dtype=H.dtype))
+        innovation = jnp.where(seen, observation - step.c, 0.0) - H @ mean
         factor = jnp.linalg.cholesky(H @ covariance @ H.T + R)
         white = jax.scipy.linalg.solve_triangular(factor, innovation, lower=True)
         increment = -0.5 * jnp.sum(white**2) - jnp.sum(jnp.log(jnp.diagonal(factor)))
@@ -128,41 +174,32 @@ def _kalman_filter(constant, observations, inputs):
         covariance = left @ covariance @ left.T + gain @ R @ gain.T
         return (mean, covariance), (mean, covariance, increment)
 
-    start, steps = (constant.m0, constant.P0), (observations, inputs)
-    _, (means, covariances, increments) = jax.lax.scan(advance, start, steps)
+    _, (means, covariances, increments) = jax.lax.scan(advance, start, (observations, told))
     return (means, covariances), increments
 
 
-def _moved(model: LinearGaussianModel, mean: Float[Array, " d"]) -> Float[Array, " d"]:
-    """A m + B u."""
-    return model.A @ mean if model.control is None else model.A @ mean + model.control
+def smoothed_moments(
+    filtered: Moments, step_of: StepOf, told: PyTree
+) -> tuple[Moments, Float[Array, "t d d"]]:
+    """Those of x_0, ..., x_t given y_1..y_t, and Cov[x_s, x_{s-1}], from the filter's of x_0 on."""
+    means, covariances = filtered
+    identity = jnp.eye(means.shape[1], dtype=means.dtype)
 
-
-@eqx.filter_jit
-def _smooth(constant, observations, inputs):
-    (means, covariances), increments = _kalman_filter(constant, observations, inputs)
-    identity = jnp.eye(constant.m0.shape[0], dtype=constant.m0.dtype)
-
-    def back(later, earlier):
+    def back(later: Moments, earlier: tuple[Array, Array, PyTree]) -> tuple[Moments, Any]:
         (later_mean, later_covariance), (mean, covariance, now) = later, earlier
-        model = with_inputs(constant, now)
-        predicted = model.A @ covariance @ model.A.T + model.Q
-        gain = jnp.linalg.solve(predicted, model.A @ covariance).T
-        left = identity - gain @ model.A
-        mean = mean + gain @ (later_mean - _moved(model, mean))
-        covariance = left @ covariance @ left.T + gain @ (model.Q + later_covariance) @ gain.T
+        step = step_of(now)
+        predicted = step.F @ covariance @ step.F.T + step.Q
+        gain = jnp.linalg.solve(predicted, step.F @ covariance).T
+        left = identity - gain @ step.F
+        mean = mean + gain @ (later_mean - (step.F @ mean + step.b))
+        covariance = left @ covariance @ left.T + gain @ (step.Q + later_covariance) @ gain.T
         return (mean, covariance), (mean, covariance, later_covariance @ gain.T)
 
     last = means[-1], covariances[-1]
-    earlier = (
-        jnp.concatenate([constant.m0[None], means[:-1]]),
-        jnp.concatenate([constant.P0[None], covariances[:-1]]),
-        inputs,
+    earlier = means[:-1], covariances[:-1], told
+    _, (means, covariances, lagged) = jax.lax.scan(back, last, earlier, reverse=True)
+    means, covariances = (
+        jnp.concatenate([rows, row[None]])
+        for rows, row in zip((means, covariances), last, strict=True)
     )
-    _, (smoothed, spreads, lagged) = jax.lax.scan(back, last, earlier, reverse=True)
-    return KalmanSmootherRun(
-        means=jnp.concatenate([smoothed, last[0][None]]),
-        covariances=jnp.concatenate([spreads, last[1][None]]),
-        lagged_covariances=lagged,
-        log_marginal_likelihood=jnp.sum(increments),
-    )
+    return (means, covariances), lagged

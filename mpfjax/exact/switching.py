@@ -6,9 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mpfjax.checks import check_type
+from mpfjax.exact.kalman import LinearStep, Moments, filtered_moments, smoothed_moments
 from mpfjax.models.switching import SwitchingLinearGaussianModel
 from mpfjax.operations.logarithms import log_sum_exp
 
@@ -100,52 +101,27 @@ def _mixed(
 
 
 def _kalman_smoother(
-    model: SwitchingLinearGaussianModel, sequence: Array, observations: Float[Array, "t p"]
-) -> tuple[tuple[Array, Array], tuple[Array, Array], Float[Array, " t"]]:
+    model: SwitchingLinearGaussianModel, sequence: Int[Array, " t1"], observations: Array
+) -> tuple[Moments, Moments, Float[Array, " t"]]:
     """Filtered and smoothed moments, and log p(y_s | y_1..y_{s-1}), given the regimes."""
-    d = model.m0.shape[-1]
-    row = lambda part, shape: jnp.broadcast_to(part, (1, *shape))[0]  # noqa: E731
-    mean, covariance = (
-        row(part, shape)
-        for part, shape in zip(model.initial_moments(sequence[:1]), ((d,), (d, d)), strict=True)
-    )
-    moments, expected, log_densities, matrices = [(mean, covariance)], [], [], []
-    for s, observation in enumerate(observations):
-        regime = sequence[s + 1 : s + 2]
-        matrix, offset, noise = model.dynamics(regime, regime)
-        matrix, offset, noise = row(matrix, (d, d)), row(offset, (d,)), row(noise, (d, d))
-        mean, covariance = matrix @ mean + offset, matrix @ covariance @ matrix.T + noise
-        matrices.append(matrix)
-        expected.append((mean, covariance))
-        p = observation.shape[0]
-        seen, offset, noise = model.emission(regime)
-        present = ~jnp.isnan(observation)
-        here = present.astype(mean.dtype)
-        seen = here[:, None] * row(seen, (p, d))
-        missed = jnp.where(present, observation - seen @ mean - row(offset, (p,)), 0.0)
-        alone = jnp.diag(1 - here)
-        spread = (
-            seen @ covariance @ seen.T + here[:, None] * here[None] * row(noise, (p, p)) + alone
-        )
-        gain = jnp.linalg.solve(spread, seen @ covariance).T
-        log_densities.append(
-            -0.5 * missed @ jnp.linalg.solve(spread, missed)
-            - 0.5 * jnp.linalg.slogdet(spread)[1]
-            - 0.5 * jnp.sum(here) * jnp.log(2 * jnp.pi)
-        )
-        mean = mean + gain @ missed
-        covariance = covariance - gain @ spread @ gain.T
-        moments.append((mean, covariance))
-    smoothed = [(mean, covariance)]
-    for s in reversed(range(len(observations))):
-        (mean, covariance), (next_mean, next_covariance) = moments[s], smoothed[-1]
-        back = jnp.linalg.solve(expected[s][1], matrices[s] @ covariance).T
-        mean = mean + back @ (next_mean - expected[s][0])
-        covariance = covariance + back @ (next_covariance - expected[s][1]) @ back.T
-        smoothed.append((mean, covariance))
-    return _stacked(moments[1:]), _stacked(smoothed[::-1]), jnp.stack(log_densities)
+    d, p = model.m0.shape[-1], observations.shape[1]
 
+    def own(parts: tuple[Array, ...], *shapes: tuple[int, ...]) -> list[Array]:
+        return [
+            jnp.broadcast_to(part, (1, *shape))[0]
+            for part, shape in zip(parts, shapes, strict=True)
+        ]
 
-def _stacked(moments: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    means, covariances = zip(*moments, strict=True)
-    return jnp.stack(means), jnp.stack(covariances)
+    def step_of(regime: Int[Array, ""]) -> LinearStep:
+        z = regime[None]
+        dynamics = own(model.dynamics(z, z), (d, d), (d,), (d, d))
+        return LinearStep(*dynamics, *own(model.emission(z), (p, d), (p,), (p, p)))
+
+    mean, covariance = own(model.initial_moments(sequence[:1]), (d,), (d, d))
+    filtered, increments = filtered_moments((mean, covariance), step_of, sequence[1:], observations)
+    means, covariances = filtered
+    from_start = (
+        jnp.concatenate([mean[None], means]), jnp.concatenate([covariance[None], covariances])
+    )  # fmt: skip
+    smoothed, _ = smoothed_moments(from_start, step_of, sequence[1:])
+    return filtered, smoothed, increments
