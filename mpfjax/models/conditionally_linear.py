@@ -109,12 +109,14 @@ def is_marginalised(model: Any) -> bool:
     return isinstance(model, AbstractConditionallyLinearModel)
 
 
-def refuse_marginalised(model: Any, needed_by: str) -> None:
+def refuse_marginalised(
+    model: Any, needed_by: str, instead: str = "take PropagateMarginalised"
+) -> None:
     """Raise a `ValueError` for a conditionally linear model, which is not moved as a whole."""
     if is_marginalised(model):
         raise ValueError(
-            f"model: {model_name(model)} is conditionally linear, and {needed_by} moves states"
-            " that are drawn as a whole; take PropagateMarginalised"
+            f"model: {model_name(model)} is conditionally linear, and {needed_by} needs states"
+            f" that are drawn as a whole; {instead}"
         )
 
 

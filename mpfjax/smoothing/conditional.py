@@ -13,6 +13,7 @@ from mpfjax.checks import as_numbers, check_flag, check_key, check_type, shown
 from mpfjax.filter import Filter, Start, sample_initial
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, model_name, require
+from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.conditional import (
     CONDITIONAL_SCHEMES,
@@ -94,7 +95,7 @@ def conditional_filter(
 
     Raises `ValueError` for a filter that is no chain of regrouping moves, `Resample` (systematic,
     stratified or multinomial), `Propagate`, `Predict` and `Reweight`; a proposal without
-    `log_density`; noise that is not independent; a model without `log_transition`, unless
+    `log_density`; a conditionally linear model; noise that is not independent; a model without `log_transition`, unless
     `backward` is false; a trajectory of other shapes or types than the model's states, or of
     density zero (RuntimeError within jit). Use it in a Gibbs sampler of your own;
     `mpfjax.tuning.particle_gibbs` is one for parameters.
@@ -240,6 +241,7 @@ def _possible(
 
 def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
     """Raise a `ValueError` for a filter that cannot keep a trajectory."""
+    refuse_marginalised(filter.model, needed_by, "metropolis_hastings and smc2 take it as it is")
     if backward:
         require(filter.model, "log_transition", f"backward sampling in {needed_by}")
     advances = [move for move in filter.moves if isinstance(move, Propagate | Predict)]

@@ -86,7 +86,7 @@ def smoothed_sums(
     """
     check_key(key)
     check_type(Filter, "a Filter", filter=filter)
-    refuse_marginalised(filter.model, "smoothed_sums")
+    refuse_marginalised(filter.model, "smoothed_sums", "take sample_trajectories")
     require(filter.model, "log_transition", "smoothed_sums")
     check_callable("a function of two states", function=function)
     if lag is not None:

@@ -7,8 +7,9 @@ import pytest
 
 import mpfjax
 from mpfjax import Filter, PropagateRegimes
-from mpfjax.exact import switching_filter
-from mpfjax.smoothing import sample_trajectories
+from mpfjax.exact import kalman_filter, switching_filter
+from mpfjax.smoothing import conditional_filter, sample_trajectories, smoothed_sums
+from mpfjax.tuning import metropolis_hastings, particle_gibbs, smc2
 from tests.moves import test_marginalised_mixed as tests_mixed
 from tests.moves.test_marginalised_mixed import Mixed, whole
 from tests.smoothing import exact_smoothers
@@ -79,3 +80,67 @@ def test_misuse_is_named():
     run = mpfjax.run_filter(key, plain, jnp.ones(3), None)
     with pytest.raises(ValueError, match="observations: only"):
         sample_trajectories(key, quadratic, run, 5, observations=jnp.ones(3))
+
+
+def test_what_draws_states_as_a_whole_refuses_by_name():
+    """What keeps or sums whole trajectories says what to take in its place."""
+    filter, key = mpfjax.particle_filter(MODEL, 4), jax.random.key(0)
+    start = filter.init(key).particles
+    path = jax.tree.map(lambda leaf: jnp.zeros((len(OBSERVATIONS) + 1, *leaf.shape[1:])), start)
+    who = r"model: SwitchingLinearGaussianModel is conditionally linear, and "
+    with pytest.raises(ValueError, match=who + "conditional_filter .* metropolis_hastings"):
+        conditional_filter(key, filter, OBSERVATIONS, path)
+    with pytest.raises(ValueError, match=who + "smoothed_sums .* sample_trajectories"):
+        smoothed_sums(key, filter, OBSERVATIONS, lambda before, after: after.mean)
+    with pytest.raises(ValueError, match=who + "particle_gibbs .* smc2"):
+        particle_gibbs(key, filter, OBSERVATIONS, 2, log_prior=lambda parameters: jnp.zeros(()))
+
+
+LINEAR = mpfjax.LinearGaussianModel(
+    0.9 * np.eye(1), np.eye(1), np.eye(1), np.eye(1), np.zeros(1), np.eye(1)
+)  # fmt: skip
+SERIES = jnp.asarray(np.random.default_rng(0).normal(size=(12, 1)), jnp.float32)
+START = {"m0": lambda filter: filter.model.m0}
+
+
+def log_prior(parameters):
+    return -0.5 * jnp.sum(parameters["m0"] - 2.0) ** 2
+
+
+def by_metropolis(key, filter):
+    run = metropolis_hastings(
+        key, filter, SERIES, 300, log_prior=log_prior, proposal_deviations=1.5, num_chains=4,
+        burn_in=50, parameters=START, progress=False,
+    )  # fmt: skip
+    return run.parameters["m0"].mean()
+
+
+def by_smc2(key, filter):
+    def sample_prior(key):
+        return {"m0": 2.0 + jax.random.normal(key, (1,))}
+
+    run = smc2(
+        key, filter, SERIES, 300, log_prior=log_prior, sample_prior=sample_prior, parameters=START,
+        progress=False,
+    )  # fmt: skip
+    return run.mean("m0")[0]
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("sample", [by_metropolis, by_smc2])
+def test_samplers_take_marginalised_models(sample):
+    """With regimes that are alike one particle has the exact likelihood, as Kalman's filter."""
+    parts = (LINEAR.A, LINEAR.Q, LINEAR.H, LINEAR.R, LINEAR.m0, LINEAR.P0)
+    alike = mpfjax.SwitchingLinearGaussianModel(np.ones((1, 1)), *parts)
+    grid = jnp.linspace(-3.0, 6.0, 200)
+
+    def log_density(m0):
+        model = mpfjax.LinearGaussianModel(*parts[:4], m0[None], parts[5])
+        evidence = kalman_filter(model, SERIES).log_marginal_likelihood
+        return evidence + log_prior({"m0": m0[None]})
+
+    weights = jax.nn.softmax(jax.vmap(log_density)(grid))
+    mean = weights @ grid
+    deviation = jnp.sqrt(weights @ (grid - mean) ** 2)
+    found = sample(jax.random.key(0), mpfjax.particle_filter(alike, 1))
+    assert abs(found - mean) < 0.2 * deviation
