@@ -48,7 +48,7 @@ def particle_filter(
     """The standard particle filter: resample, propagate.
 
     Vermaak et al. (2003), section 3, with one component; bootstrap unless a proposal is given.
-    Use it for a filtering distribution with one mode; of several modes it loses all but one.
+    Use it for a filtering distribution with one mode. If there are several, it loses all but one.
     `gradient` is that of `Resample`. "stop" is also that of `Propagate`: take it for tuning.
     `num_draws` is that of `PropagateNested`, how many x_t each particle draws to keep one.
     `noise` is that of `Propagate`. With "rqmc", particles stand along a Hilbert curve of their
@@ -196,7 +196,7 @@ def gaussian_mixture_particle_filter(
     initial_kmeans: KMeans | None = None,
     regroup_every: int = 1,
 ) -> Filter:
-    """GM-MPF: each component redrawn from the Gaussian of its moments, propagated, regrouped.
+    """GM-MPF: redraw each component from the Gaussian of its moments, propagate, regroup.
 
     Lin et al. (2012), section 4: the mixture particle filter with Gaussian regeneration in place
     of resampling. The paper can be read in two ways about what is drawn from the importance
@@ -266,13 +266,13 @@ def distributed_partitioned_sampling(
     """DPS: the particles are dealt into C sets, and the objects move in another order in each.
 
     Smith and Gatica-Perez (2004), section 4: pool and resample, deal the particles into C sets at
-    random, do partitioned sampling in each, reassemble. A fixed order leaves its first objects few
-    distinct hypotheses; here this loss is shared by all objects. `orders` are C permutations of
-    the objects; None is the J circular shifts, and "random" J new permutations at every step.
-    `reassembly` is "prior", the paper's, where every set returns to its mass (an approximation:
-    the marginal likelihood is biased), or "evidence", which is exact. See `Partitioned` for both,
-    and for `gradient`. Use it where you do not know which object will be hard to track, with
-    enough particles that each set of N/C can track.
+    random, do partitioned sampling in each, reassemble. A fixed order leaves few distinct
+    hypotheses of its first objects. Here all objects share this loss. `orders` are C permutations
+    of the objects; None is the J circular shifts, and "random" J new permutations at every step.
+    `reassembly` is "prior", the paper's, where every set returns to its mass (an approximation: the
+    marginal likelihood is biased), or "evidence", which is exact. See `Partitioned` for both, and
+    for `gradient`. Use it where you do not know which object will be hard to track, with enough
+    particles that each set of N/C can track.
     """
     require_multi_object(model, "distributed_partitioned_sampling")
     if orders is None:
@@ -299,8 +299,8 @@ def independent_particle_filters(
 ) -> Filter:
     """A small particle filter for each object, as if there were no other.
 
-    Each object has N particles, so the cost is that of a joint filter of N. It is exact where the
-    objects do not interact, and then the best choice. It ignores an interaction, and look-alikes
+    Each object has N particles, so the cost is that of a joint filter of N. Where the objects do
+    not interact it is exact, and the best choice. It ignores an interaction: filters of look-alikes
     that cross may end on the same object. Estimates are after resampling; see
     `PropagateIndependently`.
     """

@@ -43,7 +43,7 @@ class AbstractStateSpaceModel(eqx.Module):
 
     A model that declares a field `inputs`, None by default, finds u_t there at each step: what is
     known beside the observation, such as a control, a covariate or the time since the last step.
-    All its methods see `self.inputs`. A model that makes something else of u_t defines
+    All its methods see `self.inputs`. A model that does something else with u_t defines
     `with_inputs` itself. x_0 has no input.
     """
 

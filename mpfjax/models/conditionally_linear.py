@@ -48,10 +48,10 @@ class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
     - `sample_transition(key, latent)`: z_t; or `transition_from_noise(noise, latent)` and
       `noise_dimension`, as in `AbstractStateSpaceModel`;
     - `dynamics(latent, previous_latent)`: F (d, d), b (d,), Q (d, d), given z_t and z_{t-1};
-    - `emission(latent)`: H (p, d), c (p,), R (p, p), given z_t; or None where nothing is seen of x.
+    - `emission(latent)`: H (p, d), c (p,), R (p, p), given z_t; or None if y_t says nothing of x.
 
-    Each array may have a leading n, one for each particle, or not, where all share it. Q and R may
-    be singular. It may also define
+    An array with a leading n has one for each particle; otherwise all particles share it. Q and R
+    may be singular. It may also define
 
     - `log_transition(latent, previous_latent)`: log p(z_t | z_{t-1}), (n,), which proposals,
       gradient "stop" and smoothing need;
@@ -69,7 +69,7 @@ class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
       where w is the noise of x_t, whose covariance is Q. It returns f (k,), A (k, d), V (k, k), or
       also S (d, k), for which V must be invertible. A draw of z_t then says something of x_{t-1}.
 
-    An entry of y_t that is NaN is missing, and `log_likelihood` must know so as well; a class
+    An entry of y_t that is NaN is missing, and `log_likelihood` must leave it out as well. A class
     with `handles_missing = False` never gets one. `particle_filter`, `mixture_particle_filter` and
     `auxiliary_particle_filter` take such a model like any other: their move is
     `PropagateMarginalised`. Use it where a part of the state is linear given the rest: regimes,

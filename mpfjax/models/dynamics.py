@@ -21,9 +21,9 @@ from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
 class AbstractDynamics(eqx.Module):
     """D(x_t | x_{t-1}, x_{t-2}) of a vector: a part of a model, not a model itself.
 
-    There is one set of parameters for all particles, or one for each, along a leading axis. Where
-    `order` is 2, a model keeps the past of x_t beside it in its state: x_{t-1}, or what else
-    `remembered` gives, which is then `previous` in the next step.
+    There is one set of parameters for all particles, or one for each, along a leading axis. If
+    `order` is 2, a model keeps the past of x_t in its state too: x_{t-1}, or whatever `remembered`
+    returns, which is then `previous` in the next step.
     """
 
     @property

@@ -37,8 +37,8 @@ class WalkWithVelocity(AbstractDynamics):
       units of the state a frame; None takes 0.
 
     Raises `TypeError` for another walk, and `ValueError` for a gain outside [0, 1], a negative
-    deviation and shapes that do not fit. Use it where objects keep their way: look-alikes that
-    cross then keep their names, and what is hidden walks on.
+    deviation and shapes that do not fit. Use it where objects keep their velocity: look-alikes that
+    cross keep their identities, and a hidden object moves on.
     """
 
     walk: AbstractRandomWalk

@@ -1,7 +1,7 @@
 """Eve indices: which particle of x_0 each particle descends from, and what that says of errors.
 
-A filter keeps them only if a `EveIndices` was put into the mixture's memory of x_0. Then `Resample`
-brings it up to date, wherever it stands in a chain or within a move.
+A filter keeps them only if an `EveIndices` is in the memory of the mixture of x_0. Then `Resample`
+updates it, wherever it is in a chain or within a move.
 `mpfjax.smoothing.log_marginal_likelihood_variance` has the equations.
 """
 

@@ -23,13 +23,13 @@ _INNER = (AbstractRegrouping, AbstractResampling, AbstractMarkovMove)
 
 
 class Every(AbstractMove):
-    """Other moves at the steps k, 2k, 3k, ..., and nothing at those between.
+    """Run other moves at the steps k, 2k, 3k, ..., and none at the steps between.
 
-    Vermaak et al. (2003), section 4, regroup "from time to time". What a move does not change, it
-    need not do at every step: regrouping is exact whenever it is done. The step's number is
-    kept in the mixture's memory, so that a run goes on from a checkpoint as if it had not been
-    broken off. It does not depend on the run: under `vmap` over seeds the steps between cost
-    nothing. A missing observation is no step, since nothing is regrouped or resampled there.
+    Vermaak et al. (2003), section 4, regroup "from time to time". Regrouping is exact whenever it
+    is done, so it need not be done at every step. The step's number is kept in the mixture's
+    memory, so that a run goes on from a checkpoint as if it had not been broken off. It does not
+    depend on the run: under `vmap` over seeds the steps between cost nothing. A missing observation
+    is no step, since nothing is regrouped or resampled there.
 
     - `num_steps`: k, from 1 on.
     - `moves`: regrouping and resampling moves, in order.

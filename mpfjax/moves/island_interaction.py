@@ -1,4 +1,4 @@
-"""IslandInteraction of particles between islands whose masses have drifted apart."""
+"""Interaction of islands: particles are dealt anew where the islands' masses drift apart."""
 
 import equinox as eqx
 import jax

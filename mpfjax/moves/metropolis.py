@@ -42,11 +42,10 @@ class AbstractMetropolis(AbstractMarkovMove):
     The move of a resample-move filter (Gilks and Berzuini 2001): after x_t was drawn and weighed,
     and resampled if need be, each x_t takes `num_steps` steps of a Markov chain that leaves
     D(x_t | x_{t-1}) L(y_t | x_t)^β as it is. So the weights stay, Ẑ stays unbiased, and offspring
-    of one particle become different. It all happens within the particle, so that components keep
-    their mass and their particles.
+    of one particle become different. Components keep their mass and their particles.
 
-    Nothing is tuned on the particles that move, since that would not be exact: the length of a
-    step is s times the spread of the dynamics, with log s uniform from that of `least_step` to 0,
+    Nothing is tuned on the particles that move, since that would not be exact. The length of a step
+    is s times the spread of the dynamics, where log s is uniform between log `least_step` and 0 and
     drawn anew each time. The spread is that of fresh draws from D(. | x_{t-1}). Parts of the state
     that are whole numbers stay.
     """
@@ -119,7 +118,7 @@ class RandomWalkMetropolis(AbstractMetropolis):
     - `model`: with `log_transition`.
     - `num_steps`: how many steps each particle takes.
     - `least_step`: the smallest s.
-    - `exponent`: β, for a likelihood that comes in by stages, as `Reweight(model, exponent)` does.
+    - `exponent`: β, for a likelihood that enters by powers, as with `Reweight(model, exponent)`.
     - `gradient`: what a derivative sees: "none" the draws that were taken, "stop" the density of
       the state after the move, as with `gradient` of `Propagate`.
 

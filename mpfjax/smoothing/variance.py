@@ -35,7 +35,7 @@ _NO_EVE_INDICES = (PropagateIndependently, PropagateInClusters, PropagateRegimes
 
 
 class _KeepFirstAncestors(AbstractRegrouping):
-    """Puts a `EveIndices` into the mixture of x_0, which `Resample` then keeps up to date."""
+    """Puts an `EveIndices` into the mixture of x_0, which `Resample` then keeps up to date."""
 
     def regroup(
         self, key: Key[Array, ""], mixture: ParticleMixture

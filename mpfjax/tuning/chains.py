@@ -46,7 +46,7 @@ class Step(NamedTuple):
 
 
 class AbstractKernel(eqx.Module):
-    """A Markov kernel on parameters, and on what else a chain carries along."""
+    """A Markov kernel on parameters, and on whatever a chain carries with them."""
 
     @property
     @abc.abstractmethod

@@ -1,4 +1,4 @@
-"""Propagation of families: each particle draws several x_t, and one of them is kept."""
+"""Nested propagation: each particle draws several x_t, and one of them is kept."""
 
 import math
 
@@ -23,11 +23,11 @@ from mpfjax.proposals import AbstractProposal
 class PropagateNested(AbstractPropagation):
     """Draw K of x_t for each particle, and keep one by its weight.
 
-    With the factors g_ik = L D / q of the K draws x_t^ik of particle i, the particle is weighed by
-    their mean, (1 / K) Σ_k g_ik, and keeps draw k with the probability g_ik / Σ_j g_ij. So it is a
-    filter of K N particles of which N are drawn again, one for each parent, in proportion to their
-    weights: Ẑ is that of K N particles, and unbiased. The model is evaluated K N times, but only N
-    particles are resampled, sorted and regrouped.
+    Draw x_t^ik of particle i has the factor g_ik = L D / q. The particle is weighed by the mean of
+    its factors, (1 / K) Σ_k g_ik, and keeps draw k with the probability g_ik / Σ_j g_ij. This is
+    nested sequential Monte Carlo in its simplest form (Naesseth, Lindsten and Schön 2015): a filter
+    of K N particles that keeps one child of each parent. Ẑ is that of K N particles, and unbiased.
+    The model is evaluated K N times, but only N particles are resampled, sorted and regrouped.
 
     - `propagate`: the `Propagate`, or `PropagateMarginalised`, that draws. With its noise "rqmc" or
       "stratified" the draws of a family fill K strata of the first dimension of the noise, and one
@@ -35,7 +35,7 @@ class PropagateNested(AbstractPropagation):
       over slot and noise as well.
     - `num_draws`: K.
 
-    Raises `ValueError` for K < 1, and for gradient "stop", which knows nothing of the draw that was
+    Raises `ValueError` for K < 1, and for gradient "stop", which does not see which draw was
     kept. Use it where the likelihood is narrow and cheap, with four to sixteen draws.
     """
 

@@ -159,9 +159,9 @@ class Predict(AbstractPropagation):
 class Reweight(AbstractPropagation):
     """Multiply the weights by L(y_t | x_t): the second half of a bootstrap `Propagate`.
 
-    `exponent` is β where the factor is L^β: the likelihood comes in by stages, with other moves in
-    between. The exponents of a chain's `Reweight` add up to 1. Raises `ValueError` for one not in
-    (0, 1]. Use it after `Predict` and what a chain does to the prediction.
+    `exponent` is β where the factor is L^β: the likelihood enters by powers, with other moves
+    between them. The exponents of a chain's `Reweight` add up to 1. Raises `ValueError` for one not
+    in (0, 1]. Use it after `Predict` and what a chain does to the prediction.
     """
 
     model: AbstractStateSpaceModel

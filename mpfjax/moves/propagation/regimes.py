@@ -87,15 +87,15 @@ class RegimeProposal(AbstractProposal):
 
 
 class PropagateRegimes(AbstractPropagation):
-    """All K children of each particle, and optimal resampling back to the slots there are.
+    """Try all K regimes for each particle, then resample optimally to the number of slots.
 
     z_t takes K values, and every particle becomes K children, each with the weight
     w_i p(z_t | z_{t-1}) p(y_t | ...). Of these N K, every component keeps as many as it has slots,
     by the optimal resampling of Fearnhead and Clifford (2003): a child of weight w is kept with the
-    probability min(w / c, 1), and has the weight max(w, c) then. c is such that the expected number
-    is that of the slots. So heavy children are kept as they are, none is kept twice, and of all
-    unbiased choices this one moves the weights least. A component keeps its mass, and Ẑ is
-    unbiased. A `Resample` before it would only add noise: `Filter(model,
+    probability min(w / c, 1), and then has the weight max(w, c). c makes the expected number of
+    children equal to the number of slots. So heavy children are kept as they are, and none is kept
+    twice. Of all unbiased choices this one changes the weights least. A component keeps its mass,
+    and Ẑ is unbiased. A `Resample` before it would only add noise: `Filter(model,
     [PropagateRegimes(model)], N)` is the whole filter.
 
     - `model`: a conditionally linear model with `all_transitions`.
@@ -105,7 +105,7 @@ class PropagateRegimes(AbstractPropagation):
       filters for particles.
     - `scheme`: of `Resample`, "systematic" or "stratified" as a rule.
 
-    A derivative takes the chances of being kept for constants, as that of
+    A derivative treats the probabilities of being kept as constants, as that of
     `Resample(gradient="stop")` does, so that derivatives of Ẑ are unbiased. Without an observation,
     children have the weight w_i p(z_t | z_{t-1}). Raises `ValueError` for another model. Use it
     where K is small.

@@ -1,4 +1,4 @@
-"""Propagation in stages: the likelihood comes in by and by, and particles move in between."""
+"""Tempered propagation: the likelihood enters by powers, and particles move in between."""
 
 from typing import Any, NamedTuple, cast
 
@@ -39,9 +39,9 @@ class PropagateTempered(AbstractPropagation):
     z' = sqrt(1 - s²) z + s ξ, ξ ~ N(0, I), and taken with the probability min(1, (L' / L)^β). This
     leaves the target as it is for any f (the preconditioned Crank-Nicolson step of Cotter and
     others 2013), because the normal distribution of z does not change. So it needs no density of
-    the dynamics and nothing is tuned on the particles: Ẑ is unbiased, and the move is exact. The
-    step s of each particle is drawn anew each time, its logarithm uniform between those of
-    `least_step` and 1, since a fitting one is different for each β.
+    the dynamics. Nothing is tuned on the particles: Ẑ is unbiased, and the move is exact. Each β
+    needs another step s. So every particle draws it anew each time, with log s uniform between log
+    `least_step` and 0.
 
     - `model`: with `transition_from_noise`.
     - `resample`: the resampling between the stages; None is `Resample()`.

@@ -15,12 +15,12 @@ from mpfjax.moves.base import AbstractRegrouping
 
 
 class GroupBy(AbstractRegrouping):
-    """The particles grouped by a label of their own: a regime, a room, a hypothesis.
+    """Group the particles by a label that they have: a regime, a room, a hypothesis.
 
-    A particle with label m is in component m. The labels take no part in the weights, so the
+    A particle with label m is in component m. The labels do not change the weights, so the
     distribution stays the same (Vermaak et al. 2003, section 4). With `Resample`, each label keeps
-    its particles however improbable it is at the moment. For regimes that is the idea of the IMM
-    particle filter (Blom and Bloem 2007).
+    particles even while it is improbable. For regimes this is the IMM particle filter (Blom and
+    Bloem 2007).
 
     - `function`: gives the label of each particle: whole numbers (n,), in [0, M), where M is the
       filter's `num_components`. A function of the particles, as `lambda states: states["room"]`.

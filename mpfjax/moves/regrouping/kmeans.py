@@ -16,11 +16,11 @@ from mpfjax.operations.segments import segment_argmax, segment_counts, segment_s
 
 
 class KMeans(AbstractRegrouping):
-    """A fixed number of K-means iterations, from the components as they are.
+    """Assign particles to the nearest component, by K-means from the components as they are.
 
-    Vermaak et al. (2003), section 4. Every particle counts the same, whatever its weight: groups
-    should cover all places that hold particles. On the quadratic model, K-means by weight loses
-    modes. A component keeps its label. A component without a particle is dead and stays dead.
+    Vermaak et al. (2003), section 4. Every particle counts the same, whatever its weight, so that
+    the components cover all places that hold particles. On the quadratic model, K-means by weight
+    loses modes. A component keeps its label. A component without a particle is dead and stays dead.
 
     - `num_iterations`: how often all particles are assigned; the centroids move in between.
     - `reseed`: start from all M components instead, seeded by farthest-first traversal from the

@@ -8,7 +8,7 @@ from mpfjax.moves.base import AbstractRegrouping
 
 
 class Pool(AbstractRegrouping):
-    """All particles into component 0, the mixture as one particle set.
+    """Put all particles into component 0, so that the mixture is one particle set.
 
     The left-hand side of eq. 3 of Smith and Gatica-Perez (2004), read from right to left. Use it
     before a `Resample` in which the components should compete. Exact: a relabelling only.

@@ -14,7 +14,7 @@ from mpfjax.operations.prefix_sums import count_upto
 
 
 class RandomPartition(AbstractRegrouping):
-    """The particles dealt at random into sets of equal size, without replacement.
+    """Deal the particles at random into sets of equal size, without replacement.
 
     Smith and Gatica-Perez (2004), section 4: C sets of N/C particles each; sizes differ by one if C
     does not divide N. Empty slots are dealt after the filled ones. The mass of a set is that of

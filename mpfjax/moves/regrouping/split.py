@@ -37,10 +37,10 @@ class Split(AbstractRegrouping):
     - they are more than `min_distance` apart, in units of `scale`;
     - the lighter half holds at least `min_share` of the component's mass.
 
-    The centres of the halves are found from every k-th particle, such that they are about
-    `sample_size` times M; None takes all. After resampling, copies stand side by side, so a part
-    that holds one in `sample_size` of them or more is met. What is a half, how far apart they are
-    and whether they split is then found from all particles.
+    The centres of the halves are found from a sample: every k-th particle, about `sample_size`
+    times M of them; None takes all. After resampling, copies stand side by side, so the sample
+    meets every part that holds one particle in `sample_size`. All particles then decide which half
+    each is in, how far apart the halves are, and whether they split.
 
     The lighter half takes a free label. If there are too few free labels, the clearest splits come
     first. Raises `ValueError` for a threshold that is negative or a share not in [0, 0.5].
