@@ -32,14 +32,19 @@ def stem(page: Path) -> str:
 
 @pytest.mark.usefixtures("as_installed")
 @pytest.mark.parametrize("page", quick_of(WITH_CODE, QUICK_PAGES), ids=stem)
-def test_the_code_of_a_page_runs(page):
+def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     """All blocks of a page in their order, as a reader runs them: without the tests' strictness."""
     document = sybil.parse(page)
+    if page.parent.name == "gallery":  # there the code draws the page's picture
+        monkeypatch.chdir(tmp_path)
     examples = list(document.examples())
     assert examples
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         for example in examples:
             example.evaluate()
+    if page.parent.name == "gallery":
+        assert [path.name for path in tmp_path.iterdir()] == [f"{page.stem}.png"]
+        assert (page.parent / f"{page.stem}.png").exists()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
