@@ -26,7 +26,7 @@ def multi_object_scores(
     Both are rows (frame, id, x, y, w, h) as MOTChallenge files have them, (x, y) the top-left
     corner, in pixels. `frames` is the first and the last frame to score; rows outside are left
     out. Without it every frame in which either has a box counts. `ignored` and `min_height` are
-    those of `remove_ignored`, which takes away first what counts for nothing; `read_truth` of
+    those of `remove_ignored`, which is called first; `read_truth` of
     `mpfjax.vision` reads all three. The scores:
 
     - "HOTA", "DetA" and "AssA", Luiten et al. (2021), each the mean over IoU thresholds of 0.05
@@ -94,7 +94,8 @@ def remove_ignored(
 
     `tracks` and `truth` are rows (frame, id, x, y, w, h), and `ignored` rows (frame, kind, x, y, w,
     h). Kind 1 is an ignored object, such as a rider where pedestrians are tracked; kind 2 a region
-    that nobody labelled; kind 3 an unscored object, that can be matched and excuses nobody.
+    that nobody labelled; kind 3 an object that is not scored: a tracked box may match it, and is
+    not taken away for it.
 
     Raises `ValueError` for what is no rows of six finite numbers, for another kind, and for a
     height below zero. Use it before scores of another library; `multi_object_scores` calls it.

@@ -101,10 +101,10 @@ def _require_independent_draws(filter: Filter) -> None:
 def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[Array, ""]:
     """An estimate of the variance of log Ẑ, from one run of `with_first_ancestors(filter)`.
 
-    Particles with different ancestors in x_0 are nearly independent, so that Ẑ varies as much as
-    the weight is in few families (Chan and Lai 2013). For one component the estimate is that of
-    Lee and Whiteley (2018), section 3: with S_e the weight of all descendants of particle e of
-    x_0, and r resamplings so far,
+    Particles with different ancestors in x_0 are nearly independent, so that Ẑ varies the more, the
+    fewer families hold the weight (Chan and Lai 2013). A family is all descendants of one particle
+    of x_0. For one component the estimate is that of Lee and Whiteley (2018), section 3: with S_e
+    the weight of all descendants of particle e of x_0, and r resamplings so far,
 
         V = 1 - (N / (N - 1))^(r + 1) (1 - Σ_e S_e²).
 
@@ -159,7 +159,7 @@ def mixture_weight_errors(run: FilterRun | ParticleMixture) -> Float[Array, " m"
     For one resampling in common it is the sum over families of (S_em - π_m S_e)², S_em being the
     part of family e that is in component m.
 
-    It is what a user needs who must decide between two explanations: 0.7 ± 0.3 is no decision. It
+    It tells whether the data decide between two explanations: 0.7 ± 0.3 decides nothing. It
     holds where `log_marginal_likelihood_variance` does: multinomial draws. It takes the components
     as given, so it says nothing of runs that would have grouped the particles in another way. It
     is too small where few families are left, as there: a component without a rival among its own
@@ -169,7 +169,7 @@ def mixture_weight_errors(run: FilterRun | ParticleMixture) -> Float[Array, " m"
       them at every step. In `collect`, call it of each mixture.
 
     Raises `ValueError` for a run of a filter without first ancestors, and one of islands. Use it to
-    see when not to believe a mass.
+    see when a mass is not reliable.
     """
     return jnp.sqrt(jnp.maximum(_mass_variances(_with_lineage(run)), 0.0))
 

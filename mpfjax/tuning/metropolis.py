@@ -103,7 +103,7 @@ def metropolis_hastings(
     - `num_steps`: after burn-in, of each chain. `num_chains` run under one vmap.
     - `burn_in`: steps before these, of which none is kept. In them the random walk learns the
       posterior's covariance from all chains (Haario, Saksman and Tamminen 2001; with `adapt=False`
-      it does not). Then it stands still, and the chains are Markov chains.
+      it does not). Then it no longer changes, and the chains are Markov chains.
     - `thinning`: k keeps every k-th step, for chains that are too long for memory.
     - `checkpoint`: a .npz file, without pickles. It is written every `checkpoint_every` steps, and
       when the chains end or are interrupted. If the file exists, the chains go on from it, the same

@@ -70,7 +70,7 @@ def fit(
     checkpoint_name: str | None = None,
     progress: bool = True,
 ) -> TuningRun:
-    """Climb the log marginal likelihood in some of a filter's parameters.
+    """Maximise the log marginal likelihood over some of a filter's parameters.
 
     Maximises the mean over seeds of log Ẑ(θ), summed over sequences, with the derivatives of the
     filter's moves. Build the filter with `gradient="stop"`: its derivatives estimate the score.
@@ -90,8 +90,8 @@ def fit(
       the same seeds in every step: there is no noise between steps, but the error of those seeds
       stays.
     - `inputs`, `missing`: as for `run_filter`; of several sequences, a list of inputs.
-    - `patience`: a number of steps. The optimisation ends when the mean of the last so many steps
-      is not more than `tolerance` nats above the mean of as many steps before them.
+    - `patience`: a number of steps k. The optimisation ends when the mean of the last k steps is at
+      most `tolerance` nats above the mean of the k steps before.
     - `curvature_seeds`: the seeds for `standard_errors` at the end, in whole batches of
       `num_seeds`; 0 for none.
     - `checkpoint`: a .npz file, without pickles. It is written every `checkpoint_every` steps, and
@@ -105,8 +105,8 @@ def fit(
       a new file after you change what those do. With another version of Python or optax, the file
       may be refused.
     - `checkpoint_name`: what the optimisation is called, such as "adam, cosine". Its file is then
-      told by this name, and no function or optimiser is looked into; numbers and arrays are
-      compared as before. Use it for functions that change what they hold, and across versions.
+      recognised by this name, and functions and the optimiser are not compared; numbers and arrays
+      are. Use it for functions that change what they hold, and across versions.
 
     If the log marginal likelihood or the gradient is not finite, the optimisation ends with the
     last good parameters, a warning, and the step in `stopped`. Raises `ValueError` for a parameter
