@@ -23,6 +23,9 @@ PALETTE = np.array(
 # Five rows of three bits for each digit, a row in an octal figure.
 _DIGITS = ("75557", "26227", "71747", "71717", "55711", "74717", "74757", "71122", "75757", "75717")
 
+# What is left of each brightness under the plate of a number.
+_DARKENED = (np.arange(256) - 0.6 * np.arange(256)).astype(np.uint8)
+
 
 def draw_stroke(
     frame: Float[np.ndarray, "h w 3"],
@@ -89,25 +92,6 @@ def draw_points(
         draw_stroke(frame, (x, y), (x, y), radius, colour)
 
 
-def draw_number(
-    frame: Float[np.ndarray, "h w 3"],
-    number: int,
-    corner: tuple[float, float],
-    colour: Float[np.ndarray, "3"],
-    size: int = 2,
-) -> None:
-    """Write a number with its top-left corner at (x, y), `size` pixels a dot, on a dark plate."""
-    plate = _plate(number, size)
-    x, y = round(corner[0]), round(corner[1])
-    window = _window(frame, x, y, x + plate.shape[1], y + plate.shape[0])
-    if window is None:
-        return
-    part, columns, lines = window
-    plate = plate[lines[:, 0].astype(int) - y][:, columns[0].astype(int) - x]
-    _blend(part, np.full(plate.shape, 0.6), np.zeros(3))
-    _blend(part, plate.astype(float), colour)
-
-
 @functools.lru_cache(maxsize=4096)
 def _plate(number: int, size: int) -> Bool[np.ndarray, "height width"]:
     """Where a number's digits are on its plate: an id comes again in every frame."""
@@ -127,25 +111,22 @@ def with_tracks(
     smooth ones on a large frame.
     """
     canvas = frame.copy()
-    height, width, _ = frame.shape
-    thickness = max(1, round(height / 360))
+    palette = PALETTE.astype(np.uint8)
+    thickness = max(1, round(frame.shape[0] / 360))
+    size = 1 + thickness
     for _, id, x, y, w, h in rows.tolist():
-        colour = PALETTE[int(id) % len(PALETTE)]
+        colour = palette[int(id) % len(palette)]
         left, top, right, bottom = (round(edge) for edge in (x, y, x + w, y + h))
         for x0, y0, x1, y1 in (
             (left, top, right, top + thickness), (left, bottom - thickness, right, bottom),
             (left, top, left + thickness, bottom), (right - thickness, top, right, bottom),
         ):  # fmt: skip
-            columns, lines = np.clip([x0, x1], 0, width), np.clip([y0, y1], 0, height)
-            canvas[lines[0] : lines[1], columns[0] : columns[1]] = colour
-        size = 1 + thickness
+            canvas[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = colour
+        plate = _plate(int(id), size)
         above, start = max(top - 5 * size - 4, 0), max(left, 0)
-        tall, wide = _plate(int(id), size).shape
-        label = canvas[above : above + tall, start : start + wide]
-        if label.size:
-            drawn = label.astype(float)
-            draw_number(drawn, int(id), (0, 0), colour, size)
-            label[:] = np.clip(drawn, 0, 255)
+        label = canvas[above : above + plate.shape[0], start : start + plate.shape[1]]
+        label[:] = _DARKENED[label]
+        label[plate[: label.shape[0], : label.shape[1]]] = colour
     return canvas
 
 

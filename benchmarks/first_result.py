@@ -1,0 +1,235 @@
+"""The seconds of CPU before a first result: cold, and with compiled programs kept.
+
+    python -m benchmarks.first_result
+
+Every figure is of a fresh process. "Cold" starts with an empty folder of compiled programs, "kept"
+runs the same once more with what the cold run left there. The first rows are of calls within a
+process, after the imports; a row for the imports stands beside them. The others are whole
+commands, from start to end. The commands track a rendered scene. CPU seconds count all threads, so
+they change little when the machine does other work. Drawing is in milliseconds a frame.
+
+--before DIR runs the same in another checkout of mpfjax, in turns with this one, for a table of
+before and after. Into --out DIR go the table as first_result.json and nothing else.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from mpfjax.console import exit_status, format_table, whole, write_json
+from mpfjax.vision import football_scene, write_tracks
+
+HERE = Path(__file__).resolve().parents[1]
+NUM_FRAMES = 60
+_BEGIN = """
+import time, json, jax, jax.numpy as jnp, numpy as np, mpfjax
+model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
+observations = jnp.abs(jnp.sin(jnp.arange(1.0, 51.0))) + 1
+key = jax.random.key(0)
+def run(filter):
+    return mpfjax.run_filter(key, filter, observations).log_marginal_likelihood.block_until_ready()
+def mixture(m):
+    return mpfjax.mixture_particle_filter(model, 1000, max_components=m)
+start, began = time.process_time(), time.perf_counter()
+"""
+_END = """
+print(json.dumps({"cpu": time.process_time() - start, "wall": time.perf_counter() - began}))
+"""
+_DRAW = """
+import time, json, numpy as np
+from mpfjax.vision.files.drawing import with_tracks
+frame = np.zeros((1080, 1920, 3), np.uint8)
+places = np.random.default_rng(0).uniform([0, 0], [1800, 900], (NUMBER, 2))
+rows = [np.column_stack([np.ones(NUMBER), np.arange(1, NUMBER + 1), places + shift,
+                         np.full((NUMBER, 2), [60, 120])]) for shift in range(60)]
+with_tracks(frame, rows[0])
+start, began = time.process_time(), time.perf_counter()
+for row in rows:
+    with_tracks(frame, row)
+print(json.dumps({"cpu": (time.process_time() - start) / len(rows),
+                  "wall": (time.perf_counter() - began) / len(rows)}))
+"""
+
+
+class Job(NamedTuple):
+    """What a process does: a script that prints its seconds, or a command that is timed whole."""
+
+    name: str
+    script: str = ""
+    command: tuple[str, ...] = ()
+
+
+class Spent(NamedTuple):
+    """Seconds of a process, and its peak memory in MB."""
+
+    cpu: float
+    wall: float
+    memory: float
+
+
+def jobs(scene: Path, out: Path) -> list[Job]:
+    """All rows of the table, in order; commands track the scene in a folder."""
+    calls = {
+        "run_filter, particle filter": "run(mpfjax.particle_filter(model, 1000))",
+        "run_filter, mixture, M = 4": "run(mixture(4))",
+        "run_filter, mixture, M = 64": "run(mixture(64))",
+        "run_filter, monte_carlo and step, M = 4": (
+            "run(mixture(4))\n"
+            "keys = jax.random.split(key, 4)\n"
+            "mpfjax.monte_carlo(keys, mixture(4), observations).final.log_weights"
+            ".block_until_ready()\n"
+            "state = mixture(4).init(key)\n"
+            "mixture(4).step(key, state, observations[0])[0].log_weights.block_until_ready()"
+        ),
+    }
+    track = ("-m", "mpfjax", "track", str(scene), "--out", str(out))
+    box = ",".join(f"{value:.0f}" for value in np.loadtxt(scene / "gt.txt", delimiter=",")[0, 2:6])
+    return [
+        Job("import mpfjax", command=("-c", "import mpfjax")),
+        *(Job(name, _BEGIN + call + _END) for name, call in calls.items()),
+        Job("mpfjax track, detections", command=(*track, "--detections", str(scene / "det.txt"))),
+        Job("mpfjax track, detections alone", command=(
+            "-m", "mpfjax", "track", str(scene / "det.txt"), "--out", str(out),
+        )),
+        Job("mpfjax track --box", command=(*track, "--box", box)),
+        Job("README's first command", command=(
+            "-m", "benchmarks.score_vs_particles", "--out", str(out),
+        )),
+        Job("drawing 24 objects, a frame", _DRAW.replace("NUMBER", "24")),
+        Job("drawing 150 objects, a frame", _DRAW.replace("NUMBER", "150")),
+    ]  # fmt: skip
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run every job, print a table, and write the results."""
+    options = parse(arguments)
+    return exit_status(lambda: run(options), arguments)
+
+
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    """The options, or a message that names the one that cannot be run."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.first_result")
+    parser.add_argument("--before", type=Path, metavar="DIR", help="another checkout, beside this")
+    parser.add_argument("--rounds", type=whole(), default=1, help="of which the least counts")
+    parser.add_argument("--only", default="", metavar="TEXT", help="rows with this in their name")
+    parser.add_argument("--out", default="results/first_result", metavar="DIR")
+    options = parser.parse_args(arguments)
+    if options.before is not None and not (options.before / "mpfjax").is_dir():
+        parser.error(f"--before: {options.before} holds no mpfjax")
+    return options
+
+
+def run(options: argparse.Namespace) -> None:
+    """Round after round of each job, in turns with the other checkout's; then the table."""
+    roots = {"now": HERE} if options.before is None else {"before": options.before, "now": HERE}
+    with tempfile.TemporaryDirectory() as folder:
+        scene = render(Path(folder) / "scene")
+        chosen = [job for job in jobs(scene, Path(folder) / "out") if options.only in job.name]
+        if not chosen:
+            raise ValueError(f"--only: no row has {options.only!r} in its name")
+        results = []
+        for job in chosen:
+            row: dict[str, Any] = {"job": job.name}
+            for name, root in roots.items():
+                row[name] = least(lambda job=job, root=root: cold_and_kept(job, root), options)
+            results.append(row)
+            print(table([row], list(roots)) if len(results) == 1 else lines([row], list(roots)))
+    out = Path(options.out)
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / "first_result.json", {"jax": jax.__version__, "rows": results})
+    print(f"results: {out}/")
+
+
+def least(measure: Callable[[], tuple[Spent, Spent]], options: argparse.Namespace) -> dict:
+    """The least of each figure over the rounds."""
+    rounds = [measure() for _ in range(options.rounds)]
+    parts = {}
+    for index, name in enumerate(("cold", "kept")):
+        figures = np.array([found[index] for found in rounds]).min(axis=0)
+        parts[name] = dict(zip(Spent._fields, np.round(figures, 4).tolist(), strict=True))
+    return parts
+
+
+def cold_and_kept(job: Job, root: Path) -> tuple[Spent, Spent]:
+    """A process with an empty folder of programs, and one with what that has left there."""
+    with tempfile.TemporaryDirectory() as folder:
+        return spent(job, root, Path(folder)), spent(job, root, Path(folder))
+
+
+def spent(job: Job, root: Path, programs: Path) -> Spent:
+    """What one process took; a `ValueError` with its last line where it failed."""
+    settings = {
+        "PYTHONPATH": str(root),
+        "JAX_COMPILATION_CACHE_DIR": str(programs),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+    }
+    measured = [sys.executable, "-c", _MEASURE, *(job.command or ("-c", job.script))]
+    ended = subprocess.run(
+        measured, cwd=root, env={**os.environ, **settings}, capture_output=True, text=True
+    )
+    if ended.returncode != 0:
+        last = ended.stderr.strip().splitlines()[-1:]
+        raise ValueError(f"{job.name}: its process ended with {ended.returncode}: {last}")
+    found = json.loads(ended.stdout.splitlines()[-1])
+    if job.script:
+        found |= json.loads(ended.stdout.splitlines()[-2])
+    return Spent(found["cpu"], found["wall"], found["memory"])
+
+
+# A process of its own starts each job, so that what it has used is the job's alone.
+_MEASURE = """
+import json, resource, subprocess, sys, time
+began = time.perf_counter()
+code = subprocess.run([sys.executable, *sys.argv[1:]]).returncode
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+wall = time.perf_counter() - began
+memory = used.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+print(json.dumps({"cpu": used.ru_utime + used.ru_stime, "wall": wall, "memory": memory}))
+sys.exit(code)
+"""
+
+
+def render(folder: Path) -> Path:
+    """A football scene as images, with its truth for detections."""
+    import imageio.v3 as imageio
+
+    scene = football_scene(jax.random.key(0), NUM_FRAMES, num_players=8, num_opponents=0)
+    (folder / "img").mkdir(parents=True)
+    for number, frame in enumerate(np.asarray(scene.frames), 1):
+        imageio.imwrite(folder / "img" / f"{number:06d}.jpg", frame)
+    write_tracks(folder / "gt.txt", scene.tracks)
+    shutil.copy(folder / "gt.txt", folder / "det.txt")
+    return folder
+
+
+def table(results: list[dict[str, Any]], names: list[str]) -> str:
+    """The results as text."""
+    header = ["CPU seconds", *(f"{name}, {part}" for part in ("cold", "kept") for name in names)]
+    return format_table([*header, "MB, kept"], [_cells(row, names) for row in results])
+
+
+def lines(results: list[dict[str, Any]], names: list[str]) -> str:
+    """Rows without the header."""
+    return table(results, names).splitlines()[-1]
+
+
+def _cells(row: dict[str, Any], names: list[str]) -> list[str]:
+    parts = [row[name][part]["cpu"] for part in ("cold", "kept") for name in names]
+    form = (lambda s: f"{1e3 * s:.1f} ms") if row["job"].startswith("drawing") else "{:.1f}".format
+    memory = row[names[-1]]["kept"]["memory"]
+    return [f"{row['job']:40s}", *(f"{form(part):>12s}" for part in parts), f"{memory:.0f}"]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
