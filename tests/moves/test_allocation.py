@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax import QuadraticModel, Resample, mixture_particle_filter
-from mpfjax.moves.resampling.allocation import LEAST_SHARE
+from mpfjax import QuadraticModel, Resample, mixture_particle_filter, run_filter
+from mpfjax.moves.resampling.allocation import FEWEST, LEAST_SHARE, demands_for_least_error
 from tests.examples import make_mixture
 from tests.marking import thorough
 
 MOVE = Resample(allocation="variance")
+LEAST_ERROR = Resample(allocation="least_error")
 
 
 @eqx.filter_jit
@@ -121,3 +122,55 @@ def test_an_allocation_beside_a_fixed_number_or_of_an_unknown_name_is_refused():
         Resample(particles_per_component=5, allocation="variance")
     with pytest.raises(ValueError, match="allocation"):
         mixture_particle_filter(QuadraticModel(0.3, 0.5, -2.0, 2.0), 10, 2, allocation="mass")
+
+
+def criteria(masses, variances):
+    """Variances of log Ẑ if all is settled later, and of the mixture weights, by slots."""
+    jacobian = np.diag(masses) - np.outer(masses, masses)
+    settled, of_weights = masses * variances, np.sum(jacobian**2, axis=0) * variances
+    return [lambda slots, a=a: np.sum(a / slots, axis=-1) for a in (settled, of_weights)]
+
+
+@pytest.mark.parametrize("masses", [[0.5, 0.3, 0.2], *thorough([[0.9, 0.099, 0.001]])])
+def test_the_least_error_is_within_twice_the_least_of_each_criterion(masses):
+    """Beside ways to share that are drawn at random, with large components: nothing is shrunk."""
+    mixture = three_components(masses, (0.2, 1.0, 1.5), n=4000)
+    sizes = np.asarray(mixture.component_effective_sample_sizes)
+    demands, _ = demands_for_least_error(mixture, mixture.active)
+    ways = np.random.default_rng(0).dirichlet(np.ones(3), size=20_000)
+    found = np.asarray(demands) / np.sum(np.asarray(demands))
+    for criterion in criteria(np.array(masses), 4000 / sizes):
+        assert criterion(found) <= 2 * np.min(criterion(ways))
+
+
+def test_of_two_components_the_one_that_seems_hopeless_keeps_a_quarter():
+    """Its mass may be off as much as that of the other, whatever the other has."""
+    labels = np.repeat([0, 1], 60)
+    log_weights = np.where(labels == 0, 0.0, -25.0)
+    found = dealt(make_mixture(np.zeros((120, 1)), log_weights, labels, 2), LEAST_ERROR)
+    assert found.sum() == 120
+    assert 30 <= found[1] <= 40
+
+
+def test_where_particles_are_few_the_least_error_shares_equally():
+    mixture = three_components((0.98, 0.01, 0.01), (1.0, 2.0, 0.0), n=FEWEST)
+    assert list(dealt(mixture, LEAST_ERROR)) == [FEWEST] * 3
+
+
+def test_narrow_likelihoods_leave_a_hopeless_component_half_an_equal_share():
+    """Of three, the lightest asks for nothing; it gets more, the fewer effective ones there are."""
+    masses = (0.5, 0.5, 1e-12)
+    wide = dealt(three_components(masses, (0.0, 0.0, 0.0), n=400), LEAST_ERROR)
+    narrow = dealt(three_components(masses, (2.0, 2.0, 2.0), n=400), LEAST_ERROR)
+    assert wide[2] == FEWEST
+    assert 5 * FEWEST < narrow[2] <= 200
+
+
+def test_a_default_mixture_of_few_particles_draws_as_with_equal_shares():
+    model = QuadraticModel(0.3, 0.5, -2.0, 2.0)
+    runs = [
+        run_filter(jax.random.key(0), mixture_particle_filter(model, 20, 2, allocation=allocation),
+                   jnp.ones(5)).log_marginal_likelihood
+        for allocation in (None, "equal")
+    ]  # fmt: skip
+    assert runs[0] == runs[1]

@@ -6,11 +6,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.mixture import ParticleMixture
+from mpfjax.operations.logarithms import scaled_exp
 from mpfjax.operations.segments import segments_in_order, spread
 from mpfjax.operations.stored import stored
 
 # A component is dealt at least its equal share divided by this, however little it asks for.
 LEAST_SHARE = 10
+# For the least error, so many particles say what a component needs; fewer do not.
+FEWEST = 10
+# A mode dies at a step with a probability of about exp(-5) if so many effective particles stay.
+SURVIVORS = 5
 
 
 class Slots(NamedTuple):
@@ -28,12 +33,14 @@ def allocate_slots(
     mixture: ParticleMixture,
     particles_per_component: int | None,
     demands: Float[Array, " m"] | None = None,
+    least: Float[Array, ""] | None = None,
 ) -> Int[Array, " m"]:
     """How many slots each component gets.
 
     Components that are not due keep their slots, `counts`. The others share the rest of the usable
     slots equally, or in proportion to their `demands`, or get `particles_per_component` each if
-    that is a number.
+    that is a number. With demands, each first gets its equal share where that is `FEWEST` or less,
+    and else `least`, of half an equal share at most; None is a tenth of an equal share.
     """
     usable, num_slots = mixture.num_usable_slots, mixture.num_particles
     if particles_per_component is not None:
@@ -47,9 +54,59 @@ def allocate_slots(
     if demands is None:
         share = _evenly(pool, due, sharers)
     else:
-        least = jnp.minimum(jnp.maximum(pool // (sharers * LEAST_SHARE), 1), pool // sharers)
-        share = least + _in_proportion(pool - least * sharers, due, demands)
+        equal_share = pool // sharers
+        if least is None:
+            kept_alive = jnp.maximum(pool // (sharers * LEAST_SHARE), 1)
+        else:
+            needed = jnp.minimum(least, equal_share.astype(least.dtype) / 2).astype(jnp.int32)
+            kept_alive = jnp.maximum(needed, FEWEST)
+        first = jnp.minimum(kept_alive, equal_share)
+        share = first + _in_proportion(pool - first * sharers, due, demands)
     return stored(jnp.where(due, share, kept), num_slots + 1)
+
+
+def demands_for_least_error(
+    mixture: ParticleMixture, due: Bool[Array, " m"]
+) -> tuple[Float[Array, " m"], Float[Array, ""]]:
+    """What each component asks for, and how many slots keep a mode alive.
+
+    The mean likelihood of k_m particles has a relative variance in proportion to v_m / k_m, with
+    v_m = (particles of m) / ESS_m from the weights as they are. So log Ẑ and the mixture weights
+    err by sums Σ_m a_m² v_m / k_m, which k_m in proportion to a_m v_m^(1/2) make least (Neyman
+    1934):
+
+    - log Ẑ, by later observations: a_m² = π_m. What counts is E[p_m²], where p_m is the mass that
+      component m of today will have been given. p_m is a martingale from π_m on; its square is
+      expected to be π_m² if nothing more is learned, and π_m if all is settled, which is most.
+    - the mixture weights, summed over components: dπ_m = π_m (e_m - Σ_l π_l e_l) for errors e, so
+      a_m² = π_m² [(1 - π_m)² + Σ_{l ≠ m} π_l²]. Two components ask for the same, whatever π is.
+
+    The demand is the mean of the two solutions: neither variance is more than twice the least one.
+    Where a component has few particles, v_m is drawn towards the mean over all, by `FEWEST`.
+    """
+    weights, _ = scaled_exp(mixture.log_weights)
+    counts = mixture.component_counts.astype(weights.dtype)
+    sums = mixture.component_sums(weights)
+    divisor = jnp.where(sums > 0, sums, 1.0)
+    # Divided one after the other: the square of a small mass is zero.
+    variances = counts * (mixture.component_sums(weights**2) / divisor) / divisor
+    variances = jnp.clip(variances, 1.0, jnp.maximum(counts, 1.0))
+    sharing = jnp.where(due, counts, 0.0)
+    mean_variance = jnp.sum(sharing * variances) / jnp.maximum(jnp.sum(sharing), 1.0)
+    variances = (counts * variances + FEWEST * mean_variance) / (counts + FEWEST)
+
+    masses = sums / jnp.sum(sums)
+    # Not 1 - π, which rounding would make zero.
+    others = jnp.where(jnp.eye(len(masses), dtype=bool), 0.0, masses[None])
+    of_masses = masses * jnp.sqrt(jnp.sum(others, axis=1) ** 2 + jnp.sum(others**2, axis=1))
+    spreads = jnp.where(due, jnp.sqrt(variances), 0.0)
+    demands = _as_shares(jnp.sqrt(masses) * spreads) + _as_shares(of_masses * spreads)
+    return demands, SURVIVORS * mean_variance
+
+
+def _as_shares(demands: Float[Array, " m"]) -> Float[Array, " m"]:
+    total = jnp.sum(demands)
+    return demands / jnp.where(total > 0, total, 1.0)
 
 
 def _evenly(

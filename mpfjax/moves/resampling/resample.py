@@ -20,7 +20,12 @@ from mpfjax.checks import (
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractAdaptiveResampling
 from mpfjax.moves.eve_indices import with_offspring
-from mpfjax.moves.resampling.allocation import Slots, allocate_slots, place_slots
+from mpfjax.moves.resampling.allocation import (
+    Slots,
+    allocate_slots,
+    demands_for_least_error,
+    place_slots,
+)
 from mpfjax.moves.resampling.layout import InPlace, SideBySide, as_they_are, side_by_side
 from mpfjax.moves.resampling.optimal_transport import require_ott, transport
 from mpfjax.moves.resampling.ordering import SortBy, check_sort_by
@@ -32,7 +37,7 @@ from mpfjax.operations.prefix_sums import count_starts
 from mpfjax.operations.segments import segment_log_sum_exp, spread
 from mpfjax.operations.stored import stored
 
-ALLOCATIONS = ("equal", "variance")
+ALLOCATIONS = ("equal", "variance", "least_error")
 GRADIENTS = ("none", "stop", "soft", "ot", "straight_through")
 
 
@@ -60,6 +65,10 @@ class Resample(AbstractAdaptiveResampling):
       independent particles give the mass of m, times k_m^(1/2): for a sum of such masses, these
       numbers leave the least variance (Neyman 1934). Each living component has at least a tenth of
       an equal share. Use it where components of little mass hold slots that others need.
+      "least_error", the default of `mixture_particle_filter`, weighs two such solutions, of log Ẑ
+      given what later observations may settle and of the mixture weights, and leaves each component
+      as many as keep a mode alive: ten, or so many that five effective ones are expected, but no
+      more than half an equal share. Use it unless you know better; docs/masses.md has the reasons.
     - `share_by`: a function that gives each particle the whole number of its group, the same within
       a component. Groups with a component that is resampled share the slots equally, and so do the
       components within a group. None makes no groups. Use it where components are rival hypotheses
@@ -225,14 +234,16 @@ class Resample(AbstractAdaptiveResampling):
         self, mixture: ParticleMixture, due: Bool[Array, " m"], counts: Int[Array, " m"]
     ) -> Int[Array, " m"]:
         """How many slots each component gets; those that are not `due` keep theirs, `counts`."""
-        demands = None
-        if self.allocation == "variance":
+        demands = least = None
+        if self.allocation == "least_error" and mixture.num_components > 1:
+            demands, least = demands_for_least_error(mixture, due)
+        elif self.allocation == "variance":
             weights, _ = scaled_exp(mixture.log_weights)
             sizes = mixture.component_counts.astype(weights.dtype)
             demands = jnp.sqrt(sizes * mixture.component_sums(weights**2))
         elif self.share_by is not None:
             demands = _shares_of_groups(mixture, self.share_by(mixture.particles), due)
-        return allocate_slots(counts, due, mixture, self.particles_per_component, demands)
+        return allocate_slots(counts, due, mixture, self.particles_per_component, demands, least)
 
     def _log_masses(
         self, mixture: ParticleMixture, line: InPlace | SideBySide
