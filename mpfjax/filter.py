@@ -59,6 +59,8 @@ class StepInfo(eqx.Module):
     """which components of the mixture that the step was given were resampled."""
     degenerate: Bool[Array, ""]
     """whether every particle had zero likelihood: the weights are then those of the prediction."""
+    labels_ran_out: Bool[Array, ""]
+    """whether all M > 1 labels are in use, so that more modes share one; see `Split.is_diffuse`."""
     log_marginal_likelihood_error: Float[Array, ""] | None = None
     """the standard error of log Ẑ of all steps so far, from this one run; None unless the filter
     is one of `mpfjax.smoothing.with_first_ancestors`."""
@@ -357,12 +359,14 @@ def _report(
         variance = jnp.where(degenerate, jnp.inf, evidence_variance(mixture))
         of_evidence = jnp.sqrt(jnp.maximum(variance, 0.0))
         of_masses = jnp.sqrt(jnp.maximum(mass_variances(mixture), 0.0))
+    sizes = mixture.component_effective_sample_sizes
     return StepInfo(
         log_likelihood_increment=increment,
-        effective_sample_sizes=mixture.component_effective_sample_sizes,
+        effective_sample_sizes=sizes,
         mixture_weights=mixture.mixture_weights,
         resampled=resampled,
         degenerate=degenerate,
+        labels_ran_out=jnp.all(sizes > 0) & (mixture.num_components > 1),
         log_marginal_likelihood_error=of_evidence,
         mixture_weight_errors=of_masses,
     )

@@ -112,7 +112,7 @@ def mixture_particle_filter(
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
     particles_per_component: int | None = None,
-    allocation: str | None = None,
+    allocation: str = "equal",
     sort_by: SortBy | None = None,
     noise: str = "independent",
     num_draws: int = 1,
@@ -136,15 +136,15 @@ def mixture_particle_filter(
     those moves, for example with other thresholds, and bring their own features and scale.
     `regroup_every` is k where they run at every k-th step (see `Every`): take 1 where modes move
     fast, or where a `Merge` counts frames with its `patience`. `gradient`, `noise` and `num_draws`
-    are those of `particle_filter`, `lookahead` that of `auxiliary_particle_filter`. `allocation` is
-    that of `Resample`; None is "least_error", or "equal" with `particles_per_component`. With
-    `noise="rqmc"` each component has a point set of its own, and masses are far more accurate. Use
-    it where there are several modes and all of them must be kept.
+    are those of `particle_filter`, `lookahead` that of `auxiliary_particle_filter`, and
+    `allocation` that of `Resample`. With `noise="rqmc"` each component has a point set of its own,
+    and the masses of modes are far more accurate. Use it where the filtering distribution has
+    several modes and all of them must be kept.
     """
     sort_by = _standing(sort_by, noise)
-    k = particles_per_component
-    deal = allocation or ("least_error" if k is None else "equal")
-    resample = Resample(scheme, ess_threshold, k, sort_by, gradient, allocation=deal)
+    resample = Resample(
+        scheme, ess_threshold, particles_per_component, sort_by, gradient, allocation=allocation
+    )
     proposal = propagating_proposal(proposal, lookahead)
     propagate = propagation(model, proposal, gradient, noise, num_draws)
     moves = [resampling(resample, lookahead), propagate]

@@ -23,7 +23,7 @@ def _auxiliary(**options: Any) -> Make:
 
 def _mixture(ahead: bool = False, **options: Any) -> Make:
     def make(scene: Scene, num_particles: int) -> mpfjax.Filter:
-        chosen: dict[str, Any] = {"regroup_every": 1, "allocation": "equal"} | options
+        chosen: dict[str, Any] = {"regroup_every": 1} | options
         lookahead = {"lookahead": scene.lookahead} if ahead else {}
         return mpfjax.mixture_particle_filter(
             scene.model, num_particles, scene.max_components,
@@ -51,9 +51,9 @@ FILTERS: dict[str, Make] = {
     "APF": _auxiliary(),
     "APF, rqmc": _auxiliary(noise="rqmc"),
     "MPF": _mixture(),
-    "MPF, by default": _mixture(regroup_every=3, allocation=None),
-    "MPF, equal slots": _mixture(regroup_every=3),
-    "MPF, by default, rqmc": _mixture(regroup_every=3, allocation=None, noise="rqmc"),
+    "MPF, as it comes": _mixture(regroup_every=3),
+    "MPF, least error": _mixture(regroup_every=3, allocation="least_error"),
+    "MPF, least error, rqmc": _mixture(regroup_every=3, allocation="least_error", noise="rqmc"),
     "MPF, rqmc": _mixture(noise="rqmc"),
     "MPF, 4 draws": _mixture(num_draws=4),
     "MPF, rqmc, 4 draws": _mixture(noise="rqmc", num_draws=4),

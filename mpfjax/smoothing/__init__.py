@@ -2,6 +2,8 @@
 
 from mpfjax.smoothing.ancestors import Genealogy as Genealogy
 from mpfjax.smoothing.ancestors import trace_ancestors as trace_ancestors
+from mpfjax.smoothing.batches import BatchEstimate as BatchEstimate
+from mpfjax.smoothing.batches import batch_estimate as batch_estimate
 from mpfjax.smoothing.conditional import ConditionalRun as ConditionalRun
 from mpfjax.smoothing.conditional import conditional_filter as conditional_filter
 from mpfjax.smoothing.forecasts import Forecast as Forecast

@@ -166,11 +166,11 @@ def test_narrow_likelihoods_leave_a_hopeless_component_half_an_equal_share():
     assert 5 * FEWEST < narrow[2] <= 200
 
 
-def test_a_default_mixture_of_few_particles_draws_as_with_equal_shares():
+def test_a_mixture_of_few_particles_draws_as_with_equal_shares():
     model = QuadraticModel(0.3, 0.5, -2.0, 2.0)
     runs = [
         run_filter(jax.random.key(0), mixture_particle_filter(model, 20, 2, allocation=allocation),
                    jnp.ones(5)).log_marginal_likelihood
-        for allocation in (None, "equal")
+        for allocation in ("least_error", "equal")
     ]  # fmt: skip
     assert runs[0] == runs[1]

@@ -216,6 +216,19 @@ class TestSplit:
         full = mixture.replace(num_components=2)
         np.testing.assert_array_equal(labels_after(Split(), full), np.repeat([0, 1], 80))
 
+    def test_more_modes_than_labels_share_them_without_losing_mass(self):
+        """Three clouds and two labels: one is full of two, which `is_diffuse` tells."""
+        modes = np.repeat([0, 1, 1], 40)
+        states = np.repeat([0.0, 20.0, 40.0], 40) + RNG.normal(size=120)
+        mixture = make_mixture(states[:, None], RNG.normal(size=120), modes, 2)
+        found = eqx.filter_jit(Split())(KEY, mixture)
+        np.testing.assert_array_equal(found.log_weights, mixture.log_weights)
+        np.testing.assert_array_equal(found.component_indicators, modes)
+        assert list(np.asarray(Split().is_diffuse(mixture))) == [False, True]
+        # With a label more, the second cloud of the two has one of its own.
+        free = eqx.filter_jit(Split())(KEY, mixture.replace(num_components=3))
+        assert len(np.unique(free.component_indicators)) == 3
+
     def test_two_splits_at_once_take_different_labels(self):
         parts = [RNG.normal(size=40) + centre for centre in (0, 12, 200, 260)]
         mixture = make_mixture(

@@ -20,6 +20,7 @@ from mpfjax.moves.regrouping.features import (
     weighted_means,
 )
 from mpfjax.operations.choices import cond_if_any
+from mpfjax.operations.gradients import without_gradient
 from mpfjax.operations.indexing import take
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.segments import segment_argmax, spread_finite
@@ -87,8 +88,24 @@ class Split(AbstractRegrouping):
         )
         return labels, mixture.memory
 
+    def is_diffuse(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
+        """Which components would split, were there a free label for each of them.
+
+        Where `StepInfo.labels_ran_out`, these are the ones in which several modes share a label.
+        """
+        return self._halves(without_gradient(mixture)).splits
+
     def _split_where_diffuse(self, mixture: ParticleMixture) -> Int[Array, " n"]:
         """The new labels, where at least one is free."""
+        parent = mixture.component_indicators
+        halves = self._halves(mixture)
+        labels = free_labels(halves.splits, halves.deviations, mixture.active)
+        lighter = spread_finite(halves.lighter, parent, 2)
+        moves = (halves.side == lighter) & mixture.occupied
+        return jnp.where(moves, spread_finite(labels, parent, mixture.num_components), parent)
+
+    def _halves(self, mixture: ParticleMixture) -> "_Halves":
+        """Each component cut in two."""
         m, size = mixture.num_components, self.sample_size
         particles = _Particles(
             self.features(mixture),
@@ -100,7 +117,7 @@ class Split(AbstractRegrouping):
         if size is not None and mixture.num_particles > size * m:
             sample = _sampled(particles, size * m, mixture)
         centres = _two_means(sample, m, self.num_iterations)
-        features, weights, parent, occupied = particles
+        features, weights, parent, _ = particles
         side, gaps = _nearer(features, centres, parent)
         halves = summarise_about(centres, gaps, weights, parent + m * side)
         masses = halves.masses.reshape(2, m)
@@ -115,9 +132,17 @@ class Split(AbstractRegrouping):
             & (distance > self.min_distance)
         )
         lighter = jnp.where(masses[1] <= masses[0], 1, 0)
-        labels = free_labels(splits, deviations, mixture.active)
-        moves = (side == spread_finite(lighter, parent, 2)) & occupied
-        return jnp.where(moves, spread_finite(labels, parent, m), parent)
+        return _Halves(side, lighter, deviations, splits)
+
+
+class _Halves(NamedTuple):
+    """In which half each particle is, and of each component which is the lighter half, how many
+    deviations they are apart, and whether that is enough."""
+
+    side: Int[Array, " n"]
+    lighter: Int[Array, " m"]
+    deviations: Float[Array, " m"]
+    splits: Bool[Array, " m"]
 
 
 class _Particles(NamedTuple):

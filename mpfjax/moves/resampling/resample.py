@@ -65,10 +65,10 @@ class Resample(AbstractAdaptiveResampling):
       independent particles give the mass of m, times k_m^(1/2): for a sum of such masses, these
       numbers leave the least variance (Neyman 1934). Each living component has at least a tenth of
       an equal share. Use it where components of little mass hold slots that others need.
-      "least_error", the default of `mixture_particle_filter`, weighs two such solutions, of log Ẑ
-      given what later observations may settle and of the mixture weights, and leaves each component
-      as many as keep a mode alive: ten, or so many that five effective ones are expected, but no
-      more than half an equal share. Use it unless you know better; docs/masses.md has the reasons.
+      "least_error" weighs two such solutions, of log Ẑ given what later observations may settle and
+      of the mixture weights, and leaves each component as many as keep a mode alive: ten, or so
+      many that five effective ones are expected, but no more than half an equal share. Use it where
+      modes must be kept and N is in the hundreds or more; docs/masses.md has the reasons.
     - `share_by`: a function that gives each particle the whole number of its group, the same within
       a component. Groups with a component that is resampled share the slots equally, and so do the
       components within a group. None makes no groups. Use it where components are rival hypotheses

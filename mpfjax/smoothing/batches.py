@@ -1,0 +1,93 @@
+"""Estimates with standard errors from a batch of independent runs, whatever their noise is."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mpfjax.checks import check_callable, shown
+from mpfjax.mixture import ParticleMixture
+from mpfjax.operations.logarithms import log_sum_exp
+from mpfjax.running.scan import FilterRun
+
+# Standard errors of fewer runs say next to nothing.
+FEWEST_RUNS = 4
+
+
+class BatchEstimate(NamedTuple):
+    """What a batch of runs says together, and how surely."""
+
+    value: Float[Array, " *shape"]
+    error: Float[Array, " *shape"]
+    """the standard error of `value`."""
+    log_marginal_likelihood: Float[Array, ""]
+    """log of the mean of Ẑ."""
+    log_marginal_likelihood_error: Float[Array, ""]
+    effective_runs: Float[Array, ""]
+    """(Σ Ẑ)² / Σ Ẑ²: below about a third of the runs, errors are too small themselves."""
+
+
+def batch_estimate(
+    runs: FilterRun, quantity: Callable[[ParticleMixture], Float[Array, " *shape"]]
+) -> BatchEstimate:
+    """An expectation and log Z from B independent runs, each with its standard error.
+
+    The runs are one particle filter of B islands that never meet: run b counts by its Ẑ_b, so that
+
+        q = Σ_b Ẑ_b q_b / Σ_b Ẑ_b,   Ẑ = Σ_b Ẑ_b / B,
+
+    and Ẑ is unbiased (Vergé et al. 2015). The errors are those of the jackknife over runs (Efron
+    1982), (B - 1) / B Σ_b (q_(b) - mean of q_(.))², with q_(b) the estimate without run b. They ask
+    for nothing but independent runs, and so hold for every scheme, every noise and every move,
+    where `with_first_ancestors` asks for multinomial draws.
+
+    - `runs`: what `monte_carlo` returned for B keys, four or more. Twelve to thirty of N / B
+      particles each are a good choice. The runs are to be large enough that log Ẑ of a single one
+      varies by about one or less: otherwise few of them count, as `effective_runs` says.
+    - `quantity`: a function of one mixture, such as `lambda m: m.average(m.particles > 0)`. A mass
+      is to be that of a place or an event: labels of components mean something else in each run.
+
+    Runs of zero likelihood count nothing. Raises `ValueError` for fewer runs, and for what is no
+    stack of runs. Use it so that one call tells whether to believe a mass.
+    """
+    check_callable("a function of a mixture", quantity=quantity)
+    if not isinstance(runs, FilterRun) or runs.log_marginal_likelihood.ndim != 1:
+        raise ValueError(f"runs: {_what(runs)} is not what monte_carlo returns for several keys")
+    number = len(runs.log_marginal_likelihood)
+    if number < FEWEST_RUNS:
+        raise ValueError(f"runs: {number}; a standard error asks for {FEWEST_RUNS} at least")
+    logs = runs.log_marginal_likelihood
+    values = jax.vmap(quantity)(runs.final)
+    # Each run is left out in turn; a difference of sums would be lost to rounding.
+    stays = jnp.concatenate([jnp.ones((1, number), bool), ~jnp.eye(number, dtype=bool)])
+    log_z, estimates = jax.vmap(lambda kept: _combined(jnp.where(kept, logs, -jnp.inf), values))(
+        stays
+    )
+    log_z -= jnp.log(jnp.sum(stays, axis=1).astype(log_z.dtype))
+    shares = jax.nn.softmax(logs)
+    return BatchEstimate(
+        value=estimates[0],
+        error=_jackknife(estimates[1:]),
+        log_marginal_likelihood=log_z[0],
+        log_marginal_likelihood_error=_jackknife(log_z[1:]),
+        effective_runs=1 / jnp.sum(shares**2),
+    )
+
+
+def _combined(
+    logs: Float[Array, " b"], values: Float[Array, "b *shape"]
+) -> tuple[Float[Array, ""], Float[Array, " *shape"]]:
+    shares = jax.nn.softmax(logs).astype(values.dtype)
+    return log_sum_exp(logs), jnp.tensordot(shares, values, axes=1)
+
+
+def _jackknife(without: Float[Array, "b *shape"]) -> Float[Array, " *shape"]:
+    number = without.shape[0]
+    centred = without - jnp.mean(without, axis=0, keepdims=True)
+    return jnp.sqrt((number - 1) / number * jnp.sum(centred**2, axis=0))
+
+
+def _what(runs: Any) -> str:
+    return "one run" if isinstance(runs, FilterRun) else shown(runs)
