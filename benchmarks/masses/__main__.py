@@ -32,7 +32,8 @@ from mpfjax.models.base import starts_from_noise
 _FEWER = {"look-alikes": 10}
 # A picture has room for as many lines as there are colours.
 _IN_THE_TABLE_ONLY = (
-    "APF", "APF, rqmc", "MPF, 4 draws", "MPF, rqmc, 4 draws", "MPF, by variance", "MPF, look-ahead"
+    "APF", "APF, rqmc", "MPF, 4 draws", "MPF, rqmc, 4 draws", "MPF, by variance", "MPF, look-ahead",
+    "MPF, as it comes", "MPF, least error", "MPF, least error, rqmc",
 )  # fmt: skip
 
 
