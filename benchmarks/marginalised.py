@@ -1,0 +1,324 @@
+"""What a Kalman filter in every particle costs, and what it brings.
+
+    python -m benchmarks.marginalised --parts time
+    python -m benchmarks.marginalised --parts regimes
+
+`time`: propagation and weighing of a state of two latent and four linear numbers, of which
+particles draw the latent ones alone, beside `Propagate`, which draws all six; in turns, processor
+time by particle and step, and the median of the turns' ratios. "shared noise" is the mixed form,
+in which the latent numbers depend on the linear ones.
+
+`regimes`: a target with three regimes in four dimensions, which is the example of dynamax's
+`rbpfilter_optimal`. The error of the regimes' probabilities is that from a filter of --reference
+particles that looks at all children, as RMS over steps and seeds. dynamax takes part where it is
+installed (pip install --no-deps dynamax; pip install tfp-nightly dm-tree fastprogress==1.0.3). The
+last column is the filter's error over that of the best of ours in the same time, between whose
+sizes the logarithms are interpolated.
+
+Into --out DIR goes marginalised.json.
+"""
+
+import argparse
+import importlib.util
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key, PyTree
+
+import mpfjax
+from mpfjax.console import exit_status, format_table, whole, write_json
+
+Once = Callable[[int], Any]
+PARTS = ("time", "regimes")
+OURS = ("marginalised", "fully adapted", "all children")
+STAYS, DYNAMICS, ERRORS = 0.8, 0.2, 10 * np.array([2.0, 1.0, 2.0, 1.0])
+_HOW = "dynamax is not there: pip install --no-deps dynamax; pip install tfp-nightly dm-tree"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the parts, print a table of each, and write the results."""
+    options = parse(arguments)
+    return exit_status(lambda: run(options), arguments)
+
+
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    """The options, or a message that names the one that cannot be run."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.marginalised")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument(
+        "--particles", type=whole(), nargs="+", default=[1000, 4000, 16_000, 64_000], metavar="N",
+        help="of the part on time",
+    )  # fmt: skip
+    parser.add_argument(
+        "--sizes", type=whole(), nargs="+", default=[10, 30, 100, 300, 1000], metavar="N",
+        help="of the part on regimes",
+    )  # fmt: skip
+    parser.add_argument("--steps", type=whole(), default=100)
+    parser.add_argument("--seeds", type=whole(2), default=20)
+    parser.add_argument("--repeats", type=whole(), default=15, help="turns, each of all that run")
+    parser.add_argument("--reference", type=whole(), default=100_000, metavar="N")
+    parser.add_argument("--out", default="results/marginalised", metavar="DIR")
+    return parser.parse_args(arguments)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Part by part; what is finished is written."""
+    out, results = Path(options.out), {}
+    out.mkdir(parents=True, exist_ok=True)
+    for part in options.parts:
+        header, rows = {"time": time_of_steps, "regimes": regimes}[part](options)
+        results[part] = [dict(zip(header, row, strict=True)) for row in rows]
+        print(format_table(header, [[_shown(value) for value in row] for row in rows]))
+        write_json(out / "marginalised.json", {"settings": vars(options), "results": results})
+    print(f"results: {out}/")
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def milliseconds(runs: dict[Any, Once], repeats: int) -> dict[Any, np.ndarray]:
+    """Processor time of each, turn by turn, after one call that compiles."""
+    taken: dict[Any, list[float]] = {name: [] for name in runs}
+    for turn in range(repeats + 1):
+        for name, once in runs.items():
+            start = time.process_time()
+            jax.block_until_ready(once(0))
+            if turn:
+                taken[name].append(1000 * (time.process_time() - start))
+    return {name: np.array(values) for name, values in taken.items()}
+
+
+class SixNumbers(mpfjax.AbstractStateSpaceModel):
+    """Two numbers that move by four others, all drawn; two of the six are seen."""
+
+    noise_dimension = 6
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n 6"]:
+        """Standard normal numbers."""
+        return mpfjax.normal(key, (num_particles, 6))
+
+    def transition_from_noise(
+        self, noise: Float[Array, "n 6"], states: Float[Array, "n 6"]
+    ) -> Float[Array, "n 6"]:
+        """Each number by its own, and by the one two places on."""
+        return 0.9 * states + 0.1 * jnp.roll(states, 2, axis=1) + 0.3 * noise
+
+    def log_likelihood(
+        self, observation: Float[Array, "2"], states: Float[Array, "n 6"]
+    ) -> Float[Array, " n"]:
+        """Gaussian errors."""
+        missed = observation[0] - jnp.sin(states[:, 0]) - states[:, 2]
+        other = observation[1] - jnp.sin(states[:, 1]) - states[:, 3]
+        return -0.5 * (missed**2 + other**2)
+
+
+class TwoAndFour(mpfjax.AbstractConditionallyLinearModel):
+    """The same with two latent numbers and moments of four."""
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n 2"]:
+        """Standard normal numbers."""
+        return mpfjax.normal(key, (num_particles, 2))
+
+    def initial_moments(self, latent: Float[Array, "n 2"]) -> tuple[Array, Array]:
+        """Those of standard normal numbers."""
+        del latent
+        return jnp.zeros(4), jnp.eye(4)
+
+    def sample_transition(
+        self, key: Key[Array, ""], latent: Float[Array, "n 2"]
+    ) -> Float[Array, "n 2"]:
+        """By their own alone."""
+        return 0.9 * latent + 0.3 * mpfjax.normal(key, latent.shape)
+
+    def dynamics(
+        self, latent: Float[Array, "n 2"], previous_latent: Float[Array, "n 2"]
+    ) -> tuple[Array, Array, Array]:
+        """Of which the offset depends on the latent."""
+        del latent
+        offset = 0.1 * jnp.concatenate([previous_latent, jnp.zeros_like(previous_latent)], axis=1)
+        return 0.9 * jnp.eye(4) + 0.1 * jnp.eye(4, k=-2), offset, 0.09 * jnp.eye(4)
+
+    def emission(self, latent: Float[Array, "n 2"]) -> tuple[Array, Array, Array]:
+        """Two of the four, beside a function of the latent."""
+        return jnp.eye(2, 4), jnp.sin(latent), jnp.eye(2)
+
+
+class SharedNoise(TwoAndFour):
+    """The mixed form, in which the latent moves by the linear numbers."""
+
+    def latent_dynamics(self, previous_latent: Float[Array, "n 2"]) -> tuple[Array, Array, Array]:
+        """By the last two of the four."""
+        return 0.9 * previous_latent, 0.1 * jnp.eye(2, 4, k=2), 0.09 * jnp.eye(2)
+
+
+def time_of_steps(options: argparse.Namespace) -> tuple[list[str], list[list[Any]]]:
+    """Nanoseconds a particle and step of each move, by N."""
+    observations = jax.random.normal(jax.random.key(1), (options.steps, 2))
+    moves = {
+        "plain": mpfjax.Propagate(SixNumbers()),
+        "marginalised": mpfjax.PropagateMarginalised(TwoAndFour()),
+        "marginalised, mixed": mpfjax.PropagateMarginalised(SharedNoise()),
+    }
+    rows = []
+    for size in options.particles:
+        runs = {}
+        for name, move in moves.items():
+            filter = mpfjax.Filter(move.model, [move], size)
+            runs[name] = lambda seed, filter=filter: _evidence(seed, filter, observations)
+        taken = milliseconds(runs, options.repeats)
+        for name, times in taken.items():
+            ratio = float(np.median(times / taken["plain"]))
+            rows.append([name, size, 1e6 * float(times.min()) / size / options.steps, ratio])
+    return ["move", "N", "ns a particle and step", "over the plain one"], rows
+
+
+def _evidence(seed: int, filter: mpfjax.Filter, observations: Array) -> Array:
+    run = mpfjax.run_filter(jax.random.key(seed), filter, observations, lambda mixture: None)
+    return run.log_marginal_likelihood
+
+
+def manoeuvre() -> mpfjax.SwitchingLinearGaussianModel:
+    """Positions and velocities, (x, x', y, y'), pushed to one side, to the other, or not at all."""
+    A = np.eye(4) + np.diag([1.0, 0.0, 1.0], k=1)
+    pushes = np.outer([0.0, -1.0, 1.0], [1.225, 0.35, -1.225, -0.35])
+    return mpfjax.SwitchingLinearGaussianModel(
+        transition_matrix=(STAYS - 0.1) * np.eye(3) + 0.1,
+        F=A, b=jnp.asarray(pushes), Q=DYNAMICS * np.eye(4), H=np.eye(4), R=np.diag(ERRORS),
+        m0=np.zeros(4), P0=1e-6 * np.eye(4), initial_probabilities=jnp.full(3, 1 / 3),
+    )  # fmt: skip
+
+
+class AllDrawn(mpfjax.AbstractStateSpaceModel):
+    """The same target, of which particles draw everything."""
+
+    target: mpfjax.SwitchingLinearGaussianModel
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
+        """At rest in the middle, in any regime."""
+        latent = self.target.sample_initial(key, num_particles)
+        return {"latent": latent, "x": jnp.zeros((num_particles, 4))}
+
+    def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
+        """The regime, and the state by it."""
+        key_latent, key_state = jax.random.split(key)
+        latent = self.target.sample_transition(key_latent, states["latent"])
+        F, b, _ = self.target.dynamics(latent, states["latent"])
+        noise = np.sqrt(DYNAMICS) * mpfjax.normal(key_state, states["x"].shape)
+        return {"latent": latent, "x": states["x"] @ F.T + b + noise}
+
+    def log_likelihood(self, observation: Float[Array, "4"], states: PyTree) -> Float[Array, " n"]:
+        """Gaussian errors."""
+        squares = (observation - states["x"]) ** 2 / jnp.asarray(ERRORS, states["x"].dtype)
+        return -0.5 * jnp.sum(squares, axis=1)
+
+
+def simulated(model: mpfjax.SwitchingLinearGaussianModel, steps: int) -> Float[Array, "t 4"]:
+    """What is seen of a target, by numpy."""
+    rng, regime, state, rows = np.random.default_rng(0), 0, np.zeros(4), []
+    F, b = np.asarray(model.F, float), np.asarray(model.b, float)
+    for _ in range(steps):
+        regime = rng.choice(3, p=np.where(np.arange(3) == regime, STAYS, (1 - STAYS) / 2))
+        state = F @ state + b[regime] + np.sqrt(DYNAMICS) * rng.normal(size=4)
+        rows.append(state + np.sqrt(ERRORS) * rng.normal(size=4))
+    return jnp.asarray(np.array(rows), jnp.float32)
+
+
+def shares(weights: Float[Array, " n"], regime: Int[Array, " n"]) -> Float[Array, "3"]:
+    """The probability of each regime."""
+    return jnp.stack([jnp.sum(jnp.where(regime == k, weights, 0.0)) for k in range(3)])
+
+
+def of_mixture(mixture: mpfjax.ParticleMixture) -> Float[Array, "3"]:
+    """The same of a mixture."""
+    particles = mixture.particles
+    latent = particles["latent"] if isinstance(particles, dict) else particles.latent
+    return shares(mixture.weights, latent)
+
+
+def regimes(options: argparse.Namespace) -> tuple[list[str], list[list[Any]]]:
+    """Time and error of each filter and size."""
+    model = manoeuvre()
+    observations = simulated(model, options.steps)
+    every = lambda size: mpfjax.Filter(model, [mpfjax.PropagateRegimes(model)], size)  # noqa: E731
+    proposal = mpfjax.RegimeProposal(model)
+    makes: dict[str, Callable[[int], mpfjax.Filter]] = {
+        "plain": lambda size: mpfjax.particle_filter(AllDrawn(model), size),
+        "marginalised": lambda size: mpfjax.particle_filter(model, size),
+        "fully adapted": lambda size: mpfjax.auxiliary_particle_filter(model, size, proposal),
+        "all children": every,
+    }
+    runs: dict[tuple[str, int], Once] = {
+        (name, size): filtered(make(size), observations)
+        for name, make in makes.items()
+        for size in options.sizes
+    }
+    if importlib.util.find_spec("dynamax") is None:
+        print(f"{_HOW} fastprogress==1.0.3")
+    else:
+        runs |= {("dynamax", size): by_dynamax(model, observations, size) for size in options.sizes}
+    truth = np.asarray(filtered(every(options.reference), observations)(0))
+    errors = {
+        name: float(np.sqrt(np.mean([(once(s) - truth) ** 2 for s in range(options.seeds)])))
+        for name, once in runs.items()
+    }
+    taken = {name: float(np.median(t)) for name, t in milliseconds(runs, options.repeats).items()}
+    rows = []
+    for name, size in runs:
+        at = taken[name, size]
+        best = min(_error_at(at, taken, errors, own) for own in OURS)
+        rows.append([name, size, at, errors[name, size], errors[name, size] / best])
+    return ["filter", "N", "ms a run", "RMS error", "over our best then"], rows
+
+
+def _error_at(at: float, taken: dict, errors: dict, name: str) -> float:
+    """The error of a filter in a time: between its sizes on a line of logarithms, else the end."""
+    points = sorted((np.log(taken[key]), np.log(errors[key])) for key in taken if key[0] == name)
+    x, y = np.array(points).T
+    return float(np.exp(np.interp(np.log(at), x, y)))
+
+
+def filtered(filter: mpfjax.Filter, observations: Array) -> Once:
+    """The regimes' probabilities of a seed."""
+    return lambda seed: (
+        mpfjax.run_filter(jax.random.key(seed), filter, observations, of_mixture).collected
+    )
+
+
+def by_dynamax(model: mpfjax.SwitchingLinearGaussianModel, observations: Array, size: int) -> Once:
+    """The same by dynamax's filter with the optimal proposal."""
+    from dynamax.slds import inference  # pyright: ignore[reportMissingImports]
+
+    of_each = lambda array: jnp.broadcast_to(array, (3, *array.shape))  # noqa: E731
+    nothing = jnp.zeros((3, 4, 1))
+    parameters = inference.ParamsSLDS(
+        discrete=inference.DiscreteParamsSLDS(
+            initial_distribution=jnp.full(3, 1 / 3),
+            transition_matrix=model.transition_matrix,
+            proposal_transition_matrix=model.transition_matrix,
+        ),
+        linear_gaussian=inference.LGParamsSLDS(
+            initial_mean=of_each(model.m0), initial_cov=of_each(model.P0),
+            dynamics_weights=of_each(model.F), dynamics_cov=of_each(model.Q),
+            dynamics_bias=jnp.asarray(model.b), dynamics_input_weights=nothing,
+            emission_weights=of_each(model.H), emission_cov=of_each(model.R),
+            emission_bias=jnp.zeros((3, 4)), emission_input_weights=nothing, initialized=True,
+        ),
+    )  # fmt: skip
+
+    @jax.jit
+    def once(key: Array) -> Float[Array, "t 3"]:
+        found = inference.rbpfilter_optimal(size, parameters, observations, key)
+        return jax.vmap(shares)(found["weights"], found["states"])
+
+    return lambda seed: once(jax.random.PRNGKey(seed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
