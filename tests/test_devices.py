@@ -173,6 +173,7 @@ class TestIslands:
         run = mpfjax.run_filter(jax.random.fold_in(key, 0), filter, OBSERVATIONS)
         chex.assert_trees_all_close(islands, run, rtol=1e-4, atol=1e-5)
 
+    @pytest.mark.thorough
     def test_the_whole_is_one_normalised_mixture(self):
         filter = island_chains()["mixture, exchange"]
         run = mpfjax.run_islands(jax.random.key(5), filter, OBSERVATIONS, num_islands=4)

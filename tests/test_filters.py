@@ -532,6 +532,7 @@ class TestWhatAUserHandsIt:
         filter = getattr(mpfjax, make)(Drift(), 20, 2, features=first, kmeans=own, regroup_every=1)
         assert own in filter.moves
 
+    @pytest.mark.thorough
     def test_features_of_a_wrapped_model_are_of_one_particle(self):
         options = {"num_particles": 20, "max_components": 2, "scale": 0.5}
         one = mpfjax.mixture_particle_filter(

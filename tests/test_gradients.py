@@ -157,6 +157,7 @@ def test_propagation_with_stopped_gradients_is_the_same_to_the_bit(kind):
     chex.assert_trees_all_equal(*moved)
 
 
+@pytest.mark.thorough
 def test_steps_without_an_observation_keep_the_score_unbiased():
     observations = ONE.at[1].set(jnp.nan)
 

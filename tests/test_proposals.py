@@ -86,6 +86,7 @@ def test_on_a_linear_model_without_inflation_the_weight_does_not_depend_on_the_d
     np.testing.assert_allclose(factors[0], expected, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.thorough
 def test_from_a_known_start_the_evidence_is_exact():
     """With x_0 known, one guided step has no noise left."""
     known = mpfjax.LinearGaussianModel(
@@ -206,6 +207,7 @@ class TestNetworkProposal:
             expected = scipy.stats.norm(mean, deviations).logpdf(np.asarray(state)).sum()
             assert float(found) == pytest.approx(expected, abs=1e-3)
 
+    @pytest.mark.thorough
     def test_the_evidence_is_unbiased_before_it_has_learned_anything(self):
         filter = self.filter(NetworkProposal.create(jax.random.key(0), 1, 1, 0.4))
         keys = jax.random.split(jax.random.key(3), 2000)

@@ -209,6 +209,7 @@ class TestWhatGoesWrongEasily:
             mpfjax.smoothing.conditional_filter(KEY, filter, jnp.ones(2), jnp.ones(3))
 
 
+@pytest.mark.thorough
 def test_without_an_observation_the_noise_is_a_point_set_as_well():
     filter = mpfjax.particle_filter(QUADRATIC, 512, noise="rqmc")
     mixture = filter.init(KEY)

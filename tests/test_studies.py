@@ -157,6 +157,7 @@ class TestBrokenOff:
             "in the cell {'filter': 'pf', 'num_particles': 8, 'noise': 0.325}"
         ]
 
+    @pytest.mark.thorough
     def test_ten_times_by_sigkill_it_ends_as_if_left_alone(self, tmp_path):
         """Each process is forked off one that has imported everything, which takes longest."""
         num_cells, rng = 80, np.random.default_rng(0)

@@ -162,6 +162,7 @@ def test_rows_are_of_believed_objects_and_end_with_the_last_guess(sequence):
         np.testing.assert_array_equal(own[:, 0], np.arange(first, 15 + 2 + 1))
 
 
+@pytest.mark.thorough
 def test_detections_outside_the_image_are_nobody(sequence):
     """What a worse detector might say: nothing comes of it, inside the frame or out."""
     outside = np.array([[WIDTH + 5.0, 10, 9, 24], [-40, 10, 9, 24], [10, HEIGHT + 1, 9, 24]])

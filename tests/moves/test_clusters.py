@@ -84,6 +84,7 @@ def pair_on_a_grid():
 
 
 class TestAgainstExactAnswers:
+    @pytest.mark.thorough
     def test_a_pair_that_repels_is_unbiased(self):
         """In some runs the pair meets at once, in others later."""
         filter = mpfjax.clustered_particle_filter(PAIR, 20)

@@ -132,6 +132,7 @@ def test_identical_boxes_and_a_box_of_all_the_weight_are_drawn_again():
             )
 
 
+@pytest.mark.thorough
 def test_a_box_that_always_moves_alike_is_drawn_within_that_plane():
     """The box before is this one, shifted: a singular covariance of the pair."""
     mixture = box_states(np.array([5.0, 5, 0.02, 0.02]))

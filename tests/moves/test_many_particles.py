@@ -140,6 +140,7 @@ class TestTwoParts:
                 key, value = jax.random.key(seed), jnp.asarray(uniform, jnp.float32)
                 assert_sound(mixture, redraw_with(Resample(scheme), key, value, mixture))
 
+    @pytest.mark.thorough
     def test_it_differs_from_the_form_for_few_by_rounding_alone(self, monkeypatch):
         mixture = large_mixture("empty slots", 1007, 5)
         for move in (Resample(), Resample(ess_threshold=0.9), Resample(particles_per_component=9)):

@@ -138,6 +138,7 @@ def test_offspring_are_the_floor_or_the_ceiling_of_what_is_expected(scheme, num_
         assert (counts <= np.ceil(expected + 1e-4)).all()
 
 
+@pytest.mark.thorough
 def test_who_stands_in_order_beside_a_run_that_does_not_is_resampled_alike():
     """Runs put their particles in order together; for one that has them so, nothing changes."""
     mixtures = [

@@ -55,6 +55,7 @@ def test_moments_are_the_kalman_filters(make):
     assert np.abs(z).max() < 4, z
 
 
+@pytest.mark.thorough
 def test_a_component_keeps_its_mass():
     """Two modes that stay apart: the probability of each is what it was."""
     model = mpfjax.QuadraticModel(0.05, 0.1, -2.0, 2.0)

@@ -14,6 +14,7 @@ ONE, SEEN = MODELS["one dimension"]
 statistics = statistics_for(ONE)
 
 
+@pytest.mark.thorough
 def test_the_filters_run_is_that_of_run_filter_and_a_long_lag_is_none():
     filter = mpfjax.particle_filter(ONE, 60)
     run = mpfjax.run_filter(jax.random.key(3), filter, SEEN, missing="skip")

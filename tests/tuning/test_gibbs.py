@@ -92,6 +92,7 @@ class Fragile(ScalarLinear):
         return jnp.where(self.a > 0.9, jnp.nan, honest)
 
 
+@pytest.mark.thorough
 def test_a_nan_is_rejected_and_counted():
     filter = mpfjax.particle_filter(Fragile(a=0.5), 10)
     with pytest.warns(UserWarning, match=r"zero density: conditional_filter \d+ times$"):

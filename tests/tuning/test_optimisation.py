@@ -423,6 +423,7 @@ def test_common_random_numbers_are_the_same_at_every_step():
     assert len(set(fresh.history["log_marginal_likelihood"])) == 3
 
 
+@pytest.mark.thorough
 def test_parameters_can_be_all_of_the_model_or_a_filter_spec():
     filter = mpfjax.particle_filter(ScalarLinear(), 16, gradient="stop")
     everything = fit(jax.random.key(0), filter, OBSERVATIONS, ADAM, 1, num_seeds=2, progress=False)

@@ -191,6 +191,7 @@ def test_hsv_likelihood_is_the_papers_formula(frame):
     np.testing.assert_allclose(found, -(1 - shared) / (2 * 0.2**2), rtol=1e-4)
 
 
+@pytest.mark.thorough
 def test_second_order_dynamics_carry_the_last_box_along(frame):
     dynamics = Autoregression.with_momentum(0.5, jnp.asarray(DEVIATIONS))
     model = model_of(frame, dynamics=dynamics)

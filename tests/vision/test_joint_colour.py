@@ -166,6 +166,7 @@ class TestScenesGoneWrong:
             means = object_boxes(model, run.final.particles)[:, :, :2].mean(axis=0)
             np.testing.assert_allclose(means, BOXES[[1, 1, 2], :2], atol=4)
 
+    @pytest.mark.thorough
     def test_an_object_that_has_left_the_frame(self, frame, model, run_all):
         """It lies at the largest distance everywhere, and drifts; the others are tracked on."""
         start = model.object_model.reference_boxes.at[0, 0, 0].set(-200.0)

@@ -134,6 +134,7 @@ def test_templates_of_many_pixels_are_learned(frame):
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("exact_colours", [False, *thorough([True])])
 def test_a_tracker_learns_the_colours_of_large_objects(frame, exact_colours):
     """An object that grows beyond what 16 bits count."""

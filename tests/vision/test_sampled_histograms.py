@@ -46,6 +46,7 @@ def test_every_point_counts_once(colours, num_parts):
     np.testing.assert_array_equal(counts, expected)
 
 
+@pytest.mark.thorough
 def test_rows_are_made_up_to_whole_bands():
     table = SampledHistogram(jnp.asarray(FRAME), HSVColours(4, 2, 2), rows=7, columns=4)
     counts = table.counts(jnp.asarray(BOXES[:1], jnp.float32), 3)

@@ -286,6 +286,7 @@ def test_greyscale_frames_are_tracked_by_their_values():
     np.testing.assert_allclose(box_of(tracks, 1)[:2], centre_of((15, 10)), atol=1.5)
 
 
+@pytest.mark.thorough
 def test_frames_may_change_their_size_between_two_steps():
     """Each size compiles; components live on in pixels, and those outside the new frame die."""
     state = TRACKER.init()
@@ -391,6 +392,7 @@ def crossing(pixels, alike, pace):
     return tracks, places
 
 
+@pytest.mark.thorough
 def test_two_who_cross_and_are_found_as_one_keep_their_names():
     """By their colours, and by `ShareDetections`; and both live all the time."""
     tracks, places = crossing(True, False, 1.0)
