@@ -118,7 +118,7 @@ class Filter(eqx.Module):
         moves: Iterable[Callable[..., ParticleMixture]],
         num_particles: int,
         num_components: int = 1,
-        initial_moves: Iterable[AbstractRegrouping] = (),
+        initial_moves: Iterable[AbstractMove] = (),
         initial_noise: str = "independent",
         starts_empty: bool = False,
     ) -> None:

@@ -38,9 +38,9 @@ FLOORS = {
         "generator", "positions", "sobol", "hilbert", "sorting", "compiling",
     ),
     "moves": (
-        "base", "eve_indices", "sharing", "results", "island_interaction", "every", "memory",
-        "regrouping", "resampling", "prune", "propagation", "metropolis", "objects", "conditional",
-        "parents",
+        "base", "local_quadratics", "eve_indices", "sharing", "results", "island_interaction",
+        "every", "memory", "regrouping", "resampling", "prune", "propagation", "twisted",
+        "metropolis", "objects", "conditional", "parents",
     ),
     "vision": ("files", "colour", "scenes", "tracking", "boxes"),
     "running": (

@@ -10,6 +10,7 @@ from mpfjax.smoothing.forecasts import Forecast as Forecast
 from mpfjax.smoothing.sums import SmoothedSums as SmoothedSums
 from mpfjax.smoothing.sums import smoothed_sums as smoothed_sums
 from mpfjax.smoothing.trajectories import sample_trajectories as sample_trajectories
+from mpfjax.smoothing.twisted import learn_lookahead as learn_lookahead
 from mpfjax.smoothing.variance import (
     log_marginal_likelihood_variance as log_marginal_likelihood_variance,
 )

@@ -1,0 +1,272 @@
+"""Moves of a twisted particle filter, whose look-ahead depends on which step it is."""
+
+from collections.abc import Callable
+from typing import cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from mpfjax.checks import check_one_of
+from mpfjax.mixture import ParticleMixture, flatten_states
+from mpfjax.models.base import (
+    AbstractStateSpaceModel,
+    HasInitialNoise,
+    HasTransitionNoise,
+    check_moved,
+    require_noise,
+)
+from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
+from mpfjax.moves.base import AbstractMove, AbstractPropagation, AbstractRegrouping
+from mpfjax.moves.local_quadratics import LocalQuadratics
+from mpfjax.moves.propagation.propagate import likelihoods, predict
+from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
+from mpfjax.moves.resampling.resample import Resample
+from mpfjax.operations.logarithms import log_sum_exp
+
+STEP = "twisted"
+
+
+class Twist(eqx.Module):
+    """ψ_1, ..., ψ_T for the steps of a series, as `mpfjax.smoothing.learn_lookahead` fits them.
+
+    - `steps`: of each step, and one more that knows nothing, for steps after the last.
+    - `initial`: of x_0, which is made of noise alone; None where the model makes it otherwise.
+    - `features`: φ, what ψ sees of a state, (n, d); None is the flattened state.
+    """
+
+    steps: LocalQuadratics
+    initial: LocalQuadratics | None
+    features: Callable[[PyTree], Array] | None = None
+
+    def at(self, step: Int[Array, ""]) -> LocalQuadratics:
+        """ψ_t, for t from 1 on."""
+        place = jnp.clip(step - 1, 0, self.steps.log_cap.shape[0] - 1)
+        return jax.tree.map(lambda leaf: leaf[place], self.steps)
+
+    def features_of(self, states: PyTree) -> Float[Array, "n d"]:
+        """φ(x) of each particle."""
+        return features_of(self.features, states)
+
+    def log_normaliser(self, step: Int[Array, ""], states: PyTree) -> Float[Array, " n"]:
+        """log ν_t of each particle, x_{t-1}."""
+        return self.at(step).log_normaliser(self.features_of(states))
+
+
+def features_of(features: Callable[[PyTree], Array] | None, states: PyTree) -> Float[Array, "n d"]:
+    """φ(x) of each particle, a row for each; without features the flattened state."""
+    if features is None:
+        return flatten_states(states)
+    found = jnp.asarray(features(states))
+    return found.reshape(found.shape[0], -1).astype(noise_dtype(states))
+
+
+class CountSteps(AbstractMove):
+    """Says which step it is, at the head of a chain whose look-ahead depends on it."""
+
+    @property
+    def weighs(self) -> bool:
+        """False: the observation changes no weight."""
+        return False
+
+    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
+        """The number of the step, and the mass of x_0 that no step has counted so far."""
+        del num_components
+        return {STEP: {"step": jnp.zeros((), jnp.int32), "log_mass": jnp.zeros(())}}
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Count the step, and the mass that x_0 was drawn with."""
+        del key, observation
+        own = mixture.memory[STEP]
+        log_mass = own["log_mass"]
+        counted = {"step": own["step"] + 1, "log_mass": jnp.zeros_like(log_mass)}
+        return mixture.replace(memory=mixture.memory | {STEP: counted}).weighed(log_mass[None])
+
+    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """Count the step; the mass of x_0 waits for one with an observation."""
+        del key
+        own = mixture.memory[STEP]
+        counted = own | {"step": own["step"] + 1}
+        return mixture.replace(memory=mixture.memory | {STEP: counted})
+
+
+class TwistInitial(AbstractMove):
+    """Draws x_0 anew: its noise from q_0, with the weights N(ε; 0, I) / q_0(ε).
+
+    The weights are normalised, and `CountSteps` counts what they added up to in the first step that
+    has an observation. So Ẑ stays unbiased.
+    """
+
+    model: AbstractStateSpaceModel
+    twist: Twist
+    noise: str = eqx.field(static=True, default="independent")
+
+    @property
+    def reads(self) -> frozenset[str]:
+        """What `CountSteps` remembers."""
+        return frozenset({STEP})
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+    ) -> ParticleMixture:
+        """The mixture of the twisted draws."""
+        del observation
+        if self.twist.initial is None:
+            return mixture
+        psi, model = self.twist.initial, cast(HasInitialNoise, self.model)
+        shape, dtype = (mixture.num_particles, model.initial_noise_dimension + 1), psi.slopes.dtype
+        noise = draw_noise(self.noise, key, shape, dtype)
+        drawn, log_ratio = psi.draw(noise, jnp.zeros((shape[0], 0), dtype))
+        states = model.initial_from_noise(drawn)
+        check_moved(states, mixture.particles, self.model, "initial_from_noise")
+        log_weights = mixture.log_weights + log_ratio.astype(mixture.log_weights.dtype)
+        log_mass = log_sum_exp(log_weights)
+        waiting = mixture.memory[STEP] | {"log_mass": log_mass}
+        return mixture.replace(
+            particles=states,
+            log_weights=log_weights - log_mass,
+            memory=mixture.memory | {STEP: waiting},
+        )
+
+
+class ResampleTwisted(AbstractMove):
+    """`AuxiliaryResample` whose look-ahead is ν_t(x_{t-1}) of the step that it is.
+
+    - `resample`: the `Resample` that draws.
+    - `twist`: ψ_1, ..., ψ_T.
+    """
+
+    resample: Resample
+    twist: Twist
+
+    def __check_init__(self) -> None:
+        AuxiliaryResample(self.resample, _no_lookahead)
+
+    @property
+    def approximate(self) -> bool:
+        """As the resampling is."""
+        return self.resample.approximate
+
+    @property
+    def weighs(self) -> bool:
+        """False: what the look-ahead adds to the weights is taken away again."""
+        return False
+
+    @property
+    def reads(self) -> frozenset[str]:
+        """What `CountSteps` remembers."""
+        return frozenset({STEP})
+
+    @property
+    def particles_per_component(self) -> int | None:
+        """That of the resampling."""
+        return self.resample.particles_per_component
+
+    def would_resample(
+        self, mixture: ParticleMixture, observation: PyTree = None
+    ) -> Bool[Array, " m"]:
+        """Which components of `mixture` the move would resample."""
+        return self._now(mixture).would_resample(mixture, observation)
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Resample every component that is due, looking ahead to y_t, ..., y_T."""
+        return self._now(mixture)(key, mixture, observation)
+
+    def _now(self, mixture: ParticleMixture) -> AuxiliaryResample:
+        step = mixture.memory[STEP]["step"]
+
+        def look(observation: PyTree, states: PyTree) -> Float[Array, " n"]:
+            del observation
+            return self.twist.log_normaliser(step, states)
+
+        return AuxiliaryResample(self.resample, look)
+
+
+class PropagateTwisted(AbstractPropagation):
+    """Draw the noise ε of x_t from q_t(ε | x_{t-1}), and weigh by L(y_t | x_t) N(ε; 0, I) / q_t.
+
+    No density of the dynamics is needed, which may be singular or mixed with discrete draws.
+    `noise` is that of `Propagate`. Raises `ValueError` for a model without
+    `transition_from_noise`, and for unknown noise.
+    """
+
+    model: AbstractStateSpaceModel
+    twist: Twist
+    noise: str = eqx.field(static=True, default="independent")
+
+    def __check_init__(self) -> None:
+        require_noise(self.model, "PropagateTwisted")
+        check_one_of(NOISES, noise=self.noise)
+
+    @property
+    def reads(self) -> frozenset[str]:
+        """What `CountSteps` remembers."""
+        return frozenset({STEP})
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+    ) -> ParticleMixture:
+        """Propagate every particle and weigh it by y_t."""
+        model, previous = cast(HasTransitionNoise, self.model), mixture.particles
+        shape = (mixture.num_particles, model.noise_dimension + 1)
+        labels, num_components = mixture.component_indicators, mixture.num_components
+        dtype = noise_dtype(previous)
+        noise = draw_noise(self.noise, key, shape, dtype, labels, num_components)
+        psi = self.twist.at(mixture.memory[STEP]["step"])
+        drawn, log_ratio = psi.draw(noise, self.twist.features_of(previous))
+        states = model.transition_from_noise(drawn, previous)
+        check_moved(states, previous, self.model, "transition_from_noise")
+        log_factors = likelihoods(self.model, observation, states)
+        return mixture.replace(particles=states).weighed(log_factors, log_ratio)
+
+    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
+        return predict(key, self.model, mixture, "none", self.noise)
+
+
+class RegroupTwisted(AbstractRegrouping):
+    """A regrouping that sees the weights times ν_{t+1}(x_t), by which the next step resamples.
+
+    The weights alone are those of the filtering distribution, which few particles carry where the
+    look-ahead has led all others to what comes.
+    """
+
+    move: AbstractRegrouping
+    twist: Twist
+
+    @property
+    def reads(self) -> frozenset[str]:
+        """What `CountSteps` remembers, and what the move itself reads."""
+        return frozenset({STEP}) | self.move.reads
+
+    @property
+    def needs_parents(self) -> bool:
+        """Whether the move does."""
+        return self.move.needs_parents
+
+    def regroup(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+        """The indicators that the move gives of the weights times ν_{t+1}."""
+        step = mixture.memory[STEP]["step"] + 1
+        log_factors = self.twist.log_normaliser(step, mixture.particles)
+        log_weights = mixture.weighed(log_factors).log_weights
+        log_weights = log_weights - log_sum_exp(log_weights)
+        return self.move.regroup(key, mixture.replace(log_weights=log_weights))
+
+    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
+        """That of the move."""
+        return self.move.initial_memory(num_components)
+
+    def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
+        """What the move forgets."""
+        return self.move.forget(memory, dead)
+
+
+def _no_lookahead(observation: PyTree, states: PyTree) -> Float[Array, " n"]:
+    raise AssertionError

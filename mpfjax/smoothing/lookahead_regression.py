@@ -1,0 +1,340 @@
+"""Backward regression of a twisted filter's ψ_t on the particles of a run."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key, PyTree
+
+from mpfjax.filter import Filter
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.local_quadratics import LocalQuadratics
+from mpfjax.moves.propagation.propagate import likelihoods
+from mpfjax.moves.twisted import Twist
+from mpfjax.observations import Series
+
+# A regression has so many particles for each of its coefficients, as its weights count them.
+_PARTICLES_A_COEFFICIENT = 4
+# In units in which features and noise have a variance of one.
+_RIDGE = 1e-5
+_LEAST_VARIANCE = 1e-5
+# The share of undisturbed noise is as large as what the fit misses, within these.
+_LEAST_DEFENCE, _MOST_DEFENCE = 1e-3, 0.1
+_HALVINGS = 16
+
+
+@eqx.filter_jit
+def fit_lookahead(
+    key: Key[Array, ""], filter: Filter, twist: Twist, mixtures: ParticleMixture, series: Series
+) -> Twist:
+    """ψ_T, ..., ψ_1 and that of x_0, from the mixtures of a run of `filter`, twisted by `twist`."""
+    key_steps, key_initial = jax.random.split(key)
+    before = lambda tree: jax.tree.map(lambda leaf: leaf[:-1], tree)  # noqa: E731
+    last = jax.tree.map(lambda leaf: leaf[-1], twist.steps)
+
+    def back(after: LocalQuadratics, step: Any) -> tuple[LocalQuadratics, LocalQuadratics]:
+        key, used, mixture, now = step
+        model = filter.with_inputs(now.inputs).model
+        points = _draw_points(key, model, twist, used, after, mixture, now)
+        fitted = _fit_step(points, used)
+        fitted = _scaled(fitted, mixture, twist.features_of(mixture.particles))
+        return fitted, fitted
+
+    keys = jax.random.split(key_steps, series.length)
+    steps = (keys, before(twist.steps), before(mixtures), series)
+    first, fitted = jax.lax.scan(back, last, steps, reverse=True)
+    whole = jax.tree.map(lambda some, end: jnp.concatenate([some, end[None]]), fitted, last)
+    initial = twist.initial
+    if initial is not None:
+        initial = _fit_initial(key_initial, filter, twist, initial, first)
+    return Twist(whole, initial, twist.features)
+
+
+class _Points(NamedTuple):
+    """What log ψ_t is fitted to.
+
+    - `features`: φ(x_{t-1}), (n, d). `noise`: ε, (n, j). `targets`: log L(y_t | x_t) ν_{t+1}(x_t).
+    - `log_importance`: of a point, for p(x_{t-1}, ε | y_1..y_T).
+    - `components`: which component each x_{t-1} was in, (n, k), one of them 1.
+    - `num_needed`: how large a sample a regression needs.
+    """
+
+    features: Float[Array, "n d"]
+    noise: Float[Array, "n j"]
+    targets: Float[Array, " n"]
+    log_importance: Float[Array, " n"]
+    components: Float[Array, "n k"]
+    num_needed: int
+
+
+def _draw_points(
+    key: Key[Array, ""],
+    model: Any,
+    twist: Twist,
+    used: LocalQuadratics,
+    after: LocalQuadratics,
+    mixture: ParticleMixture,
+    now: Series,
+) -> _Points:
+    """Every particle as often as any other, so that none is lost, with noise from q_t."""
+    num_experts, dimension = used.centres.shape
+    num_coefficients = _num_coefficients(dimension + model.noise_dimension)
+    needed = _PARTICLES_A_COEFFICIENT * num_coefficients
+    copies = -(-2 * needed * num_experts // mixture.num_particles)
+    repeated = lambda leaf: jnp.repeat(leaf, copies, axis=0)  # noqa: E731
+    states = jax.tree.map(repeated, mixture.particles)
+    features, log_weights = twist.features_of(states), repeated(mixture.log_weights)
+    shape = (len(log_weights), model.noise_dimension + 1)
+    noise, log_ratio = used.draw(jax.random.normal(key, shape, features.dtype), features)
+    moved = model.transition_from_noise(noise, states)
+    log_likelihoods = likelihoods(model, now.observations, moved)
+    if now.present is not None:
+        log_likelihoods = jnp.where(now.present, log_likelihoods, 0.0)
+    targets = log_likelihoods + after.log_fitted(twist.features_of(moved))
+    is_number = jnp.isfinite(targets)
+    targets = jnp.where(is_number, targets, jnp.min(jnp.where(is_number, targets, jnp.inf)))
+    log_importance = jnp.where(is_number, targets + log_ratio + log_weights, -jnp.inf)
+    labels = repeated(mixture.component_indicators)
+    components = jax.nn.one_hot(labels, num_experts, dtype=features.dtype)
+    return _Points(
+        features, noise, targets.astype(features.dtype), log_importance.astype(features.dtype),
+        components, needed * copies,
+    )  # fmt: skip
+
+
+def _fit_step(points: _Points, used: LocalQuadratics) -> LocalQuadratics:
+    """An expert for each component: first where it is, then its quadratic."""
+    weights = _tempered(points.log_importance, points.components, points.num_needed)
+    means, factors = _moments(points.features, weights)
+    inverses = _inverses(factors)
+    alive = jnp.sum(weights, axis=0) > 0
+    log_volumes = jnp.sum(jnp.log(jnp.diagonal(inverses, axis1=1, axis2=2)), axis=1)
+    log_shares = jnp.where(alive, log_volumes, -jnp.inf)
+    located = _replaced(used, centres=means, whitening=inverses, log_shares=log_shares)
+    whitened = located.whitened(points.features)
+    near = jnp.exp(located.log_near(whitened))
+    weights = _tempered(points.log_importance, near, points.num_needed)
+    weights = weights / jnp.maximum(jnp.sum(weights, axis=0), 1e-30)[None]
+
+    def fit(of_expert: tuple[Array, Array]) -> "_Expert":
+        return _integrated(*_regressed(*of_expert, points.noise, points.targets))
+
+    experts = jax.lax.map(fit, (weights.T, jnp.moveaxis(whitened, 1, 0)))
+    missed = jnp.sum(jnp.where(alive, experts.missed, 0.0)) / _count(alive, points.targets.dtype)
+    return _replaced(
+        located,
+        constants=experts.constant,
+        slopes=experts.slope,
+        curvatures=experts.curvature,
+        noise_means=experts.noise_mean,
+        noise_slopes=experts.noise_slope,
+        noise_factors=experts.noise_factor,
+        log_cap=jnp.max(points.targets),
+        defence=jnp.clip(missed, _LEAST_DEFENCE, _MOST_DEFENCE),
+    )
+
+
+def _scaled(
+    fitted: LocalQuadratics, mixture: ParticleMixture, features: Float[Array, "n d"]
+) -> LocalQuadratics:
+    """ν with a mean of 1 over the filtering distribution, and its floor, δ of that mean."""
+    log_factors = jnp.where(mixture.occupied, fitted.log_fitted(features), -jnp.inf)
+    log_mean = jax.nn.logsumexp(mixture.log_weights + log_factors)
+    return _replaced(
+        fitted,
+        constants=fitted.constants - log_mean,
+        log_cap=fitted.log_cap - log_mean,
+        log_floor=jnp.log(fitted.defence),
+    )
+
+
+def _fit_initial(
+    key: Key[Array, ""],
+    filter: Filter,
+    twist: Twist,
+    used: LocalQuadratics,
+    first: LocalQuadratics,
+) -> LocalQuadratics:
+    """A Gaussian mixture in the noise of x_0: the moments near each expert of ψ_1."""
+    model: Any = filter.model
+    num_experts, dimension = used.noise_means.shape
+    needed = _PARTICLES_A_COEFFICIENT * _num_coefficients(dimension)
+    size = max(4 * filter.num_particles, 4 * needed * num_experts)
+    key_used, key_fitted = jax.random.split(key)
+
+    def draw(key: Key[Array, ""], psi: LocalQuadratics) -> tuple[Array, Array, Array]:
+        shape = (size, dimension + 1)
+        dtype = used.slopes.dtype
+        standard = jax.random.normal(key, shape, dtype)
+        noise, log_ratio = psi.draw(standard, jnp.zeros((size, 0), dtype))
+        features = twist.features_of(model.initial_from_noise(noise))
+        return noise, features, first.log_fitted(features) + log_ratio
+
+    noise, features, log_importance = draw(key_used, used)
+    near = jnp.exp(first.log_near(first.whitened(features)))
+    weights = _tempered(log_importance, near, needed)
+    means, factors = _moments(noise, weights)
+    shares = jax.nn.softmax(log_importance) @ near
+    alive = (jnp.sum(weights, axis=0) > 0) & (first.log_shares > -jnp.inf)
+    # Half of the draws go to all experts alike: a mode that few draws have hit is not lost.
+    shares = jnp.where(alive, 0.5 * shares + 0.5 / _count(alive, shares.dtype), 0.0)
+    fitted = _replaced(
+        used,
+        log_shares=jnp.log(shares),
+        noise_means=means,
+        noise_factors=factors,
+        defence=jnp.full_like(used.defence, _MOST_DEFENCE),
+    )
+    log_weights = draw(key_fitted, fitted)[2]
+    log_sum, log_squares = (jax.nn.logsumexp(power * log_weights) for power in (1, 2))
+    missed = size * jnp.exp(log_squares - 2 * log_sum) - 1
+    return _replaced(fitted, defence=jnp.clip(missed, _LEAST_DEFENCE, _MOST_DEFENCE))
+
+
+def _tempered(
+    log_importance: Float[Array, " n"], members: Float[Array, "n k"], needed: float
+) -> Float[Array, "n k"]:
+    """w_i^α of each expert's members, with the largest α up to 1 that leaves so large a sample."""
+    is_member = (members > 0) & (log_importance > -jnp.inf)[:, None]
+    logs = jnp.where(is_member, log_importance[:, None], -jnp.inf)
+    most = jnp.max(logs, axis=0)
+    logs = jnp.where(is_member, logs - jnp.where(most > -jnp.inf, most, 0.0)[None], 0.0)
+    members = jnp.where(is_member, members, 0.0)
+
+    def size(powers: Float[Array, " k"]) -> Float[Array, " k"]:
+        values = jnp.exp(powers[None] * logs)
+        squares = jnp.sum(members * values**2, axis=0)
+        return jnp.sum(members * values, axis=0) ** 2 / jnp.maximum(squares, 1e-30)
+
+    low, high = jnp.zeros_like(most), jnp.ones_like(most)
+    goal = jnp.minimum(needed, 0.5 * size(low))
+    full = size(high) >= goal
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        enough = size(middle) >= goal
+        low, high = jnp.where(enough, middle, low), jnp.where(enough, high, middle)
+    return members * jnp.exp(jnp.where(full, 1.0, low)[None] * logs)
+
+
+def _moments(
+    values: Float[Array, "n d"], weights: Float[Array, "n k"]
+) -> tuple[Float[Array, "k d"], Float[Array, "k d d"]]:
+    """The mean and the Cholesky factor of the covariance by each column of weights."""
+    total = jnp.sum(weights, axis=0)
+    weights = weights / jnp.where(total > 0, total, 1.0)[None]
+    spread = jnp.std(values, axis=0)
+    unit = jnp.where(spread > 0, spread, 1.0)
+
+    def moments(own: Float[Array, " n"]) -> tuple[Array, Array]:
+        mean = own @ values
+        scaled = (values - mean[None]) / unit[None]
+        covariance = (scaled * own[:, None]).T @ scaled
+        return mean, unit[:, None] * _factor(covariance)
+
+    return jax.vmap(moments)(weights.T)
+
+
+class _Expert(NamedTuple):
+    """log ν_k and q_k of one expert, and the mean square of what log ψ misses."""
+
+    constant: Float[Array, "*k"]
+    slope: Float[Array, "*k d"]
+    curvature: Float[Array, "*k d d"]
+    noise_mean: Float[Array, "*k j"]
+    noise_slope: Float[Array, "*k j d"]
+    noise_factor: Float[Array, "*k j j"]
+    missed: Float[Array, "*k"]
+
+
+def _regressed(
+    weights: Float[Array, " n"],
+    whitened: Float[Array, "n d"],
+    noise: Float[Array, "n j"],
+    targets: Float[Array, " n"],
+) -> tuple[Array, Array, Array, Array, int]:
+    """a, b and H of the quadratic a + bᵀz + zᵀHz / 2 in z = (features, ε), H not positive."""
+    values = jnp.concatenate([whitened, noise], axis=1)
+    size, dtype = values.shape[1], values.dtype
+    mean = weights @ values
+    centred = values - mean[None]
+    inverse = _inverses(_factor((centred * weights[:, None]).T @ centred)[None])[0]
+    standard = centred @ inverse.T
+    # Of independent normal numbers these functions are orthogonal.
+    rows, columns = jnp.triu_indices(size)
+    is_square, root = rows == columns, jnp.sqrt(2.0).astype(dtype)
+    products = standard[:, rows] * standard[:, columns]
+    products = jnp.where(is_square[None], (products - 1) / root, products)
+    design = jnp.concatenate([jnp.ones_like(products[:, :1]), standard, products], axis=1)
+    level = weights @ targets
+    weighted = design * weights[:, None]
+    normal, right = weighted.T @ design, weighted.T @ (targets - level)
+    ridge = jnp.eye(len(right), dtype=dtype)
+    rough = jnp.linalg.solve(normal + _RIDGE * ridge, right)
+    # The better the fit and the larger the sample, the less it is held back.
+    noisy = weights @ (targets - level - design @ rough) ** 2 * jnp.sum(weights**2)
+    found = jnp.linalg.solve(normal + (_RIDGE + noisy) * ridge.at[0, 0].set(0.0), right)
+    slope, upper = found[1 : 1 + size], found[1 + size :]
+    upper = jnp.where(is_square, root * upper, upper)
+    hessian = jnp.zeros((size, size), dtype).at[rows, columns].set(upper)
+    values_, vectors = jnp.linalg.eigh(hessian + jnp.triu(hessian, 1).T)
+    hessian = (vectors * jnp.minimum(values_, 0.0)[None]) @ vectors.T
+    constant = level + found[0] - 0.5 * jnp.trace(hessian)
+    curved = 0.5 * jnp.sum((standard @ hessian) * standard, axis=1)
+    residuals = targets - constant - standard @ slope - curved
+    constant = constant + weights @ residuals
+    missed = weights @ residuals**2 - (weights @ residuals) ** 2
+    hessian, slope = inverse.T @ hessian @ inverse, inverse.T @ slope
+    constant = constant - slope @ mean + 0.5 * mean @ hessian @ mean
+    return constant, slope - hessian @ mean, hessian, missed, whitened.shape[1]
+
+
+def _integrated(
+    constant: Float[Array, ""],
+    slope: Float[Array, " z"],
+    hessian: Float[Array, "z z"],
+    missed: Float[Array, ""],
+    num_features: int,
+) -> _Expert:
+    """The quadratic in features and noise, with N(ε; 0, I) and integrated over ε."""
+    d = num_features
+    of_noise, mixed = hessian[d:, d:], hessian[:d, d:]
+    precision = jnp.eye(len(of_noise), dtype=hessian.dtype) - of_noise
+    values, vectors = jnp.linalg.eigh(precision)
+    # No less than what it is without ψ, up to rounding.
+    values = jnp.maximum(values, 1.0)
+    covariance = (vectors / values[None]) @ vectors.T
+    mean, gain = covariance @ slope[d:], covariance @ mixed.T
+    return _Expert(
+        constant=constant + 0.5 * slope[d:] @ mean - 0.5 * jnp.sum(jnp.log(values)),
+        slope=slope[:d] + mixed @ mean,
+        curvature=hessian[:d, :d] + mixed @ gain,
+        noise_mean=mean,
+        noise_slope=gain,
+        noise_factor=jnp.linalg.cholesky(covariance),
+        missed=missed,
+    )
+
+
+def _num_coefficients(dimension: int) -> int:
+    """Of a quadratic."""
+    return 1 + dimension + dimension * (dimension + 1) // 2
+
+
+def _count(alive: Bool[Array, " k"], dtype: Any) -> Float[Array, ""]:
+    return jnp.maximum(jnp.sum(alive.astype(dtype)), 1.0)
+
+
+def _factor(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    size = len(covariance)
+    return jnp.linalg.cholesky(covariance + _LEAST_VARIANCE * jnp.eye(size, dtype=covariance.dtype))
+
+
+def _inverses(factors: Float[Array, "k d d"]) -> Float[Array, "k d d"]:
+    identity = jnp.broadcast_to(jnp.eye(factors.shape[1], dtype=factors.dtype), factors.shape)
+    return jax.scipy.linalg.solve_triangular(factors, identity, lower=True)
+
+
+def _replaced(psi: LocalQuadratics, **fields: PyTree) -> LocalQuadratics:
+    own = {name: getattr(psi, name) for name in psi.__dataclass_fields__}
+    return LocalQuadratics(**own | fields)

@@ -1,0 +1,146 @@
+"""Twisted particle filters: a look-ahead to all observations, learned from earlier runs."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Key, PyTree
+
+from mpfjax.checks import check_callable, check_key, check_type, check_whole, given
+from mpfjax.filter import Filter
+from mpfjax.models.base import mapped, require_noise, starts_from_noise
+from mpfjax.models.noise import noise_dtype
+from mpfjax.moves.base import AbstractRegrouping
+from mpfjax.moves.every import Every
+from mpfjax.moves.local_quadratics import neutral
+from mpfjax.moves.propagation.propagate import Propagate
+from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
+from mpfjax.moves.resampling.resample import Resample
+from mpfjax.moves.twisted import (
+    CountSteps,
+    PropagateTwisted,
+    RegroupTwisted,
+    ResampleTwisted,
+    Twist,
+    TwistInitial,
+    features_of,
+)
+from mpfjax.observations import as_series
+from mpfjax.running.run import run_filter
+from mpfjax.smoothing.history import mixtures_of
+from mpfjax.smoothing.lookahead_regression import fit_lookahead
+
+
+def learn_lookahead(
+    key: Key[Array, ""],
+    filter: Filter,
+    observations: PyTree,
+    num_passes: int = 5,
+    *,
+    features: Callable[[PyTree], Array] | None = None,
+    inputs: PyTree = None,
+    missing: str = "error",
+) -> Filter:
+    """The filter with a look-ahead to all observations to come, and proposals that know them.
+
+    A twisted particle filter (Whiteley and Lee 2014), whose twisting functions are learned by
+    iteration (Guarniero, Johansen and Lee 2017; Heng, Bishop, Deligiannidis and Doucet 2020). A
+    pass runs the filter with what was learned so far. Then it goes back in time: with
+    x_t = f(x_{t-1}, ε), ψ_T first and ν_{T+1} = 1, it fits
+
+        log ψ_t(x_{t-1}, ε) ≈ log L(y_t | x_t) + log ν_{t+1}(x_t)
+
+    by least squares to particles x_{t-1} of the pass and fresh noise ε, and has in closed form
+    ν_t(x) = ∫ N(ε; 0, I) ψ_t(x, ε) dε ≈ p(y_t, ..., y_T | x), by which x_{t-1} is resampled, and
+    q_t(ε | x) ∝ N(ε; 0, I) ψ_t(x, ε), by which x_t is drawn. log ψ_t is a quadratic in φ(x) and ε
+    for each mode, found by the filter's components; a constant and a share of undisturbed noise
+    keep its tails heavy (`LocalQuadratics`). x_0 is twisted as well where the model makes it of
+    noise.
+
+    The filter that is returned is exact: given ψ, which other keys led to, Ẑ is unbiased, and
+    weights are those of the filtering distribution. Its log Ẑ varies far less, and so do masses at
+    the end. Before the end its particles stand where all observations lead, so means of x_t given
+    y_1..y_t are less exact than those of `filter`. It is for these observations alone; for another
+    series of the same length it is exact and of no use. For other parameters of the model it is
+    exact too, and good where the posterior is much the same: `eqx.tree_at` of its `model`, or
+    the samplers of `mpfjax.tuning`, which do so.
+
+    - `filter`: of moves `Resample` (or `AuxiliaryResample`, whose look-ahead is replaced),
+      `Propagate` and regrouping. Its model makes x_t of noise, `transition_from_noise`. Take one
+      with components where there are modes.
+    - `num_passes`: how often the filter runs to learn.
+    - `features`: φ, in which log ψ is nearly quadratic, (states) -> (n, d); of one particle, if the
+      model is wrapped by `per_particle`. None is the flattened state.
+    - `inputs`, `missing`: those of `run_filter`; steps without an observation are looked over.
+
+    Raises `ValueError` for another filter, and for a model that makes x_t otherwise. Use it where
+    all observations are there from the start: for log Ẑ in `metropolis_hastings` and `smc2`, to
+    compare models, for the masses of modes at the end.
+    """
+    check_key(key)
+    check_type(Filter, "a Filter", filter=filter)
+    check_whole(num_passes=num_passes)
+    check_callable("features of the states", **given(features=features))
+    model: Any = filter.model
+    require_noise(model, "learn_lookahead")
+    series = as_series(observations, inputs, missing, model)
+    twist = _knowing_nothing(key, filter, series.length, mapped(model, features))
+    for pass_key in jax.random.split(key, num_passes):
+        run_key, fit_key = jax.random.split(pass_key)
+        twisted = _twisted(filter, twist)
+        run = run_filter(run_key, twisted, observations, inputs=inputs, missing=missing)
+        twist = fit_lookahead(fit_key, twisted, twist, mixtures_of(run), series)
+    return _twisted(filter, twist)
+
+
+def _knowing_nothing(
+    key: Key[Array, ""], filter: Filter, length: int, features: Callable[[PyTree], Array] | None
+) -> Twist:
+    """ψ = 1 at every step."""
+    model: Any = filter.model
+    states = jax.eval_shape(lambda key: model.sample_initial(key, 2), key)
+    num_features = jax.eval_shape(partial(features_of, features), states).shape[1]
+    size, dtype = filter.num_components, noise_dtype(states)
+    one = neutral(size, num_features, model.noise_dimension, dtype)
+    steps = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (length + 1, *leaf.shape)), one)
+    initial = None
+    if starts_from_noise(model):
+        initial = neutral(size, 0, model.initial_noise_dimension, dtype)
+    return Twist(steps, initial, features)
+
+
+def _twisted(filter: Filter, twist: Twist) -> Filter:
+    """The filter whose moves look ahead by `twist`; a `ValueError` for one that cannot."""
+    moves = [_looking_ahead(move, filter, twist) for move in filter.moves]
+    for kind, needed in ((ResampleTwisted, "Resample"), (PropagateTwisted, "Propagate")):
+        if sum(isinstance(move, kind) for move in moves) != 1:
+            raise ValueError(f"filter: its moves need one {needed}, in the chain itself")
+    regroupings = [_looking_ahead(move, filter, twist) for move in filter.initial_moves]
+    initial: list[Any] = [TwistInitial(filter.model, twist, filter.initial_noise), *regroupings]
+    return Filter(
+        filter.model,
+        [CountSteps(), *moves],
+        filter.num_particles,
+        filter.num_components,
+        initial,
+        filter.initial_noise,
+    )
+
+
+def _looking_ahead(move: Any, filter: Filter, twist: Twist) -> Any:
+    if isinstance(move, AuxiliaryResample):
+        move = move.resample
+    if isinstance(move, Resample):
+        return ResampleTwisted(move, twist)
+    if isinstance(move, Propagate) and move.gradient == "none":
+        return PropagateTwisted(filter.model, twist, move.noise)
+    if isinstance(move, Every):
+        return Every(move.num_steps, [_looking_ahead(inner, filter, twist) for inner in move.moves])
+    if isinstance(move, AbstractRegrouping):
+        return RegroupTwisted(move, twist)
+    raise ValueError(
+        f"filter: {type(move).__name__}, one of its moves, cannot look ahead; Resample, Propagate"
+        " of gradient 'none' and regrouping can"
+    )
