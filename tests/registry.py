@@ -94,6 +94,7 @@ WITHIN_COMPONENTS: dict[str, AbstractResampling] = {
     "systematic, fixed number": Resample(particles_per_component=5),
     "residual, fixed number, adaptive": Resample("residual", 0.5, 5),
     "systematic, shared by variance": Resample(allocation="variance"),
+    "systematic, for the least error": Resample(allocation="least_error"),
     "residual, shared by variance, adaptive": Resample("residual", 0.5, allocation="variance"),
     "soft": Resample(gradient="soft"),
     "soft, fixed number, adaptive": Resample("residual", 0.5, 5, gradient="soft", softness=0.3),
