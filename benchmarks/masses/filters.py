@@ -3,12 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-
 import mpfjax
 from benchmarks.masses.scenes import Scene
-from mpfjax.smoothing import learn_lookahead
 
 Make = Callable[[Scene, int], mpfjax.Filter]
 
@@ -49,13 +45,6 @@ def _in_stages(scene: Scene, num_particles: int) -> mpfjax.Filter:
     )
 
 
-def _learned(scene: Scene, num_particles: int) -> mpfjax.Filter:
-    """The mixture filter with a look-ahead to all observations, learned in five passes."""
-    filter = _mixture(allocation="variance", regroup_every=4)(scene, num_particles)
-    observations = jnp.asarray(scene.observations)
-    return learn_lookahead(jax.random.key(1), filter, observations, 5)
-
-
 FILTERS: dict[str, Make] = {
     "PF": _plain(),
     "PF, rqmc": _plain(noise="rqmc"),
@@ -73,6 +62,5 @@ FILTERS: dict[str, Make] = {
     "MPF, look-ahead": _mixture(ahead=True),
     "MPF, in stages": _in_stages,
     "MPF, all but draws": _mixture(noise="rqmc", allocation="variance", regroup_every=4),
-    "MPF, learned": _learned,
     "MPF, all": _mixture(noise="rqmc", num_draws=4, allocation="variance", regroup_every=4),
 }

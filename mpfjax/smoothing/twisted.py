@@ -60,8 +60,9 @@ def learn_lookahead(
     noise.
 
     The filter that is returned is exact: given ψ, which other keys led to, Ẑ is unbiased, and
-    weights are those of the filtering distribution. Its log Ẑ varies far less, and so do masses at
-    the end. Before the end its particles stand where all observations lead, so means of x_t given
+    weights are those of the filtering distribution. Its log Ẑ and the masses at the end vary
+    far less where log ψ is nearly quadratic, and no less where few particles taught it badly.
+    Before the end its particles stand where all observations lead, so means of x_t given
     y_1..y_t are less exact than those of `filter`. It is for these observations alone; for another
     series of the same length it is exact and of no use. For other parameters of the model it is
     exact too, and good where the posterior is much the same: `eqx.tree_at` of its `model`, or
