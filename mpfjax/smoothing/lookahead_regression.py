@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.local_quadratics import LocalQuadratics
+from mpfjax.moves.local_quadratics import LocalQuadratics, neutral
 from mpfjax.moves.propagation.propagate import likelihoods
 from mpfjax.moves.twisted import Twist
 from mpfjax.observations import Series
@@ -39,6 +39,7 @@ def fit_lookahead(
         points = _draw_points(key, model, twist, used, after, mixture, now)
         fitted = _fit_step(points, used)
         fitted = _scaled(fitted, mixture, twist.features_of(mixture.particles))
+        fitted = _numbers_or_neutral(fitted)
         return fitted, fitted
 
     keys = jax.random.split(key_steps, series.length)
@@ -47,7 +48,7 @@ def fit_lookahead(
     whole = jax.tree.map(lambda some, end: jnp.concatenate([some, end[None]]), fitted, last)
     initial = twist.initial
     if initial is not None:
-        initial = _fit_initial(key_initial, filter, twist, initial, first)
+        initial = _numbers_or_neutral(_fit_initial(key_initial, filter, twist, initial, first))
     return Twist(whole, initial, twist.features)
 
 
@@ -314,6 +315,14 @@ def _integrated(
         noise_factor=jnp.linalg.cholesky(covariance),
         missed=missed,
     )
+
+
+def _numbers_or_neutral(psi: LocalQuadratics) -> LocalQuadratics:
+    """ψ, or ψ = 1 where a fit is no number."""
+    num_experts, num_noises, num_features = psi.noise_slopes.shape
+    nothing = neutral(num_experts, num_features, num_noises, psi.slopes.dtype)
+    broken = jnp.any(jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(psi)]))
+    return jax.tree.map(lambda own, other: jnp.where(broken, other, own), psi, nothing)
 
 
 def _num_coefficients(dimension: int) -> int:
