@@ -180,8 +180,12 @@ def time_of_steps(options: argparse.Namespace) -> tuple[list[str], list[list[Any
 
 
 def _evidence(seed: int, filter: mpfjax.Filter, observations: Array) -> Array:
-    run = mpfjax.run_filter(jax.random.key(seed), filter, observations, lambda mixture: None)
+    run = mpfjax.run_filter(jax.random.key(seed), filter, observations, nothing)
     return run.log_marginal_likelihood
+
+
+def nothing(mixture: mpfjax.ParticleMixture) -> None:
+    """What is collected."""
 
 
 def manoeuvre() -> mpfjax.SwitchingLinearGaussianModel:
