@@ -274,7 +274,8 @@ def _regressed(
     rough = jnp.linalg.solve(normal + _RIDGE * ridge, right)
     # The better the fit and the larger the sample, the less it is held back.
     noisy = weights @ (targets - level - design @ rough) ** 2 * jnp.sum(weights**2)
-    found = jnp.linalg.solve(normal + (_RIDGE + noisy) * ridge.at[0, 0].set(0.0), right)
+    held = _RIDGE * ridge + noisy * ridge.at[0, 0].set(0.0)
+    found = jnp.linalg.solve(normal + held, right)
     slope, upper = found[1 : 1 + size], found[1 + size :]
     upper = jnp.where(is_square, root * upper, upper)
     hessian = jnp.zeros((size, size), dtype).at[rows, columns].set(upper)
