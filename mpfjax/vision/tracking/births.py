@@ -78,7 +78,7 @@ class Births(AbstractMove):
         wanted &= ~jnp.any(covered & lives.alive[:, None], axis=0)
         # One that a stronger one covers is its double, even where that one founds none either.
         doubles = (overlap(found.boxes, found.boxes) > self.birth_overlap) & wanted[:, None]
-        return wanted & ~jnp.any(doubles & _stronger(found), axis=0)
+        return wanted & ~jnp.any(doubles & stronger(found), axis=0)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
@@ -87,7 +87,7 @@ class Births(AbstractMove):
         del key
         found, lives = observation.detections, mixture.memory[LIVES]
         founding = self.founding(mixture, observation)
-        source, born = _matched(founding, found, ~lives.alive)
+        source, born = matched(founding, found, ~lives.alive)
         seats, filled = self._seats(mixture, born)
         drawn = self._started(mixture, seats, take(found.boxes, source))
         particles = jax.tree.map(
@@ -171,13 +171,13 @@ def _ranks(found: Detections) -> Int[Array, " d"]:
     return jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=jnp.int32))
 
 
-def _stronger(found: Detections) -> Bool[Array, "d d"]:
+def stronger(found: Detections) -> Bool[Array, "d d"]:
     """Whether the first of a pair is the stronger one."""
     ranks = _ranks(found)
     return ranks[:, None] < ranks[None]
 
 
-def _matched(
+def matched(
     wanted: Bool[Array, " d"], found: Detections, free: Bool[Array, " m"]
 ) -> tuple[Int[Array, " m"], Bool[Array, " m"]]:
     """For each free place the wanted row that it takes, strongest first, and whether it does."""

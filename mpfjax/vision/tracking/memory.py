@@ -10,7 +10,7 @@ from mpfjax.vision.tracking.model import DetectedObjectModel, Noises, boxes_of
 
 SCORES, ASSIGNED, LIVES, REFERENCES = "scores", "assigned", "lives", "references"
 EXTENT, SHARED, HIDDEN, DOUBTS = "extent", "shared", "hidden", "doubts"
-CAMERA, NOISES, RIVALS = "camera", "noises", "rivals"
+CAMERA, NOISES, RIVALS, FATES = "camera", "noises", "rivals", "fates"
 
 
 class Scores(NamedTuple):
