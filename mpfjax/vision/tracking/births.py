@@ -108,7 +108,6 @@ class Births(AbstractMove):
             identities=jnp.where(born, lives.last_identity + number, lives.identities),
             last_identity=lives.last_identity + number[-1],
             seen=jnp.where(born, 1, lives.seen),
-            alone=jnp.where(born, 1, lives.alone),
             unseen=jnp.where(born, 0, lives.unseen),
             unsure=jnp.where(born, 0, lives.unsure),
             confirmed=lives.confirmed | at_the_start,

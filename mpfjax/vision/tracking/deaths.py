@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
-from mpfjax.checks import check_positive, check_whole
+from mpfjax.checks import check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.indexing import take
@@ -20,7 +20,7 @@ from mpfjax.vision.tracking.memory import (
     remember,
     shared_detections,
 )
-from mpfjax.vision.tracking.observation import TrackedFrame, covered, within
+from mpfjax.vision.tracking.observation import TrackedFrame, within
 
 
 class Deaths(AbstractMove):
@@ -29,34 +29,25 @@ class Deaths(AbstractMove):
     A component dies where no detection has been assigned to it for more than `patience` frames in a
     row, for more than none while it is not confirmed; where its centre has left the frame; and
     where all its particles have zero likelihood. It is confirmed once strong detections have borne
-    it out in `confirmation` frames in which it stood alone, or in `confirmation_in_contact` of any
-    kind. It does not stand alone where older, confirmed components cover more than the share
-    `contact` of its box: what is found between or before two objects is often a second detection of
-    one of them. Frames in which another hides it (`ShareDetections`) do not count as without a
-    detection. Where there are no pixels, the frame reaches as far as all detections so far.
+    it out in `confirmation` frames. Frames in which another hides it (`ShareDetections`) do not
+    count as without a detection. Where there are no pixels, the frame reaches as far as all
+    detections so far.
     A component is shown while it is confirmed, for at most `longest_guess` frames without a
     detection and `longest_unsure` without a strong one. Memory: `Lives`, with `Births`, and that
     extent.
 
     Deaths are decided and not sampled (`approximate` is true). Raises `ValueError` for a number of
-    frames that is not whole, or below 1, and a share that is not positive.
+    frames that is not whole, or below 1.
     """
 
     confirmation: int = eqx.field(static=True, default=2)
     patience: int = eqx.field(static=True, default=20)
-    confirmation_in_contact: int = eqx.field(static=True, default=4)
-    contact: float = eqx.field(static=True, default=0.4)
     longest_guess: int = eqx.field(static=True, default=2)
     longest_unsure: int = eqx.field(static=True, default=8)
 
     def __check_init__(self) -> None:
-        check_whole(
-            confirmation=self.confirmation,
-            patience=self.patience,
-            confirmation_in_contact=self.confirmation_in_contact,
-        )
+        check_whole(confirmation=self.confirmation, patience=self.patience)
         check_whole(0, longest_guess=self.longest_guess, longest_unsure=self.longest_unsure)
-        check_positive(contact=self.contact)
 
     @property
     def reads(self) -> frozenset[str]:
@@ -79,7 +70,6 @@ class Deaths(AbstractMove):
         kept = lives._replace(
             identities=jnp.where(dead, 0, lives.identities),
             seen=jnp.where(dead, 0, lives.seen),
-            alone=jnp.where(dead, 0, lives.alone),
             unseen=jnp.where(dead, 0, lives.unseen),
             unsure=jnp.where(dead, 0, lives.unsure),
             confirmed=lives.confirmed & ~dead,
@@ -100,9 +90,7 @@ class Deaths(AbstractMove):
         missed = ~borne_out & (shared_detections(mixture) < 0)
         unseen = jnp.where(borne_out, 0, lives.unseen + missed.astype(jnp.int32))
         unsure = jnp.where(strong, 0, lives.unsure + (missed | borne_out).astype(jnp.int32))
-        alone = lives.alone + (strong & ~self._in_contact(mixture)).astype(jnp.int32)
-        often = (alone >= self.confirmation) | (seen >= self.confirmation_in_contact)
-        confirmed = lives.alive & (lives.confirmed | often)
+        confirmed = lives.alive & (lives.confirmed | (seen >= self.confirmation))
         patience = jnp.where(confirmed, self.patience, 0)
         stays = lives.alive & mixture.active & (unseen <= patience)
         extent = observation.extent(mixture.memory[EXTENT])
@@ -113,7 +101,6 @@ class Deaths(AbstractMove):
         recent = (guesses <= self.longest_guess) & (unsure <= self.longest_unsure)
         lives = lives._replace(
             seen=seen,
-            alone=alone,
             unseen=unseen,
             unsure=unsure,
             confirmed=confirmed,
@@ -123,11 +110,3 @@ class Deaths(AbstractMove):
 
     def _hidden(self, mixture: ParticleMixture) -> Int[Array, " m"]:
         return mixture.memory.get(HIDDEN, jnp.zeros(mixture.num_components, jnp.int32))
-
-    def _in_contact(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
-        """Whether older components that are believed in cover much of each component's box."""
-        lives: Lives = mixture.memory[LIVES]
-        boxes, names = mean_boxes(mixture), lives.identities
-        older = lives.confirmed[None] & (names[None] < names[:, None])
-        shares = jnp.where(older, covered(boxes, boxes), 0.0)
-        return jnp.sum(shares, axis=1) > self.contact

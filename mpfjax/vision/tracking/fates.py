@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.operations.floats import default_float
@@ -13,7 +14,7 @@ from mpfjax.vision.tracking.detections import Detections
 from mpfjax.vision.tracking.observation import overlap
 
 _BINS = 10  # of shares of a sure detection's score
-_CENTRES = (jnp.arange(_BINS) + 0.5) / _BINS
+_CENTRES = (np.arange(_BINS) + 0.5) / _BINS
 _SURE = 0.9  # who reaches this share is an object
 _SLOPE = 0.15  # the prior odds are logistic in the share, of this scale
 _PRIOR = 5.0  # detections that the prior of each bin counts as
@@ -92,7 +93,7 @@ class Fates(NamedTuple):
 
         It is `prior_share` before anything is known.
         """
-        centres = _CENTRES.astype(self.good.dtype)
+        centres = jnp.asarray(_CENTRES, self.good.dtype)
         prior = jax.nn.sigmoid((centres - prior_share) / _SLOPE)
         number = self.good + self.bad + _PRIOR
         odds = jax.scipy.special.logit(rising((self.good + _PRIOR * prior) / number, number))

@@ -36,8 +36,7 @@ class Lives(NamedTuple):
     """Of `Deaths` and `Births`: who each component is, and how well it is borne out.
 
     - `identities`: 0 for a dead component; `last_identity`: the highest ever given.
-    - `seen`: in how many frames a strong detection bore it out; `alone`: in how many of these it
-      stood alone.
+    - `seen`: in how many frames a strong detection bore it out.
     - `unseen`, `unsure`: for how many frames no detection, and no strong one, has.
     - `confirmed`: whether it was borne out often enough to be believed.
     - `shown`: whether it is worth showing.
@@ -48,7 +47,6 @@ class Lives(NamedTuple):
     identities: Int[Array, " m"]
     last_identity: Int[Array, ""]
     seen: Int[Array, " m"]
-    alone: Int[Array, " m"]
     unseen: Int[Array, " m"]
     unsure: Int[Array, " m"]
     confirmed: Bool[Array, " m"]
@@ -61,9 +59,7 @@ class Lives(NamedTuple):
         """Nobody lives yet."""
         nobody = jnp.zeros(num_components, jnp.int32)
         zero = jnp.zeros((), jnp.int32)
-        return cls(
-            nobody, zero, nobody, nobody, nobody, nobody, nobody > 0, nobody > 0, zero > 0, zero > 0
-        )
+        return cls(nobody, zero, nobody, nobody, nobody, nobody > 0, nobody > 0, zero > 0, zero > 0)
 
     @property
     def alive(self) -> Bool[Array, " m"]:

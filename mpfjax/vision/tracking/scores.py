@@ -34,8 +34,8 @@ class RankScores(AbstractMove):
     - `strong_share`: the share before anything is learned; `weak_share`: from which one counts.
     - `strong_score`, `weak_score`: thresholds in place of those, where the scale is known.
 
-    It leaves the particles as they are; memory: `Scores` and `Fates`. Raises `ValueError` for shares outside
-    [0, 1], a threshold that is not finite, and weak above strong.
+    It leaves the particles as they are; memory: `Scores` and `Fates`. Raises `ValueError` for
+    shares outside [0, 1], a threshold that is not finite, and weak above strong.
     """
 
     strong_share: float = eqx.field(static=True, default=0.5)
