@@ -219,7 +219,7 @@ class AllDrawn(mpfjax.AbstractStateSpaceModel):
 
     def log_likelihood(self, observation: Float[Array, "4"], states: PyTree) -> Float[Array, " n"]:
         """Gaussian errors."""
-        squares = (observation - states["x"]) ** 2 / jnp.asarray(ERRORS, states["x"].dtype)
+        squares = (observation[None] - states["x"]) ** 2 / jnp.asarray(ERRORS[None], jnp.float32)
         return -0.5 * jnp.sum(squares, axis=1)
 
 
