@@ -226,7 +226,6 @@ QUICK_CHAINS = (
     "pf",
     "pf rqmc",
     "mpf",
-    "mpf rqmc, M = 6",
     "guided mpf",
     "gaussian mixture",
     "dps",

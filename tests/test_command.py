@@ -111,6 +111,7 @@ def test_rows_are_of_what_was_known_when_the_frame_came(sequence, tmp_path):
     np.testing.assert_array_equal(found["offline"][was_known], found["online"])
 
 
+@pytest.mark.thorough
 def test_some_frames_of_a_video_without_colours_or_truth(sequence, tmp_path):
     video = tmp_path / "video.mp4"
     write_video(video, read_frames(sequence), 12.5)

@@ -150,7 +150,7 @@ def island_chains():
 
 
 class TestIslands:
-    @pytest.mark.parametrize("chain", ["mixture, exchange", *thorough(["pf, exchange"])])
+    @pytest.mark.parametrize("chain", thorough(["mixture, exchange", "pf, exchange"]))
     def test_evidence_and_means_are_unbiased(self, chain):
         runs, keys = 1500, jax.random.split(jax.random.key(3), 1500)
         filter = island_chains()[chain]
@@ -191,6 +191,7 @@ class TestIslands:
         assert np.abs(np.asarray(whole.particles)[1:] - parents).max() < 5 * 0.3
         assert (ancestors // 12 != home).any()
 
+    @pytest.mark.thorough
     def test_islands_without_any_likelihood_die_and_an_exchange_revives_them(self):
         model = Cliff(0.3, 0.5, -2.0, 2.0)
         propagate = mpfjax.Propagate(model)

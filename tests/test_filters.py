@@ -549,6 +549,7 @@ class TestWhatAUserHandsIt:
         labels = [run.final.component_indicators for run in runs]
         np.testing.assert_array_equal(*labels)
 
+    @pytest.mark.thorough
     def test_one_of_two_sensors_may_be_missing(self):
         """Against the Kalman filter, whose missing sensor has a variance of 10⁸."""
         observations = np.array([[1.0, np.nan], [np.nan, 0.3], [0.4, 0.1], [np.nan, np.nan]])

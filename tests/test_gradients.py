@@ -121,6 +121,7 @@ def test_plain_derivatives_are_biased():
     assert max(map(abs, found.values())) > 10, found
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "options", [{"ess_threshold": 0.5}, *thorough([{}, {"scheme": "residual"}])]
 )

@@ -268,7 +268,7 @@ EVERYWHERE = {
         lambda joint: mpfjax.clustered_particle_filter(joint, 32, start="together")
     ),
 }  # fmt: skip
-QUICK = ("guided mpf rqmc", "clusters")
+QUICK = ("guided mpf rqmc",)
 
 
 @pytest.mark.parametrize(

@@ -199,6 +199,7 @@ class TestNoiseOfFamilies:
         assert (strata == np.arange(FAMILY)).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("num_draws", [2, 3])
 def test_any_number_of_draws_fills_its_strata(num_draws):
     """Two strata are half of all numbers of 32 bits each, which int32 does not hold."""

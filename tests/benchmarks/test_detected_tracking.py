@@ -173,6 +173,7 @@ def test_detections_outside_the_image_are_nobody(sequence):
     assert ((centres > 0) & (centres < [WIDTH, HEIGHT])).all()
 
 
+@pytest.mark.thorough
 def test_a_grey_video_is_tracked_by_its_values(tmp_path):
     """Images of one channel in a folder: the colour models see three equal ones."""
     folder = sequence_of(tmp_path, ())

@@ -51,6 +51,7 @@ def perfect(frames_per_second):
     return step
 
 
+@pytest.mark.thorough
 def test_one_row_for_each_tracker_and_setting(sequence, tmp_path, monkeypatch, capsys):
     others = [Peer("Other", setting, perfect) for setting in ("defaults", "advised")]
     monkeypatch.setattr(benchmark, "peers", lambda: others)

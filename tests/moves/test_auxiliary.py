@@ -42,6 +42,7 @@ def test_laplaces_approximation_is_close_where_the_state_is_well_known():
         assert float(value) == pytest.approx(exact, abs=0.06)
 
 
+@pytest.mark.thorough
 def test_fully_adapted_weights_are_equal_and_the_evidence_varies_less():
     filters = {
         "adapted": mpfjax.auxiliary_particle_filter(TWO, 100, ADAPTED),

@@ -47,6 +47,7 @@ def test_resampling_is_reported_where_it_happens():
     np.testing.assert_array_equal(happened, [[False, True] * 3 + [False]] * len(KEYS))
 
 
+@pytest.mark.thorough
 def test_step_by_step_from_a_checkpoint_it_is_the_same_run(tmp_path):
     filter = chain(Every(3, [RandomLabels()]))
     whole = mpfjax.run_filter(KEYS[1], filter, OBSERVATIONS, labels)

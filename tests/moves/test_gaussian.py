@@ -146,6 +146,7 @@ def test_a_box_that_always_moves_alike_is_drawn_within_that_plane():
     assert np.asarray(after.box)[:10].std(axis=0).min() > 0.005
 
 
+@pytest.mark.thorough
 def test_where_leaves_the_rest_to_resampling():
     mixture = a_mixture()
     states = {"box": mixture.particles, "kind": mixture.component_indicators * 10}
@@ -196,6 +197,7 @@ def test_misread_importance_is_named(options, named):
         mpfjax.gaussian_mixture_particle_filter(model, 50, 2, **options)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("importance", ["predictive_gaussian", *thorough(["propagated"])])
 @pytest.mark.parametrize("max_components", [3, *thorough([1])])
 def test_moments_are_the_kalman_filters(max_components, importance):

@@ -139,6 +139,7 @@ class TestTwoParts:
     def always(self, monkeypatch):
         monkeypatch.setattr(positions, "MOST_IN_ONE_FLOAT", 0)
 
+    @pytest.mark.thorough
     @pytest.mark.parametrize("scheme", quick_of(SCHEMES, ["residual"]))
     @pytest.mark.parametrize("m", [9, *thorough([1])])
     def test_no_particle_of_zero_weight_is_ever_fed(self, scheme, m):

@@ -70,7 +70,7 @@ FILTERS = {
         initial_moves=[GroupBy(by_regime)],
     ),
 }
-QUICK = ("a component for each regime", "all children, by regime")
+QUICK = ("a component for each regime",)
 
 
 @cache

@@ -36,6 +36,7 @@ class Marked(mpfjax.AbstractStateSpaceModel):
         return jnp.log(self.likelihoods[states]) + 0 * observation
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("noise", ["rqmc", *thorough(["independent"])])
 def test_weights_are_means_and_draws_are_kept_by_theirs(noise):
     """E[weight of those that keep a value] is its likelihood, for every value, one of them zero."""

@@ -216,6 +216,7 @@ class TestSplit:
         full = mixture.replace(num_components=2)
         np.testing.assert_array_equal(labels_after(Split(), full), np.repeat([0, 1], 80))
 
+    @pytest.mark.thorough
     def test_more_modes_than_labels_share_them_without_losing_mass(self):
         """Three clouds and two labels: one is full of two, which `is_diffuse` tells."""
         modes = np.repeat([0, 1, 1], 40)

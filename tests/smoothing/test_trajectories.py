@@ -13,6 +13,7 @@ QUADRATIC = mpfjax.QuadraticModel(0.3, 0.4, -2.0, 2.0)
 SQUARES = np.array([1.2, 0.8, 1.5, 1.0], np.float32)
 
 
+@pytest.mark.thorough
 def test_trajectories_of_one_component_stay_with_its_mode():
     """With little noise the modes are apart from the second step on, and nobody changes sides."""
     sharp = mpfjax.QuadraticModel(0.1, 0.1, -2.0, 2.0)

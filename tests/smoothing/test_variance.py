@@ -83,6 +83,7 @@ def test_the_second_moment_is_unbiased(name):
 SQUARES = np.array([1.2, 0.8, 1.5, 1.0, 0.6, 0.9, 1.1, 1.3], np.float32)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("filter", "observations"),
     [
@@ -186,6 +187,7 @@ def test_every_step_reports_them_and_no_other_filter_does():
     assert info.log_marginal_likelihood_error is None
 
 
+@pytest.mark.thorough
 def test_a_run_in_more_slots_than_particles_counts_its_particles():
     filter = with_first_ancestors(mpfjax.particle_filter(ONE, 30, **DRAWS))
     keys = jax.random.split(jax.random.key(2), 400)

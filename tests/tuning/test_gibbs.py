@@ -51,6 +51,7 @@ def assert_moments(chains, exact):
 
 
 class TestPosterior:
+    @pytest.mark.thorough
     def test_of_a_conditional_draw_is_the_exact_one(self):
         run = sample(320, num_chains=60, collect=lambda trajectory: trajectory[0])
         assert_moments(run.parameters["a"][:, 20:], posterior_of_a())

@@ -135,6 +135,7 @@ def centre_of(corner):
     return np.array(corner) + np.array(SIZE) / 2
 
 
+@pytest.mark.thorough
 def test_nothing_is_tracked_where_nothing_is_detected():
     for tracks in run([[]] * 4):
         assert living(tracks) == []
