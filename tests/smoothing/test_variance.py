@@ -244,7 +244,10 @@ class TestBadInput:
         plain = mpfjax.run_filter(jax.random.key(0), filter, SQUARES)
         keys = jax.random.split(jax.random.key(0), 2)
         several = mpfjax.monte_carlo(keys, with_first_ancestors(filter), SQUARES)
-        first = lambda mixture: mixture.memory["eve_indices"].indices  # noqa: E731
+
+        def first(mixture):
+            return mixture.memory["eve_indices"].indices
+
         mixture = with_first_ancestors(filter).init(jax.random.key(0))
         # The memory of islands keeps a leading axis.
         islands = eqx.tree_at(first, mixture, first(mixture).reshape(2, -1))
