@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Key
 
 import mpfjax
 from benchmarks.interacting_objects.model import BOX, SHARPNESS, Blob, place_of
+from benchmarks.interacting_objects.partitions import adaptive_partitions, independent_partitions
 from benchmarks.interacting_objects.scenes import NUM_FRAMES, Scene, Setting
 from mpfjax.metrics.tracking_quality import track_state
 
@@ -31,12 +32,20 @@ def splitting(model: mpfjax.MultiObjectModel, num_particles: int) -> mpfjax.Filt
     return mpfjax.clustered_particle_filter(model, num_particles, split_after=5)
 
 
+def adaptive_with_draws(model: mpfjax.MultiObjectModel, num_particles: int) -> mpfjax.Filter:
+    """Adaptive partitions with five points in each row, so up to five times the likelihoods."""
+    return adaptive_partitions(model, num_particles, num_draws=5)
+
+
 METHODS: dict[str, tuple[str, Callable[..., mpfjax.Filter]]] = {
     "joint": ("joint PF", mpfjax.particle_filter),
     "ps": ("PS", mpfjax.partitioned_sampling),
     "dps_prior": ("DPS, prior", dps("prior")),
     "dps_evidence": ("DPS, evidence", dps("evidence")),
     "independent": ("independent", mpfjax.independent_particle_filters),
+    "independent_partitions": ("independent partitions", independent_partitions),
+    "adaptive": ("adaptive partitions", adaptive_partitions),
+    "adaptive_draws": ("adaptive partitions, K = 5", adaptive_with_draws),
     "crossing": ("one cluster", crossing),
     "clusters": ("clusters", mpfjax.clustered_particle_filter),
     "splitting": ("clusters that split", splitting),

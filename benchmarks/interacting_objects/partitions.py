@@ -1,0 +1,138 @@
+"""Independent and adaptive partitions, proposals of one joint filter that are close to clusters."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+import mpfjax
+
+
+class ProposeInPartitions(mpfjax.AbstractPropagation):
+    """Draw objects that are far from all others independently, and the others within their row.
+
+    Independent partitions (Orton and Fitzgerald 2002): an object's points x^{jl}, one from each
+    row l, are resampled by L_j alone, so that a row may get the point of another row. That takes
+    its prediction to be independent of the other objects.
+
+    Adaptive partitions (Kreucher, Kastella and Hero 2005): at each step this is done with objects
+    that are far from all others. An object that is near another one keeps to its row. There it
+    draws K points, and keeps one in proportion to L_j, and the row is weighed by the mean L_j. Two
+    objects are near where ψ ≠ 1 between any two of their points, as in `PropagateInClusters`.
+
+    Both weigh every row by ψ afterwards. They need rows of equal weight: put `Resample()` first.
+
+    - `num_draws`: K; None takes every object to be far from all others.
+    """
+
+    model: mpfjax.MultiObjectModel
+    num_draws: int | None = eqx.field(static=True, default=1)
+
+    @property
+    def approximate(self) -> bool:
+        """True: objects far apart need not be independent."""
+        return True
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: mpfjax.ParticleMixture, observation: PyTree
+    ) -> mpfjax.ParticleMixture:
+        """Propagate every object, and weigh the rows by what they see and by ψ."""
+        num_draws = self.num_draws or 1
+        keys = jax.random.split(key, 3 * self.model.num_objects).reshape(3, -1)
+        objects = jnp.arange(self.model.num_objects, dtype=jnp.int32)
+        seen = self.model.prepare_observation(observation)
+        # The K points of a row stand side by side.
+        repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_draws, axis=0), mixture.particles)
+
+        def draw(key: Key[Array, ""], states: PyTree, j: Int[Array, ""]) -> tuple:
+            points = self.model.sample_object_transition(key, states, j)
+            log_likelihoods = self.model.object_log_likelihood(seen, points, j)
+            return points, log_likelihoods.reshape(-1, num_draws)
+
+        points, tables = jax.vmap(draw, in_axes=(0, 1, 0), out_axes=(1, 0))(
+            keys[0], repeated, objects
+        )
+        near = jnp.zeros(len(objects), bool)
+        if self.num_draws is not None:
+            near = self._near(jax.tree.map(lambda leaf: leaf[::num_draws], points))
+        from_any = jax.vmap(_from_any_row)(keys[1], tables)
+        from_own = jax.vmap(_from_own_row)(keys[2], tables)
+        places, log_factors = (
+            jnp.where(near[:, None], own, any_row)
+            for own, any_row in zip(from_own, from_any, strict=True)
+        )
+        gather = jax.vmap(lambda leaf, rows: leaf[rows], in_axes=(1, 0), out_axes=1)
+        particles = jax.tree.map(lambda leaf: gather(leaf, places), points)
+        log_factors = jnp.sum(log_factors, axis=0)
+        for i, j in self._pairs():
+            log_factors += self._log_psi(*_states_of(particles, i, j))
+        return mixture.replace(particles=particles).weighed(log_factors)
+
+    def predict(
+        self, key: Key[Array, ""], mixture: mpfjax.ParticleMixture
+    ) -> mpfjax.ParticleMixture:
+        """Draw x_t ~ D(. | x_{t-1}) of all objects."""
+        return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
+
+    def _pairs(self) -> list[tuple[int, int]]:
+        """The pairs of objects that may interact."""
+        num_objects = self.model.num_objects if self.model.interaction is not None else 0
+        return [(i, j) for j in range(num_objects) for i in range(j)]
+
+    def _log_psi(self, states: PyTree, others: PyTree) -> Float[Array, " n"]:
+        assert self.model.interaction is not None
+        return self.model.interaction(states, others)
+
+    def _near(self, points: PyTree) -> Bool[Array, " objects"]:
+        """Which objects have a point that interacts with any point of another object."""
+        near = jnp.zeros(self.model.num_objects, bool)
+        for i, j in self._pairs():
+            states, others = _states_of(points, i, j)
+
+            def meets(state: PyTree, others: PyTree = others) -> Bool[Array, ""]:
+                repeat = lambda own, other: jnp.broadcast_to(own[None], other.shape)  # noqa: E731
+                return jnp.any(self._log_psi(jax.tree.map(repeat, state, others), others) != 0)
+
+            near = near.at[jnp.array([i, j])].max(jnp.any(jax.vmap(meets)(states)))
+        return near
+
+
+def _states_of(particles: PyTree, *objects: int) -> list[PyTree]:
+    """The states of each of these objects."""
+    return [jax.tree.map(lambda leaf, j=j: leaf[:, j], particles) for j in objects]
+
+
+def _from_any_row(
+    key: Key[Array, ""], table: Float[Array, "n draws"]
+) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+    """Points resampled from the first of every row, and log of the mean weight for all."""
+    num_rows, num_draws = table.shape
+    log_weights = table[:, 0]
+    weights = jax.nn.softmax(log_weights)
+    rows = jax.random.choice(key, num_rows, (num_rows,), p=weights)
+    log_mean = jax.nn.logsumexp(log_weights) - jnp.log(num_rows)
+    return rows * num_draws, jnp.full_like(log_weights, log_mean)
+
+
+def _from_own_row(
+    key: Key[Array, ""], table: Float[Array, "n draws"]
+) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+    """A point of each row's own, and log of the mean weight of its points."""
+    num_rows, num_draws = table.shape
+    drawn = jax.random.categorical(key, table, axis=1)
+    log_means = jax.nn.logsumexp(table, axis=1) - jnp.log(num_draws)
+    return jnp.arange(num_rows, dtype=drawn.dtype) * num_draws + drawn, log_means
+
+
+def independent_partitions(model: mpfjax.MultiObjectModel, num_particles: int) -> mpfjax.Filter:
+    """Every object drawn on its own; the rows weighed by ψ."""
+    moves = [mpfjax.Resample(), ProposeInPartitions(model, None)]
+    return mpfjax.Filter(model, moves=moves, num_particles=num_particles)
+
+
+def adaptive_partitions(
+    model: mpfjax.MultiObjectModel, num_particles: int, num_draws: int = 1
+) -> mpfjax.Filter:
+    """Objects near another one drawn in their rows, the others each on its own."""
+    moves = [mpfjax.Resample(), ProposeInPartitions(model, num_draws)]
+    return mpfjax.Filter(model, moves=moves, num_particles=num_particles)
