@@ -71,8 +71,8 @@ from mpfjax.running.processes import join_processes as join_processes
 from mpfjax.running.run import monte_carlo as monte_carlo
 from mpfjax.running.run import run_filter as run_filter
 from mpfjax.running.scan import FilterRun as FilterRun
-from mpfjax.running.storage import load_checkpoint as load_checkpoint
-from mpfjax.running.storage import save_checkpoint as save_checkpoint
+from mpfjax.running.storage.states import load_checkpoint as load_checkpoint
+from mpfjax.running.storage.states import save_checkpoint as save_checkpoint
 from mpfjax.running.studies import Study as Study
 from mpfjax.running.studies import read_study as read_study
 from mpfjax.running.studies import run_study as run_study

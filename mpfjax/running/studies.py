@@ -23,16 +23,8 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import as_series, check_series
 from mpfjax.running.run import monte_carlo
 from mpfjax.running.scan import FilterRun
-from mpfjax.running.storage import (
-    as_path,
-    describe,
-    differences,
-    fingerprint,
-    load_arrays,
-    named,
-    write_arrays,
-    write_whole,
-)
+from mpfjax.running.storage.descriptions import describe, differences, fingerprint, named
+from mpfjax.running.storage.files import as_path, load_arrays, write_arrays, write_whole
 
 Values = Sequence[Any] | np.ndarray | Array
 

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from mpfjax.checks import check_flag, check_whole
 from mpfjax.operations.compiling import jit_on_wide_vectors
-from mpfjax.tuning.checkpoints import Checkpoint, Notes, identity_of
+from mpfjax.running.storage.checkpoints import Checkpoint, Notes, identity_of
 from mpfjax.tuning.problem import Reals
 from mpfjax.tuning.starts import Starts, drawn, repeated
 from mpfjax.tuning.walks import RandomWalk, random_walk

@@ -26,7 +26,8 @@ from mpfjax.models.base import require
 from mpfjax.models.inputs import with_inputs
 from mpfjax.observations import Series, as_series
 from mpfjax.running.scan import scan
-from mpfjax.running.storage import fingerprint
+from mpfjax.running.storage.checkpoints import check_checkpoint
+from mpfjax.running.storage.descriptions import fingerprint
 from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.conditional import check_conditional, draw_trajectory, is_possible, renew
 from mpfjax.tuning.chains import (
@@ -37,7 +38,6 @@ from mpfjax.tuning.chains import (
     as_checkpoint,
     chosen,
 )
-from mpfjax.tuning.checkpoints import check_checkpoint
 from mpfjax.tuning.densities import LogPrior, Prior, is_invalid, number_or_zero
 from mpfjax.tuning.problem import Parameters, Problem, Reals, pose_filter
 from mpfjax.tuning.starts import SamplePrior, Starts, constrained

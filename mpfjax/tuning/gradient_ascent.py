@@ -13,7 +13,7 @@ import optax
 from jaxtyping import Array, Key, PyTree
 from tqdm import tqdm
 
-from mpfjax.tuning.checkpoints import Checkpoint, Notes, identity_of
+from mpfjax.running.storage.checkpoints import Checkpoint, Notes, identity_of
 from mpfjax.tuning.problem import Problem, Reals, scores
 
 

@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import check_callable, check_flag, check_key, check_type, check_whole, given
 from mpfjax.filter import Filter
-from mpfjax.running.storage import fingerprint
+from mpfjax.running.storage.checkpoints import check_checkpoint
+from mpfjax.running.storage.descriptions import fingerprint
 from mpfjax.tuning.chains import (
     AbstractKernel,
     Plan,
@@ -22,7 +23,6 @@ from mpfjax.tuning.chains import (
     as_checkpoint,
     chosen,
 )
-from mpfjax.tuning.checkpoints import check_checkpoint
 from mpfjax.tuning.densities import LogDensity, LogPrior, check_exact
 from mpfjax.tuning.problem import Parameters, Reals, pose_evidence
 from mpfjax.tuning.starts import SamplePrior, Starts, constrained

@@ -22,8 +22,8 @@ from mpfjax.checks import (
     shown,
 )
 from mpfjax.filter import Filter
-from mpfjax.running.storage import fingerprint
-from mpfjax.tuning.checkpoints import check_checkpoint
+from mpfjax.running.storage.checkpoints import check_checkpoint
+from mpfjax.running.storage.descriptions import fingerprint
 from mpfjax.tuning.curvature import errors_at
 from mpfjax.tuning.gradient_ascent import Optimisation
 from mpfjax.tuning.problem import Objective, Parameters, Problem, pose, pose_evidence, warn_of_bias

@@ -19,7 +19,7 @@ from mpfjax.checks import (
     given,
 )
 from mpfjax.filter import Filter
-from mpfjax.tuning.checkpoints import check_checkpoint, identity_of
+from mpfjax.running.storage.checkpoints import check_checkpoint, identity_of
 from mpfjax.tuning.densities import LogPrior, check_exact, checked_prior
 from mpfjax.tuning.parameter_particles import Sampler
 from mpfjax.tuning.problem import Parameters, pose_filter

@@ -15,9 +15,9 @@ from tqdm import tqdm
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Series, as_series
-from mpfjax.running.storage import fingerprint
+from mpfjax.running.storage.checkpoints import Checkpoint, Notes
+from mpfjax.running.storage.descriptions import fingerprint
 from mpfjax.tuning.chains import warn_of_invalid
-from mpfjax.tuning.checkpoints import Checkpoint, Notes
 from mpfjax.tuning.parameter_particles import (
     FilterOf,
     Sampler,

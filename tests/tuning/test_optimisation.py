@@ -18,8 +18,9 @@ from scipy.optimize import minimize
 
 import mpfjax
 from mpfjax.exact import kalman_filter
+from mpfjax.running.storage.descriptions import contents_of
+from mpfjax.running.storage.files import load_arrays, write_arrays
 from mpfjax.tuning import Interval, Positive, fit, standard_errors
-from mpfjax.tuning.identity import contents_of
 from tests.full_disk import no_room_beyond
 from tests.user_models import ScalarLinear
 
@@ -217,15 +218,15 @@ class TestResuming:
     def test_a_file_with_other_arrays_is_damaged(self, tmp_path, name, array):
         path = tmp_path / "fit.npz"
         short_fit(2, checkpoint=path)
-        arrays = mpfjax.running.storage.load_arrays(path)
+        arrays = load_arrays(path)
         del arrays[name]
-        mpfjax.running.storage.write_arrays(path, arrays | ({} if array is None else {name: array}))
+        write_arrays(path, arrays | ({} if array is None else {name: array}))
         with pytest.raises(ValueError, match=r"checkpoint: .*fit\.npz: damaged"):
             short_fit(checkpoint=path)
 
     def test_a_file_of_something_else_is_refused(self, tmp_path):
         path = tmp_path / "fit.npz"
-        mpfjax.running.storage.write_arrays(path, {"step": np.array(3)})
+        write_arrays(path, {"step": np.array(3)})
         with pytest.raises(ValueError, match=r"fit\.npz is no checkpoint of fit"):
             short_fit(checkpoint=path)
 
@@ -368,7 +369,7 @@ class TestOptimisers:
         """Where addresses and the order of sets are others."""
         code = """
 import hashlib, jax, mpfjax, optax
-from mpfjax.tuning.identity import contents_of
+from mpfjax.running.storage.descriptions import contents_of
 filter = mpfjax.mixture_particle_filter(mpfjax.QuadraticModel(0.3, 0.3, -2.5, 2.5), 20, 2)
 rate = optax.cosine_decay_schedule(0.05, 100)
 optimizer = optax.chain(optax.clip(1.0), optax.adam(lambda t: rate(t) if t in {1, 2} else 0.1))

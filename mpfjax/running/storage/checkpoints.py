@@ -11,15 +11,9 @@ import numpy as np
 from jaxtyping import PyTree
 
 from mpfjax.checks import check_type, check_whole, given
-from mpfjax.running.storage import (
-    arrays_of,
-    as_path,
-    filled,
-    fingerprint,
-    load_arrays,
-    write_arrays,
-)
-from mpfjax.tuning.identity import contents_of, unlike
+from mpfjax.running.storage.descriptions import contents_of, differences, fingerprint
+from mpfjax.running.storage.files import as_path, load_arrays, read_description, write_arrays
+from mpfjax.running.storage.states import arrays_of, filled
 
 _NOTES = "notes"
 Notes = dict[str, Any]
@@ -52,7 +46,7 @@ class Checkpoint:
         found, own = notes["identity"], dict(self.identity(notes["step"]))
         if found != own:
             raise ValueError(
-                f"checkpoint: {self.path} is of another {self.caller}: {unlike(found, own)}"
+                f"checkpoint: {self.path} is of another {self.caller}: {differences(found, own)}"
             )
         try:
             return notes, filled(self.path, arrays, like(notes))
@@ -61,7 +55,7 @@ class Checkpoint:
 
     def _notes(self, arrays: Mapping[str, np.ndarray]) -> Notes:
         try:
-            notes = json.loads(str(arrays[_NOTES]))
+            notes = read_description(self.path, arrays, _NOTES)
             is_own = notes["caller"] == self.caller and notes["step"] >= 0
         except (KeyError, TypeError, ValueError):
             is_own, notes = False, {}

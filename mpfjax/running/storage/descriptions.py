@@ -1,20 +1,97 @@
-"""Whether two optimisations are the same: their numbers and functions by name, as text."""
+"""What a pytree, a function or a setting is, as text by which two runs are compared."""
 
+import dataclasses
 import functools
 import hashlib
+import json
+import re
 import types
 from collections.abc import Mapping
 from typing import Any, cast
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-
-from mpfjax.running.storage import differences, fingerprint, named
+from jaxtyping import PyTree
 
 # Functions of these libraries are compared by name, others by their code as well.
 _LIBRARIES = ("chex", "equinox", "jax", "jaxlib", "mpfjax", "numpy", "optax")
 _MOST_SHOWN = 4
+
+
+def describe(tree: PyTree) -> dict[str, str]:
+    """Every leaf's shape and dtype, every static field, and what else there is, by its place."""
+    return _static_fields(tree, ()) | {
+        jax.tree_util.keystr(place): kind(leaf) if is_data(leaf) else named(leaf)
+        for place, leaf in jax.tree_util.tree_leaves_with_path(tree)
+    }
+
+
+def fingerprint(tree: PyTree) -> str:
+    """SHA-256 of all that a pytree holds: its description and its arrays' bytes."""
+    digest = hashlib.sha256(json.dumps(describe(tree)).encode())
+    for leaf in filter(is_data, jax.tree.leaves(tree)):
+        digest.update(as_numpy(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    """In words, the first few things in which two descriptions differ."""
+    found = []
+    for name in sorted(there.keys() | here.keys()):
+        if name not in there:
+            found.append(f"{name} is only here")
+        elif name not in here:
+            found.append(f"{name} is only there")
+        elif there[name] != here[name]:
+            found.append(f"{name} is {there[name]} there and {here[name]} here")
+    more = len(found) - _MOST_SHOWN
+    return "; ".join(found[:_MOST_SHOWN]) + (f"; and {more} more" if more > 0 else "")
+
+
+def named(value: Any) -> str:
+    """A name for a function, or another thing without a value; the same in every process."""
+    return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+
+
+def is_data(leaf: Any) -> bool:
+    """Whether it is an array, a key or a number, the shape of one included."""
+    arrays = (jax.Array, np.ndarray, np.generic, jax.ShapeDtypeStruct)
+    return isinstance(leaf, (*arrays, bool, int, float, complex))
+
+
+def is_number(leaf: Any) -> bool:
+    return isinstance(leaf, bool | int | float | complex) and not isinstance(leaf, np.generic)
+
+
+def kind(leaf: Any) -> str:
+    if is_number(leaf):
+        return f"a Python {type(leaf).__name__}"
+    return f"{leaf.dtype}{list(leaf.shape)}"
+
+
+def is_key(leaf: Any) -> bool:
+    return not is_number(leaf) and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def as_numpy(leaf: Any) -> np.ndarray:
+    return np.asarray(jax.random.key_data(leaf) if is_key(leaf) else leaf)
+
+
+def _static_fields(tree: PyTree, place: tuple[Any, ...]) -> dict[str, str]:
+    """The class and static fields of every module in a pytree, by their places."""
+    found = {}
+    if isinstance(tree, eqx.Module):
+        start = jax.tree_util.keystr(place)
+        found[f"{start}.__class__"] = type(tree).__name__
+        for field in dataclasses.fields(tree):
+            if field.metadata.get("static", False):
+                found[f"{start}.{field.name}"] = named(getattr(tree, field.name, None))
+    is_inner = lambda node: node is not tree and isinstance(node, eqx.Module)  # noqa: E731
+    for inner, node in jax.tree_util.tree_leaves_with_path(tree, is_leaf=is_inner):
+        if is_inner(node):
+            found |= _static_fields(node, place + inner)
+    return found
 
 
 def contents_of(name: str, value: Any) -> dict[str, str]:
@@ -30,24 +107,11 @@ def contents_of(name: str, value: Any) -> dict[str, str]:
     return found
 
 
-def unlike(there: Mapping[str, str], here: Mapping[str, str]) -> str:
-    """In words, the first few things in which two descriptions differ."""
-    names = [name for name in sorted(there.keys() | here.keys()) if _differ(name, there, here)]
-    first = names[:_MOST_SHOWN]
-    only = lambda of: {name: of[name] for name in first if name in of}  # noqa: E731
-    more = len(names) - len(first)
-    return differences(only(there), only(here)) + (f"; and {more} more" if more else "")
-
-
-def _differ(name: str, there: Mapping[str, str], here: Mapping[str, str]) -> bool:
-    return there.get(name) != here.get(name)
-
-
 def _collect(name: str, value: Any, found: dict[str, str], seen: dict[int, Any]) -> None:
     """Write down a value, and what it holds."""
     if value is None or isinstance(value, str | bytes | np.dtype):
         found[name] = repr(value)
-    elif _is_data(value):
+    elif is_data(value):
         found[name] = _value(value)
     elif isinstance(value, type | types.BuiltinFunctionType | types.ModuleType):
         found[name] = named(value)
@@ -109,7 +173,7 @@ def _parts_of_function(function: types.FunctionType) -> dict[str, Any]:
     for variable in sorted(_names(function.__code__)):
         value = function.__globals__.get(variable)
         own_function = isinstance(value, types.FunctionType) and not _of_library(value)
-        if own_function or _is_data(value) or isinstance(value, str):
+        if own_function or is_data(value) or isinstance(value, str):
             parts[f".{variable}"] = value
     return parts
 
@@ -138,10 +202,6 @@ def _digest(code: types.CodeType) -> str:
     return digest.hexdigest()[:12]
 
 
-def _is_data(value: Any) -> bool:
-    return isinstance(value, jax.Array | np.ndarray | np.generic | bool | int | float | complex)
-
-
 def _is_count(value: Any) -> bool:
     """A whole number that is the same as a float."""
     return type(value) is int and abs(value) < 2**53
@@ -152,6 +212,6 @@ def _value(value: Any) -> str:
     if not isinstance(value, jax.Array | np.ndarray | np.generic):
         return str(value)
     kind = f"{value.dtype}{list(value.shape)}"
-    if jnp.issubdtype(value.dtype, jax.dtypes.prng_key) or value.size != 1:
+    if is_key(value) or value.size != 1:
         return f"{kind} of fingerprint {fingerprint(value)[:12]}"
     return f"{kind} of {np.asarray(value).reshape(())[()]!s}"

@@ -1,0 +1,162 @@
+"""Files that are written whole or not at all, and that load without running code."""
+
+import json
+import math
+import os
+import platform
+import re
+import secrets
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from mpfjax.checks import check_type, shown
+
+
+def as_path(path: str | os.PathLike[str], name: str = "path") -> Path:
+    """The path, or a `ValueError` naming the argument where it is none or empty."""
+    check_type((str, os.PathLike), "a path", **{name: path})
+    if not os.fspath(path):
+        raise ValueError(f"{name}: '' is no path; '.' is the folder that this runs in")
+    return Path(path)
+
+
+def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
+    """Write a file so that an interruption or an error leaves the old one or the new one.
+
+    Several threads and processes may write one path: whoever ends last has written the file, and
+    who reads it finds one that is whole. Raises `OSError` that names the file where there is no
+    room for it, or no permission.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Writers that shared a name would write into each other's file, and take it from each other.
+    ours = f"{platform.node()}-{os.getpid()}"
+    partial = path.with_name(f"{path.name}.{ours}-{secrets.token_hex(8)}.partial")
+    _remove_what_the_killed_left(path)
+    try:
+        with open(partial, "xb") as file:
+            write(file)
+            file.flush()
+            # Without it, the file could be empty under its new name after a power cut.
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except BaseException as error:
+        partial.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            fault = f"{error.strerror or error}; nothing that was written before is lost"
+            raise OSError(error.errno, fault, str(path)) from error
+        raise
+
+
+def _remove_what_the_killed_left(path: Path) -> None:
+    """Remove what processes of this machine that no longer run were writing to the path."""
+    if os.name != "posix":
+        return
+    name = re.compile(rf"{re.escape(f'{path.name}.{platform.node()}')}-(\d+)-[0-9a-f]+\.partial")
+    for other in path.parent.iterdir():
+        found = name.fullmatch(other.name)
+        if found is not None and not _is_running(int(found[1])):
+            other.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays by name as .npz, whole or not at all; `np.load` reads it without pickles.
+
+    Raises `ValueError` for an array that could not be read so, and `OSError` as `write_whole`.
+    """
+    for name, array in arrays.items():
+        if array.dtype.hasobject or array.dtype.kind == "V":
+            raise ValueError(f"{name}: an array of {array.dtype} does not load without pickles")
+
+    def write(file: BinaryIO) -> None:
+        # Not by np.savez, which takes an array named "file" for its first argument.
+        with zipfile.ZipFile(file, "w") as archive:
+            for name, array in arrays.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    np.lib.format.write_array(member, array, allow_pickle=False)
+
+    write_whole(path, write)
+
+
+# The errors that a flipped bit may lead to; the last is for an unknown compression or encryption.
+_DAMAGE = (
+    zipfile.BadZipFile, zlib.error, EOFError, OSError, OverflowError, ValueError, RuntimeError,
+)  # fmt: skip
+
+
+def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """The arrays of a .npz file; `ValueError` for one that is cut off, damaged or no such file.
+
+    It takes memory only for what the file really holds, whatever its headers claim.
+    """
+    arrays = {}
+    with open(path, "rb") as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                for member in archive.infolist():
+                    arrays[member.filename.removesuffix(".npy")] = _load_array(archive, member)
+        except _DAMAGE as error:
+            raise ValueError(f"{path}: cut off, damaged or no .npz file ({error})") from error
+    return arrays
+
+
+_PIECE = 2**20
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def _load_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """What `np.lib.format.read_array` reads, which takes the memory that the header claims."""
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{member.filename} is compressed as numpy compresses nothing")
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        if version not in _HEADERS:
+            raise ValueError(f"{member.filename} is of the unknown version {version}")
+        try:
+            shape, is_fortran, dtype = _HEADERS[version](file)
+        except MemoryError as error:
+            raise ValueError(f"{member.filename}'s header is no description") from error
+        if dtype.hasobject or dtype.itemsize == 0:
+            raise ValueError(f"{member.filename} holds {dtype}, which is no array of numbers")
+        claimed, present = math.prod(shape) * dtype.itemsize, member.file_size - file.tell()
+        if claimed != present:
+            raise ValueError(f"{member.filename} claims {claimed} bytes and has {present}")
+        # In pieces, since the archive may claim too much as well.
+        content = bytearray()
+        while piece := file.read(_PIECE):
+            content += piece
+    return np.ndarray(shape, dtype, content, order="F" if is_fortran else "C")
+
+
+def read_description(
+    path: Path, arrays: Mapping[str, np.ndarray], name: str = "description"
+) -> dict[str, Any]:
+    """What the arrays of a checkpoint say of themselves, in the JSON of this name."""
+    if name not in arrays:
+        raise ValueError(f"{path}: no checkpoint, for it does not describe what it holds")
+    text = str(arrays[name])
+    try:
+        description = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: no checkpoint, its description is no JSON ({error})") from error
+    if not isinstance(description, dict):
+        raise ValueError(f"{path}: no checkpoint, its description is {shown(description)}")
+    return description
