@@ -21,8 +21,6 @@ from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
 from mpfjax.moves.base import AbstractMove, AbstractPropagation, AbstractRegrouping
 from mpfjax.moves.local_quadratics import LocalQuadratics
 from mpfjax.moves.propagation.propagate import likelihoods, predict
-from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
-from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.logarithms import log_sum_exp
 
 STEP = "twisted"
@@ -132,59 +130,24 @@ class TwistInitial(AbstractMove):
         )
 
 
-class ResampleTwisted(AbstractMove):
-    """`AuxiliaryResample` whose look-ahead is ν_t(x_{t-1}) of the step that it is.
+class TwistedLookahead(eqx.Module):
+    """The look-ahead of an `AuxiliaryResample` that is ν_t(x_{t-1}) of the step that it is."""
 
-    - `resample`: the `Resample` that draws.
-    - `twist`: ψ_1, ..., ψ_T.
-    """
-
-    resample: Resample
     twist: Twist
-
-    def __check_init__(self) -> None:
-        AuxiliaryResample(self.resample, _no_lookahead)
-
-    @property
-    def approximate(self) -> bool:
-        """As the resampling is."""
-        return self.resample.approximate
-
-    @property
-    def weighs(self) -> bool:
-        """False: what the look-ahead adds to the weights is taken away again."""
-        return False
 
     @property
     def reads(self) -> frozenset[str]:
         """What `CountSteps` remembers."""
         return frozenset({STEP})
 
-    @property
-    def particles_per_component(self) -> int | None:
-        """That of the resampling."""
-        return self.resample.particles_per_component
-
-    def would_resample(
-        self, mixture: ParticleMixture, observation: PyTree = None
-    ) -> Bool[Array, " m"]:
-        """Which components of `mixture` the move would resample."""
-        return self._now(mixture).would_resample(mixture, observation)
-
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
-        """Resample every component that is due, looking ahead to y_t, ..., y_T."""
-        return self._now(mixture)(key, mixture, observation)
-
-    def _now(self, mixture: ParticleMixture) -> AuxiliaryResample:
+    def at_step_of(self, mixture: ParticleMixture) -> Callable[[PyTree, PyTree], Array]:
+        """log ν_t in this step, of an observation, which plays no part, and the states."""
         step = mixture.memory[STEP]["step"]
+        return lambda observation, states: self.twist.log_normaliser(step, states)
 
-        def look(observation: PyTree, states: PyTree) -> Float[Array, " n"]:
-            del observation
-            return self.twist.log_normaliser(step, states)
-
-        return AuxiliaryResample(self.resample, look)
+    def __call__(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
+        """A look-ahead outside of a filter would not know the step."""
+        raise NotImplementedError
 
 
 class PropagateTwisted(AbstractPropagation):
@@ -266,7 +229,3 @@ class RegroupTwisted(AbstractRegrouping):
     def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
         """What the move forgets."""
         return self.move.forget(memory, dead)
-
-
-def _no_lookahead(observation: PyTree, states: PyTree) -> Float[Array, " n"]:
-    raise AssertionError

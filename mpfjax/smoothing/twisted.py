@@ -22,8 +22,8 @@ from mpfjax.moves.twisted import (
     CountSteps,
     PropagateTwisted,
     RegroupTwisted,
-    ResampleTwisted,
     Twist,
+    TwistedLookahead,
     TwistInitial,
     features_of,
 )
@@ -115,7 +115,7 @@ def _knowing_nothing(
 def _twisted(filter: Filter, twist: Twist) -> Filter:
     """The filter whose moves look ahead by `twist`; a `ValueError` for one that cannot."""
     moves = [_looking_ahead(move, filter, twist) for move in filter.moves]
-    for kind, needed in ((ResampleTwisted, "Resample"), (PropagateTwisted, "Propagate")):
+    for kind, needed in ((AuxiliaryResample, "Resample"), (PropagateTwisted, "Propagate")):
         if sum(isinstance(move, kind) for move in moves) != 1:
             raise ValueError(f"filter: its moves need one {needed}, in the chain itself")
     regroupings = [_looking_ahead(move, filter, twist) for move in filter.initial_moves]
@@ -134,7 +134,7 @@ def _looking_ahead(move: Any, filter: Filter, twist: Twist) -> Any:
     if isinstance(move, AuxiliaryResample):
         move = move.resample
     if isinstance(move, Resample):
-        return ResampleTwisted(move, twist)
+        return AuxiliaryResample(move, TwistedLookahead(twist))
     if isinstance(move, Propagate) and move.gradient == "none":
         return PropagateTwisted(filter.model, twist, move.noise)
     if isinstance(move, Every):

@@ -13,7 +13,8 @@ import optax
 from jaxtyping import Array, Key, PyTree
 from tqdm import tqdm
 
-from mpfjax.running.storage.checkpoints import Checkpoint, Notes, identity_of
+from mpfjax.checks import check_finite, check_flag, check_whole, given
+from mpfjax.running.storage.checkpoints import Checkpoint, Notes, check_checkpoint, identity_of
 from mpfjax.tuning.problem import Problem, Reals, scores
 
 
@@ -40,6 +41,40 @@ class End:
     stopped: str | None
 
 
+@dataclass(frozen=True)
+class Plan:
+    """How long to go on, and what to keep: the arguments that `fit` and `maximise` share."""
+
+    num_steps: int
+    common_random_numbers: bool
+    patience: int | None
+    tolerance: float
+    checkpoint: str | os.PathLike[str] | None
+    checkpoint_every: int
+    checkpoint_name: str | None
+    progress: bool
+
+    def __post_init__(self) -> None:
+        check_whole(1, num_steps=self.num_steps)
+        check_whole(1, **given(patience=self.patience))
+        check_finite(tolerance=self.tolerance)
+        check_flag(common_random_numbers=self.common_random_numbers, progress=self.progress)
+        check_checkpoint(self.checkpoint, self.checkpoint_every, self.checkpoint_name)
+
+    def converged(self, values: tuple[float, ...]) -> str | None:
+        """Why it ends after these values, or None."""
+        patience = self.patience
+        if patience is None or len(values) < 2 * patience:
+            return None
+        before = np.mean(values[-2 * patience : -patience])
+        gain = float(np.mean(values[-patience:]) - before)
+        if gain > self.tolerance:
+            return None
+        return (
+            f"{patience} steps gained {gain:.3g} nats, no more than the tolerance, {self.tolerance}"
+        )
+
+
 class Optimisation:
     """The steps of one maximisation, by the public function that is `caller`."""
 
@@ -53,6 +88,7 @@ class Optimisation:
         num_seeds: int,
         settings: dict[str, Any],
         code: dict[str, Any],
+        plan: Plan,
     ) -> None:
         """`settings` and `code` of the objective, as `identity_of` takes them."""
         self.caller = caller
@@ -63,47 +99,36 @@ class Optimisation:
         self.num_seeds = num_seeds
         self.settings = settings
         self.code = code
-        self.common_random_numbers = False
+        self.plan = plan
 
     @property
     def named(self) -> str:
         """The objective in words."""
         return self.objective.replace("_", " ")
 
-    def run(
-        self,
-        num_steps: int,
-        common_random_numbers: bool,
-        patience: int | None,
-        tolerance: float,
-        checkpoint: str | os.PathLike[str] | None,
-        checkpoint_every: int,
-        checkpoint_name: str | None,
-        progress: bool,
-    ) -> End:
+    def run(self) -> End:
         """All steps, from the start or from the step of the checkpoint."""
-        self.common_random_numbers = common_random_numbers
-        state, file = self.start(), None
-        if checkpoint is not None:
+        plan, state, file = self.plan, self.start(), None
+        if plan.checkpoint is not None:
             # Before the first step, at which an optimiser may change what its closures hold.
-            identity = self.identity(checkpoint_name)
-            file = Checkpoint(Path(checkpoint), self.caller, lambda step: identity)
+            identity = self.identity(plan.checkpoint_name)
+            file = Checkpoint(Path(plan.checkpoint), self.caller, lambda step: identity)
             state = self.saved(file, state)
         if state.fault is not None:
             self.warn(state.fault, stacklevel=4)
         saved = state
         # An optimisation that has ended before ends again, by the same values.
-        stopped = state.fault or _converged(state.values, patience, tolerance)
-        bar = tqdm(total=num_steps, initial=state.step, disable=not progress, unit="step")
+        stopped = state.fault or plan.converged(state.values)
+        bar = tqdm(total=plan.num_steps, initial=state.step, disable=not plan.progress, unit="step")
         try:
-            while state.step < num_steps and stopped is None:
+            while state.step < plan.num_steps and stopped is None:
                 state = self.advance(state)
                 stopped = state.fault
                 if stopped is None:
                     bar.update()
                     bar.set_postfix({self.objective: f"{state.values[-1]:.2f}"}, refresh=False)
-                    stopped = _converged(state.values, patience, tolerance)
-                if file is not None and state.step % checkpoint_every == 0:
+                    stopped = plan.converged(state.values)
+                if file is not None and state.step % plan.checkpoint_every == 0:
                     self.save(file, state, stopped)
                     saved = state
             state, value = self.finish(state)
@@ -132,7 +157,7 @@ class Optimisation:
 
     def evaluate(self, state: State) -> tuple[np.ndarray, Reals, str | None]:
         """The objective of each seed, the gradient of their mean, and what is wrong with either."""
-        step = 0 if self.common_random_numbers else state.step
+        step = 0 if self.plan.common_random_numbers else state.step
         keys = jax.random.split(jax.random.fold_in(self.key, step), self.num_seeds)
         values, gradient = scores(self.problem, state.reals, keys)
         values = np.asarray(values)
@@ -201,7 +226,7 @@ class Optimisation:
             "transforms": self.problem.transforms,
             "key": self.key,
             "num_seeds": int(self.num_seeds),
-            "common_random_numbers": bool(self.common_random_numbers),
+            "common_random_numbers": bool(self.plan.common_random_numbers),
         }
         code = {"optimizer": self.optimizer} | self.code
         return places | identity_of(name, settings | self.settings, code)
@@ -245,13 +270,3 @@ class Optimisation:
             ),
             fault=notes["stopped"] if notes["broken"] else None,
         )
-
-
-def _converged(values: tuple[float, ...], patience: int | None, tolerance: float) -> str | None:
-    if patience is None or len(values) < 2 * patience:
-        return None
-    before = np.mean(values[-2 * patience : -patience])
-    gain = float(np.mean(values[-patience:]) - before)
-    if gain > tolerance:
-        return None
-    return f"{patience} steps gained {gain:.3g} nats, no more than the tolerance, {tolerance}"

@@ -14,18 +14,14 @@ from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import (
     check_callable,
-    check_finite,
-    check_flag,
     check_key,
     check_whole,
-    given,
     shown,
 )
 from mpfjax.filter import Filter
-from mpfjax.running.storage.checkpoints import check_checkpoint
 from mpfjax.running.storage.descriptions import fingerprint
 from mpfjax.tuning.curvature import errors_at
-from mpfjax.tuning.gradient_ascent import Optimisation
+from mpfjax.tuning.gradient_ascent import Optimisation, Plan
 from mpfjax.tuning.problem import Objective, Parameters, Problem, pose, pose_evidence, warn_of_bias
 from mpfjax.tuning.transforms import AbstractTransform
 
@@ -114,8 +110,9 @@ def fit(
     it for a checkpoint of another fit, naming what differs, for one that is cut off or lacks an
     array, and where `run_filter` does. Raises `RuntimeError` if the start itself is not finite.
     """
-    _check_optimisation(
-        key, optimizer, num_steps, num_seeds, common_random_numbers, patience, tolerance,
+    _check_optimisation(key, optimizer, num_seeds)
+    plan = Plan(
+        num_steps, common_random_numbers, patience, tolerance,
         checkpoint, checkpoint_every, checkpoint_name, progress,
     )  # fmt: skip
     check_whole(0, curvature_seeds=curvature_seeds)
@@ -125,17 +122,10 @@ def fit(
     observed = fingerprint(problem.objective)
     settings = {"filter": problem.tree, "observations": observed, "missing": missing}
     objective = "log_marginal_likelihood"
-    optimisation = Optimisation("fit", objective, key, problem, optimizer, num_seeds, settings, {})
-    end = optimisation.run(
-        num_steps,
-        common_random_numbers,
-        patience,
-        tolerance,
-        checkpoint,
-        checkpoint_every,
-        checkpoint_name,
-        progress,
+    optimisation = Optimisation(
+        "fit", objective, key, problem, optimizer, num_seeds, settings, {}, plan
     )
+    end = optimisation.run()
     errors = None
     if curvature_seeds:
         key_curvature = jax.random.fold_in(key, num_steps + 1)
@@ -186,7 +176,7 @@ def maximise(
     checkpoint_name: str | None = None,
     progress: bool = True,
 ) -> Maximisation:
-    """Optimisation any objective in some of a model's, or a filter's, parameters.
+    """Maximise any objective in some of a model's, or a filter's, parameters.
 
     Maximises the mean over seeds of `objective(key, model)`, a scalar that JAX can differentiate,
     as `fit` does for the log marginal likelihood: same arguments, same checks, same report. Use it
@@ -202,8 +192,9 @@ def maximise(
     floating point scalar. For a `checkpoint` the objective must also be the same: the code and
     closure of a function, the fields of an `equinox.Module`.
     """
-    _check_optimisation(
-        key, optimizer, num_steps, num_seeds, common_random_numbers, patience, tolerance,
+    _check_optimisation(key, optimizer, num_seeds)
+    plan = Plan(
+        num_steps, common_random_numbers, patience, tolerance,
         checkpoint, checkpoint_every, checkpoint_name, progress,
     )  # fmt: skip
     check_callable("a function of a key and a model", objective=objective)
@@ -212,18 +203,9 @@ def maximise(
 
     settings, code = {"model": problem.tree}, {"objective": objective}
     optimisation = Optimisation(
-        "maximise", "value", key, problem, optimizer, num_seeds, settings, code
+        "maximise", "value", key, problem, optimizer, num_seeds, settings, code, plan
     )
-    end = optimisation.run(
-        num_steps,
-        common_random_numbers,
-        patience,
-        tolerance,
-        checkpoint,
-        checkpoint_every,
-        checkpoint_name,
-        progress,
-    )
+    end = optimisation.run()
     return Maximisation(
         model=problem.at(end.state.reals),
         parameters=problem.constrained(end.state.reals),
@@ -233,20 +215,8 @@ def maximise(
     )
 
 
-def _check_optimisation(
-    key: Any,
-    optimizer: Any,
-    num_steps: Any,
-    num_seeds: Any,
-    common_random_numbers: Any,
-    patience: Any,
-    tolerance: Any,
-    checkpoint: Any,
-    checkpoint_every: Any,
-    checkpoint_name: Any,
-    progress: Any,
-) -> None:
-    """The arguments that `fit` and `maximise` share, before anything compiles."""
+def _check_optimisation(key: Any, optimizer: Any, num_seeds: Any) -> None:
+    """The other arguments that `fit` and `maximise` share, before anything compiles."""
     check_key(key)
     for method in ("init", "update"):
         if isinstance(optimizer, type) or not callable(getattr(optimizer, method, None)):
@@ -254,11 +224,7 @@ def _check_optimisation(
                 f"optimizer: {shown(optimizer)} has no {method}; take one of optax, such as"
                 " optax.adam(0.05)"
             )
-    check_whole(1, num_steps=num_steps, num_seeds=num_seeds)
-    check_whole(1, **given(patience=patience))
-    check_finite(tolerance=tolerance)
-    check_flag(common_random_numbers=common_random_numbers, progress=progress)
-    check_checkpoint(checkpoint, checkpoint_every, checkpoint_name)
+    check_whole(1, num_seeds=num_seeds)
 
 
 def _check_scalar(problem: Problem, key: Key[Array, ""]) -> None:

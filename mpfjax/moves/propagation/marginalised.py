@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_one_of, check_type, saying
+from mpfjax.checks import check_type, saying
 from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.base import (
     HasTransitionNoise,
@@ -16,7 +16,6 @@ from mpfjax.models.base import (
     is_made_of_noise,
     model_name,
     require,
-    require_noise,
 )
 from mpfjax.models.conditionally_linear import (
     AbstractConditionallyLinearModel,
@@ -28,9 +27,15 @@ from mpfjax.models.conditionally_linear import (
     require_marginalised,
     updated,
 )
-from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
+from mpfjax.models.noise import noise_dtype
 from mpfjax.moves.base import AbstractPropagation
-from mpfjax.moves.propagation.propagate import likelihoods, log_transition
+from mpfjax.moves.propagation.propagate import (
+    check_noise,
+    check_propagated_gradient,
+    likelihoods,
+    log_transition,
+    noise_of_slots,
+)
 from mpfjax.operations.generator import normal
 from mpfjax.operations.gradients import add_gradient, without_gradient
 from mpfjax.proposals import AbstractProposal
@@ -68,29 +73,22 @@ class PropagateMarginalised(AbstractPropagation):
     def __check_init__(self) -> None:
         require_marginalised(self.model, "PropagateMarginalised")
         check_model(self.model, "PropagateMarginalised")
-        check_one_of(("none", "stop"), gradient=self.gradient)
-        check_one_of(NOISES, noise=self.noise)
+        # The mixed form has the law of z_t and its noise whatever the model's methods are.
+        own = None if is_mixed(self.model) else self.model
+        check_propagated_gradient(self.gradient, own)
+        check_noise(self.noise, own, self.proposal)
         if self.proposal is not None:
             what = "a proposal, such as RegimeProposal(model)"
             check_type(AbstractProposal, what, proposal=self.proposal)
-        if self.noise != "independent" and self.proposal is not None:
-            for method in ("propose_from_noise", "noise_dimension"):
-                require(self.proposal, method, f"noise={self.noise!r}", "proposal")
-        if is_mixed(self.model):
-            return
-        if self.proposal is not None:
-            require(self.model, "log_transition", f"proposal {type(self.proposal).__name__}")
-        elif self.noise != "independent":
-            require_noise(self.model, f"noise={self.noise!r}")
-        if self.gradient == "stop":
-            require(self.model, "log_transition", "gradient='stop'")
+            if own is not None:
+                require(own, "log_transition", f"proposal {type(self.proposal).__name__}")
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
         if self.noise != "independent":
-            noise = self._noise(key, self.noise_dimension(mixture), mixture)
+            noise = noise_of_slots(self.noise, key, self.noise_dimension(mixture), mixture)
             return self.from_noise(noise, mixture, observation)
         if self.proposal is None:
             return _weighed(self.model, self.predict(key, mixture), observation)
@@ -120,21 +118,13 @@ class PropagateMarginalised(AbstractPropagation):
         made_of_noise = is_mixed(self.model) or is_made_of_noise(self.model)
         if self.noise != "independent" and made_of_noise:
             dimension = _own_noise_dimension(self.model, state)
-            return self._made_of(self._noise(key, dimension, mixture), mixture)
+            return self._made_of(noise_of_slots(self.noise, key, dimension, mixture), mixture)
         if is_mixed(self.model):
             shape = (mixture.num_particles, _own_noise_dimension(self.model, state))
             return self._made_of(normal(key, shape, noise_dtype(state)), mixture)
         latent = self.model.sample_transition(key, state.latent)
         check_moved(latent, state.latent, self.model)
         return self._moved(latent, mixture)
-
-    def _noise(
-        self, key: Key[Array, ""], dimension: int, mixture: ParticleMixture
-    ) -> Float[Array, "n k"]:
-        """Noise for every slot; its points are those of the slot's component."""
-        shape, dtype = (mixture.num_particles, dimension), noise_dtype(mixture.particles)
-        labels, num_components = mixture.component_indicators, mixture.num_components
-        return draw_noise(self.noise, key, shape, dtype, labels, num_components)
 
     def _made_of(self, noise: Float[Array, "n k"], mixture: ParticleMixture) -> ParticleMixture:
         """The prediction with z_t made of this noise."""

@@ -75,7 +75,7 @@ class Propagate(AbstractPropagation):
     ) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
         if self.noise != "independent":
-            noise = _noise(self.noise, key, self.noise_dimension(mixture), mixture)
+            noise = noise_of_slots(self.noise, key, self.noise_dimension(mixture), mixture)
             return self.from_noise(noise, mixture, observation)
         if self.proposal is None:
             return _weigh(self.model, self.predict(key, mixture), observation)
@@ -196,9 +196,12 @@ def _check_whole_states(model: Any, needed_by: str) -> None:
 
 
 def check_propagated_gradient(gradient: str, model: object) -> None:
-    """Raise a `ValueError` for an unknown gradient, or one whose density the model lacks."""
+    """Raise a `ValueError` for an unknown gradient, or one whose density the model lacks.
+
+    A model that is None lacks nothing.
+    """
     check_one_of(("none", "stop"), gradient=gradient)
-    if gradient == "stop":
+    if gradient == "stop" and model is not None:
         require(model, "log_transition", "gradient='stop'")
 
 
@@ -208,13 +211,14 @@ def check_noise(noise: str, model: object, proposal: object = None) -> None:
     if noise == "independent":
         return
     if proposal is None:
-        require_noise(model, f"noise={noise!r}")
+        if model is not None:
+            require_noise(model, f"noise={noise!r}")
         return
     for method in ("propose_from_noise", "noise_dimension"):
         require(proposal, method, f"noise={noise!r}", "proposal")
 
 
-def _noise(
+def noise_of_slots(
     kind: str, key: Key[Array, ""], dimension: int, mixture: ParticleMixture
 ) -> Float[Array, "n k"]:
     """Noise for every slot; its points are those of the slot's component."""
@@ -233,7 +237,7 @@ def predict(
     """Draws of x_t, with the weights' derivatives times D / ⊥D where the draws have none."""
     if noise != "independent":
         dimension = cast(HasTransitionNoise, model).noise_dimension
-        return _made_of(_noise(noise, key, dimension, mixture), model, mixture, gradient)
+        return _made_of(noise_of_slots(noise, key, dimension, mixture), model, mixture, gradient)
     states = model.sample_transition(key, mixture.particles)
     check_moved(states, mixture.particles, model)
     return _moved(states, model, mixture, gradient)

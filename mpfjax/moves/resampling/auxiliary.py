@@ -62,6 +62,11 @@ class AuxiliaryResample(AbstractMove):
         return False
 
     @property
+    def reads(self) -> frozenset[str]:
+        """What the look-ahead reads of the memory of other moves."""
+        return getattr(self.lookahead, "reads", frozenset())
+
+    @property
     def particles_per_component(self) -> int | None:
         """That of the resampling."""
         return self.resample.particles_per_component
@@ -92,6 +97,8 @@ class AuxiliaryResample(AbstractMove):
     def _log_factors(self, mixture: ParticleMixture, observation: PyTree) -> Float[Array, " n"]:
         """log ν of each particle, zero in a component where ν is zero throughout."""
         look: Any = self.lookahead
+        if hasattr(look, "at_step_of"):
+            look = look.at_step_of(mixture)
         with saying("in lookahead, which is called with an observation and the particles"):
             look = getattr(look, "log_normaliser", look)
             values = look(observation, mixture.particles)
