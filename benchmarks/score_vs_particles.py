@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 import mpfjax
 from mpfjax import plotting
-from mpfjax.console import exit_status, format_table, seed, whole, write_json
+from mpfjax.console import exit_status, format_table, seed, whole, write_figure, write_json
 from mpfjax.exact import grid_filter
 from mpfjax.metrics import mass_above, modes_represented
 
@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> None:
         "score_vs_particles": plotting.draw_scores(results, LABELS),
     }
     for stem, figure in figures.items():
-        figure.savefig(out / f"{stem}.png", dpi=150)
+        write_figure(out / f"{stem}.png", figure, dpi=150)
     # The next run is to show what the code does then, not what it did now.
     shutil.rmtree(unfinished)
     print(f"results and figures: {out}/")

@@ -12,6 +12,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,13 @@ def fill_in(
             setattr(options, name, default)
         elif not is_used:
             parser.error(f"argument --{name.replace('_', '-')}: does nothing {why}")
+
+
+def write_figure(path: Path, figure: Any, dpi: int = 150) -> None:
+    """Write a matplotlib figure as PNG, for pages, and beside it as PDF, for print."""
+    for kind in ("png", "pdf"):
+        draw = partial(figure.savefig, format=kind, dpi=dpi)
+        write_whole(path.with_suffix(f".{kind}"), draw)
 
 
 def write_json(path: Path, content: Any) -> None:

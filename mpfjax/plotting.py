@@ -339,20 +339,21 @@ class CostPanel:
 
 
 def draw_costs(rows: Sequence[Sequence[CostPanel]]) -> Figure:
-    """Panels of costs in rows that share their axis of costs.
+    """Panels of costs, which share their axis of costs along a row, or else down a column.
 
     A name has the same colour and marker in all of them.
     """
+    shared = "row" if len({panel.ylabel for panel in rows[0]}) == 1 else "col"
     num_columns = max(len(row) for row in rows)
     figure = Figure(figsize=(3.9 * num_columns, 3.3 * len(rows) + 0.5), layout="constrained")
-    axes = figure.subplots(len(rows), num_columns, squeeze=False, sharey="row")
+    axes = figure.subplots(len(rows), num_columns, squeeze=False, sharey=shared)
     names = list(dict.fromkeys(name for row in rows for panel in row for name in panel.lines))
     for row_axes, row in zip(axes, rows, strict=True):
         for axis in row_axes[len(row) :]:
             axis.set_axis_off()
         for axis, panel in zip(row_axes, row, strict=False):
             _draw_cost_panel(axis, panel, names)
-        _set_cost_ticks(row_axes[0])
+            _set_cost_ticks(axis)
     handles = {
         label: handle
         for axis in axes.ravel()

@@ -27,7 +27,7 @@ from benchmarks.gm_mpf.runs import Step, errors_by_size, held, reference_estimat
 from benchmarks.gm_mpf.tables import study_table, timing_table
 from benchmarks.gm_mpf.targets import open_targets
 from benchmarks.gm_mpf.timing import profile, time_filters, time_quadratic
-from mpfjax.console import exit_status, format_table, seed, whole, write_json
+from mpfjax.console import exit_status, format_table, seed, whole, write_figure, write_json
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -113,7 +113,7 @@ def run(options: argparse.Namespace) -> None:
         "rmse": draw_errors(found, targets, references),
     }
     for name, figure in figures.items():
-        figure.savefig(options.out / f"{name}.png", dpi=130)
+        write_figure(options.out / f"{name}.png", figure, dpi=130)
     print(f"written to {options.out}")
 
 

@@ -30,7 +30,7 @@ from benchmarks.interacting_objects.scenes import (
     SCENES,
     UNLIKE,
 )
-from mpfjax.console import seed, whole, write_json
+from mpfjax.console import seed, whole, write_figure, write_json
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(as_table(results, estimate), end="\n\n")
     for scene in options.scenes:
         print(f"{scene}: {SCENES[scene].title}; N = {SCENES[scene].num_particles}")
-    draw(results).savefig(out / "interacting_objects.png", dpi=150)
+    write_figure(out / "interacting_objects.png", draw(results), dpi=150)
     print(f"results and figure: {out}/")
     return 0
 

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 import mpfjax
 from mpfjax import plotting
-from mpfjax.console import format_table, write_json
+from mpfjax.console import format_table, write_figure, write_json
 from mpfjax.metrics.coverage import covers
 from mpfjax.metrics.tracking_quality import intersection_area
 from mpfjax.tuning import (
@@ -210,7 +210,7 @@ def run_labels(options: Any, out: Path) -> None:
     if not results:
         raise FileNotFoundError("--sequences: none of them is there")
     print(as_label_table(results))
-    plotting.draw_overlaps(panels).savefig(out / "overlaps.png", dpi=150)
+    write_figure(out / "overlaps.png", plotting.draw_overlaps(panels), dpi=150)
 
 
 def judge(

@@ -18,7 +18,7 @@ import mpfjax
 from benchmarks.likelihood_tuning.quadratic import COARSE_GRID, GRID, OBSERVATIONS, exact_quadratic
 from benchmarks.score_vs_particles import HIGH, LOW, position
 from mpfjax import plotting
-from mpfjax.console import format_table, write_json
+from mpfjax.console import format_table, write_figure, write_json
 from mpfjax.tuning import Positive, TuningRun, fit
 
 STARTS = (0.04, 0.5)
@@ -73,7 +73,7 @@ def run_starts(options: argparse.Namespace, settings: dict[str, Any], out: Path)
     print(as_start_table(results, maximum))
     levels = surface()
     figure = plotting.draw_optimisations(*levels, paths, np.exp(maximum.point))
-    figure.savefig(out / "optimisations.png", dpi=150)
+    write_figure(out / "optimisations.png", figure, dpi=150)
 
 
 def optimisations(

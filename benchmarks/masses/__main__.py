@@ -25,7 +25,7 @@ from benchmarks.masses import measure
 from benchmarks.masses.filters import FILTERS
 from benchmarks.masses.scenes import SCENES, Scene
 from mpfjax import plotting
-from mpfjax.console import exit_status, format_table, seed, whole, write_json
+from mpfjax.console import exit_status, format_table, seed, whole, write_figure, write_json
 from mpfjax.models.base import starts_from_noise
 
 # A reference of so many particles where the likelihood of a particle is that of its pixels.
@@ -85,7 +85,7 @@ def run(options: argparse.Namespace) -> None:
         sure = f"known to within {known.errors.max():.4f}; log Z {known.log_z:.2f}"
         print(f"\n{name}: masses {_numbers(known.masses)}, {sure} ± {known.log_z_error:.2f}")
         print(table([row for row in rows if row["scene"] == name]))
-    picture(rows).savefig(options.out / "masses.png", dpi=130)
+    write_figure(options.out / "masses.png", picture(rows), dpi=130)
     print(f"written to {options.out}")
 
 
@@ -145,12 +145,11 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def picture(rows: list[dict[str, Any]]) -> Any:
-    """For each scene the errors of masses above and of log Ẑ below, against the time of a step."""
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    """For each scene the error of masses, and of log Ẑ beside it, against the time of a step."""
     panels = []
-    for what, label in (("mass_rmse", "RMS error of masses"), ("log_z_sd", "sd of log Ẑ")):
+    for scene in dict.fromkeys(row["scene"] for row in rows):
         line = []
-        for scene in scenes:
+        for what, label in (("mass_rmse", "RMS error of masses"), ("log_z_sd", "sd of log Ẑ")):
             lines: dict[str, list[tuple[float, float]]] = {}
             for row in rows:
                 if row["scene"] == scene and row["filter"] not in _IN_THE_TABLE_ONLY:

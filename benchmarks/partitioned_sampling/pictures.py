@@ -14,6 +14,7 @@ from benchmarks.partitioned_sampling.study import Order, Row
 from benchmarks.partitioned_sampling.tables import label
 from benchmarks.partitioned_sampling.text import TITLES
 from mpfjax import plotting
+from mpfjax.console import write_figure
 from mpfjax.vision.files import drawing, frames
 
 ANIMATION_RATE, MOST_DRAWN = 5.0, 100  # frames a second, particles
@@ -23,15 +24,15 @@ def write_pictures(
     out: Path, scenes: Sequence[Scene], rows: Sequence[Row], content: dict[str, Any]
 ) -> None:
     """All figures, and an animation of a PS run that fails beside a DPS run that recovers."""
-    draw_impoverishment(scenes[0], rows, content).savefig(out / "uniqueness.png", dpi=110)
-    draw_recovery(content).savefig(out / "recovery.png", dpi=110)
+    write_figure(out / "uniqueness.png", draw_impoverishment(scenes[0], rows, content), dpi=110)
+    write_figure(out / "recovery.png", draw_recovery(content), dpi=110)
     scene, runs = pair_of_runs(scenes, rows)
     if not runs:
         return
     shown = np.linspace(2, len(scene.stills) - 1, 4).round().astype(int).clip(0)
     sheet = [(name, [annotate(scene, kept, t) for t in shown]) for name, kept in runs]
     titles = [f"frame {scene.first + t}" for t in shown]
-    plotting.draw_contact_sheet(sheet, titles).savefig(out / "contact_sheet.png", dpi=90)
+    write_figure(out / "contact_sheet.png", plotting.draw_contact_sheet(sheet, titles), dpi=90)
     between = np.full((scene.stills.shape[1], 4, 3), 255, np.uint8)
 
     def beside(t: int) -> np.ndarray:

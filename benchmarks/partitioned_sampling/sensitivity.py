@@ -11,7 +11,7 @@ from benchmarks.partitioned_sampling.pictures import draw_sensitivity
 from benchmarks.partitioned_sampling.rates import Rates, measure, over_scenes, pool
 from benchmarks.partitioned_sampling.scenes import DEFAULT, Scene, Setting, synthetic_scenes
 from benchmarks.partitioned_sampling.study import Row, study
-from mpfjax.console import format_table, write_json
+from mpfjax.console import format_table, write_figure, write_json
 
 LAMBDA = 20.0
 FILTERS = {"joint": "joint PF", "ps": "PS, mean of orders", "dps": "DPS"}
@@ -71,7 +71,7 @@ def run_sensitivity(
         )
     drawn = [entry for entry in entries if entry["axis"] in CHOSEN]
     if drawn:
-        draw_sensitivity(drawn, CHOSEN).savefig(out / "sensitivity.png", dpi=110)
+        write_figure(out / "sensitivity.png", draw_sensitivity(drawn, CHOSEN), dpi=110)
 
 
 def sensitivity_text(entries: Sequence[dict[str, Any]]) -> str:

@@ -27,7 +27,7 @@ from benchmarks.peers.jobs import JOBS, Job, Quadratic
 from benchmarks.peers.libraries import LIBRARIES, model_of
 from benchmarks.peers.tables import as_tables, draw
 from benchmarks.peers.worker import Worker, stop_all
-from mpfjax.console import exit_status, positive, whole, write_json
+from mpfjax.console import exit_status, positive, whole, write_figure, write_json
 from mpfjax.exact import grid_filter, kalman_filter
 
 RIVALS = {  # and how each is installed
@@ -95,7 +95,7 @@ def run(options: argparse.Namespace, refused: list[str]) -> None:
     labels = labels_of(options.devices)
     for job_name in options.jobs:
         print(as_tables(job_name, content["results"], labels), end="\n\n")
-    draw(content["results"], labels).savefig(out / "peers.png", dpi=150)
+    write_figure(out / "peers.png", draw(content["results"], labels), dpi=150)
     print(f"results and figure: {out}/")
 
 

@@ -38,7 +38,7 @@ from benchmarks.scaling.islands import NUM_ISLANDS, island_table, run_as_islands
 from benchmarks.scaling.price import FULL_PRICE, QUICK_PRICE, first_calls, price, price_table
 from benchmarks.scaling.spread import spread_over, spread_table
 from benchmarks.scaling.tables import as_tables, draw
-from mpfjax.console import exit_status, whole, write_json
+from mpfjax.console import exit_status, whole, write_figure, write_json
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -115,7 +115,7 @@ def run(options: argparse.Namespace) -> None:
         print(island_table(content["islands"]), end="\n\n")
     write_json(out / "scaling.json", content)
     if content["results"]:
-        draw(content["results"]).savefig(out / "scaling.png", dpi=150)
+        write_figure(out / "scaling.png", draw(content["results"]), dpi=150)
     print(f"results: {out}/")
 
 

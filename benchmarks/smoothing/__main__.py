@@ -21,7 +21,7 @@ from typing import Any
 
 from benchmarks.smoothing import accuracy, modes, posteriors, variance
 from benchmarks.smoothing.jobs import JOBS, Quadratic
-from mpfjax.console import exit_status, seed, whole, write_json
+from mpfjax.console import exit_status, seed, whole, write_figure, write_json
 
 PARTS = ("accuracy", "modes", "variance", "posteriors")
 
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> None:
         if not accuracy.particles_is_there():
             print("particles is not installed: pip install particles")
         print(accuracy.table(found))
-        accuracy.picture(found).savefig(options.out / "accuracy.png", dpi=130)
+        write_figure(options.out / "accuracy.png", accuracy.picture(found), dpi=130)
     if "modes" in options.parts:
         job = Quadratic(options.steps, options.seed)
         masses = modes.masses(job, options.mode_particles, options.seeds, options.seed)
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> None:
         print(f"\nmass of one of two modes, N = {options.mode_particles}, {options.seeds} seeds")
         print(f"lost by a seed: a mode whose smoothed mass is below {modes.LOST:.0%} at some time")
         print(modes.table(content["modes"]))
-        modes.picture(masses).savefig(options.out / "modes.png", dpi=130)
+        write_figure(options.out / "modes.png", modes.picture(masses), dpi=130)
     if "variance" in options.parts:
         size, runs = options.variance_particles, options.variance_runs
         content["variance"] = variance.measure(jobs, options.schemes, size, runs, options.seed)
@@ -95,7 +95,7 @@ def run(options: argparse.Namespace) -> None:
         write_json(options.out / "smoothing.json", content)
         print(f"\nposterior of two parameters, N = {size}, chains of {steps} steps")
         print(posteriors.table(content["posteriors"]))
-        posteriors.picture(truth, found).savefig(options.out / "posteriors.png", dpi=130)
+        write_figure(options.out / "posteriors.png", posteriors.picture(truth, found), dpi=130)
     print(f"written to {options.out}")
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.visual_tracking.source import Source
+from mpfjax.console import write_figure
 from mpfjax.plotting import draw_contact_sheet
 from mpfjax.vision.boxes.snapshots import Snapshot, annotate
 from mpfjax.vision.files import boxes as box_files
@@ -48,7 +49,7 @@ def write_contact_sheet(path: Path, source: Source, tracked: dict[str, list[Snap
         for name, snapshots in tracked.items()
     ]
     titles = [f"frame {source.first + t}" for t in chosen]
-    draw_contact_sheet(rows, titles).savefig(path, dpi=110)
+    write_figure(path, draw_contact_sheet(rows, titles), dpi=110)
 
 
 def _region(shown: list[Snapshot], boxes: np.ndarray, shape: tuple) -> tuple[slice, slice]:
