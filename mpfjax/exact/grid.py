@@ -58,9 +58,9 @@ def grid_filter(
     - `log_initial`: log p(x_0) at the grid points; None calls the model's own `log_initial`.
     - `inputs`: u_1, ..., u_t, as for `run_filter`.
 
-    Costs O(t g²). Differentiable in the model's parameters. Raises `ValueError` for a grid that
-    is not one ascending row, or a model without these densities. Use it as the truth for a
-    scalar model.
+    Costs O(t g²). Differentiable in the model's parameters. Raises `ValueError` for a grid that is
+    not one ascending row, or a model without these densities. Use it as the reference for a scalar
+    model.
     """
     observations = jax.tree.map(jnp.asarray, as_arrays(observations))
     grid = real_arrays("...", grid=grid)

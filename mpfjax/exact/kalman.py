@@ -66,13 +66,14 @@ def kalman_filter(
     Covariances are updated in Joseph's form, which stays positive in float32. Differentiable, and
     `jax.vmap` maps it over several series.
 
-    - `inputs`: the model's, with a leading axis t: controls, or matrices that change in time.
+    - `inputs`: those of the model, with a leading axis t: controls, or matrices that change in
+      time.
     - `missing`: "error" raises a `ValueError` for a NaN or an infinity, as far as the numbers are
       known. "skip" leaves out each number that is NaN: of two sensors, the one that is there
       counts. (A particle filter leaves out the whole step, unless its model has `handles_missing`.)
 
-    Raises `ValueError` for another model and observations that are not (t, p). Use it as the truth
-    for a linear-Gaussian model.
+    Raises `ValueError` for another model and observations that are not (t, p). Use it as the
+    reference for a linear-Gaussian model.
     """
     series = _checked(model, observations, inputs, missing)
     filtered, increments = _kalman_filter(model, *series)
@@ -95,8 +96,8 @@ def kalman_smoother(
         (I - G A) P (I - G A)ᵀ + G (Q + P') Gᵀ,
 
     a sum of positive terms, which stays positive in float32. Differentiable, and `jax.vmap` maps it
-    over several series. Arguments and errors are those of `kalman_filter`. Use it as the truth for
-    what a particle smoother says of a linear-Gaussian model.
+    over several series. Arguments and errors are those of `kalman_filter`. Use it as the reference
+    for particle smoothers of a linear-Gaussian model.
     """
     return _smooth(model, *_checked(model, observations, inputs, missing))
 

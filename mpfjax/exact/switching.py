@@ -39,11 +39,10 @@ _MOST_SEQUENCES = 2**20
 def switching_filter(model: Any, observations: Float[Array, "t ..."]) -> SwitchingFilterRun:
     """All K^(t+1) sequences of regimes z_0, ..., z_t, and a Kalman smoother for each.
 
-    `model` is a `SwitchingLinearGaussianModel`. The sum over sequences is the exact answer, and no
-    recursion has one: the number of Gaussians grows K-fold with every step. An entry of the
-    observations that is NaN is missing. Differentiable. Raises `ValueError` for another model, for
-    observations that are not (t, p), and for more than a million sequences. Use it as the truth
-    for a short series.
+    `model` is a `SwitchingLinearGaussianModel`. The answer is exact. No recursion gives it, since
+    the number of Gaussians grows K-fold with every step. An entry of the observations that is NaN
+    is missing. Differentiable. Raises `ValueError` for another model, for observations that are not
+    (t, p), and for more than a million sequences. Use it as the reference for a short series.
     """
     check_type(SwitchingLinearGaussianModel, "a SwitchingLinearGaussianModel", model=model)
     num_rows, k = model.H.shape[-2], model.num_regimes

@@ -2,7 +2,7 @@
 
 The measures of Smith and Gatica-Perez (2004), section 3.1, for one box of each object in each
 frame, E the estimated box and G the true one. Boxes are (x, y, w, h) with (x, y) the top-left
-corner, in pixels. All of it works under jit and vmap.
+corner, in pixels. All functions work under jit and vmap.
 """
 
 from typing import NamedTuple

@@ -34,7 +34,7 @@ class AbstractMove(eqx.Module):
     def needs_parents(self) -> bool:
         """Whether the move looks at `mixture.parents`, x_{t-1} of each particle that has x_t.
 
-        A filter keeps them for the step where one of its moves does. Else they cost nothing.
+        If one of its moves does, a filter keeps them during the step. Otherwise they cost nothing.
         """
         return False
 

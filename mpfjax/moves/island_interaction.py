@@ -16,12 +16,12 @@ class IslandInteraction(AbstractMove):
     """Deal every island's particles to all islands, where their masses have drifted apart.
 
     It is for `run_islands`; elsewhere there is one island, and it does nothing. An island resamples
-    within itself and keeps its mass. So in time a few islands hold all the mass, and the others
-    work for nothing. The effective number of islands is (Σ π_g)² / Σ π_g², with π_g the mass of
-    island g. Where it falls below `threshold` times the number of islands G, particle i of every
-    island goes to island i mod G, with its joint weight, component label and ancestor. All
-    islands then hold nearly the same mass. Exact: the whole mixture has the same particles, in
-    other places (Whiteley, Lee and Heine 2016, say when islands should interact).
+    within itself and keeps its mass. After some time a few islands hold all the mass, and the
+    others compute in vain. The effective number of islands is (Σ π_g)² / Σ π_g², with π_g the mass
+    of island g. Where it falls below `threshold` times the number of islands G, particle i of every
+    island goes to island i mod G, with its joint weight, component label and ancestor. All islands
+    then hold nearly the same mass. Exact: the whole mixture has the same particles, in other places
+    (Whiteley, Lee and Heine 2016, say when islands should interact).
 
     - `threshold`: in [0, 1]; 0 never exchanges.
 

@@ -33,8 +33,8 @@ def trace_ancestors(mixtures: FilterRun | ParticleMixture) -> Genealogy:
 
     `mixtures` is a run of `run_filter(..., collect=None)`, whose first time is then x_0, or the
     mixtures that it collected, whose first time is x_1. Raises `ValueError` for anything else. Use
-    it to see how far back the history of a mode goes: resampling leaves few ancestors of long ago,
-    and `sample_trajectories` draws anew what it lost.
+    it to see how far back the history of a mode goes. Resampling leaves few ancestors at early
+    times; `sample_trajectories` draws new ones.
     """
     return _trace(mixtures_of(mixtures))
 

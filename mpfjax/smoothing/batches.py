@@ -17,7 +17,7 @@ FEWEST_RUNS = 4
 
 
 class BatchEstimate(NamedTuple):
-    """What a batch of runs says together, and how surely."""
+    """Estimates from a batch of runs, with their standard errors."""
 
     value: Float[Array, " *shape"]
     error: Float[Array, " *shape"]
@@ -39,18 +39,19 @@ def batch_estimate(
         q = Σ_b Ẑ_b q_b / Σ_b Ẑ_b,   Ẑ = Σ_b Ẑ_b / B,
 
     and Ẑ is unbiased (Vergé et al. 2015). The errors are those of the jackknife over runs (Efron
-    1982), (B - 1) / B Σ_b (q_(b) - mean of q_(.))², with q_(b) the estimate without run b. They ask
-    for nothing but independent runs, and so hold for every scheme, every noise and every move,
-    where `with_first_ancestors` asks for multinomial draws.
+    1982), (B - 1) / B Σ_b (q_(b) - mean of q_(.))², with q_(b) the estimate without run b. They
+    need only independent runs, so they hold for every scheme, noise and move.
+    (`with_first_ancestors` needs multinomial draws.)
 
     - `runs`: what `monte_carlo` returned for B keys, four or more. Twelve to thirty of N / B
-      particles each are a good choice. The runs are to be large enough that log Ẑ of a single one
-      varies by about one or less: otherwise few of them count, as `effective_runs` says.
-    - `quantity`: a function of one mixture, such as `lambda m: m.average(m.particles > 0)`. A mass
-      is to be that of a place or an event: labels of components mean something else in each run.
+      particles each are a good choice. Take so many particles that log Ẑ of a single run has a
+      standard deviation of about one or less. Otherwise few runs count, as `effective_runs` says.
+    - `quantity`: a function of one mixture, such as `lambda m: m.average(m.particles > 0)`. For a
+      mass take the probability of a place or an event, since the labels of components differ
+      between runs.
 
     Runs of zero likelihood count nothing. Raises `ValueError` for fewer runs, and for what is no
-    stack of runs. Use it so that one call tells whether to believe a mass.
+    stack of runs. Use it to see whether a mass can be trusted.
     """
     check_callable("a function of a mixture", quantity=quantity)
     if not isinstance(runs, FilterRun) or runs.log_marginal_likelihood.ndim != 1:

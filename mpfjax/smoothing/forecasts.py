@@ -58,12 +58,12 @@ def forecast(
     - `inputs`: u_{t+1}, ..., u_{t+k}, the known inputs of the steps to come, as for `run_filter`. A
       method of the model, given as `simulate_observation`, sees them too.
 
-    `key` is one that nothing else was given: `jax.random.fold_in(key, 1)` of the run's own key is
-    a key that the run has used.
+    Give a `key` that is used nowhere else. Do not take `jax.random.fold_in(key, 1)` of the run's
+    own key, which the run has used.
 
     Raises `ValueError` for arguments of another kind, for moves that do not say what they do
     without an observation, and for simulated observations that are not one a particle. Use it for
-    forecasts with intervals, and for what a filter is scored by.
+    forecasts with intervals, and to score a filter by its forecasts.
     """
     check_key(key)
     check_type(Filter, "a Filter", filter=filter)

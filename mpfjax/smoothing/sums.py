@@ -61,12 +61,12 @@ def smoothed_sums(
 ) -> SmoothedSums:
     """E[Σ_t h(x_{t-1}, x_t) | y], online: PaRIS, in memory that does not grow with t.
 
-    Olsson and Westerborn (2017): each particle i of step t carries τ_t^i, the expected sum over
-    the trajectories that end in it. Some particles J of step t - 1 are drawn by the backward
-    kernel, W_{t-1}^J D(x_t^i | x_{t-1}^J), and τ_t^i is the mean of τ_{t-1}^J + h(x_{t-1}^J, x_t^i)
-    over them. The estimate is Σ_i W_t^i τ_t^i. W are joint weights, so that it is as right for a
-    mixture: a particle may come from another component. Times Ẑ, it is unbiased if Ẑ is. The
-    filter's run is that of `run_filter` with the same key.
+    Olsson and Westerborn (2017): each particle i of step t carries τ_t^i, the expected sum over the
+    trajectories that end in it. Some particles J of step t - 1 are drawn by the backward kernel,
+    W_{t-1}^J D(x_t^i | x_{t-1}^J), and τ_t^i is the mean of τ_{t-1}^J + h(x_{t-1}^J, x_t^i) over
+    them. The estimate is Σ_i W_t^i τ_t^i. W are joint weights, so this holds for a mixture too: a
+    particle may come from another component. Times Ẑ, it is unbiased if Ẑ is. The filter's run is
+    that of `run_filter` with the same key.
 
     - `function`: h. It takes x_{t-1} and x_t of n particles, leaves (n, ...), and returns values of
       each, leaves (n, ...); of one particle if the model is wrapped by `per_particle`.
@@ -75,8 +75,8 @@ def smoothed_sums(
       with N, but the variance does not grow with t - r. A lag of t or more is one of t - 1.
     - `method`: "exact" weighs all N particles, O(N²) a step. "mcmc" (Dau and Chopin 2023) takes
       the ancestor and goes on by steps of independent Metropolis-Hastings, O(N), and is as exact.
-    - `num_draws`: how many particles J are drawn for each particle. With one, few different ones
-      of long ago are left, as in a genealogy; two are enough.
+    - `num_draws`: how many particles J are drawn for each particle. With one, few distinct
+      particles of early times are left, as in a genealogy. Two are enough.
     - `observations`, `inputs`, `missing`: as in `run_filter`.
 
     Raises `ValueError` for a model without `log_transition`, values that are not one a particle,

@@ -48,9 +48,9 @@ def sample_trajectories(
       mixtures alone.
     - `component`: draw x_t from this component of the last mixture alone: the past of one mode.
     - `method`: "exact" weighs all N particles, O(N) for a trajectory and step. "mcmc" (Dau and
-      Chopin 2023) goes from the ancestor of x_{s+1} `num_steps` steps of independent
-      Metropolis-Hastings with proposals by W_s, O(1) for a trajectory and step, and is as exact
-      as N grows.
+      Chopin 2023) starts at the ancestor of x_{s+1} and makes `num_steps` steps of independent
+      Metropolis-Hastings, with proposals by W_s: O(1) for a trajectory and step. It is as exact as
+      N grows.
     - `num_steps`: of "mcmc"; None is one.
     - `inputs`: u_1, ..., u_t, the known inputs that the run had.
     - `observations`: y_1..y_t, which a conditionally linear model needs and no other takes.
@@ -60,10 +60,10 @@ def sample_trajectories(
 
     Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
     that is not there or dead, and for `num_steps` with "exact"; a RuntimeError where no particle
-    can have moved to the next. A RuntimeWarning names the share of distinct trajectories where at
-    some time it is below a tenth, since the backward weights degenerate. Use it where estimates of
-    the past are wanted: the genealogy of the particles (`trace_ancestors`) is exact as well, but
-    has few distinct states of long ago.
+    can have moved to the next. If the backward weights degenerate, so that at some time fewer than
+    a tenth of the trajectories are distinct, a RuntimeWarning names the share. Use it for estimates
+    of the past. The genealogy of the particles (`trace_ancestors`) is exact as well, but has few
+    distinct states at early times.
     """
     check_key(key)
     check_model(model, "sample_trajectories")

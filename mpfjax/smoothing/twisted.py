@@ -43,7 +43,8 @@ def learn_lookahead(
     inputs: PyTree = None,
     missing: str = "error",
 ) -> Filter:
-    """The filter with a look-ahead to all observations to come, and proposals that know them.
+    """Learn a filter that looks ahead to all later observations, when it resamples and when it
+    draws.
 
     A twisted particle filter (Whiteley and Lee 2014), whose twisting functions are learned by
     iteration (Guarniero, Johansen and Lee 2017; Heng, Bishop, Deligiannidis and Doucet 2020). A
@@ -59,14 +60,14 @@ def learn_lookahead(
     keep its tails heavy (`LocalQuadratics`). x_0 is twisted as well where the model makes it of
     noise.
 
-    The filter that is returned is exact: given ψ, which other keys led to, Ẑ is unbiased, and
-    weights are those of the filtering distribution. Its log Ẑ and the masses at the end vary
-    far less where log ψ is nearly quadratic, and no less where few particles taught it badly.
-    Before the end its particles stand where all observations lead, so means of x_t given
-    y_1..y_t are less exact than those of `filter`. It is for these observations alone; for another
-    series of the same length it is exact and of no use. For other parameters of the model it is
-    exact too, and good where the posterior is much the same: `eqx.tree_at` of its `model`, or
-    the samplers of `mpfjax.tuning`, which do so.
+    The returned filter is exact. Other keys led to ψ, so Ẑ is unbiased given ψ, and the weights are
+    those of the filtering distribution. If log ψ is nearly quadratic, log Ẑ and the masses at the
+    end vary far less. If too few particles taught ψ, they vary no less than before. Before the end,
+    the particles are where all observations lead, so means of x_t given y_1..y_t are less exact
+    than those of `filter`. The filter is good for these observations alone; for another series of
+    the same length it is exact, but no better. With other parameters of the model it is exact too,
+    and good as long as the posterior of the states is similar. `eqx.tree_at` changes its `model`,
+    and so do the samplers of `mpfjax.tuning`.
 
     - `filter`: of moves `Resample` (or `AuxiliaryResample`, whose look-ahead is replaced),
       `Propagate` and regrouping. Its model makes x_t of noise, `transition_from_noise`. Take one
@@ -76,9 +77,9 @@ def learn_lookahead(
       model is wrapped by `per_particle`. None is the flattened state.
     - `inputs`, `missing`: those of `run_filter`; steps without an observation are looked over.
 
-    Raises `ValueError` for another filter, and for a model that makes x_t otherwise. Use it where
-    all observations are there from the start: for log Ẑ in `metropolis_hastings` and `smc2`, to
-    compare models, for the masses of modes at the end.
+    Raises `ValueError` for another filter, and for a model that makes x_t otherwise. Use it if all
+    observations are known from the start: for log Ẑ in `metropolis_hastings` and `smc2`, to compare
+    models, and for the masses of modes at the end.
     """
     check_key(key)
     check_type(Filter, "a Filter", filter=filter)

@@ -101,19 +101,19 @@ def _require_independent_draws(filter: Filter) -> None:
 def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[Array, ""]:
     """An estimate of the variance of log Ẑ, from one run of `with_first_ancestors(filter)`.
 
-    Particles with different ancestors in x_0 are nearly independent, so that Ẑ varies the more, the
-    fewer families hold the weight (Chan and Lai 2013). A family is all descendants of one particle
-    of x_0. For one component the estimate is that of Lee and Whiteley (2018), section 3: with S_e
-    the weight of all descendants of particle e of x_0, and r resamplings so far,
+    Particles with different ancestors in x_0 are nearly independent. The fewer families hold the
+    weight, the more Ẑ varies (Chan and Lai 2013). A family is all descendants of one particle of
+    x_0. For one component the estimate is that of Lee and Whiteley (2018), section 3: with S_e the
+    weight of all descendants of particle e of x_0, and r resamplings so far,
 
         V = 1 - (N / (N - 1))^(r + 1) (1 - Σ_e S_e²).
 
     Ẑ² (1 - V) is then an unbiased estimate of Z², for any N, and N V is consistent for N times the
-    relative variance of Ẑ. If log Ẑ is normal, E[Ẑ²] / Z² is exp of its variance, which hence is
-    -log(1 - V). What is returned are its first two terms, V + V² / 2: the others add more noise to
-    one run than they take from the bias. V alone is too small where it is not small itself: on
-    the quadratic model, for an MPF of 1000 particles after 100 steps, .83 of the variance in the
-    mean, where V + V² / 2 is .98 of it. A single estimate may be negative.
+    relative variance of Ẑ. If log Ẑ is normal with variance s², then E[Ẑ²] / Z² = exp(s²), so s² =
+    -log(1 - V). The function returns the first two terms of this, V + V² / 2. Further terms would
+    add more noise than they remove bias. V alone is too small unless s² is small: on the quadratic
+    model, with an MPF of 1000 particles after 100 steps, the mean of V is .83 s², and that of V +
+    V² / 2 is .98 s². A single estimate may be negative.
 
     In a mixture, components are resampled on their own. Two offspring in different components are
     drawn independently of each other. Two in the same one, of k_m draws, are different draws for
@@ -130,9 +130,9 @@ def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[
     The other schemes draw more evenly than the independent draws of the formula, and no consistent
     estimate is known for them. For "systematic" V is far too small: with N = 1000 and t = 100 it
     was a seventh of the variance for a PF on a linear-Gaussian model, and negative for an MPF on
-    the quadratic one. It needs several families: with t not much less than N, few are left; with
-    one, the estimate is 1.5, whatever the truth is. A component of one particle, which has no
-    pair, is left out of the product.
+    the quadratic one. The estimate needs several families. If t is not much less than N, few are
+    left. With one family it is 1.5, whatever the truth is. A component of one particle, which has
+    no pair, is left out of the product.
 
     - `run`: a `FilterRun`, or a mixture that `step` returned. Use `jax.vmap` for those of
       `monte_carlo`.
@@ -159,17 +159,17 @@ def mixture_weight_errors(run: FilterRun | ParticleMixture) -> Float[Array, " m"
     For one resampling in common it is the sum over families of (S_em - π_m S_e)², S_em being the
     part of family e that is in component m.
 
-    It tells whether the data decide between two explanations: 0.7 ± 0.3 decides nothing. It
-    holds where `log_marginal_likelihood_variance` does: multinomial draws. It takes the components
-    as given, so it says nothing of runs that would have grouped the particles in another way. It
-    is too small where few families are left, as there: a component without a rival among its own
-    ancestors' families seems certain. Where V_m is negative, its root is given as zero.
+    It tells whether the data decide between two explanations: 0.7 ± 0.3 decides nothing. It holds
+    where `log_marginal_likelihood_variance` does: multinomial draws. It takes the components as
+    given, so it says nothing of runs that would have grouped the particles in another way. It is
+    too small if few families are left: a component whose ancestors' families are in no other
+    component seems certain. Where V_m is negative, its root is given as zero.
 
     - `run`: a `FilterRun`, or a mixture that `step` returned. `StepInfo.mixture_weight_errors` has
       them at every step. In `collect`, call it of each mixture.
 
     Raises `ValueError` for a run of a filter without first ancestors, and one of islands. Use it to
-    see when a mass is not reliable.
+    see whether a mass is reliable.
     """
     return jnp.sqrt(jnp.maximum(_mass_variances(_with_lineage(run)), 0.0))
 

@@ -30,7 +30,7 @@ def to_inference_data(result: Chains | PyTree) -> Any:
       `log_marginal_likelihood` and `accepted`.
     - of `particle_gibbs`: `posterior` has the parameters, and the trajectories as `state`, with a
       dimension `time`; for states that are several arrays, `state_` and the name of each. What
-      `collect` made of trajectories is called so too. `sample_stats` has `acceptance_rate`, and
+      `collect` made of trajectories has the same name. `sample_stats` has `acceptance_rate`, and
       `renewed`, which states changed in a step.
     - of `smc2`: `posterior` has as many draws of its weighted samples as there are samples, of
       equal weight (systematic resampling), in an order without meaning, as one chain. Samples of

@@ -67,7 +67,7 @@ def label_log_posteriors(
     likelihood is about a pixel wide: λ has a finite best value.
 
     Shapes are as in `LabelLikelihood`. Frames are taken one after the other and computed again for
-    the derivative. So only the data grow with t in memory.
+    the derivative. So in memory only the data grow with t.
     """
     require(model, "log_likelihood", "label_log_posteriors")
     _check(observations, labels, candidates)

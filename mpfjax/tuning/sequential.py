@@ -110,10 +110,10 @@ def smc2(
     """Sample p(θ | y_1..y_s) for s = 1, ..., t: particles of θ, each with a filter of its own.
 
     SMC² (Chopin, Jacob and Papaspiliopoulos 2013). All filters take one observation at a time,
-    under one vmap, and every θ is weighted by its filter's increment of Ẑ. Where the effective
-    sample size of the θs falls below a share of their number, they are resampled together with
-    their filters. Then each makes steps of particle marginal Metropolis-Hastings: a Gaussian step
-    in unconstrained numbers u, a new filter over all observations so far, accepted by the ratio of
+    under one vmap, and every θ is weighted by its filter's increment of Ẑ. If the effective sample
+    size of the θs falls below a share of their number, they are resampled together with their
+    filters. Then each makes steps of particle marginal Metropolis-Hastings: a Gaussian step in
+    unconstrained numbers u, a new filter over all observations so far, accepted by the ratio of
     prior times Ẑ. The covariance of these steps is that of the weighted θs times 2.38² / d. Since Ẑ
     is unbiased, the weighted θs are samples of the posterior as `num_samples` grows, for any number
     of particles in the filters. The evidence of the model, with θ integrated out, comes with it.

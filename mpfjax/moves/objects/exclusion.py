@@ -74,7 +74,7 @@ class Exclusion(AbstractExclusion):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
-        """Reweight down every particle by the other components' nearness."""
+        """Lower the weight of every particle by its nearness to the other components."""
         del key, observation
         if mixture.num_components == 1:
             return mixture

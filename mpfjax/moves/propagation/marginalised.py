@@ -46,14 +46,14 @@ class PropagateMarginalised(AbstractPropagation):
 
     The step of a Rao-Blackwellised particle filter, or mixture Kalman filter (Chen and Liu 2000;
     Doucet, de Freitas, Murphy and Russell 2000), for an `AbstractConditionallyLinearModel`. Each
-    particle (z, m, P) draws z_t, its Kalman filter predicts x_t, its weight is multiplied by
+    particle (z, m, P) draws z_t, and its Kalman filter predicts x_t. The weight is multiplied by
 
         p(y_t | z_0, ..., z_t, y_1..y_{t-1}) = N(y_t; H m + c, H P Hᵀ + R)
 
-    and by what is seen of z_t alone, and its Kalman filter is updated. Joint weights then have
-    their mixture weights updated as in `Propagate`, and Ẑ is unbiased. In the mixed form, z_t is
-    drawn from its law given y_1..y_{t-1}, N(f + A m, A P Aᵀ + V), and first updates x_{t-1}. The
-    covariance is updated in Joseph's form, which keeps it positive in float32.
+    and by the likelihood of what is seen of z_t alone. Then the Kalman filter is updated. Joint
+    weights then have their mixture weights updated as in `Propagate`, and Ẑ is unbiased. In the
+    mixed form, z_t is drawn from its law given y_1..y_{t-1}, N(f + A m, A P Aᵀ + V), and first
+    updates x_{t-1}. The covariance is updated in Joseph's form, which keeps it positive in float32.
 
     - `proposal`: z_t ~ q in place of its own law, as `RegimeProposal(model)`. An `AbstractProposal`
       whose `propose(key, observation, particles)` is given the particles (latent, mean,

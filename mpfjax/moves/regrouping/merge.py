@@ -31,10 +31,10 @@ class Merge(AbstractRegrouping):
       that joins them (Ashman's D; at 1 two equal Gaussians share 62% of their mass, at 2 32%);
     - their means are less than `max_distance` apart, in units of `scale`.
 
-    None leaves out a condition. `patience` is how many times in a row they must be found to overlap
-    before they merge, so that two objects which pass each other do not become one: frames, where
-    this move runs at every frame, and k frames each within `Every(k, ...)`.
-    A chain of overlapping components becomes one component, which keeps the lowest label.
+    None leaves out a condition. `patience` is how many times in a row they must overlap before they
+    merge, so that two objects that pass each other do not become one. It counts runs of this move:
+    frames, or within `Every(k, ...)` every k-th frame. A chain of overlapping components becomes
+    one component, which keeps the lowest label.
 
     Raises `ValueError` where both conditions are None, for a threshold that is not positive, or
     for a patience below 1. Exact: a relabelling only.

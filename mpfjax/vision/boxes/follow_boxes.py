@@ -37,7 +37,7 @@ def follow_boxes(
     - `key`: of the random numbers; None takes `jax.random.key(0)`.
 
     Raises `ValueError` for boxes of no area, outside the first frame or none at all, and for frames
-    as `track` does. Use it where nothing can be detected, and somebody says what to follow.
+    as `track` does. Use it if no detector finds the objects, and a user draws boxes around them.
     """
     check_type(Iterable, "frames one after the other", frames=frames)
     boxes = to_rows(4, "boxes", boxes)

@@ -34,9 +34,9 @@ class LearnedColourModel(AbstractStateSpaceModel):
     `ColourModel`, contrast included: the share `anchor` of it from the reference of the first
     frame, and the rest from the particle's own `appearance`. The second term is of an object that
     cannot be seen, whatever is in its box. So a hypothesis waits near the place where its object
-    vanished, and a look-alike at a distance of d_hidden or more does not draw it away. `appearance`
-    are part of the state and change only by `AdaptAppearance`; the motion is that of the
-    `ColourModel`. Observations are those of the `ColourModel`.
+    vanished, and no look-alike at a distance of d_hidden or more attracts it. `appearance` is part
+    of the state, and only `AdaptAppearance` changes it; the motion is that of the `ColourModel`.
+    Observations are those of the `ColourModel`.
 
     - `hidden_distance`: d_hidden, squared, in units of Σ_c B². People in a street scene were at .2
       from themselves, at .5 to .7 from others and from 1 on from the background.
@@ -118,8 +118,8 @@ class AdaptAppearance(AbstractPropagation):
 
     appearance <- appearance + rate · P(seen | x, y) (h(x) - appearance), with P(seen | x, y) the
     share of the first term in the likelihood of the `LearnedColourModel`. Rival hypotheses learn
-    different appearance, and the `anchor` of the model keeps the first frame's in the balance. The
-    weights stay.
+    different appearances. The `anchor` of the model keeps a share of the first frame's. The weights
+    stay.
 
     What is seen changes what is expected (`approximate` is true). Raises `TypeError` for another
     model and `ValueError` for a rate outside [0, 1]. Use it after `Propagate`.

@@ -41,7 +41,7 @@ class ObjectExclusion(AbstractExclusion):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
-        """Reweight down every particle by the other objects' nearness."""
+        """Lower the weight of every particle by its nearness to the other objects."""
         del key, observation
         states, owners = mixture.particles, component_references(mixture)
         centres = states.box[:, :2] / jnp.array([self.scale], states.box.dtype)

@@ -84,9 +84,9 @@ def track_rows(
 
     (x, y) is the top-left corner in pixels, as `write_tracks` takes it; the first snapshot is of
     frame `first`. With `by_reference` the id is 1 for all components of the first given box, 2 for
-    those of the second and so on: whom a row is a hypothesis about, several rows a frame. Raises
-    `ValueError` for a run or a frame that is not a whole number from 0 on, and where snapshots have
-    no references.
+    those of the second and so on. Then an id may have several rows in a frame, one for each
+    hypothesis. Raises `ValueError` for a run or a frame that is not a whole number from 0 on, and
+    where snapshots have no references.
     """
     check_whole(0, run=run, first=first)
     check_flag(by_reference=by_reference)

@@ -19,17 +19,17 @@ ROWS, COLUMNS = 18, 8
 class SampledHistogram(eqx.Module):
     """The colours of a frame, counted at a grid of points in each box that is asked for.
 
-    It stands where an `IntegralHistogram` does and is asked the same way, but its cost grows with
-    the number of boxes alone, not with the frame or with their size: nothing is made of a frame
-    before. A box is seen through `rows` x `columns` points, each of which takes the colour of the
-    pixel that it lies in; B² differs from that of all pixels by about 0.03.
+    It has the methods of an `IntegralHistogram`. Nothing is computed from the whole frame, so its
+    cost grows with the number of boxes alone, not with their size or that of the frame. A box is
+    sampled at `rows` x `columns` points, each of which takes the colour of its pixel. B² differs
+    from that of all pixels by about 0.03.
 
     - `frame`: RGB, (h, w, 3), of type uint8.
     - `colours`: the bins.
     - `rows`, `columns`: points of a box from top to bottom and from side to side.
 
     Raises `ValueError` for a frame of one channel or not of eight bits, and for counts that are no
-    whole numbers from 1 on. Use it where a few thousand boxes are asked for in a large frame.
+    whole numbers from 1 on. Use it for up to a few thousand boxes in a large frame.
     """
 
     frame: UInt8[Array, "h w 3"]
