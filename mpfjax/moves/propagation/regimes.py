@@ -90,8 +90,8 @@ class PropagateRegimes(AbstractPropagation):
     """Try all K regimes for each particle, then resample optimally to the number of slots.
 
     z_t takes K values, and every particle becomes K children, each with the weight
-    w_i p(z_t | z_{t-1}) p(y_t | ...). Of these N K, every component keeps as many as it has slots, by the
-    optimal resampling of Fearnhead and Clifford (2003): a child of weight w is kept with the
+    w_i p(z_t | z_{t-1}) p(y_t | ...). Of these N K, every component keeps as many as it has slots,
+    by the optimal resampling of Fearnhead and Clifford (2003): a child of weight w is kept with the
     probability min(w / c, 1), and then has the weight max(w, c). c makes the expected number of
     children equal to the number of slots. Heavy children are kept as they are, and none is kept
     twice. Among unbiased choices this one changes the weights least. A component keeps its mass,
