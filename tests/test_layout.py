@@ -1,6 +1,7 @@
 """Imports inside mpfjax go one way, only plotting draws, and every benchmark is a command."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -146,3 +147,22 @@ def test_everything_in_benchmarks_is_a_command(path):
 def test_no_file_of_a_command_is_longer_than_a_visitor_reads(path):
     most = 530 if path.name == "partitioned_sampling.py" else 400
     assert len(path.read_text(encoding="utf-8").splitlines()) <= most
+
+
+WALKS = (PACKAGE.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+WALKS = WALKS.split("\nWalks,")[1].split("\n## ")[0]
+
+
+@pytest.mark.parametrize("walk", WALKS.split("\n- ")[1:], ids=lambda walk: walk.split("?")[0])
+def test_every_walk_ends_at_a_file_that_is_there(walk):
+    """And what it names as a function is defined in the file that it names with it."""
+    names = re.findall(r"`([^`]+)`", walk)
+    commands = [name.split()[-1] for name in names if name.startswith("python -m ")]
+    paths = [name for name in names if "/" in name]
+    paths += [command.replace(".", "/") for command in commands]
+    assert paths
+    for path in paths:
+        assert (PACKAGE.parent / path).exists(), path
+    for name, path in re.findall(r"`(\w+)` in `([^`]+\.py)`", walk):
+        text = (PACKAGE.parent / path).read_text(encoding="utf-8")
+        assert re.search(rf"^def {name}\b", text, re.MULTILINE), f"{name} is not in {path}"

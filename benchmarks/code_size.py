@@ -1,0 +1,102 @@
+"""How large the library is: public names, the most arguments of a call, lines of code.
+
+    python -m benchmarks.code_size [CHECKOUT ...]
+
+reads the source of one checkout or several, without importing it, and prints a table. Lines of code
+are those beside docstrings, comments and blank ones. A public name is one that `mpfjax`, or one of
+its public modules, exports. Arguments of a class are its fields, unless it has an `__init__`.
+"""
+
+import argparse
+import ast
+import sys
+from pathlib import Path
+
+from mpfjax.console import exit_status, format_table
+
+MODULES = ("", "exact", "metrics", "plotting", "smoothing", "tuning", "vision")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Count, and print the table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.code_size")
+    here = Path(__file__).resolve().parents[1]
+    parser.add_argument("checkouts", nargs="*", type=Path, default=[here], metavar="CHECKOUT")
+    options = parser.parse_args(arguments)
+    return exit_status(lambda: run(options.checkouts), arguments)
+
+
+def run(checkouts: list[Path]) -> None:
+    """A line for each checkout."""
+    rows = []
+    for checkout in checkouts:
+        package = checkout / "mpfjax"
+        if not package.is_dir():
+            raise FileNotFoundError(f"CHECKOUT: {checkout} holds no mpfjax")
+        trees = {
+            path: ast.parse(path.read_text(encoding="utf-8"))
+            for path in sorted(package.rglob("*.py"))
+        }
+        names = public_names(package, trees)
+        name, most = most_arguments(trees, names)
+        lines = sum(map(lines_of_code, trees))
+        rows.append(
+            [str(checkout), f"{len(trees)}", f"{lines}", f"{len(names)}", f"{most} ({name})"]
+        )
+    titles = ["checkout", "files", "lines of code", "public names", "most arguments of a call"]
+    print(format_table(titles, rows))
+
+
+def lines_of_code(path: Path) -> int:
+    """Lines that are neither blank, nor a comment, nor in a docstring."""
+    text = path.read_text(encoding="utf-8")
+    told: set[int] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and node.body:
+            first = node.body[0]
+            if ast.get_docstring(node) is not None:
+                told |= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
+    lines = enumerate(text.splitlines(), 1)
+    return sum(
+        bool(line.strip()) and not line.strip().startswith("#") and number not in told
+        for number, line in lines
+    )
+
+
+def public_names(package: Path, trees: dict[Path, ast.Module]) -> set[str]:
+    """What the public modules import under a name of their own, or define."""
+    names: set[str] = set()
+    for module in MODULES:
+        for path in (package / module / "__init__.py", package / f"{module}.py"):
+            for node in trees[path].body if path in trees else ():
+                if isinstance(node, ast.ImportFrom):
+                    names |= {alias.asname or "_" for alias in node.names}
+                elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+                    names.add(node.name)
+    return {name for name in names if not name.startswith("_")} - set(MODULES)
+
+
+def most_arguments(trees: dict[Path, ast.Module], names: set[str]) -> tuple[str, int]:
+    """The public function or class that takes the most, and how many."""
+    counts = {
+        node.name: num_arguments(node)
+        for tree in trees.values()
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name in names
+    }
+    name = max(counts, key=lambda name: counts[name])
+    return name, counts[name]
+
+
+def num_arguments(node: ast.FunctionDef | ast.ClassDef) -> int:
+    """Of a function, or of the making of an object; `self` does not count."""
+    if isinstance(node, ast.FunctionDef):
+        return len(node.args.posonlyargs + node.args.args + node.args.kwonlyargs)
+    for inner in node.body:
+        if isinstance(inner, ast.FunctionDef) and inner.name == "__init__":
+            return num_arguments(inner) - 1
+    return sum(isinstance(inner, ast.AnnAssign) for inner in node.body)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
