@@ -89,3 +89,26 @@ def test_every_public_name_is_on_an_api_page():
     assert len(shown) == len(set(shown)), "a name stands on two pages"
     names = api.public_names()
     assert set(names.values()) == {names.get(name, name) for name in shown}
+
+
+@pytest.mark.parametrize(
+    ("page", "words"),
+    [
+        ("model.md", "## Known inputs"),
+        ("extending.md", "### A move with memory"),
+        ("index.md", "## How to cite"),
+        ("filters.md", "## How many components (M)"),
+        ("filters.md", "If there are more modes than M"),
+        ("tuning.md", "**`num_samples`**"),
+    ],
+    ids=lambda value: value.strip("#*` "),
+)
+def test_a_new_reader_is_two_clicks_away(page, words):
+    """From the index, by the links of its text and of one page after it."""
+    assert words in (DOCS / page).read_text(encoding="utf-8")
+    reached = {"index.md"}
+    for _click in range(2):
+        texts = [(DOCS / name).read_text(encoding="utf-8") for name in reached]
+        links = {link for text in texts for link in re.findall(r"\]\(([a-z_]+\.md)", text)}
+        reached |= {link for link in links if (DOCS / link).exists()}
+    assert page in reached

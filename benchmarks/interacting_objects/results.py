@@ -1,5 +1,6 @@
 """Recovery rates with their intervals, in a table and a figure."""
 
+from textwrap import fill
 from typing import Any
 
 import jax.numpy as jnp
@@ -84,9 +85,13 @@ def as_table(results: list[dict[str, Any]], estimate: str) -> str:
 def draw(results: list[dict[str, Any]]) -> Figure:
     """A panel for each scene: every method's rate and interval, by both estimates."""
     scenes = list(dict.fromkeys(line["scene"] for line in results))
-    figure = Figure(figsize=(3.0 * len(scenes) + 1.5, 3.6), layout="constrained")
-    panels = figure.subplots(1, len(scenes), sharey=True, squeeze=False)[0]
-    for panel, scene in zip(panels, scenes, strict=True):
+    columns = min(len(scenes), 3)
+    num_rows = -(-len(scenes) // columns)
+    figure = Figure(figsize=(2.3 * columns + 1.8, 3.7 * num_rows), layout="constrained")
+    panels = figure.subplots(num_rows, columns, sharey=True, squeeze=False).ravel()
+    for panel in panels[len(scenes) :]:
+        panel.set_axis_off()
+    for panel, scene in zip(panels, scenes, strict=False):
         lines = [line for line in results if line["scene"] == scene]
         for estimate, shift, colour in (("median", -0.13, "C0"), ("mean", 0.13, "C1")):
             cells = [line["recovery"][estimate] for line in lines]
@@ -95,11 +100,11 @@ def draw(results: list[dict[str, Any]]) -> Figure:
             at = np.arange(len(lines)) + shift
             panel.hlines(at, ends[:, 0], ends[:, 1], colors=colour, linewidth=2)
             panel.plot(rates, at, "o", color=colour, markersize=4, label=estimate)
-        panel.set_title(f"{scene}: {SCENES[scene].title}", fontsize=8)
+        panel.set_title(fill(f"{scene}: {SCENES[scene].title}", 28), fontsize=9)
         panel.set_xlim(-0.03, 1.03)
         panel.grid(axis="x", alpha=0.3)
         panel.set_yticks(range(len(lines)), [line["label"] for line in lines])
         panel.set_xlabel("recovery rate")
     panels[0].invert_yaxis()
-    panels[-1].legend(fontsize=8, loc="lower left")
+    panels[0].legend(fontsize=8, loc="lower left")
     return figure
