@@ -11,7 +11,9 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import grid_filter
-from mpfjax.running.scan import scan_filter
+from mpfjax.filter import Start
+from mpfjax.observations import Series
+from mpfjax.running.scan import scan
 from mpfjax.tuning import Positive, particle_gibbs
 from tests.marking import quick_of
 from tests.precision import float64
@@ -44,7 +46,9 @@ def assert_double(tree):
 def test_every_chain_is_traced(chain):
     filter, seen = CHAINS[chain](quadratic()), jnp.asarray(SQUARES)
     present = jnp.isfinite(seen)
-    run = eqx.filter_eval_shape(lambda key: scan_filter(key, filter, seen, present, None), KEY)
+    run = eqx.filter_eval_shape(
+        lambda key: scan(Start(key), filter, Series(seen, present), None), KEY
+    )
     assert_double(run)
 
 

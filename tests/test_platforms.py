@@ -7,11 +7,13 @@ import pytest
 from jax import export
 
 import mpfjax
+from mpfjax.filter import Start
+from mpfjax.observations import Series
 from mpfjax.operations.platforms import default_forms
 from mpfjax.operations.positions import exact_sum_before
 from mpfjax.operations.prefix_sums import count_upto, sum_before
 from mpfjax.operations.stored import stored
-from mpfjax.running.scan import scan_filter
+from mpfjax.running.scan import scan
 from tests.marking import quick_of
 from tests.registry import CHAINS
 
@@ -51,7 +53,7 @@ def test_a_whole_filter_is_lowered_for_a_gpu():
     filter = CHAINS["mpf"](MODEL)
 
     def run(key):
-        return scan_filter(key, filter, OBSERVATIONS, None, None).log_marginal_likelihood
+        return scan(Start(key), filter, Series(OBSERVATIONS, None), None).log_marginal_likelihood
 
     lowered = export.export(jax.jit(run), platforms=["cuda"])(jax.random.key(0))
     assert lowered.platforms == ("cuda",)

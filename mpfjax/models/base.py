@@ -88,7 +88,8 @@ class AbstractStateSpaceModel(eqx.Module):
         """Draw x_0, ..., x_t, leaves (t + 1, ...), and y_1, ..., y_t, leaves (t, ...).
 
         The model defines `sample_observation(key, states)`, y given each of n states; it raises
-        `ValueError` otherwise. `inputs` are as for `run_filter`. Use it where truth is wanted.
+        `ValueError` otherwise. `inputs` are as for `run_filter`. Use it to test a filter on data
+        whose states are known.
         """
         from mpfjax.models.simulation import simulate
 

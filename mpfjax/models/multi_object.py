@@ -164,7 +164,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
     def simulate(
         self, key: Key[Array, ""], num_steps: int, *, inputs: PyTree = None
     ) -> tuple[PyTree, PyTree]:
-        """As of any model; a `ValueError` where there is an interaction, whose ψ nobody draws."""
+        """As of any model; a `ValueError` with an interaction, which cannot be simulated."""
         if self.interaction is not None:
             raise ValueError("interaction: a model with one gives weights, and cannot be simulated")
         return super().simulate(key, num_steps, inputs=inputs)

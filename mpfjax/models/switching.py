@@ -31,7 +31,7 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel):
         x_t = F[z_t] x_{t-1} + b[z_t] + N(0, Q[z_t]),    y_t = H[z_t] x_t + c[z_t] + N(0, R[z_t])
 
     A jump Markov linear system, or switching state-space model. The latent is the regime, whole
-    numbers (n,). `exact.switching_filter` is the truth for a short series.
+    numbers (n,). `exact.switching_filter` is exact for a short series.
 
     - `transition_matrix`: Π, (K, K), each row sums to one.
     - `F`, `Q`: (d, d), or (K, d, d) with one for each regime; `H`: (p, d) or (K, p, d); `R`: (p, p)

@@ -36,17 +36,6 @@ class FilterRun(eqx.Module):
     """the steps at which every particle had zero likelihood."""
 
 
-def scan_filter(
-    key: Key[Array, ""],
-    filter: Filter,
-    observations: PyTree,
-    present: Bool[Array, " t"] | None,
-    collect: Callable[[ParticleMixture], PyTree] | None,
-) -> FilterRun:
-    """`run_filter` under the caller's jit, unchecked; `present` is what `present_steps` gives."""
-    return scan(Start(key), filter, Series(observations, present), collect)
-
-
 def scan(
     start: Start,
     filter: Filter,
@@ -54,6 +43,7 @@ def scan(
     collect: Callable[[ParticleMixture], PyTree] | None,
     bar: Bar | None = None,
 ) -> FilterRun:
+    """`run_filter` under the caller's jit, its arguments unchecked."""
     key_initial, key_steps = split_keys(start.key, 2)
 
     def advance(
