@@ -5,8 +5,10 @@
 Every figure is of a fresh process. "Cold" starts with an empty folder of compiled programs, "kept"
 runs the same once more with what the cold run left there. The first rows are of calls within a
 process, after the imports; a row for the imports stands beside them. The others are whole
-commands, from start to end. The commands track a rendered scene. CPU seconds count all threads, so
-they change little when the machine does other work. Drawing is in milliseconds a frame.
+commands, from start to end. The commands track a rendered scene, of one frame for the seconds to
+the first, and 795 frames of PETS where --data holds them. CPU seconds count all threads, so they
+change little when the machine does other work; seconds of the clock stand beside them. Drawing is
+in milliseconds a frame.
 
 --before DIR runs the same in another checkout of mpfjax, in turns with this one, for a table of
 before and after. Into --out DIR go the table as first_result.json and nothing else.
@@ -77,8 +79,8 @@ class Spent(NamedTuple):
     memory: float
 
 
-def jobs(scene: Path, out: Path) -> list[Job]:
-    """All rows of the table, in order; commands track the scene in a folder."""
+def jobs(scene: Path, out: Path, data: Path) -> list[Job]:
+    """All rows of the table, in order; commands track a scene, and sequences of `data`."""
     calls = {
         "run_filter, particle filter": "run(mpfjax.particle_filter(model, 1000))",
         "run_filter, mixture, M = 4": "run(mixture(4))",
@@ -92,22 +94,40 @@ def jobs(scene: Path, out: Path) -> list[Job]:
             "mixture(4).step(key, state, observations[0])[0].log_weights.block_until_ready()"
         ),
     }
-    track = ("-m", "mpfjax", "track", str(scene), "--out", str(out))
-    box = ",".join(f"{value:.0f}" for value in np.loadtxt(scene / "gt.txt", delimiter=",")[0, 2:6])
+    detections, pets = str(scene / "det.txt"), data / "pets09_s2l1"
+
+    def track(name: str, source: Path, *options: str) -> Job:
+        command = ("-m", "mpfjax", "track", str(source), "--out", str(out), *options)
+        return Job(f"mpfjax track{name}", command=command)
+
+    first, only = scene / "first", ("--no-video",)
+    box = f"--box={_first_box(scene / 'gt.txt')}"
     return [
         Job("import mpfjax", command=("-c", "import mpfjax")),
         *(Job(name, _BEGIN + call + _END) for name, call in calls.items()),
-        Job("mpfjax track, detections", command=(*track, "--detections", str(scene / "det.txt"))),
-        Job("mpfjax track, detections alone", command=(
-            "-m", "mpfjax", "track", str(scene / "det.txt"), "--out", str(out),
-        )),
-        Job("mpfjax track --box", command=(*track, "--box", box)),
+        track(", detections, one frame", first, "--detections", detections, *only),
+        track(", detections", scene, "--detections", detections),
+        track(", detections alone", scene / "det.txt"),
+        track(" --box, one frame", first, box, *only),
+        track(" --box", scene, box),
+        *(
+            [track(", 795 frames of PETS", pets, "--detections", str(pets / "det.txt"))]
+            if pets.is_dir()
+            else []
+        ),
         Job("README's first command", command=(
             "-m", "benchmarks.score_vs_particles", "--out", str(out),
         )),
         Job("drawing 24 objects, a frame", _DRAW.replace("NUMBER", "24")),
         Job("drawing 150 objects, a frame", _DRAW.replace("NUMBER", "150")),
     ]  # fmt: skip
+
+
+def _first_box(truth: Path) -> str:
+    """The first object of the first frame that is wholly inside it, as --box takes it."""
+    rows = np.loadtxt(truth, delimiter=",")
+    inside = (rows[:, 0] == 1) & (rows[:, 2] >= 0) & (rows[:, 3] >= 0)
+    return ",".join(f"{value:.0f}" for value in rows[inside][0, 2:6])
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -122,6 +142,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--before", type=Path, metavar="DIR", help="another checkout, beside this")
     parser.add_argument("--rounds", type=whole(), default=1, help="of which the least counts")
     parser.add_argument("--only", default="", metavar="TEXT", help="rows with this in their name")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     parser.add_argument("--out", default="results/first_result", metavar="DIR")
     options = parser.parse_args(arguments)
     if options.before is not None and not (options.before / "mpfjax").is_dir():
@@ -134,14 +155,20 @@ def run(options: argparse.Namespace) -> None:
     roots = {"now": HERE} if options.before is None else {"before": options.before, "now": HERE}
     with tempfile.TemporaryDirectory() as folder:
         scene = render(Path(folder) / "scene")
-        chosen = [job for job in jobs(scene, Path(folder) / "out") if options.only in job.name]
+        found = jobs(scene, Path(folder) / "out", options.data.resolve())
+        chosen = [job for job in found if options.only in job.name]
         if not chosen:
             raise ValueError(f"--only: no row has {options.only!r} in its name")
         results = []
         for job in chosen:
             row: dict[str, Any] = {"job": job.name}
             for name, root in roots.items():
-                row[name] = least(lambda job=job, root=root: cold_and_kept(job, root), options)
+                try:
+                    row[name] = least(lambda job=job, root=root: cold_and_kept(job, root), options)
+                except ValueError:
+                    if root is HERE:
+                        raise
+                    row[name] = None  # it has no such command yet
             results.append(row)
             print(table([row], list(roots)) if len(results) == 1 else lines([row], list(roots)))
     out = Path(options.out)
@@ -208,15 +235,19 @@ def render(folder: Path) -> Path:
     (folder / "img").mkdir(parents=True)
     for number, frame in enumerate(np.asarray(scene.frames), 1):
         imageio.imwrite(folder / "img" / f"{number:06d}.jpg", frame)
+    # Without a truth beside it, which would be scored with.
+    (folder / "first" / "img").mkdir(parents=True)
+    shutil.copy(folder / "img" / "000001.jpg", folder / "first" / "img")
     write_tracks(folder / "gt.txt", scene.tracks)
     shutil.copy(folder / "gt.txt", folder / "det.txt")
     return folder
 
 
 def table(results: list[dict[str, Any]], names: list[str]) -> str:
-    """The results as text."""
-    header = ["CPU seconds", *(f"{name}, {part}" for part in ("cold", "kept") for name in names)]
-    return format_table([*header, "MB, kept"], [_cells(row, names) for row in results])
+    """The results as text: seconds of the CPU, then seconds of the clock and memory when kept."""
+    parts = ("cold", "kept", "kept, clock", "kept, MB")
+    header = ["CPU seconds", *(f"{name}, {part}" for part in parts for name in names)]
+    return format_table(header, [_cells(row, names) for row in results])
 
 
 def lines(results: list[dict[str, Any]], names: list[str]) -> str:
@@ -225,10 +256,13 @@ def lines(results: list[dict[str, Any]], names: list[str]) -> str:
 
 
 def _cells(row: dict[str, Any], names: list[str]) -> list[str]:
-    parts = [row[name][part]["cpu"] for part in ("cold", "kept") for name in names]
-    form = (lambda s: f"{1e3 * s:.1f} ms") if row["job"].startswith("drawing") else "{:.1f}".format
-    memory = row[names[-1]]["kept"]["memory"]
-    return [f"{row['job']:40s}", *(f"{form(part):>12s}" for part in parts), f"{memory:.0f}"]
+    time = (lambda s: f"{1e3 * s:.1f} ms") if row["job"].startswith("drawing") else "{:.1f}".format
+    figures = [("cold", "cpu"), ("kept", "cpu"), ("kept", "wall"), ("kept", "memory")]
+    cells = []
+    for part, figure in figures:
+        form = "{:.0f}".format if figure == "memory" else time
+        cells += [form(row[name][part][figure]) if row[name] else "-" for name in names]
+    return [f"{row['job']:40s}", *cells]
 
 
 if __name__ == "__main__":

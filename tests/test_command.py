@@ -277,6 +277,9 @@ DETECTIONS = ["--detections", "DET"]
         ("--box: '1,2,3' is not four numbers", ["--box", "1,2,3"]),
         ("--box: 1,2,0,4 has no area", ["--box", "1,2,0,4"]),
         ("--box: 100,2,4,4 lies outside the first frame, 64 x 48", ["--box", "100,2,4,4"]),
+        # argparse takes what begins with a minus sign for an option.
+        ("--box: -9,2,4,4 lies outside the first frame, 64 x 48", ["--box", "-9,2,4,4"]),
+        ("argument --box: expected one argument", ["--box", "--offline"]),
         ("--filter: not allowed with --box", ["--box", "1,2,4,4", "--filter", "mpf"]),
         ("--min-score: not allowed with --detect", ["--detect", "--min-score", "1"]),
         ("--frames: '7' is not A:B", [*DETECTIONS, "--frames", "7"]),

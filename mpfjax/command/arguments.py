@@ -2,6 +2,8 @@
 
 import argparse
 import importlib
+import re
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -101,7 +103,8 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         action="store_true",
         help="write an object's first frames too, from before it was believed in",
     )
-    options = parser.parse_args(arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    options = parser.parse_args(_with_boxes_joined(given))
     if not (options.detections or options.detect or options.box) and _has_pixels(options.source):
         track.error("one of the arguments --detections --detect --box is required")
     if options.box is not None:
@@ -111,6 +114,20 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     if options.detect and options.min_score is not None:
         track.error("argument --min-score: not allowed with --detect, which gives no scores")
     return options
+
+
+def _with_boxes_joined(arguments: list[str]) -> list[str]:
+    """`--box` and its value in one argument: argparse takes a box that begins with - for an option.
+
+    Such a box reaches beyond the left border.
+    """
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1] == "--box" and re.match(r"-[\d.]", argument):
+            joined[-1] = f"--box={argument}"
+        else:
+            joined.append(argument)
+    return joined
 
 
 def open_source(options: argparse.Namespace) -> Source:

@@ -45,6 +45,13 @@ def test_a_table_of_before_and_after(tmp_path, capsys):
     assert "before, cold" in capsys.readouterr().out
 
 
+def test_a_row_that_the_other_checkout_cannot_run_is_empty():
+    part = {"cpu": 1.0, "wall": 2.0, "memory": 3.0}
+    row = {"job": "new command", "before": None, "now": {"cold": part, "kept": part}}
+    cells = first_result.lines([row], ["before", "now"]).split()
+    assert cells == ["new", "command", "-", "1.0", "-", "1.0", "-", "2.0", "-", "3"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [(["--before", "nowhere"], "--before: nowhere"), (["--rounds", "0"], "--rounds")],
@@ -60,6 +67,12 @@ def test_the_commands_track_the_scene_that_was_rendered(tmp_path, monkeypatch):
     monkeypatch.setattr(first_result, "NUM_FRAMES", 3)
     scene = first_result.render(tmp_path / "scene")
     assert len(list((scene / "img").iterdir())) == 3
-    for job in first_result.jobs(scene, tmp_path / "out"):
+    jobs = first_result.jobs(scene, tmp_path / "out", tmp_path / "no data")
+    for job in jobs:
         paths = [Path(part) for part in job.command if part.startswith(str(scene))]
         assert all(path.exists() for path in paths), job.name
+    (box,) = {part for job in jobs for part in job.command if part.startswith("--box=")}
+    assert min(float(value) for value in box.removeprefix("--box=").split(",")) >= 0
+    assert not any("PETS" in job.name for job in jobs)
+    (tmp_path / "data" / "pets09_s2l1").mkdir(parents=True)
+    assert any("PETS" in job.name for job in first_result.jobs(scene, tmp_path, tmp_path / "data"))
