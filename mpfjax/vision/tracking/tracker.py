@@ -222,7 +222,7 @@ class ObjectTracker(eqx.Module):
 
     def init(self) -> ParticleMixture:
         """Nothing tracked yet: every component dead, every slot empty."""
-        return self.filter.init(jax.random.key(0))
+        return _begin(self.filter)
 
     @eqx.filter_jit
     def step(
@@ -268,6 +268,12 @@ class ObjectTracker(eqx.Module):
             wide = frame.shape[0] * frame.shape[1] >= _LARGEST_NARROW
             return integral_histogram(frame, self.colours, wide)
         return SampledHistogram(frame, self.colours)
+
+
+@eqx.filter_jit
+def _begin(filter: Filter) -> ParticleMixture:
+    """One program, where its operations one by one would be some forty."""
+    return filter.init(jax.random.key(0))
 
 
 def object_model(
