@@ -89,6 +89,7 @@ def test_nor_does_the_program_that_follows_drawn_boxes():
     frame = np.zeros((40, 50, 3), np.uint8)
     filter = objects_filters(frame, np.array([[5.0, 5, 10, 20]]))["mpf"]
     key = jax.random.key(0)
-    mixture = drawn._begin(filter, key)
-    program = drawn._advance.lower(filter, key, mixture, jnp.asarray(frame), 1)
+    mixture = eqx.filter_jit(drawn._begin)(filter, key)
+    arguments = (filter, 1, key, jnp.asarray(1), mixture, jnp.asarray(frame))
+    program = eqx.filter_jit(drawn._advance).lower(*arguments)
     assert "callback" not in program.as_text()

@@ -86,9 +86,11 @@ def in_little_memory() -> dict[str, bool]:
 def keep_programs(folder: str | Path | None = None) -> Path:
     """Keep compiled programs in a folder: a later process that needs the same ones starts sooner.
 
-    This is JAX's persistent compilation cache, for programs of any size. A program is found again
-    where the code, the shapes and types, the options, JAX and the processor are the same; numbers
-    in a model may differ. Nothing is ever deleted: the folder may be, at any time.
+    This is JAX's persistent compilation cache, for programs of any size; the programs of `track` and
+    `follow_boxes` are kept beside it such that they need not even be traced. A program is found
+    again where the code, the shapes and types, the options, JAX and the processor are the same;
+    numbers in a model may differ. Nothing is ever deleted: the folder may be, at any time. What is
+    in it is run, so nobody else should write to it.
 
     - `folder`: None takes `jax_compilation_cache_dir` if that is set, and otherwise `mpfjax` in
       the user's folder of caches ($XDG_CACHE_HOME, or ~/.cache).
@@ -108,7 +110,16 @@ def keep_programs(folder: str | Path | None = None) -> Path:
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
         # What was compiled before has settled whether there is a cache.
         compilation_cache.reset_cache()
+    _kept_folders[:] = [kept]
     return kept
+
+
+_kept_folders: list[Path] = []
+
+
+def kept_folder() -> Path | None:
+    """The folder that `keep_programs` was last given in this process, None where it was not."""
+    return _kept_folders[0] if _kept_folders else None
 
 
 def is_traced(tree: PyTree) -> bool:

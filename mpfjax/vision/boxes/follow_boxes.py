@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from mpfjax.checks import check_key, check_type, to_rows
 from mpfjax.filter import Filter, step_and_faults
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Fault, raise_faults
+from mpfjax.operations.kept_programs import kept_program
 from mpfjax.vision.boxes.object_moves import best_components
 from mpfjax.vision.boxes.recipes import objects_filters
 from mpfjax.vision.files.frames import of_one_kind
@@ -53,25 +53,26 @@ def _followed(stills: Iterator[np.ndarray], boxes: np.ndarray, key: Array) -> It
     if first is None:
         return
     filter = objects_filters(first, boxes)["mpf"]
-    mixture = _begin(filter, key)
+    mixture = kept_program(_begin, (filter,), (key,))(key)
+    advance = None
     for t, still in enumerate(itertools.chain([first], stills)):
-        step_key = jax.random.fold_in(key, t)
-        mixture, tracks, faults = _advance(
-            filter, step_key, mixture, jnp.asarray(still), len(boxes)
-        )
+        # An array, since a new Python number would compile anew.
+        moving = (np.asarray(t), mixture, still)
+        if advance is None:
+            advance = kept_program(_advance, (filter, len(boxes), key), moving)
+        mixture, tracks, faults = advance(*moving)
         yield jax.device_get(raise_faults(tracks, faults))
 
 
-@eqx.filter_jit
 def _begin(filter: Filter, key: Array) -> ParticleMixture:
     return filter.init(key)
 
 
-@eqx.filter_jit
 def _advance(
-    filter: Filter, key: Array, mixture: ParticleMixture, frame: Array, num_objects: int
+    filter: Filter, num_objects: int, key: Array, t: Array, mixture: ParticleMixture, frame: Array
 ) -> tuple[ParticleMixture, Tracks, tuple[Fault, ...]]:
-    mixture, _, faults = step_and_faults(filter, key, mixture, frame)
+    step_key = jax.random.fold_in(key, t)
+    mixture, _, faults = step_and_faults(filter, step_key, mixture, frame)
     model: Any = filter.model
     best, held = best_components(mixture, num_objects)
     means = mixture.component_averages(model.boxes(mixture.particles))

@@ -1,10 +1,8 @@
 """The loop over frames: from video and detections, or detections alone, to tracks."""
 
-import functools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree, UInt8
@@ -12,6 +10,7 @@ from jaxtyping import Array, Float, Key, PyTree, UInt8
 from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole, given
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.compiling import in_little_memory
+from mpfjax.operations.kept_programs import kept_program
 from mpfjax.vision.files.boxes import top_left
 from mpfjax.vision.files.frames import of_one_kind
 from mpfjax.vision.tracking.adapters import (
@@ -97,7 +96,7 @@ def _tracked(
     room: int,
     use_colours: bool,
 ) -> Iterator[Tracks]:
-    state, once, advance = tracker.init(), Once(), _compiled()
+    state, once, advance = tracker.init(), Once(), None
     for number, still, found in _observed(stills, detector, first):
         found, kept = sieve(found, number, still)
         if len(found.boxes) > room:
@@ -109,7 +108,10 @@ def _tracked(
         observation = Detections.from_boxes(found.boxes, room, found.scores)
         pixels = tracker.look(still, observation) if use_colours and still is not None else None
         # An array, since a new Python number would compile anew.
-        state, tracks = advance(tracker, key, np.asarray(number), state, pixels, observation)
+        moving = (np.asarray(number), state, pixels, observation)
+        if advance is None:
+            advance = kept_program(_advance, (tracker, key), moving, in_little_memory())
+        state, tracks = advance(*moving)
         tracks = jax.device_get(tracks)
         if tracks.full:
             once.warn(
@@ -131,13 +133,6 @@ def _advance(
 ) -> tuple[PyTree, Tracks]:
     """A step, with the key of the frame drawn in the same program: a call is half a millisecond."""
     return tracker.step(jax.random.fold_in(key, number), state, pixels, observation)
-
-
-@functools.cache
-def _compiled() -> Callable[..., tuple[PyTree, Tracks]]:
-    """`_advance`; asking for its options any earlier would keep processes from joining."""
-    with_options: Any = eqx.filter_jit
-    return with_options(_advance, compiler_options=in_little_memory())
 
 
 def _observed(
