@@ -86,9 +86,8 @@ def in_little_memory() -> dict[str, bool]:
 def keep_programs(folder: str | Path | None = None) -> Path:
     """Keep compiled programs in a folder: a later process that needs the same ones starts sooner.
 
-    This is JAX's persistent compilation cache, for programs of any size; the programs of `track` and
-    `follow_boxes` are kept beside it such that they need not even be traced. A program is found
-    again where the code, the shapes and types, the options, JAX and the processor are the same;
+    This is JAX's persistent compilation cache, for programs of any size; those of `track` and
+    `follow_boxes` are kept such that they need not even be traced. A program is found again where the code, the shapes and types, the options, JAX and the processor are the same;
     numbers in a model may differ. Nothing is ever deleted: the folder may be, at any time. What is
     in it is run, so nobody else should write to it.
 
