@@ -87,9 +87,10 @@ def keep_programs(folder: str | Path | None = None) -> Path:
     """Keep compiled programs in a folder: a later process that needs the same ones starts sooner.
 
     This is JAX's persistent compilation cache, for programs of any size; those of `track` and
-    `follow_boxes` are kept such that they need not even be traced. A program is found again where the code, the shapes and types, the options, JAX and the processor are the same;
-    numbers in a model may differ. Nothing is ever deleted: the folder may be, at any time. What is
-    in it is run, so nobody else should write to it.
+    `follow_boxes` are kept such that they need not even be traced. A program is found again where
+    the code, the shapes and types, the options, JAX and the processor are the same; numbers in a
+    model may differ. Nothing is ever deleted: the folder may be, at any time. What is in it is
+    run, so nobody else should write to it.
 
     - `folder`: None takes `jax_compilation_cache_dir` if that is set, and otherwise `mpfjax` in
       the user's folder of caches ($XDG_CACHE_HOME, or ~/.cache).
