@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Array
 from tqdm import tqdm
 
-import mpfjax
 from benchmarks.visual_tracking.source import Source
 from mpfjax.vision import (
     BackgroundSubtraction,
     Detections,
     ObjectTracker,
     Tracks,
+    make_tracker,
     offline_rows,
 )
 from mpfjax.vision.boxes.snapshots import Snapshot
@@ -46,9 +46,7 @@ def detect_all(source: Source) -> Detected:
 
 def make_trackers() -> dict[str, ObjectTracker]:
     """The same tracker with resampling and with Gaussian regeneration."""
-    gaussian = ObjectTracker()
-    resample = mpfjax.Resample(particles_per_component=gaussian.particles_per_object)
-    return {"mpf": ObjectTracker(resampling=resample), "gm_mpf": gaussian}
+    return {name: make_tracker(name) for name in ("mpf", "gm_mpf")}
 
 
 def track_detected(

@@ -194,7 +194,7 @@ TABLE = {
     "ObjectTracker": (
         vision.ObjectTracker,
         {},
-        {"max_objects": "count", "particles_per_object": "count", "resampling": "kind?",
+        {"max_objects": "count", "particles_per_object": "count?", "resampling": "kind?",
          "colours": "kind?", "sigma": "positive?", "frames_per_second": "positive?",
          "exact_colours": "flag", "moves": "kind?"},
     ),

@@ -511,7 +511,7 @@ def test_a_bad_setting_is_named(as_installed, name, value):
 )
 def test_a_rejuvenation_that_would_leave_no_room_is_named(resampling, said):
     with pytest.raises(ValueError, match=f"^resampling: .*{said}"):
-        ObjectTracker(resampling=resampling)
+        ObjectTracker(particles_per_object=16, resampling=resampling)
 
 
 def chain_without(*kinds):

@@ -107,6 +107,38 @@ def test_a_step_is_kalmans_where_the_detection_is_its_own(doubt):
         assert left[occupied].any()
 
 
+def test_matched_moments_are_those_of_both_branches():
+    """By second moments of Kalman's posterior and the prediction; no random number is drawn."""
+    mixture, frame = tracked()
+    source, doubt = np.array([0, 1, 2, 4]), 0.3
+    memory = mixture.memory | {
+        "assigned": jnp.asarray(source, jnp.int32),
+        "doubts": jnp.full(M, doubt),
+    }
+    mixture = mixture.replace(memory=memory)
+    boxes = np.asarray(frame.detections.boxes, float)
+    followed, log_z = step_by_hand(mixture, source, boxes, [True, False, True, True, True, False])
+    stays = np.stack(MODEL.predicted(mixture.particles, MODEL.noises).gaussian, axis=2)
+    match = PropagateObjects(MODEL, matched=True)
+    got = np.stack(match(KEY, mixture, frame).particles.gaussian, axis=2)
+    again = np.stack(match(jax.random.key(8), mixture, frame).particles.gaussian, axis=2)
+    np.testing.assert_array_equal(got, again)
+    weights = np.asarray(mixture.component_weights, float)
+    for m in range(3):
+        own = np.asarray(mixture.component_indicators) == m
+        z = np.exp(log_z[own] - log_z[own].max())
+        odds = (1 - doubt) * z / (weights[own] @ z)
+        share = (odds / (odds + doubt))[:, None]
+
+        def moments(branches):
+            x, v, var_x, cov, var_v = np.moveaxis(branches, 2, 0)
+            return np.stack([x, v, var_x + x * x, cov + x * v, var_v + v * v], axis=2)
+
+        both = share[..., None] * moments(followed[own])
+        both = both + (1 - share[..., None]) * moments(stays[own])
+        np.testing.assert_allclose(moments(got[own].astype(float)), both, rtol=2e-3, atol=2e-3)
+
+
 def test_colours_are_looked_at_where_a_place_is_drawn():
     """The places that were drawn and what is left of velocities have the moments from before."""
     mixture, frame = tracked()
@@ -401,6 +433,14 @@ def test_the_marginals_are_those_of_all_assignments(loops, bound):
     assert np.mean(gaps) < bound / 5
 
 
+def test_marginals_of_large_odds_are_no_overflow():
+    """As a low temperature makes them: the better pairing of two is certain, by any scale."""
+    log_odds = jnp.array([[400.0, 350.0, -jnp.inf], [380.0, 300.0, -jnp.inf], [-900.0, 20.0, 19.0]])
+    found = np.asarray(jax.jit(marginals)(log_odds))
+    # 350 + 380 beats 400 + 300, and the third row goes to the third column.
+    np.testing.assert_allclose(found, [[0, 1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-4)
+
+
 def test_how_far_off_the_marginals_are_is_as_said():
     """The worst case of the docstring, and no worse one among two by two with log odds up to 5."""
     compute = jax.jit(jax.vmap(marginals))
@@ -585,6 +625,12 @@ def test_who_is_gone_is_emptied():
     np.testing.assert_array_equal(moved.memory["lives"].confirmed, [True, True, True, False])
     kept = Deaths(2, 3)(KEY, mixture, frame)
     np.testing.assert_array_equal(kept.log_weights, mixture.log_weights)
+    # Believed in at once, as in a first frame, and seen no more: not waited for.
+    lives = mixture.memory["lives"]
+    once = lives._replace(seen=jnp.ones_like(lives.seen))
+    memory = mixture.memory | {"lives": once}
+    gone = Deaths(2, 3, longest_guess=1)(KEY, mixture.replace(memory=memory), frame)
+    np.testing.assert_array_equal(gone.active, [True, False, True, False])
 
 
 def test_masses_are_shared_and_weights_within_components_kept():

@@ -66,6 +66,19 @@ class Gaussian(NamedTuple):
         )
         return posterior, gap, variance
 
+    def mixed_with(self, other: "Gaussian", share: Float[Array, "*n #4"]) -> "Gaussian":
+        """The Gaussian with the moments of the mixture: `share` of this one, the rest the other."""
+        away, away_velocity = self.place - other.place, self.velocity - other.velocity
+        between = share * (1 - share)
+        rest = 1 - share
+        return Gaussian(
+            share * self.place + rest * other.place,
+            share * self.velocity + rest * other.velocity,
+            share * self.var_place + rest * other.var_place + between * away**2,
+            share * self.cov + rest * other.cov + between * away * away_velocity,
+            share * self.var_velocity + rest * other.var_velocity + between * away_velocity**2,
+        )
+
 
 class ObjectState(eqx.Module):
     """A hypothesis of where an object is, how large, how fast, and which object it is.

@@ -1,9 +1,11 @@
 """The objects' own step: propagate every component and weigh it by its detection and colours."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from mpfjax.checks import check_flag
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.operations.indexing import take
@@ -32,16 +34,24 @@ _FARTHEST = 30.0
 class PropagateObjects(AbstractPropagation):
     """Propagate every hypothesis, and weigh it by the detection that is its component's own.
 
-    A hypothesis is that the detection is its object's own, with the probability 1 - doubt, or
-    another's. Of each it has the exact Gaussian posterior, Kalman's update or the prediction, so
-    that one of the two is drawn by its posterior probability; the weight is the sum
-    (1 - doubt) Z_i / Z + doubt, where Z_i is the predictive density of the detection and Z its mean
-    in the component. Who is hidden follows the detection that it shares, less surely. With σ,
-    places are drawn and weighed by their colours as well. Components share no weights here: what
-    they say of each other's mass, `ShareMass` takes away again.
+    The detection is its object's own with the probability 1 - doubt, or another's. Of each of the
+    two a hypothesis has the exact Gaussian posterior, Kalman's update or the prediction. Either one
+    of them is drawn by its posterior probability; or, where `matched` is true, the Gaussian with
+    the moments of both is taken, as in probabilistic data association (Bar-Shalom and Tse 1975),
+    and no random number is. The weight is the sum (1 - doubt) Z_i / Z + doubt, where Z_i is the
+    predictive density of the detection and Z its mean in the component. Who is hidden follows the
+    detection that it shares, less surely. With σ, places are drawn and weighed by their colours as
+    well. Components share no weights here: what they say of each other's mass, `ShareMass` takes
+    away again.
+
+    Draw where particles are to be rival hypotheses; match where each component is one Gaussian.
     """
 
     model: DetectedObjectModel
+    matched: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self) -> None:
+        check_flag(matched=self.matched)
 
     @property
     def reads(self) -> frozenset[str]:
@@ -52,7 +62,7 @@ class PropagateObjects(AbstractPropagation):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
-        """Predict, draw what the detection is of, and weigh it."""
+        """Predict, settle what the detection is of, and weigh it."""
         source, shared = mixture.memory[ASSIGNED], shared_detections(mixture)
         borrowed = shared >= 0
         own = own_detections(jnp.where(borrowed, shared, source), observation.detections)
@@ -71,12 +81,11 @@ class PropagateObjects(AbstractPropagation):
         places, errors = self.model.detection_of(seen, moved, noises)
         updated, gaps, variances = moved.gaussian.updated(places, errors)
         followed, log_factors = self._odds(log_normal(gaps, variances), mixture, seen)
-        follows = jax.random.uniform(key_which, followed.shape, followed.dtype) < followed
-        states = jax.tree.map(
-            lambda new, old: jnp.where(follows.reshape(-1, *[1] * (new.ndim - 1)), new, old),
-            ObjectState.of(updated, moved.label),
-            moved,
-        )
+        if not self.matched:
+            draws = jax.random.uniform(key_which, followed.shape, followed.dtype)
+            followed = (draws < followed).astype(followed.dtype)
+        both = updated.mixed_with(moved.gaussian, followed[:, None])
+        states = ObjectState.of(both, moved.label)
         states, log_colours = self.model.seen(key_place, seen, states)
         return mixture.replace(particles=states).weighed(log_factors, log_colours)
 

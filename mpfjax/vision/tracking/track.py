@@ -22,7 +22,7 @@ from mpfjax.vision.tracking.adapters import (
     as_detector,
 )
 from mpfjax.vision.tracking.detections import Detections
-from mpfjax.vision.tracking.tracker import ObjectTracker, Tracks
+from mpfjax.vision.tracking.tracker import RIVALS_PER_OBJECT, ObjectTracker, Tracks
 
 
 def track(
@@ -163,7 +163,8 @@ def make_tracker(
 ) -> ObjectTracker:
     """The tracker by the name of its filter, "gm_mpf" or "mpf", with room for so many objects.
 
-    They differ in how a component's particles are redrawn: from a Gaussian, or by resampling.
+    A component is one Gaussian, or particles that are resampled, rival hypotheses of whose each
+    detection is.
     `settings` are the tracker's own. Raises `ValueError` for another name, and for `moves`, which
     an `ObjectTracker` takes.
     """
@@ -172,11 +173,10 @@ def make_tracker(
         raise ValueError("moves: they are in place of a filter's; give them to ObjectTracker")
     if frames_per_second is not None:
         settings["frames_per_second"] = frames_per_second
-    tracker = ObjectTracker(max_objects, **settings)
-    if filter == "gm_mpf":
-        return tracker
-    resample = Resample(particles_per_component=tracker.particles_per_object)
-    return ObjectTracker(max_objects, resampling=resample, **settings)
+    if filter == "mpf":
+        particles = settings.get("particles_per_object", RIVALS_PER_OBJECT)
+        settings["resampling"] = Resample(particles_per_component=particles)
+    return ObjectTracker(max_objects, **settings)
 
 
 # --- tracks as files have them -------------------------------------------------------------

@@ -47,6 +47,8 @@ from mpfjax.vision.tracking.scores import RankScores
 
 # A box of so many pixels cannot be counted in 16 bits.
 _LARGEST_NARROW = 2**16
+# Particles of an object, where they differ.
+RIVALS_PER_OBJECT = 16
 
 
 class Tracks(NamedTuple):
@@ -108,12 +110,15 @@ class ObjectTracker(eqx.Module):
     - `ShareMass`: the same for every object.
 
     Lengths are in boxes, so that nothing depends on the size of a frame or of the objects, and what
-    is learned in the first second serves from then on. Particles carry Gaussian moments: they are
-    rival hypotheses of whose a detection is. All but `PropagateObjects` and the resampling is
-    outside the exact recursion (`approximate`). Use it to track an unknown and changing number of
-    objects, with any detector.
+    is learned in the first second serves from then on. Particles carry Gaussian moments. With
+    Gaussian regeneration a component is one Gaussian, so that P = 1 is enough and, unless particles
+    are weighed by colours, nothing is drawn at random. With a resampling they are rival hypotheses
+    of whose a detection is. All but `PropagateObjects` and the resampling is outside the exact
+    recursion (`approximate`). Use it to track an unknown and changing number of objects, with any
+    detector.
 
-    - `max_objects`: M; `particles_per_object`: P.
+    - `max_objects`: M; `particles_per_object`: P. None takes that of the resampling, or else 1, or
+      16 where particles are weighed by colours.
     - `frames_per_second`: of the video: an object is waited for for a second, and shown for a tenth
       of one after its last detection. None takes 25.
     - `resampling`: `Resample(particles_per_component=P)` for an MPF, or
@@ -143,7 +148,7 @@ class ObjectTracker(eqx.Module):
     def __init__(
         self,
         max_objects: int = 24,
-        particles_per_object: int = 16,
+        particles_per_object: int | None = None,
         *,
         frames_per_second: float | None = None,
         resampling: AbstractResampling | None = None,
@@ -154,6 +159,9 @@ class ObjectTracker(eqx.Module):
         weak_score: float | None = None,
         moves: Iterable[AbstractMove] | None = None,
     ) -> None:
+        moves = tuple(moves) if is_series(moves) else moves
+        if particles_per_object is None:
+            particles_per_object = _enough_particles(resampling, moves, sigma)
         check_whole(max_objects=max_objects, particles_per_object=particles_per_object)
         check_positive(**given(frames_per_second=frames_per_second, sigma=sigma))
         check_flag(exact_colours=exact_colours)
@@ -184,7 +192,7 @@ class ObjectTracker(eqx.Module):
                 FollowCamera(assign),
                 assign,
                 resampling,
-                PropagateObjects(model),
+                PropagateObjects(model, matched=isinstance(resampling, GaussianRegeneration)),
                 Deaths(
                     patience=max(round(rate), 8),
                     longest_guess=max(round(0.1 * rate), 1),
@@ -288,6 +296,16 @@ def object_model(
     model = DetectedObjectModel(sigma=sigma)
     speeds = model.start_velocity * min(25 / frames_per_second, 2.5)
     return eqx.tree_at(lambda model: model.start_velocity, model, speeds)
+
+
+def _enough_particles(resampling: Any, moves: Any, sigma: float | None) -> int:
+    """Those that the resampling gives an object, or else as many as there is to draw for."""
+    for move in [resampling] if moves is None or not is_series(moves) else moves:
+        number = getattr(move, "particles_per_component", None)
+        if number is not None:
+            return number
+    nothing_drawn = resampling is None and moves is None and sigma is None
+    return 1 if nothing_drawn else RIVALS_PER_OBJECT
 
 
 def _own_chain(
