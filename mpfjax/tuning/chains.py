@@ -126,24 +126,16 @@ class Outcome:
         return {name: np.asarray(counts) for name, counts in self.chains.num_invalid.items()}
 
 
+@dataclass(frozen=True)
 class Run:
     """Chains of a kernel, by the public function that is `caller`."""
 
-    def __init__(
-        self,
-        caller: str,
-        kernel: AbstractKernel,
-        starts: Starts,
-        key: Key[Array, ""],
-        plan: Plan,
-        file: Checkpoint | None,
-    ) -> None:
-        self.caller = caller
-        self.kernel = kernel
-        self.starts = starts
-        self.key = key
-        self.plan = plan
-        self.file = file
+    caller: str
+    kernel: AbstractKernel
+    starts: Starts
+    key: Key[Array, ""]
+    plan: Plan
+    file: Checkpoint | None
 
     def sample(self, every: int, progress: bool) -> Outcome:
         """All steps, from the start or from the step of the checkpoint, which is written `every` so

@@ -75,31 +75,22 @@ class Plan:
         )
 
 
+@dataclass(frozen=True)
 class Optimisation:
-    """The steps of one maximisation, by the public function that is `caller`."""
+    """The steps of one maximisation, by the public function that is `caller`.
 
-    def __init__(
-        self,
-        caller: str,
-        objective: str,
-        key: Key[Array, ""],
-        problem: Problem,
-        optimizer: optax.GradientTransformation,
-        num_seeds: int,
-        settings: dict[str, Any],
-        code: dict[str, Any],
-        plan: Plan,
-    ) -> None:
-        """`settings` and `code` of the objective, as `identity_of` takes them."""
-        self.caller = caller
-        self.objective = objective
-        self.key = key
-        self.problem = problem
-        self.optimizer = optimizer
-        self.num_seeds = num_seeds
-        self.settings = settings
-        self.code = code
-        self.plan = plan
+    `settings` and `code` are those of the objective, as `identity_of` takes them.
+    """
+
+    caller: str
+    objective: str
+    key: Key[Array, ""]
+    problem: Problem
+    optimizer: optax.GradientTransformation
+    num_seeds: int
+    settings: dict[str, Any]
+    code: dict[str, Any]
+    plan: Plan
 
     @property
     def named(self) -> str:
