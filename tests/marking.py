@@ -7,7 +7,7 @@ import pytest
 
 
 def thorough(cases: Iterable[Any]) -> list[Any]:
-    """The cases for `parametrize`, marked: they take another way to what others show as well.
+    """The cases for `parametrize`, marked: they test the same behaviour as others, differently.
 
     `python -m pytest` leaves them out, `python -m pytest -m thorough` runs them alone; what is
     taken in has passed both.

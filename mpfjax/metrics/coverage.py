@@ -44,8 +44,7 @@ def coverage(
     keeps it while the track covers it. Otherwise it is assigned to the nearest covering track that
     no other object keeps, and if it had another track before, a swap is counted. `others` are true
     boxes of objects that are not to be tracked. Boxes on these count apart from boxes on nothing.
-    Raises `ValueError` where there are no true boxes, and for what is no rows of six finite
-    numbers.
+    Raises `ValueError` without true boxes, and for rows that are not six finite numbers.
     """
     tracks, objects = _checked(tracks, "tracks"), _checked(objects, "objects")
     others = _checked(np.zeros((0, 6)) if others is None else others, "others")

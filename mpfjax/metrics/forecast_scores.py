@@ -22,9 +22,9 @@ def crps(
     the absolute error where all weight is in one draw. A weight of zero leaves a draw out, and
     weights need not sum to one. A NaN in a row makes its score NaN.
 
-    Use it for what `mpfjax.forecast(..., simulate_observation=...)` draws, with the weights of the
-    forecast's mixtures. Raises `ValueError` for what is no array of real numbers, for shapes that
-    do not fit, and for a weight below zero.
+    Use it to score the draws of `mpfjax.forecast(..., simulate_observation=...)`, with the weights
+    of the forecast's mixtures. Raises `ValueError` for anything but arrays of real numbers, for
+    shapes that do not fit, and for a weight below zero.
     """
     values, weights = real_arrays("... n", values=values, weights=weights)
     observations = real_arrays("...", observations=observations)
@@ -56,7 +56,8 @@ def log_score(
     no particle has any likelihood.
 
     Use it to compare models that see the same observations, with likelihoods that are normalised.
-    Raises `ValueError` for what is no model or no mixture, and for a likelihood of another shape.
+    Raises `ValueError` for anything but a model and a mixture, and for a likelihood of another
+    shape.
     """
     check_model(model, "log_score")
     check_type(ParticleMixture, "a mixture, as in a Forecast", mixture=mixture)

@@ -19,8 +19,8 @@ def modes_represented(
     """Whether some particle of positive weight lies within `radius` of each mode.
 
     Vermaak et al. (2003), section 5.1, count the steps at which both modes are represented; their
-    share over a run is its score. Positions, modes and radius are in the state's unit. Use it on
-    a model whose modes are known. Raises `ValueError` for what is no array, masks of another shape
+    share over a run is its score. Positions, modes and radius are in the state's unit. Use it on a
+    model whose modes are known. Raises `ValueError` for anything but arrays, masks of another shape
     than the positions, and a radius that is not positive and finite.
     """
     check_shape("... n", occupied=occupied)
@@ -39,9 +39,9 @@ def modes_represented(
 def mass_above(mixture: ParticleMixture, threshold: float) -> Float[Array, ""]:
     """P(x_t > threshold | y_1..y_t) of a scalar state; a particle at the threshold counts half.
 
-    The particles' estimate of `GridFilterRun.mass_above`. With a threshold between two modes it
-    is the mass of the upper one. Raises `ValueError` for a threshold that is not finite, and for a
-    mixture that is none or whose states are not scalar.
+    The particles' estimate of `GridFilterRun.mass_above`. With a threshold between two modes it is
+    the mass of the upper one. Raises `ValueError` for a threshold that is not finite, and for
+    anything but a mixture of scalar states.
     """
     check_type(ParticleMixture, "a ParticleMixture", mixture=mixture)
     shapes = [leaf.shape for leaf in jax.tree.leaves(mixture.particles)]

@@ -36,11 +36,11 @@ def multi_object_scores(
     - "IDF1", Ristani et al. (2016), at an IoU of 0.5.
 
     Without tracks every object is a miss and every ratio 0. A box without area overlaps nothing.
-    Raises `ValueError` for what is no rows of six numbers, where an id has two boxes in one frame,
-    where a number is not finite, where `frames` ends before it begins or is no pair of whole
-    numbers, where there are no true boxes to score against, and as `remove_ignored` does;
-    `ImportError` without the extra "trackeval". Use it to compare with published trackers;
-    `coverage` is looser about the boxes' size.
+    Raises `ValueError` for rows that are not six finite numbers, for an id with two boxes in one
+    frame, for `frames` that are no pair of whole numbers or end before they begin, without true
+    boxes to score against, and as `remove_ignored` does; `ImportError` without the extra
+    "trackeval". Use it to compare with published trackers; `coverage` is looser about the boxes'
+    size.
     """
     tracks, truth = _checked(tracks, "tracks"), _checked(truth, "truth")
     check_not_negative(min_height=min_height)
@@ -97,8 +97,8 @@ def remove_ignored(
     that nobody labelled; kind 3 an object that is not scored: a tracked box may match it, and is
     not taken away for it.
 
-    Raises `ValueError` for what is no rows of six finite numbers, for another kind, and for a
-    height below zero. Use it before scores of another library; `multi_object_scores` calls it.
+    Raises `ValueError` for rows that are not six finite numbers, for another kind, and for a height
+    below zero. Use it before scores of another library; `multi_object_scores` calls it.
     """
     tracks, truth = _checked(tracks, "tracks"), _checked(truth, "truth")
     ignored = to_rows(6, "ignored", ignored)

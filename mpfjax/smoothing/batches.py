@@ -50,8 +50,8 @@ def batch_estimate(
       mass take the probability of a place or an event, since the labels of components differ
       between runs.
 
-    Runs of zero likelihood count nothing. Raises `ValueError` for fewer runs, and for what is no
-    stack of runs. Use it to see whether a mass can be trusted.
+    Runs of zero likelihood count nothing. Raises `ValueError` for fewer runs, and for anything but
+    a stack of runs. Use it to see whether a mass can be trusted.
     """
     check_callable("a function of a mixture", quantity=quantity)
     if not isinstance(runs, FilterRun) or runs.log_marginal_likelihood.ndim != 1:

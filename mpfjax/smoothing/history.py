@@ -15,7 +15,7 @@ _NEEDED = "a FilterRun of run_filter(..., collect=None), or the mixtures that it
 def mixtures_of(run: Any) -> ParticleMixture:
     """The stacked mixtures of a run; with those of a whole `FilterRun` x_0 comes first.
 
-    Raises `ValueError` for what holds no stack of mixtures, and for a stack of several runs.
+    Raises `ValueError` for anything but a stack of mixtures, and for a stack of several runs.
     """
     initial, mixtures = None, run
     if isinstance(run, FilterRun):

@@ -57,7 +57,7 @@ def with_first_ancestors(filter: Filter) -> Filter:
 
     Draws and weights are the same to the bit. A step takes O(N) more memory and time, and the runs
     can be given to `log_marginal_likelihood_variance` and `mixture_weight_errors`. `StepInfo` then
-    has both errors at every step. Raises `ValueError` for what is no filter, for a filter whose
+    has both errors at every step. Raises `ValueError` for anything but a filter, for a filter whose
     particles have no single ancestors or whose Ẑ is not unbiased (one with an approximate move,
     `PropagateIndependently`, `PropagateInClusters` or `IslandInteraction`), and for draws that are
     not independent: a scheme other than "multinomial", or a noise other than "independent".

@@ -126,19 +126,19 @@ def particle_gibbs(
       the density given a trajectory has no noise: it aims at accepting 44% of the Metropolis
       steps for one number, 23% for several. With `draw` nothing is learned.
     - `backward`: as for `conditional_filter`.
-    - `collect`: a function of one trajectory, for what to keep of it, such as
-      `lambda trajectory: trajectory[-1]`, or `lambda trajectory: None`; None keeps all.
+    - `collect`: a function of one trajectory that returns what to keep of it, such as
+      `lambda trajectory: trajectory[-1]`, or `lambda trajectory: None`. None keeps all.
     - `checkpoint`, `checkpoint_every`, `checkpoint_name`: as for `metropolis_hastings`. The file
       holds what is kept of the trajectories too.
     - `observations`: one sequence. `parameters`, `transforms`, `inputs`, `missing`: as for `fit`.
       Parameters are usually the model's; those of a proposal have no posterior.
 
-    A proposal whose density is NaN or +inf is rejected, and where the conditional filter meets one,
-    the whole step is; `num_invalid` counts them, with a warning. Ctrl-C returns the
-    draws so far with a warning, if there are any. Raises `ValueError` for both or none of `draw`
-    and `log_prior`, a draw of other names or shapes than the parameters, a list of sequences, a
-    checkpoint of other chains, and what `conditional_filter` and `fit` do; `RuntimeError` where
-    the start, or a hundred draws of the prior, have no likelihood.
+    A proposal whose density is NaN or +inf is rejected. If the conditional filter meets such a
+    density, the whole step is rejected. `num_invalid` counts both, with a warning. Ctrl-C returns
+    the draws so far with a warning, if there are any. Raises `ValueError` for both or none of
+    `draw` and `log_prior`, a draw of other names or shapes than the parameters, a list of
+    sequences, a checkpoint of other chains, and what `conditional_filter` and `fit` do;
+    `RuntimeError` where the start, or a hundred draws of the prior, have no likelihood.
 
     Use it where the trajectory makes the parameters' distribution simple, or long sequences make
     `metropolis_hastings` reject nearly all. If θ and the trajectory fix each other, as a small

@@ -26,8 +26,9 @@ class GroupBy(AbstractRegrouping):
       filter's `num_components`. A function of the particles, as `lambda states: states["room"]`.
 
     A label outside [0, M) of a filled slot is a RuntimeError that names the move. Raises
-    `ValueError` for what is no function, or a function that returns other than whole numbers (n,).
-    Use it where you know what the modes are, and `KMeans`, `Merge` and `Split` where you do not.
+    `ValueError` for anything but a function, and for a function that does not return whole numbers
+    (n,). Use it where you know what the modes are, and `KMeans`, `Merge` and `Split` where you do
+    not.
     """
 
     function: Callable[[PyTree], Int[Array, " n"]] = eqx.field(static=True)

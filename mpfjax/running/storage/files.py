@@ -28,9 +28,9 @@ def as_path(path: str | os.PathLike[str], name: str = "path") -> Path:
 def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
     """Write a file so that an interruption or an error leaves the old one or the new one.
 
-    Several threads and processes may write one path: whoever ends last has written the file, and
-    who reads it finds one that is whole. Raises `OSError` that names the file where there is no
-    room for it, or no permission.
+    Several threads and processes may write one path. The file is that of the last one to end, and
+    it is whole whenever it is read. Raises `OSError` that names the file where there is no room for
+    it, or no permission.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

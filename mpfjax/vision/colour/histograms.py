@@ -112,10 +112,9 @@ def bhattacharyya(
 ) -> Float[Array, "*batch"]:
     """B² = 1 - Σ_b sqrt(h_b r_b), the squared Bhattacharyya distance of normalised histograms.
 
-    Vermaak et al. (2003), section 5.2. Between 0, for equal histograms, and 1, for histograms
-    that share no colour; an empty histogram shares none. The square is what the likelihood needs.
-    Raises `ValueError` for what is no array, and for another number of bins in one than in the
-    other.
+    Vermaak et al. (2003), section 5.2. Between 0, for equal histograms, and 1, for histograms that
+    share no colour; an empty histogram shares none. The square is what the likelihood needs. Raises
+    `ValueError` for anything but arrays, and for different numbers of bins.
     """
     check_shape("... bins", histograms=histograms, references=references)
     if histograms.shape[-1] != references.shape[-1]:

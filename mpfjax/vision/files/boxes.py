@@ -59,8 +59,8 @@ def top_left(boxes: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k 4"]:
 def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     """Read a MOTChallenge file into rows (frame, id, x, y, w, h), (x, y) the top-left corner.
 
-    Frames count from 1. Every row is read, whatever stands in its further columns; for a ground
-    truth, whose flags and classes say what counts, use `read_truth`. Raises `ValueError` for a line
+    Frames count from 1. Every row is read, whatever its further columns are. For a ground truth,
+    where flags and classes say which rows count, use `read_truth`. Raises `ValueError` for a line
     that cannot be read, naming the file and the line, and for a file without any box. Warns where
     the seventh column is that of a ground truth of which some rows do not count.
     """

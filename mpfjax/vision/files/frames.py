@@ -29,12 +29,11 @@ def read_frames(
     """Read frames `first` to `last` in RGB, counted from 1 and both ends in, one at a time.
 
     `path` is a video file, a folder of images in the natural order of their names (2.png before
-    10.png), or a folder with such a folder `img` or `img1`. The frames of a video are those that
-    it holds, one after the other, whatever time lies between them, turned as the file says; a
-    `RuntimeWarning` says where some are too damaged to be decoded. Raises `ImportError` if imageio
-    or PyAV is missing, `FileNotFoundError` if `path` is, and `ValueError` naming `path` if it
-    cannot be read, has no frames, or has frames of different sizes, and for `first` and `last` that
-    are no range.
+    10.png), or a folder with such a folder `img` or `img1`. The frames of a video are all that it
+    holds, whatever the time between them, rotated as the file says. A `RuntimeWarning` names those
+    that are too damaged to be decoded. Raises `ImportError` if imageio or PyAV is missing,
+    `FileNotFoundError` if `path` is, and `ValueError` naming `path` if it cannot be read, has no
+    frames, or has frames of different sizes, and for `first` and `last` that are no range.
     """
     check_type((str, Path), "a path", path=path)
     check_whole(first=first, **given(last=last))
@@ -106,7 +105,7 @@ def write_video(
 def open_video(
     path: str | Path, frames_per_second: float = 10.0
 ) -> Iterator[Callable[[UInt8[np.ndarray, "h w 3"]], None]]:
-    """What appends RGB frames to a new MP4 or GIF, which is whole however the block is left.
+    """A context that appends RGB frames to a new MP4 or GIF, whole however the block ends.
 
     Raises as `write_video` does. Use it where the frames come from somewhere else.
     """

@@ -10,7 +10,7 @@ _INFO = "seqinfo.ini"
 
 
 class SequenceInfo(NamedTuple):
-    """What a MOTChallenge `seqinfo.ini` says; None for what it leaves out.
+    """The contents of a MOTChallenge `seqinfo.ini`; None for missing entries.
 
     - `name`: of the sequence; `frame_rate`: frames a second; `length`: the number of frames.
     - `size`: height and width of a frame, in pixels.

@@ -44,23 +44,23 @@ class Truth(NamedTuple):
 
 
 def read_truth(path: str | Path) -> Truth:
-    """Read the ground truth of a sequence with all that its benchmark takes away before scoring.
+    """Read the ground truth of a sequence, and what its benchmark removes before scoring.
 
     `path` is a MOTChallenge file, or a folder with `gt.txt` or `gt/gt.txt`. Rows are
     frame,id,x,y,w,h,flag and up to three more columns. Those whose flag is 0 do not count. Where
     the eighth column holds MOTChallenge's classes, whole numbers from 1 to 13 in every row, only
-    pedestrians (class 1) count; people on vehicles, static persons, distractors and reflections
-    are ignored objects, in MOT20 other vehicles as well; the rest is unscored. Without a single
-    pedestrian the classes are those of somebody else, and all rows with a flag count.
+    pedestrians (class 1) count; people on vehicles, static persons, distractors and reflections are
+    ignored objects, in MOT20 other vehicles as well; the rest is unscored. If there is not a single
+    pedestrian, the classes are not MOTChallenge's, and all rows with a flag count.
 
     An `ignore.txt` beside it adds rows frame,kind,x,y,w,h of kind 1, an ignored object, or 2, an
-    ignored region. The benchmark is told by the start of the sequence's name in `seqinfo.ini`,
-    or else of the folder: that of "MOT20..." has a class more that is ignored, that of "kitti..."
-    a `min_height` of 25 pixels.
+    ignored region. The start of the sequence's name in `seqinfo.ini`, or else of the folder's,
+    tells the benchmark: "MOT20..." ignores one more class, "kitti..." has a `min_height` of 25
+    pixels.
 
     Raises `ValueError` for a line that cannot be read, naming the file and the line, and for a file
-    without any row; `FileNotFoundError` where there is none. Use it with `multi_object_scores`; for
-    the rows of a tracker there is `read_tracks`.
+    without any row; `FileNotFoundError` where there is none. Use it with `multi_object_scores`. For
+    the rows of a tracker use `read_tracks`.
     """
     check_type((str, Path), "a path", path=path)
     path = _truth_file(Path(path))

@@ -93,10 +93,10 @@ def distracter_scene(
     - `deviation`: of ω_t of object 1, in pixels, where the others have 3.
     - `noise`: of the background, "grey" or "colour".
 
-    `size=(32, 40), speed=6.0, deviation=3.0, noise="colour"` is a scene whose distracter runs
-    away. Raises `ValueError` for numbers out of their range and another noise, and, naming the
-    argument to change, where 20 000 tries find no path. Use it to see what a filter makes of an
-    object that looks like something else for a while.
+    `size=(32, 40), speed=6.0, deviation=3.0, noise="colour"` is a scene whose distracter runs away.
+    Raises `ValueError` for numbers out of their range and another noise, and, naming the argument
+    to change, where 20 000 tries find no path. Use it to see how a filter copes with a look-alike
+    that leads it away.
     """
     check_key(key)
     check_whole(_APPEARS, num_frames=num_frames)
