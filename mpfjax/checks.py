@@ -51,44 +51,40 @@ def check_numbered(what: str, number: int, /, **arguments: Any) -> None:
 
 def check_positive(**arguments: Any) -> None:
     """Each argument is a finite number above zero."""
-    for name, value in arguments.items():
-        if not (_is_number(value) and 0 < value < math.inf):
-            raise ValueError(f"{name}: {shown(value)} is not a positive, finite number")
+    _check_numbers_are(lambda value: 0 < value < math.inf, "a positive, finite number", arguments)
 
 
 def check_not_negative(**arguments: Any) -> None:
     """Each argument is a finite number of at least zero."""
-    for name, value in arguments.items():
-        if not (_is_number(value) and 0 <= value < math.inf):
-            raise ValueError(f"{name}: {shown(value)} is not a finite number of at least 0")
+    _check_numbers_are(
+        lambda value: 0 <= value < math.inf, "a finite number of at least 0", arguments
+    )
 
 
 def check_finite(**arguments: Any) -> None:
     """Each argument is a finite number."""
-    for name, value in arguments.items():
-        if not (_is_number(value) and math.isfinite(value)):
-            raise ValueError(f"{name}: {shown(value)} is not a finite number")
+    _check_numbers_are(math.isfinite, "a finite number", arguments)
 
 
 def check_share(most: float = 1.0, /, **arguments: Any) -> None:
     """Each argument is a number in [0, most]."""
-    for name, value in arguments.items():
-        if not (_is_number(value) and 0 <= value <= most):
-            raise ValueError(f"{name}: {shown(value)} is not a number in [0, {most:g}]")
+    _check_numbers_are(lambda value: 0 <= value <= most, f"a number in [0, {most:g}]", arguments)
 
 
 def check_inner_share(**arguments: Any) -> None:
     """Each argument is a number in (0, 1)."""
-    for name, value in arguments.items():
-        if not (_is_number(value) and 0 < value < 1):
-            raise ValueError(f"{name}: {shown(value)} is not a number in (0, 1)")
+    _check_numbers_are(lambda value: 0 < value < 1, "a number in (0, 1)", arguments)
 
 
 def check_exponent(**arguments: Any) -> None:
     """Each argument is a number in (0, 1], as the power of a likelihood that comes in by stages."""
+    _check_numbers_are(lambda value: 0 < value <= 1, "a number in (0, 1]", arguments)
+
+
+def _check_numbers_are(holds: Callable[[Any], bool], what: str, arguments: dict[str, Any]) -> None:
     for name, value in arguments.items():
-        if not (_is_number(value) and 0 < value <= 1):
-            raise ValueError(f"{name}: {shown(value)} is not a number in (0, 1]")
+        if not (_is_number(value) and holds(value)):
+            raise ValueError(f"{name}: {shown(value)} is not {what}")
 
 
 def check_one_of(choices: Collection[str], /, **arguments: Any) -> None:
