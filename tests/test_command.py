@@ -1,6 +1,5 @@
 """The command: what it writes, and what it says of bad input."""
 
-import json
 import subprocess
 import sys
 
@@ -16,6 +15,7 @@ from mpfjax.vision.files import frames as frame_files
 from mpfjax.vision.files.boxes import read_tracks, write_tracks
 from mpfjax.vision.files.frames import read_frames, write_image, write_video
 from tests.examples import two_walkers
+from tests.track_command import SMALL, run, summary_in
 
 pytest.importorskip(
     "imageio", reason="reading and writing frames needs the extra 'video', which 'test' brings"
@@ -31,18 +31,6 @@ FIELDS = [
     "frames", "objects", "frames_without_room", "seconds", "frames_per_second", "peak_memory_mb"
 ]  # fmt: skip
 SCORES = ["HOTA", "MOTA", "IDF1"]
-SMALL = ("--max-objects", 3)
-
-
-def run(*arguments):
-    try:
-        return command.main(["track", *map(str, arguments)])
-    except SystemExit as stopped:  # argparse's way out
-        return stopped.code
-
-
-def summary_in(folder):
-    return json.loads((folder / "summary.json").read_text())
 
 
 @pytest.fixture(scope="module")

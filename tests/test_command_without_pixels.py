@@ -1,31 +1,17 @@
 """The command on detections alone: what it takes, what it says of it, and what it cannot take."""
 
-import json
-
 import numpy as np
 import pytest
 
-from mpfjax import command
 from mpfjax.vision.files.boxes import read_tracks, write_tracks
 from mpfjax.vision.tracking.adapters import Rows
 from mpfjax.vision.tracking.track import make_tracker, online_rows, track
 from tests.examples import two_walkers
+from tests.track_command import SMALL, run, summary_in
 
 pytestmark = pytest.mark.usefixtures("as_installed")
 
 NUM_FRAMES, LENGTH = 7, 9
-SMALL = ("--max-objects", 3)
-
-
-def run(*arguments):
-    try:
-        return command.main(["track", *map(str, arguments)])
-    except SystemExit as stopped:  # argparse's way out
-        return stopped.code
-
-
-def summary_in(folder):
-    return json.loads((folder / "summary.json").read_text())
 
 
 def detected(num_frames=NUM_FRAMES, score=0.9):
