@@ -625,12 +625,13 @@ def test_who_is_gone_is_emptied():
     np.testing.assert_array_equal(moved.memory["lives"].confirmed, [True, True, True, False])
     kept = Deaths(2, 3)(KEY, mixture, frame)
     np.testing.assert_array_equal(kept.log_weights, mixture.log_weights)
-    # Believed in at once, as in a first frame, and seen no more: not waited for.
+    # Believed in at once, as in a first frame, and seen no more: waited for while there is room.
     lives = mixture.memory["lives"]
-    once = lives._replace(seen=jnp.ones_like(lives.seen))
-    memory = mixture.memory | {"lives": once}
-    gone = Deaths(2, 3, longest_guess=1)(KEY, mixture.replace(memory=memory), frame)
-    np.testing.assert_array_equal(gone.active, [True, False, True, False])
+    for full in (False, True):
+        once = lives._replace(seen=jnp.ones_like(lives.seen), full=jnp.asarray(full))
+        memory = mixture.memory | {"lives": once}
+        gone = Deaths(2, 3, longest_guess=1)(KEY, mixture.replace(memory=memory), frame)
+        np.testing.assert_array_equal(gone.active, [True, not full, True, False])
 
 
 def test_masses_are_shared_and_weights_within_components_kept():

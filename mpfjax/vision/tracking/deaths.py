@@ -29,8 +29,9 @@ class Deaths(AbstractMove):
     A component dies where no detection has been assigned to it for more than `patience` frames in a
     row, or for more than none while it is not confirmed; where its centre has left the frame; and
     where all its particles have zero likelihood. It is confirmed once strong detections have borne
-    it out in `confirmation` frames. One that was believed in before that, as those of the first
-    frame are, is waited for no longer than it is shown. Frames in which another hides it
+    it out in `confirmation` frames. Where others find no room, one that was
+    believed in before that, as those of the first frame are, is waited for no longer than it is
+    shown. Frames in which another hides it
     (`ShareDetections`) do not count as without a detection. Where there are no pixels, the frame
     reaches as far as all detections so far.
     A component is shown while it is confirmed, for at most `longest_guess` frames without a
@@ -92,9 +93,10 @@ class Deaths(AbstractMove):
         unseen = jnp.where(borne_out, 0, lives.unseen + missed.astype(jnp.int32))
         unsure = jnp.where(strong, 0, lives.unsure + (missed | borne_out).astype(jnp.int32))
         confirmed = lives.alive & (lives.confirmed | (seen >= self.confirmation))
-        # Who was believed in at once, and never borne out again, is not waited for.
-        proven = jnp.where(seen >= self.confirmation, self.patience, self.longest_guess)
-        patience = jnp.where(confirmed, proven, 0)
+        # Who was believed in at once, and not borne out since, makes room where there is none.
+        in_the_way = lives.full & (seen < self.confirmation)
+        patience = jnp.where(in_the_way, self.longest_guess, self.patience)
+        patience = jnp.where(confirmed, patience, 0)
         stays = lives.alive & mixture.active & (unseen <= patience)
         extent = observation.extent(mixture.memory[EXTENT])
         stays &= within(mean_boxes(mixture), extent)
