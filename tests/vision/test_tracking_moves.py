@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision import Detections, HSVColours, SampledHistogram
 from mpfjax.vision.tracking.appearance import LearnAppearance
-from mpfjax.vision.tracking.assignment import Assign, marginals
+from mpfjax.vision.tracking.assignment import Assign, _marginals_of_logs, marginals
 from mpfjax.vision.tracking.births import Births, ShareMass
 from mpfjax.vision.tracking.camera import FollowCamera
 from mpfjax.vision.tracking.deaths import Deaths
@@ -437,6 +437,8 @@ def test_marginals_of_large_odds_are_no_overflow():
     """As a low temperature makes them: the better pairing of two is certain, by any scale."""
     log_odds = jnp.array([[400.0, 350.0, -jnp.inf], [380.0, 300.0, -jnp.inf], [-900.0, 20.0, 19.0]])
     found = np.asarray(jax.jit(marginals)(log_odds))
+    logs = jnp.asarray(np.random.default_rng(7).normal(1, 2, (3, 3)))
+    np.testing.assert_allclose(_marginals_of_logs(logs), marginals(logs), atol=1e-5)
     # 350 + 380 beats 400 + 300, and the third row goes to the third column.
     np.testing.assert_allclose(found, [[0, 1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-4)
 
