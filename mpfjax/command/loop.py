@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ from mpfjax.command.arguments import (
     read_boxes,
 )
 from mpfjax.command.scoring import SCORES, scores_of
+from mpfjax.command.threads import read_ahead, write_behind
 from mpfjax.console import Clock, format_table, peak_memory, write_json
 from mpfjax.vision.boxes.follow_boxes import follow_boxes
 from mpfjax.vision.files import boxes as box_files
@@ -33,6 +35,7 @@ class Results:
 
     def __init__(self, options: argparse.Namespace, source: Source) -> None:
         self.options, self.source = options, source
+        # Reading and writing have threads of their own: what counts is how long the run waits.
         self.clock = Clock("read", "detect", "track", "write")
         self.compiling = 0.0  # seconds of detecting and tracking in the first frame
         self.rows: list[np.ndarray] = []
@@ -150,20 +153,19 @@ def _track(results: Results, start: Start) -> None:
     options, source, clock = results.options, results.source, results.clock
     shown: list[np.ndarray] = []  # the frame that is being tracked in, for the picture
 
-    def watched() -> Iterator[np.ndarray]:
-        stills = frames.read_frames(source.path, source.first, source.last)
+    def watched(stills: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
         for still in clock.over("read", stills):
             shown[:] = [still]
             yield still
 
-    video = contextlib.nullcontext(None)
-    if source.has_pixels and not options.no_video:
-        rate = source.frames_per_second or 10.0
-        video = frames.open_video(options.out / VIDEO, rate)
     bar = tqdm(total=source.num_frames, desc="Tracking", unit="frame", disable=None)
-    with contextlib.ExitStack() as opened, video as append, bar:
-        file = None
-        stills = watched() if source.has_pixels else None
+    with contextlib.ExitStack() as opened, bar:
+        file = draw = stills = None
+        if source.has_pixels and not options.no_video:
+            draw = opened.enter_context(_video(options.out / VIDEO, source.frames_per_second))
+        if source.has_pixels:
+            read = frames.read_frames(source.path, source.first, source.last)
+            stills = watched(opened.enter_context(read_ahead(read)))
         for tracks in clock.over("track", start(stills, clock)):
             rows = results.add(tracks)
             with clock.of("write"):
@@ -174,9 +176,21 @@ def _track(results: Results, start: Start) -> None:
                 # A line at once, so that a run that is killed leaves them too.
                 file.write(box_files.format_tracks(rows))
                 file.flush()
-                if append is not None:
-                    append(drawing.with_tracks(shown[0], rows))
+                if draw is not None:
+                    draw(shown[0], rows)
             bar.update()
+
+
+@contextlib.contextmanager
+def _video(path: Path, frames_per_second: float | None) -> Iterator[Callable[..., None]]:
+    """What draws rows on a still for a new video, in a thread of its own."""
+    with frames.open_video(path, frames_per_second or 10.0) as append:
+
+        def draw(still: np.ndarray, rows: np.ndarray) -> None:
+            append(drawing.with_tracks(still, rows))
+
+        with write_behind(draw) as hand_over:
+            yield hand_over
 
 
 def _table(summary: dict[str, Any]) -> str:
