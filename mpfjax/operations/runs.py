@@ -7,7 +7,9 @@ segment takes its own entries: they can only be in the first and the last block 
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mpfjax.operations.indexing import take
@@ -34,8 +36,10 @@ class Runs(NamedTuple):
         """The first and the last masked place of each segment; some place where it has none."""
         places = jnp.arange(mask.shape[0], dtype=jnp.int32)
         last = mask.shape[0] - 1
-        firsts = self._reduced("min", jnp.where(mask, places, last), last)
-        return firsts, self._reduced("max", jnp.where(mask, places, 0), 0)
+        # The last place is the least of the negative ones: one minimum finds both.
+        signed = jnp.where(mask[None], jnp.stack([places, -places]), last)
+        firsts, lasts = jax.vmap(lambda row: self._reduced("min", row, last))(signed)
+        return firsts, jnp.maximum(-lasts, 0)
 
     def _reduced(
         self, how: str, values: Shaped[Array, " p"], nothing: float
@@ -47,19 +51,17 @@ class Runs(NamedTuple):
             how, reduce(blocks, axis=1), jnp.where(is_whole, self.labels[:, 0], m), m, nothing
         )
 
-        def at(block: Int[Array, " m"], counts: bool | Bool[Array, " m"]) -> Shaped[Array, " m"]:
-            """Of the segment's own entries in this block, unless the block is whole."""
-            labels = take(self.labels, block)
-            counts &= labels[:, 0] != labels[:, -1]
-            is_own = labels == jnp.arange(m, dtype=labels.dtype)[:, None]
-            own = jnp.where(is_own & counts[:, None], take(blocks, block), nothing)
-            return reduce(own.astype(values.dtype), axis=1)
-
-        ends = (
-            at(self.first_blocks, True),
-            at(self.last_blocks, self.last_blocks > self.first_blocks),
+        # Of the first and the last block of each segment, unless it is whole, its own entries.
+        ends = jnp.concatenate([self.first_blocks, self.last_blocks])
+        labels = take(self.labels, ends)
+        is_last = np.arange(2 * m) >= m
+        counts = (labels[:, 0] != labels[:, -1]) & (
+            ~is_last | jnp.tile(self.last_blocks > self.first_blocks, 2)
         )
-        return reduce(jnp.stack([found, *ends]), axis=0)
+        is_own = labels == np.tile(np.arange(m, dtype=labels.dtype), 2)[:, None]
+        own = jnp.where(is_own & counts[:, None], take(blocks, ends), nothing)
+        of_ends = reduce(own.astype(values.dtype), axis=1)
+        return reduce(jnp.stack([found, of_ends[:m], of_ends[m:]]), axis=0)
 
 
 def runs_of(labels: Int[Array, " p"], num_segments: int) -> Runs:
@@ -70,11 +72,8 @@ def runs_of(labels: Int[Array, " p"], num_segments: int) -> Runs:
     before = jnp.sum((blocks[:, -1:] < label).astype(jnp.int32), axis=0)
     after = jnp.sum((blocks[:, :1] > label).astype(jnp.int32), axis=0)
     bound = blocks.shape[0] + 1
-    return Runs(
-        blocks,
-        stored(jnp.minimum(before, last), bound),
-        stored(jnp.maximum(last - after, 0), bound),
-    )
+    ends = jnp.stack([jnp.minimum(before, last), jnp.maximum(last - after, 0)])
+    return Runs(blocks, *stored(ends, bound))
 
 
 def whole(values: Array, fill: float) -> Array:

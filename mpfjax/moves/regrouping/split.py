@@ -81,9 +81,11 @@ class Split(AbstractRegrouping):
     ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
         """The lighter half of every component that is too diffuse, to a free label."""
         del key
+        # Before the condition, where the moves beside this one compute them too.
+        features, active = self.features(mixture), mixture.active
         labels = cond_if_any(
-            jnp.any(~mixture.active),
-            lambda: self._split_where_diffuse(mixture),
+            jnp.any(~active),
+            lambda: self._split_where_diffuse(mixture, features, active),
             lambda: mixture.component_indicators,
         )
         return labels, mixture.memory
@@ -93,22 +95,25 @@ class Split(AbstractRegrouping):
 
         Where `StepInfo.labels_ran_out`, these are the ones in which several modes share a label.
         """
-        return self._halves(without_gradient(mixture)).splits
+        mixture = without_gradient(mixture)
+        return self._halves(mixture, self.features(mixture)).splits
 
-    def _split_where_diffuse(self, mixture: ParticleMixture) -> Int[Array, " n"]:
+    def _split_where_diffuse(
+        self, mixture: ParticleMixture, features: Float[Array, "n k"], active: Bool[Array, " m"]
+    ) -> Int[Array, " n"]:
         """The new labels, where at least one is free."""
         parent = mixture.component_indicators
-        halves = self._halves(mixture)
-        labels = free_labels(halves.splits, halves.deviations, mixture.active)
+        halves = self._halves(mixture, features)
+        labels = free_labels(halves.splits, halves.deviations, active)
         lighter = spread_finite(halves.lighter, parent, 2)
         moves = (halves.side == lighter) & mixture.occupied
         return jnp.where(moves, spread_finite(labels, parent, mixture.num_components), parent)
 
-    def _halves(self, mixture: ParticleMixture) -> "_Halves":
+    def _halves(self, mixture: ParticleMixture, features: Float[Array, "n k"]) -> "_Halves":
         """Each component cut in two."""
         m, size = mixture.num_components, self.sample_size
         particles = _Particles(
-            self.features(mixture),
+            features,
             relative_weights(mixture),
             mixture.component_indicators,
             mixture.occupied,
@@ -117,7 +122,7 @@ class Split(AbstractRegrouping):
         if size is not None and mixture.num_particles > size * m:
             sample = _sampled(particles, size * m, mixture)
         centres = _two_means(sample, m, self.num_iterations)
-        features, weights, parent, _ = particles
+        _, weights, parent, _ = particles
         side, gaps = _nearer(features, centres, parent)
         halves = summarise_about(centres, gaps, weights, parent + m * side)
         masses = halves.masses.reshape(2, m)

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -114,7 +115,8 @@ def _evenly(
 ) -> Int[Array, " m"]:
     """The same number for each, and one more for the first ones where it does not divide."""
     rank = jnp.cumsum(due.astype(jnp.int32)) - 1
-    return pool // sharers + (rank < pool % sharers).astype(jnp.int32)
+    share = jax.lax.div(pool, sharers)  # neither is negative
+    return share + (rank < pool - share * sharers).astype(jnp.int32)
 
 
 def _in_proportion(

@@ -178,9 +178,8 @@ class SideBySide(NamedTuple):
         return take(self.order, stored(places, self.order.shape[0]))
 
     def _extents(self, mask: Bool[Array, " p"]) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
-        firsts, lasts = self.runs.extents(mask)
-        num_places = self.order.shape[0]
-        return stored(firsts, num_places), stored(lasts, num_places)
+        firsts, lasts = stored(jnp.stack(self.runs.extents(mask)), self.order.shape[0])
+        return firsts, lasts
 
 
 def _sums_in_one_float(values: Float[Array, " p"]) -> tuple[Positions, Bool[Array, " p"]]:
