@@ -112,7 +112,7 @@ def mixture_particle_filter(
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
     particles_per_component: int | None = None,
-    allocation: str = "equal",
+    allocation: str = "variance",
     sort_by: SortBy | None = None,
     noise: str = "independent",
     num_draws: int = 1,

@@ -93,9 +93,8 @@ WITHIN_COMPONENTS: dict[str, AbstractResampling] = {
     "systematic, along a Hilbert curve": Resample(sort_by="hilbert"),
     "systematic, fixed number": Resample(particles_per_component=5),
     "residual, fixed number, adaptive": Resample("residual", 0.5, 5),
-    "systematic, shared by variance": Resample(allocation="variance"),
-    "systematic, for the least error": Resample(allocation="least_error"),
-    "residual, shared by variance, adaptive": Resample("residual", 0.5, allocation="variance"),
+    "systematic, shared equally": Resample(allocation="equal"),
+    "residual, adaptive": Resample("residual", 0.5),
     "soft": Resample(gradient="soft"),
     "soft, fixed number, adaptive": Resample("residual", 0.5, 5, gradient="soft", softness=0.3),
     "gaussian": GaussianRegeneration(),
@@ -253,7 +252,7 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "every second step a random walk": lambda model: _chain(
         Resample(), then=[Every(2, [RandomWalkMetropolis(model)])]
     )(model),
-    "mpf shared by variance": _mpf(allocation="variance"),
+    "mpf of equal shares": _mpf(allocation="equal"),
     "regrouped every second step": _mpf(regroup_every=2),
     "resampled every second step": _chain(Every(2, [Resample("stratified"), KMeans(2)])),
     "in stages": _in_stages(1),

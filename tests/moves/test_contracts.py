@@ -30,7 +30,7 @@ QUICK_REJUVENATIONS = (
     "ssp, adaptive",
     "systematic, along a Hilbert curve",
     "residual, fixed number, adaptive",
-    "residual, shared by variance, adaptive",
+    "residual, adaptive",
     "soft, fixed number, adaptive",
     "gaussian",
     "gaussian, point sets",

@@ -83,7 +83,9 @@ class Partitioned(AbstractPropagation):
         else:
             self.rule, self.orders = None, check_orders(orders, model.num_objects)
         self.model = model
-        self.resample = Resample(scheme, ess_threshold, gradient=gradient)
+        self.resample = Resample(
+            scheme, ess_threshold, gradient=gradient, allocation="equal"
+        )
         if self._stops_draws:
             require(model.object_model, "log_transition", "gradient='stop'")
         self.reassembly = reassembly

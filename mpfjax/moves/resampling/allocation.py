@@ -11,12 +11,11 @@ from mpfjax.operations.logarithms import scaled_exp
 from mpfjax.operations.segments import segments_in_order, spread
 from mpfjax.operations.stored import stored
 
-# A component is dealt at least its equal share divided by this, however little it asks for.
-LEAST_SHARE = 10
-# For the least error, so many particles say what a component needs; fewer do not.
+# So much of the slots is shared equally at least and at most: of variances of Ẑ the first leaves
+# 4/3 of the least, the second twice the least.
+EQUAL_PARTS = (1 / 4, 1 / 2)
+# A mode lives on as many effective particles; fewer particles tell little of their variance.
 FEWEST = 10
-# A mode dies at a step with a probability of about exp(-5) if so many effective particles stay.
-SURVIVORS = 5
 
 
 class Slots(NamedTuple):
@@ -34,14 +33,12 @@ def allocate_slots(
     mixture: ParticleMixture,
     particles_per_component: int | None,
     demands: Float[Array, " m"] | None = None,
-    least: Float[Array, ""] | None = None,
 ) -> Int[Array, " m"]:
     """How many slots each component gets.
 
     Components that are not due keep their slots, `counts`. The others share the rest of the usable
-    slots equally, or in proportion to their `demands`, or get `particles_per_component` each if
-    that is a number. With demands, each first gets its equal share where that is `FEWEST` or less,
-    and else `least`, of half an equal share at most; None is a tenth of an equal share.
+    slots equally, or in proportion to their `demands` with one for each, or get
+    `particles_per_component` each if that is a number.
     """
     usable, num_slots = mixture.num_usable_slots, mixture.num_particles
     if particles_per_component is not None:
@@ -55,35 +52,23 @@ def allocate_slots(
     if demands is None:
         share = _evenly(pool, due, sharers)
     else:
-        equal_share = pool // sharers
-        if least is None:
-            kept_alive = jnp.maximum(pool // (sharers * LEAST_SHARE), 1)
-        else:
-            needed = jnp.minimum(least, equal_share.astype(least.dtype) / 2).astype(jnp.int32)
-            kept_alive = jnp.maximum(needed, FEWEST)
-        first = jnp.minimum(kept_alive, equal_share)
+        first = jnp.minimum(pool // sharers, 1)
         share = first + _in_proportion(pool - first * sharers, due, demands)
     return stored(jnp.where(due, share, kept), num_slots + 1)
 
 
-def demands_for_least_error(
-    mixture: ParticleMixture, due: Bool[Array, " m"]
-) -> tuple[Float[Array, " m"], Float[Array, ""]]:
-    """What each component asks for, and how many slots keep a mode alive.
+def demands_by_variance(mixture: ParticleMixture, due: Bool[Array, " m"]) -> Float[Array, " m"]:
+    """The share of the slots that each component which is due asks for.
 
-    The mean likelihood of k_m particles has a relative variance in proportion to v_m / k_m, with
-    v_m = (particles of m) / ESS_m from the weights as they are. So log Ẑ and the mixture weights
-    err by sums Σ_m a_m² v_m / k_m, which k_m in proportion to a_m v_m^(1/2) make least (Neyman
-    1934):
+    The mean likelihood of k_m particles has a relative variance v_m / k_m. The weights as they are
+    tell v_m = (particles of m) / ESS_m. So Ẑ errs by Σ_m π_m² v_m / k_m, which k_m in proportion to
+    π_m v_m^(1/2) make least (Neyman 1934). Where a component has few particles, v_m is drawn
+    towards the mean over all, as if `FEWEST` more particles had that.
 
-    - log Ẑ, by later observations: a_m² = π_m. What counts is E[p_m²], where p_m is the mass that
-      component m of today will have been given. p_m is a martingale from π_m on; its square is
-      expected to be π_m² if nothing more is learned, and π_m if all is settled, which is most.
-    - the mixture weights, summed over components: dπ_m = π_m (e_m - Σ_l π_l e_l) for errors e, so
-      a_m² = π_m² [(1 - π_m)² + Σ_{l ≠ m} π_l²]. Two components ask for the same, whatever π is.
-
-    The demand is the mean of the two solutions: neither variance is more than twice the least one.
-    Where a component has few particles, v_m is drawn towards the mean over all, by `FEWEST`.
+    A mode has to stay alive, and its own moments have an error too. So a part e of the slots is
+    shared equally: as much as gives each component `FEWEST` effective particles, within
+    `EQUAL_PARTS`. Ẑ's variance is then at most 1 / (1 - e) times the least one (a defensive
+    mixture: Hesterberg 1995). All is shared equally where that gives `FEWEST` particles or less.
     """
     weights, _ = scaled_exp(mixture.log_weights)
     counts = mixture.component_counts.astype(weights.dtype)
@@ -96,18 +81,14 @@ def demands_for_least_error(
     mean_variance = jnp.sum(sharing * variances) / jnp.maximum(jnp.sum(sharing), 1.0)
     variances = (counts * variances + FEWEST * mean_variance) / (counts + FEWEST)
 
-    masses = sums / jnp.sum(sums)
-    # Not 1 - π, which rounding would make zero.
-    others = jnp.where(jnp.eye(len(masses), dtype=bool), 0.0, masses[None])
-    of_masses = masses * jnp.sqrt(jnp.sum(others, axis=1) ** 2 + jnp.sum(others**2, axis=1))
-    spreads = jnp.where(due, jnp.sqrt(variances), 0.0)
-    demands = _as_shares(jnp.sqrt(masses) * spreads) + _as_shares(of_masses * spreads)
-    return demands, SURVIVORS * mean_variance
-
-
-def _as_shares(demands: Float[Array, " m"]) -> Float[Array, " m"]:
+    demands = jnp.where(due, sums * jnp.sqrt(variances), 0.0)
     total = jnp.sum(demands)
-    return demands / jnp.where(total > 0, total, 1.0)
+    sharers = jnp.maximum(jnp.sum(due.astype(weights.dtype)), 1.0)
+    slots_each = jnp.asarray(mixture.num_usable_slots, weights.dtype) / sharers
+    equal_part = jnp.clip(FEWEST * mean_variance / slots_each, *EQUAL_PARTS)
+    equal_part = jnp.where((total > 0) & (slots_each > FEWEST), equal_part, 1.0)
+    demands = demands / jnp.where(total > 0, total, 1.0)
+    return jnp.where(due, equal_part / sharers, 0.0) + (1 - equal_part) * demands
 
 
 def _evenly(

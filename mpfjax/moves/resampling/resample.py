@@ -23,7 +23,7 @@ from mpfjax.moves.eve_indices import with_offspring
 from mpfjax.moves.resampling.allocation import (
     Slots,
     allocate_slots,
-    demands_for_least_error,
+    demands_by_variance,
     place_slots,
 )
 from mpfjax.moves.resampling.layout import InPlace, SideBySide, as_they_are, side_by_side
@@ -37,7 +37,7 @@ from mpfjax.operations.prefix_sums import count_starts
 from mpfjax.operations.segments import segment_log_sum_exp, spread
 from mpfjax.operations.stored import stored
 
-ALLOCATIONS = ("equal", "variance", "least_error")
+ALLOCATIONS = ("variance", "equal")
 GRADIENTS = ("none", "stop", "soft", "ot", "straight_through")
 
 
@@ -59,16 +59,13 @@ class Resample(AbstractAdaptiveResampling):
     - `particles_per_component`: None shares the slots equally among the living components that are
       resampled. A number k gives each living component k particles and leaves the other slots
       empty, as section 5.2 of the paper does.
-    - `allocation`: how the components share the slots, where `particles_per_component` is None.
-      "equal" is the paper's. "variance" deals component m a number in proportion to
-      (k_m Σ_{c_i = m} exp 2ℓ_i)^(1/2) = π_m (k_m / ESS_m)^(1/2), the standard deviation that k_m
-      independent particles give the mass of m, times k_m^(1/2): for a sum of such masses, these
-      numbers leave the least variance (Neyman 1934). Each living component has at least a tenth of
-      an equal share. Use it where components of little mass hold slots that others need.
-      "least_error" weighs two such solutions, of log Ẑ given what later observations may settle and
-      of the mixture weights, and leaves each component as many as keep a mode alive: ten, or so
-      many that five effective ones are expected, but no more than half an equal share. Use it where
-      modes must be kept and N is in the hundreds or more; docs/masses.md has the reasons.
+    - `allocation`: how the components share the slots, where neither `particles_per_component` nor
+      `share_by` says it. "variance" deals component m a number in proportion to
+      (k_m Σ_{c_i = m} exp 2ℓ_i)^(1/2) = π_m (k_m / ESS_m)^(1/2), which leaves Ẑ the least variance
+      (Neyman 1934), and shares a quarter of the slots equally, so that every mode stays alive. Its
+      log Ẑ and masses are as exact as the plain filter's, or more so; docs/masses.md has the
+      reasons. "equal" is the paper's: it keeps modes of little mass longest, and log Ẑ is less
+      exact.
     - `share_by`: a function that gives each particle the whole number of its group, the same within
       a component. Groups with a component that is resampled share the slots equally, and so do the
       components within a group. None makes no groups. Use it where components are rival hypotheses
@@ -117,7 +114,7 @@ class Resample(AbstractAdaptiveResampling):
     gradient: str = eqx.field(static=True, default="none")
     softness: float = eqx.field(static=True, default=0.5)
     regularisation: float = eqx.field(static=True, default=0.5)
-    allocation: str = eqx.field(static=True, default="equal")
+    allocation: str = eqx.field(static=True, default="variance")
     share_by: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
@@ -127,14 +124,8 @@ class Resample(AbstractAdaptiveResampling):
         check_sort_by(self.sort_by)
         check_one_of(GRADIENTS, gradient=self.gradient)
         check_one_of(ALLOCATIONS, allocation=self.allocation)
-        if self.allocation != "equal" and self.particles_per_component is not None:
-            raise ValueError(
-                f"allocation: {self.allocation!r} has no say where particles_per_component is"
-                f" {self.particles_per_component}"
-            )
         check_callable("a function of the particles", **given(share_by=self.share_by))
         if self.share_by is not None:
-            check_one_of(("equal",), allocation=self.allocation)
             if self.particles_per_component is not None:
                 raise ValueError(
                     "share_by: groups have no say where particles_per_component is"
@@ -234,16 +225,12 @@ class Resample(AbstractAdaptiveResampling):
         self, mixture: ParticleMixture, due: Bool[Array, " m"], counts: Int[Array, " m"]
     ) -> Int[Array, " m"]:
         """How many slots each component gets; those that are not `due` keep theirs, `counts`."""
-        demands = least = None
-        if self.allocation == "least_error" and mixture.num_components > 1:
-            demands, least = demands_for_least_error(mixture, due)
-        elif self.allocation == "variance":
-            weights, _ = scaled_exp(mixture.log_weights)
-            sizes = mixture.component_counts.astype(weights.dtype)
-            demands = jnp.sqrt(sizes * mixture.component_sums(weights**2))
-        elif self.share_by is not None:
+        demands = None
+        if self.share_by is not None:
             demands = _shares_of_groups(mixture, self.share_by(mixture.particles), due)
-        return allocate_slots(counts, due, mixture, self.particles_per_component, demands, least)
+        elif self.allocation != "equal" and mixture.num_components > 1:
+            demands = demands_by_variance(mixture, due)
+        return allocate_slots(counts, due, mixture, self.particles_per_component, demands)
 
     def _log_masses(
         self, mixture: ParticleMixture, line: InPlace | SideBySide
