@@ -31,10 +31,7 @@ from mpfjax.models.base import starts_from_noise
 # A reference of so many particles where the likelihood of a particle is that of its pixels.
 _FEWER = {"look-alikes": 10}
 # A picture has room for as many lines as there are colours.
-_IN_THE_TABLE_ONLY = (
-    "APF", "APF, rqmc", "MPF, 4 draws", "MPF, rqmc, 4 draws", "MPF, by variance", "MPF, look-ahead",
-    "MPF, as it comes", "MPF, least error", "MPF, least error, rqmc",
-)  # fmt: skip
+_IN_THE_TABLE_ONLY = ("APF", "APF, rqmc", "MPF, 4 draws", "MPF, tempered", "MPF, look-ahead")
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:

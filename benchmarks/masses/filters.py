@@ -23,18 +23,17 @@ def _auxiliary(**options: Any) -> Make:
 
 def _mixture(ahead: bool = False, **options: Any) -> Make:
     def make(scene: Scene, num_particles: int) -> mpfjax.Filter:
-        chosen: dict[str, Any] = {"regroup_every": 1} | options
         lookahead = {"lookahead": scene.lookahead} if ahead else {}
         return mpfjax.mixture_particle_filter(
             scene.model, num_particles, scene.max_components,
-            **scene.grouping, **lookahead, **chosen,
+            **scene.grouping, **lookahead, **options,
         )  # fmt: skip
 
     return make
 
 
-def _in_stages(scene: Scene, num_particles: int) -> mpfjax.Filter:
-    """The mixture filter with a propagation in stages in place of its own."""
+def _tempered(scene: Scene, num_particles: int) -> mpfjax.Filter:
+    """The mixture filter with a tempered propagation in place of its own."""
     plain = _mixture()(scene, num_particles)
     moves = [
         mpfjax.PropagateTempered(scene.model) if isinstance(move, mpfjax.Propagate) else move
@@ -51,16 +50,10 @@ FILTERS: dict[str, Make] = {
     "APF": _auxiliary(),
     "APF, rqmc": _auxiliary(noise="rqmc"),
     "MPF": _mixture(),
-    "MPF, as it comes": _mixture(regroup_every=3),
-    "MPF, equal slots": _mixture(regroup_every=3, allocation="equal"),
-    "MPF, as it comes, rqmc": _mixture(regroup_every=3, noise="rqmc"),
+    "MPF, equal slots": _mixture(allocation="equal"),
     "MPF, rqmc": _mixture(noise="rqmc"),
     "MPF, 4 draws": _mixture(num_draws=4),
     "MPF, rqmc, 4 draws": _mixture(noise="rqmc", num_draws=4),
-    "MPF, by variance": _mixture(allocation="variance"),
-    "MPF, every 4th": _mixture(regroup_every=4),
     "MPF, look-ahead": _mixture(ahead=True),
-    "MPF, in stages": _in_stages,
-    "MPF, all but draws": _mixture(noise="rqmc", allocation="variance", regroup_every=4),
-    "MPF, all": _mixture(noise="rqmc", num_draws=4, allocation="variance", regroup_every=4),
+    "MPF, tempered": _tempered,
 }
