@@ -1,5 +1,6 @@
 """Twisted particle filters: a look-ahead to all observations, learned from earlier runs."""
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -70,7 +71,7 @@ def learn_lookahead(
     and so do the samplers of `mpfjax.tuning`.
 
     - `filter`: of moves `Resample` (or `AuxiliaryResample`, whose look-ahead is replaced),
-      `Propagate` and regrouping. Its model makes x_t of noise, `transition_from_noise`. Take one
+      `Propagate` and regrouping, with equal slots for its components. Its model makes x_t of noise, `transition_from_noise`. Take one
       with components where there are modes.
     - `num_passes`: how often the filter runs to learn.
     - `features`: φ, in which log ψ is nearly quadratic, (states) -> (n, d); of one particle, if the
@@ -135,7 +136,9 @@ def _looking_ahead(move: Any, filter: Filter, twist: Twist) -> Any:
     if isinstance(move, AuxiliaryResample):
         move = move.resample
     if isinstance(move, Resample):
-        return AuxiliaryResample(move, TwistedLookahead(twist))
+        # Masses of today tell little where ψ knows what is to come: each ψ_t errs by its own fit.
+        equally = dataclasses.replace(move, allocation="equal")
+        return AuxiliaryResample(equally, TwistedLookahead(twist))
     if isinstance(move, Propagate) and move.gradient == "none":
         return PropagateTwisted(filter.model, twist, move.noise)
     if isinstance(move, Every):

@@ -1,7 +1,5 @@
 """How the components share the slots: by what the variance of their masses asks for."""
 
-import itertools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -133,7 +133,7 @@ def test_offspring_are_the_floor_or_the_ceiling_of_what_is_expected(scheme, num_
     mixture = make_mixture(rng.normal(size=60), rng.normal(size=60), labels, num_components)
     expected = expected_offspring(mixture, 60 // num_components)
     for seed in range(50):
-        counts = offspring(mixture, draw(Resample(scheme), mixture, seed))
+        counts = offspring(mixture, draw(Resample(scheme, allocation="equal"), mixture, seed))
         assert (counts >= np.floor(expected - 1e-4)).all()
         assert (counts <= np.ceil(expected + 1e-4)).all()
 
@@ -204,14 +204,18 @@ class TestResidual:
         mixture = make_mixture(rng.normal(size=60), rng.normal(size=60), np.arange(60) % 3, 3)
         expected = expected_offspring(mixture, 20)
         for seed in range(20):
-            counts = offspring(mixture, draw(Resample("residual"), mixture, seed))
+            counts = offspring(
+                mixture, draw(Resample("residual", allocation="equal"), mixture, seed)
+            )
             assert (counts >= np.floor(expected - 1e-4)).all()
 
     @pytest.mark.parametrize("size", [7, 99])
     def test_equal_weights_leave_nothing_to_chance(self, size):
         mixture = make_mixture(np.arange(size), np.zeros(size), np.zeros(size), 1)
         for seed in range(5):
-            counts = offspring(mixture, draw(Resample("residual"), mixture, seed))
+            counts = offspring(
+                mixture, draw(Resample("residual", allocation="equal"), mixture, seed)
+            )
             assert (counts == 1).all()
 
 
@@ -220,7 +224,7 @@ class TestAllocation:
         rng = np.random.default_rng(10)
         labels = rng.choice([0, 2, 3], 50, p=[0.8, 0.15, 0.05])
         mixture = make_mixture(rng.normal(size=50), rng.normal(size=50), labels, 5)
-        counts = np.asarray(draw(Resample(), mixture, 0).component_counts)
+        counts = np.asarray(draw(Resample(allocation="equal"), mixture, 0).component_counts)
         assert counts.sum() == 50
         assert (counts[[1, 4]] == 0).all()
         living = counts[[0, 2, 3]]

@@ -100,7 +100,7 @@ def test_the_evidence_and_moments_are_unbiased_at_every_step(case):
         return
     plain = runs(case, CASES[case][1](CASES[case][0]))
     spread = float(np.asarray(plain.log_marginal_likelihood).std())
-    assert logs[:, -1].std() < 0.4 * spread
+    assert logs[:, -1].std() < 0.5 * spread
 
 
 @pytest.mark.thorough

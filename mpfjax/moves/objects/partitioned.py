@@ -83,9 +83,7 @@ class Partitioned(AbstractPropagation):
         else:
             self.rule, self.orders = None, check_orders(orders, model.num_objects)
         self.model = model
-        self.resample = Resample(
-            scheme, ess_threshold, gradient=gradient, allocation="equal"
-        )
+        self.resample = Resample(scheme, ess_threshold, gradient=gradient, allocation="equal")
         if self._stops_draws:
             require(model.object_model, "log_transition", "gradient='stop'")
         self.reassembly = reassembly

@@ -32,7 +32,6 @@ from mpfjax.moves.resampling.ordering import SortBy, check_sort_by
 from mpfjax.moves.resampling.schemes import SCHEMES
 from mpfjax.operations.gradients import add_gradient
 from mpfjax.operations.indexing import take
-from mpfjax.operations.logarithms import scaled_exp
 from mpfjax.operations.prefix_sums import count_starts
 from mpfjax.operations.segments import segment_log_sum_exp, spread
 from mpfjax.operations.stored import stored
@@ -125,12 +124,11 @@ class Resample(AbstractAdaptiveResampling):
         check_one_of(GRADIENTS, gradient=self.gradient)
         check_one_of(ALLOCATIONS, allocation=self.allocation)
         check_callable("a function of the particles", **given(share_by=self.share_by))
-        if self.share_by is not None:
-            if self.particles_per_component is not None:
-                raise ValueError(
-                    "share_by: groups have no say where particles_per_component is"
-                    f" {self.particles_per_component}"
-                )
+        if self.share_by is not None and self.particles_per_component is not None:
+            raise ValueError(
+                "share_by: groups have no say where particles_per_component is"
+                f" {self.particles_per_component}"
+            )
         check_positive(softness=self.softness, regularisation=self.regularisation)
         check_share(softness=self.softness)
         if self.gradient == "ot":
