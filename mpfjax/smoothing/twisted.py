@@ -71,8 +71,8 @@ def learn_lookahead(
     and so do the samplers of `mpfjax.tuning`.
 
     - `filter`: of moves `Resample` (or `AuxiliaryResample`, whose look-ahead is replaced),
-      `Propagate` and regrouping, with equal slots for its components. Its model makes x_t of noise, `transition_from_noise`. Take one
-      with components where there are modes.
+      `Propagate` and regrouping; its components get equal slots. Its model makes x_t of noise,
+      `transition_from_noise`. Take one with components where there are modes.
     - `num_passes`: how often the filter runs to learn.
     - `features`: φ, in which log ψ is nearly quadratic, (states) -> (n, d); of one particle, if the
       model is wrapped by `per_particle`. None is the flattened state.
