@@ -138,11 +138,14 @@ def build(
     mixture: dict[str, Any],
     num_particles: int,
 ) -> mpfjax.Filter:
-    """The filter of that name; `mixture` are the options of those that are mixtures."""
+    """The filter of that name; `mixture` are the options of those that are mixtures.
+
+    Components have equal numbers of particles, as in the paper.
+    """
     if name == "pf":
         return mpfjax.particle_filter(model, num_particles)
     if name == "mpf":
-        return mpfjax.mixture_particle_filter(model, num_particles, **mixture)
+        return mpfjax.mixture_particle_filter(model, num_particles, allocation="equal", **mixture)
     regeneration = mpfjax.GaussianRegeneration(noise="stratified")
     if name == "gpf":
         return mpfjax.gaussian_particle_filter(model, num_particles, regeneration=regeneration)
@@ -153,6 +156,7 @@ def build(
     return mpfjax.mixture_particle_filter(
         model,
         num_particles,
+        allocation="equal",
         **mixture,
         proposal=mpfjax.GaussNewtonProposal(model, noise="stratified"),
         sort_by=position,
