@@ -1,4 +1,4 @@
-"""Frames, boxes, colour histograms and their models, detection, an object tracker, scenes."""
+"""Computer vision: frames, boxes, colour histograms, detections, the object tracker, scenes."""
 
 from mpfjax.vision.boxes.colour_model import BoxState as BoxState
 from mpfjax.vision.boxes.colour_model import ColourModel as ColourModel

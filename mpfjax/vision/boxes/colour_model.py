@@ -1,4 +1,4 @@
-"""The colour tracking model of Vermaak et al. (2003), section 5.2, and Lin et al. (2012), 2."""
+"""The colour model of Vermaak et al. (2003), section 5.2, and Lin et al. (2012), section 2."""
 
 from typing import Any
 
@@ -38,12 +38,12 @@ PAPER_VARIANCES = (2.5, 1.5, 0.05, 0.05)
 
 
 class BoxState(eqx.Module):
-    """Where a box is, how large it is, and which reference box it is compared with.
+    """The place and size of a box, and the reference box that it is compared with.
 
     - `box`: (x, y, s_x, s_y), the centre in pixels and the size in units of the reference box.
     - `reference`: r, the reference box it is compared with, in [0, number of references).
-    - `previous`: what the dynamics remember of the past, if they are of second order: the box one
-    frame before, or what else their `remembered` gives.
+    - `previous`: the memory of second-order dynamics, as their `remembered` gives it: the box one
+      frame before.
     """
 
     box: Float[Array, "*n 4"]
@@ -54,9 +54,9 @@ class BoxState(eqx.Module):
 class AbstractBoxModel(AbstractStateSpaceModel):
     """The motion of boxes, without a likelihood.
 
-    x_0 scatters about the reference boxes, with equally many particles for each. (x, y, s_x, s_y)
-    follow the dynamics. In each frame, r is drawn again with the switch probability, which may be
-    zero.
+    x_0 is Gaussian about the reference boxes, with equally many particles for each. (x, y, s_x,
+    s_y) follow the dynamics. In each frame, r is drawn again with the switch probability, which may
+    be zero.
     """
 
     reference_boxes: eqx.AbstractVar[Float[Array, "k 4"]]
@@ -94,7 +94,7 @@ class AbstractBoxModel(AbstractStateSpaceModel):
 
     @property
     def noise_dimension(self) -> int:
-        """That of the dynamics, and one for r where it may be drawn again."""
+        """That of the dynamics, plus one for r where it may be drawn again."""
         return self.dynamics.noise_dimension + (self.switch_probability > 0)
 
     def transition_from_noise(self, noise: Float[Array, "n k"], states: BoxState) -> BoxState:
@@ -102,7 +102,7 @@ class AbstractBoxModel(AbstractStateSpaceModel):
         check_shape(f"n {self.noise_dimension}", noise=noise)
         reference = states.reference
         if self.switch_probability > 0:
-            # Below the probability, where a share lies says which r is drawn.
+            # A uniform number below the probability is uniform there, so that it also draws r.
             shares = jax.scipy.special.ndtr(noise[:, -1]) / self.switch_probability
             k = self.reference_boxes.shape[0]
             drawn = jnp.clip(jnp.floor(k * shares), 0, k - 1).astype(reference.dtype)
@@ -121,7 +121,7 @@ class AbstractBoxModel(AbstractStateSpaceModel):
         return log_density + self.log_switch(states, previous_states)
 
     def log_switch(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
-        """log P(r_t | r_{t-1}), the part of `log_transition` that is not about the box."""
+        """log P(r_t | r_{t-1}), the part of `log_transition` that concerns the reference."""
         drawn = self.switch_probability / self.reference_boxes.shape[0]
         stays = states.reference == previous_states.reference
         return jnp.log(
@@ -129,7 +129,7 @@ class AbstractBoxModel(AbstractStateSpaceModel):
         )
 
     def with_history(self, states: BoxState, previous_states: BoxState) -> BoxState:
-        """The states as children of the previous ones: they remember those boxes."""
+        """The states as offspring of the previous ones, whose boxes they remember."""
         dynamics = self.dynamics_of(previous_states)
         past = dynamics.remembered(states.box, previous_states.box, previous_states.previous)
         return BoxState(states.box, states.reference, past)
@@ -148,25 +148,30 @@ class ColourModel(AbstractBoxModel):
     """Boxes that move at random and are recognised by the colours in them.
 
     Vermaak et al. (2003), section 5.2: (x, y, s_x, s_y) follow independent Gaussian random walks,
-    and L(y | x) ∝ exp(-Σ_c B²(h^c, h_ref^c) / 2σ²) with B the Bhattacharyya distance of the
-    normalised histograms of the colours c = R, G, B in the hypothesised and in the reference box.
-    Lin et al. (2012), section 2, is the same with one `HSVColours` histogram (eqs. 1 to 3) and an
-    `Autoregression` (eq. 4). Two extensions are in neither paper, and off unless asked for:
+    and
+
+        L(y | x) ∝ exp(-Σ_c B²(h^c, h_ref^c) / 2σ²)
+
+    where B is the Bhattacharyya distance of the normalised histograms of the colours c = R, G, B in
+    the hypothesised and in the reference box. Lin et al. (2012), section 2, is the same with one
+    `HSVColours` histogram (eqs. 1 to 3) and an `Autoregression` (eq. 4). Two extensions are in
+    neither paper, and off by default:
 
     - several references: r, the reference that a particle is compared with, is part of the state,
-      so the recursion stays exact. x_0 is spread equally over all references. r never changes, or
-      is drawn again with a small probability in every frame, for objects that change their looks;
+      so that the recursion stays exact. x_0 is spread equally over all references. r never changes,
+      or is drawn again with a small probability in every frame, for objects that change their
+      appearance;
     - boxes cut into bands from top to bottom, whose B² are averaged, so that a shirt is not
-    confused
-      with trousers; and weights of colours: a colour counts by how much more of it is in a
-      reference box than around the box, so that grass in a box counts little.
+      confused with trousers; and weights of colours: a colour has more weight the larger its share
+      in a reference box is, compared with the surroundings of the box. Grass in a box then has
+      little weight.
 
     An observation is an RGB frame, uint8 of shape (h, w, 3), or its `IntegralHistogram`. A box
     outside the frame has no colour and the largest distance, B = 1. So has a box of more pixels
     than can be counted, see `wide_counts`. Make a model with `from_frame`. Use it for objects that
     keep their colours and are not surrounded by the same colours.
 
-    - `reference_boxes`: (k, 4), centre and size in pixels; x_0 scatters about them.
+    - `reference_boxes`: (k, 4), centre and size in pixels; x_0 is Gaussian about them.
     - `references`, `colour_weights`: h_ref and the weights of its colours, (k, parts, channels,
       bins).
     - `dynamics`: of (x, y, s_x, s_y), in pixels for x and y and in units of the reference box for
@@ -175,10 +180,10 @@ class ColourModel(AbstractBoxModel):
     - `sigma`: σ, the width of the likelihood.
     - `colours`: the bins of the histograms.
     - `switch_probability`: the probability, in each frame, that r is drawn again from all
-    references.
-    - `contrast`: how much a box gains if the areas at its sides, half a width each, do not have the
-      reference's colours. 0 looks at the box alone, as in the paper. If a box with its sides is too
-      large to be counted, it gains nothing.
+      references.
+    - `contrast`: how much the log-likelihood gains if the areas at both sides of a box, half a
+      width each, do not have the reference's colours. 0 uses the box alone, as in the paper. A box
+      that is too large to be counted together with its sides gains nothing.
     - `wide_counts`: count pixels in 32 bits; see `integral_histogram`. Without it, a box, or with
       `contrast` a box with its sides, may have at most 65 535 pixels.
     """
@@ -217,15 +222,15 @@ class ColourModel(AbstractBoxModel):
           paper's, the roots of (2.5, 1.5, 0.05, 0.05).
         - `dynamics`: instead of the random walk; one for all boxes, or with a row for each.
         - `num_parts`: bands from top to bottom.
-        - `weigh_colours`: weight each colour by its share in the box compared with its share in the
-          surround, which has twice the width and height.
-        - `share_reference`: all particles are compared with one reference, the mean of all boxes.
-          The paper too has one B_ref for all players.
+        - `weigh_colours`: weight each colour by its share in the box relative to its share in the
+          surroundings, a box of twice the width and height.
+        - `share_reference`: compare all particles with one reference, the mean of all boxes. The
+          paper also has one B_ref for all players.
         - `switch_probability`, `contrast`: see the class.
 
-        Raises `ValueError` naming the argument for one of another kind, for a frame that is not
-        (h, w, 3) of type uint8, for a box without area or outside the frame, for a number that is
-        not positive, and for a probability outside [0, 1].
+        Raises `ValueError`, with the name of the argument, for an argument of another kind, for a
+        frame that is not (h, w, 3) of type uint8, for a box without area or outside the frame, for
+        a number that is not positive, and for a probability outside [0, 1].
         """
         check_frame(frame)
         boxes = to_rows(4, "boxes", boxes)
@@ -278,7 +283,7 @@ class ColourModel(AbstractBoxModel):
     def counts(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
     ) -> tuple[Float[Array, "n parts channels bins"], Float[Array, "n parts channels bins"] | None]:
-        """Pixels of each colour in each box, and at its sides if there is a `contrast`."""
+        """Pixels of each colour in each box, and at its sides where `contrast` is positive."""
         num_parts = self.references.shape[1]
         observation, boxes = self._counted(observation), self.boxes(states)
         counts = observation.counts(boxes, num_parts)
@@ -294,7 +299,7 @@ class ColourModel(AbstractBoxModel):
         states: BoxState,
         references: Float[Array, "n parts channels bins"],
     ) -> Float[Array, " n"]:
-        """Σ_c B² - contrast Σ_c B²_around of counted boxes, from references of their own."""
+        """Σ_c B² - contrast Σ_c B²_around of boxes with these counts, from these references."""
         return self._contrasted(counts, sides, self.colour_weights[states.reference], references)
 
     def prepare_observation(
@@ -330,7 +335,7 @@ class ColourModel(AbstractBoxModel):
     def _own(self, counts: Array, states: BoxState) -> tuple[Array, Array]:
         """The weights and the references of the particles."""
         weights, references = self.colour_weights, self.references
-        # With one reference, a gather of it costs more than the distance. Only under vmap, where
+        # With one reference, a gather costs more than the distance. Under vmap, where
         # each particle has a model of its own, the two gathers fuse.
         if references.shape[0] > 1 or counts.shape[0] == 1:
             weights, references = weights[states.reference], references[states.reference]

@@ -1,4 +1,4 @@
-"""The loop over frames for boxes drawn in the first: one track for each box, in their order."""
+"""The loop over frames for boxes drawn in the first frame: one track for each box, in order."""
 
 import itertools
 from collections.abc import Iterable, Iterator
@@ -28,16 +28,17 @@ def follow_boxes(
 ) -> Iterator[Tracks]:
     """Follow boxes (x, y, w, h) of the first frame by their colours: yields `Tracks`, k rows each.
 
-    Row j, with the identity j + 1, is what the recipe "objects" of `PRESETS` holds for the
-    likeliest place of box j: the mean of the heaviest of the components that stand for it. An
-    object of which no component is left has the identity 0. Nothing is detected, so that
-    `confirmed` says whether the object is held at all, and `unseen` is 0.
+    Row j has the identity j + 1. It is the most probable place of box j under the recipe "objects"
+    of `PRESETS`: the mean of the heaviest of the components that stand for it. An object without
+    any component left has the identity 0. There are no detections: `confirmed` says whether the
+    object has a component, and `unseen` is 0.
 
     - `frames`: as for `track`; the boxes, top-left corner first, in pixels, lie in the first.
     - `key`: of the random numbers; None takes `jax.random.key(0)`.
 
-    Raises `ValueError` for boxes of no area, outside the first frame or none at all, and for frames
-    as `track` does. Use it if no detector finds the objects, and a user draws boxes around them.
+    Raises `ValueError` for no boxes, for boxes without area or outside the first frame, and for
+    frames as `track` does. Use it if no detector finds the objects, and a user draws boxes around
+    them.
     """
     check_type(Iterable, "frames one after the other", frames=frames)
     boxes = to_rows(4, "boxes", boxes)
@@ -56,7 +57,7 @@ def _followed(stills: Iterator[np.ndarray], boxes: np.ndarray, key: Array) -> It
     mixture = kept_program(_begin, (filter,), (key,))(key)
     advance = None
     for t, still in enumerate(itertools.chain([first], stills)):
-        # An array, since a new Python number would compile anew.
+        # An array: each new Python number would compile anew.
         moving = (np.asarray(t), mixture, still)
         if advance is None:
             advance = kept_program(_advance, (filter, len(boxes), key), moving)

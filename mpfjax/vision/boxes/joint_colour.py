@@ -33,13 +33,16 @@ def joint_colour_model(
 ) -> MultiObjectModel:
     """J boxes with second-order dynamics, each recognised by the histograms of its own template.
 
-    Smith and Gatica-Perez (2004), sections 2 and 3.2: L(y | x^j) ∝ exp(-λ d²). d² is the squared
-    Bhattacharyya distance of HSV histograms, summed over the P bands into which a box is cut from
-    top to bottom, as in Pérez, Hue, Vermaak and Gangnet (2002), where λ is 20 as well. The
-    dynamics are x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + σ ω_t. Each object has a `ColourModel`,
-    which takes the mean over bands, so its σ² is 1 / (2 λ P). The paper has one scale α; here width
-    and height have a scale each. An observation is an RGB frame for all objects. Its integral
-    histogram is built once in each step, and under `monte_carlo` once for all runs.
+    Smith and Gatica-Perez (2004), sections 2 and 3.2:
+
+        L(y | x^j) ∝ exp(-λ d²),  x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + σ ω_t
+
+    d² is the squared Bhattacharyya distance of HSV histograms, summed over the P bands into which a
+    box is cut from top to bottom, as in Pérez, Hue, Vermaak and Gangnet (2002), where λ is also 20.
+    Each object has a `ColourModel`, which takes the mean over bands, so that its σ² is 1 / (2 λ P).
+    The paper has one scale α; here width and height have a scale each. An observation is an RGB
+    frame for all objects. Its integral histogram is built once in each step, and under
+    `monte_carlo` once for all runs.
 
     - `boxes`: (x, y, w, h), top-left corner first, where the objects start, and where their
       templates are in `frame`.
@@ -47,12 +50,12 @@ def joint_colour_model(
     - `num_parts`: bands.
     - `colours`: the bins of the histograms; None takes `HSVColours()`.
     - `deviations`: σ of x and y in pixels and of the scales of width and height; also those of x_0.
-    - `templates`: for an object whose looks are taken from elsewhere, by its index: (frame, box).
+    - `templates`: (frame, box) for an object whose template is in another frame, by its index.
     - `interaction`: that of `MultiObjectModel`, between `BoxState`s.
 
-    Raises `ValueError` naming the argument for no boxes, a box of no area or outside its frame,
-    an index in `templates` that is none, and numbers that are not positive. Use it where each
-    object has colours of its own.
+    Raises `ValueError`, with the name of the argument, for no boxes, a box without area or outside
+    its frame, a key of `templates` that is no object's index, and numbers that are not positive.
+    Use it where each object has colours of its own.
     """
     boxes = to_rows(4, "boxes", boxes)
     sigma = _sigma(lambda_, num_parts)
@@ -96,8 +99,8 @@ def joint_colour_model(
 def with_lambda(model: MultiObjectModel, lambda_: float) -> MultiObjectModel:
     """A `joint_colour_model` with another λ, whose filters compile to the same programs.
 
-    Raises `ValueError` for a λ that is not positive, and for another model. Use it to try several
-    λ.
+    Raises `ValueError` for a λ that is not positive, and for another model. Use it to compare
+    values of λ.
     """
     _check_model(model, "with_lambda")
     colour_model: Any = model.object_model
@@ -139,7 +142,7 @@ def _sigma(lambda_: float, num_parts: int) -> float:
 
 
 def _one_each(model: ColourModel) -> ColourModel:
-    """A model of k references as k models of one, side by side."""
+    """k models with one reference each, stacked, made of one model with k references."""
     num_objects = model.reference_boxes.shape[0]
     sigma = jnp.broadcast_to(model.sigma, (num_objects,))
     split = jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[:, None], model)

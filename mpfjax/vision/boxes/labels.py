@@ -58,9 +58,9 @@ def boxes_around(
 
     Centres are uniform within `reach` widths and heights to each side; width and height are
     multiplied by up to `stretch`, or divided by it, uniformly in the logarithm. Use them as
-    candidates of a `LabelLikelihood` that the dynamics reach in many steps, not in one: without
-    boxes of wrong sizes it does not learn about size. Raises `ValueError` for fewer than one box,
-    a reach that is not positive, and a stretch below one.
+    candidates of a `LabelLikelihood`. Unlike boxes that the dynamics reach in one step, they
+    include boxes of wrong sizes, without which the likelihood does not learn about size. Raises
+    `ValueError` for fewer than one box, a reach that is not positive, and a stretch below one.
     """
     check_key(key)
     check_type(AbstractBoxModel, "a model of boxes, such as a ColourModel", model=model)

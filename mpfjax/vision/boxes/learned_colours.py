@@ -1,4 +1,4 @@
-"""Boxes recognised by colours that are learned on the way, and that may be hidden."""
+"""Boxes recognised by colours that are learned during tracking, and that may be hidden."""
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ from mpfjax.vision.colour.histograms import IntegralHistogram, normalise
 
 
 class LearnedBoxState(eqx.Module):
-    """A `BoxState`, and the colours that the hypothesis has seen in its box lately.
+    """A `BoxState`, and the recent colours in the box of this hypothesis.
 
     - `box`, `reference`, `previous`: as in `BoxState`.
     - `appearance`: the learned histograms, (n, parts, channels, bins); at first those of the
@@ -30,16 +30,18 @@ class LearnedBoxState(eqx.Module):
 class LearnedColourModel(AbstractStateSpaceModel):
     """A `ColourModel` of objects that change their appearance and that are hidden at times.
 
-    L(y | x) ∝ exp(-d / 2σ²) + exp(-d_hidden / 2σ²), where d is the squared distance of the
-    `ColourModel`, contrast included: the share `anchor` of it from the reference of the first
-    frame, and the rest from the particle's own `appearance`. The second term is of an object that
-    cannot be seen, whatever is in its box. So a hypothesis waits near the place where its object
-    vanished, and no look-alike at a distance of d_hidden or more attracts it. `appearance` is part
-    of the state, and only `AdaptAppearance` changes it; the motion is that of the `ColourModel`.
-    Observations are those of the `ColourModel`.
+        L(y | x) ∝ exp(-d / 2σ²) + exp(-d_hidden / 2σ²)
 
-    - `hidden_distance`: d_hidden, squared, in units of Σ_c B². People in a street scene were at .2
-      from themselves, at .5 to .7 from others and from 1 on from the background.
+    d is the squared distance of the `ColourModel`, including contrast: a share `anchor` of it is
+    the distance from the reference of the first frame, and the rest the distance from the
+    particle's own `appearance`. The second term stands for a hidden object, and does not depend on
+    the box. A hypothesis therefore stays near the place where its object vanished, and no
+    look-alike at a distance of d_hidden or more attracts it. `appearance` is part of the state, and
+    only `AdaptAppearance` changes it; the motion is that of the `ColourModel`. Observations are
+    those of the `ColourModel`.
+
+    - `hidden_distance`: d_hidden, squared, in units of Σ_c B². In a street scene, people were at a
+      distance of .2 from themselves, .5 to .7 from others and 1 or more from the background.
 
     Raises `TypeError` for another model, `ValueError` for a share outside [0, 1] and a distance
     that is not positive. Use it where objects hide behind others or turn round.
@@ -60,7 +62,7 @@ class LearnedColourModel(AbstractStateSpaceModel):
         return _with_appearance(states, self.colour_model.references[states.reference])
 
     def sample_transition(self, key: Key[Array, ""], states: LearnedBoxState) -> LearnedBoxState:
-        """x_t of the `ColourModel`, with the appearance that it had."""
+        """x_t of the `ColourModel`, with the appearance of the previous state."""
         return _with_appearance(
             self.colour_model.sample_transition(key, _bare(states)), states.appearance
         )
@@ -72,7 +74,7 @@ class LearnedColourModel(AbstractStateSpaceModel):
     def log_likelihood(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: LearnedBoxState
     ) -> Float[Array, " n"]:
-        """log of the sum of the two terms, seen and hidden."""
+        """log of the sum of the two terms, visible and hidden."""
         log_seen, log_hidden, _ = self._seen(observation, states)
         return jnp.logaddexp(log_seen, log_hidden)
 
@@ -88,10 +90,10 @@ class LearnedColourModel(AbstractStateSpaceModel):
         states: LearnedBoxState,
         rate: float,
     ) -> LearnedBoxState:
-        """The states whose appearance moves by rate · P(seen | x, y) towards what is in the box."""
+        """The states, after rate · P(seen | x, y) (h(x) - appearance) is added to appearances."""
         log_seen, log_hidden, counts = self._seen(observation, states)
         shown = normalise(counts, self.colour_model.colour_weights[states.reference])
-        # What holds no pixel, or more than can be counted, teaches nothing.
+        # A box that holds no pixel, or more than can be counted, has no colours to learn.
         some = jnp.any(shown > 0, axis=(1, 2, 3)) & jnp.all(jnp.isfinite(shown), axis=(1, 2, 3))
         share = jnp.where(some, rate * jax.nn.sigmoid(log_seen - log_hidden), 0.0)
         share = share.astype(shown.dtype)[:, None, None, None]
@@ -114,15 +116,16 @@ class LearnedColourModel(AbstractStateSpaceModel):
 
 
 class AdaptAppearance(AbstractPropagation):
-    """Let every particle learn the colours in its box, as far as its object is likely seen.
+    """Let every particle learn the colours in its box, in proportion to P(object is visible).
 
-    appearance <- appearance + rate · P(seen | x, y) (h(x) - appearance), with P(seen | x, y) the
-    share of the first term in the likelihood of the `LearnedColourModel`. Rival hypotheses learn
-    different appearances. The `anchor` of the model keeps a share of the first frame's. The weights
-    stay.
+        appearance <- appearance + rate · P(seen | x, y) (h(x) - appearance)
 
-    What is seen changes what is expected (`approximate` is true). Raises `TypeError` for another
-    model and `ValueError` for a rate outside [0, 1]. Use it after `Propagate`.
+    P(seen | x, y) is the share of the first term in the likelihood of the `LearnedColourModel`.
+    Rival hypotheses learn different appearances. The `anchor` of the model keeps a share of the
+    first frame's. The weights do not change.
+
+    The model changes with the data (`approximate` is true). Raises `TypeError` for another model
+    and `ValueError` for a rate outside [0, 1]. Use it after `Propagate`.
     """
 
     model: LearnedColourModel
@@ -134,7 +137,7 @@ class AdaptAppearance(AbstractPropagation):
 
     @property
     def approximate(self) -> bool:
-        """True: what is seen changes what is expected."""
+        """True: appearances are learned from the same data that they explain."""
         return True
 
     def __call__(

@@ -11,13 +11,15 @@ from mpfjax.moves.objects.exclusion import AbstractExclusion
 
 
 class ObjectExclusion(AbstractExclusion):
-    """Lower the weights of particles near where the other objects probably are.
+    """Lower the weights of particles near the probable places of other objects.
 
-    log-weight_i -= strength · Σ_m s_m exp(-|x_i - μ_m|² / (2 radius²)) over the components m of
-    other objects. μ_m is the mean of the propagated particles, and s_m the component's share of its
-    object's mass. The object of a component is the reference that its particles carry
-    (`BoxState`). Components of one object are rival hypotheses and do not push each other.
-    Distances are in units of `scale`, the width and height of a box in pixels.
+        log-weight_i -= strength · Σ_m s_m exp(-|x_i - μ_m|² / (2 radius²))
+
+    The sum runs over the components m of other objects; μ_m is the mean of the propagated
+    particles, and s_m the component's share of its object's mass. The object of a component is the
+    reference that its particles carry (`BoxState`). Components of one object are rival hypotheses
+    and do not repel each other. Distances are in units of `scale`, the width and height of a box in
+    pixels.
 
     This is NOT part of the exact recursion. Objects interact as in a Markov random field, but
     through their means instead of their states. The marginal likelihood is biased (`approximate` is
@@ -41,7 +43,7 @@ class ObjectExclusion(AbstractExclusion):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
-        """Lower the weight of every particle by its nearness to the other objects."""
+        """Lower the weight of every particle according to its distance from the other objects."""
         del key, observation
         states, owners = mixture.particles, component_references(mixture)
         centres = states.box[:, :2] / jnp.array([self.scale], states.box.dtype)
@@ -58,13 +60,12 @@ class ObjectExclusion(AbstractExclusion):
 
 
 class PruneHypotheses(AbstractPropagation):
-    """Empty the components that have become hopeless hypotheses about their object.
+    """Empty the components that have become improbable hypotheses about their object.
 
     A component dies if its mass is less than `least_share` of that of the heaviest component with
     the same reference. Within one object the mixture weights are the posterior odds of its
-    hypotheses (Vermaak et al. 2003, eq. 4). So each component that dies takes away at most this
-    share of its object's mass: an approximation with a bound that you choose. Use it with `Split`,
-    to remove hypotheses that turned out wrong.
+    hypotheses (Vermaak et al. 2003, eq. 4). Each component that dies takes away at most this share
+    of its object's mass. Use it with `Split`, to remove hypotheses that turned out wrong.
 
     Raises `ValueError` for a share outside (0, 1).
     """
@@ -76,13 +77,13 @@ class PruneHypotheses(AbstractPropagation):
 
     @property
     def approximate(self) -> bool:
-        """True: a little mass is thrown away."""
+        """True: the mass of the pruned components is lost."""
         return True
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
-        """Take all weight from the hopeless components."""
+        """Set the weights of improbable components to zero."""
         del key, observation
         masses = mixture.log_mixture_weights
         rivals = _same_object(mixture, component_references(mixture))
@@ -102,7 +103,7 @@ def best_components(
 
 
 def component_references(mixture: ParticleMixture) -> Int[Array, " m"]:
-    """The reference of each component: the whole number nearest to its particles' mean."""
+    """The reference of each component: the integer nearest to its particles' mean."""
     reference = mixture.particles.reference.astype(mixture.log_weights.dtype)
     return jnp.round(mixture.component_averages(reference)).astype(jnp.int32)
 

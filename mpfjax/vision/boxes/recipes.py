@@ -1,9 +1,9 @@
 """Recipes for tracking boxes in video by their colours: a PF and an MPF, ready to run.
 
 Each recipe takes the first frame and a box for each object. It returns two filters with the same
-model and the same particles at the start: a particle filter of 200 particles, and a mixture
-particle filter of at most 10 components of 20. "objects" has twice as many particles, and of more
-than three objects more of both, see `most_components`. `PRESETS` has the recipes by name.
+model and the same initial particles: a particle filter of 200 particles, and a mixture particle
+filter of at most 10 components of 20. "objects" has twice as many particles, and for more than
+three objects more of both, see `most_components`. `PRESETS` has the recipes by name.
 """
 
 from typing import Any
@@ -38,7 +38,7 @@ HYPOTHESES, PARTICLES_PER_HYPOTHESIS = 3, 40
 def paper_filters(
     frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
 ) -> dict[str, Filter]:
-    """The model with the paper's parameters; the rest of the MPF in units of the mean box."""
+    """The paper's model and parameters; thresholds of the MPF are in units of the mean box."""
     model = ColourModel.from_frame(frame, boxes, sigma=0.15, deviations=None, share_reference=True)
     where: dict[str, Any] = {"features": _centre, "scale": boxes[:, 2:].mean(axis=0)}
     mixture = mixture_particle_filter(
@@ -57,7 +57,7 @@ def paper_filters(
 def default_filters(
     frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
 ) -> dict[str, Filter]:
-    """The recipe that covers most on real video: any component may follow any object.
+    """The recipe with the highest coverage on real video: any component may follow any object.
 
     A particle is compared with one of the given boxes, and sometimes changes to another. Sometimes
     it takes a long step. Components exclude each other. They split if they cover two places, and
@@ -83,17 +83,17 @@ def objects_filters(
 ) -> dict[str, Filter]:
     """The recipe with the fewest strays and swaps: every component keeps to its object.
 
-    Every particle is compared only with the box that it started from, and learns how its object
-    looks and moves now. So the components of an object are rival hypotheses about it. It may be
-    hidden, and then they walk on. Only components of one object merge, a component splits where
-    hypotheses diverge, and hopeless ones are pruned. Objects exclude each other where they are
-    nearly at one place. They share the particles equally: 400, and from four objects on 120 for
-    each object.
+    Every particle is compared only with the box that it started from, and learns the current
+    appearance and motion of its object. The components of an object are therefore rival hypotheses
+    about it. An object may be hidden; its components then move on by the dynamics. Only components
+    of one object merge, a component splits where hypotheses diverge, and improbable ones are
+    pruned. Objects exclude each other where they are nearly at one place. They share the particles
+    equally: 400 in all, and from four objects on 120 for each object.
     """
     check_frame(frame)
     check_boxes(boxes, *frame.shape[:2])
     size = boxes[:, 2:].mean(axis=0)
-    # Around their velocity people keep their way, up and down more than to the side.
+    # Steps about a velocity are shorter than those of a random walk.
     steps = _steps(boxes) * np.array([0.3, 0.5, 1.0, 1.0])
     walk = _walking(_with_jumps(steps, probability=0.1, times=(8.0, 6.0)), boxes)
     model = LearnedColourModel(_own_references(frame, boxes, steps, walk))
@@ -157,7 +157,7 @@ def _steps(boxes: np.ndarray) -> np.ndarray:
 def _with_jumps(
     steps: np.ndarray, probability: float, times: tuple[float, float] = (6.0, 6.0)
 ) -> RandomWalkWithJumps:
-    """Some steps are so many times as long, to the side and up, though sizes never jump."""
+    """Some steps of the places are longer by this factor; sizes never jump."""
     return RandomWalkWithJumps(steps, steps * np.array([*times, 1.0, 1.0]), probability)
 
 
@@ -194,7 +194,7 @@ def _one_component_a_box(size: np.ndarray) -> list[AbstractRegrouping]:
 
 
 def _apart(size: np.ndarray) -> dict[str, Any]:
-    """Features by which particles of different references are never near each other."""
+    """Features in which particles of different references are never near each other."""
     return {"features": _centre_and_reference, "scale": (*size, 1e-5)}
 
 

@@ -1,4 +1,4 @@
-"""Boxes followed through a video: what is kept of each frame, as tracks and as pictures."""
+"""Boxes followed through a video: a snapshot of each frame, as tracks and as pictures."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from mpfjax.vision.files import drawing
 
 
 class Snapshot(NamedTuple):
-    """What is kept of one frame of several runs; of one run, the same without the leading axis.
+    """The state of several runs in one frame; for a single run, without the leading axis.
 
     - `means`: (runs, m, 4), the mean box of each component, centre and size in pixels.
     - `active`: (runs, m), which components are alive.
@@ -41,9 +41,9 @@ def follow(
     """Run a filter of boxes online, once for each key, and yield a snapshot for each frame.
 
     The filter's model has a method `boxes(states)`, as `ColourModel` does. A frame is read only
-    when the one before it is done, so frames may come from a camera. Raises `TypeError` for
-    something that is no filter, and `ValueError` for keys that are not a stack of keys. Use it with
-    the `PRESETS`, and `track_rows` to make tracks of the snapshots.
+    after the frame before it is done, so that frames may come from a camera. Raises `TypeError` for
+    anything but a filter, and `ValueError` for keys that are not a stack of keys. Use it with the
+    `PRESETS`, and `track_rows` to make tracks of the snapshots.
     """
     check_type(Filter, "a Filter", filter=filter)
     check_key(keys, "keys", batch=True)
@@ -117,10 +117,10 @@ def annotate(
 ) -> UInt8[np.ndarray, "zh zw 3"]:
     """A frame, cropped and enlarged, with the particles and mean boxes of the first run.
 
-    Both are drawn in the colour of their component. `crop` is of rows and columns, or of rows
-    alone, as slices count: from the end where they are negative. `zoom` is how many pixels a pixel
-    becomes, each way. Raises `ValueError` for a zoom that is not a whole number from 1 on, and for
-    a crop that is no slices of step one or leaves no pixel.
+    Both are drawn in the colour of their component. `crop` is a slice of rows and one of columns,
+    or of rows alone; negative numbers count from the end. `zoom` is the side in pixels to which
+    each pixel is enlarged. Raises `ValueError` for a zoom that is not a whole number from 1 on, and
+    for a crop that is no slices of step one or leaves no pixel.
     """
     check_whole(zoom=zoom)
     rows, columns = _within(frame, crop)

@@ -1,4 +1,4 @@
-"""Colour histograms with a derivative in the box, in the image and in all that is tuned."""
+"""Colour histograms that are differentiable in the box, in the image and in their parameters."""
 
 import math
 from functools import partial
@@ -20,10 +20,12 @@ from mpfjax.vision.files.frames import check_frame
 class SoftColourModel(AbstractBoxModel):
     """Boxes recognised by their colours, with a likelihood that is smooth in all its arguments.
 
-    L(y | x) ∝ exp(-λ Σ_c B²(h^c, h_ref^c)), as in `ColourModel` with λ = 1 / 2σ², where the
-    histograms h are those of `soft_histograms`. h and h_ref are mixed with the uniform histogram,
-    which bounds the derivative of the square root in B² = 1 - Σ_b sqrt(h_b h_ref,b). A box outside
-    the frame has B = 1. Its motion is that of `ColourModel`.
+        L(y | x) ∝ exp(-λ Σ_c B²(h^c, h_ref^c))
+
+    as in `ColourModel` with λ = 1 / 2σ², where the histograms h are those of `soft_histograms`. h
+    and h_ref are mixed with the uniform histogram, which bounds the derivative of the square root
+    in B² = 1 - Σ_b sqrt(h_b h_ref,b). A box outside the frame has B = 1. The motion is that of
+    `ColourModel`.
 
     An observation is an RGB frame (h, w, 3), uint8 or floating point in [0, 256). Make one with
     `from_frame`. Use it to tune λ, the reference and the bandwidth (`maximise` with a
@@ -36,8 +38,8 @@ class SoftColourModel(AbstractBoxModel):
     - `num_points`: K, of the grid in a box, a multiple of the number of parts; static.
     - `floor`: the share of the uniform histogram; static.
 
-    Raises `ValueError` for a number that is not positive, a `floor` outside (0, 1), and points
-    that make no whole rows in a part.
+    Raises `ValueError` for a number that is not positive, a `floor` outside (0, 1), and a number of
+    points that is no multiple of the number of parts.
     """
 
     reference_boxes: Float[Array, "k 4"]
@@ -71,7 +73,7 @@ class SoftColourModel(AbstractBoxModel):
         - `num_bins`: of each of red, green and blue.
         - `sigma`: σ, with λ = 1 / 2σ².
         - `bandwidth`, `num_points`, `floor`: see the class.
-        - The rest is that of `ColourModel.from_frame`, which also says what is refused.
+        - The other arguments and the errors are those of `ColourModel.from_frame`.
         """
         check_positive(bandwidth=bandwidth)
         check_inner_share(floor=floor)
@@ -141,13 +143,13 @@ def soft_histograms(
     The points are the centres of K x K cells of the box. The frame's colours there are interpolated
     linearly from the four pixels around, as in a spatial transformer (Jaderberg et al. 2015). Each
     shade is spread over the bins by a triangular kernel of half-width `bandwidth` (in bins), with a
-    sum of one for each point. As the bandwidth goes to zero, with a point on every pixel, the
-    limit is the hard histogram. It is smooth in the boxes, the frame and the bandwidth, apart from
-    kinks where a point moves from one pixel to the next.
+    sum of one for each point. As the bandwidth goes to zero, with a point on every pixel, the limit
+    is the hard histogram. The shares are smooth in the boxes, the frame and the bandwidth, apart
+    from kinks where a point moves from one pixel to the next.
 
-    Boxes are (x, y, w, h) about their centre, in pixels; points outside the frame do not count,
-    those within half a pixel of its edge count in part. Bands run from top to bottom. A box that
-    is not finite counts nothing. Raises `ValueError` for K that is no multiple of `num_parts`, a
+    Boxes are (x, y, w, h) about their centre, in pixels. Points outside the frame do not count, and
+    those within half a pixel of its edge count in part. Bands run from top to bottom. A box that is
+    not finite has zero counts. Raises `ValueError` for K that is no multiple of `num_parts`, a
     number of bins outside 1 to 256, a frame that is not (h, w, 3), and arrays of other shapes.
     """
     _check_points(num_points, num_parts)
@@ -200,7 +202,7 @@ def _interpolated(
 
 
 def _between(places: Float[Array, "n K"], size: int) -> tuple[Array, Array]:
-    """The last pixel whose centre is not past each place, and how far the place is past it."""
+    """The last pixel whose centre is not past each place, and the distance from that centre."""
     within = jnp.clip(places - 0.5, 0.0, size - 1.0)
     first = jax.lax.stop_gradient(jnp.floor(within))
     return first.astype(jnp.int32), within - first

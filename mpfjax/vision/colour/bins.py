@@ -1,4 +1,4 @@
-"""What counts as one colour: the bins into which a histogram sorts pixels."""
+"""The bins into which a colour histogram sorts pixels."""
 
 import abc
 
@@ -53,13 +53,13 @@ class RGBColours(AbstractColours):
 
 
 class HSVColours(AbstractColours):
-    """Hue and saturation together, and the value of pixels that have hardly any colour.
+    """Hue and saturation together, and the value of pixels with little colour.
 
     N = N_h N_s + N_v bins in one histogram, Lin et al. (2012), section 2.1, after Pérez, Hue,
     Vermaak and Gangnet (2002). A pixel with a saturation of at least `least_saturation` and a value
-    of at least `least_value` (both in [0, 1]) counts in one of N_h N_s bins of hue and saturation.
-    The hue of any other pixel means little: it counts in one of N_v bins of value. Use it where the
-    light changes, or where one histogram should replace three.
+    of at least `least_value` (both in [0, 1]) is counted in one of N_h N_s bins of hue and
+    saturation. The hue of any other pixel is unreliable: the pixel is counted in one of N_v bins of
+    value. Use it where the light changes, or where one histogram should replace three.
 
     Raises `ValueError` for a number of bins outside 1 to 256 and thresholds outside [0, 1].
     """

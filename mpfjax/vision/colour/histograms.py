@@ -13,7 +13,7 @@ from mpfjax.vision.colour.bins import AbstractColours
 from mpfjax.vision.files.frames import check_frame
 
 _BLOCK = 32
-# XLA for a CPU builds the table up to four times faster if its rows are so wide, in such steps.
+# Widths of rows and of blocks for which XLA for a CPU builds the table up to four times faster.
 _BINS_STEP, _LEAST_WIDTH = 16, 48
 
 
@@ -21,8 +21,8 @@ class IntegralHistogram(eqx.Module):
     """How many pixels of each colour lie above and to the left of every corner of a frame.
 
     Entry (r, c, k) counts the pixels in rows < r and columns < c whose channel k // num_bins falls
-    into bin k % num_bins, so that any box is counted exactly from its corners, at a cost that does
-    not depend on its size (Porikli 2005). Build it once a frame, for all particles and all runs.
+    into bin k % num_bins. Any box is counted exactly from its four corners, at a cost that does not
+    depend on its size (Porikli 2005). Build it once a frame, for all particles and all runs.
 
     - `table`: shape (h + 1, at least w + 1, num_channels times at least num_bins). Counts wrap
       around in 16 bits, which cancels in the difference of corners as long as a box holds fewer
@@ -47,12 +47,12 @@ class IntegralHistogram(eqx.Module):
     ) -> Float[Array, "n parts channels bins"]:
         """Pixels of each colour in each box, cut into `num_parts` bands from top to bottom.
 
-        Boxes are (x, y, w, h) about their centre, in pixels, the frame spanning [0, width] x
-        [0, height]; a pixel belongs to a box that covers its centre. Boxes that leave the frame
-        are clipped to it, and one that lies wholly outside, has no area or is not finite counts
-        nothing. The counts of one that holds more than `largest_box` pixels are NaN, for a zero
-        would say that it has none of a colour. Raises `ValueError` for boxes that are no array of
-        four numbers each and a number of parts that is no whole number from 1 on.
+        Boxes are (x, y, w, h) about their centre, in pixels, and the frame spans [0, width] x [0,
+        height]. A pixel belongs to a box that covers its centre. Boxes that leave the frame are
+        clipped to it. A box that lies wholly outside, has no area or is not finite has zero counts.
+        The counts of a box with more than `largest_box` pixels are NaN, since zeros would mean that
+        it has none of a colour. Raises `ValueError` for boxes that are no array of four numbers
+        each and a number of parts that is no whole number from 1 on.
         """
         check_shape("n 4", boxes=boxes)
         check_whole(num_parts=num_parts)
@@ -75,8 +75,8 @@ def integral_histogram(
 ) -> IntegralHistogram:
     """Build the integral histogram of an RGB frame, whose pixels `colours` sorts into bins.
 
-    `wide_counts` counts in 32 bits, two to four times slower, for boxes of 65 536 pixels or more.
-    Raises `ValueError` for a frame of one channel or not of eight bits.
+    `wide_counts` counts in 32 bits, which takes two to four times as long, for boxes of 65 536
+    pixels or more. Raises `ValueError` for a frame of one channel or not of eight bits.
     """
     check_frame(frame)
     check_type(AbstractColours, "AbstractColours such as RGBColours()", colours=colours)
@@ -97,8 +97,7 @@ def normalise(
 ) -> Float[Array, "... bins"]:
     """Counts as shares that sum to one over the bins.
 
-    All zero where nothing was counted, or nothing could be: counts of NaN leave none behind, nor in
-    a derivative.
+    All zero where nothing was counted, and where counts are NaN; derivatives are then zero too.
     """
     counts = jnp.where(counts >= 0, counts, 0.0)
     if bin_weights is not None:

@@ -1,4 +1,4 @@
-"""The colours of boxes in a frame, by which their objects are known from then on."""
+"""Reference histograms: the colours of boxes in a frame, by which their objects are recognised."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ def reference_histograms(
     return normalise(counts, weights), weights
 
 
-# Two programs, since a hundred single operations take seconds to be found, even where kept.
+# Two programs: a hundred single operations take seconds to be loaded, even from the cache.
 @eqx.filter_jit
 def _most_pixels(boxes: Float[Array, "k 4"], height: int, width: int) -> Int[Array, ""]:
     return jnp.max(num_pixels(boxes, height, width))

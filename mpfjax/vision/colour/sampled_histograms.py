@@ -17,11 +17,11 @@ ROWS, COLUMNS = 18, 8
 
 
 class SampledHistogram(eqx.Module):
-    """The colours of a frame, counted at a grid of points in each box that is asked for.
+    """The colours of a frame, counted at a grid of points in each box.
 
-    It has the methods of an `IntegralHistogram`. Nothing is computed from the whole frame, so its
-    cost grows with the number of boxes alone, not with their size or that of the frame. A box is
-    sampled at `rows` x `columns` points, each of which takes the colour of its pixel. B² differs
+    It has the methods of an `IntegralHistogram`. Nothing is computed from the whole frame, so that
+    the cost grows with the number of boxes alone, not with their size or that of the frame. A box
+    is sampled at `rows` x `columns` points, each of which takes the colour of its pixel. B² differs
     from that of all pixels by about 0.03.
 
     - `frame`: RGB, (h, w, 3), of type uint8.
@@ -57,10 +57,10 @@ class SampledHistogram(eqx.Module):
     ) -> Float[Array, "n parts channels bins"]:
         """Points of each colour in each box, cut into `num_parts` bands from top to bottom.
 
-        Boxes are (x, y, w, h) about their centre, in pixels. Points outside the frame count
-        nothing, nor does a box that has no area or is not finite. The rows are shared out over the
-        bands: each has rows / num_parts of them, rounded up. Raises `ValueError` for boxes that are
-        no array of four numbers each and a number of parts that is no whole number from 1 on.
+        Boxes are (x, y, w, h) about their centre, in pixels. Points outside the frame are not
+        counted; a box that has no area or is not finite has zero counts. The rows are divided among
+        the bands: each has rows / num_parts of them, rounded up. Raises `ValueError` for boxes that
+        are no array of four numbers each and a number of parts that is no whole number from 1 on.
         """
         check_shape("n 4", boxes=boxes)
         check_whole(num_parts=num_parts)
@@ -71,13 +71,13 @@ class SampledHistogram(eqx.Module):
 
 
 class SampledBoxes(eqx.Module):
-    """What the boxes that a detector found show of a frame: the pixels at a grid of points in each.
+    """The colours of detected boxes: the pixels of a frame at a grid of points in each.
 
-    They are looked up by NumPy, outside of what is compiled, so that neither its time nor its
-    shapes depend on the frame. It counts what a `SampledHistogram` would, for these boxes alone.
+    NumPy looks them up, outside of the compiled program, whose time and shapes then do not depend
+    on the frame. It counts the same points as a `SampledHistogram`, for these boxes alone.
 
-    - `pixels`: RGB, (d, rows, columns, 3), of type uint8; `inside`: (d, rows, columns), whether
-      the point is in the frame.
+    - `pixels`: RGB, (d, rows, columns, 3), of type uint8; `inside`: (d, rows, columns), whether the
+      point is in the frame.
     - `height`, `width`: of the frame, in pixels.
     """
 
@@ -97,7 +97,7 @@ class SampledBoxes(eqx.Module):
         rows: int = ROWS,
         columns: int = COLUMNS,
     ) -> "SampledBoxes":
-        """Look at boxes (x, y, w, h) about their centre, in so many bands.
+        """Sample boxes (x, y, w, h) about their centre, in `num_parts` bands.
 
         Raises `ValueError` for a frame that is not (h, w, 3) of type uint8.
         """
@@ -111,7 +111,7 @@ class SampledBoxes(eqx.Module):
     def counts(self, num_parts: int = 1) -> Float[Array, "d parts channels bins"]:
         """Points of each colour in each box, cut into `num_parts` bands from top to bottom.
 
-        Raises `ValueError` for a number of bands into which the rows cannot be shared out.
+        Raises `ValueError` for a number of bands into which the rows cannot be divided.
         """
         rows = self.pixels.shape[1]
         if rows % num_parts:
@@ -151,5 +151,5 @@ def _counted(
 
 
 def _grid(xp: Any, number: int, dtype: Any) -> Any:
-    """The middles of so many equal parts of [-1/2, 1/2]."""
+    """The centres of equal parts of [-1/2, 1/2]."""
     return ((xp.arange(number, dtype=dtype) + 0.5) / number - 0.5)[None].astype(dtype)

@@ -59,10 +59,10 @@ def top_left(boxes: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k 4"]:
 def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     """Read a MOTChallenge file into rows (frame, id, x, y, w, h), (x, y) the top-left corner.
 
-    Frames count from 1. Every row is read, whatever its further columns are. For a ground truth,
+    Frames count from 1. Every row is read, and further columns are ignored. For a ground truth,
     where flags and classes say which rows count, use `read_truth`. Raises `ValueError` for a line
-    that cannot be read, naming the file and the line, and for a file without any box. Warns where
-    the seventh column is that of a ground truth of which some rows do not count.
+    that cannot be read, with the file and the line, and for a file without any box. Warns where the
+    seventh column is that of a ground truth of which some rows do not count.
     """
     check_type((str, Path), "a path", path=path)
     rows = [parse_track(path, number, line) for number, line in numbered_lines(path)]
@@ -82,10 +82,10 @@ def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
 def read_detections(path: str | Path) -> Float[np.ndarray, "rows columns"]:
     """Read a MOTChallenge file of detections into rows (frame, id, x, y, w, h, score).
 
-    The id, -1 in such files, means nothing. Without scores, in files of six columns, there are six
-    columns here as well. Raises `ValueError` naming the file and the line where one does not parse,
-    holds a number that is not finite, lies in a frame before 1, or has a score where others have
-    none, and where the file holds no detection at all.
+    The id, -1 in such files, has no meaning. For a file of six columns, without scores, the result
+    has six columns too. Raises `ValueError` with the file and the line for a row that cannot be
+    parsed, holds a number that is not finite, lies in a frame before 1, or has a score where other
+    rows have none; and for a file without any detection.
     """
     check_type((str, Path), "a path", path=path)
     rows: list[list[float]] = []
@@ -96,7 +96,9 @@ def read_detections(path: str | Path) -> Float[np.ndarray, "rows columns"]:
                 f"{path}, line {number}: lies in frame {row[0]:.0f}, and frames count from 1"
             )
         if rows and len(row) != len(rows[0]):
-            raise ValueError(f"{path}, line {number}: has a score, or none, unlike those before it")
+            raise ValueError(
+                f"{path}, line {number}: has a score, or none, unlike the lines before it"
+            )
         rows.append(row)
     if not rows:
         raise ValueError(f"{path}: holds no detections")
@@ -146,7 +148,7 @@ def numbered_lines(path: str | Path) -> Iterator[tuple[int, str]]:
 def parse_track(path: str | Path, number: int, line: str) -> list[float]:
     """The numbers of a row frame,id,x,y,w,h,... of seven to ten columns; further ones may be NaN.
 
-    Raises `ValueError` naming the file and the line for what is no such row.
+    Raises `ValueError` with the file and the line for any other text.
     """
     fields = line.split(",")
     try:

@@ -1,7 +1,7 @@
 """Drawing on RGB frames: strokes, boxes, points and numbers, with smooth edges.
 
-Every function draws in place on a float frame with values in [0, 255], and clips what it draws at
-the frame's border. Coordinates are in pixels, the centre of the first pixel at (0.5, 0.5).
+Every function draws in place on a float frame with values in [0, 255], and clips at the frame's
+border. Coordinates are in pixels; the centre of the first pixel is at (0.5, 0.5).
 """
 
 import functools
@@ -23,7 +23,7 @@ PALETTE = np.array(
 # Five rows of three bits for each digit, a row in an octal figure.
 _DIGITS = ("75557", "26227", "71747", "71717", "55711", "74717", "74757", "71122", "75757", "75717")
 
-# What is left of each brightness under the plate of a number.
+# The share of the brightness that remains under the plate of a number.
 _DARKENED = (np.arange(256) - 0.6 * np.arange(256)).astype(np.uint8)
 
 
@@ -35,7 +35,7 @@ def draw_stroke(
     colour: Float[np.ndarray, "3"],
     opacity: float = 1.0,
 ) -> None:
-    """Draw a line with round ends, `radius` half its width; a dot where the ends coincide."""
+    """Draw a line of half-width `radius` with round ends; a dot where the ends coincide."""
     (x0, y0), (x1, y1) = start, end
     reach = radius + 1
     window = _window(frame, min(x0, x1) - reach, min(y0, y1) - reach,
@@ -94,7 +94,7 @@ def draw_points(
 
 @functools.lru_cache(maxsize=4096)
 def _plate(number: int, size: int) -> Bool[np.ndarray, "height width"]:
-    """Where a number's digits are on its plate: an id comes again in every frame."""
+    """The plate of a number, and where its digits are; cached, since ids come in every frame."""
     rows = [" ".join(f"{int(_DIGITS[int(d)][i]):03b}" for d in str(number)) for i in range(5)]
     dots = np.array([[character == "1" for character in row] for row in rows])
     plate = np.pad(np.kron(dots, np.ones((size, size), bool)), 2)

@@ -19,20 +19,20 @@ from mpfjax.checks import check_positive, check_shape, check_type, check_whole, 
 from mpfjax.vision.files.sequences import read_sequence_info
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp")
-# Where sequences keep their images; MOTChallenge's have the second.
+# The folder of images in a sequence; MOTChallenge's is the second.
 _INNER = ("img", "img1")
 
 
 def read_frames(
     path: str | Path, first: int = 1, last: int | None = None
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """Read frames `first` to `last` in RGB, counted from 1 and both ends in, one at a time.
+    """Read frames `first` to `last`, both included and counted from 1, in RGB, one at a time.
 
     `path` is a video file, a folder of images in the natural order of their names (2.png before
-    10.png), or a folder with such a folder `img` or `img1`. The frames of a video are all that it
-    holds, whatever the time between them, rotated as the file says. A `RuntimeWarning` names those
-    that are too damaged to be decoded. Raises `ImportError` if imageio or PyAV is missing,
-    `FileNotFoundError` if `path` is, and `ValueError` naming `path` if it cannot be read, has no
+    10.png), or a folder with such a folder `img` or `img1`. All frames of a video are read,
+    whatever the time between them, rotated as the file says. A `RuntimeWarning` names those that
+    are too damaged to be decoded. Raises `ImportError` if imageio or PyAV is missing,
+    `FileNotFoundError` if `path` is, and `ValueError` with `path` if it cannot be read, has no
     frames, or has frames of different sizes, and for `first` and `last` that are no range.
     """
     check_type((str, Path), "a path", path=path)
@@ -71,8 +71,8 @@ def num_images(path: str | Path) -> int:
 def frame_rate(path: str | Path) -> float | None:
     """Frames per second of a video file, or of a folder whose `seqinfo.ini` names a `frameRate`.
 
-    The mean over a video whose rate varies. None where nothing says it. Raises `ValueError` for a
-    file that is no video.
+    The mean for a video whose rate varies; None where the rate is not given. Raises `ValueError`
+    for a file that is no video.
     """
     check_type((str, Path), "a path", path=path)
     path = Path(path)
@@ -105,9 +105,9 @@ def write_video(
 def open_video(
     path: str | Path, frames_per_second: float = 10.0
 ) -> Iterator[Callable[[UInt8[np.ndarray, "h w 3"]], None]]:
-    """A context that appends RGB frames to a new MP4 or GIF, whole however the block ends.
+    """A context that appends RGB frames to a new MP4 or GIF, complete however the block ends.
 
-    Raises as `write_video` does. Use it where the frames come from somewhere else.
+    Raises as `write_video` does. Use it where frames are made one at a time.
     """
     check_type((str, Path), "a path", path=path)
     check_positive(frames_per_second=frames_per_second)
@@ -125,7 +125,7 @@ def open_video(
 
     def append(frame: np.ndarray) -> None:
         check_frame(frame, "frames")
-        # imageio kills the encoder that is interrupted while it is fed, and the video with it.
+        # Interrupted while it is fed, imageio kills the encoder, and the video is lost.
         with _uninterrupted():
             writer.append_data(_even(frame) if suffix == ".mp4" else frame)
 
@@ -135,9 +135,9 @@ def open_video(
 
 @contextlib.contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Put off a Ctrl-C that comes within the block to its end."""
+    """Put off a Ctrl-C that comes within the block until its end."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # Python tells the main thread alone
+        yield  # Python sends signals to the main thread alone
         return
     pending: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _: pending.append(number))
@@ -150,7 +150,7 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def check_frame(frame: Any, argument: str = "frame", *, eight_bits: bool = True) -> None:
-    """Raise `ValueError` for what is no colour image (h, w, 3), or by default not of eight bits."""
+    """Raise `ValueError` unless `frame` is a colour image (h, w, 3), by default of eight bits."""
     check_shape("...", **{argument: frame})
     if frame.ndim != 3 or frame.shape[2] != 3 or 0 in frame.shape:
         raise ValueError(f"{argument}: {frame.shape} is not the shape (h, w, 3) of a colour image")
@@ -161,10 +161,10 @@ def check_frame(frame: Any, argument: str = "frame", *, eight_bits: bool = True)
 def of_one_kind(
     frames: Iterable[UInt8[np.ndarray, "..."]], first: int = 1
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """The frames in RGB, grey ones as well, numbered from `first` on in what goes wrong.
+    """The frames in RGB, also from grey ones; errors name frames by their number from `first` on.
 
-    Raises `ValueError` at the first that is no image of eight bits, or of another size than those
-    before it.
+    Raises `ValueError` at the first frame that is no image of eight bits, or of another size than
+    the frames before it.
     """
     shape = None
     for number, frame in enumerate(frames, first):
@@ -200,7 +200,7 @@ def _image_paths(folder: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> tuple[list[Any], str]:
-    """By its numbers as numbers and the text between them; by the name where these are the same."""
+    """A key for the natural order of names: numbers in them are compared as numbers."""
     parts = re.split(r"([0-9]+)", path.name)
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
@@ -231,7 +231,7 @@ def _read_video(path: Path, first: int, last: int | None) -> Iterator[np.ndarray
 
 
 def _decode_gif(path: Path) -> Generator[Callable[[], np.ndarray]]:
-    """What makes an image of each frame of a GIF."""
+    """Functions that decode the frames of a GIF, one for each frame."""
     images = iter(_imageio().imiter(path, plugin="pillow"))
     while True:
         with _naming(path, "a video"):
@@ -242,7 +242,7 @@ def _decode_gif(path: Path) -> Generator[Callable[[], np.ndarray]]:
 
 
 def _decode_video(path: Path) -> Generator[Callable[[], np.ndarray]]:
-    """What makes an image of each frame of a video: most frames before the first need none."""
+    """A function for each frame of a video that decodes it; unneeded ones are not called."""
     with _opened(path) as (container, stream):
         stream.thread_type = "AUTO"
         packets, any_frame, damaged = container.demux(stream), False, None
@@ -253,7 +253,7 @@ def _decode_video(path: Path) -> Generator[Callable[[], np.ndarray]]:
                 break
             try:
                 frames = packet.decode()
-            except (OSError, ValueError) as error:  # what the library says of a damaged packet
+            except (OSError, ValueError) as error:  # the library's error for a damaged packet
                 damaged = damaged or error
                 continue
             for frame in frames:
@@ -280,7 +280,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def _upright(frame: Any) -> np.ndarray:
-    """The pixels of a decoded frame, turned and mirrored by quarters as its file says."""
+    """The pixels of a decoded frame, rotated by quarters and mirrored as its file says."""
     image = frame.to_ndarray(format="rgb24")
     matrix = frame.side_data.get("DISPLAYMATRIX")
     if matrix is None:
@@ -294,10 +294,10 @@ def _upright(frame: Any) -> np.ndarray:
 
 @contextlib.contextmanager
 def _naming(path: Path, what: str) -> Iterator[None]:
-    """Say of whatever a library raises that this file cannot be read, in one line."""
+    """Turn any exception of a library into a one-line error that this file cannot be read."""
     try:
         yield
-    # Of a damaged file decoders raise nearly anything, SyntaxError and struct.error among it.
+    # For a damaged file decoders raise nearly anything, even SyntaxError and struct.error.
     except Exception as error:
         said = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
         raise ValueError(f"{path}: cannot be read as {what} ({said.splitlines()[0]})") from error

@@ -1,4 +1,4 @@
-"""What a sequence's folder says of it: its `seqinfo.ini`, and its files of detections."""
+"""The metadata of a sequence's folder: its `seqinfo.ini`, and its files of detections."""
 
 import re
 from pathlib import Path
@@ -23,7 +23,7 @@ class SequenceInfo(NamedTuple):
 
 
 def read_sequence_info(*folders: Path) -> SequenceInfo:
-    """What the `seqinfo.ini` says that lies in the first of these folders to hold one."""
+    """Read the `seqinfo.ini` in the first of these folders that has one."""
     path = next((folder / _INFO for folder in folders if (folder / _INFO).is_file()), None)
     if path is None:
         return SequenceInfo()
@@ -45,13 +45,13 @@ def detection_files(folder: Path) -> list[Path]:
 
 
 def sequence_of(detections: Path) -> Path | None:
-    """The folder whose file of detections this is, by its name and place; None for any other."""
+    """The folder of the sequence to which a file of detections belongs, by its path, or None."""
     folders = Path(detections).absolute().parents[:2]
     return next((folder for folder in folders if _is_among(detections, folder)), None)
 
 
 def last_frame(info: SequenceInfo, *rows: np.ndarray) -> int:
-    """The number of the last frame where there are no images: as said, or the last of any rows."""
+    """The number of the last frame where there are no images: as given, or the last of any rows."""
     if info.length is not None:
         return info.length
     return int(max((found[:, 0].max() for found in rows if len(found)), default=0))

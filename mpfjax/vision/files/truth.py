@@ -1,4 +1,4 @@
-"""The ground truth of a sequence: what is to be found, and what counts for nothing."""
+"""The ground truth of a sequence: the objects to be tracked, and what is not scored."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -11,8 +11,8 @@ from mpfjax.metrics.tracking_scores import IGNORED_OBJECT, IGNORED_REGION, UNSCO
 from mpfjax.vision.files.boxes import numbered_lines, parse_track
 from mpfjax.vision.files.sequences import read_sequence_info
 
-# MOTChallenge's classes: 1 are pedestrians, and who tracks one of these is not to blame. Rows of
-# the others (vehicles, occluders) only stand in the way when boxes are matched.
+# MOTChallenge's classes: 1 are pedestrians; a track of one of these is no false positive. Rows of
+# the others (vehicles, occluders) only take part when boxes are matched.
 _CLASSES = range(1, 14)
 _PEDESTRIAN = 1
 _PERSON_ON_VEHICLE, _VEHICLE, _STATIC_PERSON, _DISTRACTOR, _REFLECTION = 2, 6, 7, 8, 12
@@ -22,12 +22,13 @@ _FLAG, _CLASS = 6, 7
 
 
 class Truth(NamedTuple):
-    """The true boxes of a sequence, as `read_truth` finds them, in pixels, (x, y) the corner.
+    """The true boxes of a sequence, from `read_truth`, in pixels, (x, y) the top-left corner.
 
-    - `objects`: (s, 6), rows (frame, id, x, y, w, h) of what is to be tracked.
-    - `ignored`: (r, 6), rows (frame, kind, x, y, w, h) of what counts for nothing, with the kinds
-      of `mpfjax.metrics.remove_ignored`.
-    - `min_height`: a box that is no higher and matches nothing counts for nothing; 0 for none.
+    - `objects`: (s, 6), rows (frame, id, x, y, w, h) of the objects to be tracked.
+    - `ignored`: (r, 6), rows (frame, kind, x, y, w, h) of what is not scored, with the kinds of
+      `mpfjax.metrics.remove_ignored`.
+    - `min_height`: a tracked box of at most this height that matches nothing is not scored; 0 for
+      none.
     """
 
     objects: Float[np.ndarray, "s 6"]
@@ -35,7 +36,7 @@ class Truth(NamedTuple):
     min_height: float = 0.0
 
     def between(self, first: int, last: float = np.inf) -> "Truth":
-        """What lies in the frames `first` to `last`, both in."""
+        """The rows of frames `first` to `last`, both included."""
         objects, ignored = (
             rows[(first <= rows[:, 0]) & (rows[:, 0] <= last)]
             for rows in (self.objects, self.ignored)
@@ -76,7 +77,7 @@ def read_truth(path: str | Path) -> Truth:
         kinds = _NOT_TO_BLAME | ({_VEHICLE} if name.startswith("mot20") else set())
         not_to_blame = np.isin(classes, sorted(kinds))
         counted &= classes == _PEDESTRIAN
-        # In the order of the file, by which TrackEval settles draws.
+        # In the order of the file, by which TrackEval breaks ties.
         ignored = boxes[~counted]
         ignored[:, 1] = np.where(not_to_blame, IGNORED_OBJECT, UNSCORED_OBJECT)[~counted]
     ignored = np.concatenate([ignored, _ignore_file(path.parent / "ignore.txt")])

@@ -1,4 +1,4 @@
-"""The synthetic sequence of Smith and Gatica-Perez (2004), section 3.2: seven objects, one bait."""
+"""The synthetic sequence of Smith and Gatica-Perez (2004), 3.2: seven objects and a distracter."""
 
 from typing import Any, NamedTuple
 
@@ -20,9 +20,9 @@ _STEP_DEVIATION, _MOMENTUM = 3.0, 0.5  # of objects 2 to 7; all have the momentu
 _STARTS = np.array(
     [[180, 144], [60, 58], [180, 52], [300, 58], [60, 230], [180, 236], [300, 230]], float
 )
-_MARGIN = 8.0  # what objects keep free between each other and to the border
-_APPEARS, _VANISHES = 3, 9  # the frame in which the distracter comes, and the first without it
-# How far object 1 is clear of the distracter in its last frame, and at least at the end.
+_MARGIN = 8.0  # the least gap between objects and to the border
+_APPEARS, _VANISHES = 3, 9  # the frame in which the distracter appears, and the first without it
+# The gap between object 1 and the distracter in its last frame, and the least at the end.
 _CLEAR, _CLEAR_AT_THE_END = (4.0, 12.0), 12.0
 _TRIES, _AT_A_TIME = 20_000, 500
 # Head, body and feet of each object; those of the distracter come last.
@@ -57,7 +57,7 @@ class DistracterScene(NamedTuple):
 
     @property
     def template(self) -> tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "4"]]:
-        """The frame and box from which the looks of object 1 are learned: the distracter's."""
+        """The frame and box from which the template of object 1 is learned: the distracter's."""
         return self.frames[_APPEARS - 1], self.distracter[_APPEARS - 1]
 
 
@@ -76,27 +76,26 @@ def distracter_scene(
 ) -> DistracterScene:
     """Render seven objects on noise, and a distracter that lures the tracker of the first away.
 
-    Smith and Gatica-Perez (2004), section 3.2 and figures 2 and 3. The paper prints: 25 frames of
-    360 x 288 pixels; a noise-filled background; objects that move by
-    x_t = x_{t-1} + 0.5 (x_{t-1} - x_{t-2}) + 3 ω_t in both directions and do not change in size;
-    a distracter similar to object 1, from which object 1's histogram is learned (`template`),
-    which appears over object 1 in frame 3, leads the tracker astray, and is gone in frame 9; and
-    that object 1 is the quicker one. The rest is ours, chosen so that tables 1 and 2 come out:
-    looks, places and sizes; that the distracter stands still while object 1 walks away; and that
-    object 1 is clear of it by 4 to 12 pixels in frame 8 and by 12 in the last frame. Paths are
-    drawn again where two would meet or one would leave the frame. The same key gives the same
-    scene.
+    Smith and Gatica-Perez (2004), section 3.2 and figures 2 and 3. The paper says: 25 frames of 360
+    x 288 pixels; a background of noise; objects that move by x_t = x_{t-1} + 0.5 (x_{t-1} -
+    x_{t-2}) + 3 ω_t in both directions and do not change in size; a distracter similar to object 1,
+    from which object 1's histogram is learned (`template`), which appears over object 1 in frame 3,
+    leads the tracker astray, and is gone in frame 9; and that object 1 is the quicker one. The rest
+    is our choice, made so that tables 1 and 2 are reproduced: colours, places and sizes; that the
+    distracter stands still while object 1 walks away; and that object 1 is clear of it by 4 to 12
+    pixels in frame 8 and by 12 in the last frame. Paths are drawn again where two would meet or one
+    would leave the frame. The same key gives the same scene.
 
     - `num_frames`: t, from 3 on.
     - `size`: width and height of every object, in pixels.
-    - `speed`: of the distracter, in pixels a frame, against the way that object 1 takes.
+    - `speed`: of the distracter, in pixels a frame, in the direction opposite to object 1.
     - `deviation`: of ω_t of object 1, in pixels, where the others have 3.
     - `noise`: of the background, "grey" or "colour".
 
     `size=(32, 40), speed=6.0, deviation=3.0, noise="colour"` is a scene whose distracter runs away.
-    Raises `ValueError` for numbers out of their range and another noise, and, naming the argument
-    to change, where 20 000 tries find no path. Use it to see how a filter copes with a look-alike
-    that leads it away.
+    Raises `ValueError` for numbers out of their range and another noise, and, with the name of the
+    argument to change, where 20 000 tries find no path. Use it to see how a filter copes with a
+    look-alike that leads it away.
     """
     check_key(key)
     check_whole(_APPEARS, num_frames=num_frames)
@@ -191,7 +190,7 @@ def _draw_first(
 def _why_no_path(
     failed: dict[str, int], num_frames: int, sides: np.ndarray, speed: float, deviation: float
 ) -> str:
-    """Which argument to change, from how many paths failed for what reason."""
+    """Which argument to change, from the number of paths that failed for each reason."""
     never = f"in none of {_TRIES} tries"
     if failed["late"]:
         return f"num_frames: {never} does object 1 keep inside and apart for {num_frames} frames"
@@ -221,7 +220,7 @@ def _walks(
 
 
 def _lure(paths: np.ndarray, speed: float) -> np.ndarray:
-    """(tries, t, 1, 2): where distracters are, from object 1's place away from where it goes."""
+    """(tries, t, 1, 2): places of distracters, which start at object 1 and move away from it."""
     num_frames = paths.shape[1]
     last = min(_VANISHES - 2, num_frames - 1)
     appears = paths[:, _APPEARS - 1]

@@ -23,7 +23,7 @@ _HAIR = ((52, 36, 24), (20, 16, 14), (122, 88, 46), (24, 20, 18))
 
 
 class Scene(NamedTuple):
-    """A rendered video and the truth about it.
+    """A rendered video and its ground truth.
 
     - `frames`: RGB, shape (t, h, w, 3).
     - `tracks`: rows (frame, id, x, y, w, h) of every player's true box, in MOTChallenge form:
@@ -56,7 +56,7 @@ class _Camera(NamedTuple):
         return np.stack([u, v], axis=-1), scale
 
     def ground(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where each pixel meets the ground, x and y in metres, and the metres that it spans."""
+        """The point (x, y) in metres where each pixel meets the ground, and metres per pixel."""
         right, forward, up = (axis.astype(np.float32) for axis in self._axes())
         u = np.arange(self.width, dtype=np.float32)[None, :, None] + 0.5 - self.width / 2
         v = self.height / 2 - np.arange(self.height, dtype=np.float32)[:, None, None] - 0.5
@@ -89,7 +89,7 @@ def football_scene(
     Players of a team differ only in skin and hair. About every two seconds, at 12 frames a second,
     two players of a team change places and cross on the way. The players to track, of kit 0, have
     the ids from 1 on; the ids of their opponents follow. The same key gives the same scene. With
-    `still_camera` the camera does not move, as detection of moving objects needs it.
+    `still_camera` the camera does not move, as background subtraction requires.
 
     Raises `ValueError` for no frames, no pixels, fewer than one player or a negative number of
     opponents.

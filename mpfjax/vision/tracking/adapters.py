@@ -13,23 +13,23 @@ from mpfjax.checks import check_finite, check_whole, given, is_series, saying, s
 
 # MOTChallenge's columns: frame, id, x, y, w, h, and the score, where there is one.
 _BOX, _SCORE = slice(2, 6), 6
-# A tracker made for rows of detections has room for so many objects, and for no more than that.
+# A tracker that is made for rows of detections has room for at most so many objects.
 LEAST_ROOM, MOST_ROOM = 24, 1024
 
 
 class DetectedBoxes(NamedTuple):
-    """What was detected in one frame: boxes (x, y, w, h) and a score for each, or None."""
+    """The boxes (x, y, w, h) detected in one frame, and a score for each, or None."""
 
     boxes: Float[np.ndarray, "k 4"]
     scores: Float[np.ndarray, " k"] | None
 
 
 class AbstractDetector(abc.ABC):
-    """What is detected in a frame, by its number and its pixels."""
+    """Finds the detections of a frame, given its number and its pixels."""
 
     @abc.abstractmethod
     def find(self, number: int, frame: Any) -> DetectedBoxes:
-        """The detections of the frame of this number, whose pixels are None where there are none.
+        """Return the detections of a frame; `frame` is None where there are no pixels.
 
         Raises `StopIteration` where there are no further frames.
         """
@@ -39,14 +39,14 @@ class AbstractDetector(abc.ABC):
         del last
 
     def most_objects(self) -> int:
-        """How many objects there should be room for, as far as can be told beforehand."""
+        """How many objects there should be room for, as far as is known beforehand."""
         return LEAST_ROOM
 
 
 def as_detector(detections: Any, first: int = 1) -> AbstractDetector:
-    """Wrap rows, an iterable or a callable; frames are numbered from `first` on.
+    """Wrap rows, an iterable or a callable as a detector. Frames are numbered from `first` on.
 
-    Raises `ValueError` for anything else, and for rows that are not MOTChallenge's.
+    Raises `ValueError` for anything else, and for rows that are not in MOTChallenge's form.
     """
     if isinstance(detections, AbstractDetector):
         return detections
@@ -111,14 +111,14 @@ class Rows(AbstractDetector):
             _warn(f"detections: {late} lie in frames after the last, {last}, and were left out")
 
     def most_objects(self) -> int:
-        """Half as many again as are detected in all but the fullest frames."""
+        """One and a half times the number of detections in all but the fullest frames."""
         counts = np.unique(self.frames, return_counts=True)[1]
         usual = float(np.quantile(counts, 0.95)) if len(counts) else 0.0
         return int(np.clip(8 * np.ceil(1.5 * usual / 8), LEAST_ROOM, MOST_ROOM))
 
 
 class _Called(AbstractDetector):
-    """Somebody's function from a frame to its boxes, or to a pair of boxes and scores."""
+    """A user's function from a frame to its boxes, or to a pair of boxes and scores."""
 
     def __init__(self, function: Callable[[Any], Any]) -> None:
         self.function = function
@@ -130,7 +130,7 @@ class _Called(AbstractDetector):
 
 
 class _Streamed(AbstractDetector):
-    """The same for one frame after the other."""
+    """A user's iterable of boxes, or of pairs of boxes and scores, one item for each frame."""
 
     def __init__(self, stream: Iterator[Any]) -> None:
         self.stream = stream
@@ -151,12 +151,12 @@ class _Streamed(AbstractDetector):
 
 
 class Sieve:
-    """Takes out what cannot be tracked, and says once of each kind that it does.
+    """Removes detections that cannot be tracked, and warns once of each kind.
 
-    Detections that are too weak are left out silently; those of no area, and those wholly outside
-    the frame, with a warning. Raises `ValueError` for what is not finite, for scores that do not
-    fit, and where there are none to compare with `min_score`. `frame_size` is height and width,
-    where there are no pixels to tell them.
+    Detections with a score below `min_score` are left out silently; those without area, and those
+    wholly outside the frame, with a warning. `frame_size` is height and width, for recordings
+    without pixels. Raises `ValueError` for boxes or scores that are not finite, for scores of the
+    wrong shape, and where `min_score` is given and there are no scores.
     """
 
     def __init__(self, min_score: float | None, frame_size: tuple[int, int] | None = None) -> None:
@@ -167,7 +167,7 @@ class Sieve:
     def __call__(
         self, found: DetectedBoxes, number: int, frame: np.ndarray | None
     ) -> tuple[DetectedBoxes, Int[np.ndarray, " k"]]:
-        """The detections of a frame that can be tracked, and their rows among all of them."""
+        """The detections of a frame that can be tracked, and the row of each among all of them."""
         boxes, scores = _checked(found, number)
         keep = np.ones(len(boxes), bool)
         if self.min_score is not None and len(boxes):
@@ -197,25 +197,23 @@ class Sieve:
 
 
 class Once:
-    """Warns of each kind of thing the first time that it comes, and not in every frame."""
+    """Warns of each kind of problem once, and not in every frame."""
 
     def __init__(self) -> None:
         self.said: set[str] = set()
 
     def warn(self, kind: str, message: str) -> None:
-        """Warn, unless of this kind before."""
+        """Warn, unless a warning of this kind was given before."""
         if kind not in self.said:
             self.said.add(kind)
             _warn(f"{message} (here and wherever else it is so)")
 
 
 def _as_found(value: Any, number: int) -> DetectedBoxes:
-    """A pair of boxes and scores, or boxes alone."""
+    """A pair of boxes and scores, whether the user gave both or boxes alone."""
     boxes, scores = value if isinstance(value, tuple) and len(value) == 2 else (value, None)
     if boxes is None:
-        raise ValueError(
-            f"detections: frame {number}: None is no boxes; [] says that there is none"
-        )
+        raise ValueError(f"detections: frame {number}: None is no array; [] has no detections")
     rows = to_rows(4, f"detections: frame {number}", boxes)
     return DetectedBoxes(rows, None if scores is None else _as_scores(scores, number))
 

@@ -1,4 +1,4 @@
-"""The colours that each object is known by, learned while it stands alone."""
+"""The colour histogram of each object, learned while the object stands alone."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,16 +15,18 @@ from mpfjax.vision.tracking.occlusion import in_front
 
 
 class LearnAppearance(AbstractMove):
-    """Move each component's reference histogram towards what its detection shows now.
+    """Move each component's reference histogram towards the colours of its detection.
 
-    h_ref <- (1 - adaptation) h_ref + adaptation h(d), in frames in which a detection bears the
-    component out and no other component overlaps its box by more than `contact` (intersection over
-    union) or shares that detection: of two in contact, either would learn the other's colours. The
-    first detection of a component gives it its reference. It leaves the particles as they are;
-    memory: the references, (m, parts, channels, bins), all zero for a component that has none.
+        h_ref <- (1 - adaptation) h_ref + adaptation h(d)
+
+    A component learns in frames in which a detection d is assigned to it, no other component's box
+    overlaps its own by more than `contact` (intersection over union), and it shares its detection
+    with no other. Objects in contact would learn each other's colours. The first detection of a
+    component sets its reference. The particles do not change. Memory: the references, (m, parts,
+    channels, bins), all zero for a component that has none.
 
     The model changes with the data (`approximate` is true). Raises `ValueError` for shares outside
-    [0, 1] and a number of parts that is no whole number from 1 on.
+    [0, 1] and for a number of parts that is not a whole number from 1 on.
     """
 
     colours: AbstractColours
@@ -43,16 +45,16 @@ class LearnAppearance(AbstractMove):
 
     @property
     def approximate(self) -> bool:
-        """True: what is seen changes what is expected."""
+        """True: the references are learned from the same data that they explain."""
         return True
 
     def initial_memory(self, num_components: int) -> dict[str, Array]:
-        """Nobody has colours yet."""
+        """No component has a reference yet."""
         shape = (num_components, self.num_parts, self.colours.num_channels, self.colours.num_bins)
         return {REFERENCES: jnp.zeros(shape)}
 
     def forget(self, memory: dict, dead: Bool[Array, " m"]) -> dict:
-        """The dead have none."""
+        """Clear the references of dead components."""
         references = memory[REFERENCES]
         return memory | {REFERENCES: jnp.where(dead[:, None, None, None], 0.0, references)}
 
@@ -70,7 +72,7 @@ class LearnAppearance(AbstractMove):
         others = alive[None] & ~jnp.eye(len(boxes), dtype=bool)
         alone = ~jnp.any((overlap(boxes, boxes) > self.contact) & others, axis=1)
         known = jnp.any(references > 0, axis=(1, 2, 3))
-        # What holds no pixel teaches nothing.
+        # A detection that holds no pixel has no colours to learn.
         alone &= ~in_front(mixture)
         teaches = (source >= 0) & jnp.any(seen > 0, axis=(1, 2, 3)) & (alone | ~known)
         rate = jnp.where(teaches, jnp.where(known, self.adaptation, 1.0), 0.0)

@@ -1,4 +1,4 @@
-"""Which detection is whose: the likeliest for all together, and how sure that is for each."""
+"""Data association: the most probable assignment, and the probability of each of its pairs."""
 
 import equinox as eqx
 import jax
@@ -26,37 +26,42 @@ from mpfjax.vision.tracking.observation import TrackedFrame
 
 _NONE, _IMPOSSIBLE = -1, 1e4
 _DIMENSIONS = 4
-_UNDECIDED = 0.25  # B² of colours that speak neither for an object nor against it
-_ROUNDS = 15  # of messages; where two components compete for two detections fewer are enough
-_LEAST = 1e-3  # a marginal below this counts as this
-_SMALL = 10.0  # log odds of which float32 keeps a thousandth of 1 beside the odds
+_UNDECIDED = 0.25  # B² at which colours are evidence neither for nor against a pair
+_ROUNDS = 15  # iterations of messages; fewer suffice where two rows compete for two columns
+_LEAST = 1e-3  # marginals are at least this
+_SMALL = 10.0  # log odds at which float32 still resolves a thousandth of 1 added to the odds
 
 
 class Assign(AbstractMove):
-    """Give every component at most one detection, and every detection to at most one component.
+    """Assign at most one detection to each component, and each detection to at most one component.
 
-    The assignment of the least total cost (Kuhn 1955). Component m and detection d cost
-    -2 log p(d | m), up to a constant, where p is Student's density with `freedom` degrees and
-    lengths count in boxes: (ν + 4) log(1 + |d - μ_m|² / ν) + log |S_m|, with μ_m and S_m the
-    moments of the component's prediction and of the detector's error. To this come `colour_cost`
-    times B² - 1/4, where B² is the mean of the detection's colours from the component's,
-    `weak_cost` for a weak detection, and `doubt_cost` for a component that is not yet confirmed.
-    No detection costs `gate`. So a component rather gets none than one that costs more, which is
-    rather that of a newcomer, above all where the component has been unseen for long; and objects
-    that meet are settled together.
+    The assignment has the least total cost (Kuhn 1955). The cost of component m and detection d is
+    -2 log p(d | m), up to a constant. Here p is Student's density with ν = `freedom` degrees of
+    freedom, and lengths are in units of the box:
 
-    How sure a component can be of its detection is the pair's probability in the joint distribution
-    of all assignments, p ∝ Π exp((gate - cost) / 2T) over its pairs, by `marginals`. The
-    `temperature` T, above 1, allows for cues that are not as independent as they are taken for.
-    With p_m that of the chosen pair, the posterior of joint probabilistic data association
-    (Fortmann, Bar-Shalom and Scheffe 1983) is that of the pair with weight p_m and the prediction
-    otherwise: of two in contact, who cannot tell whose a detection is follows it less.
+        cost(m, d) = (ν + 4) log(1 + |d - μ_m|² / ν) + log |S_m|
 
-    It leaves the particles as they are; memory: the row of each component's detection, -1 for none,
-    and the doubts, 1 - p_m.
+    where μ_m and S_m are the mean and covariance of the predicted detection. To this are added
+    `colour_cost` times (B² - 1/4), where B² is the mean squared Bhattacharyya distance between the
+    colours of the detection and those of the component; `weak_cost` for a weak detection; and
+    `doubt_cost` for a component that is not yet confirmed. A component without a detection costs
+    `gate`, so that no pair with a higher cost is formed: its detection more probably belongs to a
+    new object. Because of log |S_m| this happens more often to components that have been unseen for
+    long.
 
-    One assignment stands for all that there are (`approximate` is true). Raises `ValueError` for a
-    gate that is not finite, a temperature or degrees that are not positive, a cost below zero.
+    The probability of a pair under the joint distribution of all assignments, p ∝ Π exp((gate -
+    cost) / 2T) over the pairs of an assignment, is computed by `marginals`. A `temperature` T above
+    1 allows for cues that are not independent. With p_m the probability of the chosen pair, the
+    posterior of joint probabilistic data association (Fortmann, Bar-Shalom and Scheffe 1983)
+    follows the pair with weight p_m and the prediction with weight 1 - p_m: where two objects are
+    in contact and the association is ambiguous, a component follows its detection less.
+
+    The particles do not change. Memory: the index of each component's detection, -1 for none, and
+    the doubts, 1 - p_m.
+
+    A single assignment stands for all possible ones (`approximate` is true). Raises `ValueError`
+    for a gate that is not finite, for a temperature or degrees of freedom that are not positive,
+    and for a cost below zero.
     """
 
     model: DetectedObjectModel
@@ -81,16 +86,16 @@ class Assign(AbstractMove):
 
     @property
     def approximate(self) -> bool:
-        """True: the likeliest assignment is taken for the only one."""
+        """True: the most probable assignment is taken for the only one."""
         return True
 
     def initial_memory(self, num_components: int) -> dict[str, Array]:
-        """Nobody has a detection."""
+        """No component has a detection."""
         nothing = jnp.full(num_components, _NONE, jnp.int32)
         return {ASSIGNED: nothing, DOUBTS: jnp.zeros(num_components)}
 
     def forget(self, memory: dict, dead: Array) -> dict:
-        """The dead have none."""
+        """Dead components have no detection."""
         return memory | {
             ASSIGNED: jnp.where(dead, _NONE, memory[ASSIGNED]),
             DOUBTS: jnp.where(dead, 0.0, memory[DOUBTS]),
@@ -99,10 +104,10 @@ class Assign(AbstractMove):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
-        """Settle whose each detection is."""
+        """Assign the detections of this frame."""
         del key
         cost = self.costs(mixture, observation)
-        # A column of its own for each component that gets none.
+        # Each component has one more column of its own, for no detection.
         none = jnp.where(jnp.eye(len(cost), dtype=bool), self.gate, _IMPOSSIBLE)
         rows, columns = hungarian_algorithm(
             jnp.concatenate([cost, none.astype(cost.dtype)], axis=1)
@@ -133,9 +138,9 @@ class Assign(AbstractMove):
         observation: TrackedFrame,
         slack: Float[Array, "2"] | None = None,
     ) -> Float[Array, "m d"]:
-        """What each pair costs, or a number beyond all costs where it is impossible.
+        """The cost of each pair, or a number above all costs where the pair is impossible.
 
-        `slack`: further standard deviations of x and y, in pixels, that all predictions have.
+        `slack`: standard deviations of x and y, in pixels, to be added to those of all predictions.
         """
         found, lives = observation.detections, mixture.memory[LIVES]
         scores = mixture.memory[SCORES]
@@ -155,14 +160,14 @@ class Assign(AbstractMove):
         boxes: Float[Array, "d 4"],
         slack: Float[Array, "2"] | None,
     ) -> tuple[Float[Array, "m d"], Float[Array, " m"]]:
-        """Squared distance of each detection in deviations of the prediction, and log |S_m|.
+        """Squared Mahalanobis distance of each detection from each prediction, and log |S_m|.
 
-        Coordinates are taken for independent.
+        Coordinates are treated as independent.
         """
         noises = noises_of(mixture, self.model)
         moved = self.model.predicted(mixture.particles, noises)
         means = mixture.component_averages(moved.place)
-        # About the mean, or rounding would drown the spread of a box at a thousand pixels.
+        # Centred first: the spread of a box a thousand pixels from the origin is lost to rounding.
         offsets = moved.place - take(means, mixture.component_indicators)
         variances = mixture.component_averages(offsets**2 + moved.gaussian.var_place)
         unit = units(means)
@@ -187,22 +192,22 @@ class Assign(AbstractMove):
 
 
 def marginals(log_odds: Float[Array, "m d"]) -> Float[Array, "m d"]:
-    """The probability of each pair where no row and no column is in more than one.
+    """The probability of each pair, where each row and each column is in at most one pair.
 
-    An assignment has the weight Π exp(log_odds) over its pairs; a row or column in none counts 1.
-    The marginals of that joint distribution by messages from rows to columns and back (loopy belief
-    propagation, Williams and Lau 2014): exact where the possible pairs form no loop. Otherwise they
-    are too sure. With log odds up to 5 that is .02 in the mean
-    over random problems of up to six by six, and up to .3 where two rows and two columns all go
-    together: for log odds of 5, 4.3, 4.3 and 4.3 it gives .88, and the marginal is .63. With log
-    odds without a bound it is up to a half.
+    An assignment has the weight Π exp(log_odds) over its pairs; a row or column without a pair
+    contributes a factor of 1. The marginals of this joint distribution are computed by loopy belief
+    propagation with messages from rows to columns and back (Williams and Lau 2014). They are exact
+    where the possible pairs form no cycle. Otherwise they are overconfident. With log odds up to 5
+    the mean error is .02 over random problems of up to six by six. The error is up to .3 where each
+    of two rows can go with each of two columns: for log odds of 5, 4.3, 4.3 and 4.3 the result is
+    .88, and the exact marginal is .63. With unbounded log odds the error is up to a half.
     """
     small = jnp.max(log_odds, initial=0.0) < _SMALL
     return jax.lax.cond(small, _marginals_of_odds, _marginals_of_logs, log_odds)
 
 
 def _marginals_of_odds(log_odds: Float[Array, "m d"]) -> Float[Array, "m d"]:
-    """A tenth of the time of `_marginals_of_logs`; large odds would drown the 1 of no pair."""
+    """The messages as odds, in a tenth of the time of `_marginals_of_logs`, for moderate odds."""
     odds = jnp.exp(log_odds)
 
     def reply(_: Int[Array, ""], back: Float[Array, "m d"]) -> Float[Array, "m d"]:
@@ -215,7 +220,7 @@ def _marginals_of_odds(log_odds: Float[Array, "m d"]) -> Float[Array, "m d"]:
 
 
 def _marginals_of_logs(log_odds: Float[Array, "m d"]) -> Float[Array, "m d"]:
-    """The same messages by their logarithms, for odds of any size."""
+    """The same messages as logarithms, for odds of any size."""
 
     def reply(_: Int[Array, ""], back: Float[Array, "m d"]) -> Float[Array, "m d"]:
         return -_others(log_odds - _others(log_odds + back, axis=1), axis=0)
@@ -228,7 +233,7 @@ def _marginals_of_logs(log_odds: Float[Array, "m d"]) -> Float[Array, "m d"]:
 def _others(logs: Float[Array, "m d"], axis: int) -> Float[Array, "m d"]:
     """log(1 + the sum of the exponentials of all others along an axis), for each.
 
-    Nothing large is subtracted from what it is part of: the highest one's others are summed anew.
+    The sum without the largest entry is computed anew, since subtracting it would cancel.
     """
     first = jnp.argmax(logs, axis=axis, keepdims=True)
     others = jnp.arange(logs.shape[axis]).reshape((1, -1) if axis == 1 else (-1, 1)) != first
@@ -243,6 +248,6 @@ def _others(logs: Float[Array, "m d"], axis: int) -> Float[Array, "m d"]:
 
 
 def own_detections(source: Int[Array, " m"], detections: Detections) -> Detections:
-    """The detection of each component, not valid where it has none."""
+    """The detection of each component; not valid for a component that has none."""
     rows = jnp.maximum(source, 0)
     return Detections(take(detections.boxes, rows), source >= 0, take(detections.scores, rows))

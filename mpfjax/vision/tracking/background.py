@@ -1,4 +1,4 @@
-"""Moving objects found by background subtraction, which start a tracker without a drawn box."""
+"""Moving objects found by background subtraction, so that a tracker needs no drawn box."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -22,48 +22,49 @@ from mpfjax.vision.files.frames import check_frame
 
 # What OpenCV's mask holds where a pixel is foreground; a shadow has another value.
 _FOREGROUND = 255
-# How many blobs are remembered for their shape, and from how many on it counts.
+# How many blobs the median shape is taken over, and the fewest that it is taken over.
 _REMEMBERED, _ENOUGH = 500, 20
-# A part of a blob may be so much narrower than one is.
+# A part that is cut from a blob has at least this share of an object's usual width.
 _NARROWEST = 2.4
-# The height of a blob before any was seen, as a share of the frame's.
+# The height of an object before any was seen, as a share of the frame's.
 _UNKNOWN_HEIGHT = 0.125
 
 
 class BackgroundSubtraction:
-    """Boxes of what moves before a still camera: an adaptive Gaussian mixture for each pixel.
+    """Boxes of moving objects before a still camera: an adaptive Gaussian mixture for each pixel.
 
-    Lin et al. (2012), section 5, detect their targets like this; the mixture is OpenCV's MOG2
-    (Zivkovic 2004). Pixels that fit none of the background's Gaussians and are no shadow make
-    blobs, gaps in a blob's height are closed, a blob that is too wide for one is cut where its
-    outline dips, as between two heads, and what does not have the size is dropped. What too wide
-    means is learned from the video, unless it is given: people or cars, most blobs are one. Two
-    one behind the other stay one blob, and what stands still long enough becomes background.
+    Lin et al. (2012), section 5, detect their targets in this way; the mixture is OpenCV's MOG2
+    (Zivkovic 2004). Pixels that fit none of the background's Gaussians and are no shadow form
+    blobs. Gaps in the height of a blob are closed. A blob too wide for one object is cut where its
+    outline dips, as between two heads. Blobs outside the limits of size and shape are dropped. The
+    usual shape is learned from the video unless it is given, under the assumption that most blobs
+    are single objects. Two objects one behind the other remain one blob, and an object that stands
+    still long enough becomes background.
 
     - `history`: frames over which the background is forgotten.
     - `threshold`: how many standard deviations from a Gaussian a pixel still belongs to it.
-    - `background_share`: share of a pixel's history, in (0, 1), that is background. Someone who
-      stands still becomes background after about log(1 / share) · history frames, or sooner in a
-      young video: (1 / share² - 1) times as many frames as came before. The larger, the sooner;
-      and ghosts, where someone stood from the first frame on, vanish by the same rule.
+    - `background_share`: share of a pixel's history, in (0, 1), that is background. An object that
+      stands still becomes background after about log(1 / share) · history frames, or earlier in a
+      young video, after (1 / share² - 1) times the number of frames before it stopped. A larger
+      share makes it earlier. Ghosts, left where an object stood from the first frame on, vanish by
+      the same rule.
     - `shadow_brightness`: darkest shadow, as a share of the background's brightness, in (0, 1);
       None where shadows count as foreground.
-    - `warm_up`: first frames that only teach the background, at least 1, the first of all.
-    - `area`: least and most area of a box, as shares of the frame's.
-    - `aspect`: least and most height of a box, in widths; None is any shape.
+    - `warm_up`: the number of first frames that only teach the background, at least 1.
+    - `area`: least and largest area of a box, as shares of the frame's.
+    - `aspect`: least and largest height of a box, in widths; None accepts any shape.
     - `largest_gap`: height of the gaps that are closed, as a share of the median height of the
       blobs so far; of an eighth of the frame's height until there are a few.
     - `cut_aspect`: a blob lower than this many widths may be cut; None takes the median of the
       blobs so far, once there are a few, and 0 cuts none.
     - `cut_depth`: how high the outline may reach between two heads, as a share of the lower one's
-      height above the blob's foot, in (0, 1).
+      height above the foot of the blob, in (0, 1).
+    - `most_pixels`: a frame with more pixels is reduced before detection, by a whole number along
+      both sides; boxes are in pixels of the original frame.
 
-    - `most_pixels`: a larger frame is reduced to at most so many before anything is looked for, by
-      a whole number along both sides; boxes are in pixels of the frame that is given.
-
-    Defaults are tuned on people before a street camera. One object serves one video, since it
-    keeps that video's background; colours may come in any fixed order of the three channels. Use
-    it to start tracks; where the camera moves, all is foreground and nothing is found.
+    Defaults are tuned on people before a street camera. An instance serves one video, since it
+    keeps that video's background. Colour channels may come in any fixed order. Use it to start
+    tracks. It is of no use with a moving camera, where every pixel is foreground.
 
     Raises `ValueError` for a setting outside its range, `ImportError` where OpenCV is missing.
     """
@@ -112,10 +113,10 @@ class BackgroundSubtraction:
     def learn(self, frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
         """Learn the background afresh from frames of the video, all with the same weight.
 
-        A hundred, spread evenly over a long video, are enough. `detect` then finds people from its
-        first frame on, but a spot that is taken in 1 - `background_share` of these frames, by
-        someone who stands still, counts as background. Use it where the whole video is at hand.
-        Raises `ValueError` where there are no frames, and for frames as `detect` does.
+        A hundred frames, spread evenly over a long video, are enough. `detect` then finds objects
+        from its first frame on. A pixel that an object covers in a share 1 - `background_share` of
+        these frames counts as background. Use it where the whole video is at hand. Raises
+        `ValueError` where there are no frames, and for frames as `detect` does.
         """
         check_type(Iterable, "frames one after the other", frames=frames)
         self._forget()
@@ -126,15 +127,15 @@ class BackgroundSubtraction:
         self._frames_seen = max(self.history, self.warm_up)
 
     def detect(self, frame: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "k 4"]:
-        """The boxes (x, y, w, h) in pixels of what moves, (x, y) the top-left corner.
+        """The boxes (x, y, w, h) in pixels of moving objects, with (x, y) the top-left corner.
 
-        Boxes lie inside the frame, ordered from left to right; there are none in the first
-        `warm_up` frames. The frame joins the background, with more weight the fewer came before.
-        Raises `ValueError` for a frame that is not (h, w, 3) of type uint8, or differs in size
-        from those before it.
+        Boxes lie inside the frame, ordered from left to right. The first `warm_up` frames have
+        none. The frame joins the background; the fewer frames came before, the larger is its
+        weight. Raises `ValueError` for a frame that is not (h, w, 3) of type uint8, or whose size
+        differs from that of the frames before it.
         """
-        # The schedule of OpenCV itself: the young background leans to what is new, so that who
-        # was there in the first frame leaves no ghost behind.
+        # OpenCV's own schedule: a young background learns fast, so that an object that was
+        # there in the first frame leaves no ghost.
         rate = 1 / min(2 * (self._frames_seen + 1), self.history)
         foreground = self._subtract(frame, rate)
         self._frames_seen += 1
@@ -187,7 +188,7 @@ class BackgroundSubtraction:
     def _blobs(self, foreground: np.ndarray) -> list[tuple[int, int, int, int]]:
         gap = round(self.largest_gap * self._usual_height(len(foreground)))
         if gap > 0:
-            # Only upward and downward: who walks side by side must not be joined.
+            # Vertically only: people who walk side by side must not be joined.
             line = np.ones((gap + 1, 1), np.uint8)
             foreground = self._cv2.morphologyEx(foreground, self._cv2.MORPH_CLOSE, line)
         _, labels, found, _ = self._cv2.connectedComponentsWithStats(foreground, connectivity=8)
@@ -198,7 +199,7 @@ class BackgroundSubtraction:
             for label, place in enumerate(found[1:].tolist(), 1)
             if place[2] * place[3] >= self.area[0] * foreground.size
         ]
-        # Who leaves the frame in part does not show its shape.
+        # An object that is partly outside the frame does not show its shape.
         bottom, right = foreground.shape
         whole = [
             (w, h)
@@ -214,7 +215,7 @@ class BackgroundSubtraction:
         return boxes
 
     def _cut_aspect(self) -> float:
-        """The height of one, in widths, below which a blob may be several; 0 where unknown."""
+        """A blob lower than this many widths may be several objects; 0 where this is unknown."""
         if self.cut_aspect is not None:
             return self.cut_aspect
         return float(np.median(self._aspects)) if len(self._aspects) >= _ENOUGH else 0.0
@@ -225,14 +226,14 @@ class BackgroundSubtraction:
         return float(np.median(self._heights)) if known else _UNKNOWN_HEIGHT * rows
 
     def _cut(self, blob: Bool[np.ndarray, "h w"], widest: float) -> list[tuple[int, int, int, int]]:
-        """The boxes of those side by side in a blob that fills its array."""
+        """The boxes of the objects that stand side by side in a blob that fills its array."""
         height, width = blob.shape
         most = min(self.aspect[1], _NARROWEST * widest)
         narrowest = max(int(np.ceil(height / most)), 1) if most > 0 else width
         if height >= widest * width or width <= 2 * narrowest:
             return [(0, 0, width, height)]
-        # How high the blob reaches in each column. It dips between two heads; the legs of one
-        # person who strides do not show.
+        # How high the blob reaches in each column. It dips between two heads, but not between
+        # the legs of one person.
         outline = np.where(blob.any(axis=0), height - blob.argmax(axis=0), 0)
         outline = np.convolve(np.pad(outline, 1, mode="edge"), np.full(3, 1 / 3), "valid")
         left = np.maximum.accumulate(outline)
@@ -262,7 +263,7 @@ class BackgroundSubtraction:
 
 
 def _range(values: Any) -> np.ndarray:
-    """Two numbers, or twice NaN where they are something else, which is in no range."""
+    """Two numbers, or twice NaN, which is in no range, where `value` is something else."""
     try:
         numbers = np.asarray(values, float)
     except (TypeError, ValueError):
@@ -279,6 +280,6 @@ def _cv2() -> ModuleType:
         import cv2
     except ImportError as error:
         raise ImportError(
-            "OpenCV is needed to detect what moves: pip install opencv-python-headless"
+            "OpenCV is needed for background subtraction: pip install opencv-python-headless"
         ) from error
     return cv2

@@ -1,4 +1,4 @@
-"""Births: a component for every strong detection that no component explains."""
+"""Births: a new component for every strong detection that no component explains."""
 
 import equinox as eqx
 import jax
@@ -31,15 +31,16 @@ from mpfjax.vision.tracking.observation import TrackedFrame, overlap, within
 
 
 class Births(AbstractMove):
-    """Found a component on each strong detection that is nobody's, while there is room.
+    """Start a component at each strong detection that has none, while there is room.
 
-    Its place scatters about the detection as the detector errs, its velocity about zero. A
-    detection that overlaps a living component's box by more than `birth_overlap`
-    (intersection over union), or a stronger founding detection, founds none: it is a second one of
-    the same object. Who is found in the first frame is no newcomer, since objects are there when a
-    video starts, and is believed in at once. Of more than there is room for, the strongest
-    are chosen. Memory: `Lives`, with `Deaths`, which keeps it; the assignments, so that a founding
-    detection is its component's own.
+    The place of a new component has the detector's error as its standard deviation, and its
+    velocity has mean zero. A detection starts no component if it is assigned to one, or if it
+    overlaps the box of a living component, or a stronger unassigned detection, by more than
+    `birth_overlap` (intersection over union): it is then a second detection of the same object.
+    Components of the first frame are confirmed at once, because objects are there when a video
+    starts. If there are more detections than there is room for, the strongest are chosen. Memory:
+    `Lives`, together with `Deaths`, which initialises it; and the assignments, so that a component
+    is assigned the detection that started it.
 
     - `particles_per_object`: P.
 
@@ -63,11 +64,11 @@ class Births(AbstractMove):
 
     @property
     def approximate(self) -> bool:
-        """True: mass appears where a detection is."""
+        """True: a birth adds probability mass at a detection."""
         return True
 
     def founding(self, mixture: ParticleMixture, observation: TrackedFrame) -> Bool[Array, " d"]:
-        """Which detections would found a component, if there were room for all."""
+        """Which detections would start a component if there were room for all."""
         found, source = observation.detections, mixture.memory[ASSIGNED]
         lives: Lives = mixture.memory[LIVES]
         rows = jnp.where(source >= 0, source, len(found.valid))
@@ -76,14 +77,14 @@ class Births(AbstractMove):
         covered = overlap(mean_boxes(mixture), found.boxes) > self.birth_overlap
         wanted = free & strong & within(found.boxes, mixture.memory[EXTENT])
         wanted &= ~jnp.any(covered & lives.alive[:, None], axis=0)
-        # One that a stronger one covers is its double, even where that one founds none either.
+        # One that a stronger one covers is a double, even where the stronger one starts none.
         doubles = (overlap(found.boxes, found.boxes) > self.birth_overlap) & wanted[:, None]
         return wanted & ~jnp.any(doubles & stronger(found), axis=0)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
-        """Found components, and give them names."""
+        """Start components, and give them identities."""
         del key
         found, lives = observation.detections, mixture.memory[LIVES]
         founding = self.founding(mixture, observation)
@@ -95,7 +96,7 @@ class Births(AbstractMove):
             drawn,
             mixture.particles,
         )
-        # The weight of a slot within its component; `ShareMass` settles that of the components.
+        # Weights within a component; `ShareMass` sets the mixture weights.
         log_share = -jnp.log(jnp.asarray(self.particles_per_object, mixture.log_weights.dtype))
         mixture = mixture.replace(
             particles=particles,
@@ -121,7 +122,7 @@ class Births(AbstractMove):
     def _started(
         self, mixture: ParticleMixture, seats: Int[Array, " n"], boxes: Float[Array, "m 4"]
     ) -> ObjectState:
-        """Hypotheses for every slot about the founding detection of its component."""
+        """Hypotheses for every slot, about the detection that started its component."""
         places = places_of(boxes)
         unit, still = units(places), jnp.zeros_like(places)
         errors = noises_of(mixture, self.model).errors[None]
@@ -132,31 +133,34 @@ class Births(AbstractMove):
     def _seats(
         self, mixture: ParticleMixture, born: Bool[Array, " m"]
     ) -> tuple[Int[Array, " n"], Bool[Array, " n"]]:
-        """Deal empty slots to the newborn, P each: the component of every slot, and whether."""
+        """Deal empty slots to new components, P each.
+
+        Returns the component of every slot, and whether the slot is one of a new component.
+        """
         empty = ~mixture.occupied
         number = (jnp.cumsum(empty, dtype=jnp.int32) - 1) // self.particles_per_object
-        order = jnp.argsort(~born, stable=True).astype(jnp.int32)  # the newborn first
+        order = jnp.argsort(~born, stable=True).astype(jnp.int32)  # new components first
         filled = empty & (number < jnp.sum(born, dtype=jnp.int32))
         return take(order, jnp.clip(number, 0, len(born) - 1)), filled
 
 
 class ShareMass(AbstractMove):
-    """Give every living component the same mass, one share of the whole each.
+    """Give every living component the same mixture weight.
 
     Components stand for objects that all exist, and are not rival hypotheses: the prior reassembly
-    of Smith and Gatica-Pérez (2004). What the likelihood says of one object against another is
-    dropped (`approximate` is true).
+    of Smith and Gatica-Pérez (2004). The likelihood of one object relative to another is dropped
+    (`approximate` is true).
     """
 
     @property
     def approximate(self) -> bool:
-        """True: the masses that the likelihood gave are replaced."""
+        """True: the mixture weights that follow from the likelihood are replaced."""
         return True
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
-        """The same mass for each."""
+        """Set all mixture weights to the same value."""
         del key, observation
         number = jnp.maximum(jnp.sum(mixture.active), 1).astype(mixture.log_weights.dtype)
         log_weights = mixture.log_component_weights - jnp.log(number)
@@ -164,7 +168,7 @@ class ShareMass(AbstractMove):
 
 
 def _ranks(found: Detections) -> Int[Array, " d"]:
-    """The place of each detection, strongest first, and of equally strong ones the largest."""
+    """The rank of each detection: the strongest first, and of equally strong ones the largest."""
     areas = jnp.prod(found.boxes[:, 2:], axis=1)
     order = jnp.lexsort((-areas, -found.scores)).astype(jnp.int32)
     return jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=jnp.int32))
@@ -179,7 +183,7 @@ def stronger(found: Detections) -> Bool[Array, "d d"]:
 def matched(
     wanted: Bool[Array, " d"], found: Detections, free: Bool[Array, " m"]
 ) -> tuple[Int[Array, " m"], Bool[Array, " m"]]:
-    """For each free place the wanted row that it takes, strongest first, and whether it does."""
+    """The index of the wanted row that each free place takes, strongest first, and whether any."""
     ranks = jnp.where(wanted, _ranks(found), len(wanted))
     rows = jnp.argsort(ranks, stable=True).astype(jnp.int32)
     rank = jnp.cumsum(free, dtype=jnp.int32) - 1

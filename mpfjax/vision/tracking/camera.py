@@ -19,18 +19,22 @@ _ROUNDS = 5
 
 
 class FollowCamera(AbstractMove):
-    """Move every component by what the innovations of all objects have in common.
+    """Shift every component by the motion that all objects have in common.
 
-    A camera that shakes or turns shifts all objects at once, by no velocity of theirs. Confirmed
-    components and strong detections that prefer each other, by the costs of `assign`, give
-    innovations e_m with variances S_m. With e_m = c + noise, c ~ N(0, σ_c²), and heavy tails for
-    those who move on their own, the posterior mean of the shift c is found by weighted least
-    squares, with Student's weights of `freedom` degrees. σ_c, in median boxes, is learned with a
-    forgetting of `rate`: before a still camera it becomes nothing.
+    A camera that shakes or turns shifts all objects at once, independently of their velocities. A
+    confirmed component and a strong detection form a pair where each has its least cost, by the
+    costs of `assign`, with the other. Pair m has an innovation e_m with variance S_m. The model is
 
-    It leaves the weights as they are; memory: the last shift, and σ_c. What objects have in common
-    is taken for the camera's (`approximate` is true). Raises `ValueError` for freedom that is not
-    positive and a rate outside [0, 1].
+        e_m = c + noise,  c ~ N(0, σ_c²)
+
+    with heavy-tailed noise for objects that move on their own. The posterior mean of the shift c is
+    computed by iterated weighted least squares, with Student's weights of `freedom` degrees. σ_c,
+    in median boxes, is learned with the forgetting rate `rate`: it tends to zero before a still
+    camera.
+
+    The weights do not change. Memory: the last shift, and σ_c. Any motion that objects have in
+    common is taken for the camera's (`approximate` is true). Raises `ValueError` for degrees of
+    freedom that are not positive and for a rate outside [0, 1].
     """
 
     assign: Assign
@@ -48,18 +52,18 @@ class FollowCamera(AbstractMove):
 
     @property
     def approximate(self) -> bool:
-        """True: what is common is taken for the camera's."""
+        """True: any common motion is taken for the camera's."""
         return True
 
     def initial_memory(self, num_components: int) -> dict[str, Camera]:
-        """A camera that stands nearly still."""
+        """A camera that is nearly still."""
         del num_components
         return {CAMERA: Camera(jnp.zeros(2), jnp.full(2, 0.02, default_float()))}
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
-        """Find the shift, and move everybody by it."""
+        """Estimate the shift, and add it to every component."""
         del key
         camera: Camera = mixture.memory[CAMERA]
         model, noises = self.assign.model, noises_of(mixture, self.assign.model)
@@ -94,7 +98,7 @@ class FollowCamera(AbstractMove):
         paired: Bool[Array, " m"],
         prior: Float[Array, "2"],
     ) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-        """The posterior mean and variance of what the gaps of the pairs have in common."""
+        """The posterior mean and variance of the shift that the innovations have in common."""
         variances = jnp.where(paired[:, None], variances, 1.0)
         gaps = jnp.where(paired[:, None], gaps, 0.0)
 
@@ -112,7 +116,7 @@ class FollowCamera(AbstractMove):
 
 
 def _mutual(cost: Float[Array, "m d"], gate: float) -> tuple[Bool[Array, " m"], Int[Array, " m"]]:
-    """Which rows are in a pair whose row and column have no cheaper one, and its column."""
+    """Rows and columns that are each other's cheapest: whether each row has one, and its column."""
     partner = jnp.argmin(cost, axis=1).astype(jnp.int32)
     cheapest = jnp.min(cost, axis=1)
     column = take(jnp.argmin(cost, axis=0).astype(jnp.int32), partner)

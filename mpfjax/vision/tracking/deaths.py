@@ -1,4 +1,4 @@
-"""Deaths: what no detection bears out any more, what has left the frame."""
+"""Deaths: the end of components without detections, or outside the frame."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,19 +24,20 @@ from mpfjax.vision.tracking.observation import TrackedFrame, within
 
 
 class Deaths(AbstractMove):
-    """Count in how many frames each component was borne out, and empty those that are gone.
+    """Count in how many frames each component had a detection, and end those that have too few.
 
-    A component dies where no detection has been assigned to it for more than `patience` frames in a
-    row, or for more than none while it is not confirmed; where its centre has left the frame; and
-    where all its particles have zero likelihood. It is confirmed once strong detections have borne
-    it out in `confirmation` frames. Where others find no room, one that was
-    believed in before that, as those of the first frame are, is waited for no longer than it is
-    shown. Frames in which another hides it
-    (`ShareDetections`) do not count as without a detection. Where there are no pixels, the frame
-    reaches as far as all detections so far.
+    A component ends if no detection has been assigned to it for more than `patience` frames in a
+    row, or in any single frame while it is not confirmed; if its centre has left the frame; or if
+    all its particles have zero likelihood. It is confirmed after `confirmation` frames with strong
+    detections. Components of the first frame are confirmed at once. Where there is no room for new
+    components, one that was confirmed at once and has had no strong detections since ends as soon
+    as it is no longer shown. Frames in which a component is hidden by another (`ShareDetections`)
+    do not count as frames without a detection. Without pixels, the frame is the smallest rectangle
+    that holds all detections so far.
+
     A component is shown while it is confirmed, for at most `longest_guess` frames without a
-    detection and `longest_unsure` without a strong one. Memory: `Lives`, with `Births`, and that
-    extent.
+    detection and `longest_unsure` frames without a strong one. Memory: `Lives`, together with
+    `Births`, and the extent of the frame.
 
     Deaths are decided and not sampled (`approximate` is true). Raises `ValueError` for a number of
     frames that is not whole, or below 1.
@@ -58,16 +59,16 @@ class Deaths(AbstractMove):
 
     @property
     def approximate(self) -> bool:
-        """True: a component's mass is thrown away."""
+        """True: the mass of a component that ends is lost."""
         return True
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """Nobody lives yet."""
+        """No component is alive yet."""
         nothing = jnp.array([jnp.inf, jnp.inf, -jnp.inf, -jnp.inf])
         return {LIVES: Lives.none(num_components), EXTENT: nothing}
 
     def forget(self, memory: dict, dead: Bool[Array, " m"]) -> dict:
-        """The dead have no name, and were never seen."""
+        """Dead components have no identity and no counts."""
         lives: Lives = memory[LIVES]
         kept = lives._replace(
             identities=jnp.where(dead, 0, lives.identities),
@@ -82,7 +83,7 @@ class Deaths(AbstractMove):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
-        """Count the frame, and end who is gone."""
+        """Count the frame, and end components."""
         del key
         lives: Lives = mixture.memory[LIVES]
         source, scores = mixture.memory[ASSIGNED], observation.detections.scores
@@ -93,7 +94,7 @@ class Deaths(AbstractMove):
         unseen = jnp.where(borne_out, 0, lives.unseen + missed.astype(jnp.int32))
         unsure = jnp.where(strong, 0, lives.unsure + (missed | borne_out).astype(jnp.int32))
         confirmed = lives.alive & (lives.confirmed | (seen >= self.confirmation))
-        # Who was believed in at once, and not borne out since, makes room where there is none.
+        # One that was confirmed at once and has had too few detections since makes room.
         in_the_way = lives.full & (seen < self.confirmation)
         patience = jnp.where(in_the_way, self.longest_guess, self.patience)
         patience = jnp.where(confirmed, patience, 0)

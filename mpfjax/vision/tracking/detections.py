@@ -1,4 +1,4 @@
-"""What a detector found in a frame: boxes, and how sure it was of each."""
+"""The detections of a frame: boxes, and how sure the detector was of each."""
 
 from typing import Any
 
@@ -33,16 +33,16 @@ class Detections(eqx.Module):
         max_detections: int,
         scores: Float[np.ndarray, " k"] | None = None,
     ) -> "Detections":
-        """Boxes (x, y, w, h), top-left corner first, and a score for each, all equal where None.
+        """Boxes (x, y, w, h), top-left corner first, and a score for each; all 1 where None.
 
-        They stay in their order. If there are too many, the strongest are kept, and of equally
-        strong ones the largest. They may leave the frame in part or as a whole. Raises
-        `ValueError` for boxes that are not four finite numbers each, or without area, for scores
-        that are not one finite number for each box, and for room for less than one.
+        The boxes stay in their order. If there are too many, the strongest are kept, and of equally
+        strong ones the largest. They may leave the frame in part or as a whole. Raises `ValueError`
+        for boxes that are not four finite numbers each, or have no area, for scores that are not
+        one finite number for each box, and for a size below one.
         """
         check_whole(max_detections=max_detections)
         rows = to_rows(4, "boxes", boxes).astype(np.float32)
-        # One box alone is more likely a slip than meant.
+        # A single box without its axis is more likely a slip than meant.
         if len(rows) > 0 and np.ndim(boxes) != 2:
             raise ValueError(f"boxes: shape {np.shape(boxes)} is not (k, 4), of boxes x,y,w,h")
         for row in rows[~(np.isfinite(rows).all(axis=1) & (rows[:, 2:] > 0).all(axis=1))]:
@@ -60,14 +60,14 @@ class Detections(eqx.Module):
         return cls(*map(jnp.asarray, (padded, valid, padded_scores, padded_rows)))
 
     def rows_of(self, indices: Int[Array, " m"]) -> Int[Array, " m"]:
-        """The rows in what the detector gave of the detections with these indices; -1 stays -1."""
+        """The rows, in what the detector gave, of detections by their indices; -1 stays -1."""
         if self.rows is None:
             return indices
         return jnp.where(indices >= 0, take(self.rows, jnp.maximum(indices, 0)), -1)
 
 
 def _checked_scores(scores: Any, number: int) -> np.ndarray:
-    """A finite score for each of so many boxes, all one where there are none given."""
+    """A finite score for each box, all one where none are given."""
     if scores is None:
         return np.ones(number, np.float32)
     values = np.asarray(as_numbers("scores", scores, floating=True), np.float32)

@@ -1,4 +1,4 @@
-"""What became of detections: whether those behind them were ever found surely, by score."""
+"""Which detections, by score, prove to be of objects: those whose chain reaches a sure score."""
 
 from typing import NamedTuple
 
@@ -15,21 +15,22 @@ from mpfjax.vision.tracking.observation import overlap
 
 _BINS = 10  # of shares of a sure detection's score
 _CENTRES = (np.arange(_BINS) + 0.5) / _BINS
-_SURE = 0.9  # who reaches this share is an object
+_SURE = 0.9  # a chain that reaches this share is an object
 _SLOPE = 0.15  # the prior odds are logistic in the share, of this scale
 _PRIOR = 5.0  # detections that the prior of each bin counts as
-_KEPT = 0.995  # of what is known, in the next frame
-_SAME, _DOUBLE = 0.3, 0.6  # overlaps of a chain's boxes, and of boxes of which one is a double
-_GONE = 2  # frames without a detection
+_KEPT = 0.995  # kept from each frame to the next
+_SAME, _DOUBLE = 0.3, 0.6  # least overlap of boxes in a chain, and of a box with its double
+_GONE = 2  # longest gap in a chain, in frames
 
 
 class Fates(NamedTuple):
-    """Chains of detections that overlap from frame to frame, and what became of earlier ones.
+    """Chains of detections that overlap from frame to frame, and counts from ended chains.
 
-    - `boxes`: (c, 4), each chain's last; `unseen`: for how many frames it has had none.
-    - `sure`: whether it has reached a sure score; `pending`: (c, bins), its detections by share,
-      of whom it is not known yet.
-    - `good`, `bad`: (bins,), detections of chains that reached one, and of those that ended before.
+    - `boxes`: (c, 4), the last box of each chain; `unseen`: frames since its last detection.
+    - `sure`: whether it has reached a sure score; `pending`: (c, bins), its detections by share
+      while it is not yet decided what they are.
+    - `good`, `bad`: (bins,), detections of chains that reached a sure score, and of chains that
+      ended without one.
     """
 
     boxes: Float[Array, "c 4"]
@@ -41,7 +42,7 @@ class Fates(NamedTuple):
 
     @classmethod
     def none(cls, num_chains: int) -> "Fates":
-        """Nothing found yet, with room for so many chains."""
+        """No chains yet, with room for this many."""
         bins = jnp.zeros(_BINS, default_float())
         return cls(
             jnp.zeros((num_chains, 4)),
@@ -53,7 +54,7 @@ class Fates(NamedTuple):
         )
 
     def after(self, found: Detections, shares: Float[Array, " d"]) -> "Fates":
-        """With a frame's detections, whose scores are these shares of a sure one's."""
+        """Update with the detections of a frame, whose scores are these shares of a sure score."""
         doubles = (overlap(found.boxes, found.boxes) > _DOUBLE) & stronger(found)
         single = found.valid & ~jnp.any(doubles & found.valid[:, None], axis=0)
         rows, goes_on = self._continued(found.boxes, single)
@@ -81,7 +82,7 @@ class Fates(NamedTuple):
     def _continued(
         self, boxes: Float[Array, "d 4"], single: Bool[Array, " d"]
     ) -> tuple[Int[Array, " c"], Bool[Array, " c"]]:
-        """The detection that each chain and no other overlaps most, and whether there is one."""
+        """The detection that overlaps each chain most, and whether the two match mutually."""
         living = (self.unseen < _GONE)[:, None] & single[None]
         shares = jnp.where(living, overlap(self.boxes, boxes), 0.0)
         partner = jnp.argmax(shares, axis=1).astype(jnp.int32)
@@ -89,9 +90,9 @@ class Fates(NamedTuple):
         return partner, mutual & (jnp.max(shares, axis=1) > _SAME)
 
     def strong_share(self, prior_share: Float[Array, ""]) -> Float[Array, ""]:
-        """The share from which on a detection is rather an object's than none's.
+        """The share above which a detection is more probably an object than none.
 
-        It is `prior_share` before anything is known.
+        It is `prior_share` before anything is learned.
         """
         centres = jnp.asarray(_CENTRES, self.good.dtype)
         prior = jax.nn.sigmoid((centres - prior_share) / _SLOPE)
@@ -107,10 +108,10 @@ class Fates(NamedTuple):
 
 
 def rising(values: Float[Array, " k"], weights: Float[Array, " k"]) -> Float[Array, " k"]:
-    """The nearest sequence that never falls, by weighted least squares: isotonic regression.
+    """Isotonic regression: the nearest non-decreasing sequence, by weighted least squares.
 
-    By its min-max formula (Barlow et al. 1972): the highest over beginnings of the lowest over
-    ends of the mean in between.
+    By its min-max formula (Barlow et al. 1972): entry i is the maximum over a ≤ i of the minimum
+    over b ≥ i of the weighted mean of entries a to b.
     """
     sums = jnp.concatenate([jnp.zeros(1, values.dtype), jnp.cumsum(weights * values)])
     totals = jnp.concatenate([jnp.zeros(1, values.dtype), jnp.cumsum(weights)])

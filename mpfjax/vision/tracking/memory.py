@@ -1,4 +1,4 @@
-"""What the tracker's moves remember of each component, and how they name it."""
+"""The memory of the tracker's moves: its fields, and the keys under which they are stored."""
 
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ CAMERA, NOISES, RIVALS, FATES = "camera", "noises", "rivals", "fates"
 
 
 class Scores(NamedTuple):
-    """Of `RankScores`: recent scores, how many there were ever, and the thresholds from them."""
+    """Memory of `RankScores`: recent scores, how many there were in all, and the thresholds."""
 
     recent: Float[Array, " k"]
     count: Int[Array, ""]
@@ -23,7 +23,7 @@ class Scores(NamedTuple):
 
 
 class Camera(NamedTuple):
-    """Of `FollowCamera`: the shift of all objects in this frame, and how far shifts usually go.
+    """Memory of `FollowCamera`: the shift in this frame, and the standard deviation of shifts.
 
     - `shift`: in pixels; `deviations`: in boxes.
     """
@@ -33,14 +33,14 @@ class Camera(NamedTuple):
 
 
 class Lives(NamedTuple):
-    """Of `Deaths` and `Births`: who each component is, and how well it is borne out.
+    """Memory of `Deaths` and `Births`: the identity of each component, and its counts of frames.
 
     - `identities`: 0 for a dead component; `last_identity`: the highest ever given.
-    - `seen`: in how many frames a strong detection bore it out.
-    - `unseen`, `unsure`: for how many frames no detection, and no strong one, has.
-    - `confirmed`: whether it was borne out often enough to be believed.
-    - `shown`: whether it is worth showing.
-    - `full`: whether there was no room for a component in the last frame.
+    - `seen`: in how many frames it had a strong detection.
+    - `unseen`, `unsure`: for how many frames it has had no detection, and no strong one.
+    - `confirmed`: whether it has had enough detections.
+    - `shown`: whether it should be shown.
+    - `full`: whether there was no room for a new component in the last frame.
     - `begun`: whether there was a frame before.
     """
 
@@ -56,10 +56,10 @@ class Lives(NamedTuple):
 
     @classmethod
     def none(cls, num_components: int) -> "Lives":
-        """Nobody lives yet."""
-        nobody = jnp.zeros(num_components, jnp.int32)
+        """No component is alive yet."""
+        none = jnp.zeros(num_components, jnp.int32)
         zero = jnp.zeros((), jnp.int32)
-        return cls(nobody, zero, nobody, nobody, nobody, nobody > 0, nobody > 0, zero > 0, zero > 0)
+        return cls(none, zero, none, none, none, none > 0, none > 0, zero > 0, zero > 0)
 
     @property
     def alive(self) -> Bool[Array, " m"]:
@@ -73,7 +73,7 @@ def mean_boxes(mixture: ParticleMixture) -> Float[Array, "m 4"]:
 
 
 def frames_unseen(mixture: ParticleMixture) -> Int[Array, " m"]:
-    """For how many frames no detection has borne each out, or stood for it while it was hidden."""
+    """For how many frames each component has had no detection and has not been hidden."""
     lives: Lives = mixture.memory[LIVES]
     hidden = mixture.memory.get(HIDDEN, jnp.zeros_like(lives.unseen))
     return lives.unseen + jnp.where(shared_detections(mixture) < 0, hidden, 0)
@@ -81,18 +81,18 @@ def frames_unseen(mixture: ParticleMixture) -> Int[Array, " m"]:
 
 def shared_detections(mixture: ParticleMixture) -> Int[Array, " m"]:
     """The row of the detection that each component shares; -1 for all where no move shares any."""
-    nobody = jnp.full(mixture.num_components, -1, jnp.int32)
-    return mixture.memory.get(SHARED, nobody)
+    none = jnp.full(mixture.num_components, -1, jnp.int32)
+    return mixture.memory.get(SHARED, none)
 
 
 def assigned_detections(mixture: ParticleMixture) -> Int[Array, " m"]:
     """The index of the detection that each component took; -1 for all where no move assigns any."""
-    nobody = jnp.full(mixture.num_components, -1, jnp.int32)
-    return mixture.memory.get(ASSIGNED, nobody)
+    none = jnp.full(mixture.num_components, -1, jnp.int32)
+    return mixture.memory.get(ASSIGNED, none)
 
 
 def noises_of(mixture: ParticleMixture, model: DetectedObjectModel) -> Noises:
-    """What was learned of the noises; the model's own where no move learns any."""
+    """The learned noises, or the model's own where no move learns any."""
     return mixture.memory.get(NOISES, model.noises)
 
 

@@ -1,4 +1,4 @@
-"""Objects that move with inertia, and are seen by a detector and by their colours."""
+"""Objects that move with inertia, observed by a detector and by their colours."""
 
 from typing import Any, NamedTuple
 
@@ -15,16 +15,16 @@ from mpfjax.vision.colour.histograms import IntegralHistogram, bhattacharyya, no
 from mpfjax.vision.colour.sampled_histograms import SampledBoxes, SampledHistogram
 from mpfjax.vision.tracking.detections import Detections
 
-# So many times the deviations of a size say nothing of it.
+# A size whose error is this many times larger is not observed.
 _NOTHING = 10.0
-# A size that grows in one frame grows less in the next: by so much of the share per frame.
+# The share of a size's growth rate that is left after a frame.
 _GROWTH_KEPT = 0.9
 
 Pixels = IntegralHistogram | SampledHistogram | SampledBoxes
 
 
 class Gaussian(NamedTuple):
-    """Place and velocity along each of the four coordinates, which are independent of each other.
+    """Moments of place and velocity along each of the four coordinates, which are independent.
 
     - `place`, `velocity`: the means; (x, y) in pixels, (log w, log h), and their change in a frame.
     - `var_place`, `cov`, `var_velocity`: the entries of the covariance of place and velocity.
@@ -39,7 +39,7 @@ class Gaussian(NamedTuple):
     def predicted(
         self, place_noise: Float[Array, "*n 4"], velocity_noise: Float[Array, "*n 4"]
     ) -> "Gaussian":
-        """A frame later: x += v + noise, v += noise, and the growth of a size decays."""
+        """The moments a frame later: x += v + noise, v += noise; growth rates of sizes decay."""
         kept = jnp.array([1.0, 1.0, _GROWTH_KEPT, _GROWTH_KEPT], self.place.dtype)
         kept = kept.reshape((1,) * (self.place.ndim - 1) + (4,))
         return Gaussian(
@@ -67,7 +67,7 @@ class Gaussian(NamedTuple):
         return posterior, gap, variance
 
     def mixed_with(self, other: "Gaussian", share: Float[Array, "*n #4"]) -> "Gaussian":
-        """The Gaussian with the moments of the mixture: `share` of this one, the rest the other."""
+        """The moments of a mixture of this Gaussian, with weight `share`, and the other."""
         away, away_velocity = self.place - other.place, self.velocity - other.velocity
         between = share * (1 - share)
         rest = 1 - share
@@ -81,16 +81,16 @@ class Gaussian(NamedTuple):
 
 
 class ObjectState(eqx.Module):
-    """A hypothesis of where an object is, how large, how fast, and which object it is.
+    """A hypothesis of the place, size and velocity of an object, and of which object it is.
 
-    Given what the detections are of, all is linear and Gaussian, so that a particle carries the
-    moments of its place and velocity, and not a draw of them (Rao-Blackwellisation, Doucet et al.
-    2000).
+    Given the assignment of detections, the model is linear and Gaussian. A particle therefore
+    carries the moments of place and velocity and not a draw of them (Rao-Blackwellisation, Doucet
+    et al. 2000).
 
     - `place`: (x, y, log w, log h), the mean of centre and size in pixels.
     - `velocity`: the mean of their change in a frame.
     - `spread`: (n, 3, 4), var place, cov, and var velocity along each coordinate.
-    - `label`: the object, by the number of its component.
+    - `label`: the object, by the index of its component.
     """
 
     place: Float[Array, "*n 4"]
@@ -106,7 +106,7 @@ class ObjectState(eqx.Module):
 
     @classmethod
     def nowhere(cls, num: int) -> "ObjectState":
-        """Boxes of one pixel about the origin: objects are founded later, by detections."""
+        """Boxes of one pixel about the origin, to fill empty slots."""
         zero = jnp.zeros((num, 4))
         return cls(zero, zero, jnp.zeros((num, 3, 4)), jnp.zeros(num, jnp.int32))
 
@@ -123,22 +123,22 @@ class ObjectState(eqx.Module):
 
 
 class NoObjectYet(AbstractStateSpaceModel):
-    """x_0 of a tracker, whose slots are all empty: detections found its components later."""
+    """x_0 of a tracker, whose slots are all empty: detections start its components later."""
 
     handles_missing = True  # absent detections are no error
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> ObjectState:
-        """States that no slot holds yet."""
+        """States to fill empty slots."""
         del key
         return ObjectState.nowhere(num_particles)
 
     def sample_transition(self, key: Key[Array, ""], states: ObjectState) -> ObjectState:
-        """The same: `PropagateObjects` is what moves objects."""
+        """The same states: `PropagateObjects` moves objects."""
         del key
         return states
 
     def log_likelihood(self, observation: Any, states: ObjectState) -> Float[Array, " n"]:
-        """Zero: `PropagateObjects` is what weighs them."""
+        """Zero: `PropagateObjects` weighs objects."""
         del observation
         return jnp.zeros(states.label.shape)
 
@@ -147,7 +147,7 @@ class Noises(NamedTuple):
     """Standard deviations along (x, y, log w, log h), lengths in boxes.
 
     - `errors`: of a strong detection.
-    - `place`, `velocity`: of what is added to an object's place and velocity in a frame.
+    - `place`, `velocity`: of the noise added to an object's place and velocity in a frame.
     """
 
     errors: Float[Array, "4"]
@@ -156,15 +156,15 @@ class Noises(NamedTuple):
 
 
 class AssignedFrame(NamedTuple):
-    """What is seen of each object in a frame: the observation of a `DetectedObjectModel`.
+    """What is observed of each object in a frame: the observation of a `DetectedObjectModel`.
 
     - `detections`: a row for each object, its own detection, valid where it has one.
-    - `weak`: (m,), which of them are weak ones; `merged`: which stand for others as well, whom the
-      object hides; `borrowed`: which are those of another object, which hides this one.
+    - `weak`: (m,), which of them are weak; `merged`: which stand for other objects as well, hidden
+      by this one; `borrowed`: which belong to another object, which hides this one.
     - `doubts`: (m,), the probability that an object's detection is not its own.
-    - `pixels`: the colours of the frame; None where nobody looks at them.
-    - `references`: (m, parts, channels, bins), the histograms that each object is known by, all
-      zero where it has none; None where nobody learns any.
+    - `pixels`: the colours of the frame; None where they are not used.
+    - `references`: (m, parts, channels, bins), the reference histograms of each object, all zero
+      where it has none; None where none are learned.
     """
 
     detections: Detections
@@ -177,20 +177,24 @@ class AssignedFrame(NamedTuple):
 
 
 class DetectedObjectModel(eqx.Module):
-    """Boxes with inertia, seen by a detector, and by their colours where that is asked for.
+    """Boxes with inertia, observed by a detector and, where σ is given, by their colours.
 
-    x_t = x_{t-1} + v_{t-1} + σ_x ε and v_t = v_{t-1} + σ_v ε' along each of x, y, log w and log h,
-    where the box (w, h) of the frame before is the unit of x and y; the velocities of log w and
-    log h decay. A detection is d = x + σ_d ε''. Given whose each is, this is Kalman's filter.
-    L(y | x) has the factor exp(-B² / 2σ²) as well where σ is given: B² is the mean squared
+    Along each of x, y, log w and log h,
+
+        x_t = x_{t-1} + v_{t-1} + σ_x ε,  v_t = v_{t-1} + σ_v ε',  d_t = x_t + σ_d ε''
+
+    where d_t is the detection, and the box (w, h) of the frame before is the unit of x and y. The
+    velocities of log w and log h decay. Given the assignment, this is a linear Gaussian model. With
+    σ the likelihood has the further factor exp(-B² / 2σ²), where B² is the mean squared
     Bhattacharyya distance of the box's bands from their references (Pérez, Vermaak and Blake 2004).
 
-    The noises here are priors: `LearnNoise` fits them to the recording.
+    The noises given here are priors: `LearnNoise` fits them to the recording.
 
-    - `detection_deviations`, `place_noise`, `velocity_noise`: σ_d, σ_x and σ_v; `weak_error` times
-      σ_d for a weak detection, `merged_error` times for one that stands for two, and
-      `borrowed_error` times in the place for one of another object, which says nothing of the size.
-    - `start_velocity`: the deviations of an object's velocity when it is first detected.
+    - `detection_deviations`, `place_noise`, `velocity_noise`: σ_d, σ_x and σ_v.
+    - `weak_error`: times σ_d for a weak detection; `merged_error`: for one that stands for two
+      objects; `borrowed_error`: for the place of one of another object, which has no information on
+      size.
+    - `start_velocity`: the standard deviation of an object's velocity when it is first detected.
     - `sigma`: σ, None where hypotheses are not weighed by colours.
 
     Raises `ValueError` for a number that is not positive. Use it in an `ObjectTracker`.
@@ -240,13 +244,13 @@ class DetectedObjectModel(eqx.Module):
     def detection_of(
         self, observation: AssignedFrame, states: ObjectState, noises: Noises
     ) -> tuple[Float[Array, "n 4"], Float[Array, "n 4"]]:
-        """The place of each state's own detection, and its deviations there."""
+        """The place of each state's own detection, and the standard deviations of its error."""
         places = places_of(observation.detections.boxes)
         deviations = units(places) * noises.errors[None] * self._errors(observation)
         return take(places, states.label), take(deviations, states.label)
 
     def _errors(self, observation: AssignedFrame) -> Float[Array, "m 4"]:
-        """How many times the deviations of a sure detection each object's own has."""
+        """The standard deviations of each object's detection, relative to a strong detection's."""
         borrowed = jnp.array([self.borrowed_error, self.borrowed_error, _NOTHING, _NOTHING])
         errors = jnp.where(observation.weak, self.weak_error, 1.0)[:, None]
         errors = errors * jnp.where(observation.merged[:, None], self.merged_error, 1.0)
@@ -255,9 +259,9 @@ class DetectedObjectModel(eqx.Module):
     def seen(
         self, key: Key[Array, ""], observation: AssignedFrame, states: ObjectState
     ) -> tuple[ObjectState, Float[Array, " n"]]:
-        """Places drawn where they are looked at, and the log-likelihood -B² / 2σ² of their colours.
+        """Draw places, and return the log-likelihood -B² / 2σ² of the colours there.
 
-        A velocity keeps its distribution given the place that was drawn.
+        Velocities keep their distribution given the places that are drawn.
         """
         references = observation.references
         if observation.pixels is None or references is None or self.sigma is None:
@@ -287,7 +291,7 @@ def places_of(boxes: Float[Array, "*m 4"]) -> Float[Array, "*m 4"]:
 
 
 def units(places: Float[Array, "*m 4"]) -> Float[Array, "*m 4"]:
-    """What lengths are counted in along each coordinate: (w, h, 1, 1)."""
+    """The units of length along each coordinate: (w, h, 1, 1)."""
     sizes = jnp.exp(places[..., 2:])
     return jnp.concatenate([sizes, jnp.ones_like(sizes)], axis=-1)
 
@@ -295,9 +299,9 @@ def units(places: Float[Array, "*m 4"]) -> Float[Array, "*m 4"]:
 def unlikeness(
     pixels: Pixels, boxes: Float[Array, "n 4"], references: Float[Array, "n parts channels bins"]
 ) -> Float[Array, " n"]:
-    """The mean B² of each box's bands from a reference of its own; zero where that is empty."""
+    """The mean B² of each box's bands from its reference; zero where the reference is empty."""
     if isinstance(pixels, SampledBoxes):
-        raise ValueError("pixels: those of detections alone do not show what particles cover")
+        raise ValueError("pixels: the colours of detections alone do not give those of particles")
     histograms = normalise(pixels.counts(boxes, references.shape[1]))
     distances = jnp.mean(jnp.sum(bhattacharyya(histograms, references), axis=2), axis=1)
     return jnp.where(jnp.any(references > 0, axis=(1, 2, 3)), distances, 0.0)

@@ -27,24 +27,29 @@ from mpfjax.vision.tracking.model import (
 from mpfjax.vision.tracking.observation import TrackedFrame
 from mpfjax.vision.tracking.occlusion import in_front
 
-# Of two hypotheses in one component, none is taken for more than e^30 times as likely.
+# Weights within a component differ by at most the factor e^30.
 _FARTHEST = 30.0
 
 
 class PropagateObjects(AbstractPropagation):
-    """Propagate every hypothesis, and weigh it by the detection that is its component's own.
+    """Propagate every hypothesis, and weigh it by the detection assigned to its component.
 
-    The detection is its object's own with the probability 1 - doubt, or another's. Of each of the
-    two a hypothesis has the exact Gaussian posterior, Kalman's update or the prediction. Either one
-    of them is drawn by its posterior probability; or, where `matched` is true, the Gaussian with
-    the moments of both is taken, as in probabilistic data association (Bar-Shalom and Tse 1975),
-    and no random number is. The weight is the sum (1 - doubt) Z_i / Z + doubt, where Z_i is the
-    predictive density of the detection and Z its mean in the component. Who is hidden follows the
-    detection that it shares, less surely. With σ, places are drawn and weighed by their colours as
-    well. Components share no weights here: what they say of each other's mass, `ShareMass` takes
-    away again.
+    The detection belongs to the object with probability 1 - doubt. The posterior of a hypothesis
+    has two Gaussian parts: Kalman's update, for a detection that is its own, and the prediction,
+    for one that is not. Where `matched` is false, one of the two is drawn by its posterior
+    probability. Where it is true, the Gaussian with the moments of both is taken, as in
+    probabilistic data association (Bar-Shalom and Tse 1975), and no random number is drawn.
+    Hypothesis i has the weight
 
-    Draw where particles are to be rival hypotheses; match where each component is one Gaussian.
+        w_i = (1 - doubt) Z_i / Z + doubt
+
+    where Z_i is its predictive density of the detection and Z the mean of Z_i in the component. A
+    hidden component follows the detection that it shares with a larger error. With σ, places are
+    drawn and weighed by their colours as well. Weights compare hypotheses within a component only,
+    since `ShareMass` replaces the mixture weights.
+
+    Use `matched=False` where particles are rival hypotheses, `matched=True` where each component is
+    one Gaussian.
     """
 
     model: DetectedObjectModel
@@ -62,7 +67,7 @@ class PropagateObjects(AbstractPropagation):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
-        """Predict, settle what the detection is of, and weigh it."""
+        """Predict, update by the detections, and weigh."""
         source, shared = mixture.memory[ASSIGNED], shared_detections(mixture)
         borrowed = shared >= 0
         own = own_detections(jnp.where(borrowed, shared, source), observation.detections)

@@ -1,4 +1,4 @@
-"""How far the detector errs and how much objects move, learned from the recording itself."""
+"""The detector's errors and the noises of the motion, learned from the recording itself."""
 
 from typing import NamedTuple
 
@@ -32,20 +32,20 @@ from mpfjax.vision.tracking.model import (
 from mpfjax.vision.tracking.observation import TrackedFrame
 from mpfjax.vision.tracking.occlusion import in_front
 
-# Rival deviations of detections, of places and of velocities, in boxes: all that real ones have.
+# Candidate deviations of detections, places and velocities, in boxes, wider than real ones.
 _ERRORS = (0.01, 0.02, 0.04, 0.08, 0.16)
 _PLACES = (0.005, 0.015, 0.045)
 _VELOCITIES = (0.001, 0.005, 0.025)
 _GRID = np.array([(r, q, v) for r in _ERRORS for q in _PLACES for v in _VELOCITIES]).T
-# How far off the priors may be, in logarithms.
+# Standard deviations of the log-normal priors.
 _DOUBTS = (0.7, 0.7, 0.9)
 
 
 class Rivals(NamedTuple):
-    """Of `LearnNoise`: what each rival says of each object, and what speaks for it.
+    """Memory of `LearnNoise`: the moments of each object under each candidate, and its evidence.
 
     - `owners`: the identities of the objects; `moments`: (m, L, 4) each.
-    - `evidence`: (L, 4), log-likelihoods of late, of all objects together.
+    - `evidence`: (L, 4), discounted log-likelihoods of all objects together.
     """
 
     owners: Int[Array, " m"]
@@ -54,19 +54,20 @@ class Rivals(NamedTuple):
 
 
 class LearnNoise(AbstractMove):
-    """Fit the detector's errors and the objects' noises to the innovations, all objects together.
+    """Fit the detector's errors and the objects' noises to the innovations of all objects.
 
-    L rival triples (σ_d, σ_x, σ_v) stand for each coordinate. Under each, Kalman's filter follows
-    each object; what it says of the object's next detection, the predictive density of its
-    innovation, is evidence for the triple, which is forgotten within `memory` frames. Innovations
-    have heavy tails, so that the density is Student's with `freedom` degrees. The noises that
-    `Assign`, `PropagateObjects` and `Births` take are exp E[log σ] under the posterior of the
-    triples, whose prior is log-normal about the model's noises. Among the multiple-model filters
-    it is Magill's (1965), with one model for all objects. Objects teach once they have had
-    `first` strong detections, and only by strong ones that are theirs alone.
+    There are L candidate triples (σ_d, σ_x, σ_v) for each coordinate. Under each candidate, a
+    Kalman filter follows each object. The predictive density of the innovation of the object's next
+    detection adds to the evidence for the candidate, which is forgotten within `memory` frames.
+    Innovations have heavy tails, so that the density is Student's with `freedom` degrees of
+    freedom. `Assign`, `PropagateObjects` and `Births` take the noises exp E[log σ] under the
+    posterior of the candidates, whose prior is log-normal about the model's noises. This is the
+    multiple-model filter of Magill (1965), with one model for all objects. Only strong detections
+    of objects that share them with no other count, and only after the object's `first` strong
+    detections.
 
-    It leaves the particles as they are; memory: `Noises` and `Rivals`. The model changes with the
-    data (`approximate` is true). Raises `ValueError` for numbers that are not positive.
+    The particles do not change. Memory: `Noises` and `Rivals`. The model changes with the data
+    (`approximate` is true). Raises `ValueError` for numbers that are not positive.
     """
 
     model: DetectedObjectModel
@@ -85,24 +86,24 @@ class LearnNoise(AbstractMove):
 
     @property
     def approximate(self) -> bool:
-        """True: what is seen changes what is expected."""
+        """True: the noises are learned from the same data that they explain."""
         return True
 
     def initial_memory(self, num_components: int) -> dict[str, Noises | Rivals]:
-        """The model's noises, and nobody followed."""
+        """The model's noises, and no object."""
         m, rivals = num_components, _GRID.shape[1]
         zero = jnp.zeros((m, rivals, 4))
         moments = Gaussian(zero, zero, zero, zero, zero)
-        nobody = jnp.zeros(m, jnp.int32)
+        none = jnp.zeros(m, jnp.int32)
         return {
             NOISES: self.model.noises,
-            RIVALS: Rivals(nobody, moments, jnp.zeros((rivals, 4))),
+            RIVALS: Rivals(none, moments, jnp.zeros((rivals, 4))),
         }
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
-        """Follow every object under every rival, and weigh the rivals."""
+        """Filter every object under every candidate, and update the evidence."""
         del key
         lives: Lives = mixture.memory[LIVES]
         source, found = mixture.memory[ASSIGNED], observation.detections
@@ -128,7 +129,7 @@ class LearnNoise(AbstractMove):
         evidence = self._log_density(gap, variance, unit)
         evidence = jnp.sum(jnp.where(teaches[:, None, None], evidence, 0.0), axis=0)
         kept = jnp.exp(jnp.asarray(-1 / self.memory, evidence.dtype))
-        # Two innovations of one object are not as independent as the filters take them for.
+        # Successive innovations of an object are correlated, unlike under the model.
         evidence = kept * rivals.evidence + 0.5 * evidence
 
         moments = _where((detected & known)[:, None, None], posterior, moments)
@@ -143,7 +144,7 @@ class LearnNoise(AbstractMove):
         variance: Float[Array, "m rivals 4"],
         unit: Float[Array, "m rivals 4"],
     ) -> Float[Array, "m rivals 4"]:
-        """Student's, up to a constant, of innovations in boxes."""
+        """Student's log density, up to a constant, of innovations in boxes."""
         power = 0.5 * (self.freedom + 1)
         tails = power * jnp.log1p(gap**2 / variance / self.freedom)
         return -tails - 0.5 * jnp.log(variance / unit**2)
@@ -153,7 +154,7 @@ class LearnNoise(AbstractMove):
         return jnp.broadcast_to(rivals, (3, 1, _GRID.shape[1], 4))
 
     def _started(self, places: Float[Array, "m 4"]) -> Gaussian:
-        """Where an object may be at its first detection, under every rival."""
+        """The moments of an object at its first detection, under every candidate."""
         errors = self._rivals(places.dtype)[0]
         shape = (len(places), errors.shape[1], 4)
         unit = units(places)[:, None]
@@ -163,7 +164,7 @@ class LearnNoise(AbstractMove):
         return Gaussian(place, still, (unit * errors) ** 2, still, speeds)
 
     def _noises(self, evidence: Float[Array, "rivals 4"]) -> Noises:
-        """The geometric mean of each noise under the posterior of the rivals."""
+        """The geometric mean of each noise under the posterior of the candidates."""
         grid = jnp.log(self._rivals(evidence.dtype)[:, 0])
         prior = jnp.log(jnp.stack(self.model.noises)).astype(evidence.dtype)
         doubts = jnp.asarray(_DOUBTS, evidence.dtype)[:, None, None]

@@ -1,4 +1,4 @@
-"""What a tracker is shown of a frame, and how boxes lie to each other."""
+"""The observation of a tracker in a frame, and how boxes overlap."""
 
 from typing import NamedTuple
 
@@ -12,20 +12,20 @@ from mpfjax.vision.tracking.model import Pixels
 
 
 class TrackedFrame(NamedTuple):
-    """One frame: what was detected in it, and its pixels, None where nobody looks at them."""
+    """One frame: its detections, and its pixels, None where they are not used."""
 
     detections: Detections
     pixels: Pixels | None = None
 
     def detected_colours(self, num_parts: int) -> Float[Array, "d parts channels bins"]:
-        """The histograms of each detection's bands; None has a colour where it holds no pixel."""
+        """The histograms of each detection's bands; all zero where a band holds no pixel."""
         if isinstance(self.pixels, SampledBoxes):
             return normalise(self.pixels.counts(num_parts))
         assert self.pixels is not None
         return normalise(self.pixels.counts(self.detections.boxes, num_parts))
 
     def extent(self, known: Float[Array, "4"]) -> Float[Array, "4"]:
-        """Left, top, right and bottom of the frame, or else of `known` and the detections."""
+        """Left, top, right, bottom of the frame; without pixels, of `known` and the detections."""
         if self.pixels is not None:
             size = [0, 0, self.pixels.width, self.pixels.height]
             return jnp.stack([jnp.asarray(side, known.dtype) for side in size])

@@ -23,23 +23,23 @@ from mpfjax.vision.tracking.observation import TrackedFrame, covered
 
 
 class ShareDetections(AbstractMove):
-    """Let a component that another one hides share the other's detection.
+    """Let a component that is hidden by another one share the other's detection.
 
-    Of two objects in contact a detector often finds one, or both as one: it keeps one of the boxes
-    that overlap. A confirmed component without a detection is therefore taken for hidden, not for
-    gone, where the detection of another confirmed one covers more than the share `cover` of its
-    predicted box. Until they part both live and both are shown; whoever is hidden learns roughly
-    where it is and nothing of its size or colours, and the other follows it less surely
-    (`PropagateObjects`, `LearnAppearance`). So neither takes the other's place, and when two
-    detections are found again, motion and colours say whose each is (`Assign`).
+    A detector often finds only one of two objects in contact, or both as one, because it keeps one
+    of the boxes that overlap. A confirmed component without a detection is therefore treated as
+    hidden, and not as unseen, where the detection of another confirmed component covers more than
+    the share `cover` of its predicted box. While it is hidden it stays alive and is shown. The
+    detection tells it roughly where it is, and nothing of its size or colours; the other component
+    follows the detection with a larger error (`PropagateObjects`, `LearnAppearance`). When both are
+    detected again, motion and colours decide which detection belongs to which (`Assign`).
 
-    - `longest`: after so many hidden frames in a row one counts as unseen again.
-    - `recent`: who has been unseen for more frames before is not hidden but lost.
+    - `longest`: after this many hidden frames in a row a component counts as unseen.
+    - `recent`: a component that has been unseen for more frames than this cannot become hidden.
 
-    It leaves the particles as they are; memory: the row of the detection that each component
-    shares, -1 for none, and for how many frames it has been hidden. That a component is hidden is
-    decided and not summed over (`approximate` is true). Raises `ValueError` for a share outside
-    [0, 1] and for numbers of frames that are not whole, or below 1 and 0.
+    The particles do not change. Memory: the index of the detection that each component shares, -1
+    for none, and for how many frames it has been hidden. Whether a component is hidden is decided
+    and not summed over (`approximate` is true). Raises `ValueError` for a share outside [0, 1] and
+    for numbers of frames that are not whole, or below 1 and 0.
     """
 
     model: DetectedObjectModel
@@ -54,23 +54,23 @@ class ShareDetections(AbstractMove):
 
     @property
     def reads(self) -> frozenset[str]:
-        """What it needs of other moves."""
+        """The memory that it needs of other moves."""
         return frozenset({ASSIGNED, LIVES})
 
     @property
     def approximate(self) -> bool:
-        """True: what is likely hidden is taken for hidden."""
+        """True: a component that is probably hidden is taken for hidden."""
         return True
 
     def initial_memory(self, num_components: int) -> dict[str, Array]:
-        """Nobody hides."""
+        """No component is hidden."""
         return {
             SHARED: jnp.full(num_components, -1, jnp.int32),
             HIDDEN: jnp.zeros(num_components, jnp.int32),
         }
 
     def forget(self, memory: dict, dead: Bool[Array, " m"]) -> dict:
-        """The dead are not hidden."""
+        """Dead components are not hidden."""
         return memory | {
             SHARED: jnp.where(dead, -1, memory[SHARED]),
             HIDDEN: jnp.where(dead, 0, memory[HIDDEN]),
@@ -79,7 +79,7 @@ class ShareDetections(AbstractMove):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
-        """Find out who is hidden, and by whose detection."""
+        """Decide which components are hidden, and by which detections."""
         del key
         source, lives = mixture.memory[ASSIGNED], mixture.memory[LIVES]
         detected = source >= 0
@@ -95,12 +95,12 @@ class ShareDetections(AbstractMove):
         return remember(mixture, shared=jnp.where(hidden, front, -1), hidden=frames)
 
     def _missed(self, lives: Lives, detected: Bool[Array, " m"]) -> Bool[Array, " m"]:
-        """Who has no detection now and had one lately."""
+        """Components without a detection now that had one lately."""
         return lives.alive & lives.confirmed & ~detected & (lives.unseen <= self.recent)
 
 
 def in_front(mixture: ParticleMixture) -> Bool[Array, " m"]:
-    """Whose detection another component shares."""
+    """Components whose detection is shared by another."""
     source: Int[Array, " m"] = mixture.memory[ASSIGNED]
     same = shared_detections(mixture)[None] == source[:, None]
     return (source >= 0) & jnp.any(same, axis=1)

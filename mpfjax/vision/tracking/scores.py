@@ -1,4 +1,4 @@
-"""Which detections are strong and which are weak, by the scores that the detector has given."""
+"""Strong and weak detections, told apart by the scores that the detector has given so far."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,30 +12,35 @@ from mpfjax.vision.tracking.memory import FATES, SCORES, Scores, remember
 from mpfjax.vision.tracking.observation import TrackedFrame
 
 _REMEMBERED = 512
-_HIGH = 0.9  # the quantile of the scores that stands for a sure detection
+_HIGH = 0.9  # the quantile of the scores that is called a sure score
 
 
 class RankScores(AbstractMove):
-    """Set the scores from which a detection is strong, and from which it counts at all.
+    """Set the score above which a detection is strong, and the least score that counts at all.
 
-    Weak detections sustain a component and only strong ones found one (Zhang et al. 2022,
-    ByteTrack). Detectors score on scales of their own, so that scores are counted in shares of a
-    sure detection's, the 0.9 quantile of the last 512, from zero on or, where some scores are
-    negative, from the lowest. Equal scores are all strong.
+    Weak detections sustain a component; only strong ones start one (Zhang et al. 2022, ByteTrack).
+    Each detector has its own scale of scores. Scores are therefore measured as shares of a sure
+    score, the 0.9 quantile of the last 512, counted from zero or, where some scores are negative,
+    from the lowest. If all scores are equal, all are strong.
 
-    Which share is strong is learned from what became of detections (`Fates`). Those that overlap
-    from frame to frame form a chain, of which one frame may be missing. It is an object where it
-    ever reaches nine tenths of a sure score, and none where it ends before. A tenth of the range
-    with g detections of the former and b of the latter has (g + n p) / (g + b + n) for its
-    probability of an object, which may not fall with the score (isotonic regression); p is a prior
-    that rises through 1/2 at `strong_share`, n = 5. Detections are strong from the share on where
-    the probability is 1/2. A hundred frames are forgotten by four tenths.
+    The share above which a detection is strong is learned from earlier detections (`Fates`).
+    Detections that overlap from frame to frame form a chain, with gaps of at most one frame. A
+    chain is an object if it ever reaches nine tenths of a sure score, and none if it ends before.
+    Let a bin, a tenth of the range of scores, hold g detections of chains that are objects and b of
+    chains that are none. A detection in this bin is an object with probability
 
-    - `strong_share`: the share before anything is learned; `weak_share`: from which one counts.
+        (g + n p) / (g + b + n),  n = 5
+
+    made non-decreasing in the score by isotonic regression. The prior p rises through 1/2 at
+    `strong_share`. Detections are strong from the share on where this probability is 1/2. Counts
+    lose four tenths in a hundred frames.
+
+    - `strong_share`: the share before anything is learned; `weak_share`: the least that counts.
     - `strong_score`, `weak_score`: thresholds in place of those, where the scale is known.
 
-    It leaves the particles as they are; memory: `Scores` and `Fates`. Raises `ValueError` for
-    shares outside [0, 1], a threshold that is not finite, and weak above strong.
+    The particles do not change. Memory: `Scores` and `Fates`. Raises `ValueError` for shares
+    outside [0, 1], for a threshold that is not finite, and for a weak threshold above the strong
+    one.
     """
 
     strong_share: float = eqx.field(static=True, default=0.5)
@@ -68,7 +73,7 @@ class RankScores(AbstractMove):
         """Remember the frame's scores and set the thresholds."""
         del key
         found, memory = observation.detections, mixture.memory[SCORES]
-        # The oldest are overwritten; what is no detection is written nowhere.
+        # The oldest are overwritten; rows that are no detection are written nowhere.
         place = (memory.count + jnp.cumsum(found.valid, dtype=jnp.int32) - 1) % _REMEMBERED
         place = jnp.where(found.valid, place, _REMEMBERED)
         scores = found.scores.astype(memory.recent.dtype)
@@ -89,6 +94,6 @@ class RankScores(AbstractMove):
             strong = jnp.full_like(strong, self.strong_score)
         if self.weak_score is not None:
             weak = jnp.full_like(weak, self.weak_score)
-        # Equal scores, the lowest of all as they are, must not be lost to rounding.
+        # Where all scores are equal, rounding must not put them below the threshold.
         weak = jnp.where(count > 0, jnp.minimum(weak, strong), -jnp.inf)
         return remember(mixture, scores=Scores(recent, count, weak, strong), fates=fates)

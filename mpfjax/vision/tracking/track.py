@@ -39,32 +39,33 @@ def track(
 ) -> Iterator[Tracks]:
     """Track what a detector finds in a video: yields the `Tracks` of each frame as it comes.
 
-    Nothing is held back: what is said of a frame is what was known then. Give it any detector:
+    The tracks of a frame depend on this frame and earlier ones only. Any detector will do:
 
         track(frames, lambda frame: network(frame))        # boxes (k, 4), or (boxes, scores)
         track(frames, read_detections("det.txt"))          # rows of a MOTChallenge file
         track(frames, BackgroundSubtraction().detect)      # what moves before a still camera
         track(None, rows)                                  # without pixels, for speed or radar
 
-    - `frames`: RGB images of eight bits, or grey ones, all of one size, in any iterable; None
-      where there are only detections.
+    - `frames`: RGB images of eight bits, or grey ones, all of one size, in any iterable; None where
+      there are only detections.
     - `detections`: a function from a frame to its boxes (x, y, w, h), top-left corner first, in
-      pixels, or to a tuple of boxes and scores; or the same for each frame, in an iterable; or an
-      array of rows (frame, id, x, y, w, h, score) whose frames count from 1.
-    - `tracker`: None takes `ObjectTracker()`, with more room where rows have more in a frame.
+      pixels, or to a tuple of boxes and scores; or an iterable of these, one item for each frame;
+      or an array of rows (frame, id, x, y, w, h, score) whose frames count from 1.
+    - `tracker`: None takes `ObjectTracker()`, with more room where a frame has more rows.
     - `key`: of the random numbers; None takes `jax.random.key(0)`.
     - `first`: the number of the first frame, by which rows are found.
-    - `min_score`: weaker detections are left out; None leaves out none.
-    - `max_detections`: room in a frame, of which the strongest are kept; None takes twice the
-      tracker's objects.
+    - `min_score`: detections with a lower score are left out; None leaves out none.
+    - `max_detections`: the most detections in a frame; if there are more, the strongest are kept.
+      None takes twice the tracker's `max_objects`.
     - `use_colours`: with False the tracker sees no pixels, and only the detector does.
-    - `frame_size`: height and width, to tell what lies outside where there are no frames.
+    - `frame_size`: height and width, for detections without frames, to tell which boxes lie
+      outside.
 
-    The tracks of each frame are NumPy arrays. Boxes of no area or outside the frame are left out
-    with a warning, as are detections in frames that do not come; there is a warning too where
-    there are more detections or objects than there is room for. Raises `ValueError` naming the
-    argument for what cannot be used, at the frame where it comes; what a detector raises comes
-    through, with the number of the frame. Use it on whole videos as on cameras.
+    The tracks of each frame are NumPy arrays. Boxes without area or outside the frame are left out
+    with a warning, as are detections in frames after the last. Another warning is given where there
+    are more detections or objects than there is room for. Raises `ValueError` with the name of the
+    argument for values that cannot be used, at the frame in which they come. An exception of the
+    detector is passed on, with the number of the frame. Use it for recorded videos and for cameras.
     """
     if frames is not None:
         check_type(Iterable, "frames one after the other, or None", frames=frames)
@@ -74,7 +75,7 @@ def track(
         height, width = frame_size
         check_whole(**{"frame_size's height": height, "frame_size's width": width})
     if frames is None and callable(detections):
-        raise ValueError("detections: a detector has nothing to look at where frames is None")
+        raise ValueError("detections: a detector needs frames, and frames is None")
     detector, sieve = as_detector(detections, first), Sieve(min_score, frame_size)
     if tracker is None:
         tracker = ObjectTracker(detector.most_objects())
@@ -107,7 +108,7 @@ def _tracked(
             )
         observation = Detections.from_boxes(found.boxes, room, found.scores)
         pixels = tracker.look(still, observation) if use_colours and still is not None else None
-        # An array, since a new Python number would compile anew.
+        # An array: each new Python number would compile anew.
         moving = (np.asarray(number), state, pixels, observation)
         if advance is None:
             advance = kept_program(_advance, (tracker, key), moving, in_little_memory())
@@ -131,7 +132,7 @@ def _advance(
     pixels: Any,
     observation: Detections,
 ) -> tuple[PyTree, Tracks]:
-    """A step, with the key of the frame drawn in the same program: a call is half a millisecond."""
+    """A step and the key of its frame, in one program: each call costs half a millisecond."""
     return tracker.step(jax.random.fold_in(key, number), state, pixels, observation)
 
 
@@ -161,12 +162,11 @@ def make_tracker(
     frames_per_second: float | None = None,
     **settings: Any,
 ) -> ObjectTracker:
-    """The tracker by the name of its filter, "gm_mpf" or "mpf", with room for so many objects.
+    """The tracker with the filter "gm_mpf" or "mpf", with room for `max_objects` objects.
 
-    A component is one Gaussian, or particles that are resampled, rival hypotheses of whose each
-    detection is.
-    `settings` are the tracker's own. Raises `ValueError` for another name, and for `moves`, which
-    an `ObjectTracker` takes.
+    With "gm_mpf" a component is one Gaussian; with "mpf" it is particles that are resampled, which
+    are rival hypotheses of the association. `settings` are those of `ObjectTracker`. Raises
+    `ValueError` for another name, and for `moves`, which only `ObjectTracker` takes.
     """
     check_one_of(("gm_mpf", "mpf"), filter=filter)
     if "moves" in settings:
@@ -183,15 +183,12 @@ def make_tracker(
 
 
 def online_rows(number: int, tracks: Tracks) -> Float[np.ndarray, "k 6"]:
-    """Rows (frame, id, x, y, w, h) of the objects that are believed in when the frame comes.
-
-    Those that `Tracks.shown` says.
-    """
+    """Rows (frame, id, x, y, w, h) of the objects that are shown in each frame (`Tracks.shown`)."""
     return _rows(number, tracks, tracks.shown)
 
 
 def offline_rows(kept: Iterable[Tracks], first: int = 1) -> Float[np.ndarray, "r 6"]:
-    """Rows of every object that was believed in at some time, its first frames among them."""
+    """Rows of every object that was confirmed at some time, including its frames before that."""
     kept = list(kept)
     believed = {0}
     for tracks in kept:
@@ -213,5 +210,5 @@ def _rows(number: int, tracks: Tracks, written: Any) -> np.ndarray:
     corners = top_left(np.asarray(tracks.boxes)[written])
     ids = np.asarray(tracks.identities)[written]
     rows = np.column_stack([np.full(len(ids), number), ids, corners])
-    # Rounded as files are, so that scores from a file are the scores.
+    # Rounded as in files, so that scores are the same from a file.
     return np.round(rows[np.argsort(ids, kind="stable")], 3)

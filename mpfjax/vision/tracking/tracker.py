@@ -45,23 +45,23 @@ from mpfjax.vision.tracking.observation import TrackedFrame
 from mpfjax.vision.tracking.occlusion import ShareDetections
 from mpfjax.vision.tracking.scores import RankScores
 
-# A box of so many pixels cannot be counted in 16 bits.
+# A box of this many pixels cannot be counted in 16 bits.
 _LARGEST_NARROW = 2**16
-# Particles of an object, where they differ.
+# The default number of particles of an object, where they differ.
 RIVALS_PER_OBJECT = 16
 
 
 class Tracks(NamedTuple):
-    """What a tracker says of one frame, a row for each of its M components.
+    """The tracks in one frame, a row for each of the M components.
 
     - `boxes`: (m, 4), the mean box of each, centre and size in pixels.
     - `identities`: (m,), a number that an object keeps for life, 0 for a dead component.
-    - `confirmed`: (m,), whether detections have borne it out often enough to be believed.
-    - `unseen`: (m,), for how many frames none has; 0 while it is hidden by another one.
-    - `full`: whether a detection that would have founded a component found no room.
-    - `shown`: (m,), which are confirmed, and were seen a moment ago or are hidden: worth showing.
-    - `detections`: (m,), the row of the detection that each took in this frame, in what the
-      detector gave; -1 where it took none. Class labels, masks and features are found by it.
+    - `confirmed`: (m,), whether it has had enough detections to be taken for an object.
+    - `unseen`: (m,), frames since its last detection; 0 while it is hidden by another one.
+    - `full`: whether a detection that would have started a component found no room.
+    - `shown`: (m,), which are confirmed, and were detected a moment ago or are hidden.
+    - `detections`: (m,), the row of the detection assigned to each in this frame, in what the
+      detector gave; -1 for none. Use it to look up class labels, masks and features.
     """
 
     boxes: Float[Array, "m 4"]
@@ -74,7 +74,7 @@ class Tracks(NamedTuple):
 
     @classmethod
     def of(cls, mixture: ParticleMixture, detections: Detections) -> "Tracks":
-        """What is tracked in a mixture, after a step with these detections."""
+        """The tracks in a mixture, after a step with these detections."""
         lives: Lives = mixture.memory[LIVES]
         return cls(
             boxes=mean_boxes(mixture),
@@ -95,50 +95,48 @@ class Tracks(NamedTuple):
 class ObjectTracker(eqx.Module):
     """A mixture particle filter with a component for each object, born and ended by detections.
 
-    `filter` is that `Filter`, which starts empty; `run_filter` takes it, with `TrackedFrame`s for
+    `filter` is a `Filter` that starts empty; `run_filter` takes it, with `TrackedFrame`s for
     observations. A step is a chain of moves on a `ParticleMixture`, each with a memory of its own:
 
     - `RankScores`: which detections are strong, by the scores seen so far;
-    - `FollowCamera`: what all objects move in common;
+    - `FollowCamera`: the motion that all objects have in common;
     - `Assign`: at most one detection for each component, at the least total cost;
     - a resampling, of the GM-MPF (Lin et al. 2012) or of the MPF (Vermaak et al. 2003);
-    - `PropagateObjects`: each hypothesis a frame on, by Kalman's filter, and weighed;
-    - `Deaths`: end what no detection bears out, or has left the frame;
+    - `PropagateObjects`: a Kalman prediction and update of each hypothesis, and its weight;
+    - `Deaths`: end components without detections, or outside the frame;
     - `Births`: a component for each strong detection that no component explains;
-    - `LearnNoise`: how far the detector errs, how objects move and grow;
-    - `LearnAppearance`: of objects that stand alone;
-    - `ShareMass`: the same for every object.
+    - `LearnNoise`: the detector's errors, and the noises of motion and growth;
+    - `LearnAppearance`: the colours of objects that stand alone;
+    - `ShareMass`: the same mixture weight for every object.
 
-    Lengths are in boxes, so that nothing depends on the size of a frame or of the objects, and what
-    is learned in the first second serves from then on. Particles carry Gaussian moments. With
-    Gaussian regeneration a component is one Gaussian, so that P = 1 is enough and, unless particles
-    are weighed by colours, nothing is drawn at random. With a resampling they are rival hypotheses
-    of whose a detection is. All but `PropagateObjects` and the resampling is outside the exact
-    recursion (`approximate`). Use it to track an unknown and changing number of objects, with any
-    detector.
+    Lengths are in boxes, so that nothing depends on the size of the frame or of the objects.
+    Particles carry Gaussian moments. With Gaussian regeneration a component is one Gaussian: P = 1
+    is enough and, unless particles are weighed by colours, nothing is drawn at random. With a
+    resampling, particles are rival hypotheses of the association. All moves except
+    `PropagateObjects` and the resampling depart from the exact recursion (`approximate`). Use it to
+    track an unknown and changing number of objects, with any detector.
 
-    - `max_objects`: M; `particles_per_object`: P. None takes that of the resampling, or else 1, or
+    - `max_objects`: M; `particles_per_object`: P. None takes P from the resampling, or else 1, or
       16 where particles are weighed by colours.
-    - `frames_per_second`: of the video: an object is waited for for a second, and shown for a tenth
-      of one after its last detection. None takes 25.
-    - `resampling`: `Resample(particles_per_component=P)` for an MPF, or
-      `GaussianRegeneration(P, where=lambda states: (states.place, states.velocity))`, by default
-      with stratified noise.
+    - `frames_per_second`: of the video. An object ends after a second without a detection, and is
+      shown for a tenth of a second after its last one. None takes 25.
+    - `resampling`: `Resample(particles_per_component=P)` for an MPF, or `GaussianRegeneration(P,
+      where=lambda states: (states.place, states.velocity))`, by default with stratified noise.
     - `colours`: the bins of the histograms.
-    - `exact_colours`: count every pixel of a box by an integral histogram, at a cost that grows
-      with the frame, and not the grid of points of a `SampledHistogram`.
+    - `exact_colours`: count every pixel of a box by an integral histogram, whose cost grows with
+      the frame, in place of the grid of points of a `SampledHistogram`.
     - `sigma`: weigh particles by their colours as well, as a `DetectedObjectModel` does; None, the
-      default, looks at colours only to assign detections, which costs less.
-    - `strong_score`, `weak_score`: the scores from which a detection founds a component, and from
-      which it counts at all; None takes them from the scores seen so far.
+      default, uses colours only to assign detections, which costs less.
+    - `strong_score`, `weak_score`: the score from which a detection starts a component, and the
+      least score that counts at all; None takes them from the scores seen so far.
     - `moves`: a chain of your own in place of all of these, with settings of its own; colours are
       learned where it holds a `LearnAppearance`, by whose bins.
 
-    Raises `ValueError` for a count that is no whole number from 1 on, a rate or σ that is not
+    Raises `ValueError` for a count that is not a whole number from 1 on, a rate or σ that is not
     positive and finite, a weak score above the strong one, and a resampling that does not give
     every component P particles or would redraw their labels. Raises `ValueError` for a setting
-    beside `moves` that they have themselves, for moves that share one memory, and for a move that
-    needs the memory of one that is not there.
+    given beside `moves` that the moves have themselves, for moves that share one memory, and for a
+    move that needs the memory of a move that is missing.
     """
 
     filter: Filter
@@ -229,7 +227,7 @@ class ObjectTracker(eqx.Module):
         return self.filter.approximate
 
     def init(self) -> ParticleMixture:
-        """Nothing tracked yet: every component dead, every slot empty."""
+        """The state before the first frame: every component dead, every slot empty."""
         return _begin(self.filter)
 
     @eqx.filter_jit
@@ -240,14 +238,12 @@ class ObjectTracker(eqx.Module):
         frame: UInt8[Array, "h w 3"] | SampledBoxes | None,
         detections: Detections,
     ) -> tuple[ParticleMixture, Tracks]:
-        """The state after a frame and its detections, and what is tracked in it.
+        """The state after a frame and its detections, and the tracks in it.
 
-        In place of the frame, what `look` returns of it does as well.
-
-        Where `frame` is None detections are tracked alone, without colours. Frames may have any
-        size, which should not change: each new one compiles anew, and boxes stay where they are in
-        pixels. Raises `ValueError` for a frame that is not (h, w, 3) of type uint8, and for
-        detections that are none.
+        The result of `look` may be given in place of the frame. Where `frame` is None detections
+        are tracked alone, without colours. Frames may have any size, but each new size compiles
+        anew, and boxes keep their places in pixels. Raises `ValueError` for a frame that is not (h,
+        w, 3) of type uint8, and for anything but `Detections`.
         """
         check_type(Detections, "Detections, as from_boxes makes them", detections=detections)
         seen = TrackedFrame(detections, self._pixels(frame))
@@ -257,12 +253,12 @@ class ObjectTracker(eqx.Module):
     def look(
         self, frame: UInt8[np.ndarray, "h w 3"], detections: Detections
     ) -> SampledBoxes | UInt8[np.ndarray, "h w 3"]:
-        """What `step` has to be given of a frame: the detections' pixels, where those are enough.
+        """The part of a frame that `step` needs: the detections' colours, where these suffice.
 
-        Then the time of a step does not depend on the size of the frame, nor does it compile anew
-        for another. It is the frame where particles are weighed by their colours, where colours are
-        exact, and for a chain that holds moves of other kinds than the default one's. Raises
-        `ValueError` for a frame as `step` does.
+        The time of a step then does not depend on the size of the frame, and a new size does not
+        compile anew. The result is the whole frame where particles are weighed by their colours,
+        where colours are exact, and for a chain that holds moves of other kinds than the default
+        chain. Raises `ValueError` for a frame as `step` does.
         """
         learned = [move.num_parts for move in self.moves if isinstance(move, LearnAppearance)]
         if self.exact_colours or len(learned) != 1 or not all(map(_sees_detections, self.moves)):
@@ -280,17 +276,17 @@ class ObjectTracker(eqx.Module):
 
 @eqx.filter_jit
 def _begin(filter: Filter) -> ParticleMixture:
-    """One program, where its operations one by one would be some forty."""
+    """All of the initial state in one program; operation by operation it would be some forty."""
     return filter.init(jax.random.key(0))
 
 
 def object_model(
     frames_per_second: float = 25.0, sigma: float | None = None
 ) -> DetectedObjectModel:
-    """What is expected of objects before anything is learned, at a frame rate.
+    """The model of objects before anything is learned, at a frame rate.
 
-    At fewer frames a second newborn objects may move further in a frame. Raises `ValueError` for a
-    rate or σ that is not positive.
+    At a lower frame rate new objects may move further in a frame. Raises `ValueError` for a rate or
+    σ that is not positive.
     """
     check_positive(frames_per_second=frames_per_second)
     model = DetectedObjectModel(sigma=sigma)
@@ -299,7 +295,7 @@ def object_model(
 
 
 def _enough_particles(resampling: Any, moves: Any, sigma: float | None) -> int:
-    """Those that the resampling gives an object, or else as many as there is to draw for."""
+    """P of the resampling, or else the least number that represents what is drawn."""
     for move in [resampling] if moves is None or not is_series(moves) else moves:
         number = getattr(move, "particles_per_component", None)
         if number is not None:
@@ -311,7 +307,7 @@ def _enough_particles(resampling: Any, moves: Any, sigma: float | None) -> int:
 def _own_chain(
     moves: Iterable[AbstractMove], particles_per_object: int, **settings: Any
 ) -> tuple[AbstractMove, ...]:
-    """The user's moves, or a `ValueError` for settings that they have and for moves that fail."""
+    """The user's moves, or a `ValueError` for settings beside them and moves that do not fit."""
     if not is_series(moves):
         raise ValueError(f"moves: {shown(moves)} is not a sequence of moves")
     for name, value in given(**settings).items():
@@ -324,14 +320,14 @@ def _own_chain(
         if isinstance(move, AbstractResampling):
             _check_resampling(move, particles_per_object, "moves")
     if not any(isinstance(move, Deaths) for move in chain):
-        raise ValueError(f"moves: {shown(chain)} lacks Deaths, which says who lives")
+        raise ValueError(f"moves: {shown(chain)} lacks Deaths, which keeps the list of objects")
     return chain
 
 
 def _learned_colours(
     moves: Iterable[AbstractMove], colours: AbstractColours | None
 ) -> AbstractColours | None:
-    """The bins of the chain's `LearnAppearance`, which those that are given have to be."""
+    """The bins of the chain's `LearnAppearance`; `colours`, if given, have to be the same."""
     for move in moves:
         if isinstance(move, LearnAppearance):
             if colours is not None and not eqx.tree_equal(colours, move.colours):
@@ -347,7 +343,7 @@ def _check_resampling(
 ) -> None:
     check_type(AbstractResampling, "a resampling move", **{argument: resampling})
     number = getattr(resampling, "particles_per_component", None)
-    # Another number would leave no empty slots for the newborn.
+    # Another number would leave no empty slots for new components.
     if number != particles_per_object:
         raise ValueError(
             f"{argument}: its particles_per_component, {number}, is not particles_per_object,"
@@ -355,12 +351,12 @@ def _check_resampling(
         )
     if isinstance(resampling, GaussianRegeneration) and resampling.where is None:
         raise ValueError(
-            f"{argument}: where is None, but which object a particle is of is no Gaussian"
+            f"{argument}: where is None, but the label of a particle's object is not Gaussian"
         )
 
 
 def _sees_detections(move: AbstractMove) -> bool:
-    """Whether it looks at the colours of detections alone, or at none."""
+    """Whether the move uses the colours of detections alone, or none."""
     if isinstance(move, PropagateObjects):
         return move.model.sigma is None
     kinds = (
