@@ -1,5 +1,5 @@
-"""Checks of arguments. Each raises a `ValueError` that names the argument and its value, and says
-what is allowed.
+"""Checks of arguments. Each raises a `ValueError` that names the argument, its value and what is
+allowed.
 
 Arguments are given by name: `check_whole(1, num_particles=num_particles)`. An argument that may be
 None goes through `given`, which leaves out None: `check_positive(**given(max_distance=None))`.
@@ -41,7 +41,7 @@ def check_whole(least: int = 1, /, **arguments: Any) -> None:
 
 
 def check_numbered(what: str, number: int, /, **arguments: Any) -> None:
-    """So many things can be numbered in 32 bits; the arguments are what there are too many of."""
+    """Each of the counted things gets a 32-bit index; the arguments are their counts."""
     if number > _MOST:
         named = ", ".join(f"{name}: {shown(value)}" for name, value in arguments.items())
         raise ValueError(
@@ -146,10 +146,10 @@ def as_numbers(
 ) -> Any:
     """The argument as an array of JAX or numpy that holds the same numbers for JAX.
 
-    By itself JAX reads bytes of another order as they stand, keeps the lower half of whole numbers
-    beyond 32 bits, and drops masks. Raises `ValueError` for masked numbers, durations, what is no
-    number, complex ones unless they may be, and what JAX's own type cannot hold. With `floating`,
-    whole numbers and booleans become floating point numbers.
+    JAX alone would misread bytes of another order, keep the lower half of whole numbers beyond 32
+    bits, and drop masks. Raises `ValueError` for masked numbers, durations, anything but numbers,
+    complex ones unless allowed, and numbers that JAX's own type cannot hold. With `floating`, whole
+    numbers and booleans become floating point numbers.
     """
     if isinstance(value, jax.ShapeDtypeStruct):
         return value
@@ -174,7 +174,7 @@ def _check_numbers(name: str, array: Any, value: Any, may_be_complex: bool) -> N
     if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
         raise ValueError(f"{name}: {shown(value)} is a key, no array of numbers")
     if jnp.issubdtype(array.dtype, jnp.complexfloating) and not may_be_complex:
-        # Further down the imaginary part would be dropped, at the latest in a density.
+        # Later the imaginary part would be dropped silently, at the latest in a density.
         raise ValueError(
             f"{name}: {array.dtype} is complex; give the real and the imaginary part as two numbers"
         )
@@ -187,7 +187,7 @@ def _check_numbers(name: str, array: Any, value: Any, may_be_complex: bool) -> N
 
 
 def _of_jax(name: str, array: np.ndarray) -> np.ndarray:
-    """The array in the type that JAX would take it for; a `ValueError` where numbers would change.
+    """The array in the type that JAX gives it; a `ValueError` where numbers would change.
 
     Floating point numbers may be rounded.
     """
@@ -252,19 +252,19 @@ def _holds_arrays(value: Any) -> bool:
 
 
 def check_positive_array(**arguments: Any) -> None:
-    """Each array has numbers, all of them positive and finite, as far as they are known."""
+    """Each array has numbers, all of them positive and finite, where their values are known."""
     _check_entries(lambda array: (array > 0) & np.isfinite(array), "positive and finite", arguments)
 
 
 def check_not_negative_array(**arguments: Any) -> None:
-    """Each array has numbers, all of them finite and none negative, as far as they are known."""
+    """Each array has numbers, all finite and none negative, where their values are known."""
     _check_entries(
         lambda array: (array >= 0) & np.isfinite(array), "finite and not negative", arguments
     )
 
 
 def check_finite_array(**arguments: Any) -> None:
-    """Each array has numbers, all of them finite, as far as they are known."""
+    """Each array has numbers, all of them finite, where their values are known."""
     _check_entries(np.isfinite, "finite", arguments)
 
 

@@ -1,4 +1,4 @@
-"""What all commands share: read numbers, write whole files, end an error with one line.
+"""Shared by all commands: reading numbers, writing whole files, one-line errors.
 
 A number out of range is an error of argparse, with exit status 2.
 """
@@ -39,7 +39,7 @@ def whole(least: int = 1, most: int = 2**31 - 1) -> Callable[[str], int]:
     return read
 
 
-# JAX makes a key of the last 32 bits only: a larger seed would be the same as a smaller one.
+# JAX makes a key of the last 32 bits only: larger seeds would repeat smaller ones.
 seed = whole(0, 2**32 - 1)
 
 
@@ -95,9 +95,9 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def refuse_overwriting(folder: Path, outputs: Iterable[str], inputs: dict[str, Any]) -> None:
-    """Raise `ValueError` where an output in `folder` is a file that is read, by any of its names.
+    """Raise `ValueError` where an output in `folder` is also an input file, under any of its names.
 
-    `inputs`: the files that are read, by the argument that names each; None for one not given.
+    `inputs`: the input files, by the argument that names each; None for one not given.
     """
     for output in outputs:
         for argument, path in inputs.items():
@@ -127,9 +127,9 @@ def format_table(header: list[str], rows: list[list[str]]) -> str:
 def exit_status(run: Callable[[], None], arguments: Sequence[str] | None = ()) -> int:
     """Run a command: bad input is one line on the error stream and 2, an interruption 130.
 
-    What it compiles is kept for the next run, where there is a folder for it. Where `arguments` is
-    None, the process is the command's own, and an interruption ends it here: one that comes while
-    JAX traces or compiles leaves its caches such that clearing them, at a process's usual end, is
+    Compiled programs are kept for the next run, where there is a folder for them. Where `arguments`
+    is None, the process is the command's own, and an interruption ends it here: if it comes while
+    JAX traces or compiles, JAX's caches are left in a state in which the interpreter's usual end is
     a segmentation fault.
     """
     with contextlib.suppress(OSError, RuntimeError):  # the latter where there is no home
@@ -150,7 +150,7 @@ def exit_status(run: Callable[[], None], arguments: Sequence[str] | None = ()) -
 
 
 def say_warnings(category: type[Warning]) -> None:
-    """From here on show warnings of this kind as one line each, every time, clear of any bar.
+    """From here on show each warning of this kind as one line, without overwriting a progress bar.
 
     Call it inside `warnings.catch_warnings()`, which ends it.
     """
@@ -183,7 +183,7 @@ class Clock:
             self.seconds[part] += time.perf_counter() - start - within
 
     def over(self, part: str, items: Iterable[Any]) -> Iterator[Any]:
-        """The items, the time to get each counted for this part."""
+        """Yield the items, and count the time that each takes to arrive for this part."""
         iterator = iter(items)
         while True:
             with self.of(part):
@@ -194,9 +194,10 @@ class Clock:
 
 
 def peak_memory() -> float:
-    """The most memory that this process has held, in MB of 2²⁰ bytes.
+    """The peak memory of this process, in MB of 2²⁰ bytes.
 
-    Linux's `ru_maxrss` goes on from the parent's at a fork; VmHWM starts anew with the program.
+    After a fork, Linux's `ru_maxrss` starts from the parent's value; VmHWM starts anew with the
+    program.
     """
     try:
         status = Path("/proc/self/status").read_text()

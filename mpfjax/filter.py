@@ -47,7 +47,7 @@ from mpfjax.operations.logarithms import scaled_log_sum_exp
 
 
 class StepInfo(eqx.Module):
-    """What a step reports beside the mixture that it returns."""
+    """The report of a step, which comes with its mixture."""
 
     log_likelihood_increment: Float[Array, ""]
     """log p(y_t | y_1..y_{t-1}), estimated; -inf where every particle has zero likelihood."""
@@ -74,7 +74,7 @@ BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
 
 class Start(NamedTuple):
-    """Where a run starts: its key, and x_0 where that was drawn before."""
+    """The start of a run: its key, and x_0 where that was drawn before."""
 
     key: Key[Array, "*seeds"]
     particles: PyTree = None
@@ -95,12 +95,13 @@ class Filter(eqx.Module):
     - `num_components`: M, the most components; the filters of the literature call it
       `max_components`.
     - `initial_moves`: regrouping of x_0, such as `KMeans(reseed=True)`.
-    - `initial_noise`: what x_0 is made of where the model has `initial_from_noise`: "independent",
-      as the model's own `sample_initial` draws it, "rqmc" or "stratified"; see `Propagate`.
-    - `starts_empty`: at time 0 no slot holds a particle, and all may be emptied again. Moves found
-      components, as the births of a tracker. A step without any mass has an increment of zero.
+    - `initial_noise`: the noise of x_0 where the model has `initial_from_noise`: "independent", as
+      the model's own `sample_initial` draws it, "rqmc" or "stratified"; see `Propagate`.
+    - `starts_empty`: at time 0 no slot holds a particle, and later all may become empty again.
+      Moves start components, as the births of a tracker. A step without any mass has an increment
+      of zero.
 
-    Raises `ValueError` for N < 1, M < 1, N < M, no moves, moves that never see an observation, or
+    Raises `ValueError` for N < 1, M < 1, N < M, no moves, moves that never use an observation, or
     fewer slots than `particles_per_component` asks for.
     """
 
@@ -186,7 +187,7 @@ class Filter(eqx.Module):
         return mixture
 
     def with_inputs(self, inputs: PyTree) -> "Filter":
-        """The filter at a step whose known inputs are u_t: every model of it has them.
+        """The filter at a step whose known inputs are u_t, which every model in it receives.
 
         `step`, `predict` and the runners do this themselves. None leaves the filter as it is.
         """
@@ -291,7 +292,7 @@ def step_and_faults(
     observation: PyTree,
     inputs: PyTree = None,
 ) -> tuple[ParticleMixture, StepInfo, tuple[Fault, ...]]:
-    """A step within a program, with what `raise_faults` has to be given where that has ended."""
+    """A step inside a compiled program, and what `raise_faults` needs when that has ended."""
     faults = faults_of(filter.model, observation, inputs)
     moved, info = filter.with_inputs(inputs)._step(key, mixture, observation)
     broken = Fault(~(info.log_likelihood_increment < jnp.inf), BROKEN_DENSITY)
@@ -327,11 +328,11 @@ def sample_initial(
 def _normalise(
     mixture: ParticleMixture, previous: ParticleMixture, may_be_empty: bool
 ) -> tuple[ParticleMixture, Float[Array, ""]]:
-    """Remove the growth of the mass. If no mass is left, take the previous weights or, where a
+    """Remove the growth of the mass. If no mass is left, keep the previous weights or, where a
     mixture may be empty, none.
 
-    The scale is removed first, which is exact. Added to it, the sum of the weights would be lost to
-    rounding.
+    The scale is removed first, which is exact. If it were added to it, the sum of the weights would
+    be lost to rounding.
     """
     log_sum, log_largest = scaled_log_sum_exp(mixture.log_weights)
     own_scale = jnp.zeros_like(log_sum) if mixture.log_scale is None else mixture.log_scale
@@ -354,7 +355,7 @@ def _report(
 ) -> StepInfo:
     degenerate = increment == -jnp.inf
     of_evidence = of_masses = None
-    # Families on several islands would have to be brought together.
+    # Families may have members on several islands.
     if EVE_INDICES in mixture.memory and num_islands() == 1:
         variance = jnp.where(degenerate, jnp.inf, evidence_variance(mixture))
         of_evidence = jnp.sqrt(jnp.maximum(variance, 0.0))

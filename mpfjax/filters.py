@@ -29,7 +29,7 @@ from mpfjax.moves.resampling.ordering import HILBERT, SortBy
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.proposals import AbstractProposal
 
-# Components that were right a few steps before need no more iterations of K-means.
+# K-means starts from the components of a few steps before, and needs few iterations.
 _WARM_ITERATIONS = 2
 
 
@@ -47,12 +47,12 @@ def particle_filter(
 ) -> Filter:
     """The standard particle filter: resample, propagate.
 
-    Vermaak et al. (2003), section 3, with one component; bootstrap unless a proposal is given.
-    Use it for a filtering distribution with one mode. If there are several, it loses all but one.
+    Vermaak et al. (2003), section 3, with one component; bootstrap unless a proposal is given. Use
+    it for a filtering distribution with one mode. If there are several, it loses all but one.
     `gradient` is that of `Resample`. "stop" is also that of `Propagate`: take it for tuning.
-    `num_draws` is that of `PropagateNested`, how many x_t each particle draws to keep one.
-    `noise` is that of `Propagate`. With "rqmc", particles stand along a Hilbert curve of their
-    state unless `sort_by` says otherwise, and the filter is sequential quasi-Monte Carlo (Gerber
+    `num_draws` is that of `PropagateNested`: each particle draws this many x_t and keeps one.
+    `noise` is that of `Propagate`. With "rqmc", particles are ordered along a Hilbert curve of
+    their state unless `sort_by` is given, and the filter is sequential quasi-Monte Carlo (Gerber
     and Chopin 2015).
     """
     sort_by = _standing(sort_by, noise)
@@ -81,12 +81,12 @@ def auxiliary_particle_filter(
     """The auxiliary particle filter: resample by w times a look-ahead to y_t, propagate.
 
     Pitt and Shephard (1999). `lookahead` is a function (y_t, states) -> log ν of each particle, or
-    a proposal with `log_normaliser`, which then also draws x_t unless there is another `proposal`.
-    Ẑ is unbiased whatever it is; see `AuxiliaryResample`. With
-    `GaussNewtonProposal(model, 1, inflation=1.0)` for a `LinearGaussianModel` the filter is fully
-    adapted: ν is p(y_t | x_{t-1}), x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are
-    equal. `noise` and `num_draws` are those of `particle_filter`. Use it where the likelihood is
-    narrow and tells early which particles will survive.
+    a proposal with `log_normaliser`, which then also draws x_t unless another `proposal` is given.
+    Ẑ is unbiased for any look-ahead; see `AuxiliaryResample`. With `GaussNewtonProposal(model, 1,
+    inflation=1.0)` for a `LinearGaussianModel` the filter is fully adapted: ν is p(y_t | x_{t-1}),
+    x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are equal. `noise` and `num_draws` are
+    those of `particle_filter`. Use it where the likelihood is narrow and y_t shows early which
+    particles will survive.
     """
     sort_by = _standing(sort_by, noise)
     resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
@@ -128,12 +128,12 @@ def mixture_particle_filter(
     """The mixture particle filter: resample within components, propagate, regroup.
 
     Vermaak et al. (2003), sections 3 and 4. Each component is resampled on its own and competes
-    with the others only through its mixture weight. So no component takes particles from another.
-    At every third step components that overlap merge, diffuse components split, and two iterations
-    of K-means refine the grouping. All of it is exact. `features` and `scale` are the coordinates
-    and units in which these three moves see the particles (see `Features`; features of one
-    particle, if the model is wrapped by `per_particle`). `merge`, `split` and `kmeans` replace
-    those moves, for example with other thresholds, and bring their own features and scale.
+    with the others only through its mixture weight, so that no component takes particles from
+    another. At every third step components that overlap merge, diffuse components split, and two
+    iterations of K-means refine the grouping. All of it is exact. `features` and `scale` are the
+    coordinates and units in which these three moves see the particles (see `Features`; features of
+    one particle, if the model is wrapped by `per_particle`). `merge`, `split` and `kmeans` replace
+    those moves, for example with other thresholds, and have their own features and scale.
     `regroup_every` is k where they run at every k-th step (see `Every`): take 1 where modes move
     fast, or where a `Merge` counts frames with its `patience`. `gradient`, `noise` and `num_draws`
     are those of `particle_filter`, `lookahead` that of `auxiliary_particle_filter`, and
@@ -267,12 +267,12 @@ def distributed_partitioned_sampling(
 
     Smith and Gatica-Perez (2004), section 4: pool and resample, deal the particles into C sets at
     random, do partitioned sampling in each, reassemble. A fixed order leaves few distinct
-    hypotheses of its first objects. Here all objects share this loss. `orders` are C permutations
+    hypotheses of its first objects; here all objects share this loss. `orders` are C permutations
     of the objects; None is the J circular shifts, and "random" J new permutations at every step.
     `reassembly` is "prior", the paper's, where every set returns to its mass (an approximation: the
     marginal likelihood is biased), or "evidence", which is exact. See `Partitioned` for both, and
-    for `gradient`. Use it where you do not know which object will be hard to track, with enough
-    particles that each set of N/C can track.
+    for `gradient`. Use it where it is unknown which object will be hard to track, and N/C particles
+    are enough to track all.
     """
     require_multi_object(model, "distributed_partitioned_sampling")
     if orders is None:
@@ -299,8 +299,8 @@ def independent_particle_filters(
 ) -> Filter:
     """A small particle filter for each object, as if there were no other.
 
-    Each object has N particles, so the cost is that of a joint filter of N. Where the objects do
-    not interact it is exact, and the best choice. It ignores an interaction: filters of look-alikes
+    Each object has N particles, at the cost of a joint filter of N. It is exact where the objects
+    do not interact, and then the best choice. It ignores an interaction: filters of look-alikes
     that cross may end on the same object. Estimates are after resampling; see
     `PropagateIndependently`.
     """
@@ -319,12 +319,12 @@ def clustered_particle_filter(
     """A joint filter of clusters of objects; clusters merge where objects meet.
 
     Every object starts with a particle filter of its own. Two objects meet if the interaction ψ
-    between any of their predicted points is not 1. Then they become one joint filter, weighted by
-    ψ. In it, objects still cross between rows: each of an object's N points serves every row,
-    with the weight L f(point | row) / Σ f(point | any row). Without interaction it is
-    `independent_particle_filters`; with interaction it is unbiased. A step costs N x J likelihood
-    evaluations, as in partitioned sampling. `PropagateInClusters` has the derivation, the options
-    and what the object model must define.
+    between any of their predicted points is not 1. Their filters then become one joint filter,
+    weighted by ψ. In it, points of an object are still recombined among rows: each of an object's N
+    points serves every row, with the weight L f(point | row) / Σ f(point | any row). Without
+    interaction it is `independent_particle_filters`; with interaction it is unbiased. A step costs
+    N x J likelihood evaluations, as in partitioned sampling. `PropagateInClusters` has the
+    derivation, the options and what the object model must define.
 
     Use it instead of a joint filter, PS or DPS wherever ψ has compact support, as in
     `PairwiseRepulsion(compact=True)`. Otherwise all objects become one cluster at once. Estimates
@@ -354,7 +354,7 @@ def _gaussian_moves(
 
 
 def _standing(sort_by: SortBy | None, noise: str) -> SortBy | None:
-    """What particles are sorted by: for point sets they must stand in some order of their state."""
+    """The key by which particles are sorted: point sets need an order of the states."""
     check_one_of(NOISES, noise=noise)
     return HILBERT if sort_by is None and noise == "rqmc" else sort_by
 

@@ -41,24 +41,24 @@ class ParticleMixture(eqx.Module):
 
     It holds ONE set of joint log-weights ℓ_i = log(π_{c_i} w_i), normalised over all particles.
     Mixture weights π_m = Σ_{c_i = m} exp ℓ_i and particle weights w_i = exp(ℓ_i) / π_{c_i} are
-    derived and never stored. So a reclustering (section 4) only changes the indicators, and the
-    exact re-weighting follows. Shapes are fixed: a slot of weight zero (ℓ = -inf) is empty, and a
-    component without a filled slot is dead.
+    derived and never stored. A reclustering (section 4) therefore only changes the indicators, and
+    the exact re-weighting follows. Shapes are fixed: a slot of weight zero (ℓ = -inf) is empty, and
+    a component without a filled slot is dead.
 
     - `particles`: a pytree whose leaves have a leading axis n, the states X.
     - `log_weights`: ℓ, shape (n,), -inf in an empty slot.
     - `component_indicators`: C, shape (n,), in [0, num_components).
-    - `ancestor_indices`: shape (n,), which slot of the previous step's mixture each came from.
+    - `ancestor_indices`: shape (n,), the slot of the previous step's mixture that each came from.
     - `num_components`: M, the most components that there can be, dead ones included; static. The
       filters of the literature call it `max_components`.
-    - `memory`: what moves with a memory carry from step to step, by the move's name.
+    - `memory`: the memory that moves keep from step to step, by the move's name.
     - `usable_slots`: how many slots a move may fill, the first ones; None is all of them. Only
       `monte_carlo(..., slots=...)` sets it.
     - `parents`: within a step, x_{t-1} of each particle after the propagation, where a move of the
       chain asks for it (`AbstractMove.needs_parents`). Elsewhere it is None.
     - `log_scale`: within a step, the logarithm of a common factor of all weights. It is kept apart
-      from ℓ, which rounding would destroy if a log-likelihood of a million were added. After a
-      step it is None, which stands for zero.
+      from ℓ, which would lose its digits if a log-likelihood of a million were added. After a step
+      it is None, which stands for zero.
 
     The properties are those of one mixture. For a stack of mixtures, as `monte_carlo` and
     `collect=None` return, they raise a `ValueError` that says to `jax.vmap` over the leading axes.
@@ -229,8 +229,8 @@ class ParticleMixture(eqx.Module):
     def weighed(self, *log_factors: Float[Array, "#n"]) -> "ParticleMixture":
         """The mixture with its weights multiplied by exp of the factors, one array or several.
 
-        The largest factor of the filled slots goes to `log_scale`. So a constant of any size only
-        changes the mass. An empty slot stays empty whatever its factor is.
+        The largest factor of the filled slots goes to `log_scale`, so that a constant of any size
+        only changes the mass. An empty slot stays empty whatever its factor is.
         """
         log_weights, log_scale = self.log_weights, self.log_scale
         for factors in log_factors:
@@ -261,7 +261,7 @@ def single_component(
 ) -> ParticleMixture:
     """Equally weighted particles, all in component 0, each its own ancestor.
 
-    With `usable_slots` only the first so many are particles; the other slots stay empty.
+    With `usable_slots` only the first `usable_slots` are particles; the other slots stay empty.
     """
     num_slots = jax.tree.leaves(particles)[0].shape[0]
     slot = jnp.arange(num_slots, dtype=jnp.int32)
@@ -281,7 +281,7 @@ def single_component(
 
 
 def points(particles: PyTree) -> PyTree:
-    """What of the particles says where they are: all but the covariances that they may carry."""
+    """The leaves of the particles that give their places: all but covariances they may carry."""
     if isinstance(particles, MarginalisedState):
         return particles.latent, particles.mean
     return particles
@@ -296,7 +296,7 @@ def flatten_states(particles: PyTree) -> Float[Array, "n d"]:
 
 
 def _numbers(values: Shaped[Array, "*shape"]) -> Inexact[Array, "*shape"]:
-    """What is averaged: also of numpy, and in floating point."""
+    """The values as an array to be averaged: also from numpy, and in floating point."""
     return jnp.asarray(as_numbers("values", values, floating=True, may_be_complex=True))
 
 

@@ -1,4 +1,4 @@
-"""What a user gives for each step: observations, which of them are missing, and known inputs."""
+"""The data of each step: observations, which of them are missing, and known inputs."""
 
 from typing import Any
 
@@ -31,9 +31,9 @@ class Series(eqx.Module):
 
 
 def as_series(observations: PyTree, inputs: PyTree, missing: str, model: Any) -> Series:
-    """The observations and inputs as arrays; a `ValueError` for what cannot be run.
+    """The observations and inputs as arrays; a `ValueError` for data that cannot be run.
 
-    A missing y_t does not miss its u_t: inputs are always finite numbers.
+    A step with a missing y_t still has its u_t: inputs are always finite numbers.
     """
     present = present_steps(observations, missing, model)
     series = Series(as_arrays(observations), present)
@@ -66,7 +66,7 @@ def steps_of_inputs(
 
 
 def one_input(inputs: PyTree, model: Any) -> PyTree:
-    """The arrays of u_t; a `ValueError` for what is no number, or a model without a place."""
+    """The arrays of u_t; a `ValueError` for anything but numbers, or a model without inputs."""
     if inputs is None:
         return None
     _require_place_for(inputs, model)
@@ -100,14 +100,14 @@ def as_arrays(observations: PyTree, name: str = "observations") -> PyTree:
 
 
 def one_observation(observation: PyTree) -> PyTree:
-    """The arrays of y_t; a `ValueError` for none, for what is no number, and for too large ones."""
+    """The arrays of y_t; a `ValueError` for none, anything but numbers, and too large ones."""
     if not jax.tree.leaves(observation):
         raise ValueError("observation: there is none; use predict to skip it")
     return as_arrays(observation, "observation")
 
 
 class Fault(eqx.Module):
-    """Whether a program came upon something for which `raise_faults` is to raise, and what."""
+    """Whether a program met a fault for which `raise_faults` is to raise, and which."""
 
     found: Bool[Array, "*runs"]
     message: str = eqx.field(static=True)
@@ -132,9 +132,9 @@ def faults_of(model: Any, observation: PyTree, inputs: PyTree) -> tuple[Fault, .
 def raise_faults(value: PyTree, faults: tuple[Fault, ...]) -> PyTree:
     """`value`, or a RuntimeError for the first of the faults that was found in any run.
 
-    A program that raises by itself calls back into Python, and no program that does is kept for the
-    next process. So it returns its faults, and they are looked at where it has ended; under the
-    caller's own jit the error is raised while that runs.
+    A program that raises errors itself calls back into Python, and such a program cannot be kept
+    for the next process. It therefore returns its faults, which are checked after it has ended.
+    Under the caller's own jit the error is raised while the program runs.
     """
     for fault in faults:
         if isinstance(fault.found, Tracer):
@@ -145,7 +145,7 @@ def raise_faults(value: PyTree, faults: tuple[Fault, ...]) -> PyTree:
 
 
 def check_series(observations: PyTree, missing: str) -> list[Any]:
-    """The arrays of y_1..y_t; a `ValueError` for what no model can be run on."""
+    """The arrays of y_1..y_t; a `ValueError` for data that no model can be run on."""
     check_one_of(("error", "skip"), missing=missing)
     leaves = jax.tree.leaves(as_arrays(observations))
     _length(leaves, observations, "observations")
@@ -153,7 +153,7 @@ def check_series(observations: PyTree, missing: str) -> list[Any]:
 
 
 def present_steps(observations: PyTree, missing: str, model: Any) -> Bool[Array, " t"] | None:
-    """Which observations are there, or None where all are; raises for what cannot be run.
+    """Which observations are there, or None where all are; raises for data that cannot be run.
 
     For a `model` with `handles_missing`, a NaN is a missing number, and a step is missing only if
     all its numbers are.

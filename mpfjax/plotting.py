@@ -97,7 +97,7 @@ def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str])
         stds = np.array([np.std(entry["scores"]) for entry in entries])
         # A score lies in [0, 1]: the bars end there too.
         bars = np.minimum(stds, [means, 1 - means])
-        # A few per cent apart, so that bars at the same N stay apart.
+        # Shifted by a few per cent, so that bars at the same N do not cover each other.
         score.errorbar(sizes * 1.04 ** (index - 1), means, yerr=bars, capsize=2, **style)
         mass.plot(sizes, [entry["mode_mass_error"] for entry in entries], **style)
         if name != "pf":
@@ -123,7 +123,7 @@ def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str])
     mass.set_ylabel(r"error of $P(x_t > 0 \mid y_1 \ldots y_t)$")
     mass.set_title("RMS error of the upper mode's mass", fontsize=10)
     mass.set_ylim(bottom=0)
-    # Above the axes: every corner of the first holds bars, at some N.
+    # Above the axes: in the first panel every corner holds bars, at some N.
     handles, texts = mass.get_legend_handles_labels()
     figure.legend(handles, texts, loc="outside upper center", ncols=len(names), fontsize=8)
     return figure
@@ -191,7 +191,7 @@ def draw_errors_by_size(
             sizes = np.array(sorted(by_size))
             mean = np.array([by_size[size].mean() for size in sizes])
             error = np.array([standard_error(by_size[size]) for size in sizes])
-            # Shifted a little, so that bars of equal heights stay apart.
+            # Shifted a little, so that bars of equal heights do not cover each other.
             shift = 1 + 0.012 * (index - (len(names) - 1) / 2)
             axis.errorbar(
                 sizes * shift, mean, error, label=name, color=COLOURS[index],
@@ -251,7 +251,7 @@ def draw_rates(
     step = min(np.diff(places), default=1.0)
     for index, (name, points) in enumerate(lines.items()):
         x, rate, low, high = np.array(sorted(points)).T
-        # Shifted a little, so that intervals at the same place stay apart.
+        # Shifted a little, so that intervals at the same place do not cover each other.
         x = x + 0.06 * step * (index - (len(lines) - 1) / 2)
         axis.errorbar(
             x, rate, np.maximum([rate - low, high - rate], 0), label=name,

@@ -139,11 +139,10 @@ class GaussNewtonProposal(AbstractProposal):
     """A Gaussian fitted by Gauss-Newton to L(y_t | x_t) D(x_t | x_{t-1}), for each particle.
 
     For models with additive Gaussian noise, x_t = f(x_{t-1}) + N(0, Q), y_t = h(x_t) + N(0, R).
-    Each iteration linearises h at the current point, its Jacobian H by JAX, and solves for the
+    Each iteration linearises h at the current point, with its Jacobian H by JAX, and solves for the
     mean of the resulting Gaussian, whose precision is Λ = Q⁻¹ + Hᵀ R⁻¹ H (Doucet, Godsill and
-    Andrieu 2000, section II.D, local linearisation). The draw is from
-    N(mean, inflation² Λ⁻¹). An inflation above one keeps the weights bounded if the Gaussian is
-    narrower than the target.
+    Andrieu 2000, section II.D, local linearisation). The draw is from N(mean, inflation² Λ⁻¹). An
+    inflation above one keeps the weights bounded if the Gaussian is narrower than the target.
 
     - `model`: has `transition_mean`, `observation_mean`, `transition_covariance`, (d, d), and
       `observation_covariance`, (p, p). States are one array, (n,) or (n, d); Q is invertible.
@@ -151,8 +150,8 @@ class GaussNewtonProposal(AbstractProposal):
       evenly. The distribution of each draw stays the same, so the filter stays unbiased.
       `Propagate(noise="rqmc")` spreads those of each component.
 
-    Raises `ValueError` for a model without these, no iterations, or an inflation not above 0.
-    Use it where bootstrap particles mostly miss the likelihood.
+    Raises `ValueError` for a model without these, no iterations, or an inflation not above 0. Use
+    it where bootstrap particles mostly miss the likelihood.
     """
 
     model: Any

@@ -12,6 +12,6 @@ def main(arguments: list[str] | None = None) -> int:
     options = parse_arguments(arguments)
     with warnings.catch_warnings():
         say_warnings(RuntimeWarning)
-        # Writing a video starts an encoder, whose fork and exec JAX's threads do not touch.
+        # Python warns of forks beside JAX's threads; the encoder's fork execs at once and is safe.
         warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
         return exit_status(lambda: run(options), arguments)

@@ -1,4 +1,4 @@
-"""What the command is asked to do, and where the frames come from."""
+"""The arguments of the command, and the source of the frames."""
 
 import argparse
 import importlib
@@ -43,21 +43,21 @@ _TEXT = (".txt", ".csv")
 
 
 class Source(NamedTuple):
-    """The frames to track in, and what is known of them beforehand."""
+    """The frames to track in, and their metadata."""
 
     path: Path
     has_pixels: bool
     rows: np.ndarray | None  # detections; None where they are yet to be found
     first: int  # the number of the first frame
-    last: int | None  # None where only reading on will tell
+    last: int | None  # None where it is unknown until all frames are read
     num_frames: int | None
     frames_per_second: float | None
-    frame_size: tuple[int, int] | None  # None where only the frames tell
+    frame_size: tuple[int, int] | None  # None where it is unknown before the frames are read
     truth: Truth | None
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
-    """The arguments, each checked as far as it can be without the frames."""
+    """The arguments, checked as far as possible without the frames."""
     parser = argparse.ArgumentParser(prog="mpfjax", description="Particle filters that track.")
     package = importlib.import_module(__name__.partition(".")[0])
     parser.add_argument("--version", action="version", version=f"mpfjax {package.__version__}")
@@ -117,7 +117,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
 
 
 def _with_boxes_joined(arguments: list[str]) -> list[str]:
-    """`--box` and its value in one argument: argparse takes a box that begins with - for an option.
+    """`--box` and its value joined, since argparse takes a box that begins with - for an option.
 
     Such a box reaches beyond the left border.
     """
@@ -131,7 +131,7 @@ def _with_boxes_joined(arguments: list[str]) -> list[str]:
 
 
 def open_source(options: argparse.Namespace) -> Source:
-    """Where the frames are, or a `ValueError` that names what is wrong."""
+    """The source of the frames; a `ValueError` for one that cannot be read."""
     first, last = frames.parse_range(options.frames, "--frames")
     path, has_pixels = options.source, _has_pixels(options.source)
     if not path.exists():
@@ -165,7 +165,7 @@ def open_source(options: argparse.Namespace) -> Source:
 
 
 def _has_pixels(path: Path) -> bool:
-    """Whether there are frames to see, and not detections alone."""
+    """Whether there are frames, and not detections alone."""
     if path.is_dir():
         return frames.num_images(path) > 0 or not detection_files(path)
     return path.suffix.lower() not in _TEXT

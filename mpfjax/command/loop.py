@@ -31,11 +31,11 @@ from mpfjax.vision.tracking.tracker import Tracks
 
 
 class Results:
-    """What is written of a run: rows as they come, the video, and the summary at the end."""
+    """The output of a run: rows as they come, the video, and the summary at the end."""
 
     def __init__(self, options: argparse.Namespace, source: Source) -> None:
         self.options, self.source = options, source
-        # Reading and writing have threads of their own: what counts is how long the run waits.
+        # Reading and writing have threads of their own: the seconds are those the run waits for them.
         self.clock = Clock("read", "detect", "track", "write")
         self.compiling = 0.0  # seconds of detecting and tracking in the first frame
         self.rows: list[np.ndarray] = []
@@ -68,7 +68,7 @@ class Results:
     def summary(self) -> dict[str, Any]:
         """The content of summary.json."""
         rows, clock, n = self.all_rows(), self.clock, self.num_frames
-        # The first frame compiles, and says nothing of the others.
+        # The first frame includes compiling, and is left out.
         rate = (n - 1) / (self._working() - self.compiling) if n > 1 else 1 / self.compiling
         summary = {
             "frames": n,
@@ -83,7 +83,7 @@ class Results:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Track, and leave behind what was done, also where it ends before the frames do."""
+    """Track, and write all results so far, also where the run ends before the frames do."""
     source = open_source(options)
     results = Results(options, source)
     start = _start(results, _first_still(source) if source.has_pixels else None)
@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> None:
     try:
         _track(results, start)
     finally:
-        # Also on the way out of an interrupted run, or of one whose frames cannot be read on.
+        # Also after an interruption, or where the next frame cannot be read.
         if results.num_frames:
             box_files.write_tracks(options.out / TRACKS, results.all_rows())
             summary = results.summary()
@@ -112,7 +112,7 @@ Start = Callable[[Iterable[np.ndarray] | None, Clock], Iterator[Tracks]]
 
 
 def _start(results: Results, still: np.ndarray | None) -> Start:
-    """The tracker that was asked for; everything that can be wrong with it is found here."""
+    """The requested tracker; raises for any fault in the arguments."""
     options, source = results.options, results.source
     key = jax.random.key(options.seed)
     if options.box is not None and still is not None:
@@ -183,7 +183,7 @@ def _track(results: Results, start: Start) -> None:
 
 @contextlib.contextmanager
 def _video(path: Path, frames_per_second: float | None) -> Iterator[Callable[..., None]]:
-    """What draws rows on a still for a new video, in a thread of its own."""
+    """A function that draws rows on a frame of a new video, in a thread of its own."""
     with frames.open_video(path, frames_per_second or 10.0) as append:
 
         def draw(still: np.ndarray, rows: np.ndarray) -> None:

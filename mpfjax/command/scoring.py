@@ -1,4 +1,4 @@
-"""What a run is compared with: the truth beside the frames, and the scores against it."""
+"""The truth of a run, and the scores against it."""
 
 import os
 import sys
@@ -19,8 +19,8 @@ _INNER = ("img", "img1")
 def find_truth(source: Path, given: Path | None, first: int, last: int | None) -> Truth | None:
     """The truth that was given, or that of a folder of images, in these frames; None without one.
 
-    A video has no folder of its own, and so no truth but one that is given. Warns of a truth beside
-    the images that cannot be read; raises `ValueError` for a given one.
+    A video has no folder, and so no truth unless it is given. Warns of a truth beside the images
+    that cannot be read; raises `ValueError` for a given one.
     """
     if given is not None:
         if not given.exists():
@@ -46,9 +46,9 @@ def find_truth(source: Path, given: Path | None, first: int, last: int | None) -
 def scores_of(
     rows: np.ndarray, truth: Truth | None, first: int, last: int, drawn: np.ndarray | None
 ) -> dict[str, float]:
-    """HOTA, MOTA and IDF1 of rows in these frames, where there is something to score them with.
+    """HOTA, MOTA and IDF1 of rows in these frames, where there is a truth.
 
-    Where boxes were drawn, only the objects that they were drawn around are to be found.
+    Where boxes were drawn, only the objects in these boxes are scored.
     """
     if truth is None or not np.any(truth.objects[:, 0] <= last):
         return {}

@@ -1,6 +1,6 @@
-"""Reading ahead of the tracker and writing behind it, in threads: all go at the slowest one's pace.
+"""Reading ahead of the tracker and writing behind it, in threads, at the pace of the slowest.
 
-What waits between threads is bounded, so memory does not grow with the video.
+Queues between threads are bounded, so that memory does not grow with the video.
 """
 
 import contextlib
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple, TypeVar
 
 T = TypeVar("T")
-# Enough to even out frames of unlike cost; a frame of 4K has 25 MB.
+# Enough to even out frames of different cost; a frame of 4K has 25 MB.
 _WAITING = 4
 # How often a thread that waits looks whether the run has ended, in seconds.
 _LOOK = 0.1
@@ -28,8 +28,8 @@ class _Made(NamedTuple):
 def read_ahead(items: Iterable[T]) -> Iterator[Iterator[T]]:
     """The items in their order, each made in another thread before it is asked for.
 
-    What making one raises is raised where it would have come. Leaving the block ends the thread,
-    which closes the items where they can be closed.
+    An exception in making an item is raised in the place of the item. Leaving the block ends the
+    thread, which closes the items if they can be closed.
     """
     made: queue.Queue[_Made] = queue.Queue(_WAITING)
     left = threading.Event()
@@ -73,8 +73,8 @@ def read_ahead(items: Iterable[T]) -> Iterator[Iterator[T]]:
 def write_behind(write: Callable[..., Any]) -> Iterator[Callable[..., None]]:
     """A function that has another thread call `write` with its arguments, one call after the other.
 
-    What `write` raises is raised by the next call or at the end of the block, and nothing more is
-    written. However the block is left, what was handed over is written first.
+    An exception of `write` is raised by the next call or at the end of the block, and nothing more
+    is written. However the block is left, all earlier calls are completed first.
     """
     waiting: queue.Queue[tuple[Any, ...] | None] = queue.Queue(_WAITING)
     errors: list[BaseException] = []
@@ -103,7 +103,7 @@ def write_behind(write: Callable[..., Any]) -> Iterator[Callable[..., None]]:
 
 
 def _started(work: Callable[[], None]) -> threading.Thread:
-    """A thread with the settings of this one, that no end of the process waits for."""
+    """A daemon thread with the settings of this one."""
     thread = threading.Thread(target=contextvars.copy_context().run, args=(work,), daemon=True)
     thread.start()
     return thread

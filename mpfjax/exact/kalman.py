@@ -151,7 +151,7 @@ def filtered_moments(
 ) -> tuple[Moments, Float[Array, " t"]]:
     """Means and covariances of x_1, ..., x_t, and the increments; a NaN is a missing number.
 
-    `step_of` makes each step of what is `told` of it, which has a leading axis t.
+    `step_of` makes the matrices of each step from its part of `told`, which has a leading axis t.
     """
     identity = jnp.eye(start[0].shape[0], dtype=start[0].dtype)
 
@@ -161,7 +161,7 @@ def filtered_moments(
         mean = step.F @ mean + step.b
         covariance = step.F @ covariance @ step.F.T + step.Q
         seen = ~jnp.isnan(observation)
-        # A number that is missing is one of variance one, of nothing and equal to what is expected.
+        # A missing number becomes one with H = 0, variance one and no error.
         H = jnp.where(seen[:, None], step.H, 0.0)
         R = jnp.where(seen[:, None] & seen[None], step.R, jnp.eye(*step.R.shape, dtype=H.dtype))
         innovation = jnp.where(seen, observation - step.c, 0.0) - H @ mean

@@ -16,14 +16,14 @@ REACH = (0.75, 0.5)
 
 
 class Coverage(NamedTuple):
-    """What `coverage` found.
+    """The scores of `coverage`.
 
     - `all_covered`: the share of frames in which every object is covered by some track.
     - `per_object`: the share of its frames in which each object is covered, by its id.
     - `on_object`: the share of all boxes of tracks that cover some object.
     - `id_swaps`: how often an object's identity passes from one track to another.
-    - `on_other`: the share of all boxes of tracks that cover none of the objects but one of the
-      others, where those are given. What is left to one lies on nothing.
+    - `on_other`: the share of all boxes of tracks that cover none of the objects but one of
+      `others`, where those are given. The remaining boxes cover nothing.
     """
 
     all_covered: float
@@ -80,7 +80,7 @@ def coverage(
 def covers(
     boxes: Float[np.ndarray, "r 4"], objects: Float[np.ndarray, "s 4"]
 ) -> Bool[np.ndarray, "r s"]:
-    """Which box covers which object: |dx| < 0.75 w and |dy| < 0.5 h of the object's box."""
+    """Whether each box covers each object: |dx| < 0.75 w and |dy| < 0.5 h of the object's box."""
     return np.all(_offsets(boxes, objects) < np.array(REACH), axis=-1)
 
 

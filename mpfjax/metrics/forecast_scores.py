@@ -1,4 +1,4 @@
-"""Scores of forecasts against what was then observed; lower is better."""
+"""Scores of forecasts against later observations; lower is better."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree

@@ -1,4 +1,4 @@
-"""Whether a filter keeps every mode, and how much mass it gives to each."""
+"""Whether a filter keeps every mode, and the mass that it gives to each."""
 
 import math
 

@@ -20,13 +20,13 @@ _assign = jax.jit(hungarian_algorithm)
 
 
 class GOSPA(NamedTuple):
-    """What `gospa` found: distance^order = localisation + missed + false.
+    """The result of `gospa`: distance^order = localisation + missed + false.
 
     - `distance`: the metric itself, in the unit of the base distance.
     - `localisation`: the sum of d^order over the estimates paired with an object.
-    - `missed`: the cost of the objects without an estimate; over cutoff^order / 2 it is their
-      number where alpha is 2.
-    - `false`: the same of the estimates without an object.
+    - `missed`: the cost of the objects without an estimate; where alpha is 2, it is their number
+      times cutoff^order / 2.
+    - `false`: the cost of the estimates without an object, in the same way.
     """
 
     distance: Float[Array, ""]

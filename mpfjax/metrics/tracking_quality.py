@@ -14,12 +14,12 @@ from mpfjax.checks import check_whole, real_arrays
 
 
 class TrackingQuality(NamedTuple):
-    """What `tracking_quality` found, each of shape (objects,), rates and shares in [0, 1].
+    """The result of `tracking_quality`, each of shape (objects,), rates and shares in [0, 1].
 
     - `success_rate`: the share of runs in which the object is tracked in every frame.
     - `recovery_rate`: the share of runs in which it is tracked throughout, or again at the end.
-    - `precision`, `recall`: means over all frames of all runs in which it is tracked, zero
-      where there is none.
+    - `precision`, `recall`: means over all frames of all runs in which it is tracked, zero where
+      there is none.
     - `tracked`: the share of frames in which it is tracked.
     """
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from mpfjax.checks import check_not_negative, check_type, check_whole, to_rows
 
-# The kinds of what counts for nothing, in the second column of its rows.
+# The kinds of objects and regions that are not scored, in the second column of their rows.
 IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT = 1, 2, 3
 _ROUNDING = float(np.finfo(float).eps)
 _SETTINGS = {"THRESHOLD": 0.5, "PRINT_CONFIG": False}
@@ -85,17 +85,17 @@ def remove_ignored(
 ) -> Float[np.ndarray, "k 6"]:
     """The tracked boxes that count, as MOTChallenge and KITTI choose them before they score.
 
-    In each frame, tracked boxes are matched with all boxes that somebody labelled, one to one, at
-    the largest sum of overlaps (IoU) of at least a half. Then these are taken away:
+    In each frame, tracked boxes are matched with all labelled boxes, one to one, at the largest sum
+    of overlaps (IoU) of at least a half. Then these tracked boxes are removed:
 
-    - what is matched to an ignored object;
-    - of what is matched to nothing, a box of which more than half lies in one ignored region, and
-      where `min_height` is above zero a box that is no higher than this, in pixels.
+    - those matched to an ignored object;
+    - of those that are matched to nothing, a box of which more than half lies in one ignored
+      region, and, with a positive `min_height`, a box whose height in pixels is at most this.
 
     `tracks` and `truth` are rows (frame, id, x, y, w, h), and `ignored` rows (frame, kind, x, y, w,
     h). Kind 1 is an ignored object, such as a rider where pedestrians are tracked; kind 2 a region
-    that nobody labelled; kind 3 an object that is not scored: a tracked box may match it, and is
-    not taken away for it.
+    without labels; kind 3 an object that is not scored: a tracked box may match it, and is not
+    removed.
 
     Raises `ValueError` for rows that are not six finite numbers, for another kind, and for a height
     below zero. Use it before scores of another library; `multi_object_scores` calls it.

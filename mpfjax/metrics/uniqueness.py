@@ -1,4 +1,4 @@
-"""How many distinct hypotheses of each object a joint filter keeps: its impoverishment."""
+"""The number of distinct hypotheses of each object in a joint filter: its impoverishment."""
 
 import jax
 import jax.numpy as jnp

@@ -20,38 +20,38 @@ from mpfjax.operations.sobol import direction_numbers
 
 
 class AbstractStateSpaceModel(eqx.Module):
-    """A Markov state x_t seen through observations y_t, all methods batched over particles.
+    """A Markov state x_t with observations y_t; all methods act on all particles at once.
 
-    p(x_0), D(x_t | x_{t-1}) and L(y_t | x_t) of Vermaak et al. (2003), section 2. x_0 is the
-    prior, before any observation; the first observation is y_1. The states are a pytree whose
-    leaves have a leading axis n of particles. One key serves all n particles, which is several
-    times faster than a key for each. If you prefer to write the model for one particle, wrap it
-    with `per_particle`.
+    p(x_0), D(x_t | x_{t-1}) and L(y_t | x_t) of Vermaak et al. (2003), section 2. x_0 is the prior,
+    before any observation; the first observation is y_1. The states are a pytree whose leaves have
+    a leading axis n of particles. One key serves all n particles, which is several times faster
+    than a key for each. If you prefer to write the model for one particle, wrap it with
+    `per_particle`.
 
-    A class may set `handles_missing = True`. It then gets observations with NaN where values are
-    missing, and its likelihood must use the values that are there.
+    A class may set `handles_missing = True`. It then receives observations with NaN where values
+    are missing, and its likelihood must use the values that are there.
 
-    A model may also define `log_transition(states, previous_states)`, log D of each particle,
-    shape (n,). Guided proposals need it; the bootstrap proposal does not.
+    A model may also define `log_transition(states, previous_states)`, log D of each particle, shape
+    (n,). Guided proposals need it; the bootstrap proposal does not.
 
-    In place of `sample_transition`, a model may say how x_t is made of noise:
+    In place of `sample_transition`, a model may define how x_t is made of noise:
     `transition_from_noise(noise, states)`, whose `noise` is standard normal, (n, k), and
     `noise_dimension`, k. `sample_transition` then draws independent noise. A uniform number is
     `jax.scipy.special.ndtr` of a normal one. `Propagate(noise="rqmc")` needs this form: its noise
     is spread evenly over the particles. `initial_from_noise(noise)` and `initial_noise_dimension`
     do the same for x_0.
 
-    A model that declares a field `inputs`, None by default, finds u_t there at each step: what is
-    known beside the observation, such as a control, a covariate or the time since the last step.
-    All its methods see `self.inputs`. A model that does something else with u_t defines
-    `with_inputs` itself. x_0 has no input.
+    A model that declares a field `inputs`, None by default, finds u_t there at each step: known
+    data beside the observation, such as a control, a covariate or the time since the last step. All
+    its methods can read `self.inputs`. A model that uses u_t in another way defines `with_inputs`
+    itself. x_0 has no input.
     """
 
     handles_missing = False
 
     @property
     def takes_inputs(self) -> bool:
-        """Whether the model has a place for u_t: a field `inputs`, or its own `with_inputs`."""
+        """Whether the model takes u_t: it has a field `inputs`, or its own `with_inputs`."""
         default = AbstractStateSpaceModel.with_inputs
         is_field = "inputs" in type(self).__dataclass_fields__
         return is_field or type(self).with_inputs is not default
@@ -59,8 +59,8 @@ class AbstractStateSpaceModel(eqx.Module):
     def with_inputs(self, inputs: PyTree) -> "AbstractStateSpaceModel":
         """The model at a step whose known inputs are u_t: the field `inputs` is set.
 
-        A model may define it otherwise, and so let any of its parameters change in time. It is
-        called while JAX traces a step, so it must not ask for the values of u_t in Python.
+        A model may override it, to let any of its parameters change in time. It is called while JAX
+        traces a step, so it must not use the values of u_t in Python.
         """
         return replaced(self, inputs=inputs)
 
@@ -107,7 +107,7 @@ class HasTransitionDensity(Protocol):
 
 @runtime_checkable
 class HasTransitionNoise(Protocol):
-    """A model that can make x_t of noise from outside."""
+    """A model whose x_t can be made of noise that is given to it."""
 
     @property
     def noise_dimension(self) -> int:
@@ -121,7 +121,7 @@ class HasTransitionNoise(Protocol):
 
 @runtime_checkable
 class HasInitialNoise(Protocol):
-    """A model that can make x_0 of noise from outside."""
+    """A model whose x_0 can be made of noise that is given to it."""
 
     @property
     def initial_noise_dimension(self) -> int:
@@ -134,13 +134,13 @@ class HasInitialNoise(Protocol):
 
 
 def is_made_of_noise(model: Any) -> bool:
-    """Whether the model makes x_t of noise, and draws no x_t of another law."""
+    """Whether the model makes x_t of noise, and has no other law for it."""
     has_noise = hasattr(model, "transition_from_noise") and hasattr(model, "noise_dimension")
     return has_noise and not _draws_otherwise(model, "sample_transition", "transition_from_noise")
 
 
 def starts_from_noise(model: Any) -> bool:
-    """Whether the model makes x_0 of noise, and draws no x_0 of another law."""
+    """Whether the model makes x_0 of noise, and has no other law for it."""
     return isinstance(model, HasInitialNoise) and not _draws_otherwise(
         model, "sample_initial", "initial_from_noise"
     )
@@ -191,7 +191,7 @@ def model_name(model: Any) -> str:
 
 
 def check_model(model: Any, needed_by: str, argument: str = "model") -> None:
-    """Raise a `ValueError` for what is no model, or one that is written for one particle."""
+    """Raise a `ValueError` for anything but a model, and for one written for a single particle."""
     if isinstance(model, type):
         raise ValueError(f"{argument}: {shown(model)} is a class; write {model.__name__}(...)")
     for method in ("sample_initial", "sample_transition", "log_likelihood"):
@@ -206,7 +206,7 @@ def check_model(model: Any, needed_by: str, argument: str = "model") -> None:
                 )
     try:
         signature = inspect.signature(model.sample_initial)
-    except (TypeError, ValueError):  # of what is not written in Python nothing is known
+    except (TypeError, ValueError):  # functions not written in Python cannot be inspected
         return
     if not _takes(signature, 2):
         wrap = "it is written for one particle: wrap it, mpfjax.per_particle(model)"
@@ -236,7 +236,7 @@ def check_states(states: Any, model: Any, method: str, num_particles: int) -> No
 def check_moved(
     states: Any, previous_states: Any, model: Any, method: str = "sample_transition"
 ) -> None:
-    """Raise a `ValueError` where x_t is not of the structure, shapes and types of x_{t-1}."""
+    """Raise a `ValueError` where structure, shapes or types of x_t are not those of x_{t-1}."""
     structures = jax.tree.structure(states), jax.tree.structure(previous_states)
     who = f"model: {model_name(model)}.{method} returned"
     if structures[0] != structures[1]:
@@ -270,7 +270,7 @@ def _takes(signature: inspect.Signature, num_arguments: int) -> bool:
 def check_log_density(
     values: Any, model: Any, method: str, num_particles: int
 ) -> Float[Array, " n"]:
-    """What a density of the model returned; a `ValueError` unless it is one real number each."""
+    """The result of a density of the model; a `ValueError` unless it is one real number each."""
     who = f"model: {model_name(model)}.{method} returned"
     if not isinstance(values, jax.Array | np.ndarray):
         raise ValueError(
@@ -285,7 +285,7 @@ def check_log_density(
     return jnp.asarray(values)
 
 
-# What a model may define beside the three methods: functions of one particle, and what all
+# Optional attributes beside the three methods: functions of one particle, and those that all
 # particles share.
 _BATCHED = (
     "log_transition", "log_initial", "with_history", "initial_from_noise", "transition_from_noise",

@@ -100,7 +100,7 @@ class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
         return jnp.zeros(jax.tree.leaves(states)[0].shape[0], default_float())
 
     def linear_observation(self, observation: PyTree) -> Float[Array, " p"]:
-        """What of an observation is y_t = H x_t + c + N(0, R)."""
+        """The part of an observation that is y_t = H x_t + c + N(0, R)."""
         return observation
 
 
@@ -112,7 +112,7 @@ def is_marginalised(model: Any) -> bool:
 def refuse_marginalised(
     model: Any, needed_by: str, instead: str = "take PropagateMarginalised"
 ) -> None:
-    """Raise a `ValueError` for a conditionally linear model, which is not moved as a whole."""
+    """Raise a `ValueError` for a conditionally linear model, which is not propagated as a whole."""
     if is_marginalised(model):
         raise ValueError(
             f"model: {model_name(model)} is conditionally linear, and {needed_by} needs states"
@@ -134,7 +134,7 @@ def is_mixed(model: Any) -> bool:
 
 
 def with_moments(model: Any, drawn: PyTree) -> PyTree:
-    """The particles of x_0: what the model drew, or beside it the moments of the rest."""
+    """The particles of x_0: the model's own draws, or these with the moments of the rest."""
     if not is_marginalised(model):
         return drawn
     n = jax.tree.leaves(drawn)[0].shape[0]
@@ -189,7 +189,7 @@ def decorrelated(
 def updated(
     model: Any, observation: PyTree, state: MarginalisedState
 ) -> tuple[MarginalisedState, Float[Array, " n"] | None]:
-    """The moments of x_t given y_t as well, and log p(y_t | z, y_1..y_{t-1}); None if unseen."""
+    """The moments of x_t given y_t too, and log p(y_t | z, y_1..y_{t-1}); None if unobserved."""
     seen = emission_of(model, state.latent, state)
     if seen is None:
         return state, None
@@ -256,7 +256,7 @@ def dynamics_of(model: Any, latent: PyTree, state: MarginalisedState) -> Linear:
 
 
 def emission_of(model: Any, latent: PyTree, state: MarginalisedState) -> Linear | None:
-    """H, c and R, checked, the particles last; None where nothing is seen of x."""
+    """H, c and R, checked, the particles last; None where x is not observed."""
     parts = model.emission(latent)
     if parts is None:
         return None

@@ -1,4 +1,4 @@
-"""How a vector moves from frame to frame: random walk, second-order autoregression."""
+"""The dynamics of a vector from frame to frame: random walk, second-order autoregression."""
 
 import abc
 
@@ -22,8 +22,8 @@ class AbstractDynamics(eqx.Module):
     """D(x_t | x_{t-1}, x_{t-2}) of a vector: a part of a model, not a model itself.
 
     There is one set of parameters for all particles, or one for each, along a leading axis. If
-    `order` is 2, a model keeps the past of x_t in its state too: x_{t-1}, or whatever `remembered`
-    returns, which is then `previous` in the next step.
+    `order` is 2, a model keeps the past of x_t in its state too: x_{t-1}, or the value of
+    `remembered`, which is then `previous` in the next step.
     """
 
     @property

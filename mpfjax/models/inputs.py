@@ -1,4 +1,4 @@
-"""Known inputs u_t, and the models that have a place for them."""
+"""Known inputs u_t, and the models that take them."""
 
 import contextlib
 import copy
@@ -9,7 +9,7 @@ from jaxtyping import PyTree
 
 
 def takes_inputs(model: Any) -> bool:
-    """Whether a model has a place for u_t: a field `inputs`, or its own `with_inputs`."""
+    """Whether a model takes u_t: it has a field `inputs`, or its own `with_inputs`."""
     if hasattr(type(model), "takes_inputs"):
         return model.takes_inputs
     # A model of one particle may be of any class.
@@ -25,7 +25,7 @@ def has_attribute(model: Any, name: str) -> bool:
 
 
 def with_inputs(model: Any, inputs: PyTree) -> Any:
-    """The model with u_t, or as it is where there is none, or no place for it."""
+    """The model with u_t, or unchanged where there is none, or where it takes none."""
     if inputs is None or not takes_inputs(model):
         return model
     if hasattr(model, "with_inputs"):
@@ -34,7 +34,7 @@ def with_inputs(model: Any, inputs: PyTree) -> Any:
 
 
 def replaced(model: Any, **fields: Any) -> Any:
-    """A copy of a model with some fields set, which nothing checks or converts again."""
+    """A copy of a model with some fields set, without checks or conversions."""
     changed = copy.copy(model)
     for name, value in fields.items():
         object.__setattr__(changed, name, value)

@@ -41,7 +41,7 @@ class RandomWalkWithJumps(AbstractRandomWalk):
 
     @property
     def noise_dimension(self) -> int:
-        """d, and one number that says who jumps."""
+        """d, and one number that decides which particles jump."""
         return self.deviations.shape[-1] + 1
 
     def from_noise(

@@ -170,7 +170,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
         return super().simulate(key, num_steps, inputs=inputs)
 
     def _sample_observation(self, key: Key[Array, ""], states: PyTree) -> PyTree:
-        """What is seen of every object, leaves (n, J, ...)."""
+        """The observation of every object, leaves (n, J, ...)."""
         if self.shared_observation:
             raise ValueError("shared_observation: how several objects make one is not known")
         keys = split(key, self.num_objects)
@@ -363,7 +363,7 @@ def _finds_object_axis(model: Any, num_objects: int) -> bool:
 
 
 def _error_of_draws(model: Any) -> Exception | None:
-    """What goes wrong where x_0 and x_1 are drawn from the model, traced without arithmetic."""
+    """The error of drawing x_0 and x_1 from the model, traced without arithmetic, or None."""
 
     def draw() -> PyTree:
         key = jax.random.key(0)

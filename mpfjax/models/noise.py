@@ -86,7 +86,7 @@ def rqmc_normal(
     else:
         directions = scrambled_directions(key_matrix, d, max((n - 1).bit_length(), 1))
         points = sobol_points(ranks, directions) ^ shifts
-    # Row by row, and only then in columns: in short rows nothing runs on vectors.
+    # Drawn row by row, then transposed: operations on short rows are not vectorised.
     return stored(_normal_of(points, dtype)).T
 
 

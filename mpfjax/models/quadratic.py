@@ -19,11 +19,11 @@ from mpfjax.operations.generator import normal, uniform
 
 
 class QuadraticModel(AbstractStateSpaceModel):
-    """A random walk seen through its square: D = N(x_{t-1}, σ_x²), L = N(y_t; x_t², σ_y²).
+    """A random walk whose square is observed: D = N(x_{t-1}, σ_x²), L = N(y_t; x_t², σ_y²).
 
     Vermaak et al. (2003), section 5.1. The observation does not depend on the sign of x_t. With a
-    symmetric prior, the filtering distribution thus has two modes of exactly equal mass, at about
-    ± sqrt(y_t).
+    symmetric prior, the filtering distribution thus has two modes of exactly equal mass, at about ±
+    sqrt(y_t).
 
     - `sigma_x`, `sigma_y`: standard deviations, positive.
     - `low`, `high`: x_0 is uniform on [low, high].

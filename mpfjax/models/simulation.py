@@ -1,4 +1,4 @@
-"""Series drawn from a model itself: states, and what is observed of them."""
+"""Series drawn from a model: states and observations."""
 
 from typing import Any
 
@@ -58,7 +58,7 @@ def _simulate(key, model, num_steps, inputs):
 
 
 def _check_observations(observations: Any, model: Any) -> None:
-    """Raise a `ValueError` for what is not one observation of the one state."""
+    """Raise a `ValueError` for anything but one observation of the one state."""
     leaves = jax.tree.leaves(observations)
     who = f"model: {model_name(model)}.sample_observation returned"
     if not leaves:

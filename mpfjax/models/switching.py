@@ -15,7 +15,7 @@ from mpfjax.operations.generator import uniform
 from mpfjax.operations.logarithms import log_or_nothing
 from mpfjax.operations.segments import spread
 
-# Rows of probabilities that are off by more than this are no rounding.
+# Sums of probabilities may differ from one by this much, for rounding.
 _ROUNDING = 1e-4
 
 
@@ -168,7 +168,7 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel):
         return self._of(latent, self.H, 2), self._of(latent, c, 1), self._of(latent, self.R, 2)
 
     def _of(self, latent: Int[Array, " n"], values: Array, rank: int) -> Float[Array, "..."]:
-        """What belongs to the regime of each particle; what all regimes share, as it is."""
+        """The parameter of each particle's regime; one that all regimes share, unchanged."""
         return values if values.ndim == rank else spread(values, latent)
 
     def _initial(self, shares: Float[Array, " n"]) -> Int[Array, " n"]:
@@ -176,7 +176,7 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel):
         return jnp.sum(shares[:, None] >= bounds[None], axis=1, dtype=jnp.int32)
 
     def _next(self, shares: Float[Array, " n"], latent: Int[Array, " n"]) -> Int[Array, " n"]:
-        """The regime in which each share of the row's probabilities falls."""
+        """The regime whose interval of the row's cumulative probabilities holds each number."""
         bounds = jnp.cumsum(self.transition_matrix, axis=1)
         drawn = jnp.zeros_like(latent)
         for j in range(self.num_regimes - 1):

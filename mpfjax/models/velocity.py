@@ -24,17 +24,17 @@ class WalkWithVelocity(AbstractDynamics):
     """x_t = x_{t-1} + v_{t-1} + e_t and v_t = v_{t-1} + gain · e_t, with e_t a step of `walk`.
 
     The local linear trend in innovations form: Holt's smoothing as a model (Hyndman, Koehler, Ord
-    and Snyder 2008, chapter 3, with α = 1). v is what a Kalman filter in its steady state expects
-    of a velocity that is itself a random walk, so a particle carries its velocity without having
-    drawn it. With a gain of 0, v never changes; with 1, it is the last displacement.
+    and Snyder 2008, chapter 3, with α = 1). v is the mean that a Kalman filter in its steady state
+    has of a velocity that is itself a random walk, so that a particle carries its velocity without
+    drawing it. With a gain of 0, v never changes; with 1, it is the last displacement.
 
-    The past that a model keeps is x_t - v_t, where x_t would come from at its velocity
+    The past that a model keeps is x_t - v_t, the place from which x_t would come at its velocity
     (`remembered`).
 
-    - `walk`: how x_t scatters, a `RandomWalk` or `RandomWalkWithJumps`.
-    - `gain`: in [0, 1], a number or one a coordinate. About 1 / gain steps count.
-    - `initial_velocity`: deviations of v_0 about 0, of the shape of the walk's deviations, in
-      units of the state a frame; None takes 0.
+    - `walk`: the noise of x_t, a `RandomWalk` or `RandomWalkWithJumps`.
+    - `gain`: in [0, 1], a number or one a coordinate. v averages over about 1 / gain steps.
+    - `initial_velocity`: deviations of v_0 about 0, of the shape of the walk's deviations, in units
+      of the state a frame; None takes 0.
 
     Raises `TypeError` for another walk, and `ValueError` for a gain outside [0, 1], a negative
     deviation and shapes that do not fit. Use it where objects keep their velocity: look-alikes that

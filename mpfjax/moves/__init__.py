@@ -1,4 +1,4 @@
-"""The moves that filters are chains of: regrouping, resampling, propagating."""
+"""The moves that make up a filter: regrouping, resampling, propagating."""
 
 from mpfjax.moves.base import AbstractMarkovMove as AbstractMarkovMove
 from mpfjax.moves.base import AbstractMove as AbstractMove

@@ -1,4 +1,4 @@
-"""The kinds of moves that a filter is a chain of."""
+"""The kinds of moves of a filter, and their contracts."""
 
 import abc
 
@@ -58,18 +58,18 @@ class AbstractMove(eqx.Module):
 
     @property
     def reads(self) -> frozenset[str]:
-        """Names of the memory that other moves keep and this one looks at."""
+        """The names of the memory of other moves that this move needs."""
         return frozenset()
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """What the move remembers from step to step, under its own name; most remember nothing."""
+        """The initial memory of the move, under its own name; most moves have none."""
         del num_components
         return {}
 
     def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
-        """The mixture's memory without what the move remembers of dead components.
+        """The mixture's memory without this move's memory of dead components.
 
-        A filter calls this after each move. So a label that is used again has no past.
+        A filter calls this after each move, so that a label that is used again has no past.
         """
         del dead
         return memory

@@ -1,9 +1,9 @@
-"""Moves around a reference trajectory: what conditional SMC does in place of each move.
+"""Moves around a reference trajectory, which conditional SMC uses in place of a filter's moves.
 
-A conditional filter keeps one trajectory x*_0, ..., x*_t. At every time it stands in one slot, the
-reference slot, and the other slots are as any filter's. Two moves are then different: the
-propagation puts x*_t into the slot, and the resampling gives the slot at least one offspring.
-`mpfjax.smoothing.conditional_filter` says why this is exact.
+A conditional filter keeps one trajectory x*_0, ..., x*_t. At every time it occupies one slot, the
+reference slot; the other slots are those of an ordinary filter. Two moves differ: the propagation
+puts x*_t into the slot, and the resampling gives the slot at least one offspring.
+`mpfjax.smoothing.conditional_filter` explains why this is exact.
 """
 
 from typing import Any
@@ -29,14 +29,14 @@ CONDITIONAL_SCHEMES = ("multinomial", "stratified", "systematic")
 
 
 class ConditionalPropagation(AbstractPropagation):
-    """Propagate every particle but the one in the reference slot, which goes to x*_t.
+    """Propagate every particle but the one in the reference slot, which moves to x*_t.
 
-    The weight of the reference is that of any particle: L D / q, with q at x*_t, so that a
-    proposal needs `log_density`.
+    The weight of the reference is that of any particle, L D / q, with q at x*_t, so that a proposal
+    needs `log_density`.
 
     - `move`: a `Propagate` or `Predict`.
     - `trajectory`: x*_0, ..., x*_t, leaves (t + 1, ...).
-    - `first_slot`: where x*_0 stands.
+    - `first_slot`: the slot of x*_0.
     """
 
     move: Propagate | Predict
@@ -44,7 +44,7 @@ class ConditionalPropagation(AbstractPropagation):
     first_slot: Int[Array, ""]
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """The reference slot, and the time at which the particles are."""
+        """The reference slot, and the time of the particles."""
         del num_components
         return {REFERENCE: {"slot": self.first_slot, "time": jnp.zeros((), jnp.int32)}}
 
@@ -84,18 +84,18 @@ class ConditionalPropagation(AbstractPropagation):
 class ConditionalResample(AbstractAdaptiveResampling):
     """Resample within components, given that the reference has an offspring.
 
-    It is the law of `Resample`'s ancestor indices, given that a slot of the reference's component,
-    each as likely as any other before, has the reference for its parent. Every scheme but the
-    residual is one point in the share of each slot, on a line where particle i has a stretch as
-    long as its expected number of offspring k w_i:
+    The ancestor indices have the law of those of `Resample`, given that one slot of the reference's
+    component, each with equal probability, has the reference for its parent. In every scheme but
+    the residual each slot draws one point of a line, on which particle i has an interval as long as
+    its expected number of offspring k w_i:
 
     - "multinomial": the slot is any of the component's; the other points are independent of it.
-    - "stratified" and "systematic": a point v, uniform on the reference's stretch, says both which
-      slot it is, the whole part of v, and the shift in that slot's share, v's fraction. In the
-      systematic scheme all slots of the component have this shift; in the stratified one, the
-      others have their own.
+    - "stratified" and "systematic": a point v is drawn uniformly on the reference's interval. Its
+      integer part is the slot, and its fractional part is the shift within that slot's unit
+      interval. In the systematic scheme all slots of the component have this shift; in the
+      stratified scheme the others have their own.
 
-    Other components are resampled as ever. `move` is the filter's own `Resample`.
+    Other components are resampled as usual. `move` is the filter's own `Resample`.
     """
 
     move: Resample
@@ -137,7 +137,7 @@ class ConditionalResample(AbstractAdaptiveResampling):
         key_reference, key_points = split(key, 2)
         reference = mixture.memory[REFERENCE]["slot"]
         own, n = mixture.component_indicators[reference], mixture.num_particles
-        # Who has a place at all stands in line, since the reference's weight may underflow.
+        # All filled slots take part, since the reference's weight may underflow.
         line = side_by_side(mixture, mixture.occupied, self.move.sort_by, without_gaps=True)
         place = jnp.argmax(line.order == reference).astype(jnp.int32)
         stretches = line.expected(targets)
@@ -183,11 +183,11 @@ class ConditionalResample(AbstractAdaptiveResampling):
 
 
 def at(values: Array, place: Int[Array, ""]) -> Array:
-    """The value at a place, which is known to lie in range."""
+    """The value at an index that is known to lie in range."""
     return take(values, place[None])[0]
 
 
 def put(values: Array, value: Array, place: Int[Array, ""]) -> Array:
-    """The values with another one at a place."""
+    """The values with another one at an index."""
     is_place = jnp.arange(values.shape[0], dtype=jnp.int32) == place
     return jnp.where(is_place.reshape(-1, *[1] * (values.ndim - 1)), value[None], values)

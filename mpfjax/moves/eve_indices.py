@@ -1,6 +1,6 @@
-"""Eve indices: which particle of x_0 each particle descends from, and what that says of errors.
+"""Eve indices: the particle of x_0 from which each particle descends, and variances from them.
 
-A filter keeps them only if an `EveIndices` is in the memory of the mixture of x_0. Then `Resample`
+A filter keeps them only if an `EveIndices` is in the memory of the mixture of x_0. `Resample` then
 updates it, wherever it is in a chain or within a move.
 `mpfjax.smoothing.log_marginal_likelihood_variance` has the equations.
 """
@@ -19,14 +19,14 @@ EVE_INDICES = "eve_indices"
 
 
 class EveIndices(eqx.Module):
-    """What the errors of log Ẑ and of the masses need of the past, O(N + M²) numbers.
+    """The memory from which the errors of log Ẑ and of the masses are estimated, O(N + M²) numbers.
 
     - `indices`: (n,), the slot in x_0 that each particle descends from.
     - `groups`: (n,), the component in which each particle was last resampled.
-    - `log_pair_factors`: (m, m), the logarithm of the factor by which a pair of particles without
-      a common first ancestor counts, by their groups. Of the pairs of k independent draws,
-      (k - 1) / k are different draws. So a pair's factor grows by k / (k - 1) whenever the
-      component that both are in is resampled.
+    - `log_pair_factors`: (m, m), the logarithm of the factor by which a pair of particles without a
+      common first ancestor counts, by their groups. Among k independent draws, a share (k - 1) / k
+      of the pairs are pairs of different draws. A pair's factor therefore grows by k / (k - 1)
+      whenever the component that both are in is resampled.
     """
 
     indices: Int[Array, " n"]
@@ -61,7 +61,7 @@ def with_offspring(
     num_drawn: Int[Array, " m"],
     due: Bool[Array, " m"],
 ) -> ParticleMixture:
-    """The resampled mixture with the eve of its particles, if one is kept."""
+    """The resampled mixture with the Eve indices of its particles, if it keeps them."""
     if EVE_INDICES not in before.memory:
         return resampled
     eve: EveIndices = before.memory[EVE_INDICES]
@@ -72,7 +72,7 @@ def with_offspring(
         log_factors = jnp.where(any_due, _by_components(eve, before), log_factors)
         groups = jnp.where(any_due, resampled.component_indicators, take(groups, parents))
     k = num_drawn.astype(log_factors.dtype)
-    # A component of one particle has no pair to count.
+    # A component of one particle has no pair.
     grown = jnp.where(due & (k > 1), -jnp.log1p(-1 / jnp.maximum(k, 2)), 0.0)
     eve = EveIndices(take(eve.indices, parents), groups, log_factors + jnp.diag(grown))
     return resampled.replace(memory=resampled.memory | {EVE_INDICES: eve})
@@ -87,12 +87,12 @@ def evidence_variance(mixture: ParticleMixture) -> Float[Array, ""]:
 
 
 def mass_variances(mixture: ParticleMixture) -> Float[Array, " m"]:
-    """The variance of each mixture weight, from the share of each family that is in it."""
+    """The variance of each mixture weight, from the share of each family in the component."""
     eve: EveIndices = mixture.memory[EVE_INDICES]
     m, masses = mixture.num_components, mixture.mixture_weights
     pairs = mixture.component_indicators * m + eve.groups
     families = eve.family_masses(mixture.weights, pairs, m * m).reshape(m, m, -1)
-    # The families' part in a component, less what it would be were all families alike.
+    # The mass of each family in a component, less the family's mass times the component's.
     excess = families - masses[:, None, None] * jnp.sum(families, axis=0)[None]
     return jax.vmap(_variance, (0, None))(excess, mixture)
 
@@ -104,7 +104,7 @@ def _variance(families: Float[Array, "m n"], mixture: ParticleMixture) -> Float[
     of_different = totals[:, None] * totals[None] - families @ families.T
     num_drawn = jnp.asarray(mixture.num_usable_slots, families.dtype)
     log_factors = eve.log_pair_factors - jnp.log1p(-1 / jnp.maximum(num_drawn, 2))
-    # The sums with factors of one, and what the factors add, which are close to one.
+    # The sums with factors of one, plus a correction for factors, which are close to one.
     of_same = jnp.sum(jnp.sum(families, axis=0) ** 2)
     return of_same - jnp.sum(of_different * jnp.expm1(log_factors))
 

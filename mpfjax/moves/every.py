@@ -25,11 +25,11 @@ _INNER = (AbstractRegrouping, AbstractResampling, AbstractMarkovMove)
 class Every(AbstractMove):
     """Run other moves at the steps k, 2k, 3k, ..., and none at the steps between.
 
-    Vermaak et al. (2003), section 4, regroup "from time to time". Regrouping is exact whenever it
-    is done, so it need not be done at every step. The step's number is kept in the mixture's
-    memory, so that a run goes on from a checkpoint as if it had not been broken off. It does not
+    Vermaak et al. (2003), section 4, regroup "from time to time". Regrouping is exact at any time,
+    and need not be done at every step. The step's number is kept in the mixture's memory, so that a
+    run that continues from a checkpoint equals a run without interruption. The number does not
     depend on the run: under `vmap` over seeds the steps between cost nothing. A missing observation
-    is no step, since nothing is regrouped or resampled there.
+    does not count as a step, since nothing is regrouped or resampled there.
 
     - `num_steps`: k, from 1 on.
     - `moves`: regrouping and resampling moves, in order.
@@ -63,7 +63,7 @@ class Every(AbstractMove):
 
     @property
     def name(self) -> str:
-        """Under which the number of the step is kept."""
+        """The name under which the number of the step is kept."""
         return f"every {self.num_steps}: {', '.join(type(move).__name__ for move in self.moves)}"
 
     def would_resample(
@@ -82,8 +82,8 @@ class Every(AbstractMove):
     ) -> ParticleMixture:
         """Run the moves if this is a k-th step.
 
-        `after` is what the filter does after each of its moves: whatever remembers components
-        forgets the dead, whose labels the next move may use again.
+        A filter calls `after` after each of its moves: moves with memory forget dead components,
+        whose labels the next move may use again.
         """
         after = self._forgetting if after is None else after
         runs, steps = self._runs(mixture), self._steps(mixture) + 1
@@ -99,7 +99,7 @@ class Every(AbstractMove):
         if not all(isinstance(move, AbstractRegrouping) for move in self.moves):
             return jax.lax.cond(runs, run, lambda: mixture)
 
-        # Only what they may change goes through the condition; the rest would be copied there.
+        # Only what they may change goes through the condition, which copies its operands.
         def regroup() -> tuple[Array, dict[str, PyTree]]:
             moved = run()
             return moved.component_indicators, moved.memory
@@ -110,14 +110,14 @@ class Every(AbstractMove):
         return mixture.replace(component_indicators=indicators, memory=memory)
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """How many steps it is since the moves ran, and what they remember themselves."""
+        """The number of steps since the moves last ran, and the moves' own memory."""
         memory: dict[str, PyTree] = {self.name: {"steps": jnp.zeros((), jnp.int32)}}
         for move in self.moves:
             memory |= move.initial_memory(num_components)
         return memory
 
     def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
-        """What the moves themselves forget of dead components."""
+        """The memory without the moves' memory of dead components."""
         for move in self.moves:
             memory = move.forget(memory, dead)
         return memory
@@ -148,7 +148,7 @@ def _as_inner_moves(moves: Any) -> tuple[AbstractMove, ...]:
 
 
 def with_inner(moves: Iterable[Any]) -> Iterator[Any]:
-    """The moves, and after each those that it runs from time to time."""
+    """The moves, and after each of them those that it runs from time to time."""
     for move in moves:
         yield move
         if isinstance(move, Every):

@@ -11,17 +11,18 @@ from mpfjax.operations.matrices import row_sums
 class LocalQuadratics(eqx.Module):
     """ψ(x, ε) = c + Σ_k r_k(x) exp Q_k(x, ε), with its normaliser and its draws in closed form.
 
-    x is what a particle knows before it moves, by its features φ(x), (n, d), and ε the standard
-    normal noise that it moves by, (n, j). Each expert k has a quadratic Q_k that is good around its
-    own particles; r_k(x), from 0 to 1 with sum 1, says how near x is to them. So with
-    ν_k(x) = ∫ N(ε; 0, I) exp Q_k(x, ε) dε, the exponential of a quadratic in φ,
+    x is the state before the move, represented by its features φ(x), (n, d), and ε the standard
+    normal noise of the move, (n, j). Each expert k has a quadratic Q_k that is accurate around its
+    own particles; r_k(x), from 0 to 1 with sum 1, measures how near x is to them. With ν_k(x) = ∫
+    N(ε; 0, I) exp Q_k(x, ε) dε, the exponential of a quadratic in φ,
 
         ν(x) = ∫ N(ε; 0, I) ψ(x, ε) dε = c + Σ_k r_k(x) ν_k(x),
         q(ε | x) = Σ_k r_k ν_k / ν N(ε; m_k(x), F_k F_kᵀ) + c / ν N(ε; 0, I).
 
     Both have heavy tails. ν is never below c, and q is mixed with a share δ of N(0, I) (defensive
-    importance sampling, Hesterberg 1995), so that no weight N(ε; 0, I) / q is above 1 / δ. Where a
-    quadratic was not fitted it says nothing: ν_k is at most a cap, and falls off far away.
+    importance sampling, Hesterberg 1995), so that no weight N(ε; 0, I) / q is above 1 / δ. Far from
+    the particles that it was fitted to, a quadratic is unreliable: ν_k is at most a cap, and falls
+    off with the distance.
 
     - `centres`, `whitening`, `log_shares`: of the experts' particles; z_k = whitening (φ - centre).
     - `constants`, `slopes`, `curvatures`: log ν_k as a quadratic in z_k.
@@ -55,7 +56,7 @@ class LocalQuadratics(eqx.Module):
     ) -> tuple[Float[Array, "n j"], Float[Array, " n"]]:
         """ε ~ q(. | x) made of standard normal noise, and log N(ε; 0, I) / q(ε | x).
 
-        The last column of the noise says of which expert ε is, or of none.
+        The last column of the noise chooses the expert of ε, or none.
         """
         noise, chooser = noise[:, :-1], noise[:, -1]
         whitened = self.whitened(features)
@@ -109,7 +110,7 @@ class LocalQuadratics(eqx.Module):
 def neutral(
     num_experts: int, num_features: int, num_noises: int, dtype: jnp.dtype
 ) -> LocalQuadratics:
-    """ψ = 1: nothing is known of what comes."""
+    """ψ = 1: no information about later observations."""
     k, d, j = num_experts, num_features, num_noises
     zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731
     return LocalQuadratics(

@@ -1,4 +1,4 @@
-"""What moves remember from step to step, and that each finds what it reads."""
+"""Checks that each move finds the memory that it reads, and that no two moves write the same."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Metropolis moves: x_t moves on under its own target, and the weights stay as they are."""
+"""Metropolis moves: each x_t moves by a kernel that keeps its own target; the weights stay."""
 
 import abc
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ class _Target(NamedTuple):
     exponent: float
 
     def __call__(self, states: PyTree) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """log D and log L, apart: a constant of any size in L would drown the differences of D."""
+        """log D and log L, separately: with a large constant in L, their sum loses digits of D."""
         log_likelihood = likelihoods(self.model, self.observation, states)
         return log_transition(self.model, states, self.parents), log_likelihood
 
@@ -39,15 +39,15 @@ class _Target(NamedTuple):
 class AbstractMetropolis(AbstractMarkovMove):
     """Steps of Metropolis and Hastings for every particle, given its parent x_{t-1}.
 
-    The move of a resample-move filter (Gilks and Berzuini 2001): after x_t was drawn and weighed,
-    and resampled if need be, each x_t takes `num_steps` steps of a Markov chain that leaves
-    D(x_t | x_{t-1}) L(y_t | x_t)^β as it is. So the weights stay, Ẑ stays unbiased, and offspring
-    of one particle become different. Components keep their mass and their particles.
+    The move of a resample-move filter (Gilks and Berzuini 2001). After x_t was drawn and weighed,
+    and perhaps resampled, each x_t takes `num_steps` steps of a Markov chain that leaves D(x_t |
+    x_{t-1}) L(y_t | x_t)^β invariant. The weights do not change, Ẑ stays unbiased, and offspring of
+    one particle become distinct. Components keep their mass and their particles.
 
     Nothing is tuned on the particles that move, since that would not be exact. The length of a step
-    is s times the spread of the dynamics, where log s is uniform between log `least_step` and 0 and
-    drawn anew each time. The spread is that of fresh draws from D(. | x_{t-1}). Parts of the state
-    that are whole numbers stay.
+    is s times the standard deviation of the dynamics, where log s is uniform between log
+    `least_step` and 0 and drawn anew each time. The standard deviation is that of new draws from
+    D(. | x_{t-1}). Integer parts of the state do not move.
     """
 
     model: eqx.AbstractVar[AbstractStateSpaceModel]
@@ -97,7 +97,7 @@ class AbstractMetropolis(AbstractMarkovMove):
             proposed, log_ratio = self.propose(key_proposal, length, states, target)
             those = target(proposed)
             log_ratio += target.ratio(those, densities)
-            taken = jnp.log(uniform(key_taken, (n,), dtype)) < log_ratio  # of a NaN: not taken
+            taken = jnp.log(uniform(key_taken, (n,), dtype)) < log_ratio  # a NaN is rejected
             states = _where(taken, proposed, states)
             densities = _where(taken, those, densities)
         log_weights = mixture.log_weights
@@ -111,16 +111,17 @@ class AbstractMetropolis(AbstractMarkovMove):
 class RandomWalkMetropolis(AbstractMetropolis):
     """Metropolis steps by a random walk: x' = x + s (a - b) / √2 with a, b ~ D(. | x_{t-1}).
 
-    The difference of two draws from the dynamics is symmetric and has twice their covariance, so
-    every particle walks in the units and along the correlations of its own dynamics, as in
-    differential evolution (ter Braak 2006), but exactly. See `AbstractMetropolis`.
+    The difference of two draws from the dynamics is symmetric and has twice their covariance. Every
+    particle therefore walks in the units and along the correlations of its own dynamics.
+    Differential evolution (ter Braak 2006) uses differences of particles in the same way, but is
+    not exact here. See `AbstractMetropolis`.
 
     - `model`: with `log_transition`.
     - `num_steps`: how many steps each particle takes.
     - `least_step`: the smallest s.
     - `exponent`: β, for a likelihood that enters by powers, as with `Reweight(model, exponent)`.
-    - `gradient`: what a derivative sees: "none" the draws that were taken, "stop" the density of
-      the state after the move, as with `gradient` of `Propagate`.
+    - `gradient`: "none" differentiates the draws, "stop" the density of the state after the move,
+      as with `gradient` of `Propagate`.
 
     Each step takes two draws of the dynamics, and one evaluation of D and L. Raises `ValueError`
     for a model without `log_transition`, no steps, a least step or an exponent out of range. Use it
@@ -136,7 +137,7 @@ class RandomWalkMetropolis(AbstractMetropolis):
     def propose(
         self, key: Key[Array, ""], length: Float[Array, " n"], states: PyTree, target: _Target
     ) -> tuple[PyTree, Float[Array, " n"]]:
-        """x + s (a - b) / √2, which is as likely as the way back."""
+        """x + s (a - b) / √2, whose reverse step has the same density."""
         first, second = _two_draws(key, self.model, target.parents)
 
         def walk(state: Array, a: Array, b: Array) -> Array:
@@ -164,7 +165,7 @@ class MetropolisAdjustedLangevin(AbstractMetropolis):
     def propose(
         self, key: Key[Array, ""], length: Float[Array, " n"], states: PyTree, target: _Target
     ) -> tuple[PyTree, Float[Array, " n"]]:
-        """A step of the Langevin diffusion, and how much likelier the way back is."""
+        """A step of the Langevin diffusion, and the reverse step's log density relative to it."""
         key_spread, key_noise = split(key, 2)
         first, second = _two_draws(key_spread, self.model, target.parents)
         deviations = _on_floats(_deviation, first, second)
@@ -189,7 +190,7 @@ class MetropolisAdjustedLangevin(AbstractMetropolis):
         go = lambda x, unit, a, b: x + _rows(length, x) * unit * (a + b)  # noqa: E731
         proposed = _on_floats(go, floats, deviations, forth, noise)
         back = drift(proposed)
-        # The way back is made of the noise that leads from x' to x.
+        # The noise of the reverse step, from x' to x.
         log_ratio = _sum_of_rows(
             lambda a, b, xi: 0.5 * (xi**2 - (a + b + xi) ** 2), forth, back, noise
         )
@@ -208,7 +209,7 @@ def _deviation(first: Array, second: Array) -> Array:
 
 
 def _on_floats(function: Any, states: PyTree, *others: PyTree) -> PyTree:
-    """The function of the leaves that are floating point; the first tree's others stay."""
+    """Apply the function to floating point leaves; the others are those of the first tree."""
 
     def of_leaf(leaf: Any, *rest: Any) -> Any:
         return function(leaf, *rest) if eqx.is_inexact_array(leaf) else leaf

@@ -16,12 +16,12 @@ from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration
 from mpfjax.operations.indexing import take
 
-# After these a particle has no one parent, or one on another island.
+# After these a particle has more than one parent, or one on another island.
 _NO_PARENT = (PropagateInClusters, PropagateIndependently, IslandInteraction)
 
 
 def runner(moves: tuple[Any, ...]) -> Callable[..., ParticleMixture]:
-    """What runs one of the moves, and keeps `mixture.parents` only where one of them needs them.
+    """A function that runs one of the moves, and keeps `mixture.parents` if any move needs them.
 
     Raises `ValueError` where the parents would not be known.
     """
@@ -50,11 +50,11 @@ def _needs_parents(move: Any) -> bool:
 def _run_with_parents(
     move: Any, key: Key[Array, ""], mixture: ParticleMixture, *arguments: Any
 ) -> ParticleMixture:
-    """The move, and the parents of the particles in their new places."""
+    """Run the move, and keep the parents of the particles in their new slots."""
     before = mixture.parents
     if before is None and isinstance(move, AbstractPropagation):
         before = mixture.particles
-    # The places that this move alone takes the particles from.
+    # The slots that this move alone takes the particles from.
     own = jnp.arange(mixture.num_particles, dtype=jnp.int32)
     moved = move(key, mixture.replace(ancestor_indices=own), *arguments)
     places = moved.ancestor_indices

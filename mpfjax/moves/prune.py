@@ -1,4 +1,4 @@
-"""Prune: components that have become hopeless are emptied."""
+"""Prune: empty improbable components."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,10 +13,10 @@ from mpfjax.operations.segments import spread
 class Prune(AbstractMove):
     """Empty the components whose mass is below a share of the heaviest component's.
 
-    Mixture weights are posterior odds (Vermaak et al. 2003, eq. 4). Resampling deals all living
-    components the same number of slots, however small their odds; a pruned one leaves its slots to
-    the others. With M components, a step loses at most the share (M - 1) `least_share` of the mass,
-    and log Ẑ falls by as much: an approximation with a bound that you choose.
+    Mixture weights are posterior odds (Vermaak et al. 2003, eq. 4). Resampling gives every living
+    component some slots, however small its odds; a pruned component leaves its slots to the others.
+    With M components, a step loses at most the share (M - 1) `least_share` of the mass, and Ẑ falls
+    by at most as much.
 
     Raises `ValueError` for a share outside (0, 1). Use it after a propagation, before regrouping,
     where hypotheses that turned out wrong hold particles that others need.
@@ -29,7 +29,7 @@ class Prune(AbstractMove):
 
     @property
     def approximate(self) -> bool:
-        """True: a little mass is thrown away."""
+        """True: the mass of the pruned components is lost."""
         return True
 
     @property
@@ -40,7 +40,7 @@ class Prune(AbstractMove):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
     ) -> ParticleMixture:
-        """Take all weight from the hopeless components."""
+        """Set the weights of improbable components to zero."""
         del key, observation
         masses = mixture.log_mixture_weights
         hopeless = masses < jnp.max(masses) + jnp.log(self.least_share)

@@ -1,4 +1,4 @@
-"""What a filter asks of its moves: that they are some, one weighs, and each returns a mixture."""
+"""Checks of the moves of a filter: there are some, one weighs, and each returns a mixture."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from mpfjax.mixture import ParticleMixture
 
 
 def as_moves(moves: Any, name: str) -> tuple[Any, ...]:
-    """The moves as a tuple; a `ValueError` for what is none, or a single one without its list."""
+    """The moves as a tuple; a `ValueError` for other things, or a single move without a list."""
     if not is_series(moves):
         raise ValueError(f"{name}: {shown(moves)} is not a list of moves")
     moves = tuple(moves)
@@ -20,7 +20,7 @@ def as_moves(moves: Any, name: str) -> tuple[Any, ...]:
 
 
 def check_result(moved: Any, mixture: ParticleMixture, move: Any) -> ParticleMixture:
-    """What a move returned; a `ValueError` unless it is a mixture of the same shapes and types."""
+    """The result of a move; a `ValueError` unless it is a mixture of the same shapes and types."""
     who = f"moves: {getattr(move, '__name__', type(move).__name__)} returned"
     if not isinstance(moved, ParticleMixture):
         raise ValueError(f"{who} {shown(moved)}, no ParticleMixture")
@@ -42,7 +42,7 @@ def check_result(moved: Any, mixture: ParticleMixture, move: Any) -> ParticleMix
 
 
 def check_weighed(moves: tuple[Any, ...]) -> None:
-    """Raise a `ValueError` for no moves, and where none of them weighs by what is observed."""
+    """Raise a `ValueError` for no moves, and where none of them weighs by the observation."""
     if not moves:
         raise ValueError("moves: a filter needs at least one")
     if not any(getattr(move, "weighs", True) for move in moves):

@@ -1,4 +1,4 @@
-"""Moves of a twisted particle filter, whose look-ahead depends on which step it is."""
+"""Moves of a twisted particle filter, whose look-ahead depends on the step."""
 
 from collections.abc import Callable
 from typing import cast
@@ -29,9 +29,9 @@ STEP = "twisted"
 class Twist(eqx.Module):
     """ψ_1, ..., ψ_T for the steps of a series, as `mpfjax.smoothing.learn_lookahead` fits them.
 
-    - `steps`: of each step, and one more that knows nothing, for steps after the last.
-    - `initial`: of x_0, which is made of noise alone; None where the model makes it otherwise.
-    - `features`: φ, what ψ sees of a state, (n, d); None is the flattened state.
+    - `steps`: ψ of each step, and one more, ψ = 1, for steps after the last.
+    - `initial`: of x_0, which is made of noise alone; None where the model draws it otherwise.
+    - `features`: φ, the features of a state that ψ depends on, (n, d); None is the flattened state.
     """
 
     steps: LocalQuadratics
@@ -61,7 +61,7 @@ def features_of(features: Callable[[PyTree], Array] | None, states: PyTree) -> F
 
 
 class CountSteps(AbstractMove):
-    """Says which step it is, at the head of a chain whose look-ahead depends on it."""
+    """Keeps the number of the step, at the head of a chain whose look-ahead depends on it."""
 
     @property
     def weighs(self) -> bool:
@@ -69,14 +69,14 @@ class CountSteps(AbstractMove):
         return False
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """The number of the step, and the mass of x_0 that no step has counted so far."""
+        """The number of the step, and the mass of x_0, which the first observed step adds to Ẑ."""
         del num_components
         return {STEP: {"step": jnp.zeros((), jnp.int32), "log_mass": jnp.zeros(())}}
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
-        """Count the step, and the mass that x_0 was drawn with."""
+        """Count the step, and add the mass of x_0 if no step has yet."""
         del key, observation
         own = mixture.memory[STEP]
         log_mass = own["log_mass"]
@@ -94,8 +94,8 @@ class CountSteps(AbstractMove):
 class TwistInitial(AbstractMove):
     """Draws x_0 anew: its noise from q_0, with the weights N(ε; 0, I) / q_0(ε).
 
-    The weights are normalised, and `CountSteps` counts what they added up to in the first step that
-    has an observation. So Ẑ stays unbiased.
+    The weights are normalised. `CountSteps` adds their sum in the first step that has an
+    observation, so that Ẑ stays unbiased.
     """
 
     model: AbstractStateSpaceModel
@@ -104,7 +104,7 @@ class TwistInitial(AbstractMove):
 
     @property
     def reads(self) -> frozenset[str]:
-        """What `CountSteps` remembers."""
+        """The memory of `CountSteps`."""
         return frozenset({STEP})
 
     def __call__(
@@ -131,22 +131,22 @@ class TwistInitial(AbstractMove):
 
 
 class TwistedLookahead(eqx.Module):
-    """The look-ahead of an `AuxiliaryResample` that is ν_t(x_{t-1}) of the step that it is."""
+    """The look-ahead of an `AuxiliaryResample` that is ν_t(x_{t-1}) of the current step."""
 
     twist: Twist
 
     @property
     def reads(self) -> frozenset[str]:
-        """What `CountSteps` remembers."""
+        """The memory of `CountSteps`."""
         return frozenset({STEP})
 
     def at_step_of(self, mixture: ParticleMixture) -> Callable[[PyTree, PyTree], Array]:
-        """log ν_t in this step, of an observation, which plays no part, and the states."""
+        """log ν_t of the states in this step; the observation is not used."""
         step = mixture.memory[STEP]["step"]
         return lambda observation, states: self.twist.log_normaliser(step, states)
 
     def __call__(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
-        """A look-ahead outside of a filter would not know the step."""
+        """Not defined: outside of a filter the step is unknown."""
         raise NotImplementedError
 
 
@@ -168,7 +168,7 @@ class PropagateTwisted(AbstractPropagation):
 
     @property
     def reads(self) -> frozenset[str]:
-        """What `CountSteps` remembers."""
+        """The memory of `CountSteps`."""
         return frozenset({STEP})
 
     def __call__(
@@ -193,10 +193,10 @@ class PropagateTwisted(AbstractPropagation):
 
 
 class RegroupTwisted(AbstractRegrouping):
-    """A regrouping that sees the weights times ν_{t+1}(x_t), by which the next step resamples.
+    """A regrouping with the weights times ν_{t+1}(x_t), by which the next step resamples.
 
-    The weights alone are those of the filtering distribution, which few particles carry where the
-    look-ahead has led all others to what comes.
+    Under the weights of the filtering distribution alone few particles carry the mass, because the
+    look-ahead has moved all others towards later observations.
     """
 
     move: AbstractRegrouping
@@ -204,18 +204,18 @@ class RegroupTwisted(AbstractRegrouping):
 
     @property
     def reads(self) -> frozenset[str]:
-        """What `CountSteps` remembers, and what the move itself reads."""
+        """The memory of `CountSteps`, and that which the move reads."""
         return frozenset({STEP}) | self.move.reads
 
     @property
     def needs_parents(self) -> bool:
-        """Whether the move does."""
+        """Whether the move needs them."""
         return self.move.needs_parents
 
     def regroup(
         self, key: Key[Array, ""], mixture: ParticleMixture
     ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
-        """The indicators that the move gives of the weights times ν_{t+1}."""
+        """The move's indicators under the weights times ν_{t+1}."""
         step = mixture.memory[STEP]["step"] + 1
         log_factors = self.twist.log_normaliser(step, mixture.particles)
         log_weights = mixture.weighed(log_factors).log_weights
@@ -223,9 +223,9 @@ class RegroupTwisted(AbstractRegrouping):
         return self.move.regroup(key, mixture.replace(log_weights=log_weights))
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """That of the move."""
+        """The memory of the move."""
         return self.move.initial_memory(num_components)
 
     def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
-        """What the move forgets."""
+        """The memory without dead components."""
         return self.move.forget(memory, dead)

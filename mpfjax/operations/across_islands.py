@@ -1,4 +1,4 @@
-"""What islands of particles exchange; outside `run_islands` there is one island.
+"""Communication between islands of particles; outside `run_islands` there is one island.
 
 In numpy, islands would be a leading axis: `sums.sum(axis=0)`. Here they are two named axes, one of
 devices and one of islands on a device. Every function says what the islands exchange.
@@ -24,7 +24,7 @@ def num_islands() -> int:
 
 
 def island_index() -> Int[Array, ""]:
-    """Which island this is, from 0. Only inside `run_islands`."""
+    """The index of this island, from 0. Only inside `run_islands`."""
     first = jax.lax.axis_index(DEVICE_AXIS) * jax.lax.psum(1, ISLAND_AXIS)
     return first + jax.lax.axis_index(ISLAND_AXIS)
 

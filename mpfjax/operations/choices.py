@@ -1,8 +1,8 @@
 """A choice that all runs of a `vmap` make together, so that only one branch runs.
 
 Under `vmap`, `jax.lax.cond` becomes a `where` as soon as its condition differs from run to run, and
-then both branches run. Where either branch is right for a run that does not need it, the runs may
-ask together: if one needs the dear branch, all take it.
+both branches run. Where the expensive branch gives the right result for every run, the runs can
+choose together: if one needs the expensive branch, all take it.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ def cond_if_any(
 ) -> PyTree:
     """`dear()` if any run of the caller's `vmap` needs it, `cheap()` otherwise.
 
-    For a run that does not need it, `dear()` must give what `cheap()` gives.
+    For a run that does not need it, `dear()` must give the result of `cheap()`.
     """
     return jax.lax.cond(any_run(is_needed), dear, cheap)
 
@@ -33,5 +33,5 @@ def _any_run_of_many(
     axis_size: int, in_batched: list[bool], is_needed: Bool[Array, " b"]
 ) -> tuple[Bool[Array, ""], bool]:
     del axis_size, in_batched
-    # A `vmap` around this one asks its own runs.
+    # A `vmap` around this one combines its own runs.
     return any_run(jnp.any(is_needed)), False

@@ -1,4 +1,4 @@
-"""How programs are compiled: on wide vectors, once for all values of a model's floats, and kept."""
+"""Compilation: on wide vectors, once for all values of a model's floats, and kept in files."""
 
 import functools
 import os
@@ -51,7 +51,7 @@ def jit_on_wide_vectors(function: Callable[..., PyTree]) -> Callable[..., PyTree
     @functools.wraps(function)
     def run(*arguments: Any, **named: Any) -> PyTree:
         if not is_traced((arguments, named)):
-            with one_at_a_time:  # threads that come first would each compile a program of their own
+            with one_at_a_time:  # or several threads would each compile the program
                 compiled = wide()
             try:
                 return compiled(*arguments, **named)
@@ -87,16 +87,16 @@ def keep_programs(folder: str | Path | None = None) -> Path:
     """Keep compiled programs in a folder: a later process that needs the same ones starts sooner.
 
     This is JAX's persistent compilation cache, for programs of any size; those of `track` and
-    `follow_boxes` are kept such that they need not even be traced. A program is found again where
-    the code, the shapes and types, the options, JAX and the processor are the same; numbers in a
-    model may differ. Nothing is ever deleted: the folder may be, at any time. What is in it is
-    run, so nobody else should write to it.
+    `follow_boxes` are kept in a form that need not even be traced. A program is found again if the
+    code, the shapes and types, the options, JAX and the processor are the same; numbers in a model
+    may differ. Nothing is ever deleted, but you may delete the folder at any time. Its content is
+    executed: do not let others write to it.
 
-    - `folder`: None takes `jax_compilation_cache_dir` if that is set, and otherwise `mpfjax` in
-      the user's folder of caches ($XDG_CACHE_HOME, or ~/.cache).
+    - `folder`: None takes `jax_compilation_cache_dir` if that is set, and otherwise `mpfjax` in the
+      user's folder of caches ($XDG_CACHE_HOME, or ~/.cache).
 
-    Returns the folder. Raises `OSError` where it cannot be made. Use it once, at the beginning of
-    a script or notebook; the commands of mpfjax and its benchmarks do.
+    Returns the folder. Raises `OSError` where it cannot be made. Use it once, at the beginning of a
+    script or notebook; the commands of mpfjax and its benchmarks do.
     """
     if folder is None:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -108,7 +108,7 @@ def keep_programs(folder: str | Path | None = None) -> Path:
         jax.config.update("jax_compilation_cache_dir", str(kept))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-        # What was compiled before has settled whether there is a cache.
+        # An earlier compilation may have decided that there is no cache.
         compilation_cache.reset_cache()
     _kept_folders[:] = [kept]
     return kept

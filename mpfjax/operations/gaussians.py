@@ -27,7 +27,7 @@ class Gaussian(NamedTuple):
 
 
 class Linear(NamedTuple):
-    """A x + b + N(0, noise): a step of linear dynamics, or what is seen of x."""
+    """A x + b + N(0, noise): a step of linear dynamics, or an observation of x."""
 
     matrix: Float[Array, "e d n"]
     offset: Float[Array, "e n"]
@@ -69,7 +69,7 @@ def _update_by_one(
     mean, covariance = state
     seen = _kept(applied(covariance, row))
     known = applied(row[None], seen)[0]
-    # Rounding may leave a variance of zero a little below it.
+    # Rounding may leave a zero variance slightly negative.
     spread = jnp.maximum(known, 0.0) + variance
     has_spread = spread > 0
     spread = jnp.where(has_spread, spread, jnp.finfo(mean.dtype).tiny)

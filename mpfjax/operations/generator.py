@@ -95,7 +95,7 @@ def _normal(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "..."]:
         fast_key(key), (math.prod(shape),), jnp.float32, minval=lowest, maxval=1.0
     )
     draws = normal_quantile(uniform)
-    # In short rows, nothing that is fused with them would run on vectors.
+    # Operations fused with short rows are not vectorised.
     is_short = len(shape) > 1 and shape[-1] < _SHORT_ROW
     return (stored(draws) if is_short else draws).reshape(shape)
 
@@ -133,7 +133,7 @@ def _polynomial(coefficients: Sequence[Any], x: Float[Array, "*shape"]) -> Float
 def _random_bits(key: UInt32[Array, " 2"], bit_width: int, shape: tuple[int, ...]) -> Array:
     stock = partial(threefry_prng_impl.random_bits, bit_width=bit_width, shape=shape)
     size = math.prod(shape)
-    # If they were fused with draws in short rows, the rounds would not run on vectors.
+    # Fused with draws in short rows, the rounds would not be vectorised.
     in_short_rows = len(shape) > 1 and shape[-1] < _SHORT_ROW and size > _FEW
     if bit_width != 32 or in_short_rows or not 0 < size < 2**32:
         return stock(key)

@@ -1,7 +1,7 @@
-"""Places along a Hilbert curve, which visits every cell of a grid, each next to the last.
+"""Positions along a Hilbert curve, which visits every cell of a grid, each next to the last.
 
-Points that are near each other on the curve are near each other in space. So a sort along it is
-to points of several dimensions what a sort by value is to numbers.
+Points that are near each other on the curve are near each other in space. To sort points of several
+dimensions along the curve corresponds to sorting numbers by value.
 """
 
 import jax.numpy as jnp

@@ -74,7 +74,7 @@ def count_places(
 
 
 def inverse_permutation(places: Int[Array, " n"]) -> Int[Array, " n"]:
-    """The index that stands at each place, given every index's place."""
+    """The index at each place, given every index's place."""
     n = places.shape[0]
 
     def scatter(rows: Int[Array, "k n"]) -> Int[Array, "k n"]:

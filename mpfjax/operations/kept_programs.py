@@ -1,8 +1,8 @@
 """Programs of the library that a later process starts without tracing them again.
 
-JAX's own cache finds a program by its operations, so that these have to be traced and lowered
-first: for a large program most of the time that is left. Here it is found by what it is made of:
-the library's source, the structure and types of its arguments, the settings, the versions and the
+JAX's own cache finds a program by its operations, which have to be traced and lowered first: for a
+large program most of the remaining time. Here a program is found by what it is made from: the
+library's source, the structure and types of its arguments, the settings, the versions and the
 processor.
 """
 
@@ -27,7 +27,7 @@ from jaxtyping import Array, PyTree
 
 from mpfjax.operations.compiling import is_traced, kept_folder
 
-# Code whose changes are seen: the library's by its source, the others' by their versions.
+# Code whose changes are detected: the library's by its source, others' by their versions.
 _LIBRARY = __name__.partition(".")[0]
 _DEPENDENCIES = ("jax", "jaxlib", "equinox", "jaxtyping", "numpy", "optax")
 _KNOWN = {_LIBRARY, *_DEPENDENCIES, "builtins", "functools", "jax.numpy", "ml_dtypes"}
@@ -52,9 +52,10 @@ def kept_program(
     """`function(*fixed, *moving)`, compiled, as a function of such `moving` arguments alone.
 
     Where `keep_programs` has been called, the program is read from its folder, or compiled and
-    left there. What cannot be kept runs by `equinox.filter_jit`, as does every call with arguments
-    of another structure: a class or a function in `fixed` that is not the library's, whose changes
-    nobody would see, and `moving` with leaves that are no arrays. `options` are the compiler's.
+    stored there. A program that cannot be kept runs by `equinox.filter_jit`, as does every call
+    with arguments of another structure: where `fixed` holds a class or a function that is not the
+    library's, whose changes would not be detected, and where `moving` has leaves that are no
+    arrays. `options` are the compiler's.
     """
     options = options or {}
     with_options: Any = eqx.filter_jit
@@ -66,7 +67,7 @@ def kept_program(
         program = _Program(function, fixed, moving)
         path = folder / f"{_LIBRARY}-{function.__module__}-{program.key(options)}"
         call = program.read(path) or program.compile(path, options)
-        # An error of the program itself comes where its result is waited for.
+        # An error of the program itself is raised where its result is awaited.
         jax.block_until_ready(jax.tree.leaves(call(*moving)))
     except _NOT_KEPT:
         return plain
@@ -77,7 +78,7 @@ def kept_program(
     return run
 
 
-# What pickle, JAX and the file system raise of what they cannot write, read or run.
+# The exceptions of pickle, JAX and the file system.
 _NOT_KEPT = (
     pickle.PickleError,
     jax.errors.JaxRuntimeError,
@@ -109,7 +110,7 @@ class _Program:
         return structure == self.structure and [_kind(leaf) for leaf in leaves] == self.kinds
 
     def key(self, options: dict[str, Any]) -> str:
-        """What tells this program from others; a `PicklingError` for code that is not known."""
+        """A key that identifies this program; a `PicklingError` for code that is not known."""
         fixed = _described(jax.tree.unflatten(self.fixed_structure, self.fixed), self.static)
         moving = _described(jax.tree.unflatten(self.structure, self.moving))
         file = io.BytesIO()
@@ -143,7 +144,7 @@ class _Program:
             bare = map(_bare, self.fixed + self.moving)
             lowered = with_options(on_arrays, compiler_options=options).lower(*bare)
             compiled = lowered.compile()
-        if not hits:  # XLA does not write out again what it has itself read
+        if not hits:  # XLA cannot write a program that it has itself read
             with contextlib.suppress(*_NOT_KEPT):
                 kept = (serialize_executable.serialize(compiled), _dumped(results[0]))
                 _write(path, pickle.dumps(kept))
@@ -196,7 +197,7 @@ def _described(tree: PyTree, static: PyTree = None) -> PyTree:
 
 
 def _kind(leaf: Any) -> str:
-    """Shape and type of an array; a `TypeError` for what is none."""
+    """Shape and type of an array; a `TypeError` for anything else."""
     if not eqx.is_array(leaf) and not hasattr(leaf, "__array__"):
         raise TypeError(f"{leaf} is no array")
     return f"{leaf.shape}{leaf.dtype}{getattr(leaf, 'weak_type', False)}"
@@ -235,7 +236,7 @@ def _versions() -> bytes:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             digest.update(f"{name} {importlib.metadata.version(name)}".encode())
     digest.update(f"{platform.python_version()} {platform.machine()}".encode())
-    with contextlib.suppress(OSError):  # Linux alone has it, and says what the processor can do
+    with contextlib.suppress(OSError):  # only on Linux; lists the processor's features
         processor = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
         said = [line for line in processor if line.startswith(("flags", "Features", "model name"))]
         digest.update("\n".join(said).encode())
@@ -244,7 +245,7 @@ def _versions() -> bytes:
 
 @contextlib.contextmanager
 def _hits() -> Iterator[list[str]]:
-    """What JAX's cache says within the block of programs that it has found."""
+    """Within the block, a list of the programs that JAX's cache has found."""
     found: list[str] = []
     _listeners.append(found)
     _listen()

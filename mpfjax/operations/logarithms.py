@@ -77,6 +77,6 @@ def masked_shares(log_values: Float[Array, " n"], shares: Float[Array, " n"]) ->
 
 
 def log_or_nothing(total: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
-    """log, -inf at zero with a gradient of zero; NaN comes out as NaN."""
+    """log with a gradient of zero at zero, where it is -inf; NaN stays NaN."""
     empty = total == 0
     return jnp.where(empty, -jnp.inf, jnp.log(jnp.where(empty, 1.0, total)))

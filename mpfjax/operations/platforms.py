@@ -12,7 +12,7 @@ _only_the_default_forms = False
 def on_platform(
     *operands: PyTree, cpu: Callable[..., PyTree], default: Callable[..., PyTree]
 ) -> PyTree:
-    """What `cpu` makes of the operands on a CPU, and what `default` makes of them elsewhere.
+    """The result of `cpu` on a CPU, and of `default` elsewhere.
 
     Both give the same numbers, up to rounding.
     """

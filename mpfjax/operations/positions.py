@@ -57,7 +57,7 @@ class Positions(NamedTuple):
 
 
 def needs_two_parts(num_values: int, dtype: jnp.dtype) -> bool:
-    """Whether sums of so many values of this type have no bits left for the fraction."""
+    """Whether sums of this many values of this type have no bits left for the fraction."""
     return num_values > MOST_IN_ONE_FLOAT and jnp.finfo(dtype).nmant < 32
 
 
@@ -152,15 +152,15 @@ def unit_shift(lengths: Int[Array, " m"], num_values: Int[Array, " m"]) -> Int[A
 def scales(
     sums: Float[Array, " m"], lengths: Int[Array, " m"], num_values: int
 ) -> Float[Array, " m"]:
-    """What values are multiplied by so that each sum is a little less than its length."""
+    """The factors of the values with which each sum is a little less than its length."""
     longest = lengths.astype(sums.dtype)
-    # As much as the values and their sum can be off by rounding.
+    # The largest rounding error of the values and their sum.
     margin = longest * 2.0**-20 + num_values * 2.0**-25
     return jnp.maximum(longest - margin, longest / 2) / jnp.where(sums > 0, sums, 1.0)
 
 
 def growths(totals: Positions, lengths: Int[Array, " m"]) -> Float[Array, " m"]:
-    """What is missing of each length, for every slot of the total."""
+    """The difference to each length, for every slot of the total."""
     total = totals.as_float()
     missing = (lengths - totals.whole).astype(total.dtype) - totals.fraction
     return jnp.maximum(missing, 0.0) / jnp.where(total > 0, total, 1.0)
@@ -169,10 +169,10 @@ def growths(totals: Positions, lengths: Int[Array, " m"]) -> Float[Array, " m"]:
 def in_slots(
     positions: Positions, growth: Float[Array, "#n"], shift: Int[Array, "#n"]
 ) -> Positions:
-    """Positions in units of 2^-shift slots, each moved on by its share of what is missing.
+    """Positions in units of 2^-shift slots, each shifted by its share of the gap to the length.
 
-    So rounding, of the values and of the number that they were divided by, does not go to the last
-    particle. Positions that are the same stay so, and the order does not change.
+    Rounding errors, of the values and of the number that they were divided by, then do not add to
+    the last particle alone. Equal positions stay equal, and the order does not change.
     """
     fraction = positions.fraction + growth * positions.as_float()
     turns = jnp.floor(fraction)
@@ -188,8 +188,8 @@ def in_slots(
 def random_positions(key: Key[Array, ""], lengths: Int[Array, " n"]) -> Positions:
     """Independent uniform points, one on each line of 0 to `length` > 0 slots.
 
-    A point is the length times a uniform number of 32 + 23 bits: with 23 alone, there would be but
-    two to a slot of four million.
+    A point is the length times a uniform number of 32 + 23 bits: with 23 bits alone, a slot of four
+    million would have only two points.
     """
     key_word, key_rest = split(key, 2)
     word = bits(key_word, lengths.shape)
@@ -220,8 +220,9 @@ def _wide_product(
 def last_before(positions: Positions, points: Positions, num_slots: int) -> Int[Array, " n"]:
     """The last of the positions, in ascending order, that is not after each point; -1 for none.
 
-    Whole parts are counted, and only among the positions of one slot is there a search. It takes
-    as many turns as the logarithm of the most positions in a slot. Points are in [0, num_slots).
+    Integer parts are counted, and a search takes place only among the positions of one slot. It
+    takes as many turns as the logarithm of the most positions in a slot. Points are in [0,
+    num_slots).
     """
     num_positions = positions.whole.shape[0]
     at_slot = count_places(jnp.clip(positions.whole, 0, num_slots), whole_blocks(num_slots + 1))

@@ -52,7 +52,7 @@ def _blocked_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"],
     # Columns are summed in the same order, so the sum does not change where the value is zero.
     within = blocks @ _ones_before(size, size, values.dtype)
     totals = within[:, -1] + blocks[:, -1]
-    # A zero after the last block has the sum of all before it.
+    # A zero in the last block has the sum of all values before it.
     before, _ = _blocked_sum_before(jnp.pad(totals, (0, 1)))
     if before.shape[0] > _ONE_BLOCK:
         before = stored(before)
@@ -105,7 +105,7 @@ def count_starts(starts: Int[Array, "*rows n"], num_slots: int) -> Int[Array, " 
     offspring has the same start as the next one and gets no slot. Starts at or past `num_slots`
     are dropped. A slot before the first start gets -1.
     """
-    # Dropped starts get a place of their own.
+    # Dropped starts share one extra place.
     num_places = whole_blocks(num_slots + 1)
     dtype = jnp.float32 if starts.size < EXACT_IN_FLOAT32 else jnp.int32
     starts = stored(jnp.minimum(starts, num_slots), num_slots + 1)

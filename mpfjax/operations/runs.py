@@ -18,7 +18,7 @@ from mpfjax.operations.stored import block_size, stored, whole_blocks
 
 
 class Runs(NamedTuple):
-    """Where segments stand, in blocks of places; all of them fill whole blocks."""
+    """The places of segments, in blocks; the segments together fill whole blocks."""
 
     labels: Int[Array, "blocks size"]
     first_blocks: Int[Array, " m"]
@@ -33,7 +33,7 @@ class Runs(NamedTuple):
         return self._reduced("max", values, -jnp.inf)
 
     def extents(self, mask: Bool[Array, " p"]) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
-        """The first and the last masked place of each segment; some place where it has none."""
+        """The first and the last masked place of each segment; any place where there is none."""
         places = jnp.arange(mask.shape[0], dtype=jnp.int32)
         last = mask.shape[0] - 1
         # The last place is the least of the negative ones: one minimum finds both.

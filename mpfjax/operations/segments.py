@@ -26,9 +26,9 @@ from mpfjax.operations.logarithms import exp, finite_or_zero, log_or_nothing, ma
 from mpfjax.operations.prefix_sums import count_starts, count_upto
 from mpfjax.operations.stored import EXACT_IN_FLOAT32, stored, whole_blocks
 
-# A sum over each of so many segments has a mask for each.
+# Up to this many segments, a sum has a mask for each.
 FEW_SEGMENTS = 4
-# One of so many values is chosen by comparing, which runs on vectors; a gather does not.
+# One of up to this many values is selected by comparing, which is vectorised; a gather is not.
 FEW_CHOICES = 16
 # Neighbours that are added to the same place go to different lanes, each with a place of its own.
 # In one place, a CPU would have to wait for each addition before the next.
@@ -39,7 +39,7 @@ _FEW_COLUMNS = 9
 # In float32, a million equal numbers, added one after the other, give a thousandth too much.
 _LONGEST_SUM = 2**10
 _COUNTED_BLOCK = 32
-# Which segments are there is kept in the bits of so many words at most.
+# The segments that occur are kept in the bits of at most this many words.
 _WORD, _MOST_WORDS = 32, 8
 _MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # eight counts for each particle
 
@@ -237,7 +237,7 @@ def segment_softmax(
     totals = segment_sum(values, segments, num_segments)
     shares = values / spread_finite(jnp.where(totals == 0, 1.0, totals), segments)
     if num_segments > FEW_SEGMENTS:
-        # Or a scatter of them would choose every particle's total, one after the other.
+        # Otherwise XLA takes the totals by a scatter, one particle after the other.
         shares = stored(shares)
     return masked_shares(log_values, shares)
 
@@ -245,7 +245,7 @@ def segment_softmax(
 def segment_argmax(
     values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Int[Array, " num_segments"]:
-    """The index of the largest value in each segment, some index where it is empty."""
+    """The index of the largest value in each segment, any index where it is empty."""
     n = values.shape[0]
     values = jax.lax.stop_gradient(values)  # an index has no derivative
     limits = jnp.finfo(values.dtype)
@@ -260,7 +260,7 @@ def segment_argmax(
 
 
 def first_places(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " num_segments"]:
-    """The first index at which each segment's label stands, n - 1 for a label that nobody has."""
+    """The first index with each segment's label, n - 1 for a label that does not occur."""
     n = segments.shape[0]
     index = jnp.arange(n, dtype=jnp.int32)
     if num_segments > FEW_SEGMENTS:
@@ -334,7 +334,7 @@ def _places_by_segment(
 def _members(
     segments: Int[Array, " n"], num_segments: int, trailing: int = 0
 ) -> Bool[Array, "num_segments n ..."]:
-    """Which entry belongs to which segment; XLA fuses this mask into a sum and never stores it."""
+    """A mask of the entries of each segment; XLA fuses it into a sum and never stores it."""
     labels = jnp.arange(num_segments, dtype=segments.dtype)
     member = segments[None] == labels[:, None]
     return member.reshape(member.shape + (1,) * trailing)

@@ -94,7 +94,7 @@ def scrambled_directions(
     """Direction numbers times a random lower triangular matrix of digits for each dimension.
 
     The linear matrix scramble of Matoušek (1998): digit k of a coordinate becomes itself plus a
-    random sum of the digits before it. A net stays one. With a random shift of all digits, each
+    random sum of the digits before it. A net stays a net. With a random shift of all digits, each
     point is uniform, and any two have the joint law that they have in Owen's nested scramble.
     """
     directions = jnp.asarray(direction_numbers(dimension, num_digits))

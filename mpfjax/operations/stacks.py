@@ -8,7 +8,7 @@ LAPACK is called once for each. A last axis of length 1 is a matrix that all par
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# A variance below so many roundings of what it was computed from counts as this much.
+# The least variance, in units of the rounding error of the numbers it was computed from.
 _ROUNDINGS = 4
 
 
@@ -18,7 +18,7 @@ def particles_last(values: Float[Array, "..."], rank: int) -> Float[Array, "... 
 
 
 def particles_first(values: Float[Array, "... n"], num_particles: int) -> Float[Array, "n ..."]:
-    """(..., n) as (n, ...); what is shared is repeated."""
+    """(..., n) as (n, ...); arrays that all particles share are repeated."""
     values = jnp.broadcast_to(values, (*values.shape[:-1], num_particles))
     return jnp.moveaxis(values, -1, 0)
 

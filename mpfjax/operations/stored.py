@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, Shaped
 from mpfjax.operations.platforms import on_platform
 
 VECTOR = 32
-# Powers of two fill the vectors, and what is far from 32 makes more rows or longer products.
+# Powers of two fill the vectors; sizes far from 32 make more rows or longer products.
 _BLOCKS = (VECTOR, 16, 40, 48, 24, 56, 28, 36, 20, 44, 52)
 EXACT_IN_FLOAT32 = 2**23  # as exact as up to 2^24, and readable from the lowest bits
 
@@ -25,7 +25,7 @@ def whole_blocks(n: int) -> int:
 
 
 def block_size(n: int) -> int:
-    # Nothing that is fused with a padding, or with a division by an odd size, runs on vectors.
+    # Operations fused with a padding, or a division by an odd size, are not vectorised.
     whole = (size for size in _BLOCKS if n % size == 0 and n > VECTOR)
     return next(whole, VECTOR)
 

@@ -1,4 +1,4 @@
-"""Runs dealt to devices, of this process or of all."""
+"""Runs distributed over devices, of this process or of all."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -116,7 +116,7 @@ def _default_devices(available: list[Any]) -> list[Any]:
 
 
 def _placed(tree: PyTree, where: Any) -> PyTree:
-    """Every array of the tree on a device or as a sharding says, wherever it was."""
+    """Every array of the tree moved to a device or sharding."""
     is_array = lambda leaf: isinstance(leaf, jax.Array | np.ndarray)  # noqa: E731
     arrays, rest = eqx.partition(tree, is_array)
     if jax.process_count() == 1:

@@ -1,4 +1,4 @@
-"""Several processes that work as one."""
+"""Several processes that work together on one study."""
 
 import math
 import os

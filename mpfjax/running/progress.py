@@ -13,13 +13,13 @@ from tqdm import tqdm
 
 from mpfjax.operations.compiling import is_traced
 
-_MOST_CALLS = 100  # of the host by one program, a call for so many parts of the run
+_MOST_CALLS = 100  # calls of the host by one program, at equal distances of the run
 _bars: dict[int, tqdm] = {}
 _numbers = itertools.count()
 
 
 class Bar(NamedTuple):
-    """Which bar a program advances, and by how many runs each step of it counts."""
+    """The bar that a program advances, and the number of runs that each of its steps counts for."""
 
     number: Int[Array, ""] | np.ndarray
     num_runs: int = 1
@@ -27,7 +27,7 @@ class Bar(NamedTuple):
 
 @contextlib.contextmanager
 def shown_progress(progress: bool, num_steps: int, arguments: Any) -> Iterator[Bar | None]:
-    """A bar of this many steps, or None where none is wanted or the caller compiles the run."""
+    """A bar of this many steps, or None without `progress` or where the caller compiles the run."""
     if not progress or is_traced(arguments):
         yield None
         return
@@ -58,5 +58,5 @@ def advance_bar(bar: Bar, step: Int[Array, ""], length: int) -> None:
 
 def _advance(number: Any, num_steps: Any) -> None:
     bar = _bars.get(int(number))
-    if bar is not None:  # runs that fill up the last block count for none
+    if bar is not None:  # runs that fill up the last block are not counted
         bar.update(min(int(num_steps), (bar.total or 0) - bar.n))

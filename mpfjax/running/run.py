@@ -18,7 +18,7 @@ from mpfjax.running.progress import shown_progress
 from mpfjax.running.scan import FilterRun, check_run, checked, scan
 from mpfjax.running.threads import num_processors, over_threads
 
-# How many particles, with all that a step makes of them, fit into a CPU's caches. Few components
+# How many particles, with the temporaries of a step, fit into a CPU's caches. Few components
 # have a row of particles each, which counts as so many times the particles.
 _IN_NEAR_CACHE, _IN_CACHE = 2**15, 2**16
 _WORTH_A_THREAD = 2**9  # particles in all runs of the thread
@@ -166,7 +166,7 @@ def _run_each(starts, filter, series, collect, bar=None):
 
 
 def _group_size(num_runs: int, filter: Filter) -> int:
-    """How many runs go on together: on a CPU, no more than fit into its cache."""
+    """How many runs are advanced together: on a CPU, no more than fit into its cache."""
     one_run = filter.num_particles
     if jax.default_backend() != "cpu" or num_runs * one_run <= _IN_CACHE:
         return num_runs

@@ -73,14 +73,14 @@ class StepReport(NamedTuple):
 
 
 def report_of(info: StepInfo) -> StepReport:
-    """What a run keeps of a step."""
+    """The part of a step's report that a run keeps."""
     return StepReport(info.log_likelihood_increment, info.resampled, info.degenerate)
 
 
 def run_of(
     initial: ParticleMixture, final: ParticleMixture, collected: PyTree, reports: StepReport
 ) -> FilterRun:
-    """The run of these steps, whose reports are stacked."""
+    """The `FilterRun` of these steps, whose reports are stacked."""
     return FilterRun(
         log_marginal_likelihood=jnp.sum(reports.log_likelihood_increment),
         log_likelihood_increments=reports.log_likelihood_increment,
@@ -128,6 +128,6 @@ def checked(run: FilterRun) -> FilterRun:
 
 
 def check_run(filter: Any, collect: Any) -> None:
-    """Raise a `ValueError` for what is no filter, or cannot collect."""
+    """Raise a `ValueError` for anything but a filter, or a `collect` that cannot be called."""
     check_type(Filter, "a Filter", filter=filter)
     check_callable("a function of a mixture", **given(collect=collect))

@@ -184,7 +184,7 @@ class _Cell:
 
 
 def _cells(study: Study) -> list[_Cell]:
-    """All cells, with their filters built: what cannot be built is an error before any runs."""
+    """All cells with their filters, built at once: a filter that cannot be built raises first."""
     axes = _axes(study)
     # Settings are outermost: neighbours, which may compile at once, are then different programs.
     outermost_first = [*study.settings, "num_particles", "filter"]
@@ -225,7 +225,7 @@ def _argument(axis: str) -> str:
 
 
 def _plain(name: str, value: Any) -> Any:
-    """A value of an axis as JSON can hold it."""
+    """A value of an axis in a form that JSON can hold."""
     is_array = isinstance(value, np.generic | np.ndarray | jax.Array)
     if is_array and value.ndim == 0 and not jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         value = value.item()
@@ -238,7 +238,7 @@ def _plain(name: str, value: Any) -> Any:
 
 
 def _manifest(study: Study, cells: list[_Cell]) -> dict[str, Any]:
-    """What has to be the same for a directory to be of this study, as JSON holds it."""
+    """All that identifies the study of a directory, in a form that JSON can hold."""
     manifest = {
         "axes": _axes(study),
         "keys": _summary(study.keys),
@@ -306,7 +306,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
 
 
 def _mapping(content: Any, name: str) -> dict[str, Any]:
-    """What JSON holds by this name, or nothing where it holds something else."""
+    """The mapping in JSON by this name; empty if it is something else."""
     found = content.get(name) if isinstance(content, dict) else None
     return found if isinstance(found, dict) else {}
 
@@ -319,7 +319,7 @@ def _as_directory(directory: str | os.PathLike[str]) -> Path:
 
 
 def _mark(manifest: dict[str, Any], file: str) -> np.ndarray:
-    """What says which cell of which study a file holds."""
+    """The text that identifies the study and the cell of a file."""
     digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
     return np.array(json.dumps({"study": digest} | manifest["cells"][file]["is"]))
 

@@ -1,4 +1,4 @@
-"""Runs dealt to threads of this process, for a CPU that is one device of many cores."""
+"""Runs distributed over threads of this process, for a CPU that is one device of many cores."""
 
 import functools
 import os
@@ -23,12 +23,12 @@ def over_threads(
     arguments: tuple[PyTree, ...],
     num_threads: int,
 ) -> PyTree:
-    """`run(inputs, *arguments)`, compiled, with the inputs dealt to threads of this process.
+    """`run(inputs, *arguments)`, compiled, with the inputs distributed over threads.
 
-    It is for programs of many short operations, which a CPU device does mostly one after the other.
+    It is for programs of many short operations, which a CPU device runs mostly one after the other.
     The blocks have equal size: the last input is repeated to fill the last block, and the extra
     results are dropped. This thread takes the first block. It takes all of them if other threads
-    would not see its settings of JAX, or a transformation of the caller.
+    would not have its settings of JAX, or a transformation of the caller.
     """
     num_inputs = length_of(inputs)
     size = -(-num_inputs // num_threads)

@@ -1,4 +1,4 @@
-"""What is known of the past given all observations, and of the future given those so far."""
+"""Smoothing given all observations, and forecasts given those so far."""
 
 from mpfjax.smoothing.ancestors import Genealogy as Genealogy
 from mpfjax.smoothing.ancestors import trace_ancestors as trace_ancestors

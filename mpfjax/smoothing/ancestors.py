@@ -1,4 +1,4 @@
-"""Genealogies: which particles of the past the particles at the end come from."""
+"""Genealogies: the ancestors at earlier times of the particles at the end."""
 
 import equinox as eqx
 import jax
@@ -16,11 +16,11 @@ class Genealogy(eqx.Module):
     """The ancestors of the particles at the end, at every time of a run.
 
     - `indices`: (t, n), the slot of each particle's ancestor; at the end its own.
-    - `trajectories`: leaves (n, t, ...), the states of the ancestors: a genealogical trajectory
-      has the weight of its particle in the final mixture.
-    - `share_apart`: (m, t), how many different ancestors the particles of each component have, over
-      how many particles it has: 1 where all have their own, 1/count where one is left, and zero
-      for a dead component.
+    - `trajectories`: leaves (n, t, ...), the states of the ancestors: a genealogical trajectory has
+      the weight of its particle in the final mixture.
+    - `share_apart`: (m, t), the number of distinct ancestors of each component's particles, divided
+      by the number of particles: 1 where all are distinct, 1/count where one is left, and zero for
+      a dead component.
     """
 
     indices: Int[Array, "t n"]
@@ -55,7 +55,7 @@ def _trace(mixtures: ParticleMixture) -> Genealogy:
     counts = final.component_counts
 
     def num_ancestors(ancestors: Array) -> Array:
-        # Those of an empty slot count for a component of their own.
+        # Empty slots are counted as a component of their own.
         labels = jnp.where(final.occupied, final.component_indicators, m)
         named = count_places(labels * n + ancestors, (m + 1) * n).reshape(m + 1, n)
         return jnp.sum(named[:m] > 0, axis=1, dtype=jnp.int32)

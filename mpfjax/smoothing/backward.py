@@ -1,7 +1,7 @@
-"""The backward kernel: which particle of s each particle of s + 1 may have come from.
+"""The backward kernel: the distribution of the particle at s from which one at s + 1 has come.
 
-The index of x_s given x_{s+1} has the probabilities W_s^i D(x_{s+1} | x_s^i), W_s the joint weights
-of the mixture at s. Component indicators have no part in it, since the weights are joint.
+The index of x_s given x_{s+1} has the probabilities W_s^i D(x_{s+1} | x_s^i), where W_s are the
+joint weights of the mixture at s. Component indicators do not enter, since the weights are joint.
 """
 
 import math
@@ -105,7 +105,7 @@ def draw_exactly(
 def propose(
     key: Key[Array, ""], mixture: ParticleMixture, num_steps: int, num_states: int
 ) -> Int[Array, "steps k"]:
-    """What `walk` proposes: indices by the weights alone, so that all can be drawn beforehand."""
+    """Proposals for `walk`: indices by the weights alone, so that all can be drawn beforehand."""
     return draw(key, (num_steps, num_states), mixture.log_weights)
 
 

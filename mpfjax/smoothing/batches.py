@@ -1,4 +1,4 @@
-"""Estimates with standard errors from a batch of independent runs, whatever their noise is."""
+"""Estimates with standard errors from a batch of independent runs, for any kind of noise."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.logarithms import log_sum_exp
 from mpfjax.running.scan import FilterRun
 
-# Standard errors of fewer runs say next to nothing.
+# Standard errors from fewer runs are not reliable.
 FEWEST_RUNS = 4
 
 
@@ -34,23 +34,25 @@ def batch_estimate(
 ) -> BatchEstimate:
     """An expectation and log Z from B independent runs, each with its standard error.
 
-    The runs are one particle filter of B islands that never meet: run b counts by its Ẑ_b, so that
+    The runs are treated as one particle filter of B islands that do not interact: run b has the
+    weight Ẑ_b, so that
 
         q = Σ_b Ẑ_b q_b / Σ_b Ẑ_b,   Ẑ = Σ_b Ẑ_b / B,
 
     and Ẑ is unbiased (Vergé et al. 2015). The errors are those of the jackknife over runs (Efron
     1982), (B - 1) / B Σ_b (q_(b) - mean of q_(.))², with q_(b) the estimate without run b. They
-    need only independent runs, so they hold for every scheme, noise and move.
-    (`with_first_ancestors` needs multinomial draws.)
+    need only independent runs, and hold for every scheme, noise and move. (`with_first_ancestors`
+    needs multinomial draws.)
 
     - `runs`: what `monte_carlo` returned for B keys, four or more. Twelve to thirty of N / B
-      particles each are a good choice. Take so many particles that log Ẑ of a single run has a
-      standard deviation of about one or less. Otherwise few runs count, as `effective_runs` says.
+      particles each are a good choice. Take enough particles that log Ẑ of a single run has a
+      standard deviation of about one or less. Otherwise a few runs have most of the weight; see
+      `effective_runs`.
     - `quantity`: a function of one mixture, such as `lambda m: m.average(m.particles > 0)`. For a
       mass take the probability of a place or an event, since the labels of components differ
       between runs.
 
-    Runs of zero likelihood count nothing. Raises `ValueError` for fewer runs, and for anything but
+    Runs of zero likelihood have no weight. Raises `ValueError` for fewer runs, and for anything but
     a stack of runs. Use it to see whether a mass can be trusted.
     """
     check_callable("a function of a mixture", quantity=quantity)

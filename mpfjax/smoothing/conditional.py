@@ -39,12 +39,12 @@ _IMPOSSIBLE = "trajectory: its density beside the observations is zero or NaN"
 
 
 class ConditionalRun(eqx.Module):
-    """What a conditional filter gives.
+    """The result of a conditional filter.
 
     - `trajectory`: the new one, leaves (t + 1, ...).
-    - `run`: the run with all its mixtures, the trajectory that was kept among their particles. Its
+    - `run`: the run with all its mixtures, with the kept trajectory among their particles. Its
       marginal likelihood is NOT unbiased, since one particle was not drawn.
-    - `slots`: (t + 1,), where the kept trajectory stands in the mixture of each time.
+    - `slots`: (t + 1,), the slot of the kept trajectory in the mixture of each time.
     - `possible`: (t + 1,), whether the model gives the kept trajectory a density above zero.
     """
 
@@ -106,7 +106,7 @@ def conditional_filter(
     check_conditional(filter, backward, "conditional_filter")
     series = as_series(observations, inputs, missing, filter.model)
     trajectory = _as_states(trajectory, filter.model, series.length + 1)
-    # Before the run: backward sampling would not find where the trajectory has come from.
+    # Checked before the run: backward sampling could not recover an impossible trajectory.
     _require(_steps_are_possible(filter.model, trajectory, series.inputs))
     run = lambda filter: _run(key, filter, series, trajectory, backward)  # noqa: E731
     found = with_floats_traced(run, filter)
@@ -128,7 +128,7 @@ def _require(possible: Bool[Array, " t"]) -> None:
 def _steps_are_possible(
     model: AbstractStateSpaceModel, trajectory: PyTree, inputs: PyTree
 ) -> Bool[Array, " t"]:
-    """At which times the trajectory is possible, without regard to what was observed."""
+    """At which times the trajectory is possible, regardless of the observations."""
     length = jax.tree.leaves(trajectory)[0].shape[0] - 1
     return _possible(model, trajectory, inputs, jnp.ones(length, bool))
 
@@ -184,7 +184,7 @@ def _around(filter: Filter, trajectory: PyTree, first_slot: Int[Array, ""]) -> F
 
 
 def _independent_initial(key: Key[Array, ""], model: Any, num_particles: int) -> PyTree:
-    """x_0 of every particle by itself: a model may draw many of them in strata."""
+    """x_0 of every particle, drawn separately: a model may draw many of them in strata."""
 
     def draw(key: Key[Array, ""]) -> PyTree:
         return jax.tree.map(lambda leaf: leaf[0], sample_initial(key, model, 1))
@@ -209,7 +209,7 @@ def draw_trajectory(
 
 
 def is_possible(model: Any, trajectory: PyTree, inputs: PyTree) -> Bool[Array, ""]:
-    """Whether the model gives a trajectory a density above zero, as far as it knows it."""
+    """Whether a trajectory has a density above zero, as far as the model's densities tell."""
     length = jax.tree.leaves(trajectory)[0].shape[0] - 1
     return jnp.all(_possible(model, trajectory, inputs, jnp.ones(length, bool)))
 
@@ -230,7 +230,7 @@ def _of_the_genealogy(key: Key[Array, ""], mixtures: ParticleMixture) -> PyTree:
 def _possible(
     model: Any, trajectory: PyTree, inputs: PyTree, later: Bool[Array, " t"]
 ) -> Bool[Array, " all"]:
-    """At which times the trajectory has a density above zero, as far as the model knows it."""
+    """At which times the trajectory has a density above zero, as far as the densities tell."""
     start = jnp.ones((1,), bool)
     if callable(getattr(model, "log_initial", None)):
         start = model.log_initial(jax.tree.map(lambda leaf: leaf[:1], trajectory)) > -jnp.inf

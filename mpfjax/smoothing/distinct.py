@@ -1,4 +1,4 @@
-"""How many of the trajectories that backward sampling drew are distinct at each time."""
+"""How many of the trajectories from backward sampling are distinct at each time."""
 
 import warnings
 from typing import Any
@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-# Below this share the trajectories say little of the past, whatever their number.
+# Below this share estimates of the past are poor, whatever the number of trajectories.
 SMALL_SHARE = 0.1
 
 
@@ -18,12 +18,13 @@ def warn_of_few(
 ) -> None:
     """A RuntimeWarning where few trajectories are distinct because backward weights degenerate.
 
-    The share at a time is that of the distinct states among as many as there could be: the
-    trajectories, or the distinct particles of positive weight where these are fewer. It may be
-    small at a time where few particles fit, and each of these still have many pasts; so it counts
-    only where trajectories that share a state nearly always share the state before as well. Of more
-    trajectories than particles the first are taken. States are told apart by their floating point
-    numbers; of a state without any, and within the caller's own jit, nothing is said.
+    The share at a time is the number of distinct states over the largest possible number: that of
+    the trajectories, or of the distinct particles of positive weight where these are fewer. The
+    share may be small at a time where few particles fit, although each of these has many pasts. It
+    therefore counts only where trajectories that share a state nearly always share the state before
+    as well. If there are more trajectories than particles, the first ones are used. States are
+    compared by their floating point numbers; for a state without any, and within the caller's own
+    jit, there is no warning.
     """
     leaves = jax.tree.leaves((trajectories, particles, log_weights))
     if any(isinstance(leaf, Tracer) or not leaf.is_fully_addressable for leaf in leaves):
@@ -53,7 +54,7 @@ def warn_of_few(
 
 
 def _share_of_own_pasts(before: np.ndarray, after: np.ndarray) -> float:
-    """Of trajectories that share a state, the share that adds another past to it; (t, k) both."""
+    """Of the trajectories that share a state, the share with a distinct past; (t, k) both."""
     num_after = _num_distinct(after)
     both = _num_distinct(before * np.uint64(0x9E3779B97F4A7C15) + after)
     num_sharing = (after.shape[1] - num_after).sum()
@@ -68,7 +69,7 @@ def _fingerprints(states: PyTree) -> Any:
     numbers = np.concatenate(
         [np.asarray(leaf, float).reshape(*leaf.shape[:2], -1) for leaf in leaves], axis=2
     )
-    # Random weights modulo 2^64 tell rows apart but for chance; -0 and 0 are one number.
+    # Random weights modulo 2^64 give distinct rows distinct sums, almost surely; -0 equals 0.
     bits = (numbers + 0.0).view(np.uint64)
     weights = np.random.default_rng(0).integers(2**63, size=bits.shape[2], dtype=np.uint64)
     return (bits * (2 * weights + np.uint64(1))).sum(axis=2)

@@ -26,10 +26,10 @@ from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 
 class Forecast(eqx.Module):
-    """What a filter expects of the next k steps.
+    """The predictive distribution of a filter for the next k steps.
 
-    - `mixtures`: the mixtures at t + 1, ..., t + k, stacked: components keep their labels as far
-      as the filter's regrouping lets them. `jax.vmap` maps what is derived from one over them.
+    - `mixtures`: the mixtures at t + 1, ..., t + k, stacked: components keep their labels as far as
+      the filter's regrouping allows. `jax.vmap` maps derived quantities over them.
     - `observations`: one simulated observation for each particle, leaves (k, n, ...), with the
       weights of the particles; None where none were asked for.
     """
@@ -104,7 +104,7 @@ def _forecast(key, filter, mixture, inputs, options):
 
 
 def _check_simulated(observations: PyTree, num_particles: int) -> None:
-    """Raise a `ValueError` for what holds no observation, or not one for each particle."""
+    """Raise a `ValueError` unless there is one observation for each particle."""
     leaves = jax.tree.leaves(observations)
     if not leaves:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The mixtures of a run, from x_0 to x_t, as every smoother takes them."""
+"""The mixtures of a run, from x_0 to x_t, in the form that all smoothers take."""
 
 from typing import Any
 
@@ -27,7 +27,7 @@ def mixtures_of(run: Any) -> ParticleMixture:
             f"mixtures: weights of shape {mixtures.log_weights.shape} are not those of one run, "
             "(t, n); jax.vmap over the leading axis of several runs"
         )
-    # Moves' memory has no part in the past, and what it holds need not be stacked alike.
+    # Smoothing does not use the moves' memory, whose leaves may not stack.
     mixtures = jax.vmap(lambda mixture: mixture.replace(memory={}))(mixtures)
     if initial is None:
         return mixtures

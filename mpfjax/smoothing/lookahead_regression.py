@@ -14,12 +14,12 @@ from mpfjax.moves.propagation.propagate import likelihoods
 from mpfjax.moves.twisted import Twist
 from mpfjax.observations import Series
 
-# A regression has so many particles for each of its coefficients, as its weights count them.
+# The effective number of particles for each coefficient of a regression.
 _PARTICLES_A_COEFFICIENT = 4
 # In units in which features and noise have a variance of one.
 _RIDGE = 1e-5
 _LEAST_VARIANCE = 1e-5
-# The share of undisturbed noise is as large as what the fit misses, within these.
+# Bounds of the share of plain noise, which equals the error of the fit.
 _LEAST_DEFENCE, _MOST_DEFENCE = 1e-3, 0.1
 _HALVINGS = 16
 
@@ -53,12 +53,12 @@ def fit_lookahead(
 
 
 class _Points(NamedTuple):
-    """What log ψ_t is fitted to.
+    """The data of a regression of log ψ_t.
 
     - `features`: φ(x_{t-1}), (n, d). `noise`: ε, (n, j). `targets`: log L(y_t | x_t) ν_{t+1}(x_t).
     - `log_importance`: of a point, for p(x_{t-1}, ε | y_1..y_T).
-    - `components`: which component each x_{t-1} was in, (n, k), one of them 1.
-    - `num_needed`: how large a sample a regression needs.
+    - `components`: the component of each x_{t-1}, (n, k), one of them 1.
+    - `num_needed`: the sample size that a regression needs.
     """
 
     features: Float[Array, "n d"]
@@ -78,7 +78,7 @@ def _draw_points(
     mixture: ParticleMixture,
     now: Series,
 ) -> _Points:
-    """Every particle as often as any other, so that none is lost, with noise from q_t."""
+    """Draw every particle with equal frequency, so that none is lost, with noise from q_t."""
     num_experts, dimension = used.centres.shape
     num_coefficients = _num_coefficients(dimension + model.noise_dimension)
     needed = _PARTICLES_A_COEFFICIENT * num_coefficients
@@ -105,7 +105,7 @@ def _draw_points(
 
 
 def _fit_step(points: _Points, used: LocalQuadratics) -> LocalQuadratics:
-    """An expert for each component: first where it is, then its quadratic."""
+    """An expert for each component: first its region, then its quadratic."""
     weights = _tempered(points.log_importance, points.components, points.num_needed)
     means, factors = _moments(points.features, weights)
     inverses = _inverses(factors)
@@ -178,7 +178,7 @@ def _fit_initial(
     means, factors = _moments(noise, weights)
     shares = jax.nn.softmax(log_importance) @ near
     alive = (jnp.sum(weights, axis=0) > 0) & (first.log_shares > -jnp.inf)
-    # Half of the draws go to all experts alike: a mode that few draws have hit is not lost.
+    # Half of the draws are shared equally by all experts, so that no mode is lost.
     shares = jnp.where(alive, 0.5 * shares + 0.5 / _count(alive, shares.dtype), 0.0)
     fitted = _replaced(
         used,
@@ -196,7 +196,7 @@ def _fit_initial(
 def _tempered(
     log_importance: Float[Array, " n"], members: Float[Array, "n k"], needed: float
 ) -> Float[Array, "n k"]:
-    """w_i^α of each expert's members, with the largest α up to 1 that leaves so large a sample."""
+    """w_i^α of each expert's members, with the largest α up to 1 with a large enough sample."""
     is_member = (members > 0) & (log_importance > -jnp.inf)[:, None]
     logs = jnp.where(is_member, log_importance[:, None], -jnp.inf)
     most = jnp.max(logs, axis=0)
@@ -237,7 +237,7 @@ def _moments(
 
 
 class _Expert(NamedTuple):
-    """log ν_k and q_k of one expert, and the mean square of what log ψ misses."""
+    """log ν_k and q_k of one expert, and the mean square error of its fit of log ψ."""
 
     constant: Float[Array, "*k"]
     slope: Float[Array, "*k d"]
@@ -261,7 +261,7 @@ def _regressed(
     centred = values - mean[None]
     inverse = _inverses(_factor((centred * weights[:, None]).T @ centred)[None])[0]
     standard = centred @ inverse.T
-    # Of independent normal numbers these functions are orthogonal.
+    # These functions of independent normal numbers are orthogonal.
     rows, columns = jnp.triu_indices(size)
     is_square, root = rows == columns, jnp.sqrt(2.0).astype(dtype)
     products = standard[:, rows] * standard[:, columns]
@@ -272,7 +272,7 @@ def _regressed(
     normal, right = weighted.T @ design, weighted.T @ (targets - level)
     ridge = jnp.eye(len(right), dtype=dtype)
     rough = jnp.linalg.solve(normal + _RIDGE * ridge, right)
-    # The better the fit and the larger the sample, the less it is held back.
+    # The better the fit and the larger the sample, the less it is regularised.
     noisy = weights @ (targets - level - design @ rough) ** 2 * jnp.sum(weights**2)
     held = _RIDGE * ridge + noisy * ridge.at[0, 0].set(0.0)
     found = jnp.linalg.solve(normal + held, right)
@@ -303,7 +303,7 @@ def _integrated(
     of_noise, mixed = hessian[d:, d:], hessian[:d, d:]
     precision = jnp.eye(len(of_noise), dtype=hessian.dtype) - of_noise
     values, vectors = jnp.linalg.eigh(precision)
-    # No less than what it is without ψ, up to rounding.
+    # At least its value without ψ, up to rounding.
     values = jnp.maximum(values, 1.0)
     covariance = (vectors / values[None]) @ vectors.T
     mean, gain = covariance @ slope[d:], covariance @ mixed.T
@@ -319,7 +319,7 @@ def _integrated(
 
 
 def _numbers_or_neutral(psi: LocalQuadratics) -> LocalQuadratics:
-    """ψ, or ψ = 1 where a fit is no number."""
+    """ψ, or ψ = 1 where a fit is not finite."""
     num_experts, num_noises, num_features = psi.noise_slopes.shape
     nothing = neutral(num_experts, num_features, num_noises, psi.slopes.dtype)
     broken = jnp.any(jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(psi)]))
@@ -327,7 +327,7 @@ def _numbers_or_neutral(psi: LocalQuadratics) -> LocalQuadratics:
 
 
 def _num_coefficients(dimension: int) -> int:
-    """Of a quadratic."""
+    """The number of coefficients of a quadratic."""
     return 1 + dimension + dimension * (dimension + 1) // 2
 
 

@@ -1,7 +1,8 @@
-"""Rao-Blackwellised backward sampling: latents from the end on, and moments of x given all y.
+"""Rao-Blackwellised backward sampling: latents backward in time, and moments of x given all y.
 
-Lindsten, Bunch, Särkkä, Schön and Godsill (2016). What the future says of x_s, given its latents,
-is exp(-x Ω x / 2 + λ x) up to a factor. The index of z_s given the future has the probabilities
+Lindsten, Bunch, Särkkä, Schön and Godsill (2016). The likelihood of later observations and latents
+as a function of x_s is exp(-x Ω x / 2 + λ x), up to a factor. The index of z_s given the future has
+the probabilities
 
     W_s^i p(z_{s+1} | z_s^i) ∫ N(x; m_i, P_i) exp(-x Ω x / 2 + λ x) dx,
 
@@ -54,7 +55,7 @@ _NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the st
 
 
 class Information(NamedTuple):
-    """What is said of x, exp(-x Ω x / 2 + λ x), the trajectories last."""
+    """A likelihood of x, exp(-x Ω x / 2 + λ x), the trajectories last."""
 
     precision: Float[Array, "d d #n"]
     vector: Float[Array, "d #n"]
@@ -63,7 +64,7 @@ class Information(NamedTuple):
 def check_marginalised(
     model: Any, mixtures: ParticleMixture, observations: Any, method: str
 ) -> None:
-    """Raise a `ValueError` for what backward sampling of latents cannot do."""
+    """Raise a `ValueError` for data that backward sampling of latents cannot use."""
     if not is_marginalised(model):
         raise ValueError("observations: only a conditionally linear model needs them")
     if observations is None:
@@ -135,7 +136,7 @@ def _joined(one: Information, other: Information) -> Information:
 
 
 def _told(target: Float[Array, "p #n"], seen: Linear) -> Information:
-    """What y = H x + c + N(0, R) says of x."""
+    """The likelihood of y = H x + c + N(0, R) as a function of x."""
     target, seen, _ = without_missing(target, seen)
     factor = cholesky(seen.noise, floor=True)
     rows = solve_lower(factor, seen.matrix)
@@ -144,7 +145,7 @@ def _told(target: Float[Array, "p #n"], seen: Linear) -> Information:
 
 
 def _seen(model: Any, observation: PyTree, latent: PyTree, like: Information) -> Information:
-    """What y_s says of x_s."""
+    """The likelihood of y_s as a function of x_s."""
     d, n = like.vector.shape
     state = MarginalisedState(
         latent, jnp.zeros((n, d), like.vector.dtype), jnp.zeros((n, d, d), like.vector.dtype)
@@ -158,7 +159,7 @@ def _seen(model: Any, observation: PyTree, latent: PyTree, like: Information) ->
 def _before(
     model: Any, latent: PyTree, before: MarginalisedState, future: Information
 ) -> Information:
-    """What z_{s+1} and all that comes after say of x_s, given z_s."""
+    """The likelihood of z_{s+1} and all that follows as a function of x_s, given z_s."""
     dynamics = dynamics_of(model, latent, before)
     told = Information(jnp.zeros_like(future.precision), jnp.zeros_like(future.vector))
     if is_mixed(model):
@@ -204,7 +205,7 @@ def _log_overlap(law: Gaussian, future: Information) -> Float[Array, " n"]:
 def _indices(
     key: Key[Array, ""], model: Any, latent: PyTree, future: Information, earlier: ParticleMixture
 ) -> Array:
-    """Which particle of s each trajectory comes from."""
+    """The particle of s that each trajectory comes from."""
     n = earlier.log_weights.shape[0]
 
     def of_one(inputs: Any) -> tuple[Array, Array]:
@@ -229,7 +230,7 @@ def _indices(
 
 
 def _smoothed(state: MarginalisedState, future: Information) -> MarginalisedState:
-    """The moments of x_s given y_1..y_s, and what the future says of it."""
+    """The moments of x_s given y_1..y_s and the likelihood of the future."""
     n, law = state.mean.shape[0], gaussian_of(state)
     root = cholesky(law.covariance)
     factor = _one_plus(future.precision, root)

@@ -127,7 +127,7 @@ def _smooth(key, filter, series, options):
             kept = jax.tree.map(lambda old, new: old.at[t % num_kept].set(new), kept, values)
         averages = jax.tree.map(jax.vmap(moved.average), kept)
         sums = jax.tree.map(lambda done, own: done + jnp.sum(own, axis=0), settled, averages)
-        # What the next step will write over: term t - lag, or zero while there is none yet.
+        # The next step overwrites term t - lag; zero while there is none yet.
         oldest = jax.tree.map(lambda own: own[(t + 1) % num_kept], averages)
         if lag is not None:
             settled = jax.tree.map(jnp.add, settled, oldest)
@@ -169,7 +169,7 @@ def _draw_pasts(
 
 
 def _mean_of_pasts(values: Array, indices: Int[Array, "n draws"]) -> Array:
-    """For each kept term, (kept, n, ...), the mean over the particles that each may come from."""
+    """For each kept term, (kept, n, ...), the mean over the drawn ancestors of each particle."""
     n, num_draws = indices.shape
     flat = indices.reshape(-1)
 
@@ -185,7 +185,7 @@ def _values(
     states: PyTree,
     indices: Int[Array, "n draws"],
 ) -> PyTree:
-    """h, its mean over the particles that each may come from."""
+    """h, its mean over the drawn ancestors of each particle."""
     n, num_draws = indices.shape
     flat = indices.reshape(-1)
     earlier = jax.tree.map(lambda leaf: take(leaf, flat), previous)

@@ -1,4 +1,4 @@
-"""What the samplers of parameters share: the loop over the steps of their chains."""
+"""The loop over the steps of Markov chains, which the samplers of parameters share."""
 
 import abc
 import math
@@ -26,15 +26,15 @@ from mpfjax.tuning.starts import Starts, drawn, repeated
 from mpfjax.tuning.walks import RandomWalk, random_walk
 
 _MOST_DRAWS_OF_A_START = 100
-# A program holds so many draws, or so many bytes of them, before they leave the device.
+# A program holds at most this many draws, or bytes of them, before they leave the device.
 _MOST_DRAWS_AT_ONCE = 256
 _MOST_BYTES_AT_ONCE = 2**24
-# Between two calls of a program bars move, files are written and Ctrl-C is heard.
+# Between two calls of a program bars advance, files are written and Ctrl-C is handled.
 _SECONDS_BETWEEN = 0.5
 
 
 class Step(NamedTuple):
-    """What one step of one chain gives."""
+    """The result of one step of one chain."""
 
     state: Any
     """where the chain is; its `reals` are the parameters."""
@@ -64,7 +64,7 @@ class AbstractKernel(eqx.Module):
 
 @dataclass(frozen=True)
 class Plan:
-    """How long chains run, and which of their steps are kept."""
+    """The length of chains, and which of their steps are kept."""
 
     num_steps: int
     burn_in: int
@@ -83,14 +83,14 @@ class Plan:
 
     @property
     def settings(self) -> dict[str, int]:
-        """What has to be the same for a checkpoint to fit, by name."""
+        """All that has to be the same for a checkpoint to fit, by name."""
         return {
             "burn_in": int(self.burn_in), "thinning": int(self.thinning), "adapt": bool(self.adapt)
         }  # fmt: skip
 
     @property
     def total(self) -> int:
-        """Steps of burn-in and those after it, as far as any is kept."""
+        """The number of steps, of burn-in and after, up to the last one that is kept."""
         return self.burn_in + self.num_steps // self.thinning * self.thinning
 
     def num_draws(self, step: int) -> int:
@@ -99,7 +99,7 @@ class Plan:
 
 
 class Chains(eqx.Module):
-    """Where all chains stand."""
+    """The present state of all chains."""
 
     states: Any
     walk: RandomWalk
@@ -108,7 +108,7 @@ class Chains(eqx.Module):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What chains have drawn, leaves (chains, draws, ...), and how they ended."""
+    """The draws of chains, leaves (chains, draws, ...), and their state at the end."""
 
     draws: PyTree
     chains: Chains
@@ -122,13 +122,13 @@ class Outcome:
 
     @property
     def num_invalid(self) -> dict[str, np.ndarray]:
-        """By chain, how often each density was no number."""
+        """How often each density was no number, by chain."""
         return {name: np.asarray(counts) for name, counts in self.chains.num_invalid.items()}
 
 
 @dataclass(frozen=True)
 class Run:
-    """Chains of a kernel, by the public function that is `caller`."""
+    """Chains of a kernel, for the public function `caller`."""
 
     caller: str
     kernel: AbstractKernel
@@ -205,9 +205,9 @@ class Run:
         return state["chains"], state["draws"], notes["step"]
 
     def _started(self) -> tuple[Chains, PyTree, int]:
-        """All chains where they start, and no draws.
+        """All chains at their starts, without draws.
 
-        A draw of the prior where no chain can start is drawn again.
+        A draw of the prior at which a chain cannot start is drawn again.
         """
         key, problem, sample_prior = self.starts.key, self.starts.problem, self.starts.sample_prior
         num = self.starts.num_chains
@@ -249,7 +249,7 @@ def chosen(accepted: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
 
 
 def warn_of_invalid(caller: str, num_invalid: Mapping[str, Any], stacklevel: int) -> None:
-    """Warn of densities that were no numbers, by their names."""
+    """Warn of densities that were not numbers, by their names."""
     counts = {name: int(np.sum(count)) for name, count in num_invalid.items()}
     found = [f"{name} {count} times" for name, count in counts.items() if count]
     if found:
@@ -274,7 +274,7 @@ def as_checkpoint(
 
 
 def _next_length(length: int, seconds: float) -> int:
-    """How many steps to take in one call, after so many took so long."""
+    """How many steps to take in the next call, given the time of the last one."""
     if seconds < _SECONDS_BETWEEN / 2:
         return 2 * length
     return max(1, length // 2) if seconds > 2 * _SECONDS_BETWEEN else length
@@ -297,7 +297,7 @@ def _start_all(kernel, keys, reals, walk):
 
 
 def _capacity(draws: PyTree) -> int:
-    """How many draws a program holds; the same for all lengths of chains, which share it."""
+    """How many draws a program holds; the same for all lengths of chains, so that they share it."""
     rows = [math.prod((leaf.shape[0], *leaf.shape[2:])) for leaf in jax.tree.leaves(draws)]
     size = 8 * sum(rows)
     return max(2, min(_MOST_DRAWS_AT_ONCE, _MOST_BYTES_AT_ONCE // max(size, 1)))

@@ -22,13 +22,13 @@ from mpfjax.tuning.problem import (
 from mpfjax.tuning.transforms import AbstractTransform, Interval, Positive, Simplex
 
 _MOST_NUMBERS = 50
-# Of 1 / I, the square of the step: what is near enough to one standard error.
+# The range of the squared step, relative to 1 / I, that is near enough to one standard error.
 _NEAR = (0.4, 2.5)
 _MOST_ROUNDS = 10
 _FURTHEST_ROUND = 16.0
-# Units in the last place of a parameter, of which a shorter step is mostly rounding.
+# In units in the last place of a parameter: a shorter step is mostly rounding.
 _FEWEST_PLACES = 256
-# Logarithms and logits have no unit, and half of one is as far as a parabola goes.
+# Logarithms and logits have no unit, and a parabola fits up to about one half.
 _WITHOUT_UNIT = (Positive, Interval, Simplex)
 _LONGEST_WITHOUT_UNIT = 0.5
 _NUM_HALVINGS = 32
@@ -136,10 +136,10 @@ def _column(
     step = float(np.clip(first, shortest, longest))
     for _ in range(_MOST_ROUNDS):
         column = _difference(score, centre, axis, step)
-        # Twice the nats that are lost by a step, if it is a parabola.
+        # Twice the loss of a step in nats, for a parabola.
         told = abs(column[:, axis].mean()) * step**2
         if not np.isfinite(column).all():
-            # Past where the model is defined.
+            # Outside the model's domain.
             longest, following = step / 2, step / 8
         elif _NEAR[0] <= told <= _NEAR[1]:
             break
@@ -160,7 +160,7 @@ def _difference(
     below, above = centre.copy(), centre.copy()
     below[axis] -= step
     above[axis] += step
-    # The distance that the numbers really have, which are rounded.
+    # The actual distance of the two points, after rounding.
     distance = float(above[axis]) - float(below[axis])
     return (score(below) - score(above)) / distance
 
@@ -182,7 +182,7 @@ def _inverse(information: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"] 
     scale = 1 / np.sqrt(steep)
     scales = np.outer(scale, scale)
     relative = information * scales
-    # No smaller than what rounding leaves of a zero.
+    # At least the rounding error of a zero.
     if np.linalg.eigvalsh(relative)[0] <= 1e-12:
         return None
     return np.linalg.inv(relative) * scales

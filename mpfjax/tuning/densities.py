@@ -49,7 +49,7 @@ class Evaluated(NamedTuple):
 
 
 def evaluated(log_prior: Float[Array, ""], log_evidence: Float[Array, ""]) -> Evaluated:
-    """The two parts as numbers or -inf, and which was none."""
+    """The two parts as numbers or -inf, and which of them was not a number."""
     has_prior = (log_prior > -jnp.inf) & (log_prior < jnp.inf)
     invalid = {
         "log_prior": is_invalid(log_prior),

@@ -226,7 +226,7 @@ class LogJoint(eqx.Module):
 
 
 class _Pair(eqx.Module):
-    """Where a chain is."""
+    """The present state of a chain."""
 
     reals: Reals
     trajectory: PyTree
@@ -245,7 +245,7 @@ class _Kernel(AbstractKernel):
 
     @property
     def learns_scale(self) -> bool:
-        """The density given a trajectory has no noise."""
+        """True: the density given a trajectory has no noise."""
         return self.draw is None
 
     def start(self, key: Key[Array, ""], reals: Reals) -> tuple[_Pair, Bool[Array, ""]]:

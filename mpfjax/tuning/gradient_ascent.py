@@ -20,7 +20,7 @@ from mpfjax.tuning.problem import Problem, Reals, scores
 
 @dataclass(frozen=True)
 class State:
-    """Where an optimisation stands: all that a checkpoint holds."""
+    """The state of an optimisation: all that a checkpoint holds."""
 
     step: int
     reals: Reals
@@ -34,7 +34,7 @@ class State:
 
 @dataclass(frozen=True)
 class End:
-    """Where an optimisation ended: its state, the objective there, and why before its time."""
+    """The end of an optimisation: its state, the objective there, and why it ended early."""
 
     state: State
     value: float
@@ -43,7 +43,7 @@ class End:
 
 @dataclass(frozen=True)
 class Plan:
-    """How long to go on, and what to keep: the arguments that `fit` and `maximise` share."""
+    """The number of steps, and what to keep: the arguments that `fit` and `maximise` share."""
 
     num_steps: int
     common_random_numbers: bool
@@ -62,7 +62,7 @@ class Plan:
         check_checkpoint(self.checkpoint, self.checkpoint_every, self.checkpoint_name)
 
     def converged(self, values: tuple[float, ...]) -> str | None:
-        """Why it ends after these values, or None."""
+        """Why the optimisation ends after these values, or None."""
         patience = self.patience
         if patience is None or len(values) < 2 * patience:
             return None
@@ -77,7 +77,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Optimisation:
-    """The steps of one maximisation, by the public function that is `caller`.
+    """The steps of one maximisation, for the public function `caller`.
 
     `settings` and `code` are those of the objective, as `identity_of` takes them.
     """
@@ -108,7 +108,7 @@ class Optimisation:
         if state.fault is not None:
             self.warn(state.fault, stacklevel=4)
         saved = state
-        # An optimisation that has ended before ends again, by the same values.
+        # An optimisation from the file of one that has ended ends at once, by the same values.
         stopped = state.fault or plan.converged(state.values)
         bar = tqdm(total=plan.num_steps, initial=state.step, disable=not plan.progress, unit="step")
         try:
@@ -147,7 +147,7 @@ class Optimisation:
         return list(jax.random.split(key, (num_batches, self.num_seeds)))
 
     def evaluate(self, state: State) -> tuple[np.ndarray, Reals, str | None]:
-        """The objective of each seed, the gradient of their mean, and what is wrong with either."""
+        """The objective of each seed, the gradient of their mean, and the fault, if any."""
         step = 0 if self.plan.common_random_numbers else state.step
         keys = jax.random.split(jax.random.fold_in(self.key, step), self.num_seeds)
         values, gradient = scores(self.problem, state.reals, keys)
@@ -207,7 +207,7 @@ class Optimisation:
         return state, state.values[-1]
 
     def identity(self, name: str | None) -> dict[str, str]:
-        """What has to be the same for a checkpoint to be of this optimisation, by name."""
+        """All that has to be the same for a checkpoint to be of this optimisation, by name."""
         leaves = jax.tree_util.tree_leaves_with_path(self.problem.tree)
         places = {
             f"parameters {name}": jax.tree_util.keystr(leaves[index][0])

@@ -1,4 +1,4 @@
-"""Posteriors as ArviZ reads them."""
+"""Conversion of posteriors to ArviZ."""
 
 import importlib
 import inspect

@@ -154,7 +154,7 @@ def metropolis_hastings(
 
 
 class _Point(eqx.Module):
-    """Where a chain is, and the log density that was found there."""
+    """The present state of a chain, and the log density there."""
 
     reals: Reals
     log_prior: Float[Array, "*chains"]
@@ -168,7 +168,7 @@ class _Kernel(AbstractKernel):
 
     @property
     def learns_scale(self) -> bool:
-        """Noise in log Ẑ rejects steps of any length, and so says nothing about the scale."""
+        """False: noise in log Ẑ rejects steps of any length, whatever the scale."""
         return False
 
     def start(self, key: Key[Array, ""], reals: Reals) -> tuple[_Point, Bool[Array, ""]]:

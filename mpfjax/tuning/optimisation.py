@@ -28,7 +28,7 @@ from mpfjax.tuning.transforms import AbstractTransform
 
 @dataclass(frozen=True)
 class TuningRun:
-    """What `fit` found, and how it got there."""
+    """The result of `fit`, and its history."""
 
     filter: Filter
     """with the parameters at the end; if it was stopped, the last good ones."""
@@ -143,7 +143,7 @@ def fit(
 
 @dataclass(frozen=True)
 class Maximisation:
-    """What `maximise` found, and how it got there."""
+    """The result of `maximise`, and its history."""
 
     model: Any
     """with the parameters at the end; if it was stopped, the last good ones."""

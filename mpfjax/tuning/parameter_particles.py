@@ -1,4 +1,4 @@
-"""Particles of parameters, each with a filter of its own: what `smc2` does at one observation."""
+"""Particles of parameters, each with a filter of its own: the step of `smc2`."""
 
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from mpfjax.tuning.walks import accepts, factor_of
 
 
 class Sample(eqx.Module):
-    """A θ with its filter, as far as that has come."""
+    """A θ with its filter, up to the present observation."""
 
     reals: Reals
     mixture: ParticleMixture
@@ -64,7 +64,7 @@ class FilterOf(eqx.Module):
 
 
 class Sampler(eqx.Module):
-    """What the samples are of, and how they move."""
+    """The problem that the samples belong to, and their moves."""
 
     problem: Problem
     run: FilterOf

@@ -1,4 +1,4 @@
-"""What is tuned: some leaves of a filter or model, and the objective that they should maximise."""
+"""The problem of tuning: leaves of a filter or model, and the objective to be maximised."""
 
 import warnings
 from collections.abc import Callable, Mapping
@@ -42,7 +42,7 @@ class Problem(eqx.Module):
 
     @property
     def tree(self) -> Any:
-        """The filter or model as it is."""
+        """The filter or model with its present parameters."""
         return jax.tree.unflatten(self.structure, self.leaves)
 
     def with_structure(self, structure: Any) -> "Problem":
@@ -50,7 +50,7 @@ class Problem(eqx.Module):
         return Problem(self.leaves, self.transforms, self.objective, self.tuned, structure)
 
     def start(self) -> Reals:
-        """The parameters as they are; raises `ValueError` for one that cannot be tuned."""
+        """The present parameters; raises `ValueError` for one that cannot be tuned."""
         reals = {}
         for name, index in self.tuned:
             value, transform = self.leaves[index], self.transforms[name]
@@ -126,7 +126,7 @@ def pose(
     parameters: Parameters,
     transforms: Mapping[str, AbstractTransform] | None,
 ) -> Problem:
-    """The problem, with a `ValueError` for arguments that make none."""
+    """The problem; a `ValueError` for arguments that do not make one."""
     leaves, structure = jax.tree.flatten(tree)
     tuned = _named_leaves(tree, parameters)
     if not tuned:
@@ -213,7 +213,7 @@ def warn_of_bias(caller: str, problem: Problem) -> None:
 
 
 def _nodes(tree: PyTree, kinds: type | tuple[type, ...]) -> list[Any]:
-    """What is of some kinds, anywhere in a pytree."""
+    """The nodes of some kinds, anywhere in a pytree."""
     is_one = lambda node: isinstance(node, kinds)  # noqa: E731
     return [node for node in jax.tree.leaves(tree, is_leaf=is_one) if is_one(node)]
 
@@ -226,7 +226,7 @@ class _Place:
 
 
 def _as_array(name: str, value: Any) -> Array:
-    """A parameter as an array; raises `ValueError` for what has no derivative."""
+    """A parameter as an array; raises `ValueError` for one without a derivative."""
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating):
         return value
     if isinstance(value, np.ndarray | np.generic) and np.issubdtype(value.dtype, np.floating):
@@ -240,7 +240,7 @@ def _as_array(name: str, value: Any) -> Array:
 
 
 def _what_there_is(tree: PyTree) -> str:
-    """A hint at the numbers that are no arrays, which are tuned by name alone."""
+    """A hint at numbers that are not arrays, which can only be tuned by name."""
     names = _names(tree)
     numbers = [
         name for name, leaf in zip(names, jax.tree.leaves(tree), strict=True)
@@ -266,7 +266,7 @@ def _checked_transforms(
 
 
 def _names(tree: PyTree) -> list[str]:
-    """What each leaf is called where it is not named."""
+    """The name of each leaf where the user gave none."""
     return [
         jax.tree_util.keystr(path).removeprefix(".model.").removeprefix(".")
         for path, _ in jax.tree_util.tree_leaves_with_path(tree)
@@ -274,7 +274,7 @@ def _names(tree: PyTree) -> list[str]:
 
 
 def _named_leaves(tree: PyTree, parameters: Parameters) -> dict[str, int]:
-    """Each parameter's name, and where it is among the tree's leaves."""
+    """Each parameter's name, and its places among the tree's leaves."""
     leaves, structure = jax.tree.flatten(tree)
     places = jax.tree.unflatten(structure, map(_Place, range(len(leaves))))
     if isinstance(parameters, Mapping):
@@ -304,7 +304,7 @@ def _named_leaves(tree: PyTree, parameters: Parameters) -> dict[str, int]:
 
 
 def _chosen(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[str, int]:
-    """What one entry of the mapping stands for: a leaf, or the arrays of a node."""
+    """The leaves that one entry of the mapping selects: a leaf, or the arrays of a node."""
     if not callable(where):
         raise ValueError(f"parameters: {name} is {shown(where)}, no function that picks from it")
     try:

@@ -30,7 +30,7 @@ from mpfjax.tuning.transforms import AbstractTransform
 
 @dataclass(frozen=True)
 class SequentialPosterior:
-    """The weighted samples of `smc2` after the last observation, and how it came to them."""
+    """The weighted samples of `smc2` after the last observation, and their history."""
 
     parameters: dict[str, np.ndarray]
     """by name, on their own scale: shape (samples, ...)."""

@@ -1,4 +1,4 @@
-"""SMC² from observation to observation: when samples move, when N doubles, and its file."""
+"""SMC² from observation to observation: moves of the samples, doubling of N, and its file."""
 
 import warnings
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ _CALLER = "smc2"
 
 @dataclass(frozen=True)
 class Observed:
-    """All that the filters are given, and how it was checked."""
+    """The data of the filters, and how they were checked."""
 
     series: Series
     """in arrays of numpy."""
@@ -41,7 +41,7 @@ class Observed:
 
     @classmethod
     def checked(cls, observations: PyTree, inputs: PyTree, missing: str, model: Any) -> "Observed":
-        """A `ValueError` for what is no sequence."""
+        """The data; a `ValueError` for anything but one sequence."""
         if isinstance(observations, list):
             raise ValueError(
                 "observations: a list is several sequences, and this takes one;"
@@ -56,11 +56,11 @@ class Observed:
         return self.series.length
 
     def first(self, length: int) -> "Observed":
-        """Those up to a step."""
+        """The data up to a step."""
         return replace(self, series=jax.tree.map(lambda leaf: leaf[:length], self.series))
 
     def followed_by(self, observations: PyTree, inputs: PyTree) -> "Observed":
-        """These and those; a `ValueError` where the two do not fit."""
+        """These data followed by others; a `ValueError` where the two do not fit."""
         new = Observed.checked(observations, inputs, self.missing, self.model).series
         before, after = self.series, new
         if (before.present is None) != (after.present is None):
@@ -75,13 +75,13 @@ class Observed:
         return replace(self, series=jax.tree.map(join, before, after))
 
     def filter_of(self, capacity: int) -> FilterOf:
-        """Runs over them, in arrays with room for so many."""
+        """Runs over the data, in arrays with room for this many steps."""
         pad = lambda leaf: jnp.asarray(np.resize(leaf, (capacity, *leaf.shape[1:])))  # noqa: E731
         return FilterOf(jax.tree.map(pad, self.series))
 
     @property
     def fingerprint(self) -> str:
-        """Of what was observed, the same whether missing steps are known to be none or not."""
+        """A digest of the observations, whether or not missing steps were looked for."""
         is_known = self.series.present is None
         missing = np.zeros(0, int) if is_known else np.flatnonzero(~np.asarray(self.series.present))
         return fingerprint((self.series.observations, self.series.inputs, missing))
@@ -94,7 +94,7 @@ def _with_all_present(series: Series) -> Series:
 
 
 def _kind(series: Series) -> str:
-    """What one step of a series looks like."""
+    """The structure, shapes and types of one step of a series."""
     return str(
         [
             f"{jax.tree_util.keystr(place)} {leaf.dtype}{list(leaf.shape[1:])}"
@@ -105,7 +105,7 @@ def _kind(series: Series) -> str:
 
 @dataclass(frozen=True)
 class Doubling:
-    """When N is doubled."""
+    """The rule by which N is doubled."""
 
     max_particles: int | None
     acceptance_threshold: float
@@ -117,7 +117,7 @@ class Doubling:
 
 @dataclass(frozen=True)
 class SamplesFile:
-    """Where samples are written, and what they are of but for the observations."""
+    """The file of the samples, and all that identifies them but the observations."""
 
     path: Path
     every: int
@@ -133,7 +133,7 @@ class SamplesFile:
 
 
 class Rows(eqx.Module):
-    """What is reported of each observation so far."""
+    """The report of each observation so far."""
 
     increments: np.ndarray
     sizes: np.ndarray
@@ -168,13 +168,13 @@ class State:
         return len(self.rows.increments)
 
     def counting(self, found: Mapping[str, Any]) -> "State":
-        """With further densities that were no numbers."""
+        """With further densities that were not numbers."""
         counts = {name: n + int(found.get(name, 0)) for name, n in self.num_invalid.items()}
         return replace(self, num_invalid=counts)
 
 
 class _NoLikelihood(Exception):
-    """No θ has any at an observation."""
+    """No θ has any likelihood at an observation."""
 
 
 @dataclass(frozen=True)
@@ -190,10 +190,10 @@ class Smc2Run:
     file: SamplesFile | None
 
     def with_observations(self, step: int, observations: PyTree, inputs: PyTree) -> "Smc2Run":
-        """The same with those that follow the first few."""
+        """The same with the observations that follow."""
         observed = self.observed.first(step).followed_by(observations, inputs)
         held = self.sampler.run.series.length
-        # Room for as many again, so that observations that come one by one share a program.
+        # With room for as many more, so that observations that come one by one share a program.
         capacity = held if observed.length <= held else max(observed.length, 2 * held)
         sampler = self.sampler.with_observations(observed.filter_of(capacity))
         return replace(self, sampler=sampler, observed=observed)
@@ -218,7 +218,7 @@ class Smc2Run:
         return State(state["samples"], notes["num_particles"], state["rows"], notes["num_invalid"])
 
     def go(self, state: State, progress: bool) -> tuple[State, str | None]:
-        """The samples after all observations, from where the state is, and why it ended before."""
+        """The samples after all observations, from a state on, and why the run ended early."""
         before, saved, stopped = dict(state.num_invalid), state.step, None
         bar = tqdm(total=self.observed.length, initial=saved, disable=not progress, unit="step")
         try:
@@ -265,7 +265,7 @@ class Smc2Run:
             if self.doubling.wanted(num_particles, rate):
                 more = exchanged(self._sampler(2 * num_particles), keys[2], samples, so_far)
                 state = state.counting({"log_marginal_likelihood": more.invalid})
-                # Where no filter of 2N particles has any likelihood, those of N stay.
+                # Where no filter of 2N particles has any likelihood, those of N are kept.
                 if float(more.increment) > -np.inf:
                     samples, num_particles = more.samples, 2 * num_particles
                     increment += float(more.increment)

@@ -1,4 +1,4 @@
-"""Where chains of parameters start, and the way back to the parameters' own scale."""
+"""The starts of chains of parameters, and the way back to the parameters' own scale."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ SamplePrior = Callable[[Key[Array, ""]], Mapping[str, Array]]
 
 @dataclass(frozen=True)
 class Starts:
-    """Where chains start: at the filter's own parameters, or at draws of the prior."""
+    """The starts of chains: the filter's own parameters, or draws of the prior."""
 
     key: Key[Array, ""]
     problem: Problem
@@ -29,7 +29,7 @@ class Starts:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What has to be the same for a checkpoint to fit, by name."""
+        """All that has to be the same for a checkpoint to fit, by name."""
         return {
             "filter": self.problem.tree,
             "parameters": str(self.problem.tuned),

@@ -58,7 +58,7 @@ class Positive(AbstractTransform):
     def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
         """exp u, no less than the least normal number and no more than the largest."""
         limits = jnp.finfo(reals.dtype)
-        # One step inside, so that rounding leads past neither.
+        # One step inside, so that rounding does not leave the range.
         ends = np.log([float(limits.tiny), float(limits.max)]).astype(reals.dtype)
         first, last = np.nextafter(ends, ends[::-1])
         return jnp.exp(jnp.clip(reals, first, last))

@@ -86,12 +86,12 @@ def best_acceptance(dimension: int) -> float:
 
 
 def accepts(key: Key[Array, ""], gain: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether a Metropolis step that gains so much log density is taken; at NaN it is not."""
+    """Whether a Metropolis step with this gain in log density is accepted; a NaN is rejected."""
     return jnp.log(jax.random.uniform(key, (), gain.dtype)) < gain
 
 
 def checked_deviations(given: float | Mapping[str, Any], start: Reals) -> Reals:
-    """The deviation of each unconstrained number; a `ValueError` for what is none."""
+    """The deviation of each unconstrained number; a `ValueError` for anything else."""
     by_name = given if isinstance(given, Mapping) else dict.fromkeys(start, given)
     if set(by_name) != set(start):
         raise ValueError(f"proposal_deviations: those of {sorted(by_name)}, not of {sorted(start)}")

@@ -34,7 +34,7 @@ class PropagateInClusters(AbstractPropagation):
     2. *Merge.* Clusters become one where log ψ ≠ 0 between any points of two of their objects,
        directly or through others. Row l of the new cluster is row l of each.
     3. *An object alone* is resampled by its likelihood. The mean likelihood is its factor of Ẑ.
-    4. *Objects in a cluster cross between rows.* Object j's N points are a draw of
+    4. *Objects in a cluster are recombined.* Object j's N points are a draw of
        q_j(x) = N⁻¹ Σ_r f_j(x | row r), the deterministic mixture of Owen and Zhou (2000), and
        serve every row r with the weight
 
@@ -109,7 +109,7 @@ class PropagateInClusters(AbstractPropagation):
         return joins and self.model.num_objects > 1
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """The clusters' labels, and for how many steps each two objects had no contact."""
+        """The clusters' labels, and the steps since the last contact of each two objects."""
         del num_components
         num_objects = self.model.num_objects
         labels = jnp.arange(num_objects, dtype=jnp.int32)
@@ -121,7 +121,7 @@ class PropagateInClusters(AbstractPropagation):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
-        """Merge the clusters that meet, then make one step of every cluster's filter."""
+        """Merge the clusters that meet, then advance the filter of every cluster by one step."""
         require_equal_rows(mixture, "PropagateInClusters")
         num_objects = self.model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
@@ -195,7 +195,7 @@ class PropagateInClusters(AbstractPropagation):
             )
             keys_last = split(key_last, len(labels))
             last, log_gain = self._resampled(keys_last, labels, log_weights)
-            # Rounding could still redraw equal weights.
+            # Without this, rounding could redraw equal weights.
             unmoved = jnp.arange(last.shape[1], dtype=last.dtype)
             last = jnp.where(alone[:, None], unmoved[None], last)
             return _rows_of_each(chosen, last), log_gain
@@ -234,16 +234,16 @@ class PropagateInClusters(AbstractPropagation):
 
 
 def _rows_of_each(particles: PyTree, rows: Int[Array, "objects n"]) -> PyTree:
-    """Every object's states from rows of its own."""
+    """Every object's states, from rows chosen for each object."""
     gather = jax.vmap(take, in_axes=(1, 0), out_axes=1)
     return jax.tree.map(lambda leaf: gather(leaf, rows), particles)
 
 
 def _shifted(key: Key[Array, ""], particles: PyTree, labels: Int[Array, " objects"]) -> PyTree:
-    """The rows of every cluster turned by a random number of places.
+    """The rows of every cluster, shifted in a circle by a random number of places.
 
-    Row i is then a draw of the product of the clouds: any two rows of two clusters meet in it
-    with the same probability.
+    Row i is then a draw of the product of the clusters: any row of one cluster meets any row of
+    another with the same probability.
     """
     places = jnp.arange(jax.tree.leaves(particles)[0].shape[0], dtype=jnp.int32)
     keys = take(split(key, len(labels)), labels)

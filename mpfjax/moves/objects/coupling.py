@@ -1,7 +1,7 @@
-"""Contact between objects: who meets whom, and the clusters that follow from it.
+"""Contact between objects: which objects meet, and the clusters that follow from it.
 
-Two objects are in contact where log ψ ≠ 0 between any of their predicted points. A cluster is
-what is linked by contact, directly or through others, and is named by its first object.
+Two objects are in contact where log ψ ≠ 0 between any of their predicted points. A cluster is a set
+of objects linked by contact, directly or through others, and is named by its first object.
 """
 
 from collections.abc import Callable
@@ -59,13 +59,13 @@ def connected(linked: Bool[Array, "objects objects"]) -> Int[Array, " objects"]:
 
 
 def alike(state: PyTree, others: PyTree) -> PyTree:
-    """The same state beside each of the others."""
+    """The same state repeated beside each of the other object's states."""
     return jax.tree.map(lambda a, b: jnp.broadcast_to(a[None], b.shape), state, others)
 
 
 def over_pairs(
     function: Callable[[PyTree, PyTree], Float[Array, " n"]],
 ) -> Callable[[PyTree, PyTree], Float[Array, "n n"]]:
-    """A function of the states of equal rows, made one of all pairs of rows."""
+    """Turn a function of the states of equal rows into one of all pairs of rows."""
     of_one = lambda state, others: function(alike(state, others), others)  # noqa: E731
     return jax.vmap(of_one, in_axes=(0, None))

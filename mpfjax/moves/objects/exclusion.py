@@ -1,4 +1,4 @@
-"""Exclusion: components push each other away, so that no two slide onto one object."""
+"""Exclusion: components repel each other, so that no two end on one object."""
 
 from collections.abc import Callable
 
@@ -13,10 +13,10 @@ from mpfjax.moves.regrouping.features import Features, Scale, summarise
 
 
 class AbstractExclusion(AbstractPropagation):
-    """Weights that fall by `strength` times how near a particle is to the means of others.
+    """Lower log-weights by `strength` times the nearness of a particle to the means of others.
 
-    Nearness to one mean μ is exp(-|x - μ|² / (2 radius²)): 1 there, and next to nothing from
-    three times the radius on. No exact recursion has this; `approximate` is true.
+    Nearness to one mean μ is exp(-|x - μ|² / (2 radius²)): 1 at the mean, and nearly 0 at three
+    times the radius. No exact recursion has this factor; `approximate` is true.
     """
 
     strength: eqx.AbstractVar[float]
@@ -24,7 +24,7 @@ class AbstractExclusion(AbstractPropagation):
 
     @property
     def approximate(self) -> bool:
-        """True: it makes components interact, on top of the model."""
+        """True: components interact in a way that the model does not have."""
         return True
 
     @property
@@ -40,16 +40,18 @@ class AbstractExclusion(AbstractPropagation):
 class Exclusion(AbstractExclusion):
     """Lower the weights of particles near the predicted means of the other components.
 
-    log-weight_i -= strength · Σ_{m ≠ c_i} exp(-|x_i - μ_m|² / (2 radius²)), summed over living
-    components, with μ_m the plain mean of the propagated particles of component m: the mean of
-    its prediction when every step resamples. Distances are in units of `scale`.
+        log-weight_i -= strength · Σ_{m ≠ c_i} exp(-|x_i - μ_m|² / (2 radius²))
+
+    The sum runs over living components. μ_m is the plain mean of the propagated particles of
+    component m: the mean of its prediction when every step resamples. Distances are in units of
+    `scale`.
 
     This is NOT part of the exact recursion of any paper here. Components interact as objects do in
     a Markov random field, but through their means instead of their states. The filtering
-    distribution is then not that of the model, and the marginal likelihood is biased
-    (`approximate` is true). Use it after `Propagate`, where each component stands for an object,
-    objects cannot share a place, and several components would otherwise end on one look-alike.
-    Never use it where components are hypotheses about ONE object.
+    distribution is then not that of the model, and the marginal likelihood is biased (`approximate`
+    is true). Use it after `Propagate`, where each component stands for an object, objects cannot
+    share a place, and several components would otherwise end on one look-alike. Never use it where
+    components are hypotheses about ONE object.
 
     Raises `ValueError` for a strength or radius that is not positive.
     """
@@ -74,7 +76,7 @@ class Exclusion(AbstractExclusion):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
-        """Lower the weight of every particle by its nearness to the other components."""
+        """Lower the weight of every particle by its nearness to the means of other components."""
         del key, observation
         if mixture.num_components == 1:
             return mixture

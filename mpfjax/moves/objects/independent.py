@@ -1,4 +1,4 @@
-"""Objects on their own: a small particle filter for each, in one mixture."""
+"""Independent objects: a small particle filter for each, in one mixture."""
 
 import equinox as eqx
 import jax
@@ -39,7 +39,7 @@ class PropagateIndependently(AbstractPropagation):
 
     @property
     def approximate(self) -> bool:
-        """Whether there is an interaction, which the objects' own filters cannot see."""
+        """Whether the model has an interaction, which this move ignores."""
         return self.model.interaction is not None
 
     def __call__(

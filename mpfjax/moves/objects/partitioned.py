@@ -31,31 +31,31 @@ class Partitioned(AbstractPropagation):
 
     Smith and Gatica-Perez (2004), section 3: object j moves by its dynamics, the particles are
     resampled by importance weights ρ_i in proportion to a weight function g, and weights are
-    divided by ρ_i. Here g is what the object adds to the target: its own likelihood, and its
+    divided by ρ_i. Here g is the object's factor of the target: its own likelihood, and its
     potentials ψ with the objects that have moved before it. Each g is multiplied into the joint
-    weights. Resampling in proportion to the weights, with equal shares for the offspring, then
-    does the division. After the last object the weights hold L(y_t | x_t) D / q of the whole
+    weights. Resampling in proportion to the weights, with equal shares for the offspring, is then
+    the same as the division. After the last object the weights hold L(y_t | x_t) D / q of the whole
     joint state, and Ẑ is unbiased in every order. Everything happens within components.
 
-    - `orders`: which object moves when, counted from 0. One order for all components; one order
-      for each component; "circular", where component c starts with object c, then c + 1, and so
-      on round; or "random", a new order for each component at every step. None is 0, ..., J-1.
+    - `orders`: the order in which objects move, counted from 0. One order for all components; one
+      order for each component; "circular", where component c starts with object c, then c + 1, and
+      so on in a circle; or "random", a new order for each component at every step. None is 0, ...,
+      J-1.
     - `scheme`, `ess_threshold`: of the resampling after each object, as in `Resample`.
-    - `reassembly`: what masses the components have afterwards (section 4 and eq. 5). "evidence"
+    - `reassembly`: the masses of the components afterwards (section 4 and eq. 5). "evidence"
       multiplies each mass by the component's evidence, eq. 4 of Vermaak et al. (2003). "prior" is
       the paper's: each component returns to the mass that it had before, and only the total grows
-      by the evidence. The marginal likelihood is then biased (`approximate` is true), but one
-      step of bad luck loses no component. With one component both are the same.
-
+      by the evidence. The marginal likelihood is then biased (`approximate` is true), but one step
+      of bad luck loses no component. With one component both are the same.
     - `gradient`: of the resampling after each object, as in `Resample`. With "stop" the objects'
       draws are constants too, and derivatives pass through their densities, as in `Propagate`.
 
     A component dies if an object leaves it without weight. The others share its slots and, with
     "prior", its mass. If all weight is lost, the particles move by their dynamics alone.
 
-    Raises `ValueError` for an order that is no permutation of the objects, a number of orders
-    other than one or the number of components, an unknown scheme, reassembly or gradient, and
-    "stop" with an object model that has no `log_transition`.
+    Raises `ValueError` for an order that is no permutation of the objects, a number of orders other
+    than one or the number of components, an unknown scheme, reassembly or gradient, and "stop" with
+    an object model that has no `log_transition`.
     """
 
     model: MultiObjectModel
@@ -203,7 +203,7 @@ class Partitioned(AbstractPropagation):
         return jnp.sum(jnp.where(has_moved[:, None], values, 0.0), axis=0)
 
     def _orders(self, key: Key[Array, ""], num_components: int) -> Int[Array, "m objects"]:
-        """The order of each component."""
+        """The order of the objects in each component."""
         num_objects = self.model.num_objects
         if self.rule == "random":
             keys = split(key, num_components)
@@ -254,7 +254,7 @@ def _of_particles(objects: Int[Array, " m"], mixture: ParticleMixture) -> Int[Ar
 
 
 def _with_masses_of(before: ParticleMixture, after: ParticleMixture) -> ParticleMixture:
-    """The total mass of `after`, parted among its living components as in `before`."""
+    """The total mass of `after`, divided among its living components as in `before`."""
     masses = after.log_mixture_weights
     alive = masses > -jnp.inf
     prior = jnp.where(alive, before.log_mixture_weights, 0.0)

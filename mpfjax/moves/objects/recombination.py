@@ -1,8 +1,8 @@
-"""Objects of one cluster cross between rows: each row may take any point of each object.
+"""Recombination of a cluster's objects: each row may take any point of each object.
 
-The mathematics of step 4 of `PropagateInClusters`. Tables (J, n) have a line for each object;
-the lines of a cluster's objects agree in what belongs to the cluster, since they are drawn with
-the same key.
+The mathematics of step 4 of `PropagateInClusters`. Tables (J, n) have a line for each object. The
+lines of a cluster's objects agree in the cluster's own quantities, since they are drawn with the
+same key.
 """
 
 from functools import partial
@@ -63,7 +63,7 @@ def recombined(
     log_sums: Float[Array, "objects n"],
     together: Bool[Array, "objects objects"],
 ) -> tuple[PyTree, Float[Array, "objects n"]]:
-    """The points that each row takes, and what its cluster's weight is multiplied by."""
+    """The points that each row takes, and the factor of its cluster's weight."""
     num_objects, num_particles = log_sums.shape
     key_start, key_points = split(key, 2)
     ks = jnp.arange(num_particles, dtype=jnp.int32)
@@ -116,7 +116,7 @@ def _log_kernels(
 def _with_history(
     model: MultiObjectModel, j: Int[Array, ""], state: PyTree, parent: PyTree
 ) -> PyTree:
-    """The state as a child of another parent than the one that it was drawn from."""
+    """The state with the past of a given parent, not that of the parent it was drawn from."""
     replace_past = getattr(model.object_at(j), "with_history", None)
     if replace_past is None:
         return state
@@ -172,5 +172,5 @@ def _finite_max(log_table: Float[Array, "k n"]) -> Float[Array, " k"]:
 
 
 def rotated(key: Key[Array, ""], indices: Int[Array, " k"]) -> Int[Array, " k"]:
-    """The numbers 0, ..., k-1 from a random one on, and round."""
+    """The numbers 0, ..., k-1 in a circle, starting from a random one."""
     return (indices + jax.random.randint(key, (), 0, len(indices), indices.dtype)) % len(indices)

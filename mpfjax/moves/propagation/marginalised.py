@@ -1,4 +1,4 @@
-"""Propagation of a conditionally linear model: the latent is drawn, the rest has its moments."""
+"""Propagation of a conditionally linear model: the latent is drawn, the rest has moments."""
 
 from typing import Any, cast
 
@@ -106,7 +106,7 @@ class PropagateMarginalised(AbstractPropagation):
         return self._proposed(drawn, mixture, observation)
 
     def noise_dimension(self, mixture: ParticleMixture) -> int:
-        """k, of how many standard normal numbers z_t is made."""
+        """k, the number of standard normal numbers that z_t is made of."""
         if self.proposal is not None:
             proposal: Any = self.proposal
             return proposal.noise_dimension(mixture.particles)

@@ -47,7 +47,7 @@ class PropagateNested(AbstractPropagation):
         check_type(kinds, "a Propagate, nor a PropagateMarginalised", propagate=self.propagate)
         check_whole(num_draws=self.num_draws)
         if self.propagate.gradient == "stop":
-            raise ValueError("propagate: gradient 'stop' knows nothing of the draw that is kept")
+            raise ValueError("propagate: gradient 'stop' does not see which draw is kept")
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -62,7 +62,7 @@ class PropagateNested(AbstractPropagation):
         weights = jnp.exp(log_weights - largest)
         upto = jnp.cumsum(jax.lax.stop_gradient(weights), axis=1)
         shares = shares.astype(upto.dtype)
-        # The last is left out: rounding must not keep a draw that is not there.
+        # The last is left out: rounding must not select a draw past the end.
         kept = jnp.sum(upto[:, :-1] <= shares[:, None] * upto[:, -1:], axis=1, dtype=jnp.int32)
         places = jnp.arange(n, dtype=jnp.int32) * k + kept
         return mixture.replace(
@@ -72,13 +72,13 @@ class PropagateNested(AbstractPropagation):
         )
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """One draw of x_t for each particle: without an observation all weigh the same."""
+        """One draw of x_t for each particle: without an observation all have the same weight."""
         return self.propagate.predict(key, mixture)
 
     def _drawn(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> tuple[ParticleMixture, Float[Array, " n"]]:
-        """The weighed mixture of all draws, and by which uniform number each particle keeps one."""
+        """The weighed mixture of all draws, and the uniform numbers by which draws are selected."""
         n, k, propagate = mixture.num_particles, self.num_draws, self.propagate
         repeated = _repeated(mixture, k)
         if propagate.noise == "independent":
@@ -117,9 +117,9 @@ def propagation(
     noise: str,
     num_draws: int,
 ) -> Propagate | PropagateMarginalised | PropagateNested:
-    """How x_t is drawn: by the kind of the model, once or several times for each particle.
+    """The propagation of x_t for this kind of model, with one or several draws of each particle.
 
-    The gradient is the one that goes with that of resampling.
+    Its gradient is the one that belongs to that of resampling.
     """
     check_whole(num_draws=num_draws)
     own_gradient = "stop" if gradient == "stop" else "none"

@@ -94,7 +94,7 @@ class Propagate(AbstractPropagation):
         return self._weighed(drawn, mixture, observation)
 
     def noise_dimension(self, mixture: ParticleMixture) -> int:
-        """k, of how many standard normal numbers x_t is made."""
+        """k, the number of standard normal numbers that x_t is made of."""
         if self.proposal is None:
             return cast(HasTransitionNoise, self.model).noise_dimension
         proposal: Any = self.proposal
@@ -102,7 +102,7 @@ class Propagate(AbstractPropagation):
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
-        # A proposal says nothing of the model's own noise.
+        # The noise may be that of the proposal alone.
         spreads = self.proposal is None or is_made_of_noise(self.model)
         noise = self.noise if spreads else "independent"
         return predict(key, self.model, mixture, self.gradient, noise)
@@ -179,12 +179,12 @@ class Reweight(AbstractPropagation):
         if self.exponent == 1:
             return _weigh(self.model, mixture, observation)
         log_factors = likelihoods(self.model, observation, mixture.particles)
-        # A common constant of any size would drown the differences.
+        # Differences would be lost to rounding beside a large common constant.
         common = finite_max(jnp.where(mixture.occupied, log_factors, -jnp.inf))
         return mixture.weighed(self.exponent * (log_factors - common), self.exponent * common[None])
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """The mixture as it is: there is nothing to weigh by."""
+        """The mixture unchanged: there is no observation."""
         del key
         return mixture
 

@@ -32,7 +32,7 @@ class RegimeProposal(AbstractProposal):
 
     Each of the K values of z_t that may follow is weighed by p(z_t | z_{t-1}) and the predictive
     density of y_t, and one is drawn (Chen and Liu 2000; Doucet, Gordon and Krishnamurthy 2001). Its
-    `log_normaliser` is log p(y_t | z_{t-1}, y_1..y_{t-1}) itself, so that
+    `log_normaliser` is exactly log p(y_t | z_{t-1}, y_1..y_{t-1}), so that
     `auxiliary_particle_filter(model, N, RegimeProposal(model))` is fully adapted: all weights are
     equal after a step. One step takes K predictive densities a particle.
 
@@ -89,21 +89,21 @@ class RegimeProposal(AbstractProposal):
 class PropagateRegimes(AbstractPropagation):
     """Try all K regimes for each particle, then resample optimally to the number of slots.
 
-    z_t takes K values, and every particle becomes K children, each with the weight
-    w_i p(z_t | z_{t-1}) p(y_t | ...). Of these N K, every component keeps as many as it has slots,
-    by the optimal resampling of Fearnhead and Clifford (2003): a child of weight w is kept with the
-    probability min(w / c, 1), and then has the weight max(w, c). c makes the expected number of
-    children equal to the number of slots. Heavy children are kept as they are, and none is kept
-    twice. Among unbiased choices this one changes the weights least. A component keeps its mass,
-    and Ẑ is unbiased. A `Resample` before it would only add noise: `Filter(model,
+    z_t takes K values, and every particle has K children, each with the weight w_i p(z_t | z_{t-1})
+    p(y_t | ...). Of these N K children, every component keeps as many as it has slots, by the
+    optimal resampling of Fearnhead and Clifford (2003): a child of weight w is kept with the
+    probability min(w / c, 1), and then has the weight max(w, c). The constant c makes the expected
+    number of children equal to the number of slots. Heavy children keep their weight, and none is
+    kept twice. Of all unbiased choices this one changes the weights least. A component keeps its
+    mass, and Ẑ is unbiased. A `Resample` before it would only add noise: `Filter(model,
     [PropagateRegimes(model)], N)` is the whole filter.
 
     - `model`: a conditionally linear model with `all_transitions`.
-    - `group`: a `GroupBy` for the children, before they are chosen among; None leaves them in
-      their parents' components. By the regime, every regime has its share of the slots at every
-      step, however improbable it is: the IMM particle filter (Blom and Bloem 2007) with Kalman
-      filters for particles.
-    - `scheme`: of `Resample`, "systematic" or "stratified" as a rule.
+    - `group`: a `GroupBy` that regroups the children before the choice; None leaves them in their
+      parents' components. With a group by the regime, every regime has its share of the slots at
+      every step, however improbable it is: the IMM particle filter (Blom and Bloem 2007) with
+      Kalman filters for particles.
+    - `scheme`: of `Resample`, usually "systematic" or "stratified".
 
     A derivative treats the probabilities of being kept as constants, as that of
     `Resample(gradient="stop")` does, so that derivatives of Ẑ are unbiased. Without an observation,
@@ -123,7 +123,7 @@ class PropagateRegimes(AbstractPropagation):
     def would_resample(
         self, mixture: ParticleMixture, observation: PyTree = None
     ) -> Bool[Array, " m"]:
-        """All that are alive."""
+        """All living components."""
         del observation
         return mixture.active
 
@@ -140,7 +140,7 @@ class PropagateRegimes(AbstractPropagation):
         pairs = self.model.all_transitions(mixture.particles.latent)  # pyright: ignore
         latents, log_priors = [latent for latent, _ in pairs], jnp.stack([log for _, log in pairs])
         moved = self._chosen(key, mixture, latents, log_priors)
-        # What the probabilities of all children have in common is no growth of the mass.
+        # A common factor of the transition probabilities must not add to the mass.
         scale = jnp.zeros(()) if moved.log_scale is None else moved.log_scale
         log_weights = moved.log_weights + scale
         return moved.replace(log_weights=log_weights, log_scale=mixture.log_scale)

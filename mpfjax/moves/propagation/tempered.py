@@ -35,12 +35,12 @@ class PropagateTempered(AbstractPropagation):
 
     A tempered step, as in a sequential Monte Carlo sampler (Del Moral, Doucet and Jasra 2006), for
     the target D(x_t | x_{t-1}) L(y_t | x_t)^β with β from β_1 to 1. After each stage but the last,
-    particles are resampled within components and move: x_t = f(z, x_{t-1}) is drawn again from
-    z' = sqrt(1 - s²) z + s ξ, ξ ~ N(0, I), and taken with the probability min(1, (L' / L)^β). This
-    leaves the target as it is for any f (the preconditioned Crank-Nicolson step of Cotter and
-    others 2013), because the normal distribution of z does not change. So it needs no density of
-    the dynamics. Nothing is tuned on the particles: Ẑ is unbiased, and the move is exact. Each β
-    needs another step s. So every particle draws it anew each time, with log s uniform between log
+    particles are resampled within components and move: x_t = f(z, x_{t-1}) is drawn again from z' =
+    sqrt(1 - s²) z + s ξ, ξ ~ N(0, I), and accepted with the probability min(1, (L' / L)^β). This
+    leaves the target invariant for any f, because it leaves the normal distribution of z invariant
+    (the preconditioned Crank-Nicolson step of Cotter and others 2013). It needs no density of the
+    dynamics. Nothing is tuned on the particles: Ẑ is unbiased, and the move is exact. The best step
+    s depends on β. Every particle therefore draws s anew each time, with log s uniform between log
     `least_step` and 0.
 
     - `model`: with `transition_from_noise`.
@@ -50,11 +50,11 @@ class PropagateTempered(AbstractPropagation):
     - `least_step`: the smallest s.
 
     A step evaluates the likelihood 1 + `num_moves` (stages - 1) times for each particle. A
-    derivative sees the draws that were taken, as with gradient "none" of `Resample`. Raises
-    `ValueError` for a model without `transition_from_noise`, for exponents that do not rise to 1,
-    for a resampling with gradient "ot", which keeps no particle as it is, and for one that sorts,
+    derivative treats the moves that were accepted as given, as with gradient "none" of `Resample`.
+    Raises `ValueError` for a model without `transition_from_noise`, for exponents that do not rise
+    to 1, for a resampling with gradient "ot", which moves every particle, and for one that sorts,
     since no point set follows. Use it where the likelihood is much narrower than the dynamics, and
-    no proposal knows where it is.
+    no proposal is known.
     """
 
     model: AbstractStateSpaceModel
@@ -90,7 +90,7 @@ class PropagateTempered(AbstractPropagation):
 
     @property
     def approximate(self) -> bool:
-        """As the resampling is."""
+        """Whether the resampling is."""
         return self.resample.approximate
 
     def __call__(
@@ -105,7 +105,7 @@ class PropagateTempered(AbstractPropagation):
         log_likelihoods = likelihoods(self.model, observation, states)
         # Resampling may lose a NaN, or a particle whose likelihood is infinite.
         broken = jnp.any(mixture.occupied & ~(log_likelihoods < jnp.inf))
-        # A common constant of any size would drown the differences that the stages weigh.
+        # Differences between stages would be lost to rounding beside a large common constant.
         common = finite_max(jnp.where(mixture.occupied, log_likelihoods, -jnp.inf))
         log_likelihoods = log_likelihoods - common
         travellers = TemperedParticles(states, parents, noise, log_likelihoods)
@@ -142,7 +142,7 @@ class PropagateTempered(AbstractPropagation):
         exponent: Float[Array, ""],
         common: Float[Array, ""],
     ) -> ParticleMixture:
-        """Each particle after one step of Metropolis in its noise, its parent kept."""
+        """Each particle after one Metropolis step in its noise, with the same parent."""
         now = mixture.particles
         key_step, key_noise, key_taken = split(key, 3)
         n, dtype = mixture.num_particles, now.noise.dtype

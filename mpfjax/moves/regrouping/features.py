@@ -1,4 +1,4 @@
-"""What regrouping looks at: chosen features of the state, in chosen units."""
+"""The features of the state that regrouping uses, and their units."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,7 +15,7 @@ from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.segments import FEW_SEGMENTS, column_sums, segment_max, spread_finite
 from mpfjax.operations.stored import stored
 
-# So many features are multiplied one by one, which runs on vectors.
+# Up to this many features are multiplied one by one, which runs on vectors.
 _FEW_FEATURES = 8
 Scale = ArrayLike | Sequence[float]
 
@@ -46,9 +46,9 @@ class Features(eqx.Module):
         check_positive_array(scale=np.asarray(self.scale))
 
     def __call__(self, mixture: ParticleMixture) -> Float[Array, "n k"]:
-        """The features of every particle, counted from their average, zero in an empty slot.
+        """The features of every particle, relative to their average, zero in an empty slot.
 
-        Regrouping needs only differences. Of values far from zero, rounding would hide them.
+        Regrouping needs only differences, and values far from zero would lose them to rounding.
         """
         particles = mixture.particles
         values = flatten_states(particles) if self.function is None else self.function(particles)
@@ -84,7 +84,7 @@ def relative_weights(mixture: ParticleMixture) -> Float[Array, " n"]:
     log_weights, labels = mixture.log_weights, mixture.component_indicators
     largest = finite_or_zero(segment_max(log_weights, labels, mixture.num_components))
     weights = exp(log_weights - spread_finite(largest, labels))
-    # Or a scatter of them would choose every particle's largest, one after the other.
+    # Otherwise XLA takes the maximum by a scatter, one particle after the other.
     return weights if mixture.num_components <= FEW_SEGMENTS else stored(weights)
 
 
@@ -121,8 +121,8 @@ def summarise_about(
 ) -> Groups:
     """`summarise` in one pass, of particles that are `gaps` away from a point of their group.
 
-    Of a group whose point is many deviations away from its mean, rounding leaves few digits of the
-    covariance. Points of K-means are near the means.
+    If the point is many deviations away from the group's mean, the covariance loses digits to
+    rounding. Points of K-means are near the means.
     """
     k = points.shape[1]
     products, entries = _products(gaps, weights)
@@ -150,7 +150,7 @@ def _first_moments(
 def _products(
     gaps: Float[Array, "n k"], weights: Float[Array, " n"]
 ) -> tuple[Float[Array, "c n"], Int[np.ndarray, "k k"]]:
-    """The weighted products of each pair of features, column by column, and which is whose."""
+    """The weighted products of each pair of features, column by column, and the pairs."""
     num_features = gaps.shape[1]
     # A covariance is symmetric: one triangle of it.
     pairs = [(i, j) for i in range(num_features) for j in range(i + 1)]
@@ -170,12 +170,12 @@ def separation(
     means_b: Float[Array, "*#g k"],
     covariances_b: Float[Array, "*#g k k"],
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """How far apart two groups are: the distance of their means, and the same in deviations.
+    """The distance between the means of two groups, and the same in pooled standard deviations.
 
-    The second is |μ_a - μ_b| over the pooled standard deviation along the line that joins them,
+    The second is |μ_a - μ_b| over the pooled standard deviation along the line through both means,
     sqrt(uᵀ (Σ_a + Σ_b) u / 2). It is Ashman's D: below 2, two Gaussians of equal mass are usually
-    said to have no clear gap. Two groups of one point each are infinitely many deviations apart,
-    or zero if the points are the same.
+    said to have no clear gap. Two groups of one point each are infinitely many deviations apart, or
+    zero if the points are the same.
     """
     gap = means_a - means_b
     distance = jnp.sqrt(jnp.sum(gap**2, axis=-1))

@@ -22,22 +22,22 @@ from mpfjax.operations.segments import spread_finite
 
 
 class Merge(AbstractRegrouping):
-    """Merge components that overlap, for as many steps as patience asks.
+    """Merge components that overlap, after they have done so `patience` times in a row.
 
-    Vermaak et al. (2003), section 4, leaves the criterion open. Here two components overlap
-    when both hold:
+    Vermaak et al. (2003), section 4, leaves the criterion open. Here two components overlap when
+    both hold:
 
     - their means are less than `max_deviations` pooled standard deviations apart, along the line
-      that joins them (Ashman's D; at 1 two equal Gaussians share 62% of their mass, at 2 32%);
+      through both means (Ashman's D; at 1 two equal Gaussians share 62% of their mass, at 2 32%);
     - their means are less than `max_distance` apart, in units of `scale`.
 
-    None leaves out a condition. `patience` is how many times in a row they must overlap before they
-    merge, so that two objects that pass each other do not become one. It counts runs of this move:
-    frames, or within `Every(k, ...)` every k-th frame. A chain of overlapping components becomes
-    one component, which keeps the lowest label.
+    None leaves out a condition. `patience` is the number of times in a row that they must overlap
+    before they merge, so that two objects that pass each other do not become one. It counts runs of
+    this move: frames, or within `Every(k, ...)` every k-th frame. A chain of overlapping components
+    becomes one component, which keeps the lowest label.
 
-    Raises `ValueError` where both conditions are None, for a threshold that is not positive, or
-    for a patience below 1. Exact: a relabelling only.
+    Raises `ValueError` where both conditions are None, for a threshold that is not positive, or for
+    a patience below 1. Exact: a relabelling only.
     """
 
     max_deviations: float | None = eqx.field(static=True)
@@ -84,7 +84,7 @@ class Merge(AbstractRegrouping):
         return spread_finite(labels, mixture.component_indicators, len(labels)), memory
 
     def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
-        """No pair with a dead component has overlapped yet."""
+        """Reset the counts of pairs with a dead component."""
         if self.patience == 1:
             return memory
         is_dead = dead[:, None] | dead[None]
@@ -113,7 +113,8 @@ class Merge(AbstractRegrouping):
 def lowest_connected(adjacent: Bool[Array, "m m"]) -> Int[Array, " m"]:
     """The lowest label in the connected component of each node of a symmetric graph.
 
-    Each node takes the lowest label of its neighbours, then that label's own, until none changes.
+    Each node takes the lowest label of its neighbours, then the label of the node of that label,
+    until none changes.
     """
     m = adjacent.shape[0]
     own = jnp.arange(m, dtype=jnp.int32)

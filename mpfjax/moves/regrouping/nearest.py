@@ -1,4 +1,4 @@
-"""The nearest of a few points, for every particle."""
+"""The nearest of a few centroids, for every particle."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.operations.matrices import row_sums
 
-# So many points in one pass over the particles. A program of all 64 takes seconds to compile.
+# Centroids in one pass over the particles. A program of all 64 takes seconds to compile.
 _AT_ONCE = 16
 
 

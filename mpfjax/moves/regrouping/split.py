@@ -1,4 +1,4 @@
-"""Split: a component that is spread too far becomes two."""
+"""Split: a component that has become too diffuse is divided in two."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -39,13 +39,13 @@ class Split(AbstractRegrouping):
     - the lighter half holds at least `min_share` of the component's mass.
 
     The centres of the halves are found from a sample: every k-th particle, about `sample_size`
-    times M of them; None takes all. After resampling, copies stand side by side, so the sample
-    meets every part that holds one particle in `sample_size`. All particles then decide which half
-    each is in, how far apart the halves are, and whether they split.
+    times M of them; None takes all. After resampling, copies are neighbours, so that the sample
+    includes every group of copies with a share of at least one in `sample_size`. All particles are
+    then used to assign them to halves and to test the conditions.
 
     The lighter half takes a free label. If there are too few free labels, the clearest splits come
-    first. Raises `ValueError` for a threshold that is negative or a share not in [0, 0.5].
-    Exact: a relabelling only.
+    first. Raises `ValueError` for a threshold that is negative or a share not in [0, 0.5]. Exact: a
+    relabelling only.
     """
 
     min_deviations: float = eqx.field(static=True)
@@ -81,7 +81,7 @@ class Split(AbstractRegrouping):
     ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
         """The lighter half of every component that is too diffuse, to a free label."""
         del key
-        # Before the condition, where the moves beside this one compute them too.
+        # Computed outside the condition, where XLA shares them with neighbouring moves.
         features, active = self.features(mixture), mixture.active
         labels = cond_if_any(
             jnp.any(~active),
@@ -91,7 +91,7 @@ class Split(AbstractRegrouping):
         return labels, mixture.memory
 
     def is_diffuse(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
-        """Which components would split, were there a free label for each of them.
+        """Which components would split if each had a free label.
 
         Where `StepInfo.labels_ran_out`, these are the ones in which several modes share a label.
         """
@@ -141,8 +141,9 @@ class Split(AbstractRegrouping):
 
 
 class _Halves(NamedTuple):
-    """In which half each particle is, and of each component which is the lighter half, how many
-    deviations they are apart, and whether that is enough."""
+    """The half of each particle; and of each component which half is lighter, how many deviations
+    the halves are apart, and whether that is enough.
+    """
 
     side: Int[Array, " n"]
     lighter: Int[Array, " m"]
@@ -151,7 +152,7 @@ class _Halves(NamedTuple):
 
 
 class _Particles(NamedTuple):
-    """What is seen of the particles, or of some of them."""
+    """The quantities of the particles, or of a sample of them, that splitting uses."""
 
     features: Float[Array, "s k"]
     weights: Float[Array, " s"]
@@ -160,11 +161,11 @@ class _Particles(NamedTuple):
 
 
 def _sampled(particles: _Particles, most: int, mixture: ParticleMixture) -> _Particles:
-    """Every k-th of the usable slots, at most so many."""
+    """Every k-th of the usable slots, at most `num` of them."""
     room = mixture.num_usable_slots
     stride = -(-room // most)
     number = most if mixture.usable_slots is not None else -(-mixture.num_particles // stride)
-    # A whole number of vectors, or nothing that is made of the sample would run on them.
+    # A multiple of the vector length, without which XLA would not vectorise the sample.
     places = stride * jnp.arange(-(-number // VECTOR) * VECTOR, dtype=jnp.int32)
     inside = places < room
     places = jnp.minimum(places, mixture.num_particles - 1)

@@ -1,4 +1,4 @@
-"""Which slots a resampling move gives to which component."""
+"""Allocation: how many slots each component gets in a resampling, and which."""
 
 from typing import NamedTuple
 
@@ -11,15 +11,15 @@ from mpfjax.operations.logarithms import scaled_exp
 from mpfjax.operations.segments import segments_in_order, spread
 from mpfjax.operations.stored import stored
 
-# So much of the slots is shared equally at least and at most: of variances of Ẑ the first leaves
-# 4/3 of the least, the second twice the least.
+# Bounds of the share of the slots that is shared equally: the variance of Ẑ is then at most
+# 4/3 of the least one at the first, and twice the least one at the second.
 EQUAL_PARTS = (1 / 4, 1 / 2)
-# A mode lives on as many effective particles; fewer particles tell little of their variance.
+# Effective particles that keep a mode alive, and that make an estimate of its variance reliable.
 FEWEST = 10
 
 
 class Slots(NamedTuple):
-    """Where the new particles of each component will stand: side by side, empty slots last."""
+    """The slots of each component's new particles: side by side, empty slots last."""
 
     components: Int[Array, " n"]
     ranks: Int[Array, " n"]  # within the component
@@ -37,8 +37,8 @@ def allocate_slots(
     """How many slots each component gets.
 
     Components that are not due keep their slots, `counts`. The others share the rest of the usable
-    slots equally, or in proportion to their `demands` with one for each, or get
-    `particles_per_component` each if that is a number.
+    slots equally; or, given `demands`, in proportion to these with at least one each; or get
+    `particles_per_component` each.
     """
     usable, num_slots = mixture.num_usable_slots, mixture.num_particles
     if particles_per_component is not None:
@@ -58,17 +58,19 @@ def allocate_slots(
 
 
 def demands_by_variance(mixture: ParticleMixture, due: Bool[Array, " m"]) -> Float[Array, " m"]:
-    """The share of the slots that each component which is due asks for.
+    """The share of the slots that each due component asks for, by mass and variance.
 
-    The mean likelihood of k_m particles has a relative variance v_m / k_m. The weights as they are
-    tell v_m = (particles of m) / ESS_m. So Ẑ errs by Σ_m π_m² v_m / k_m, which k_m in proportion to
-    π_m v_m^(1/2) make least (Neyman 1934). Where a component has few particles, v_m is drawn
-    towards the mean over all, as if `FEWEST` more particles had that.
+    The mean likelihood of k_m particles has a relative variance v_m / k_m, where v_m is estimated
+    from the present weights by (particles of m) / ESS_m. The variance of Ẑ is then Σ_m π_m² v_m /
+    k_m, which is least for k_m in proportion to π_m v_m^(1/2) (Neyman 1934). Where a component has
+    few particles, v_m is shrunk towards the mean over all components, as if `FEWEST` more particles
+    had that mean.
 
-    A mode has to stay alive, and its own moments have an error too. So a part e of the slots is
-    shared equally: as much as gives each component `FEWEST` effective particles, within
-    `EQUAL_PARTS`. Ẑ's variance is then at most 1 / (1 - e) times the least one (a defensive
-    mixture: Hesterberg 1995). All is shared equally where that gives `FEWEST` particles or less.
+    A mode has to stay alive, and its own moments have an error too. A part e of the slots is
+    therefore shared equally: as much as gives each component `FEWEST` effective particles, within
+    `EQUAL_PARTS`. The variance of Ẑ is then at most 1 / (1 - e) times the least one (a defensive
+    mixture: Hesterberg 1995). All slots are shared equally where this gives `FEWEST` particles or
+    less to each.
     """
     weights, _ = scaled_exp(mixture.log_weights)
     counts = mixture.component_counts.astype(weights.dtype)
@@ -94,7 +96,7 @@ def demands_by_variance(mixture: ParticleMixture, due: Bool[Array, " m"]) -> Flo
 def _evenly(
     pool: Int[Array, ""], due: Bool[Array, " m"], sharers: Int[Array, ""]
 ) -> Int[Array, " m"]:
-    """The same number for each, and one more for the first ones where it does not divide."""
+    """The same number for each, and one more for the first ones if it does not divide evenly."""
     rank = jnp.cumsum(due.astype(jnp.int32)) - 1
     share = jax.lax.div(pool, sharers)  # neither is negative
     return share + (rank < pool - share * sharers).astype(jnp.int32)
@@ -103,20 +105,20 @@ def _evenly(
 def _in_proportion(
     pool: Int[Array, ""], due: Bool[Array, " m"], demands: Float[Array, " m"]
 ) -> Int[Array, " m"]:
-    """Whole numbers that sum to the pool, each within one of its part."""
+    """Integers that sum to `pool`, each within one of its exact part."""
     asked = jnp.where(due, demands, 0)
     total = jnp.sum(asked)
     asked = jnp.where(total > 0, asked, due.astype(asked.dtype))
     parts = jnp.cumsum(asked) / jnp.maximum(jnp.sum(asked), jnp.finfo(asked.dtype).tiny)
     ends = jnp.round(parts * pool.astype(asked.dtype)).astype(jnp.int32)
-    # Rounding must not leave slots over, nor give any to a component that is not due.
+    # Despite rounding all slots are given, and none to a component that is not due.
     still_due = jnp.cumsum(due[::-1].astype(jnp.int32))[::-1] - due.astype(jnp.int32)
     ends = jnp.where(still_due > 0, jnp.minimum(ends, pool), pool)
     return jnp.diff(ends, prepend=0)
 
 
 def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:
-    """The slots of each component, given how many it gets."""
+    """The slots of each component, given their number for each."""
     firsts = jnp.cumsum(targets) - targets
     slot = jnp.arange(num_particles, dtype=jnp.int32)
     components = segments_in_order(firsts, num_particles)

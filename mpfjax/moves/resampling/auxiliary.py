@@ -1,4 +1,4 @@
-"""Resampling by a look-ahead: the auxiliary particle filter as a move."""
+"""Resampling with a look-ahead: the auxiliary particle filter as a move."""
 
 from typing import Any
 
@@ -20,18 +20,19 @@ from mpfjax.proposals import AbstractProposal
 class AuxiliaryResample(AbstractMove):
     """Resample in proportion to w_i ν(y_t, x_{t-1}^i), and divide the weights by ν again.
 
-    The auxiliary particle filter's first stage (Pitt and Shephard 1999): ν looks ahead to how well
-    y_t will be explained. Particles that will explain it have more offspring, before anything is
-    drawn at t. The distribution stays the same in expectation, whatever ν is: a particle with k
-    times the offspring has 1 / k of the weight. So Ẑ stays unbiased. The mass does not stay the
-    same, unlike that of `Resample`. Everything happens within components.
+    The first stage of the auxiliary particle filter (Pitt and Shephard 1999). The look-ahead ν
+    predicts how well each particle will explain y_t. Particles with a larger ν have more offspring,
+    before anything is drawn at t. The distribution stays the same in expectation for any ν:
+    offspring of a particle with k times the offspring have 1 / k of the weight. Ẑ stays unbiased.
+    Unlike that of `Resample`, the mass of a component changes. Everything happens within
+    components.
 
-    - `resample`: the `Resample` that draws; its `ess_threshold` looks at the weights times ν.
+    - `resample`: the `Resample` that draws; its `ess_threshold` applies to the weights times ν.
     - `lookahead`: a function (y_t, states) -> log ν of each particle, (n,), or a proposal that has
       `log_normaliser`, such as `GaussNewtonProposal`. The best ν is p(y_t | x_{t-1}). It must be
-      above zero for every particle that can explain y_t, and its tails no thinner than those of
-      p(y_t | x_{t-1}): a ν that is too sure of itself leaves a few particles with most of the
-      weight. Where ν is zero for all particles of a component, it is resampled by w alone.
+      positive for every particle that can explain y_t, and its tails no thinner than those of p(y_t
+      | x_{t-1}): an overconfident ν leaves most of the weight to a few particles. Where ν is zero
+      for all particles of a component, the component is resampled by w alone.
 
     Without an observation nothing is resampled. Raises `ValueError` for a `resample` with gradient
     "ot", which draws nothing, and for a look-ahead that is neither function nor such a proposal.
@@ -53,22 +54,22 @@ class AuxiliaryResample(AbstractMove):
 
     @property
     def approximate(self) -> bool:
-        """As the resampling is."""
+        """Whether the resampling is."""
         return self.resample.approximate
 
     @property
     def weighs(self) -> bool:
-        """False: what the look-ahead adds to the weights is taken away again."""
+        """False: the weights are divided by the look-ahead again."""
         return False
 
     @property
     def reads(self) -> frozenset[str]:
-        """What the look-ahead reads of the memory of other moves."""
+        """The memory that the look-ahead reads."""
         return getattr(self.lookahead, "reads", frozenset())
 
     @property
     def particles_per_component(self) -> int | None:
-        """That of the resampling."""
+        """`particles_per_component` of the resampling."""
         return self.resample.particles_per_component
 
     def would_resample(
@@ -118,12 +119,12 @@ class AuxiliaryResample(AbstractMove):
 def propagating_proposal(
     proposal: AbstractProposal | None, lookahead: Any
 ) -> AbstractProposal | None:
-    """The proposal that x_t is drawn by: that of the look-ahead, unless there is another."""
+    """The proposal that draws x_t: that of the look-ahead, unless another is given."""
     if proposal is None and isinstance(lookahead, AbstractProposal):
         return lookahead
     return proposal
 
 
 def resampling(resample: Resample, lookahead: Any) -> Resample | AuxiliaryResample:
-    """The resampling move, which looks ahead if there is a `lookahead`."""
+    """The resampling move, with a look-ahead if there is a `lookahead`."""
     return resample if lookahead is None else AuxiliaryResample(resample, lookahead)

@@ -25,25 +25,25 @@ from mpfjax.operations.segments import segment_argmax, spread
 class GaussianRegeneration(AbstractResampling):
     """Replace each component's particles by draws from N(μ_m, Σ_m), its own mean and covariance.
 
-    μ_m = Σ w_i x_i and Σ_m = Σ w_i (x_i - μ_m)(x_i - μ_m)ᵀ, over the particles of component m
-    (Lin et al. 2012, eqs. 10 and 11; Kotecha and Djuric 2003 for one component). The component
-    keeps its mass, which its new particles share equally. It is an approximation unless the
-    component is Gaussian (`approximate` is true): any shape other than an ellipse is lost. Use it
-    where components are unimodal and resampling would leave too few distinct particles.
+    μ_m = Σ w_i x_i and Σ_m = Σ w_i (x_i - μ_m)(x_i - μ_m)ᵀ, over the particles of component m (Lin
+    et al. 2012, eqs. 10 and 11; Kotecha and Djuric 2003 for one component). The component keeps its
+    mass, which its new particles share equally. It is an approximation unless the component is
+    Gaussian (`approximate` is true): any shape other than an ellipse is lost. Use it where
+    components are unimodal and resampling would leave too few distinct particles.
 
     - `particles_per_component`: as for `Resample`.
-    - `where`: selects the part of the state that is redrawn, such as `lambda state: state.box`.
-      The rest (angles, bounded or whole numbers) is copied from resampled particles. None redraws
-      the whole state.
-    - `inflation`: of the standard deviations; above 1 it counters the loss of spread.
+    - `where`: selects the part of the state that is redrawn, such as `lambda state: state.box`. The
+      rest (angles, bounded or whole numbers) is copied from resampled particles. None redraws the
+      whole state.
+    - `inflation`: of the standard deviations; above 1 it compensates for the loss of spread.
     - `noise`: "independent"; or "stratified" or "rqmc", which spread the draws of all slots, or of
-      each component, evenly. With "rqmc", each component's draws then stand along a Hilbert curve,
-      as `Propagate(noise="rqmc")` needs them.
+      each component, evenly. With "rqmc", each component's draws are then ordered along a Hilbert
+      curve, as `Propagate(noise="rqmc")` needs them.
 
     With a singular Σ_m, draws stay in its plane; a component of one particle, or of copies of one,
-    gives that particle again. With `where`, ancestors are the resampled particles; without it,
-    the heaviest particle of the component. Raises `ValueError` for an inflation that is not
-    positive, an unknown noise or particles_per_component < 1.
+    gives that particle again. With `where`, ancestors are the resampled particles; without it, the
+    heaviest particle of the component. Raises `ValueError` for an inflation that is not positive,
+    an unknown noise or particles_per_component < 1.
     """
 
     particles_per_component: int | None = eqx.field(static=True, default=None)
@@ -59,7 +59,7 @@ class GaussianRegeneration(AbstractResampling):
 
     @property
     def approximate(self) -> bool:
-        """True: a component is taken for a Gaussian."""
+        """True: each component is replaced by a Gaussian."""
         return True
 
     def __call__(
@@ -79,7 +79,7 @@ class GaussianRegeneration(AbstractResampling):
         return self._in_line(vacated.replace(particles=drawn))
 
     def _in_line(self, mixture: ParticleMixture) -> ParticleMixture:
-        """The same mixture, its slots in order if the next noise is a point set over them."""
+        """The same mixture, ordered if the next noise is a point set over its slots."""
         if self.noise != "rqmc":
             return mixture
         labels = mixture.component_indicators
@@ -127,7 +127,7 @@ class GaussianRegeneration(AbstractResampling):
                     " a Gaussian is; choose the leaves that are floating point"
                 )
         states = jnp.where(mixture.occupied[:, None], flatten_states(chosen), 0.0)
-        centre = origin(states, mixture)  # far from zero, rounding would hide the moments
+        centre = origin(states, mixture)  # far from zero, rounding would lose the moments
         states = jnp.where(mixture.occupied[:, None], states - centre[None], 0.0)
         weights = mixture.component_weights.astype(states.dtype)
         moments = summarise(states, weights, mixture.component_indicators, mixture.num_components)

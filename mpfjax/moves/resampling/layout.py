@@ -1,9 +1,9 @@
-"""How particles stand in line to be resampled: side by side, component by component.
+"""The layout of particles for resampling: on a line, component by component.
 
-Imagine the particles along a line, each with a stretch as long as its expected number of offspring.
-Every slot places a point on the line and takes the particle whose stretch holds it. The particles
-of a component must stand together. After resampling they do, so as long as nobody regroups them
-there is nothing to put in order.
+Imagine the particles on a line, each with an interval ("stretch") as long as its expected number of
+offspring. Every slot has a point on the line and takes the particle whose interval holds it. The
+particles of a component must be neighbours. After resampling they are, and until they are regrouped
+nothing has to be sorted.
 """
 
 from typing import NamedTuple
@@ -34,7 +34,7 @@ from mpfjax.operations.stored import stored
 
 
 class Stretches(NamedTuple):
-    """For each place, where in the line the particles and the slots of its component are."""
+    """For each place, the part of the line that its component's particles and slots occupy."""
 
     firsts: Int[Array, " p"]
     counts: Int[Array, " p"]  # how many places the component has
@@ -42,16 +42,16 @@ class Stretches(NamedTuple):
 
 
 class InPlace(NamedTuple):
-    """The particles of one component as they stand.
+    """The particles of a single component, in their present order.
 
-    The line has p places, as many as make whole blocks for the prefix sums.
+    The line has p places, a multiple of the block length of the prefix sums.
     """
 
     weights: Float[Array, " p"]  # zero at an empty place
     counts: Int[Array, " 1"]
 
     def of_places(self, values: Shaped[Array, " 1"]) -> Shaped[Array, " 1"]:
-        """At each place the value of its component, the only one."""
+        """The component's value at each place."""
         return values
 
     def expected(self, targets: Int[Array, " 1"]) -> Float[Array, " p"]:
@@ -65,9 +65,9 @@ class InPlace(NamedTuple):
     def positions(
         self, values: Float[Array, " p"], lengths: Int[Array, " 1"], slots: Slots
     ) -> tuple[Positions, Bool[Array, " p"]]:
-        """Where each stretch begins, in slots, and which are not after the last one.
+        """The start of each interval, in slots, and which of them are not after the last slot.
 
-        The values are the stretches, and sum to the length but for rounding.
+        The values are the lengths of the intervals; they sum to the line's length up to rounding.
         """
         if not needs_two_parts(values.shape[0], values.dtype):
             return _sums_in_one_float(values)
@@ -75,7 +75,7 @@ class InPlace(NamedTuple):
         return _sums_in_two_parts(self, values, lengths, slots.firsts, (firsts, lasts))
 
     def num_slots(self, targets: Int[Array, " 1"], num_particles: int) -> Int[Array, ""]:
-        """How many slots there are to fill."""
+        """How many slots are to be filled."""
         del num_particles
         return targets[0]
 
@@ -85,25 +85,25 @@ class InPlace(NamedTuple):
         return parents
 
     def stretches(self, slots: Slots) -> Stretches:
-        """The whole line is one stretch."""
+        """The whole line belongs to the component."""
         del slots
         zeros = jnp.zeros(self.weights.shape, jnp.int32)
         return Stretches(zeros, zeros + self.weights.shape[0], zeros)
 
     def places_by_rank(self, ranks: Int[Array, " n"], slots: Slots) -> Int[Array, " n"]:
-        """The place of a rank in the component."""
+        """The place of a given rank in the component."""
         del slots
         return ranks
 
     def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
-        """Which particles stand at these places."""
+        """The particles at these places."""
         return places
 
 
 class SideBySide(NamedTuple):
     """The particles in a line of p places, component by component."""
 
-    relative_weights: Float[Array, " p"]  # beside the component's largest; zero at an empty place
+    relative_weights: Float[Array, " p"]  # over the component's largest; 0 at an empty place
     log_largest: Float[Array, " m"]  # the logarithm of that largest weight, or 0
     order: Int[Array, " p"]  # which particle stands at each place
     components: Int[Array, " p"]
@@ -126,7 +126,7 @@ class SideBySide(NamedTuple):
         return log_or_nothing(self.totals) + self.log_largest
 
     def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, " p"]:
-        """At each place the value of its component."""
+        """The value of the component at each place."""
         return spread(values, self.components)
 
     def expected(self, targets: Int[Array, " m"]) -> Float[Array, " p"]:
@@ -142,9 +142,10 @@ class SideBySide(NamedTuple):
     def positions(
         self, values: Float[Array, " p"], lengths: Int[Array, " m"], slots: Slots
     ) -> tuple[Positions, Bool[Array, " p"]]:
-        """Where each stretch begins, in slots, and which are not after the last one.
+        """The start of each interval, in slots, and which of them are not after the last slot.
 
-        The values are the stretches, and sum to each component's length but for rounding.
+        The values are the lengths of the intervals; they sum to each component's length up to
+        rounding.
         """
         if not needs_two_parts(values.shape[0], values.dtype):
             return _sums_in_one_float(values)
@@ -152,7 +153,7 @@ class SideBySide(NamedTuple):
         return _sums_in_two_parts(self, values, lengths, slots.firsts, extents)
 
     def num_slots(self, targets: Int[Array, " m"], num_particles: int) -> Int[Array, ""]:
-        """How many slots there are to fill; the last ones may stay empty."""
+        """How many slots are to be filled; the last ones may stay empty."""
         del targets
         return jnp.asarray(num_particles, jnp.int32)
 
@@ -162,8 +163,8 @@ class SideBySide(NamedTuple):
         return jnp.clip(parents, spread(firsts, slots.components), spread(lasts, slots.components))
 
     def stretches(self, slots: Slots) -> Stretches:
-        """The components' particles and slots, side by side."""
-        # Those that nothing is drawn from are among them, so that every place has a rank from 0 on.
+        """The parts of the line of the components' particles and slots."""
+        # Includes particles that are never drawn, so that every place has a rank from 0 on.
         firsts, lasts = self._extents(jnp.ones_like(self.is_drawn))
         counts = lasts - firsts + 1
         return Stretches(*map(self.of_places, (firsts, counts, slots.firsts)))
@@ -174,7 +175,7 @@ class SideBySide(NamedTuple):
         return spread(firsts, slots.components) + ranks
 
     def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
-        """Which particles stand at these places."""
+        """The particles at these places."""
         return take(self.order, stored(places, self.order.shape[0]))
 
     def _extents(self, mask: Bool[Array, " p"]) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
@@ -183,7 +184,7 @@ class SideBySide(NamedTuple):
 
 
 def _sums_in_one_float(values: Float[Array, " p"]) -> tuple[Positions, Bool[Array, " p"]]:
-    """The sums over all places, those of earlier components among them."""
+    """The sums over all places, across components."""
     before, total = sum_before(values)
     return as_positions(before), before < total
 
@@ -195,7 +196,7 @@ def _sums_in_two_parts(
     first_slots: Int[Array, " m"],
     extents: tuple[Int[Array, " m"], Int[Array, " m"]],
 ) -> tuple[Positions, Bool[Array, " p"]]:
-    """The same from each component's own first slot, so that none has the rounding of others."""
+    """The sums from each component's own first slot, without the rounding errors of others."""
     num_places = values.shape[0]
     firsts, lasts = extents
     shift = unit_shift(lengths, lasts - firsts + 1)
@@ -209,7 +210,7 @@ def _sums_in_two_parts(
     within = in_slots(before.after(starts), line.of_places(growth), line.of_places(shift))
     is_inside = (before.whole < total.whole) | (before.fraction < total.fraction)
     positions = Positions(within.whole + line.of_places(first_slots), within.fraction)
-    # A place after a component's last weight is at its end to the bit.
+    # A place after a component's last weight is exactly at its end.
     ends = Positions(*map(line.of_places, ends))
     is_after = (before.whole == ends.whole) & (before.fraction == ends.fraction)
     end = line.of_places(first_slots + lengths)
@@ -230,9 +231,9 @@ def side_by_side(
 ) -> SideBySide:
     """The components in a line.
 
-    If `without_gaps`, the particles of a component stand without others between them that nothing
-    is drawn from. A weight may underflow to zero where its logarithm does not. Such a particle is
-    not drawn where its component is resampled, and is kept where its component `stays` as it is.
+    If `without_gaps`, the particles of a component that can be drawn are neighbours. A weight may
+    underflow to zero where its logarithm does not. Such a particle is not drawn where its component
+    is resampled, and is kept where its component `stays` as it is.
     """
     m = mixture.num_components
     labels = mixture.component_indicators
@@ -245,7 +246,7 @@ def side_by_side(
 
     def in_line(order: Int[Array, " p"]) -> tuple[Array, Array, Array]:
         own = take(labels, order)
-        # Labels that nothing stands under come last.
+        # Labels without particles come last.
         return order, jnp.where(own < m, take(log_weights, order), -jnp.inf), own
 
     def by_component() -> tuple[Array, Array, Array]:

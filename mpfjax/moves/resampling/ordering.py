@@ -1,4 +1,4 @@
-"""In which order the particles of a component stand: by a number, or along a Hilbert curve."""
+"""The order of the particles of a component: by a number, or along a Hilbert curve."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,7 +18,7 @@ from mpfjax.operations.stored import stored
 
 HILBERT = "hilbert"
 SortBy = Callable[[PyTree], Array] | str
-_STEEPNESS = 1.702  # the logistic function of so many deviations is nearly the normal's
+_STEEPNESS = 1.702  # the logistic function of this multiple is nearly the normal CDF
 
 
 def check_sort_by(sort_by: SortBy | None) -> None:
@@ -30,10 +30,10 @@ def check_sort_by(sort_by: SortBy | None) -> None:
 def sorted_order(
     mixture: ParticleMixture, labels: Int[Array, " n"], sort_by: SortBy
 ) -> Int[Array, " n"]:
-    """The indices of the particles by label, in [0, M], and within one by `sort_by`.
+    """The indices of the particles by label, in [0, M], and within each label by `sort_by`.
 
     Particles are sorted by one coordinate, or along a Hilbert curve through several. Each
-    coordinate is counted from the mean of the particle's component, in its deviations.
+    coordinate is standardised by the mean and deviation of the particle's component.
     """
     rows = _coordinates(mixture, sort_by)
     if rows.shape[0] == 1:
@@ -47,7 +47,7 @@ def sorted_order(
 
 
 def _coordinates(mixture: ParticleMixture, sort_by: SortBy) -> Array:
-    """What the particles are sorted by, (d, n): a row for each coordinate."""
+    """The coordinates by which the particles are sorted, (d, n): a row for each."""
     n = mixture.num_particles
     if isinstance(sort_by, str):
         leaves = [
@@ -77,18 +77,18 @@ def _coordinates(mixture: ParticleMixture, sort_by: SortBy) -> Array:
 def _cells(
     rows: Float[Array, "d n"], mixture: ParticleMixture, num_bits: int
 ) -> UInt32[Array, "d n"]:
-    """The cell of each coordinate, of 2^num_bits that hold about equally many of a component."""
+    """The cell of each coordinate, of 2^num_bits cells that hold about equally many particles."""
     labels, m = mixture.component_indicators, mixture.num_components
     rows = jnp.where(mixture.occupied[None], rows, 0.0)
     weights = mixture.component_weights.astype(rows.dtype)
     averages = lambda rows: column_sums(weights[None] * rows, labels, m)  # noqa: E731
-    # A gather is stored, since nothing that is fused with it would run on vectors.
+    # The result of a gather is stored: operations fused with it would not be vectorised.
     own = lambda values: stored(  # noqa: E731
         jnp.stack([spread(column, labels) for column in jnp.nan_to_num(values).T])
     )
     centred = rows - own(averages(rows))
     variances = averages(centred**2)
-    # At one point, all are in the same cell.
+    # Particles at a single point are all in the same cell.
     is_spread = (variances > 0) & (variances < jnp.inf)
     scales = own(jnp.where(is_spread, _STEEPNESS / jnp.sqrt(variances), 1.0))
     shares = jax.nn.sigmoid(centred * scales)

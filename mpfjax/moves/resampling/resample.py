@@ -126,7 +126,7 @@ class Resample(AbstractAdaptiveResampling):
         check_callable("a function of the particles", **given(share_by=self.share_by))
         if self.share_by is not None and self.particles_per_component is not None:
             raise ValueError(
-                "share_by: groups have no say where particles_per_component is"
+                "share_by: groups have no effect where particles_per_component is"
                 f" {self.particles_per_component}"
             )
         check_positive(softness=self.softness, regularisation=self.regularisation)
@@ -168,7 +168,7 @@ class Resample(AbstractAdaptiveResampling):
         num_slots = jnp.maximum(drawn.targets, 1).astype(mixture.log_weights.dtype)
         log_shares = self._log_masses(mixture, drawn.line) - jnp.log(num_slots)
         if mixture.num_components > 1:
-            # A dead one of several has no slots; its share must be finite to be stored.
+            # A dead component has no slots; its share must be finite to be stored.
             log_shares = stored(jnp.where(log_shares == -jnp.inf, 0.0, log_shares))
         redrawn = copies.replace(log_weights=spread(log_shares, slots.components))
         if self.gradient == "stop":
@@ -196,14 +196,14 @@ class Resample(AbstractAdaptiveResampling):
             line = as_they_are(mixture)
         else:
             stays = None if all_are_due else ~spread(due, mixture.component_indicators)
-            # Who stays by rank, or is transported, needs those of its component beside it.
+            # Particles that stay by rank, or are transported, need their component's as neighbours.
             without_gaps = not all_are_due or self.gradient == "ot"
             line = side_by_side(mixture, stays, self.sort_by, without_gaps)
         # If all living components are due, none keeps its particles.
         counts = due.astype(jnp.int32) if all_are_due else line.counts
         targets = self.deal(mixture, due, counts)
         if isinstance(line, InPlace):
-            # What is not redrawn keeps its place, and there may be empty slots before it.
+            # Particles that are not redrawn keep their places; empty slots may come before them.
             targets = jnp.where(due, targets, num_particles)
         slots = place_slots(targets, num_particles)
         expected = line.expected(targets)
@@ -233,7 +233,7 @@ class Resample(AbstractAdaptiveResampling):
     def _log_masses(
         self, mixture: ParticleMixture, line: InPlace | SideBySide
     ) -> Float[Array, " m"]:
-        """The logarithm of each component's mass, which the line knows where it drew from it."""
+        """The logarithm of each component's mass, reused from the layout where that has it."""
         if isinstance(line, InPlace) or self.gradient == "soft":
             return mixture.log_mixture_weights
         return add_gradient(line.log_masses, mixture.log_mixture_weights)
@@ -276,14 +276,14 @@ class Resample(AbstractAdaptiveResampling):
 def _shares_of_groups(
     mixture: ParticleMixture, groups: Int[Array, " n"], due: Bool[Array, " m"]
 ) -> Float[Array, " m"]:
-    """One over the number of components of the same group that share with each."""
+    """For each component, one over the number of components of its group that share slots."""
     group = jnp.round(mixture.component_averages(groups)).astype(jnp.int32)
     rivals = jnp.sum((group[:, None] == group[None]) & due[None], axis=1)
     return 1 / jnp.maximum(rivals, 1).astype(mixture.log_weights.dtype)
 
 
 class _Drawn(NamedTuple):
-    """Who stands where after resampling."""
+    """The parents of the slots, and their weights, after resampling."""
 
     parents: Int[Array, " n"]
     slots: Slots
@@ -292,7 +292,7 @@ class _Drawn(NamedTuple):
 
 
 def _copies(mixture: ParticleMixture, drawn: _Drawn) -> ParticleMixture:
-    """Every slot's parent as it was, with its weight."""
+    """Every slot's parent unchanged, with its weight."""
     is_one = mixture.num_components == 1
     return mixture.replace(
         particles=jax.tree.map(lambda leaf: take(leaf, drawn.parents), mixture.particles),

@@ -1,9 +1,9 @@
 """The schemes of resampling: systematic, stratified, multinomial, residual, SSP.
 
-A scheme returns the first slot of every particle's offspring. Each particle has a stretch of the
-line, as long as its expected number of offspring k_m w_i.
-The scheme knows where each stretch begins, `before`, in whole slots and a fraction, and places one
-point in the share of each slot. To add a scheme, write such a function and name it in `SCHEMES`.
+A scheme returns the first slot of every particle's offspring. Each particle has an interval of the
+line, as long as its expected number of offspring k_m w_i. The scheme is given the start of each
+interval, `before`, as a whole number of slots and a fraction, and places one point in the unit
+interval of each slot. To add a scheme, write such a function and name it in `SCHEMES`.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ def stratified(key, expected, before, targets, slots, line):
 
 
 def _points_before(before: Positions, shift: Float[Array, " #p"]) -> Int[Array, " p"]:
-    """How many of the points s + shift, one in each slot s, come before a particle's stretch."""
+    """How many of the points s + shift, one in each slot s, come before a particle's interval."""
     return before.whole + (shift < before.fraction).astype(jnp.int32)
 
 
@@ -55,17 +55,17 @@ def residual(key, expected, before, targets, slots, line):
 def ssp(key, expected, before, targets, slots, line):
     """Srinivasan's process: fractions are paired until each is 0 or 1 (Gerber et al. 2019).
 
-    Of two fractions with the sum s, one becomes 0 and the other s; or, if s >= 1, one becomes 1
-    and the other s - 1. Which one is drawn so that each keeps its mean. Every particle thus has
-    the floor or the ceiling of its expected number of offspring. Pairs are those of a tree over
-    each component, so that all of a level are settled at once: O(log N) levels.
+    Of two fractions with the sum s, one becomes 0 and the other s; or, if s >= 1, one becomes 1 and
+    the other s - 1. The choice is random, such that each keeps its mean. Every particle thus has
+    the floor or the ceiling of its expected number of offspring. The pairs form a tree over each
+    component, and all pairs of a level are settled at once: O(log N) levels.
     """
     places = line.stretches(slots)
     whole = jnp.floor(expected * (1 + 16 * jnp.finfo(expected.dtype).eps))
     uniforms = uniform(key, expected.shape, expected.dtype)
     is_up = _settle(jnp.maximum(expected - whole, 0.0), uniforms, places)
     offspring = whole.astype(jnp.int32) + is_up.astype(jnp.int32)
-    # Counted from the first of its component: a rounding error does not pass to the next.
+    # Relative to the component's first, so that rounding errors stay within the component.
     earlier = jnp.cumsum(offspring) - offspring
     return earlier - take(earlier, places.firsts) + places.first_slots
 
@@ -89,7 +89,7 @@ def _settle(
         right = jnp.where(has_right, at(left_over, 2 * ranks + 1), 0.0)
         total = left + right
         one_is_up = total >= 1
-        # The middle of a pair's stretch is that of no other pair.
+        # The middle of a pair's interval belongs to no other pair.
         draw = at(uniforms, (2 * ranks + 1) * length) * jnp.where(one_is_up, 2.0 - total, total)
         left_stays = draw < jnp.where(one_is_up, 1 - left, left)
         levels.append((left_stays, one_is_up))
@@ -104,18 +104,18 @@ def _settle(
 def _random_points_before(
     key: Key[Array, ""], before: Positions, slots: Slots, targets: Int[Array, " m"]
 ) -> Int[Array, " p"]:
-    """How many of independent points on the components' slots come before a particle's stretch."""
+    """How many of independent points on the components' slots come before a particle's interval."""
     num_places, num_slots = before.whole.shape[0], slots.components.shape[0]
     points = random_points(key, slots, targets)
     parents = jnp.maximum(last_before(before, points, num_slots), 0)
-    # The points of empty slots are on nobody's stretch.
+    # The points of empty slots are in no particle's interval.
     places = jnp.where(slots.filled, parents, num_places)
     offspring = count_places(places, whole_blocks(num_places + 1))[:num_places]
     return count_upto(offspring, num_slots) - offspring
 
 
 def random_points(key: Key[Array, ""], slots: Slots, targets: Int[Array, " m"]) -> Positions:
-    """For each slot an independent uniform point on its component's stretch of slots."""
+    """For each slot an independent uniform point on its component's interval of slots."""
     lengths = jnp.maximum(spread(targets, slots.components), 1)
     points = random_positions(key, lengths)
     return Positions(points.whole + spread(slots.firsts, slots.components), points.fraction)

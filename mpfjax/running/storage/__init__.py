@@ -1,1 +1,1 @@
-"""What is kept in files: arrays, states, and the identity of the run that they are of."""
+"""Files of arrays and states, and the identity of the run to which they belong."""

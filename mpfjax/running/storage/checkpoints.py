@@ -1,4 +1,4 @@
-"""The file of an optimisation or of chains: their state, and a description of what it is of."""
+"""The checkpoint of an optimisation or of chains: their state, and a description of their run."""
 
 import json
 import os
@@ -22,9 +22,9 @@ Notes = dict[str, Any]
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A file that the public function `caller` goes on from where it exists.
+    """A checkpoint file of the public function `caller`, which continues from it if it exists.
 
-    `identity` describes all that has to be the same, as far as a step.
+    `identity` describes all that has to be the same for this run, up to a step.
     """
 
     path: Path
@@ -32,14 +32,14 @@ class Checkpoint:
     identity: Callable[[int], Mapping[str, str]]
 
     def save(self, step: int, state: PyTree, **notes: Any) -> None:
-        """Write the whole state after a step, with what to note about it."""
+        """Write the whole state after a step, with notes about it."""
         notes |= {"caller": self.caller, "identity": dict(self.identity(step)), "step": int(step)}
         write_arrays(self.path, arrays_of(state) | {_NOTES: np.array(json.dumps(notes))})
 
     def load(self, like: Callable[[Notes], PyTree]) -> tuple[Notes, PyTree]:
-        """The notes and the state, which looks `like` what the notes say.
+        """The notes and the state; `like` makes a state of the same structure from the notes.
 
-        Raises `ValueError` for the file of another run, or for half of one.
+        Raises `ValueError` for the file of another run, and for an incomplete one.
         """
         arrays = load_arrays(self.path)
         notes = self._notes(arrays)
@@ -76,10 +76,10 @@ def check_checkpoint(checkpoint: Any, checkpoint_every: Any, checkpoint_name: An
 def identity_of(
     name: str | None, settings: Mapping[str, Any], code: Mapping[str, Any]
 ) -> dict[str, str]:
-    """What has to be the same for a file to be of this run, as text.
+    """All that has to be the same for a file to belong to this run, as text.
 
     `settings` are texts, numbers, arrays and modules, and always compared. `code` are functions and
-    optimisers: all that they hold is compared, or only the name that the user gave it.
+    optimisers: all that they hold is compared, or only the name that the user gave.
     """
     told = {part: held for part, held in settings.items() if isinstance(held, str)}
     rest = {part: held for part, held in settings.items() if part not in told}

@@ -1,4 +1,4 @@
-"""What a pytree, a function or a setting is, as text by which two runs are compared."""
+"""Descriptions of a pytree, a function or a setting, as text by which two runs are compared."""
 
 import dataclasses
 import functools
@@ -36,7 +36,7 @@ def fingerprint(tree: PyTree) -> str:
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """In words, the first few things in which two descriptions differ."""
+    """The first few differences between two descriptions, in words."""
     found = []
     for name in sorted(there.keys() | here.keys()):
         if name not in there:
@@ -50,7 +50,7 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
 
 
 def named(value: Any) -> str:
-    """A name for a function, or another thing without a value; the same in every process."""
+    """A name for a function, or for another thing without a value; the same in every process."""
     return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
 
 
@@ -189,7 +189,7 @@ def _names(code: types.CodeType) -> set[str]:
 
 
 def _digest(code: types.CodeType) -> str:
-    """Of what a function does, wherever it is written."""
+    """A digest of the code of a function, wherever it is written."""
     digest = hashlib.sha256(code.co_code + repr((code.co_names, code.co_varnames)).encode())
     for const in code.co_consts:
         if isinstance(const, types.CodeType):

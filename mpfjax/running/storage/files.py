@@ -54,7 +54,7 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
 
 
 def _remove_what_the_killed_left(path: Path) -> None:
-    """Remove what processes of this machine that no longer run were writing to the path."""
+    """Remove temporary files for this path that processes on this machine left when killed."""
     if os.name != "posix":
         return
     name = re.compile(rf"{re.escape(f'{path.name}.{platform.node()}')}-(\d+)-[0-9a-f]+\.partial")
@@ -100,9 +100,9 @@ _DAMAGE = (
 
 
 def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file; `ValueError` for one that is cut off, damaged or no such file.
+    """The arrays of a .npz file; `ValueError` for one that is cut off, damaged or of another kind.
 
-    It takes memory only for what the file really holds, whatever its headers claim.
+    It allocates memory only for data that the file really holds, whatever its headers claim.
     """
     arrays = {}
     with open(path, "rb") as file:
@@ -123,7 +123,7 @@ _HEADERS = {
 
 
 def _load_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """What `np.lib.format.read_array` reads, which takes the memory that the header claims."""
+    """The result of `np.lib.format.read_array`, without allocating what the header claims."""
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{member.filename} is compressed as numpy compresses nothing")
     with archive.open(member) as file:
@@ -149,7 +149,7 @@ def _load_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray
 def read_description(
     path: Path, arrays: Mapping[str, np.ndarray], name: str = "description"
 ) -> dict[str, Any]:
-    """What the arrays of a checkpoint say of themselves, in the JSON of this name."""
+    """The description in the arrays of a checkpoint, stored as JSON under this name."""
     if name not in arrays:
         raise ValueError(f"{path}: no checkpoint, for it does not describe what it holds")
     text = str(arrays[name])

@@ -118,7 +118,7 @@ def _stored_dtype(dtype: np.dtype) -> np.dtype:
 
 
 def _as_leaf(array: np.ndarray, like: Any) -> Any:
-    """The array in the form of the leaf that it was."""
+    """The array in the form of the original leaf."""
     if is_number(like):
         return type(like)(array.item())
     if is_key(like):
