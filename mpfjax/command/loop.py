@@ -35,7 +35,7 @@ class Results:
 
     def __init__(self, options: argparse.Namespace, source: Source) -> None:
         self.options, self.source = options, source
-        # Reading and writing have threads of their own: the seconds are those the run waits for them.
+        # Reading and writing have their own threads: these are the seconds that the run waits.
         self.clock = Clock("read", "detect", "track", "write")
         self.compiling = 0.0  # seconds of detecting and tracking in the first frame
         self.rows: list[np.ndarray] = []
