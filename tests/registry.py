@@ -225,10 +225,8 @@ QUICK_CHAINS = (
     "pf",
     "pf rqmc",
     "mpf",
-    "guided mpf",
     "gaussian mixture",
     "dps",
-    "partitioned in clusters",
 )
 CHAINS: dict[str, Callable[..., Filter]] = {
     "pf": _pf(),

@@ -89,12 +89,7 @@ EXACT = [
 ]
 
 
-QUICK = [
-    (chain, model)
-    for chain, model in EXACT
-    if chain in QUICK_CHAINS
-    if model == "quadratic" or chain == "pf rqmc"
-]
+QUICK = [(chain, model) for chain, model in EXACT if chain in QUICK_CHAINS if model == "quadratic"]
 
 
 @cache

@@ -7,6 +7,7 @@ from mpfjax.vision.files.boxes import read_tracks, write_tracks
 from mpfjax.vision.tracking.adapters import Rows
 from mpfjax.vision.tracking.track import make_tracker, online_rows, track
 from tests.examples import two_walkers
+from tests.marking import thorough
 from tests.track_command import SMALL, run, summary_in
 
 pytestmark = pytest.mark.usefixtures("as_installed")
@@ -124,7 +125,7 @@ def test_rows_that_will_not_do_are_named_with_their_line(tmp_path, capsys, spoil
 
 
 @pytest.mark.parametrize("num_frames", [1, NUM_FRAMES])
-@pytest.mark.parametrize("score", [0.0, 0.3, -2.0])
+@pytest.mark.parametrize("score", [0.0, -2.0, *thorough([0.3])])
 def test_equal_scores_and_a_single_frame_are_tracked(tmp_path, num_frames, score):
     rows = detected(num_frames, score)
     path = write_detections(tmp_path / "rows.txt", rows)

@@ -167,6 +167,7 @@ class TestIslands:
             standard_error = estimates.std(axis=0) / np.sqrt(runs)
             assert (np.abs(estimates.mean(axis=0) - truth) < 4 * standard_error).all()
 
+    @pytest.mark.thorough
     def test_one_island_is_a_run_of_the_filter(self):
         filter, key = island_chains()["pf, exchange"], jax.random.key(4)
         islands = mpfjax.run_islands(key, filter, OBSERVATIONS, num_islands=1)

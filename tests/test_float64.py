@@ -53,7 +53,7 @@ def test_every_chain_is_traced(chain):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("chain", QUICK_CHAINS)
+@pytest.mark.parametrize("chain", [*QUICK_CHAINS, "guided mpf", "partitioned in clusters"])
 def test_chains_of_each_kind_run(chain):
     """And Ẑ is unbiased where the chain is exact."""
     filter = CHAINS[chain](quadratic())

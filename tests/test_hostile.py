@@ -408,13 +408,13 @@ def test_the_good_calls_work(table):
         assert function(**arguments) is not None, name
 
 
-@unhurried(max_examples=2000)
+@unhurried(max_examples=1000)
 @given(calls(BUILT))
 def test_constructors_work_or_name_the_argument(call):
     check_built(call)
 
 
-@unhurried(max_examples=250)
+@unhurried(max_examples=150)
 @given(calls(RUN))
 def test_runners_work_or_name_the_argument(call):
     name, arguments, changed = call

@@ -31,7 +31,10 @@ from mpfjax.models.base import starts_from_noise
 # A reference of so many particles where the likelihood of a particle is that of its pixels.
 _FEWER = {"look-alikes": 10}
 # A picture has room for as many lines as there are colours.
-_IN_THE_TABLE_ONLY = ("APF", "APF, rqmc", "MPF, 4 draws", "MPF, tempered", "MPF, look-ahead")
+_IN_THE_TABLE_ONLY = (
+    "APF", "APF, rqmc", "MPF, 4 draws", "MPF, tempered", "MPF, look-ahead",
+    "MPF, learned look-ahead",
+)  # fmt: skip
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:

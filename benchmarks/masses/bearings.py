@@ -94,6 +94,12 @@ def position(states: PyTree) -> Float[Array, "n 2"]:
     return states["motion"][:, :2]
 
 
+def motion_and_turn(states: PyTree) -> Float[Array, "n 5"]:
+    """The motion, and the angle by which the mode turns it: the mode's number says nothing."""
+    turn = jnp.asarray(TURNS)[states["mode"]]
+    return jnp.concatenate([states["motion"], turn[:, None]], axis=1)
+
+
 def observations(num_steps: int, seed: int) -> np.ndarray:
     """What is heard of a target that goes straight on, turns, and goes on."""
     rng = np.random.default_rng(seed)

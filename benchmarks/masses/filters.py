@@ -3,8 +3,11 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax
+
 import mpfjax
 from benchmarks.masses.scenes import Scene
+from mpfjax.smoothing import learn_lookahead
 
 Make = Callable[[Scene, int], mpfjax.Filter]
 
@@ -44,6 +47,12 @@ def _tempered(scene: Scene, num_particles: int) -> mpfjax.Filter:
     )
 
 
+def _learned(scene: Scene, num_particles: int) -> mpfjax.Filter:
+    """The mixture filter, which knows the whole series from five earlier runs."""
+    plain = _mixture()(scene, num_particles)
+    return learn_lookahead(jax.random.key(0), plain, scene.observations, features=scene.features)
+
+
 FILTERS: dict[str, Make] = {
     "PF": _plain(),
     "PF, rqmc": _plain(noise="rqmc"),
@@ -56,4 +65,5 @@ FILTERS: dict[str, Make] = {
     "MPF, rqmc, 4 draws": _mixture(noise="rqmc", num_draws=4),
     "MPF, look-ahead": _mixture(ahead=True),
     "MPF, tempered": _tempered,
+    "MPF, learned look-ahead": _learned,
 }

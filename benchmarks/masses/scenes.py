@@ -23,6 +23,7 @@ class Scene(NamedTuple):
     - `grouping`: the coordinates and units in which components are grouped.
     - `lookahead`: (y_t, states) -> log ν of each particle, for resampling ahead.
     - `exact`: the masses and log Z, where a grid or symmetry tells them; else None.
+    - `features`: of a state, by which a look-ahead is learned; None is the state itself.
     - `truth`: the region that the observations come from.
     """
 
@@ -34,6 +35,7 @@ class Scene(NamedTuple):
     grouping: dict[str, Any]
     lookahead: Callable[[PyTree, PyTree], Array]
     exact: tuple[np.ndarray, float | None] | None = None
+    features: Callable[[PyTree], Array] | None = None
     truth: int = 0
 
 
@@ -87,6 +89,7 @@ def make_bearings(num_steps: int, seed: int) -> Scene:
         max_components=4,
         grouping={"features": bearings.position, "scale": 4.0},
         lookahead=flattened(model, model.transition_mean),
+        features=bearings.motion_and_turn,
         truth=1,
     )  # fmt: skip
 

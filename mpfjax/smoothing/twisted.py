@@ -33,6 +33,9 @@ from mpfjax.running.run import run_filter
 from mpfjax.smoothing.history import mixtures_of
 from mpfjax.smoothing.lookahead_regression import fit_lookahead
 
+# So many times the particles of a run in each pass.
+_LEARNERS = 4
+
 
 def learn_lookahead(
     key: Key[Array, ""],
@@ -40,6 +43,7 @@ def learn_lookahead(
     observations: PyTree,
     num_passes: int = 5,
     *,
+    num_particles: int | None = None,
     features: Callable[[PyTree], Array] | None = None,
     inputs: PyTree = None,
     missing: str = "error",
@@ -74,6 +78,8 @@ def learn_lookahead(
       `Propagate` and regrouping; its components get equal slots. Its model makes x_t of noise,
       `transition_from_noise`. Take one with components where there are modes.
     - `num_passes`: how often the filter runs to learn.
+    - `num_particles`: of these runs. None is four times as many as `filter` has, since errors of ψ
+      stay, and those of a run do not.
     - `features`: φ, in which log ψ is nearly quadratic, (states) -> (n, d); of one particle, if the
       model is wrapped by `per_particle`. None is the flattened state.
     - `inputs`, `missing`: those of `run_filter`; steps without an observation are looked over.
@@ -84,18 +90,19 @@ def learn_lookahead(
     """
     check_key(key)
     check_type(Filter, "a Filter", filter=filter)
-    check_whole(num_passes=num_passes)
+    check_whole(num_passes=num_passes, **given(num_particles=num_particles))
     check_callable("features of the states", **given(features=features))
     model: Any = filter.model
     require_noise(model, "learn_lookahead")
     series = as_series(observations, inputs, missing, model)
     twist = _knowing_nothing(key, filter, series.length, mapped(model, features))
+    learners = num_particles or _LEARNERS * filter.num_particles
     for pass_key in jax.random.split(key, num_passes):
         run_key, fit_key = jax.random.split(pass_key)
-        twisted = _twisted(filter, twist)
+        twisted = _twisted(filter, twist, learners)
         run = run_filter(run_key, twisted, observations, inputs=inputs, missing=missing)
         twist = fit_lookahead(fit_key, twisted, twist, mixtures_of(run), series)
-    return _twisted(filter, twist)
+    return _twisted(filter, twist, filter.num_particles)
 
 
 def _knowing_nothing(
@@ -114,7 +121,7 @@ def _knowing_nothing(
     return Twist(steps, initial, features)
 
 
-def _twisted(filter: Filter, twist: Twist) -> Filter:
+def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
     """The filter whose moves look ahead by `twist`; a `ValueError` for one that cannot."""
     moves = [_looking_ahead(move, filter, twist) for move in filter.moves]
     for kind, needed in ((AuxiliaryResample, "Resample"), (PropagateTwisted, "Propagate")):
@@ -125,7 +132,7 @@ def _twisted(filter: Filter, twist: Twist) -> Filter:
     return Filter(
         filter.model,
         [CountSteps(), *moves],
-        filter.num_particles,
+        num_particles,
         filter.num_components,
         initial,
         filter.initial_noise,

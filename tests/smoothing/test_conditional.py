@@ -114,6 +114,7 @@ class TestInvariance:
         assert (by_time > (0.5 if CASES[name][1] else 0.2)).all()
 
 
+@pytest.mark.thorough
 def test_the_trajectory_goes_from_component_to_component():
     """So that regrouping has had a part in what is tested above."""
     _, found = renewed("guided, eager mixture, systematic")

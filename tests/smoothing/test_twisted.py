@@ -82,7 +82,7 @@ def truth(case):
 
 @pytest.mark.parametrize(
     "case",
-    ["two modes", *thorough(["linear", "linear, one missing", "two modes, adaptive, rqmc"])],
+    thorough(CASES),
 )
 def test_the_evidence_and_moments_are_unbiased_at_every_step(case):
     """E[Ẑ/Z] = 1 and E[Ẑ/Z φ̂] = E[φ | y], within four standard errors; and the noise is less."""

@@ -16,7 +16,7 @@ from mpfjax.smoothing import (
     mixture_weight_errors,
     with_first_ancestors,
 )
-from tests.marking import quick_of, thorough
+from tests.marking import thorough
 from tests.registry import RandomLabels
 
 ONE = mpfjax.LinearGaussianModel(A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.4]], m0=[0.5], P0=[[1.0]])
@@ -66,7 +66,7 @@ def exact_evidence(num_objects):
     return sum(float(run.log_marginal_likelihood) for run in runs)
 
 
-@pytest.mark.parametrize("name", quick_of(SMALL, ["kmeans, adaptive"]))
+@pytest.mark.parametrize("name", thorough(SMALL))
 def test_the_second_moment_is_unbiased(name):
     """E[Ẑ² (1 - V)] = Z², also where N is so small that Ẑ is far from normal."""
     filter, observations = SMALL[name]

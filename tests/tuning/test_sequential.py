@@ -214,6 +214,7 @@ def test_interrupted_and_resumed_the_samples_are_those_of_one_run(tmp_path, monk
         sample(**kept | {"num_moves": 2})
 
 
+@pytest.mark.thorough
 def test_where_particles_double_weights_change_by_the_ratio_of_likelihoods():
     """And the mean of these ratios joins the evidence."""
     run, state = sample(acceptance_threshold=1.0, max_particles=20)._goes_on

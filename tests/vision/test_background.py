@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mpfjax.vision import BackgroundSubtraction, read_frames, read_tracks
+from tests.marking import thorough
 
 cv2 = pytest.importorskip("cv2", reason="detection needs the extra 'video'")
 
@@ -278,7 +279,7 @@ def test_a_missing_opencv_says_how_to_install_it(monkeypatch):
 
 
 @pytest.mark.real_data
-@pytest.mark.parametrize("learned", [False, True])
+@pytest.mark.parametrize("learned", [False, *thorough([True])])
 def test_people_on_a_real_street_are_found(data, learned):
     """Frames 1 to 120, with people from the first on, pairs, and an unlabelled walker."""
     folder = data / "pets09_s2l1"
