@@ -34,7 +34,7 @@ from mpfjax.smoothing.history import mixtures_of
 from mpfjax.smoothing.lookahead_regression import fit_lookahead
 
 # So many times the particles of a run in each pass.
-_LEARNERS = 4
+_LEARNERS = 16
 
 
 def learn_lookahead(
@@ -78,8 +78,8 @@ def learn_lookahead(
       `Propagate` and regrouping; its components get equal slots. Its model makes x_t of noise,
       `transition_from_noise`. Take one with components where there are modes.
     - `num_passes`: how often the filter runs to learn.
-    - `num_particles`: of these runs. None is four times as many as `filter` has, since errors of ψ
-      stay, and those of a run do not.
+    - `num_particles`: of these runs. None is sixteen times as many as `filter` has, since errors
+      of ψ stay. Each pass is kept whole while ψ is fitted. Take more where a mode may be missed.
     - `features`: φ, in which log ψ is nearly quadratic, (states) -> (n, d); of one particle, if the
       model is wrapped by `per_particle`. None is the flattened state.
     - `inputs`, `missing`: those of `run_filter`; steps without an observation are looked over.
