@@ -2,11 +2,12 @@
 
     python -m benchmarks.first_result
 
-Every figure is of a fresh process. "Cold" starts with an empty folder of compiled programs, "kept"
-runs the same once more with what the cold run left there. The first rows are of calls within a
-process, after the imports; a row for the imports stands beside them. The others are whole
-commands, from start to end. The commands track a rendered scene, of one frame for the seconds to
-the first, and 795 frames of PETS where --data holds them. CPU seconds count all threads, so they
+Every figure is of a fresh process, which finds Python's bytecode in place, as installed packages
+have it, whatever PYTHONDONTWRITEBYTECODE says. "Cold" starts with an empty folder of compiled
+programs, "kept" runs the same once more with what the cold run left there. The first rows are of
+calls within a process, after the imports; a row for the imports stands beside them. The others are
+whole commands, from start to end. The commands track a rendered scene, of one frame for the seconds
+to the first, and 795 frames of PETS where --data holds them. CPU seconds count all threads, so they
 change little when the machine does other work; seconds of the clock stand beside them. Drawing is
 in milliseconds a frame.
 
@@ -22,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,6 +62,17 @@ for row in rows:
     with_tracks(frame, row)
 print(json.dumps({"cpu": (time.process_time() - start) / len(rows),
                   "wall": (time.perf_counter() - began) / len(rows)}))
+"""
+# What the rows import, so that its bytecode is there.
+_IMPORT_ALL = """
+import contextlib, importlib, pkgutil, mpfjax
+names = [found.name for found in pkgutil.walk_packages(mpfjax.__path__, "mpfjax.")
+         if not found.name.endswith("__main__")]
+names += ["benchmarks.score_vs_particles", "matplotlib.pyplot", "matplotlib.backends.backend_pdf",
+          "scipy.optimize", "trackeval", "imageio.v2", "imageio.v3", "imageio_ffmpeg", "PIL.Image"]
+for name in names:
+    with contextlib.suppress(ImportError):
+        importlib.import_module(name)
 """
 
 
@@ -159,12 +172,16 @@ def run(options: argparse.Namespace) -> None:
         chosen = [job for job in found if options.only in job.name]
         if not chosen:
             raise ValueError(f"--only: no row has {options.only!r} in its name")
+        bytecode = Path(folder) / "bytecode"
+        for root in roots.values():
+            spent(Job("the imports", command=("-c", _IMPORT_ALL)), root, bytecode / "x", bytecode)
         results = []
         for job in chosen:
             row: dict[str, Any] = {"job": job.name}
             for name, root in roots.items():
                 try:
-                    row[name] = least(lambda job=job, root=root: cold_and_kept(job, root), options)
+                    run = partial(cold_and_kept, job, root, bytecode)
+                    row[name] = least(run, options)
                 except ValueError:
                     if root is HERE:
                         raise
@@ -187,16 +204,19 @@ def least(measure: Callable[[], tuple[Spent, Spent]], options: argparse.Namespac
     return parts
 
 
-def cold_and_kept(job: Job, root: Path) -> tuple[Spent, Spent]:
+def cold_and_kept(job: Job, root: Path, bytecode: Path) -> tuple[Spent, Spent]:
     """A process with an empty folder of programs, and one with what that has left there."""
     with tempfile.TemporaryDirectory() as folder:
-        return spent(job, root, Path(folder)), spent(job, root, Path(folder))
+        cold, kept = (spent(job, root, Path(folder), bytecode) for _ in range(2))
+        return cold, kept
 
 
-def spent(job: Job, root: Path, programs: Path) -> Spent:
+def spent(job: Job, root: Path, programs: Path, bytecode: Path) -> Spent:
     """What one process took; a `ValueError` with its last line where it failed."""
     settings = {
         "PYTHONPATH": str(root),
+        "PYTHONPYCACHEPREFIX": str(bytecode),
+        "PYTHONDONTWRITEBYTECODE": "",
         "JAX_COMPILATION_CACHE_DIR": str(programs),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",

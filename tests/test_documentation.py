@@ -10,6 +10,7 @@ import pytest
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser, SkipParser
 
+from mpfjax.operations import compiling
 from tests.marking import quick_of
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -34,6 +35,7 @@ def stem(page: Path) -> str:
 @pytest.mark.parametrize("page", quick_of(WITH_CODE, QUICK_PAGES), ids=stem)
 def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     """All blocks of a page in their order, as a reader runs them: without the tests' strictness."""
+    monkeypatch.setattr(compiling, "_kept_folders", [])  # where `keep_programs` notes its folder
     document = sybil.parse(page)
     if page.parent.name == "gallery":  # there the code draws the page's picture
         monkeypatch.chdir(tmp_path)
@@ -45,6 +47,12 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     if page.parent.name == "gallery":
         assert [path.name for path in tmp_path.iterdir()] == [f"{page.stem}.png"]
         assert (page.parent / f"{page.stem}.png").exists()
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/start.md"])
+def test_the_first_lines_keep_programs(page):
+    example = next(iter(sybil.parse(REPOSITORY / page).examples()))
+    assert "mpfjax.keep_programs()" in example.parsed.splitlines()[2]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)

@@ -12,25 +12,38 @@ from benchmarks.first_result import Job, cold_and_kept, spent
 
 def test_seconds_are_those_of_the_process(tmp_path):
     work = "sum(i * i for i in range(3_000_000))"
-    found = spent(Job("work", command=("-c", work)), first_result.HERE, tmp_path)
+    found = spent(Job("work", command=("-c", work)), first_result.HERE, tmp_path, tmp_path)
     assert 0.05 < found.cpu < 20
     assert found.memory > 5
     script = 'print(\'{"cpu": 7.0, "wall": 8.0}\')'
-    assert spent(Job("said", script=script), first_result.HERE, tmp_path)[:2] == (7.0, 8.0)
+    assert spent(Job("said", script=script), first_result.HERE, tmp_path, tmp_path)[:2] == (
+        7.0,
+        8.0,
+    )
+
+
+def test_processes_find_bytecode_as_installed_packages_have_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    (tmp_path / "tried.py").touch()
+    job = Job(
+        "import", command=("-c", f"import sys; sys.path += [{str(tmp_path)!r}]; import tried")
+    )
+    spent(job, first_result.HERE, tmp_path, tmp_path / "bytecode")
+    assert list((tmp_path / "bytecode").rglob("tried.*.pyc"))
 
 
 def test_a_process_that_fails_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"broken: its process ended with 1: .*ZeroDivisionError"):
-        spent(Job("broken", command=("-c", "1 / 0")), first_result.HERE, tmp_path)
+        spent(Job("broken", command=("-c", "1 / 0")), first_result.HERE, tmp_path, tmp_path)
 
 
 @pytest.mark.thorough
-def test_kept_programs_are_found_by_the_second_process():
+def test_kept_programs_are_found_by_the_second_process(tmp_path):
     say = "import json; print(json.dumps({'cpu': 1.0 + n, 'wall': 1.0}))"
     make = "import jax, jax.numpy as jnp; jax.jit(lambda x: x @ x)(jnp.ones((3, 3)))"
     folder = "os.environ['JAX_COMPILATION_CACHE_DIR']"
     script = f"import os; n = len(os.listdir({folder}))\n{make}\n{say}"
-    cold, kept = cold_and_kept(Job("programs", script=script), first_result.HERE)
+    cold, kept = cold_and_kept(Job("programs", script=script), first_result.HERE, tmp_path)
     assert cold.cpu == 1.0
     assert kept.cpu > 1.0
 
