@@ -48,7 +48,11 @@ def test_z_has_nearly_the_least_variance(masses):
     def variance(shares):
         return np.sum(np.square(masses) * variances / shares, axis=-1)
 
-    found = variance(np.asarray(demands_by_variance(mixture, mixture.active)))
+    asked = demands_by_variance(
+        mixture.log_mixture_weights, mixture.component_effective_sample_sizes,
+        mixture.component_counts, mixture.active, mixture.num_usable_slots,
+    )  # fmt: skip
+    found = variance(np.asarray(asked))
     assert found <= np.min(variance(ways)) / (1 - EQUAL_PARTS[0])
     assert found < 0.9 * variance(np.full(3, 1 / 3))
 

@@ -57,14 +57,20 @@ def allocate_slots(
     return stored(jnp.where(due, share, kept), num_slots + 1)
 
 
-def demands_by_variance(mixture: ParticleMixture, due: Bool[Array, " m"]) -> Float[Array, " m"]:
+def demands_by_variance(
+    log_masses: Float[Array, " m"],
+    sample_sizes: Float[Array, " m"],
+    counts: Int[Array, " m"],
+    due: Bool[Array, " m"],
+    num_slots: int | Int[Array, ""],
+) -> Float[Array, " m"]:
     """The share of the slots that each due component asks for, by mass and variance.
 
     The mean likelihood of k_m particles has a relative variance v_m / k_m, where v_m is estimated
-    from the present weights by (particles of m) / ESS_m. The variance of Ẑ is then Σ_m π_m² v_m /
-    k_m, which is least for k_m in proportion to π_m v_m^(1/2) (Neyman 1934). Where a component has
-    few particles, v_m is shrunk towards the mean over all components, as if `FEWEST` more particles
-    had that mean.
+    by (particles of m) / ESS_m, `counts` over the effective `sample_sizes`. The variance of Ẑ is
+    then Σ_m π_m² v_m / k_m, which is least for k_m in proportion to π_m v_m^(1/2) (Neyman 1934).
+    Where a component has few particles, v_m is shrunk towards the mean over all components, as if
+    `FEWEST` more particles had that mean.
 
     A mode has to stay alive, and its own moments have an error too. A part e of the slots is
     therefore shared equally: as much as gives each component `FEWEST` effective particles, within
@@ -72,21 +78,17 @@ def demands_by_variance(mixture: ParticleMixture, due: Bool[Array, " m"]) -> Flo
     mixture: Hesterberg 1995). All slots are shared equally where this gives `FEWEST` particles or
     less to each.
     """
-    weights, _ = scaled_exp(mixture.log_weights)
-    counts = mixture.component_counts.astype(weights.dtype)
-    sums = mixture.component_sums(weights)
-    divisor = jnp.where(sums > 0, sums, 1.0)
-    # Divided one after the other: the square of a small mass is zero.
-    variances = counts * (mixture.component_sums(weights**2) / divisor) / divisor
-    variances = jnp.clip(variances, 1.0, jnp.maximum(counts, 1.0))
-    sharing = jnp.where(due, counts, 0.0)
+    dtype = log_masses.dtype
+    sharing = jnp.where(due, counts, 0).astype(dtype)
+    variances = jnp.maximum(sharing / jnp.maximum(sample_sizes, 1.0), 1.0)
     mean_variance = jnp.sum(sharing * variances) / jnp.maximum(jnp.sum(sharing), 1.0)
-    variances = (counts * variances + FEWEST * mean_variance) / (counts + FEWEST)
+    variances = (sharing * variances + FEWEST * mean_variance) / (sharing + FEWEST)
 
-    demands = jnp.where(due, sums * jnp.sqrt(variances), 0.0)
+    masses, _ = scaled_exp(jnp.where(due, log_masses, -jnp.inf))
+    demands = masses * jnp.sqrt(variances)
     total = jnp.sum(demands)
-    sharers = jnp.maximum(jnp.sum(due.astype(weights.dtype)), 1.0)
-    slots_each = jnp.asarray(mixture.num_usable_slots, weights.dtype) / sharers
+    sharers = jnp.maximum(jnp.sum(due.astype(dtype)), 1.0)
+    slots_each = jnp.asarray(num_slots, dtype) / sharers
     equal_part = jnp.clip(FEWEST * mean_variance / slots_each, *EQUAL_PARTS)
     equal_part = jnp.where((total > 0) & (slots_each > FEWEST), equal_part, 1.0)
     demands = demands / jnp.where(total > 0, total, 1.0)

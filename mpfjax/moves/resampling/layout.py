@@ -125,6 +125,12 @@ class SideBySide(NamedTuple):
         """The logarithm of each component's mass."""
         return log_or_nothing(self.totals) + self.log_largest
 
+    @property
+    def effective_sample_sizes(self) -> Float[Array, " m"]:
+        """(Σ w)² / Σ w² of each component, zero for a dead one."""
+        squares = self.sums(self.relative_weights**2)
+        return self.totals**2 / jnp.where(squares > 0, squares, 1.0)
+
     def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, " p"]:
         """The value of the component at each place."""
         return spread(values, self.components)

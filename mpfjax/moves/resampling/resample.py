@@ -55,13 +55,13 @@ class Resample(AbstractAdaptiveResampling):
     - `ess_threshold`: a component is resampled if its effective sample size is below this share of
       its particles. 1.0 resamples at every step. Under `vmap`, a lower threshold reduces the noise
       but not the time.
-    - `particles_per_component`: None shares the slots equally among the living components that are
-      resampled. A number k gives each living component k particles and leaves the other slots
-      empty, as section 5.2 of the paper does.
+    - `particles_per_component`: None shares all slots among the living components that are
+      resampled, as `allocation` says. A number k gives each living component k particles and
+      leaves the other slots empty, as section 5.2 of the paper does.
     - `allocation`: how the components share the slots, where neither `particles_per_component` nor
       `share_by` says it. "variance" deals component m a number in proportion to
       (k_m Σ_{c_i = m} exp 2ℓ_i)^(1/2) = π_m (k_m / ESS_m)^(1/2), which leaves Ẑ the least variance
-      (Neyman 1934), and shares a quarter of the slots equally, so that every mode stays alive. Its
+      (Neyman 1934), and shares a quarter to a half equally, so that every mode stays alive. Its
       log Ẑ and masses are as exact as the plain filter's, or more so; docs/masses.md has the
       reasons. "equal" is the paper's: it keeps modes of little mass longest, and log Ẑ is less
       exact.
@@ -102,8 +102,8 @@ class Resample(AbstractAdaptiveResampling):
       mean squared spread of a component's particles, as Corenflos et al. scale it.
 
     "soft" and "ot" are approximate: Ẑ is biased. Raises `ValueError` for an unknown scheme or
-    gradient or allocation, a threshold outside [0, 1], k < 1, k together with an allocation by
-    variance, and s or ε out of range; `ImportError` for "ot" without ott-jax.
+    gradient or allocation, a threshold outside [0, 1], k < 1, k together with `share_by`, and s
+    or ε out of range; `ImportError` for "ot" without ott-jax.
     """
 
     scheme: str = eqx.field(static=True, default="systematic")
@@ -201,7 +201,7 @@ class Resample(AbstractAdaptiveResampling):
             line = side_by_side(mixture, stays, self.sort_by, without_gaps)
         # If all living components are due, none keeps its particles.
         counts = due.astype(jnp.int32) if all_are_due else line.counts
-        targets = self.deal(mixture, due, counts)
+        targets = self.deal(mixture, due, counts, line if isinstance(line, SideBySide) else None)
         if isinstance(line, InPlace):
             # Particles that are not redrawn keep their places; empty slots may come before them.
             targets = jnp.where(due, targets, num_particles)
@@ -220,14 +220,27 @@ class Resample(AbstractAdaptiveResampling):
         return _Drawn(parents, slots, targets, line)
 
     def deal(
-        self, mixture: ParticleMixture, due: Bool[Array, " m"], counts: Int[Array, " m"]
+        self,
+        mixture: ParticleMixture,
+        due: Bool[Array, " m"],
+        counts: Int[Array, " m"],
+        line: SideBySide | None = None,
     ) -> Int[Array, " m"]:
-        """How many slots each component gets; those that are not `due` keep theirs, `counts`."""
+        """How many slots each component gets; those that are not `due` keep theirs, `counts`.
+
+        Masses and effective sample sizes are those of the `line`, where there is one.
+        """
         demands = None
         if self.share_by is not None:
             demands = _shares_of_groups(mixture, self.share_by(mixture.particles), due)
         elif self.allocation != "equal" and mixture.num_components > 1:
-            demands = demands_by_variance(mixture, due)
+            weighed = (
+                (mixture.log_mixture_weights, mixture.component_effective_sample_sizes)
+                if line is None
+                else (line.log_masses, line.effective_sample_sizes)
+            )
+            present = mixture.component_counts if line is None else line.counts
+            demands = demands_by_variance(*weighed, present, due, mixture.num_usable_slots)
         return allocate_slots(counts, due, mixture, self.particles_per_component, demands)
 
     def _log_masses(
