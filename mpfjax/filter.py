@@ -7,13 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import (
-    check_flag,
-    check_key,
-    check_one_of,
-    check_type,
-    check_whole,
-)
+from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -165,15 +159,19 @@ class Filter(eqx.Module):
     def init(self, key: Key[Array, ""]) -> ParticleMixture:
         """The mixture at time 0: draws of x_0 with equal weights, grouped by the initial moves."""
         check_key(key)
-        return self._init(Start(key))
+        start = Start(key, self._sample_initial(key))
+        return with_floats_traced(lambda filter: _from_particles(filter, start), self)
+
+    def _sample_initial(self, key: Key[Array, ""]) -> PyTree:
+        key_initial = split_keys(key, 1 + len(self._initial_moves))[0]
+        with saying_that_none_were_given(self.model):
+            return sample_initial(key_initial, self.model, self.num_particles, self.initial_noise)
 
     def _init(self, start: Start) -> ParticleMixture:
         keys = split_keys(start.key, 1 + len(self._initial_moves))
         particles = start.particles
         if particles is None:
-            with saying_that_none_were_given(self.model):
-                size, noise = self.num_particles, self.initial_noise
-                particles = sample_initial(keys[0], self.model, size, noise)
+            particles = self._sample_initial(start.key)
         memory = {}
         for move in self.moves:
             if isinstance(move, AbstractMove):
@@ -300,6 +298,12 @@ def step_and_faults(
 
 
 _step_and_faults = jit_on_wide_vectors(step_and_faults)
+
+
+@jit_on_wide_vectors
+def _from_particles(filter, start):
+    # Not with the draws of x_0, whose last digits depend on the program that they are part of.
+    return filter._init(start)
 
 
 @jit_on_wide_vectors

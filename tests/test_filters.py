@@ -10,6 +10,7 @@ from scipy.stats import multivariate_normal
 
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter
+from mpfjax.filter import Start
 from tests.marking import thorough
 from tests.precision import float64
 from tests.registry import CHAINS
@@ -591,3 +592,11 @@ class TestWhatAUserHandsIt:
         assert np.isfinite(info.log_likelihood_increment)
         with pytest.raises(RuntimeError, match="observation: infinite"):
             filter.step(jax.random.key(1), mixture, np.array([np.inf, np.nan]))
+
+
+def test_a_start_is_what_its_parts_give_one_after_the_other():
+    """To the last digit: the draws of x_0 are not part of the program that groups them."""
+    filter = mpfjax.mixture_particle_filter(mpfjax.QuadraticModel(), 60, max_components=3)
+    keys = jax.random.split(jax.random.key(0), 3)
+    for key in keys:
+        chex.assert_trees_all_equal(filter.init(key), filter._init(Start(key)))

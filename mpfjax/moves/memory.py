@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import equinox as eqx
+
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.every import Every, with_inner
 
@@ -26,4 +28,6 @@ def check_memory(moves: tuple[Any, ...]) -> None:
 
 
 def _own_memory(move: AbstractMove) -> list[str]:
-    return [move.name] if isinstance(move, Every) else list(move.initial_memory(1))
+    if isinstance(move, Every):
+        return [move.name]
+    return list(eqx.filter_eval_shape(move.initial_memory, 1))  # its names, without its arrays
