@@ -278,6 +278,24 @@ def test_order_by_segment_counts_and_sorts_alike(n, m):
         np.testing.assert_array_equal(counts, np.bincount(labels.astype(int), minlength=m + 1)[:m])
 
 
+def test_a_handful_of_entries_is_summed_by_masks():
+    """No more entries than segments: some segments have two, some none."""
+    labels = RNG.integers(0, 30, 40)
+    values = RNG.normal(size=(40, 11)).astype(np.float32)
+    arrays = jnp.asarray(values), jnp.asarray(labels, jnp.int32)
+    sums = np.zeros((30, 11), np.float32)
+    np.add.at(sums, labels, values)
+    held = np.bincount(labels, minlength=50) > 0
+    for columns in (1, 11):
+        found = segment_sum(arrays[0][:, :columns], arrays[1], 50)
+        np.testing.assert_allclose(found[:30], sums[:, :columns], rtol=1e-5, atol=1e-6)
+    largest = segment_max(arrays[0][:, 0], arrays[1], 50)
+    expected = [values[labels == m, 0].max(initial=-np.inf) for m in range(50)]
+    np.testing.assert_array_equal(largest, np.array(expected, np.float32))
+    shares = segment_softmax(arrays[0][:, 0], arrays[1], 50)
+    np.testing.assert_allclose(segment_sum(shares, arrays[1], 50), held, rtol=1e-5)
+
+
 def test_runs_of_one_segment_are_added_up_in_lanes():
     """Enough entries a segment for the lanes, and both ways through `vmap` and its gradient."""
     rng = np.random.default_rng(5)

@@ -36,6 +36,8 @@ _LANES = 8
 # A sum over the entries runs on vectors where they lie side by side, column by column: up to ten
 # times as fast. To bring many columns into that order costs more than it gains.
 _FEW_COLUMNS = 9
+# Up to this many masked entries, a scatter takes longer to compile than it could ever save.
+_HANDFUL = 2**12
 # In float32, a million equal numbers, added one after the other, give a thousandth too much.
 _LONGEST_SUM = 2**10
 _COUNTED_BLOCK = 32
@@ -72,7 +74,7 @@ def spread_finite(
 
     Whole numbers must be in [0, bound). A choice between few values runs on vectors anyway.
     """
-    if values.shape[0] <= FEW_CHOICES:
+    if values.shape[0] <= FEW_CHOICES or _is_handful(len(segments), values.shape[0]):
         return spread(values, segments)
     columns = stored(values.reshape(values.shape[0], -1).T, bound)
     return spread(columns.T.reshape(values.shape), segments)
@@ -94,6 +96,9 @@ def column_sums(
     columns: Float[Array, "c n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, "num_segments c"]:
     """`segment_sum` of values that lie column by column, each entry beside the next."""
+    if _is_handful(columns.shape[1], num_segments):
+        member = _members(segments, num_segments)
+        return jnp.sum(jnp.where(member, columns[:, None], jnp.zeros((), columns.dtype)), axis=2).T
     if len(columns) <= _FEW_COLUMNS:
         # A sum of several columns at once would be of columns that are chosen number by number.
         return jnp.stack([_column_sum(column, segments, num_segments) for column in columns], 1)
@@ -109,11 +114,19 @@ def _column_sum(
     return jnp.sum(jnp.where(member, column[None], jnp.zeros((), column.dtype)), axis=1)
 
 
+def _is_handful(n: int, num_segments: int) -> bool:
+    """Whether hardly any segment has two entries, and there are few: masks compile into one loop.
+
+    A tracker has a particle for each object, and most of its time to the first frame is compiling.
+    """
+    return n <= num_segments and n * num_segments <= _HANDFUL
+
+
 def segment_max(
     values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " num_segments"]:
     """The largest value in each segment, -inf in an empty one."""
-    if num_segments > FEW_SEGMENTS:
+    if num_segments > FEW_SEGMENTS and not _is_handful(len(values), num_segments):
         return _scattered("max", values, segments, num_segments, -jnp.inf)
     member = _members(segments, num_segments)
     return jnp.max(jnp.where(member, values[None], jnp.array(-jnp.inf, values.dtype)), axis=1)
@@ -143,7 +156,7 @@ def segment_reduce(
     nothing: float,
 ) -> Shaped[Array, " num_segments"]:
     """The sum ("add"), "max" or "min" of each segment's values, `nothing` for an empty one."""
-    if num_segments > FEW_SEGMENTS:
+    if num_segments > FEW_SEGMENTS and not _is_handful(len(values), num_segments):
         return _scattered(how, values, segments, num_segments, nothing)
     own = jnp.where(_members(segments, num_segments), values[None], nothing)
     return REDUCTIONS[how](own.astype(values.dtype), axis=1)
@@ -236,7 +249,7 @@ def segment_softmax(
     values = exp(log_values - spread_finite(shift, segments))
     totals = segment_sum(values, segments, num_segments)
     shares = values / spread_finite(jnp.where(totals == 0, 1.0, totals), segments)
-    if num_segments > FEW_SEGMENTS:
+    if num_segments > FEW_SEGMENTS and not _is_handful(len(values), num_segments):
         # Otherwise XLA takes the totals by a scatter, one particle after the other.
         shares = stored(shares)
     return masked_shares(log_values, shares)

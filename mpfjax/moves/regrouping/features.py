@@ -15,8 +15,10 @@ from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.segments import FEW_SEGMENTS, column_sums, segment_max, spread_finite
 from mpfjax.operations.stored import stored
 
-# Up to this many features are multiplied one by one, which runs on vectors.
+# Up to this many features are multiplied one by one, which runs on vectors, but compiles pair by
+# pair: it takes more particles than these before that is worth it.
 _FEW_FEATURES = 8
+_FEW_PARTICLES = 64
 Scale = ArrayLike | Sequence[float]
 
 
@@ -158,7 +160,7 @@ def _products(
     for entry, (i, j) in enumerate(pairs):
         entries[i, j] = entries[j, i] = entry
     columns, weights = gaps.T, weights.astype(gaps.dtype)
-    if num_features > _FEW_FEATURES:
+    if num_features > _FEW_FEATURES or len(weights) <= _FEW_PARTICLES:
         left, right = np.array(pairs).T
         return weights[None] * columns[left] * columns[right], entries
     return jnp.stack([weights * columns[i] * columns[j] for i, j in pairs]), entries
