@@ -56,8 +56,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         help="of the part on time",
     )  # fmt: skip
     parser.add_argument(
-        "--sizes", type=whole(), nargs="+", default=[10, 30, 100, 300, 1000], metavar="N",
+        "--sizes", type=whole(), nargs="+", default=[10, 30, 100, 300, 1000, 3000], metavar="N",
         help="of the part on regimes",
+    )  # fmt: skip
+    parser.add_argument(
+        "--dynamax-sizes", type=whole(), nargs="+", default=[10, 30, 100, 300], metavar="N",
+        help="of dynamax, whose program grows with N",
     )  # fmt: skip
     parser.add_argument("--steps", type=whole(), default=100)
     parser.add_argument("--seeds", type=whole(2), default=20)
@@ -266,7 +270,10 @@ def regimes(options: argparse.Namespace) -> tuple[list[str], list[list[Any]]]:
     if importlib.util.find_spec("dynamax") is None:
         print(f"{_HOW} fastprogress==1.0.3")
     else:
-        runs |= {("dynamax", size): by_dynamax(model, observations, size) for size in options.sizes}
+        runs |= {
+            ("dynamax", size): by_dynamax(model, observations, size)
+            for size in options.dynamax_sizes
+        }
     truth = np.asarray(filtered(every(options.reference), observations)(0))
     errors = {
         name: float(np.sqrt(np.mean([(once(s) - truth) ** 2 for s in range(options.seeds)])))

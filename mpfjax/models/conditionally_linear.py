@@ -51,7 +51,9 @@ class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
     - `emission(latent)`: H (p, d), c (p,), R (p, p), given z_t; or None if y_t says nothing of x.
 
     An array with a leading n has one for each particle; otherwise all particles share it. Q and R
-    may be singular. It may also define
+    may be singular. If no matrix has a leading n, every particle has the same covariance, which is
+    then computed once: a step takes a fraction of the time (Schön, Gustafsson and Nordlund 2005).
+    It may also define
 
     - `log_transition(latent, previous_latent)`: log p(z_t | z_{t-1}), (n,), which proposals,
       gradient "stop" and smoothing need;
@@ -138,16 +140,24 @@ def with_moments(model: Any, drawn: PyTree) -> PyTree:
     if not is_marginalised(model):
         return drawn
     n = jax.tree.leaves(drawn)[0].shape[0]
-    moments = model.initial_moments(drawn)
-    mean, covariance = _arrays(model, "initial_moments", moments, (1, 2), "m0 and P0")
+    mean, covariance = _initial_moments(model, drawn)
     d = mean.shape[-1]
-    _check_shape(model, "initial_moments", "P0", covariance, (d, d), n)
-    _check_shape(model, "initial_moments", "m0", mean, (d,), n)
     return MarginalisedState(
         drawn,
         jnp.broadcast_to(mean, (n, d)),
         jnp.broadcast_to(covariance, (n, d, d)),
     )
+
+
+def _initial_moments(model: Any, latent: PyTree) -> tuple[Array, Array]:
+    """m0 and P0, checked."""
+    n = jax.tree.leaves(latent)[0].shape[0]
+    moments = model.initial_moments(latent)
+    mean, covariance = _arrays(model, "initial_moments", moments, (1, 2), "m0 and P0")
+    d = mean.shape[-1]
+    _check_shape(model, "initial_moments", "P0", covariance, (d, d), n)
+    _check_shape(model, "initial_moments", "m0", mean, (d,), n)
+    return mean, covariance
 
 
 def predicted(model: Any, latent: PyTree, state: MarginalisedState) -> MarginalisedState:
@@ -161,11 +171,11 @@ def predicted(model: Any, latent: PyTree, state: MarginalisedState) -> Marginali
 
 def predicted_gaussian(model: Any, latent: PyTree, state: MarginalisedState) -> Gaussian:
     """The same with the particles last."""
-    law = gaussian_of(state)
+    law = filtered_gaussian(model, state)
     dynamics = dynamics_of(model, latent, state)
     if is_mixed(model):
         mixed, shared = latent_dynamics_of(model, state)
-        law, _ = gaussians.update(law, latent_rows(model, latent), mixed)
+        law, _ = gaussians.update_by_all(law, latent_rows(model, latent), mixed)
         dynamics = decorrelated(dynamics, mixed, shared, latent_rows(model, latent))
     return gaussians.predict(law, dynamics)
 
@@ -194,7 +204,7 @@ def updated(
     if seen is None:
         return state, None
     n, rows = state.mean.shape[0], observation_rows(model, observation, seen, state.mean.dtype)
-    law, log_density = gaussians.update(gaussian_of(state), rows, seen)
+    law, log_density = gaussians.update(filtered_gaussian(model, state), rows, seen)
     mean, covariance = particles_first(law.mean, n), particles_first(law.covariance, n)
     return MarginalisedState(state.latent, mean, covariance), jnp.broadcast_to(log_density, (n,))
 
@@ -215,7 +225,7 @@ def log_predictive(
 def latent_law(model: Any, state: MarginalisedState) -> Gaussian:
     """N(f + A m, A P Aᵀ + V), the law of z_t in the mixed form, the particles last."""
     mixed, _ = latent_dynamics_of(model, state)
-    return gaussians.predict(gaussian_of(state), mixed)
+    return gaussians.predict(filtered_gaussian(model, state), mixed)
 
 
 def latent_from_noise(
@@ -230,7 +240,9 @@ def latent_from_noise(
 def log_latent_density(model: Any, latent: Array, state: MarginalisedState) -> Float[Array, " n"]:
     """log p(z_t | z_{t-1}, y_1..y_{t-1}) of the mixed form."""
     mixed, _ = latent_dynamics_of(model, state)
-    return gaussians.update(gaussian_of(state), latent_rows(model, latent), mixed)[1]
+    return gaussians.update_by_all(
+        filtered_gaussian(model, state), latent_rows(model, latent), mixed
+    )[1]
 
 
 def latent_rows(model: Any, latent: Any) -> Float[Array, "k n"]:
@@ -241,6 +253,34 @@ def latent_rows(model: Any, latent: Any) -> Float[Array, "k n"]:
             f" (n, k), and it is {shown(latent)}"
         )
     return jnp.asarray(latent).T
+
+
+def filtered_gaussian(model: Any, state: MarginalisedState) -> Gaussian:
+    """The moments of each particle, the particles last; one covariance, if it is that of all."""
+    if _shares_covariance(model, state):
+        state = state._replace(covariance=state.covariance[0])
+    return gaussian_of(state)
+
+
+def _shares_covariance(model: Any, state: MarginalisedState) -> bool:
+    """Whether no matrix of the model depends on z, so that all particles have one covariance.
+
+    So it is computed once for all (Schön, Gustafsson and Nordlund 2005). The shapes tell it: P0, F,
+    Q, H and R, and A, V and S of the mixed form, come without a leading axis n.
+    """
+
+    def matrices(state: MarginalisedState) -> list[Array]:
+        _, initial = _initial_moments(model, state.latent)
+        found = [particles_last(initial, 2)]
+        for part in (
+            dynamics_of(model, state.latent, state),
+            emission_of(model, state.latent, state),
+            latent_dynamics_of(model, state) if is_mixed(model) else None,
+        ):
+            found += [leaf for leaf in jax.tree.leaves(part) if leaf.ndim == 3]
+        return found
+
+    return all(matrix.shape[-1] == 1 for matrix in jax.eval_shape(matrices, state))
 
 
 def gaussian_of(state: MarginalisedState) -> Gaussian:

@@ -52,10 +52,19 @@ def update(
     second order only; for one entry it takes O(d²). An entry of y that is NaN is missing.
     """
     observation, seen, present = without_missing(observation, seen)
+    law, log_density = update_by_all(state, observation, seen)
+    missing = jnp.sum((~present).astype(log_density.dtype), axis=0)
+    return law, log_density + 0.5 * math.log(2 * math.pi) * missing
+
+
+def update_by_all(
+    state: Gaussian, observation: Float[Array, "p #n"], seen: Linear
+) -> tuple[Gaussian, Float[Array, " n"]]:
+    """The same where no entry of y is missing: what all particles share stays shared."""
     factor, variances = without_correlations(seen.noise)
     rows = solve_lower(factor, seen.matrix)
-    targets = solve_lower(factor, (observation - seen.offset)[:, None])[:, 0]
-    log_density = -0.5 * math.log(2 * math.pi) * jnp.sum(present.astype(rows.dtype), axis=0)
+    targets = _kept(solve_lower(factor, (observation - seen.offset)[:, None])[:, 0])
+    log_density = jnp.asarray(-0.5 * math.log(2 * math.pi) * len(rows), rows.dtype)
     for row, target, variance in zip(rows, targets, variances, strict=True):
         state, log_factor = _update_by_one(state, row, target, variance)
         log_density = log_density + log_factor
@@ -73,18 +82,24 @@ def _update_by_one(
     spread = jnp.maximum(known, 0.0) + variance
     has_spread = spread > 0
     spread = jnp.where(has_spread, spread, jnp.finfo(mean.dtype).tiny)
+    precision, log_spread = _once(1 / spread), _once(jnp.log(spread))
     missed = target - applied(row[None], mean)[0]
-    gain = _kept(jnp.where(has_spread, 1 / spread, 0.0)[None] * seen)
+    gain = _kept(jnp.where(has_spread, precision, 0.0)[None] * seen)
     left = covariance - gain[:, None] * seen[None]
     both = left - applied(left, row)[:, None] * gain[None]
     both = both + variance[None, None] * gain[:, None] * gain[None]
-    log_density = -0.5 * (missed**2 / spread + jnp.log(spread))
+    log_density = -0.5 * (precision * missed**2 + log_spread)
     return Gaussian(mean + gain * missed[None], symmetric(both)), log_density
 
 
 def _kept(values: Float[Array, "*rest n"]) -> Float[Array, "*rest n"]:
-    """`stored` numbers of the particles: each is used d times, and would be computed d times."""
-    return values if values.shape[-1] == 1 else stored(values)
+    """`stored` numbers: each is used d times, and for each particle, and would be computed anew."""
+    return _once(values) if values.shape[-1] == 1 else stored(values)
+
+
+def _once(values: Float[Array, "*rest n"]) -> Float[Array, "*rest n"]:
+    """The values, `stored` if they are shared: they would be computed anew for each particle."""
+    return stored(values.reshape(-1)).reshape(values.shape) if values.shape[-1] == 1 else values
 
 
 def without_missing(

@@ -8,6 +8,8 @@ LAPACK is called once for each. A last axis of length 1 is a matrix that all par
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mpfjax.operations.stored import stored
+
 # The least variance, in units of the rounding error of the numbers it was computed from.
 _ROUNDINGS = 4
 
@@ -17,9 +19,12 @@ def particles_last(values: Float[Array, "..."], rank: int) -> Float[Array, "... 
     return values[..., None] if values.ndim == rank else jnp.moveaxis(values, 0, -1)
 
 
-def particles_first(values: Float[Array, "... n"], num_particles: int) -> Float[Array, "n ..."]:
-    """(..., n) as (n, ...); arrays that all particles share are repeated."""
-    values = jnp.broadcast_to(values, (*values.shape[:-1], num_particles))
+def particles_first(values: Float[Array, "... k"], num_particles: int) -> Float[Array, "n ..."]:
+    """(..., n) as (n, ...); arrays (..., 1) that all particles share are repeated."""
+    if values.shape[-1] == 1:
+        # Or each copy would be computed anew.
+        shared = stored(values[..., 0])
+        return jnp.broadcast_to(shared[None], (num_particles, *shared.shape))
     return jnp.moveaxis(values, -1, 0)
 
 

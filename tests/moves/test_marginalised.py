@@ -385,6 +385,46 @@ def test_derivatives_of_the_evidence_are_unbiased(kind):
         assert abs(values.mean() - float(expected)) < 4 * error
 
 
+class Wandering(mpfjax.AbstractConditionallyLinearModel):
+    """The latent moves by x and shifts what is seen; matrices are shared, or one a particle."""
+
+    repeated: bool = eqx.field(static=True)
+
+    def sample_initial(self, key, num_particles):
+        return jax.random.normal(key, (num_particles, 1))
+
+    def initial_moments(self, latent):
+        return LINEAR.m0, LINEAR.P0
+
+    def latent_dynamics(self, previous_latent):
+        return previous_latent, jnp.array([[0.3, 0.1]]), jnp.array([[0.2]])
+
+    def dynamics(self, latent, previous_latent):
+        A = jnp.broadcast_to(LINEAR.A, (len(latent), 2, 2)) if self.repeated else LINEAR.A
+        return A, jnp.repeat(0.1 * previous_latent, 2, axis=1), LINEAR.Q
+
+    def emission(self, latent):
+        return LINEAR.H, jnp.repeat(jnp.sin(latent), 2, axis=1), LINEAR.R
+
+
+def test_a_covariance_that_all_share_is_that_of_each():
+    """Computed once or for each particle, also where an entry or an observation is missing."""
+    series = SERIES.at[1].set(jnp.nan).at[2, 0].set(jnp.nan)
+    collected = lambda mixture: (mixture.particles.mean, mixture.particles.covariance)  # noqa: E731
+    runs = [
+        mpfjax.run_filter(
+            KEY, mpfjax.particle_filter(Wandering(repeated), 20), series, collected, missing="skip"
+        )
+        for repeated in (False, True)
+    ]
+    np.testing.assert_allclose(
+        runs[0].log_marginal_likelihood, runs[1].log_marginal_likelihood, rtol=1e-5
+    )
+    for shared, own in zip(*(run.collected for run in runs), strict=True):
+        np.testing.assert_allclose(shared, own, rtol=1e-4, atol=1e-5)
+    assert np.ptp(np.asarray(runs[0].collected[1]), axis=1).max() == 0
+
+
 class Pushed(OnePath):
     """A push that is known moves x."""
 
