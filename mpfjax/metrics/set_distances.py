@@ -11,12 +11,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
-from optax.assignment import hungarian_algorithm
 
 from mpfjax.checks import check_callable, check_finite, check_positive, check_shape, real_arrays
 
-# Without this, every call outside of `jax.jit` would compile the search again.
-_assign = jax.jit(hungarian_algorithm)
+
+@jax.jit  # without it, every call outside of `jax.jit` would compile the search again
+def _assign(costs: Float[Array, "a b"]) -> tuple[Array, Array]:
+    from optax.assignment import hungarian_algorithm  # where it is used: all of optax comes with it
+
+    return hungarian_algorithm(costs)
 
 
 class GOSPA(NamedTuple):

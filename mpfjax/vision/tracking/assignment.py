@@ -4,7 +4,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
-from optax.assignment import hungarian_algorithm
 
 from mpfjax.checks import check_finite, check_not_negative, check_positive
 from mpfjax.mixture import ParticleMixture
@@ -105,6 +104,8 @@ class Assign(AbstractMove):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
         """Assign the detections of this frame."""
+        from optax.assignment import hungarian_algorithm  # kept programs start without optax
+
         del key
         cost = self.costs(mixture, observation)
         # Each component has one more column of its own, for no detection.
