@@ -1,9 +1,14 @@
-"""What figures show: the standard errors of means are those of the sample."""
+"""What figures show: standard errors of the sample, and the moments of components."""
 
+import jax
 import numpy as np
+import pytest
 import scipy.stats
 
-from mpfjax.plotting import draw_errors_by_size, draw_overlaps, standard_error
+import mpfjax
+from mpfjax.plotting import draw_components, draw_errors_by_size, draw_overlaps, standard_error
+from tests.switching import MODEL as SWITCHING
+from tests.switching import OBSERVATIONS as SEEN
 
 RUNS = np.random.default_rng(0).normal(size=(3, 5))
 
@@ -25,3 +30,32 @@ def test_bars_and_bands_are_standard_errors():
     corners = band.get_paths()[0].vertices
     width = [np.ptp(corners[corners[:, 0] == frame, 1]) for frame in (2, 3, 4)]
     np.testing.assert_allclose(width, 2 * scipy.stats.sem(RUNS, axis=0)[1:4])
+
+
+def kept_run(model, observations):
+    filter = mpfjax.mixture_particle_filter(model, 40, 2)
+    return mpfjax.run_filter(jax.random.key(0), filter, observations, collect=None).collected
+
+
+def test_components_stand_where_their_moments_are():
+    """A dot at each living component's mean, and a bar of two deviations of particles and between."""
+    mixtures = kept_run(SWITCHING, SEEN)
+    axis = draw_components(mixtures, 1, truth=np.zeros(len(SEEN)), least_mass=0.0).axes[0]
+    lines = axis.get_lines()
+    bars = [line.get_ydata() for line in lines if len(line.get_xdata()) == 2]
+    last = jax.tree.map(lambda leaf: leaf[-1], mixtures)
+    alive = np.flatnonzero(last.mixture_weights > 0)
+    means = np.asarray(last.component_means().mean)[alive, 0]
+    deviations = np.sqrt(np.asarray(last.component_means().covariance)[alive, 0, 0])
+    for mean, deviation in zip(means, deviations, strict=True):
+        expected = [mean - 2 * deviation, mean + 2 * deviation]
+        assert any(np.allclose(bar, expected, rtol=1e-3) for bar in bars)
+    assert len(lines) == 1 + 2 * len(bars)
+
+
+def test_mixtures_without_time_and_numbers_that_are_not_there_are_named():
+    mixtures = kept_run(SWITCHING, SEEN)
+    with pytest.raises(ValueError, match="mixtures: log-weights of shape"):
+        draw_components(jax.tree.map(lambda leaf: leaf[0], mixtures))
+    with pytest.raises(ValueError, match="index: 9 of a state of"):
+        draw_components(mixtures, 9)

@@ -1,4 +1,4 @@
-"""Figures of the papers; the only file that imports matplotlib."""
+"""Figures of the papers, and of what the benchmarks measure."""
 
 import textwrap
 from collections.abc import Mapping, Sequence

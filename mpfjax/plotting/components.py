@@ -1,0 +1,72 @@
+"""A run as the moments of its components over time."""
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+from matplotlib.figure import Figure
+
+from mpfjax.checks import check_whole, shown
+from mpfjax.mixture import ParticleMixture, flatten_states
+from mpfjax.plotting.papers import COLOURS
+
+
+def draw_components(
+    mixtures: ParticleMixture,
+    index: int = 0,
+    *,
+    truth: np.ndarray | None = None,
+    least_mass: float = 0.01,
+) -> Figure:
+    """Each component's mean and two standard deviations over time, the darker the heavier.
+
+    The moments of component m are E[x | c = m] and Cov[x | c = m]. Those of a conditionally linear
+    model hold the Gaussians of the particles and the spread between them.
+
+    - `mixtures`: with a leading axis of time, as `run_filter(..., collect=None).collected`.
+    - `index`: which number of the flattened state is drawn; of a `MarginalisedState` the latent
+      comes first, then x.
+    - `truth`: (t,), a line in black. `least_mass`: components of less mass are left out.
+
+    Raises `ValueError` for an index that the state has not, and for mixtures without an axis of
+    time. Use it to see where modes part, and how much of the mass each has.
+    """
+    if mixtures.log_weights.ndim != 2:
+        raise ValueError(
+            f"mixtures: log-weights of shape {mixtures.log_weights.shape}, not (t, n); keep them by"
+            " run_filter(..., collect=None)"
+        )
+    check_whole(0, index=index)
+    masses, means, variances = map(np.asarray, jax.vmap(_moments)(mixtures))
+    if index >= means.shape[2]:
+        raise ValueError(f"index: {shown(index)} of a state of {means.shape[2]} numbers")
+    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
+    axis = figure.subplots()
+    times = np.arange(1, len(masses) + 1)
+    for m in range(masses.shape[1]):
+        mean, deviation = means[:, m, index], np.sqrt(np.maximum(variances[:, m, index], 0.0))
+        colour, label = COLOURS[m % len(COLOURS)], f"component {m + 1}"
+        for t in np.flatnonzero(masses[:, m] >= least_mass):
+            low, high = mean[t] - 2 * deviation[t], mean[t] + 2 * deviation[t]
+            alpha = 0.15 + 0.85 * float(masses[t, m])
+            axis.plot(times[[t, t]], [low, high], color=colour, lw=3, alpha=0.4 * alpha)
+            axis.plot(times[t], mean[t], "o", ms=3, mew=0, color=colour, alpha=alpha, label=label)
+            label = None
+    if truth is not None:
+        axis.plot(times, truth, color="black", lw=1, label="true state")
+    axis.set(xlabel="time step $t$", ylabel=f"state, number {index}")
+    axis.set_title("components: mean ± 2 standard deviations, darker for more mass", fontsize=10)
+    axis.grid(alpha=0.25)
+    legend = figure.legend(loc="outside lower center", fontsize=8, ncols=5)
+    for handle in legend.legend_handles:
+        if handle is not None:
+            handle.set_alpha(1.0)
+    return figure
+
+
+def _moments(
+    mixture: ParticleMixture,
+) -> tuple[Float[Array, " m"], Float[Array, "m d"], Float[Array, "m d"]]:
+    """Masses, means and variances of the components."""
+    means = mixture.component_averages(flatten_states(mixture.particles))
+    covariances = mixture.component_covariances()
+    return mixture.mixture_weights, means, covariances.diagonal(axis1=1, axis2=2)
