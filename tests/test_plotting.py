@@ -38,7 +38,7 @@ def kept_run(model, observations):
 
 
 def test_components_stand_where_their_moments_are():
-    """A dot at each living component's mean, and a bar of two deviations of particles and between."""
+    """A dot at each living component's mean; bars hold deviations within particles and between."""
     mixtures = kept_run(SWITCHING, SEEN)
     axis = draw_components(mixtures, 1, truth=np.zeros(len(SEEN)), least_mass=0.0).axes[0]
     lines = axis.get_lines()
