@@ -217,6 +217,24 @@ def test_who_moves_at_random_is_not_taken_for_a_bad_detector():
     assert (np.asarray(noises.velocity)[2:] < 0.006).all()
 
 
+def test_the_speed_of_newborn_objects_is_the_scale_of_those_before():
+    """Four objects whose first detections come anew in every frame, as often as it takes."""
+    move, (mixture, frame) = LearnNoise(MODEL, first=9), tracked()
+    boxes = np.asarray(frame.detections.boxes)[:M]
+    noises = followed(None, [move], 300, lambda t: boxes).memory["noises"]
+    moments, unit = mixture.particles.gaussian, np.ones((M, 4))
+    unit[:, :2] = np.exp(np.asarray(mixture.component_averages(moments.place))[:, 2:])
+    squares = mixture.component_averages(moments.velocity**2 + moments.var_velocity)
+    squares = np.asarray(squares, float) / unit**2
+    # One in 50 is forgotten; the prior counts as four.
+    number = M / (1 - (1 - 1 / 50) ** M)
+    prior = expected = np.asarray(MODEL.start_velocity, float) ** 2
+    for _ in range(1000):
+        trust = (move.freedom + 1) / (move.freedom + squares / expected)
+        expected = (4 * prior + number * np.mean(trust * squares, axis=0)) / (4 + number)
+    np.testing.assert_allclose(np.asarray(noises.start_velocity) ** 2, expected, rtol=0.01)
+
+
 def _little(spread):
     return 1e-4 * spread
 

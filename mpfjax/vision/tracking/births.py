@@ -125,9 +125,9 @@ class Births(AbstractMove):
         """Hypotheses for every slot, about the detection that started its component."""
         places = places_of(boxes)
         unit, still = units(places), jnp.zeros_like(places)
-        errors = noises_of(mixture, self.model).errors[None]
-        speeds = self.model.start_velocity[None]
-        moments = Gaussian(places, still, (unit * errors) ** 2, still, (unit * speeds) ** 2)
+        noises = noises_of(mixture, self.model)
+        errors, speeds = unit * noises.errors[None], unit * noises.start_velocity[None]
+        moments = Gaussian(places, still, errors**2, still, speeds**2)
         return ObjectState.of(Gaussian(*(take(moment, seats) for moment in moments)), seats)
 
     def _seats(

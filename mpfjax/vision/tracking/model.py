@@ -148,11 +148,13 @@ class Noises(NamedTuple):
 
     - `errors`: of a strong detection.
     - `place`, `velocity`: of the noise added to an object's place and velocity in a frame.
+    - `start_velocity`: of an object's velocity at its first detection.
     """
 
     errors: Float[Array, "4"]
     place: Float[Array, "4"]
     velocity: Float[Array, "4"]
+    start_velocity: Float[Array, "4"]
 
 
 class AssignedFrame(NamedTuple):
@@ -233,7 +235,9 @@ class DetectedObjectModel(eqx.Module):
     @property
     def noises(self) -> Noises:
         """The noises before anything is learned."""
-        return Noises(self.detection_deviations, self.place_noise, self.velocity_noise)
+        return Noises(
+            self.detection_deviations, self.place_noise, self.velocity_noise, self.start_velocity
+        )
 
     def predicted(self, states: ObjectState, noises: Noises) -> ObjectState:
         """The hypotheses a frame later."""

@@ -35,10 +35,12 @@ from mpfjax.vision.tracking.occlusion import in_front
 # Candidate deviations of detections, places and velocities, in boxes, wider than real ones.
 _ERRORS = (0.01, 0.02, 0.04, 0.08, 0.16)
 _PLACES = (0.005, 0.015, 0.045)
-_VELOCITIES = (0.001, 0.005, 0.025)
+_VELOCITIES = (0.001, 0.005, 0.025, 0.1)
 _GRID = np.array([(r, q, v) for r in _ERRORS for q in _PLACES for v in _VELOCITIES]).T
 # Standard deviations of the log-normal priors.
 _DOUBTS = (0.7, 0.7, 0.9)
+# The prior of newborn speeds counts as so many objects; of so many later ones, one is forgotten.
+_NEWBORN, _LATEST = 4.0, 50.0
 
 
 class Rivals(NamedTuple):
@@ -46,11 +48,14 @@ class Rivals(NamedTuple):
 
     - `owners`: the identities of the objects; `moments`: (m, L, 4) each.
     - `evidence`: (L, 4), discounted log-likelihoods of all objects together.
+    - `squares`, `newborn`: sum of squared velocities of newborn objects, in boxes; their number.
     """
 
     owners: Int[Array, " m"]
     moments: Gaussian
     evidence: Float[Array, "rivals 4"]
+    squares: Float[Array, "4"]
+    newborn: Float[Array, ""]
 
 
 class LearnNoise(AbstractMove):
@@ -61,10 +66,11 @@ class LearnNoise(AbstractMove):
     detection adds to the evidence for the candidate, which is forgotten within `memory` frames.
     Innovations have heavy tails, so that the density is Student's with `freedom` degrees of
     freedom. `Assign`, `PropagateObjects` and `Births` take the noises exp E[log σ] under the
-    posterior of the candidates, whose prior is log-normal about the model's noises. This is the
-    multiple-model filter of Magill (1965), with one model for all objects. Only strong detections
-    of objects that share them with no other count, and only after the object's `first` strong
-    detections.
+    posterior of the candidates, whose prior is log-normal about the model's noises. The speed of
+    newborn objects is the scale of Student's distribution of the velocities after `first` strong
+    detections. This is the multiple-model filter of Magill (1965), with one model for all objects.
+    Only strong detections of objects that share them with no other count, and only after the
+    object's `first` strong detections.
 
     The particles do not change. Memory: `Noises` and `Rivals`. The model changes with the data
     (`approximate` is true). Raises `ValueError` for numbers that are not positive.
@@ -97,7 +103,7 @@ class LearnNoise(AbstractMove):
         none = jnp.zeros(m, jnp.int32)
         return {
             NOISES: self.model.noises,
-            RIVALS: Rivals(none, moments, jnp.zeros((rivals, 4))),
+            RIVALS: Rivals(none, moments, jnp.zeros((rivals, 4)), jnp.zeros(4), jnp.zeros(())),
         }
 
     def __call__(
@@ -133,10 +139,37 @@ class LearnNoise(AbstractMove):
         evidence = kept * rivals.evidence + 0.5 * evidence
 
         moments = _where((detected & known)[:, None, None], posterior, moments)
-        moments = _where((detected & ~known)[:, None, None], self._started(places), moments)
+        start: Noises = mixture.memory[NOISES]
+        started = self._started(places, start.start_velocity)
+        moments = _where((detected & ~known)[:, None, None], started, moments)
         owners = jnp.where(detected | known, lives.identities, 0)
-        noises = self._noises(evidence)
-        return remember(mixture, noises=noises, rivals=Rivals(owners, moments, evidence))
+        grown = alone & strong & (lives.seen == self.first)
+        squares, newborn = self._speeds(mixture, rivals, grown)
+        speeds = jnp.sqrt(
+            (_NEWBORN * self.model.start_velocity**2 + squares) / (_NEWBORN + newborn)
+        )
+        errors, place, velocity = self._noises(evidence)
+        noises = Noises(errors, place, velocity, speeds)
+        rivals = Rivals(owners, moments, evidence, squares, newborn)
+        return remember(mixture, noises=noises, rivals=rivals)
+
+    def _speeds(
+        self, mixture: ParticleMixture, rivals: Rivals, grown: Bool[Array, " m"]
+    ) -> tuple[Float[Array, "4"], Float[Array, ""]]:
+        """The sum of squared velocities of newborn objects and their number, with this frame's.
+
+        The sum is weighted by a step of expectation maximisation for the scale of Student's
+        distribution. One in `_LATEST` is forgotten.
+        """
+        scale = mixture.memory[NOISES].start_velocity[None]
+        moments = mixture.particles.gaussian
+        unit = units(mixture.component_averages(moments.place))
+        squares = mixture.component_averages(moments.velocity**2 + moments.var_velocity) / unit**2
+        trust = (self.freedom + 1) / (self.freedom + squares / scale**2)
+        number = jnp.sum(grown).astype(scale.dtype)
+        kept = (1 - 1 / _LATEST) ** number
+        squares = jnp.sum(jnp.where(grown[:, None], trust * squares, 0.0), axis=0)
+        return kept * rivals.squares + squares, kept * rivals.newborn + number
 
     def _log_density(
         self,
@@ -153,24 +186,24 @@ class LearnNoise(AbstractMove):
         rivals = jnp.asarray(_GRID, dtype)[:, None, :, None]
         return jnp.broadcast_to(rivals, (3, 1, _GRID.shape[1], 4))
 
-    def _started(self, places: Float[Array, "m 4"]) -> Gaussian:
+    def _started(self, places: Float[Array, "m 4"], speeds: Float[Array, "4"]) -> Gaussian:
         """The moments of an object at its first detection, under every candidate."""
         errors = self._rivals(places.dtype)[0]
         shape = (len(places), errors.shape[1], 4)
         unit = units(places)[:, None]
         still = jnp.zeros(shape, places.dtype)
-        speeds = jnp.broadcast_to((unit * self.model.start_velocity[None, None]) ** 2, shape)
+        speeds = jnp.broadcast_to((unit * speeds[None, None]) ** 2, shape)
         place = jnp.broadcast_to(places[:, None], shape)
         return Gaussian(place, still, (unit * errors) ** 2, still, speeds)
 
-    def _noises(self, evidence: Float[Array, "rivals 4"]) -> Noises:
+    def _noises(self, evidence: Float[Array, "rivals 4"]) -> Float[Array, "3 4"]:
         """The geometric mean of each noise under the posterior of the candidates."""
         grid = jnp.log(self._rivals(evidence.dtype)[:, 0])
-        prior = jnp.log(jnp.stack(self.model.noises)).astype(evidence.dtype)
+        prior = jnp.log(jnp.stack(self.model.noises[:3])).astype(evidence.dtype)
         doubts = jnp.asarray(_DOUBTS, evidence.dtype)[:, None, None]
         log_prior = -0.5 * jnp.sum(((grid - prior[:, None]) / doubts) ** 2, axis=0)
         weights = jax.nn.softmax(evidence + log_prior, axis=0)
-        return Noises(*jnp.exp(jnp.sum(weights[None] * grid, axis=1)))
+        return jnp.exp(jnp.sum(weights[None] * grid, axis=1))
 
 
 def _where(chosen: Bool[Array, "m 1 1"], a: Gaussian, b: Gaussian) -> Gaussian:
