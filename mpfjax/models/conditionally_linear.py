@@ -53,6 +53,7 @@ class AbstractConditionallyLinearModel(AbstractStateSpaceModel):
     An array with a leading n has one for each particle; otherwise all particles share it. Q and R
     may be singular. If no matrix has a leading n, every particle has the same covariance, which is
     then computed once: a step takes a fraction of the time (Schön, Gustafsson and Nordlund 2005).
+    A move that gives particles covariances of their own needs F with a leading n.
     It may also define
 
     - `log_transition(latent, previous_latent)`: log p(z_t | z_{t-1}), (n,), which proposals,

@@ -145,10 +145,6 @@ class TwistedLookahead(eqx.Module):
         step = mixture.memory[STEP]["step"]
         return lambda observation, states: self.twist.log_normaliser(step, states)
 
-    def __call__(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
-        """Not defined: outside of a filter the step is unknown."""
-        raise NotImplementedError
-
 
 class PropagateTwisted(AbstractPropagation):
     """Draw the noise ε of x_t from q_t(ε | x_{t-1}), and weigh by L(y_t | x_t) N(ε; 0, I) / q_t.

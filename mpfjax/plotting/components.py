@@ -1,8 +1,10 @@
 """A run as the moments of its components over time."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from mpfjax.checks import check_whole, shown
@@ -43,14 +45,16 @@ def draw_components(
     axis = figure.subplots()
     times = np.arange(1, len(masses) + 1)
     for m in range(masses.shape[1]):
-        mean, deviation = means[:, m, index], np.sqrt(np.maximum(variances[:, m, index], 0.0))
-        colour, label = COLOURS[m % len(COLOURS)], f"component {m + 1}"
-        for t in np.flatnonzero(masses[:, m] >= least_mass):
-            low, high = mean[t] - 2 * deviation[t], mean[t] + 2 * deviation[t]
-            alpha = 0.15 + 0.85 * float(masses[t, m])
-            axis.plot(times[[t, t]], [low, high], color=colour, lw=3, alpha=0.4 * alpha)
-            axis.plot(times[t], mean[t], "o", ms=3, mew=0, color=colour, alpha=alpha, label=label)
-            label = None
+        alive = (masses[:, m] > 0) & (masses[:, m] >= least_mass)
+        if not alive.any():
+            continue
+        mean, deviation = means[alive, m, index], np.sqrt(variances[alive, m, index])
+        colour, opacity = COLOURS[m % len(COLOURS)], 0.15 + 0.85 * masses[alive, m]
+        bars = [to_rgba(colour, 0.4 * alpha) for alpha in opacity]
+        dots = [to_rgba(colour, alpha) for alpha in opacity]
+        low, high = mean - 2 * deviation, mean + 2 * deviation
+        axis.vlines(times[alive], low, high, colors=bars, lw=3)
+        axis.scatter(times[alive], mean, s=9, lw=0, c=dots, label=f"component {m + 1}")
     if truth is not None:
         axis.plot(times, truth, color="black", lw=1, label="true state")
     axis.set(xlabel="time step $t$", ylabel=f"state, number {index}")
@@ -69,4 +73,6 @@ def _moments(
     """Masses, means and variances of the components."""
     means = mixture.component_averages(flatten_states(mixture.particles))
     covariances = mixture.component_covariances()
-    return mixture.mixture_weights, means, covariances.diagonal(axis1=1, axis2=2)
+    # Rounding may leave a variance of zero slightly negative.
+    variances = jnp.maximum(covariances.diagonal(axis1=1, axis2=2), 0.0)
+    return mixture.mixture_weights, means, variances

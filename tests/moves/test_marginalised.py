@@ -410,7 +410,10 @@ class Wandering(mpfjax.AbstractConditionallyLinearModel):
 def test_a_covariance_that_all_share_is_that_of_each():
     """Computed once or for each particle, also where an entry or an observation is missing."""
     series = SERIES.at[1].set(jnp.nan).at[2, 0].set(jnp.nan)
-    collected = lambda mixture: (mixture.particles.mean, mixture.particles.covariance)  # noqa: E731
+
+    def collected(mixture):
+        return mixture.particles.mean, mixture.particles.covariance
+
     runs = [
         mpfjax.run_filter(
             KEY, mpfjax.particle_filter(Wandering(repeated), 20), series, collected, missing="skip"

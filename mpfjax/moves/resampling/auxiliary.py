@@ -29,10 +29,12 @@ class AuxiliaryResample(AbstractMove):
 
     - `resample`: the `Resample` that draws; its `ess_threshold` applies to the weights times ν.
     - `lookahead`: a function (y_t, states) -> log ν of each particle, (n,), or a proposal that has
-      `log_normaliser`, such as `GaussNewtonProposal`. The best ν is p(y_t | x_{t-1}). It must be
-      positive for every particle that can explain y_t, and its tails no thinner than those of p(y_t
-      | x_{t-1}): an overconfident ν leaves most of the weight to a few particles. Where ν is zero
-      for all particles of a component, the component is resampled by w alone.
+      `log_normaliser`, such as `GaussNewtonProposal`. Where ν depends on the step, its
+      `at_step_of(mixture)` gives that function, as of `TwistedLookahead`. The best ν is
+      p(y_t | x_{t-1}). It must be positive for every particle that can explain y_t, and its tails
+      no thinner than those of p(y_t | x_{t-1}): an overconfident ν leaves most of the weight to a
+      few particles. Where ν is zero for all particles of a component, the component is resampled
+      by w alone.
 
     Without an observation nothing is resampled. Raises `ValueError` for a `resample` with gradient
     "ot", which draws nothing, and for a look-ahead that is neither function nor such a proposal.
@@ -48,7 +50,7 @@ class AuxiliaryResample(AbstractMove):
             raise ValueError("resample: gradient 'ot' draws no ancestors that could be weighed")
         if isinstance(self.lookahead, AbstractProposal):
             require(self.lookahead, "log_normaliser", "AuxiliaryResample", "lookahead")
-        else:
+        elif not hasattr(self.lookahead, "at_step_of"):
             what = "a function of an observation and states, nor a proposal"
             check_callable(what, lookahead=self.lookahead)
 

@@ -234,13 +234,15 @@ class Resample(AbstractAdaptiveResampling):
         if self.share_by is not None:
             demands = _shares_of_groups(mixture, self.share_by(mixture.particles), due)
         elif self.allocation != "equal" and mixture.num_components > 1:
-            weighed = (
-                (mixture.log_mixture_weights, mixture.component_effective_sample_sizes)
-                if line is None
-                else (line.log_masses, line.effective_sample_sizes)
+            if line is None:
+                log_masses, present = mixture.log_mixture_weights, mixture.component_counts
+                sample_sizes = mixture.component_effective_sample_sizes
+            else:
+                log_masses, present = line.log_masses, line.counts
+                sample_sizes = line.effective_sample_sizes
+            demands = demands_by_variance(
+                log_masses, sample_sizes, present, due, mixture.num_usable_slots
             )
-            present = mixture.component_counts if line is None else line.counts
-            demands = demands_by_variance(*weighed, present, due, mixture.num_usable_slots)
         return allocate_slots(counts, due, mixture, self.particles_per_component, demands)
 
     def _log_masses(
