@@ -4,6 +4,7 @@ import pytest
 
 from benchmarks import histograms, score_vs_particles, tracking_speed
 from benchmarks.gm_mpf import __main__ as gm_mpf
+from benchmarks.hand_written_c import __main__ as hand_written_c
 from benchmarks.interacting_objects import __main__ as interacting_objects
 from benchmarks.likelihood_tuning import __main__ as likelihood_tuning
 from benchmarks.partitioned_sampling import __main__ as partitioned_sampling
@@ -14,6 +15,7 @@ from benchmarks.visual_tracking import __main__ as visual_tracking
 
 COUNTS = {
     gm_mpf: ["particles", "seeds"],
+    hand_written_c: ["particles", "seeds", "threads", "repeats"],
     histograms: ["boxes", "size", "repeats"],
     interacting_objects: ["runs"],
     likelihood_tuning: ["runs", "particles", "starts", "steps", "label-runs", "label-steps"],
