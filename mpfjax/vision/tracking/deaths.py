@@ -12,6 +12,7 @@ from mpfjax.operations.segments import spread
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
     EXTENT,
+    GUESSES,
     HIDDEN,
     LIVES,
     SCORES,
@@ -36,7 +37,8 @@ class Deaths(AbstractMove):
     that holds all detections so far.
 
     A component is shown while it is confirmed, for at most `longest_guess` frames without a
-    detection and `longest_unsure` frames without a strong one. Memory: `Lives`, together with
+    detection, or as many as `LearnGuesses` has learned, and `longest_unsure` frames without a
+    strong one. Memory: `Lives`, together with
     `Births`, and the extent of the frame.
 
     Deaths are decided and not sampled (`approximate` is true). Raises `ValueError` for a number of
@@ -104,7 +106,7 @@ class Deaths(AbstractMove):
         dies = ~spread(stays, mixture.component_indicators)
         log_weights = jnp.where(dies, -jnp.inf, mixture.log_weights)
         guesses = unseen + jnp.where(shared_detections(mixture) < 0, self._hidden(mixture), 0)
-        recent = (guesses <= self.longest_guess) & (unsure <= self.longest_unsure)
+        recent = (guesses <= self._longest_guess(mixture)) & (unsure <= self.longest_unsure)
         lives = lives._replace(
             seen=seen,
             unseen=unseen,
@@ -113,6 +115,10 @@ class Deaths(AbstractMove):
             shown=confirmed & stays & recent,
         )
         return remember(mixture.replace(log_weights=log_weights), lives=lives, extent=extent)
+
+    def _longest_guess(self, mixture: ParticleMixture) -> Int[Array, ""] | int:
+        guesses = mixture.memory.get(GUESSES)
+        return self.longest_guess if guesses is None else guesses.longest
 
     def _hidden(self, mixture: ParticleMixture) -> Int[Array, " m"]:
         return mixture.memory.get(HIDDEN, jnp.zeros(mixture.num_components, jnp.int32))

@@ -17,8 +17,8 @@ _BINS = 10  # of shares of a sure detection's score
 _CENTRES = (np.arange(_BINS) + 0.5) / _BINS
 _SURE = 0.9  # a chain that reaches this share is an object
 _SLOPE = 0.15  # the prior odds are logistic in the share, of this scale
-_PRIOR = 5.0  # detections that the prior of each bin counts as
-_KEPT = 0.995  # kept from each frame to the next
+PRIOR = 5.0  # detections that the prior of each bin counts as
+KEPT = 0.995  # kept from each frame to the next
 _SAME, _DOUBLE = 0.3, 0.6  # least overlap of boxes in a chain, and of a box with its double
 _GONE = 2  # longest gap in a chain, in frames
 
@@ -75,8 +75,8 @@ class Fates(NamedTuple):
             unseen=unseen,
             sure=sure,
             pending=jnp.where((sure | ended)[:, None], 0.0, pending),
-            good=_KEPT * self.good + good,
-            bad=_KEPT * self.bad + bad,
+            good=KEPT * self.good + good,
+            bad=KEPT * self.bad + bad,
         )
 
     def _continued(
@@ -96,8 +96,8 @@ class Fates(NamedTuple):
         """
         centres = jnp.asarray(_CENTRES, self.good.dtype)
         prior = jax.nn.sigmoid((centres - prior_share) / _SLOPE)
-        number = self.good + self.bad + _PRIOR
-        odds = jax.scipy.special.logit(rising((self.good + _PRIOR * prior) / number, number))
+        number = self.good + self.bad + PRIOR
+        odds = jax.scipy.special.logit(rising((self.good + PRIOR * prior) / number, number))
         above = jnp.argmax(odds >= 0)
         below = jnp.maximum(above - 1, 0)
         step = odds[above] - odds[below]

@@ -11,6 +11,7 @@ from mpfjax.vision.tracking.model import DetectedObjectModel, Noises, boxes_of
 SCORES, ASSIGNED, LIVES, REFERENCES = "scores", "assigned", "lives", "references"
 EXTENT, SHARED, HIDDEN, DOUBTS = "extent", "shared", "hidden", "doubts"
 CAMERA, NOISES, RIVALS, FATES = "camera", "noises", "rivals", "fates"
+GUESSES = "guesses"
 
 
 class Scores(NamedTuple):

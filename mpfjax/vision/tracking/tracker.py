@@ -31,6 +31,7 @@ from mpfjax.vision.tracking.births import Births, ShareMass
 from mpfjax.vision.tracking.camera import FollowCamera
 from mpfjax.vision.tracking.deaths import Deaths
 from mpfjax.vision.tracking.detections import Detections
+from mpfjax.vision.tracking.guesses import LearnGuesses
 from mpfjax.vision.tracking.memory import (
     LIVES,
     Lives,
@@ -101,6 +102,7 @@ class ObjectTracker(eqx.Module):
     - `RankScores`: which detections are strong, by the scores seen so far;
     - `FollowCamera`: the motion that all objects have in common;
     - `Assign`: at most one detection for each component, at the least total cost;
+    - `LearnGuesses`: for how long an object without a detection is shown;
     - a resampling, of the GM-MPF (Lin et al. 2012) or of the MPF (Vermaak et al. 2003);
     - `PropagateObjects`: a Kalman prediction and update of each hypothesis, and its weight;
     - `Deaths`: end components without detections, or outside the frame;
@@ -118,8 +120,8 @@ class ObjectTracker(eqx.Module):
 
     - `max_objects`: M; `particles_per_object`: P. None takes P from the resampling, or else 1, or
       16 where particles are weighed by colours.
-    - `frames_per_second`: of the video. An object ends after a second without a detection, and is
-      shown for a tenth of a second after its last one. None takes 25.
+    - `frames_per_second`: of the video. An object ends after a second without a detection. None
+      takes 25.
     - `resampling`: `Resample(particles_per_component=P)` for an MPF, or `GaussianRegeneration(P,
       where=lambda states: (states.place, states.velocity))`, by default with stratified noise.
     - `colours`: the bins of the histograms.
@@ -185,17 +187,19 @@ class ObjectTracker(eqx.Module):
             rate = 25.0 if frames_per_second is None else frames_per_second
             model = object_model(rate, sigma)
             assign = Assign(model)
+            deaths = Deaths(
+                patience=max(round(rate), 8),
+                longest_guess=max(round(0.1 * rate), 1),
+                longest_unsure=max(round(0.3 * rate), 1),
+            )
             moves = (
                 RankScores(strong_score=strong_score, weak_score=weak_score),
                 FollowCamera(assign),
                 assign,
+                LearnGuesses(model, deaths),
                 resampling,
                 PropagateObjects(model, matched=isinstance(resampling, GaussianRegeneration)),
-                Deaths(
-                    patience=max(round(rate), 8),
-                    longest_guess=max(round(0.1 * rate), 1),
-                    longest_unsure=max(round(0.3 * rate), 1),
-                ),
+                deaths,
                 Births(model, particles_per_object),
                 LearnNoise(model),
                 LearnAppearance(colours),
