@@ -35,8 +35,8 @@ ORDER = (
 FLOORS = {
     "operations": (
         "floats", "gradients", "platforms", "stored", "indexing", "prefix_sums", "logarithms",
-        "segments", "runs", "choices", "matrices", "stacks", "gaussians", "across_islands",
-        "generator", "positions", "sobol", "hilbert", "sorting", "compiling",
+        "segments", "runs", "choices", "matrices", "coordinates", "stacks", "gaussians",
+        "across_islands", "generator", "positions", "sobol", "hilbert", "sorting", "compiling",
         "kept_programs",
     ),
     "moves": (

@@ -7,6 +7,7 @@ import pytest
 
 from mpfjax.operations import positions
 from mpfjax.operations.choices import cond_if_any
+from mpfjax.operations.coordinates import coordinates, inner, log_total, transformed
 from mpfjax.operations.floats import default_float
 from mpfjax.operations.indexing import count_places, take
 from mpfjax.operations.logarithms import exp, log_sum_exp, softmax
@@ -568,3 +569,18 @@ def test_columns_of_no_weight_are_not_drawn_at_the_borders_of_blocks():
 def test_the_last_column_is_drawn_of_a_row_without_weight():
     found = draw_columns(jnp.array([0.0, 0.7]), jnp.zeros((2, 11)))
     np.testing.assert_array_equal(found, [10, 10])
+
+
+@pytest.mark.parametrize("d", [3, 12])
+def test_points_by_their_coordinates(d):
+    """Sums that are written out, and products of matrices where there are too many."""
+    points = RNG.normal(size=(40, d)).astype(np.float32)
+    matrix = np.tril(RNG.normal(size=(d, d))).astype(np.float32)
+    found = coordinates(jnp.asarray(points))
+    for is_lower in (False, True):
+        moved = transformed(jnp.asarray(matrix), found, is_lower)
+        np.testing.assert_allclose(jnp.stack(moved, 1), points @ matrix.T, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(inner(found, found), np.sum(points**2, axis=1), rtol=1e-5)
+    points[0] = -np.inf
+    sums = log_total(coordinates(jnp.asarray(points)))
+    np.testing.assert_allclose(sums, np.logaddexp.reduce(points, axis=1), rtol=1e-5, atol=1e-6)

@@ -1,11 +1,23 @@
 """A look-ahead over many steps: a mixture of exponentials of quadratics, with heavy tails."""
 
+import itertools
+from collections.abc import Callable
+from functools import partial
+from operator import itemgetter
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from mpfjax.operations.matrices import row_sums
+from mpfjax.operations.coordinates import Coordinates, coordinates, inner, log_total, transformed
+
+# The place of an expert.
+Index = int | Int[Array, ""]
+
+# Up to so many experts are written out, which is one loop over the particles.
+_FEW = 8
 
 
 class LocalQuadratics(eqx.Module):
@@ -27,6 +39,7 @@ class LocalQuadratics(eqx.Module):
     - `centres`, `whitening`, `log_shares`: of the experts' particles; z_k = whitening (φ - centre).
     - `constants`, `slopes`, `curvatures`: log ν_k as a quadratic in z_k.
     - `noise_means`, `noise_slopes`, `noise_factors`: m_k = mean + slope z_k, and F_k, triangular.
+    - `noise_whitening`: F_k⁻¹, of which every step and particle has use.
     - `log_floor`, `log_cap`, `defence`: log c, the cap of log ν_k, and δ.
     """
 
@@ -39,17 +52,18 @@ class LocalQuadratics(eqx.Module):
     noise_means: Float[Array, "*t k j"]
     noise_slopes: Float[Array, "*t k j d"]
     noise_factors: Float[Array, "*t k j j"]
+    noise_whitening: Float[Array, "*t k j j"]
     log_floor: Float[Array, "*t"]
     log_cap: Float[Array, "*t"]
     defence: Float[Array, "*t"]
 
     def log_normaliser(self, features: Float[Array, "n d"]) -> Float[Array, " n"]:
         """log ν."""
-        return jnp.logaddexp(self.log_fitted(features), self.log_floor)
+        return self._log_sum(self._log_parts(coordinates(features)))
 
     def log_fitted(self, features: Float[Array, "n d"]) -> Float[Array, " n"]:
         """log Σ_k r_k ν_k, without the constant c."""
-        return jax.nn.logsumexp(self._log_parts(self.whitened(features)), axis=1)
+        return log_total(self._log_parts(coordinates(features)))
 
     def draw(
         self, noise: Float[Array, "n j_and_1"], features: Float[Array, "n d"]
@@ -58,53 +72,98 @@ class LocalQuadratics(eqx.Module):
 
         The last column of the noise chooses the expert of ε, or none.
         """
-        noise, chooser = noise[:, :-1], noise[:, -1]
-        whitened = self.whitened(features)
-        log_parts = self._log_parts(whitened)
-        log_total = jnp.logaddexp(jax.nn.logsumexp(log_parts, axis=1), self.log_floor)
-        log_shares = jnp.log1p(-self.defence) + log_parts - log_total[:, None]
-        undisturbed = self.defence + (1 - self.defence) * jnp.exp(self.log_floor - log_total)
-        upto = jnp.cumsum(jnp.exp(log_shares), axis=1)
-        chosen = jnp.sum(jax.scipy.special.ndtr(chooser)[:, None] >= upto, axis=1, dtype=jnp.int32)
-        means = self.noise_means[None] + jnp.einsum("kjd,nkd->nkj", self.noise_slopes, whitened)
-        of_experts = means + jnp.einsum("kij,nj->nki", self.noise_factors, noise)
-        is_chosen = chosen[:, None] == jnp.arange(means.shape[1], dtype=jnp.int32)[None]
-        drawn = jnp.sum(jnp.where(is_chosen[:, :, None], of_experts, 0.0), axis=1)
-        drawn = jnp.where(jnp.any(is_chosen, axis=1)[:, None], drawn, noise)
-        identity = jnp.eye(noise.shape[1], dtype=noise.dtype)
-        inverses = jax.scipy.linalg.solve_triangular(
-            self.noise_factors, jnp.broadcast_to(identity, self.noise_factors.shape), lower=True
-        )
-        residuals = jnp.einsum("kij,nkj->nki", inverses, drawn[:, None] - means)
-        log_volumes = jnp.sum(jnp.log(jnp.diagonal(inverses, axis1=1, axis2=2)), axis=1)
-        log_ratios = 0.5 * (row_sums(drawn**2)[:, None] - jnp.sum(residuals**2, axis=2))
-        log_ratios = log_shares + log_ratios + log_volumes[None]
-        log_ratio = jnp.logaddexp(jax.nn.logsumexp(log_ratios, axis=1), jnp.log(undisturbed))
-        return drawn, -log_ratio
+        states = coordinates(features)
+        *standard, chooser = coordinates(noise)
+        log_parts = self._log_parts(states)
+        log_sum = self._log_sum(log_parts)
+        log_shares = [jnp.log1p(-self.defence) + log_part - log_sum for log_part in log_parts]
+        undisturbed = self.defence + (1 - self.defence) * jnp.exp(self.log_floor - log_sum)
 
-    def whitened(self, features: Float[Array, "n d"]) -> Float[Array, "n k d"]:
-        """z_k of each particle."""
-        centred = features[:, None] - self.centres[None]
-        return jnp.einsum("kij,nkj->nki", self.whitening, centred)
+        def draw_of(k: Index) -> Coordinates:
+            own = transformed(self.noise_factors[k], standard, is_lower=True)
+            return [mean + part for mean, part in zip(self._mean(k, states), own, strict=True)]
 
-    def log_near(self, whitened: Float[Array, "n k d"]) -> Float[Array, "n k"]:
+        uniform = jax.scipy.special.ndtr(chooser)
+        upto = list(itertools.accumulate(jnp.exp(log_share) for log_share in log_shares))
+        drawn = standard
+        for limit, of_expert in reversed(list(zip(upto, self._each(draw_of), strict=True))):
+            drawn = [
+                jnp.where(uniform < limit, own, other)
+                for own, other in zip(of_expert, drawn, strict=True)
+            ]
+        norm = inner(drawn, drawn)
+
+        def log_ratio_of(k: Index) -> Float[Array, " n"]:
+            away = [x - mean for x, mean in zip(drawn, self._mean(k, states), strict=True)]
+            residuals = transformed(self.noise_whitening[k], away, is_lower=True)
+            log_volume = jnp.sum(jnp.log(jnp.diagonal(self.noise_whitening[k])))
+            return 0.5 * (norm - inner(residuals, residuals)) + log_volume
+
+        ratios = zip(log_shares, self._each(log_ratio_of), strict=True)
+        log_ratios = [log_share + log_ratio for log_share, log_ratio in ratios]
+        return jnp.stack(drawn, axis=1), -log_total([*log_ratios, jnp.log(undisturbed)])
+
+    def whitened(self, features: Float[Array, "n d"]) -> Float[Array, "k d n"]:
+        """z_k of each particle, the particles last."""
+        states = coordinates(features)
+        return jnp.stack([jnp.stack(z) for z in self._each(partial(self._whitened, points=states))])
+
+    def log_near(self, features: Float[Array, "n d"]) -> Float[Array, "k n"]:
         """log r_k: by the Gaussians of the experts' particles."""
-        log_near = self.log_shares[None] - 0.5 * jnp.sum(whitened**2, axis=2)
-        return log_near - jax.nn.logsumexp(log_near, axis=1, keepdims=True)
+        states = coordinates(features)
 
-    def _log_parts(self, whitened: Float[Array, "n k d"]) -> Float[Array, "n k"]:
-        """log r_k ν_k."""
-        d = whitened.shape[2]
+        def log_density_of(k: Index) -> Float[Array, " n"]:
+            z = self._whitened(k, states)
+            return self.log_shares[k] - 0.5 * inner(z, z)
+
+        log_densities = self._each(log_density_of)
+        log_sum = log_total(log_densities)
+        return jnp.stack([log_density - log_sum for log_density in log_densities])
+
+    def _log_sum(self, log_parts: Coordinates) -> Float[Array, " n"]:
+        """log ν of its parts."""
+        return jnp.logaddexp(log_total(log_parts), self.log_floor)
+
+    def _log_parts(self, points: Coordinates) -> Coordinates:
+        """log r_k ν_k of each expert."""
+        pairs = self._each(partial(self._log_density_and_normaliser, points=points))
+        log_sum = log_total([log_density for log_density, _ in pairs])
+        return [log_density - log_sum + log_normaliser for log_density, log_normaliser in pairs]
+
+    def _log_density_and_normaliser(
+        self, k: Index, points: Coordinates
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """log r_k but for its sum over k, and log ν_k."""
+        z = self._whitened(k, points)
+        d, square = len(z), inner(z, z)
         # Three standard deviations above the mean of a χ² of d degrees of freedom.
         most = (d + 3 * (2 * d) ** 0.5) ** 0.5
-        radius = jnp.sqrt(jnp.maximum(jnp.sum(whitened**2, axis=2), 1e-12))
-        within = whitened * jnp.minimum(1.0, most / radius)[:, :, None]
-        log_normalisers = self.constants[None] + jnp.einsum("nkd,kd->nk", within, self.slopes)
-        curved = jnp.einsum("nkd,kde->nke", within, self.curvatures)
-        log_normalisers = log_normalisers + 0.5 * jnp.sum(curved * within, axis=2)
-        log_normalisers = jnp.minimum(log_normalisers, self.log_cap)
+        radius = jnp.sqrt(jnp.maximum(square, 1e-12))
+        inwards = jnp.minimum(1.0, most / radius)
+        within = [inwards * x for x in z]
+        curved = transformed(self.curvatures[k], within)
+        bent = [self.slopes[k, i] + 0.5 * x for i, x in enumerate(curved)]
+        log_normaliser = jnp.minimum(self.constants[k] + inner(bent, within), self.log_cap)
         beyond = jnp.maximum(radius - most, 0.0)
-        return self.log_near(whitened) + log_normalisers - 0.5 * beyond**2
+        return self.log_shares[k] - 0.5 * square, log_normaliser - 0.5 * beyond**2
+
+    def _whitened(self, k: Index, points: Coordinates) -> Coordinates:
+        """z_k."""
+        centred = [x - self.centres[k, i] for i, x in enumerate(points)]
+        return transformed(self.whitening[k], centred, is_lower=True)
+
+    def _mean(self, k: Index, points: Coordinates) -> Coordinates:
+        """m_k(x)."""
+        moved = transformed(self.noise_slopes[k], self._whitened(k, points))
+        return [self.noise_means[k, i] + x for i, x in enumerate(moved)]
+
+    def _each(self, function: Callable[[Index], Any]) -> list[Any]:
+        """What the function gives for each expert: written out for few, a loop over many."""
+        num_experts = self.centres.shape[-2]
+        if num_experts <= _FEW:
+            return [function(k) for k in range(num_experts)]
+        found = jax.lax.map(function, jnp.arange(num_experts, dtype=jnp.int32))
+        return [jax.tree.map(itemgetter(k), found) for k in range(num_experts)]
 
 
 def neutral(
@@ -113,8 +172,9 @@ def neutral(
     """ψ = 1: no information about later observations."""
     k, d, j = num_experts, num_features, num_noises
     zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731
+    identities = jnp.broadcast_to(jnp.eye(j, dtype=dtype), (k, j, j))
     return LocalQuadratics(
         zeros(k, d), zeros(k, d, d), zeros(k), zeros(k), zeros(k, d), zeros(k, d, d),
-        zeros(k, j), zeros(k, j, d), jnp.broadcast_to(jnp.eye(j, dtype=dtype), (k, j, j)),
+        zeros(k, j), zeros(k, j, d), identities, identities,
         log_floor=jnp.full((), -jnp.inf, dtype), log_cap=zeros(), defence=jnp.ones((), dtype),
     )  # fmt: skip

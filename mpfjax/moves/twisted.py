@@ -117,7 +117,7 @@ class TwistInitial(AbstractMove):
         psi, model = self.twist.initial, cast(HasInitialNoise, self.model)
         shape, dtype = (mixture.num_particles, model.initial_noise_dimension + 1), psi.slopes.dtype
         noise = draw_noise(self.noise, key, shape, dtype)
-        drawn, log_ratio = psi.draw(noise, jnp.zeros((shape[0], 0), dtype))
+        drawn, log_ratio = psi.draw(noise, jnp.zeros((shape[0], 1), dtype))
         states = model.initial_from_noise(drawn)
         check_moved(states, mixture.particles, self.model, "initial_from_noise")
         log_weights = mixture.log_weights + log_ratio.astype(mixture.log_weights.dtype)

@@ -113,15 +113,15 @@ def _fit_step(points: _Points, used: LocalQuadratics) -> LocalQuadratics:
     log_volumes = jnp.sum(jnp.log(jnp.diagonal(inverses, axis1=1, axis2=2)), axis=1)
     log_shares = jnp.where(alive, log_volumes, -jnp.inf)
     located = _replaced(used, centres=means, whitening=inverses, log_shares=log_shares)
-    whitened = located.whitened(points.features)
-    near = jnp.exp(located.log_near(whitened))
+    near = jnp.exp(located.log_near(points.features)).T
     weights = _tempered(points.log_importance, near, points.num_needed)
     weights = weights / jnp.maximum(jnp.sum(weights, axis=0), 1e-30)[None]
 
     def fit(of_expert: tuple[Array, Array]) -> "_Expert":
         return _integrated(*_regressed(*of_expert, points.noise, points.targets))
 
-    experts = jax.lax.map(fit, (weights.T, jnp.moveaxis(whitened, 1, 0)))
+    whitened = jnp.swapaxes(located.whitened(points.features), 1, 2)
+    experts = jax.lax.map(fit, (weights.T, whitened))
     missed = jnp.sum(jnp.where(alive, experts.missed, 0.0)) / _count(alive, points.targets.dtype)
     return _replaced(
         located,
@@ -131,6 +131,7 @@ def _fit_step(points: _Points, used: LocalQuadratics) -> LocalQuadratics:
         noise_means=experts.noise_mean,
         noise_slopes=experts.noise_slope,
         noise_factors=experts.noise_factor,
+        noise_whitening=_inverses(experts.noise_factor),
         log_cap=jnp.max(points.targets),
         defence=jnp.clip(missed, _LEAST_DEFENCE, _MOST_DEFENCE),
     )
@@ -168,12 +169,12 @@ def _fit_initial(
         shape = (size, dimension + 1)
         dtype = used.slopes.dtype
         standard = jax.random.normal(key, shape, dtype)
-        noise, log_ratio = psi.draw(standard, jnp.zeros((size, 0), dtype))
+        noise, log_ratio = psi.draw(standard, jnp.zeros((size, 1), dtype))
         features = twist.features_of(model.initial_from_noise(noise))
         return noise, features, first.log_fitted(features) + log_ratio
 
     noise, features, log_importance = draw(key_used, used)
-    near = jnp.exp(first.log_near(first.whitened(features)))
+    near = jnp.exp(first.log_near(features)).T
     weights = _tempered(log_importance, near, needed)
     means, factors = _moments(noise, weights)
     shares = jax.nn.softmax(log_importance) @ near
@@ -185,6 +186,7 @@ def _fit_initial(
         log_shares=jnp.log(shares),
         noise_means=means,
         noise_factors=factors,
+        noise_whitening=_inverses(factors),
         defence=jnp.full_like(used.defence, _MOST_DEFENCE),
     )
     log_weights = draw(key_fitted, fitted)[2]

@@ -117,7 +117,8 @@ def _knowing_nothing(
     steps = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (length + 1, *leaf.shape)), one)
     initial = None
     if starts_from_noise(model):
-        initial = neutral(size, 0, model.initial_noise_dimension, dtype)
+        # x_0 has no state before it: one feature, which is zero.
+        initial = neutral(size, 1, model.initial_noise_dimension, dtype)
     return Twist(steps, initial, features)
 
 
