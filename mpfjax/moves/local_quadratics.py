@@ -3,21 +3,15 @@
 import itertools
 from collections.abc import Callable
 from functools import partial
-from operator import itemgetter
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from mpfjax.operations.coordinates import Coordinates, coordinates, inner, log_total, transformed
 
-# The place of an expert.
-Index = int | Int[Array, ""]
-
-# Up to so many experts are written out, which is one loop over the particles.
-_FEW = 8
+Index = Int[Array, ""]
 
 
 class LocalQuadratics(eqx.Module):
@@ -83,10 +77,11 @@ class LocalQuadratics(eqx.Module):
             own = transformed(self.noise_factors[k], standard, is_lower=True)
             return [mean + part for mean, part in zip(self._mean(k, states), own, strict=True)]
 
+        of_experts = zip(*self._each(draw_of), strict=True)
         uniform = jax.scipy.special.ndtr(chooser)
         upto = list(itertools.accumulate(jnp.exp(log_share) for log_share in log_shares))
         drawn = standard
-        for limit, of_expert in reversed(list(zip(upto, self._each(draw_of), strict=True))):
+        for limit, of_expert in reversed(list(zip(upto, of_experts, strict=True))):
             drawn = [
                 jnp.where(uniform < limit, own, other)
                 for own, other in zip(of_expert, drawn, strict=True)
@@ -106,7 +101,7 @@ class LocalQuadratics(eqx.Module):
     def whitened(self, features: Float[Array, "n d"]) -> Float[Array, "k d n"]:
         """z_k of each particle, the particles last."""
         states = coordinates(features)
-        return jnp.stack([jnp.stack(z) for z in self._each(partial(self._whitened, points=states))])
+        return jnp.stack(self._each(partial(self._whitened, points=states)), axis=1)
 
     def log_near(self, features: Float[Array, "n d"]) -> Float[Array, "k n"]:
         """log r_k: by the Gaussians of the experts' particles."""
@@ -117,8 +112,7 @@ class LocalQuadratics(eqx.Module):
             return self.log_shares[k] - 0.5 * inner(z, z)
 
         log_densities = self._each(log_density_of)
-        log_sum = log_total(log_densities)
-        return jnp.stack([log_density - log_sum for log_density in log_densities])
+        return log_densities - log_total(list(log_densities))[None]
 
     def _log_sum(self, log_parts: Coordinates) -> Float[Array, " n"]:
         """log ν of its parts."""
@@ -126,9 +120,9 @@ class LocalQuadratics(eqx.Module):
 
     def _log_parts(self, points: Coordinates) -> Coordinates:
         """log r_k ν_k of each expert."""
-        pairs = self._each(partial(self._log_density_and_normaliser, points=points))
-        log_sum = log_total([log_density for log_density, _ in pairs])
-        return [log_density - log_sum + log_normaliser for log_density, log_normaliser in pairs]
+        function = partial(self._log_density_and_normaliser, points=points)
+        log_densities, log_normalisers = self._each(function)
+        return list(log_densities - log_total(list(log_densities))[None] + log_normalisers)
 
     def _log_density_and_normaliser(
         self, k: Index, points: Coordinates
@@ -157,13 +151,12 @@ class LocalQuadratics(eqx.Module):
         moved = transformed(self.noise_slopes[k], self._whitened(k, points))
         return [self.noise_means[k, i] + x for i, x in enumerate(moved)]
 
-    def _each(self, function: Callable[[Index], Any]) -> list[Any]:
-        """What the function gives for each expert: written out for few, a loop over many."""
-        num_experts = self.centres.shape[-2]
-        if num_experts <= _FEW:
-            return [function(k) for k in range(num_experts)]
-        found = jax.lax.map(function, jnp.arange(num_experts, dtype=jnp.int32))
-        return [jax.tree.map(itemgetter(k), found) for k in range(num_experts)]
+    def _each(self, function: Callable[[Index], PyTree]) -> PyTree:
+        """What the function gives for each expert, stacked.
+
+        A loop keeps it. Written out, XLA would compute it again wherever it is used.
+        """
+        return jax.lax.map(function, jnp.arange(self.centres.shape[-2], dtype=jnp.int32))
 
 
 def neutral(
