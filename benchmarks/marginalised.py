@@ -2,6 +2,7 @@
 
     python -m benchmarks.marginalised --parts time
     python -m benchmarks.marginalised --parts regimes
+    python -m benchmarks.marginalised --parts bearings
 
 `time`: propagation and weighing of a state of two latent and four linear numbers, of which
 particles draw the latent ones alone, beside `Propagate`, which draws all six; in turns, processor
@@ -14,6 +15,12 @@ particles that looks at all children, as RMS over steps and seeds. dynamax takes
 installed (pip install --no-deps dynamax; pip install tfp-nightly dm-tree fastprogress==1.0.3). The
 last column is the filter's error over that of the best of ours in the same time, between whose
 sizes the logarithms are interpolated.
+
+`bearings`: the scene of docs/masses.md. Errors of the masses and of log Ẑ over --runs keys and
+processor time of a run, as a ratio, of the mixture filter of 1000 particles, the same with
+marginalised velocity, and the filters of --learned-sizes that look ahead by what passes of 16 000
+particles learned. The time to learn, which is spent once for a series, is a column of its own;
+compiling is left out of it.
 
 Into --out DIR goes marginalised.json.
 """
@@ -32,10 +39,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 import mpfjax
+from benchmarks.masses import marginalised_bearings, measure
+from benchmarks.masses.filters import FILTERS
+from benchmarks.masses.scenes import SCENES, Scene
 from mpfjax.console import exit_status, format_table, whole, write_json
+from mpfjax.smoothing import learn_lookahead
 
 Once = Callable[[int], Any]
-PARTS = ("time", "regimes")
+PARTS = ("time", "regimes", "bearings")
 OURS = ("marginalised", "fully adapted", "all children")
 STAYS, DYNAMICS, ERRORS = 0.8, 0.2, 10 * np.array([2.0, 1.0, 2.0, 1.0])
 _HOW = "dynamax is not there: pip install --no-deps dynamax; pip install tfp-nightly dm-tree"
@@ -63,6 +74,11 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         "--dynamax-sizes", type=whole(), nargs="+", default=[10, 30, 100, 300], metavar="N",
         help="of dynamax, whose program grows with N",
     )  # fmt: skip
+    parser.add_argument(
+        "--learned-sizes", type=whole(), nargs="+", default=[100, 150, 200, 1000], metavar="N",
+        help="of the part on bearings",
+    )  # fmt: skip
+    parser.add_argument("--runs", type=whole(2), default=100, help="of the part on bearings")
     parser.add_argument("--steps", type=whole(), default=100)
     parser.add_argument("--seeds", type=whole(2), default=20)
     parser.add_argument("--repeats", type=whole(), default=15, help="turns, each of all that run")
@@ -76,7 +92,7 @@ def run(options: argparse.Namespace) -> None:
     out, results = Path(options.out), {}
     out.mkdir(parents=True, exist_ok=True)
     for part in options.parts:
-        header, rows = {"time": time_of_steps, "regimes": regimes}[part](options)
+        header, rows = TABLES[part](options)
         results[part] = [dict(zip(header, row, strict=True)) for row in rows]
         print(format_table(header, [[_shown(value) for value in row] for row in rows]))
         write_json(out / "marginalised.json", {"settings": vars(options), "results": results})
@@ -329,6 +345,58 @@ def by_dynamax(model: mpfjax.SwitchingLinearGaussianModel, observations: Array, 
         return jax.vmap(shares)(found["weights"], found["states"])
 
     return lambda seed: once(jax.random.PRNGKey(seed))
+
+
+def bearings(options: argparse.Namespace) -> tuple[list[str], list[list[Any]]]:
+    """Errors and time of each filter, and what was spent on learning."""
+    make, num_steps = SCENES["bearings"]
+    scene = make(num_steps, 0)
+    velocity = scene._replace(
+        model=marginalised_bearings.MarginalisedBearings(),
+        region=marginalised_bearings.is_above,
+        grouping=scene.grouping | {"features": marginalised_bearings.position},
+    )
+    known = measure.truth(scene, options.reference, 1)
+    plain, size = FILTERS["MPF"], 1000
+    learned, seconds = learning(scene, plain(scene, size))
+    rows = {
+        ("MPF", size): (scene, plain(scene, size), 0.0),
+        ("MPF, marginalised velocity", size): (velocity, plain(velocity, size), 0.0),
+    }
+    for fewer in options.learned_sizes:
+        filter = mpfjax.Filter(
+            learned.model, learned.moves, fewer, learned.num_components, learned.initial_moves
+        )
+        rows["MPF, learned look-ahead", fewer] = scene, filter, seconds
+    observations = jnp.asarray(scene.observations)
+    runs: dict[Any, Once] = {
+        name: lambda seed, filter=filter: _evidence(seed, filter, observations)
+        for name, (_, filter, _) in rows.items()
+    }
+    taken = milliseconds(runs, options.repeats)
+    base, found = taken["MPF", size], []
+    for name, (own, filter, spent) in rows.items():
+        errors = measure.errors(own, filter, known, options.runs, 0)
+        ratio = float(np.median(taken[name] / base))
+        found.append([*name, errors["mass_rmse"], errors["log_z_rmse"], ratio, spent])
+    header = ["filter", "N", "error of masses", "error of log Ẑ", "time of a run", "s to learn"]
+    return header, found
+
+
+def learning(scene: Scene, filter: mpfjax.Filter) -> tuple[mpfjax.Filter, float]:
+    """The filter that learned to look ahead, and the seconds of the processor once compiled."""
+    taken = 0.0
+    for _ in range(2):
+        start = time.process_time()
+        learned = learn_lookahead(
+            jax.random.key(0), filter, scene.observations, features=scene.features
+        )
+        jax.block_until_ready(jax.tree.leaves(learned))
+        taken = time.process_time() - start
+    return learned, taken
+
+
+TABLES = {"time": time_of_steps, "regimes": regimes, "bearings": bearings}
 
 
 if __name__ == "__main__":

@@ -20,10 +20,10 @@ TURNS = np.array([0.0, 0.12, -0.12], np.float32)
 _STAYS = 0.9
 # A normal number below the first keeps the mode; those above it, in equal parts, are for each mode.
 _DRAWS_OF_MODE = [NormalDist().inv_cdf(_STAYS + (1 - _STAYS) * i / 3) for i in range(3)]
-_ACCELERATION = 0.1
-_NOISE = 0.1
-_START = np.array([5.0, 0.0, 0.0, 0.0], np.float32)
-_SPREAD = np.array([3.0, 3.0, 0.15, 0.15], np.float32)
+ACCELERATION = 0.1
+NOISE = 0.1
+START = np.array([5.0, 0.0, 0.0, 0.0], np.float32)
+SPREAD = np.array([3.0, 3.0, 0.15, 0.15], np.float32)
 _TRUTH = np.array([3.0, 4.0, 0.12, -0.03])
 
 
@@ -52,16 +52,15 @@ class BearingsModel(mpfjax.AbstractStateSpaceModel):
     def initial_from_noise(self, noise: Float[Array, "n 4"]) -> PyTree:
         """The same from standard normal numbers."""
         return {
-            "motion": _START[None] + _SPREAD[None] * noise,
+            "motion": START[None] + SPREAD[None] * noise,
             "mode": jnp.zeros(len(noise), jnp.int32),
         }
 
     def transition_from_noise(self, noise: Float[Array, "n 3"], states: PyTree) -> PyTree:
         """Two accelerations and a mode from three standard normal numbers."""
-        drawn = sum((noise[:, 2] > bound).astype(jnp.int32) for bound in _DRAWS_OF_MODE[1:])
-        mode = jnp.where(noise[:, 2] < _DRAWS_OF_MODE[0], states["mode"], drawn)
+        mode = drawn_mode(noise[:, 2], states["mode"])
         return {
-            "motion": _moved(states["motion"], mode, _ACCELERATION * noise[:, :2]),
+            "motion": _moved(states["motion"], mode, ACCELERATION * noise[:, :2]),
             "mode": mode,
         }
 
@@ -72,8 +71,14 @@ class BearingsModel(mpfjax.AbstractStateSpaceModel):
 
     def log_likelihood(self, observation: Float[Array, "2"], states: PyTree) -> Float[Array, " n"]:
         """Independent Gaussian errors of the two angles."""
-        errors = (observation[:, None] - heard(states["motion"])) / _NOISE
-        return -0.5 * jnp.sum(errors**2, axis=0) - 2 * jnp.log(_NOISE * jnp.sqrt(2 * jnp.pi))
+        errors = (observation[:, None] - heard(states["motion"])) / NOISE
+        return -0.5 * jnp.sum(errors**2, axis=0) - 2 * jnp.log(NOISE * jnp.sqrt(2 * jnp.pi))
+
+
+def drawn_mode(noise: Float[Array, " n"], mode: Array) -> Array:
+    """The next mode, made of a standard normal number."""
+    drawn = sum((noise > bound).astype(jnp.int32) for bound in _DRAWS_OF_MODE[1:])
+    return jnp.where(noise < _DRAWS_OF_MODE[0], mode, drawn)
 
 
 def heard(motion: Float[Array, "n 4"]) -> Float[Array, "2 n"]:
@@ -106,9 +111,9 @@ def observations(num_steps: int, seed: int) -> np.ndarray:
     motion, found = jnp.asarray(_TRUTH[None], jnp.float32), []
     for step in range(num_steps):
         turning = num_steps // 3 <= step < num_steps // 2
-        pushed = jnp.asarray(_ACCELERATION * rng.normal(size=(1, 2)), jnp.float32)
+        pushed = jnp.asarray(ACCELERATION * rng.normal(size=(1, 2)), jnp.float32)
         motion = _moved(motion, jnp.asarray([2 if turning else 0]), pushed)
-        found.append(np.asarray(heard(motion))[:, 0] + _NOISE * rng.normal(size=2))
+        found.append(np.asarray(heard(motion))[:, 0] + NOISE * rng.normal(size=2))
     return np.array(found, np.float32)
 
 

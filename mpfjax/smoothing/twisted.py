@@ -12,6 +12,7 @@ from jaxtyping import Array, Key, PyTree
 from mpfjax.checks import check_callable, check_key, check_type, check_whole, given
 from mpfjax.filter import Filter
 from mpfjax.models.base import mapped, require_noise, starts_from_noise
+from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import noise_dtype
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.every import Every
@@ -84,7 +85,8 @@ def learn_lookahead(
       model is wrapped by `per_particle`. None is the flattened state.
     - `inputs`, `missing`: those of `run_filter`; steps without an observation are looked over.
 
-    Raises `ValueError` for another filter, and for a model that makes x_t otherwise. Use it if all
+    Raises `ValueError` for another filter, and for a model that makes x_t otherwise or is
+    conditionally linear. Use it if all
     observations are known from the start: for log Ẑ in `metropolis_hastings` and `smc2`, to compare
     models, and for the masses of modes at the end.
     """
@@ -93,6 +95,7 @@ def learn_lookahead(
     check_whole(num_passes=num_passes, **given(num_particles=num_particles))
     check_callable("features of the states", **given(features=features))
     model: Any = filter.model
+    refuse_marginalised(model, "learn_lookahead", "learn from a model that draws x as well")
     require_noise(model, "learn_lookahead")
     series = as_series(observations, inputs, missing, model)
     twist = _knowing_nothing(key, filter, series.length, mapped(model, features))

@@ -12,6 +12,7 @@ import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter
 from mpfjax.smoothing import learn_lookahead
 from tests.marking import thorough
+from tests.switching import MODEL as REGIMES
 
 NUM_RUNS = 400
 GRID = jnp.linspace(-4.0, 4.0, 1601)
@@ -170,6 +171,12 @@ def test_samplers_take_it():
                 jax.random.key(0), mpfjax.Filter(SQUARE, [mpfjax.Propagate(SQUARE)], 20), PATH
             ),
             "filter: its moves need one Resample",
+        ),
+        (
+            lambda: learn_lookahead(
+                jax.random.key(0), mpfjax.particle_filter(REGIMES, 20), PATH[:, None]
+            ),
+            "model: .* is conditionally linear, and learn_lookahead needs",
         ),
     ],
 )
