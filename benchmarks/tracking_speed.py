@@ -2,11 +2,12 @@
 
     python -m benchmarks.tracking_speed
 
-24 objects of 100 x 250 pixels walk before a still camera in a rendered video of 1920 x 1080, and
-in the same video at 384 x 288. Each way of tracking them is a process of its own, so that its peak
-memory is its own; they take turns, so that what else the machine does is shared by all. Making the
-frames is not timed, as reading them is not; nothing is written. The first round compiles and is not
-counted. `frames/s` is that of the best round. Into --out DIR goes tracking_speed.json.
+24 objects of 100 x 250 pixels walk before a still camera in a rendered video of 1920 x 1080, and in
+the same video at 384 x 288. Without pixels there are also 60 and 150, which are smaller. Each way
+of tracking them is a process of its own, so that its peak memory is its own; they take turns, so
+that what else the machine does is shared by all. Making the frames is not timed, as reading them is
+not; nothing is written. The first round compiles and is not counted. `frames/s` is that of the best
+round. Into --out DIR goes tracking_speed.json.
 """
 
 import argparse
@@ -29,12 +30,10 @@ from mpfjax.vision.tracking.adapters import LEAST_ROOM
 from mpfjax.vision.tracking.background import BackgroundSubtraction
 from mpfjax.vision.tracking.track import make_tracker, track
 
-ROWS, COLUMNS = 3, 8
-NUM_OBJECTS = ROWS * COLUMNS
-BOX = 100 / 1920, 250 / 1080  # as shares of the frame
+FEW, MORE, CROWD = (3, 8), (6, 10), (10, 15)  # rows and columns of objects
+BOX = 100 / 240, 250 / 360  # as shares of an object's field
 LARGE, SMALL = (1080, 1920), (288, 384)
 ERROR = 0.02  # of a detection, in boxes
-ROOM = 40  # for objects, as `mpfjax track --detections` has it for a file with so many a frame
 
 
 class Way(NamedTuple):
@@ -43,6 +42,17 @@ class Way(NamedTuple):
     name: str
     size: tuple[int, int] | None
     detect: bool = False
+    fields: tuple[int, int] = FEW
+
+    @property
+    def num_objects(self) -> int:
+        """As many as there are fields."""
+        return self.fields[0] * self.fields[1]
+
+    @property
+    def room(self) -> int:
+        """Room for objects, as `mpfjax track` has it for a file with so many a frame, or none."""
+        return LEAST_ROOM if self.detect else 8 * -(-3 * self.num_objects // 16)
 
 
 WAYS = (
@@ -50,35 +60,40 @@ WAYS = (
     Way("384 x 288", SMALL),
     Way("1920 x 1080, --detect", LARGE, detect=True),
     Way("no pixels", None),
+    Way("no pixels, 60 objects", None, fields=MORE),
+    Way("no pixels, 150 objects", None, fields=CROWD),
 )
 
 
 class Street:
     """A video of so many objects, each of which walks to and fro in a field of its own."""
 
-    def __init__(self, height: int, width: int) -> None:
+    def __init__(self, height: int, width: int, fields: tuple[int, int] = FEW) -> None:
         generator = np.random.default_rng(0)
-        field = np.array([width / COLUMNS, height / ROWS])
-        where = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), axis=-1).reshape(-1, 2)
+        rows, columns = fields
+        field = np.array([width / columns, height / rows])
+        where = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
         self.centres = (where + 0.5) * field
-        self.box = np.round(np.array(BOX) * [width, height])
+        self.box = np.round(np.array(BOX) * field)
         self.reach = 0.5 * (field - self.box) * [0.9, 0.5]
-        self.phases = generator.uniform(0, 2 * np.pi, (NUM_OBJECTS, 2))
+        self.phases = generator.uniform(0, 2 * np.pi, (len(self.centres), 2))
         blocks = generator.integers(90, 130, (height // 12 + 1, width // 12 + 1, 3))
         self.background = blocks.repeat(12, 0).repeat(12, 1)[:height, :width].astype(np.uint8)
         # Dark or bright clothes before a middling background, from head to foot.
-        self.clothes = generator.choice([10, 40, 200, 240], (NUM_OBJECTS, 6, 3)).astype(np.uint8)
+        self.clothes = generator.choice([10, 40, 200, 240], (len(self.centres), 6, 3)).astype(
+            np.uint8
+        )
 
     def boxes(self, t: int) -> np.ndarray:
         """(x, y, w, h) of each object, whole pixels."""
         centres = self.centres + self.reach * np.sin(0.1 * t + self.phases)
         corners = np.round(centres - self.box / 2)
-        return np.concatenate([corners, np.tile(self.box, (NUM_OBJECTS, 1))], axis=1)
+        return np.concatenate([corners, np.tile(self.box, (len(self.centres), 1))], axis=1)
 
     def detected(self, t: int) -> tuple[np.ndarray, np.ndarray]:
         """Boxes with errors, and scores."""
-        noise = np.random.default_rng(t).normal(0, ERROR, (NUM_OBJECTS, 4))
-        return self.boxes(t) + noise * np.tile(self.box, 2), np.full(NUM_OBJECTS, 0.9)
+        noise = np.random.default_rng(t).normal(0, ERROR, (len(self.centres), 4))
+        return self.boxes(t) + noise * np.tile(self.box, 2), np.full(len(self.centres), 0.9)
 
     def frame(self, t: int) -> np.ndarray:
         """The picture; in the first, nobody is there yet."""
@@ -95,7 +110,7 @@ class Timed:
 
     def __init__(self, way: Way) -> None:
         self.clock = Clock("read", "detect", "track")
-        street = Street(*(way.size or LARGE))
+        street = Street(*(way.size or LARGE), way.fields)
         frames = None
         if way.size is not None:
             frames = self.clock.over("read", map(street.frame, _count()))
@@ -103,7 +118,7 @@ class Timed:
             detections: Any = self._detecting(BackgroundSubtraction())
         else:
             detections = self.clock.over("read", map(street.detected, _count()))
-        tracker = make_tracker("gm_mpf", LEAST_ROOM if way.detect else ROOM)
+        tracker = make_tracker("gm_mpf", way.room)
         self.tracked = self.clock.over("track", track(frames, detections, tracker))
 
     def _detecting(self, background: BackgroundSubtraction) -> Callable[[np.ndarray], np.ndarray]:
@@ -253,7 +268,6 @@ def settings_of(options: argparse.Namespace) -> dict[str, Any]:
     return {
         "frames": options.frames,
         "rounds": options.rounds,
-        "objects": NUM_OBJECTS,
         "jax": jax.__version__,
         "mpfjax": mpfjax.__version__,
         "machine": platform.machine(),
