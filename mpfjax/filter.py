@@ -1,69 +1,58 @@
 """A filter: a chain of moves on a particle mixture, one step at a time."""
 
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple, cast
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Int, Key, PyTree
 
-from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole
-from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import (
-    AbstractStateSpaceModel,
-    HasInitialNoise,
-    check_model,
-    check_states,
-    starts_from_noise,
+from mpfjax.checks import (
+    check_flag,
+    check_key,
+    check_numbered,
+    check_one_of,
+    check_type,
+    check_whole,
 )
-from mpfjax.models.conditionally_linear import with_moments
+from mpfjax.mixture import ParticleMixture, single_component
+from mpfjax.models.base import AbstractStateSpaceModel, check_model
 from mpfjax.models.inputs import saying_that_none_were_given
-from mpfjax.models.noise import NOISES, draw_noise
+from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import (
     AbstractMarkovMove,
     AbstractMove,
+    AbstractPropagation,
     AbstractRegrouping,
     AbstractResampling,
 )
-from mpfjax.moves.eve_indices import EVE_INDICES, evidence_variance, mass_variances
 from mpfjax.moves.every import Every, with_inner
+from mpfjax.moves.initial import (
+    START,
+    StartMemory,
+    at_start,
+    choose_initial,
+    leaving_start,
+    looking_moves,
+    sample_initial,
+    started,
+    unless_chosen,
+)
 from mpfjax.moves.island_interaction import IslandInteraction
 from mpfjax.moves.memory import check_memory
 from mpfjax.moves.parents import runner
-from mpfjax.moves.results import as_moves, check_result, check_weighed
+from mpfjax.moves.report import StepInfo, step_info
+from mpfjax.moves.results import as_moves, check_result, check_weighed, normalised
 from mpfjax.moves.sharing import give_inputs, tie, untie
 from mpfjax.observations import Fault, faults_of, one_input, one_observation, raise_faults
-from mpfjax.operations.across_islands import excess_over_islands, island_index, num_islands
+from mpfjax.operations.across_islands import island_index, num_islands
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
-from mpfjax.operations.floats import default_float
 from mpfjax.operations.generator import split
-from mpfjax.operations.logarithms import scaled_log_sum_exp
-
-
-class StepInfo(eqx.Module):
-    """The report of a step, which comes with its mixture."""
-
-    log_likelihood_increment: Float[Array, ""]
-    """log p(y_t | y_1..y_{t-1}), estimated; -inf where every particle has zero likelihood."""
-    effective_sample_sizes: Float[Array, " m"]
-    """of each component of the new mixture, zero for a dead one."""
-    mixture_weights: Float[Array, " m"]
-    """the mass of each component of the new mixture."""
-    resampled: Bool[Array, " m"]
-    """which components of the mixture that the step was given were resampled."""
-    degenerate: Bool[Array, ""]
-    """whether every particle had zero likelihood: the weights are then those of the prediction."""
-    labels_ran_out: Bool[Array, ""]
-    """whether all M > 1 labels are in use, so that more modes share one; see `Split.is_diffuse`."""
-    log_marginal_likelihood_error: Float[Array, ""] | None = None
-    """the standard error of log Ẑ of all steps so far, from this one run; None unless the filter
-    is one of `mpfjax.smoothing.with_first_ancestors`."""
-    mixture_weight_errors: Float[Array, " m"] | None = None
-    """the standard error of each mixture weight; None likewise."""
-
 
 # Moves that do not change the total mass; there is nothing to normalise after them.
 _KEEP_MASS = (AbstractRegrouping, AbstractResampling, AbstractMarkovMove, IslandInteraction)
+_FOR_THE_START = 2**31  # folded into the key of the first step
 BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
 
@@ -73,6 +62,8 @@ class Start(NamedTuple):
     key: Key[Array, "*seeds"]
     particles: PyTree = None
     """one for each slot; the slots after the first `num_particles` are empty."""
+    pool: PyTree = None
+    """the draws of x_0 that a filter with `initial_draws` chooses from, likewise."""
     num_particles: Int[Array, "*seeds"] | None = None
 
 
@@ -91,12 +82,17 @@ class Filter(eqx.Module):
     - `initial_moves`: regrouping of x_0, such as `KMeans(reseed=True)`.
     - `initial_noise`: the noise of x_0 where the model has `initial_from_noise`: "independent", as
       the model's own `sample_initial` draws it, "rqmc" or "stratified"; see `Propagate`.
+    - `initial_draws`: K. With more than one, the first step draws x_0 anew, K N times, and keeps N
+      by what they say of y_1 (`choose_initial`): a wide prior is covered as by K N particles, at
+      the cost of 2 K more draws of x_1 in the whole run. A run's `initial` has those that were
+      kept, and their weights. A first step that only predicts leaves x_0 as it is.
     - `starts_empty`: at time 0 no slot holds a particle, and later all may become empty again.
       Moves start components, as the births of a tracker. A step without any mass has an increment
       of zero.
 
     Raises `ValueError` for N < 1, M < 1, N < M, no moves, moves that never use an observation, or
-    fewer slots than `particles_per_component` asks for.
+    fewer slots than `particles_per_component` asks for; and for K > 1 with `starts_empty`, or with
+    propagations other than `Propagate`, `PropagateMarginalised` and `PropagateNested`.
     """
 
     model: AbstractStateSpaceModel
@@ -106,6 +102,7 @@ class Filter(eqx.Module):
     num_components: int = eqx.field(static=True)
     initial_noise: str = eqx.field(static=True)
     starts_empty: bool = eqx.field(static=True)
+    initial_draws: int = eqx.field(static=True)
 
     def __init__(
         self,
@@ -116,6 +113,7 @@ class Filter(eqx.Module):
         initial_moves: Iterable[AbstractMove] = (),
         initial_noise: str = "independent",
         starts_empty: bool = False,
+        initial_draws: int = 1,
     ) -> None:
         check_model(model, "Filter")
         moves = as_moves(moves, "moves")
@@ -140,6 +138,12 @@ class Filter(eqx.Module):
         check_flag(starts_empty=starts_empty)
         self.initial_noise = initial_noise
         self.starts_empty = bool(starts_empty)
+        check_whole(initial_draws=initial_draws)
+        if initial_draws > 1:
+            num_drawn = 2 * initial_draws * num_particles
+            check_numbered("draws up to", num_drawn, initial_draws=initial_draws)
+            looking_moves(moves, starts_empty)
+        self.initial_draws = int(initial_draws)
 
     @property
     def moves(self) -> tuple[Any, ...]:
@@ -157,7 +161,10 @@ class Filter(eqx.Module):
         return any(getattr(move, "approximate", True) for move in self.moves)
 
     def init(self, key: Key[Array, ""]) -> ParticleMixture:
-        """The mixture at time 0: draws of x_0 with equal weights, grouped by the initial moves."""
+        """The mixture at time 0: draws of x_0 with equal weights, grouped by the initial moves.
+
+        A filter with `initial_draws` draws x_0 anew when it sees y_1; `choose_initial` has these.
+        """
         check_key(key)
         start = Start(key, self._sample_initial(key))
         return with_floats_traced(lambda filter: _from_particles(filter, start), self)
@@ -167,7 +174,7 @@ class Filter(eqx.Module):
         with saying_that_none_were_given(self.model):
             return sample_initial(key_initial, self.model, self.num_particles, self.initial_noise)
 
-    def _init(self, start: Start) -> ParticleMixture:
+    def _init(self, start: Start, grouped: bool = True) -> ParticleMixture:
         keys = split_keys(start.key, 1 + len(self._initial_moves))
         particles = start.particles
         if particles is None:
@@ -177,12 +184,57 @@ class Filter(eqx.Module):
             if isinstance(move, AbstractMove):
                 memory |= move.initial_memory(self.num_components)
         mixture = single_component(particles, self.num_components, start.num_particles)
+        if self.initial_draws > 1:
+            memory[START] = at_start()
         mixture = mixture.replace(memory=memory)
-        for move_key, move in zip(keys[1:], self.initial_moves, strict=True):
-            mixture = move(move_key, mixture)
+        if grouped:
+            mixture = self._grouped(keys[1:], mixture)
         if self.starts_empty:
             mixture = mixture.replace(log_weights=jnp.full_like(mixture.log_weights, -jnp.inf))
         return mixture
+
+    def _grouped(self, keys: Sequence[Key[Array, ""]], mixture: ParticleMixture) -> ParticleMixture:
+        for move_key, move in zip(keys, self.initial_moves, strict=True):
+            mixture = move(move_key, mixture)
+        return mixture
+
+    def with_one_draw(self) -> "Filter":
+        """The filter with `initial_draws` of one, for runs that keep plain draws of x_0."""
+        if self.initial_draws == 1:
+            return self
+        return Filter(
+            self.model, self.moves, self.num_particles, self.num_components,
+            self.initial_moves, self.initial_noise,
+        )  # fmt: skip
+
+    def choose_initial(
+        self,
+        key: Key[Array, ""],
+        mixture: ParticleMixture,
+        observation: PyTree,
+        pool: PyTree = None,
+    ) -> ParticleMixture:
+        """The mixture of x_0 that the first step, of this key and observation, goes on from.
+
+        `step` calls it, and draws the same from this mixture as from that of `init`. Call it before
+        where the history of an online run is kept: ancestor indices of the first step refer to
+        it. `pool` are the draws of `sample_pool`, where that was called before.
+        """
+        _, key_choice, *move_keys = self._start_keys(key)
+        if pool is None:
+            with saying_that_none_were_given(self.model):
+                pool = self.sample_pool(key)
+        moves = looking_moves(self.moves, self.starts_empty)
+        chosen = choose_initial(key_choice, mixture, pool, moves, observation, self.initial_noise)
+        return self._grouped(move_keys, chosen)
+
+    def sample_pool(self, key: Key[Array, ""]) -> PyTree:
+        """The K N draws of x_0 of the first step, of this key."""
+        number = self.initial_draws * self.num_particles
+        return sample_initial(self._start_keys(key)[0], self.model, number, self.initial_noise)
+
+    def _start_keys(self, key: Key[Array, ""]) -> list[Key[Array, ""]]:
+        return split_keys(jax.random.fold_in(key, _FOR_THE_START), 2 + len(self._initial_moves))
 
     def with_inputs(self, inputs: PyTree) -> "Filter":
         """The filter at a step whose known inputs are u_t, which every model in it receives.
@@ -239,25 +291,36 @@ class Filter(eqx.Module):
                 f"mixture: its num_components, {mixture.num_components}, is not the filter's,"
                 f" {self.num_components}"
             )
+        if self.initial_draws > 1:
+            choose = lambda prior: self.choose_initial(key, prior, observation)  # noqa: E731
+            is_prior = mixture.memory[START].is_prior
+            mixture = jax.lax.cond(is_prior, choose, lambda mixture: mixture, mixture)
         mixture = _own_ancestors(mixture)
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
         run = runner(self._moves)
+        start: StartMemory | None = mixture.memory.get(START)
         for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
+            if start is not None and isinstance(move, AbstractPropagation):
+                increment += start.log_mass.astype(increment.dtype)
+                mixture, start = started(mixture), None
             if isinstance(move, AbstractMove):
-                resampled |= move.would_resample(mixture, observation)
+                due = move.would_resample(mixture, observation)
+                resampled |= due if start is None else due & ~start.is_chosen
             after = (self._forgetting,) if isinstance(move, Every) else ()
             with saying_that_none_were_given(self.model):
                 moved = run(move, move_key, mixture, observation, *after)
+            if start is not None:
+                moved = unless_chosen(moved, mixture)
             moved = check_result(moved, mixture, move)
             if after:
                 mixture = moved
                 continue
             if not isinstance(move, _KEEP_MASS):
-                moved, log_growth = _normalise(moved, mixture, self.starts_empty)
+                moved, log_growth = normalised(moved, mixture, self.starts_empty)
                 increment += log_growth
             mixture = self._forgetting(moved)
-        return mixture.replace(parents=None), _report(mixture, increment, resampled)
+        return mixture.replace(parents=None), step_info(mixture, increment, resampled)
 
     def _forgetting(self, mixture: ParticleMixture) -> ParticleMixture:
         """The mixture without any memory of components that have died."""
@@ -273,6 +336,7 @@ class Filter(eqx.Module):
         self, key: Key[Array, ""], mixture: ParticleMixture
     ) -> tuple[ParticleMixture, StepInfo]:
         mixture = _own_ancestors(mixture)
+        mixture = leaving_start(mixture)
         for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
             if not isinstance(move, AbstractMove):
                 raise ValueError(f"moves: {move!r} does not define predict, for a missing y_t")
@@ -280,7 +344,7 @@ class Filter(eqx.Module):
                 moved = move.predict(move_key, mixture)
             mixture = self._forgetting(check_result(moved, mixture, move))
         increment = jnp.zeros((), mixture.log_weights.dtype)
-        return mixture, _report(mixture, increment, jnp.zeros(self.num_components, bool))
+        return mixture, step_info(mixture, increment, jnp.zeros(self.num_components, bool))
 
 
 def step_and_faults(
@@ -310,71 +374,6 @@ def _from_particles(filter, start):
 def _predict_and_faults(filter, key, mixture, inputs):
     moved, info = filter.with_inputs(inputs)._predict(key, mixture)
     return moved, info, faults_of(filter.model, None, inputs)
-
-
-def sample_initial(
-    key: Key[Array, ""],
-    model: AbstractStateSpaceModel,
-    num_particles: int,
-    noise: str = "independent",
-) -> PyTree:
-    """The particles of x_0, of this noise if the model can; raises for leaves of another length."""
-    if noise == "independent" or not starts_from_noise(model):
-        particles = model.sample_initial(key, num_particles)
-    else:
-        maker = cast(HasInitialNoise, model)
-        shape = (num_particles, maker.initial_noise_dimension)
-        particles = maker.initial_from_noise(draw_noise(noise, key, shape, default_float()))
-    check_states(particles, model, "sample_initial", num_particles)
-    return with_moments(model, particles)
-
-
-def _normalise(
-    mixture: ParticleMixture, previous: ParticleMixture, may_be_empty: bool
-) -> tuple[ParticleMixture, Float[Array, ""]]:
-    """Remove the growth of the mass. If no mass is left, keep the previous weights or, where a
-    mixture may be empty, none.
-
-    The scale is removed first, which is exact. If it were added to it, the sum of the weights would
-    be lost to rounding.
-    """
-    log_sum, log_largest = scaled_log_sum_exp(mixture.log_weights)
-    own_scale = jnp.zeros_like(log_sum) if mixture.log_scale is None else mixture.log_scale
-    log_excess, log_total, log_scale = excess_over_islands(own_scale, log_largest, log_sum)
-    has_mass = log_total > -jnp.inf
-    log_share = log_excess - jnp.where(has_mass, log_total, 0.0)
-    normalised = (mixture.log_weights - log_largest) + log_share
-    # A comparison with NaN is false, but NaN is not a step of zero likelihood.
-    keep = has_mass | jnp.isnan(log_total)
-    without_mass = mixture.log_weights if may_be_empty else previous.log_weights
-    log_weights = jnp.where(keep, normalised, without_mass)
-    log_growth = log_scale + log_total
-    if may_be_empty:
-        log_growth = jnp.where(keep, log_growth, 0.0)
-    return mixture.replace(log_weights=log_weights, log_scale=None), log_growth
-
-
-def _report(
-    mixture: ParticleMixture, increment: Float[Array, ""], resampled: Bool[Array, " m"]
-) -> StepInfo:
-    degenerate = increment == -jnp.inf
-    of_evidence = of_masses = None
-    # Families may have members on several islands.
-    if EVE_INDICES in mixture.memory and num_islands() == 1:
-        variance = jnp.where(degenerate, jnp.inf, evidence_variance(mixture))
-        of_evidence = jnp.sqrt(jnp.maximum(variance, 0.0))
-        of_masses = jnp.sqrt(jnp.maximum(mass_variances(mixture), 0.0))
-    sizes = mixture.component_effective_sample_sizes
-    return StepInfo(
-        log_likelihood_increment=increment,
-        effective_sample_sizes=sizes,
-        mixture_weights=mixture.mixture_weights,
-        resampled=resampled,
-        degenerate=degenerate,
-        labels_ran_out=jnp.all(sizes > 0) & (mixture.num_components > 1),
-        log_marginal_likelihood_error=of_evidence,
-        mixture_weight_errors=of_masses,
-    )
 
 
 def _own_ancestors(mixture: ParticleMixture) -> ParticleMixture:

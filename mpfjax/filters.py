@@ -31,6 +31,7 @@ from mpfjax.proposals import AbstractProposal
 
 # K-means starts from the components of a few steps before, and needs few iterations.
 _WARM_ITERATIONS = 2
+_INITIAL_DRAWS = 4
 
 
 def particle_filter(
@@ -43,6 +44,7 @@ def particle_filter(
     sort_by: SortBy | None = None,
     noise: str = "independent",
     num_draws: int = 1,
+    initial_draws: int = 1,
     gradient: str = "none",
 ) -> Filter:
     """The standard particle filter: resample, propagate.
@@ -53,7 +55,7 @@ def particle_filter(
     `num_draws` is that of `PropagateNested`: each particle draws this many x_t and keeps one.
     `noise` is that of `Propagate`. With "rqmc", particles are ordered along a Hilbert curve of
     their state unless `sort_by` is given, and the filter is sequential quasi-Monte Carlo (Gerber
-    and Chopin 2015).
+    and Chopin 2015). `initial_draws` is that of `Filter`.
     """
     sort_by = _standing(sort_by, noise)
     resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
@@ -62,6 +64,7 @@ def particle_filter(
         moves=[resample, propagation(model, proposal, gradient, noise, num_draws)],
         num_particles=num_particles,
         initial_noise=noise,
+        initial_draws=initial_draws,
     )
 
 
@@ -116,6 +119,7 @@ def mixture_particle_filter(
     sort_by: SortBy | None = None,
     noise: str = "independent",
     num_draws: int = 1,
+    initial_draws: int | None = None,
     gradient: str = "none",
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
@@ -136,10 +140,11 @@ def mixture_particle_filter(
     those moves, for example with other thresholds, and have their own features and scale.
     `regroup_every` is k where they run at every k-th step (see `Every`): take 1 where modes move
     fast, or where a `Merge` counts frames with its `patience`. `gradient`, `noise` and `num_draws`
-    are those of `particle_filter`, `lookahead` that of `auxiliary_particle_filter`, and
-    `allocation` that of `Resample`. With `noise="rqmc"` each component has a point set of its own,
-    and the masses of modes are far more accurate. Use it where the filtering distribution has
-    several modes and all of them must be kept.
+    are those of `particle_filter`, `lookahead` that of `auxiliary_particle_filter`, `allocation`
+    that of `Resample`. `initial_draws` is that of `Filter`; None is four, and one if M is one: the
+    plain filter. With `noise="rqmc"` each component has a point set of its own, and the masses of
+    modes are far more accurate. Use it where the filtering distribution has several modes and all
+    of them must be kept.
     """
     sort_by = _standing(sort_by, noise)
     resample = Resample(
@@ -150,9 +155,11 @@ def mixture_particle_filter(
     moves = [resampling(resample, lookahead), propagate]
     seen: dict[str, Any] = {"features": mapped(model, features), "scale": scale}
     kmeans = KMeans(_WARM_ITERATIONS, **seen) if kmeans is None else kmeans
+    if initial_draws is None:
+        initial_draws = 1 if max_components == 1 else _INITIAL_DRAWS
     return _mixture_filter(
         model, num_particles, max_components, moves, features, scale,
-        merge, split, kmeans, initial_kmeans, regroup_every, noise,
+        merge, split, kmeans, initial_kmeans, regroup_every, noise, initial_draws,
     )  # fmt: skip
 
 
@@ -241,16 +248,9 @@ def partitioned_sampling(
         orders = check_orders(order, model.num_objects, "order")
         if orders.shape[0] != 1:
             raise ValueError(f"order: {orders.shape[0]} orders where there is one component")
-    return Filter(
-        model,
-        moves=[
-            Resample(scheme, ess_threshold, gradient=gradient),
-            Partitioned(
-                model, orders, scheme=scheme, ess_threshold=ess_threshold, gradient=gradient
-            ),
-        ],
-        num_particles=num_particles,
-    )
+    settings: dict[str, Any] = {"ess_threshold": ess_threshold, "gradient": gradient}
+    partitioned = Partitioned(model, orders, scheme=scheme, **settings)
+    return Filter(model, [Resample(scheme, **settings), partitioned], num_particles)
 
 
 def distributed_partitioned_sampling(
@@ -372,6 +372,7 @@ def _mixture_filter(
     initial_kmeans: KMeans | None,
     regroup_every: int,
     noise: str,
+    initial_draws: int = 1,
 ) -> Filter:
     """The given moves, then regrouping; x_0 grouped by K-means from seeds."""
     check_whole(max_components=max_components, regroup_every=regroup_every)
@@ -391,10 +392,6 @@ def _mixture_filter(
     if regroup_every > 1:
         regroup = [Every(regroup_every, regroup)]
     return Filter(
-        model,
-        moves=[*moves, *regroup],
-        num_particles=num_particles,
-        num_components=max_components,
-        initial_moves=[initial_kmeans],
-        initial_noise=noise,
-    )
+        model, [*moves, *regroup], num_particles, max_components,
+        [initial_kmeans], noise, initial_draws=initial_draws,
+    )  # fmt: skip

@@ -234,6 +234,8 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "pf adaptive": _pf(ess_threshold=0.5),
     "pf ssp": _pf(scheme="ssp"),
     "pf rqmc": _pf(noise="rqmc"),
+    "pf of many initial draws": _pf(initial_draws=5),
+    "pf rqmc of many initial draws": _pf(noise="rqmc", num_draws=2, initial_draws=3),
     "auxiliary pf, adaptive": lambda model: mpfjax.auxiliary_particle_filter(
         model, NUM_PARTICLES, GaussNewtonProposal(model), ess_threshold=0.5
     ),

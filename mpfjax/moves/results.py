@@ -1,12 +1,15 @@
-"""Checks of the moves of a filter: there are some, one weighs, and each returns a mixture."""
+"""The moves of a filter, checked: there are some, one weighs, each returns a mixture; its mass."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from mpfjax.checks import check_callable, is_series, shown
 from mpfjax.mixture import ParticleMixture
+from mpfjax.operations.across_islands import excess_over_islands
+from mpfjax.operations.logarithms import scaled_log_sum_exp
 
 
 def as_moves(moves: Any, name: str) -> tuple[Any, ...]:
@@ -51,3 +54,28 @@ def check_weighed(moves: tuple[Any, ...]) -> None:
             f"moves: {names} never weigh the particles by what is observed, and log Ẑ would be 0;"
             " Propagate does, or Reweight after Predict"
         )
+
+
+def normalised(
+    mixture: ParticleMixture, previous: ParticleMixture, may_be_empty: bool
+) -> tuple[ParticleMixture, Float[Array, ""]]:
+    """Remove the growth of the mass. If no mass is left, keep the previous weights or, where a
+    mixture may be empty, none.
+
+    The scale is removed first, which is exact. If it were added to it, the sum of the weights would
+    be lost to rounding.
+    """
+    log_sum, log_largest = scaled_log_sum_exp(mixture.log_weights)
+    own_scale = jnp.zeros_like(log_sum) if mixture.log_scale is None else mixture.log_scale
+    log_excess, log_total, log_scale = excess_over_islands(own_scale, log_largest, log_sum)
+    has_mass = log_total > -jnp.inf
+    log_share = log_excess - jnp.where(has_mass, log_total, 0.0)
+    shares = (mixture.log_weights - log_largest) + log_share
+    # A comparison with NaN is false, but NaN is not a step of zero likelihood.
+    keep = has_mass | jnp.isnan(log_total)
+    without_mass = mixture.log_weights if may_be_empty else previous.log_weights
+    log_weights = jnp.where(keep, shares, without_mass)
+    log_growth = log_scale + log_total
+    if may_be_empty:
+        log_growth = jnp.where(keep, log_growth, 0.0)
+    return mixture.replace(log_weights=log_weights, log_scale=None), log_growth

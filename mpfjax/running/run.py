@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_flag, check_key, check_whole, given
-from mpfjax.filter import Filter, Start, sample_initial, split_keys
+from mpfjax.filter import Filter, Start, split_keys
 from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import choose_devices, over_devices
@@ -108,7 +109,7 @@ def monte_carlo(
     def run(filter: Filter) -> FilterRun:
         starts = Start(keys)
         if slots is not None:
-            starts, filter = _in_slots(keys, filter, slots)
+            starts, filter = _in_slots(keys, filter, slots, series.length)
         arguments = (filter, series, collect, *bars)
         leave_to_caller = devices is None and is_traced((starts, arguments))
         chosen = None if leave_to_caller else choose_devices(devices)
@@ -125,30 +126,43 @@ def _run(key, filter, series, collect, bar=None):
     return scan(Start(key), filter, series, collect, bar)
 
 
-def _in_slots(keys: Key[Array, " seeds"], filter: Filter, slots: int) -> tuple[Start, Filter]:
+def _in_slots(
+    keys: Key[Array, " seeds"], filter: Filter, slots: int, num_steps: int
+) -> tuple[Start, Filter]:
     """The starts of the runs and the filter, both with this number of slots whatever N is."""
     num_particles = filter.num_particles
     if slots < num_particles:
         raise ValueError(f"slots: {slots} is no whole number of at least N, {num_particles}")
     # A model's draws may depend on N, as stratified draws do. So this is a separate program.
-    particles = _sample_each(keys, filter.model, num_particles, int(slots), filter.initial_noise)
+    particles, pool = _sample_each(keys, filter, int(slots), num_steps)
     limits = jnp.full(keys.shape, num_particles, jnp.int32)
     filter = Filter(
         filter.model, filter.moves, int(slots), filter.num_components, filter.initial_moves,
-        filter.initial_noise,
+        filter.initial_noise, initial_draws=filter.initial_draws,
     )  # fmt: skip
-    return Start(keys, particles, limits), filter
+    return Start(keys, particles, pool, limits), filter
 
 
 @jit_on_wide_vectors
-def _sample_each(keys, model, num_particles, slots, noise):
-    """x_0 of each run; the slots that stay empty hold one of its states as well."""
+def _sample_each(keys, filter, slots, num_steps):
+    """x_0 of each run, and the draws that it is chosen from; slots that stay empty hold one of its
+    states as well.
+    """
+    n = filter.num_particles
 
-    def sample(key: Key[Array, ""]) -> PyTree:
-        key_initial = split_keys(split_keys(key, 2)[0], 1)[0]
-        particles = sample_initial(key_initial, model, num_particles, noise)
-        index = np.minimum(np.arange(slots), num_particles - 1)
+    def filled(particles: PyTree, number: int, slots: int) -> PyTree:
+        index = np.minimum(np.arange(slots), number - 1)
         return jax.tree.map(lambda leaf: leaf[index], particles)
+
+    def sample(key: Key[Array, ""]) -> tuple[PyTree, PyTree]:
+        key_initial, key_steps = split_keys(key, 2)
+        key_initial = split_keys(key_initial, 1)[0]
+        particles = sample_initial(key_initial, filter.model, n, filter.initial_noise)
+        pool, draws = None, filter.initial_draws
+        if draws > 1:
+            pool = filter.sample_pool(jax.random.split(key_steps, num_steps)[0])
+            pool = filled(pool, draws * n, draws * slots)
+        return filled(particles, n, slots), pool
 
     return jax.vmap(sample)(keys)
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from mpfjax.checks import check_callable, check_type, given, saying
 from mpfjax.filter import BROKEN_DENSITY, Filter, Start, StepInfo, split_keys
 from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.initial import leaving_start
 from mpfjax.observations import Series
 from mpfjax.operations.across_islands import num_islands
 from mpfjax.running.progress import Bar, advance_bar
@@ -58,10 +59,35 @@ def scan(
         return mixture, (kept, report_of(info))
 
     numbers = None if bar is None else jnp.arange(series.length, dtype=jnp.int32)
-    steps = (jax.random.split(key_steps, series.length), series, numbers)
-    initial = _share_of_islands(filter._init(start._replace(key=key_initial)))
+    step_keys = jax.random.split(key_steps, series.length)
+    steps = (step_keys, series, numbers)
+    start = start._replace(key=key_initial)
+    initial, filter = first_mixture(start, filter, step_keys[0], series)
+    initial = _share_of_islands(initial)
     final, outputs = jax.lax.scan(advance, initial, steps)
     return run_of(initial, final, *outputs)
+
+
+def first_mixture(
+    start: Start, filter: Filter, key: Key[Array, ""], series: Series
+) -> tuple[ParticleMixture, Filter]:
+    """The mixture of x_0 that the first step, of this `key`, goes on from; and the filter for the
+    steps, which need not choose it any more.
+
+    A run has y_1 before it starts, so that its `initial` is what the particles descend from.
+    """
+    if filter.initial_draws == 1:
+        return filter._init(start), filter
+    first = jax.tree.map(lambda leaf: leaf[0], series)
+    given = filter.with_inputs(first.inputs)
+
+    def choose(initial: ParticleMixture) -> ParticleMixture:
+        return given.choose_initial(key, initial, first.observations, start.pool)
+
+    if first.present is None:
+        return choose(filter._init(start, grouped=False)), filter.with_one_draw()
+    initial = jax.lax.cond(first.present, choose, leaving_start, filter._init(start))
+    return initial, filter.with_one_draw()
 
 
 class StepReport(NamedTuple):

@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import as_numbers, check_flag, check_key, check_type, shown
-from mpfjax.filter import Filter, Start, sample_initial
+from mpfjax.filter import Filter, Start
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, model_name, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
@@ -24,6 +24,7 @@ from mpfjax.moves.conditional import (
     put,
 )
 from mpfjax.moves.every import Every
+from mpfjax.moves.initial import sample_initial
 from mpfjax.moves.island_interaction import IslandInteraction
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
 from mpfjax.moves.resampling.resample import Resample

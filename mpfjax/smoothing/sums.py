@@ -28,7 +28,14 @@ from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.floats import as_inexact
 from mpfjax.operations.generator import split
 from mpfjax.operations.indexing import take
-from mpfjax.running.scan import FilterRun, checked, report_of, run_of, step_or_predict
+from mpfjax.running.scan import (
+    FilterRun,
+    checked,
+    first_mixture,
+    report_of,
+    run_of,
+    step_or_predict,
+)
 from mpfjax.smoothing.backward import draw_exactly, propose, walk
 
 
@@ -107,7 +114,8 @@ def _smooth(key, filter, series, options):
     # The first two are those of `run_filter`.
     key_initial, key_steps, key_backward = split_keys(key, 3)
     length = series.length
-    initial = filter._init(Start(key_initial))
+    step_keys = jax.random.split(key_steps, length)
+    initial, filter = first_mixture(Start(key_initial), filter, step_keys[0], series)
     num_kept = 1 if lag is None else lag + 1
     shapes = _shapes(function, initial.particles)
     kept = jax.tree.map(lambda leaf: jnp.zeros((num_kept, *leaf.shape), leaf.dtype), shapes)
@@ -133,7 +141,7 @@ def _smooth(key, filter, series, options):
             settled = jax.tree.map(jnp.add, settled, oldest)
         return (moved, kept, settled), (sums, oldest, report_of(info))
 
-    keys = jax.random.split(key_steps, length), jax.random.split(key_backward, length)
+    keys = step_keys, jax.random.split(key_backward, length)
     steps = (jnp.arange(length, dtype=jnp.int32), *keys, series)
     carry, outputs = jax.lax.scan(advance, (initial, kept, settled), steps)
     final, kept, _ = carry

@@ -21,9 +21,10 @@ from mpfjax.checks import (
     saying,
     shown,
 )
-from mpfjax.filter import Filter, Start, sample_initial
+from mpfjax.filter import Filter, Start
 from mpfjax.models.base import require
 from mpfjax.models.inputs import with_inputs
+from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import Series, as_series
 from mpfjax.running.scan import scan
 from mpfjax.running.storage.checkpoints import check_checkpoint

@@ -37,14 +37,14 @@ class FilterOf(eqx.Module):
 
     def start(self, key: Key[Array, ""], filter: Filter) -> ParticleMixture:
         """The mixture of x_0."""
-        return filter._init(Start(key))
+        return filter.with_one_draw()._init(Start(key))
 
     def step(
         self, key: Key[Array, ""], filter: Filter, mixture: ParticleMixture, t: Int[Array, ""]
     ) -> tuple[ParticleMixture, Float[Array, ""]]:
         """The mixture after one more observation, and the increment of log Ẑ."""
         now = jax.tree.map(lambda leaf: jnp.asarray(leaf)[t], self.series)
-        mixture, info = step_or_predict(filter, key, mixture, now)
+        mixture, info = step_or_predict(filter.with_one_draw(), key, mixture, now)
         return mixture, info.log_likelihood_increment
 
     def __call__(

@@ -1,0 +1,202 @@
+"""x_0: its draws, and which of many draws a filter keeps once it sees the first observation."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from mpfjax.mixture import ParticleMixture, single_component
+from mpfjax.models.base import (
+    AbstractStateSpaceModel,
+    HasInitialNoise,
+    check_states,
+    starts_from_noise,
+)
+from mpfjax.models.conditionally_linear import with_moments
+from mpfjax.models.noise import draw_noise
+from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.propagation.marginalised import PropagateMarginalised
+from mpfjax.moves.propagation.nested import PropagateNested
+from mpfjax.moves.propagation.propagate import Propagate
+from mpfjax.moves.resampling.ordering import HILBERT, sorted_order
+from mpfjax.operations.floats import default_float
+from mpfjax.operations.generator import split, uniform
+from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import log_sum_exp
+from mpfjax.operations.prefix_sums import count_starts, sum_before
+
+# The name of the memory of a filter whose x_0 is chosen.
+START = "start"
+# A particle that the first observation tells nothing of keeps a quarter of its chance, so that no
+# weight is more than four times the mean.
+_MOST_TRUST = 3 / 4
+
+
+class StartMemory(NamedTuple):
+    """How far the choice of x_0 has got.
+
+    - `is_prior`: the particles are plain draws of x_0, of which nothing was observed.
+    - `is_chosen`: they are chosen by the next observation, whose step must not resample them.
+    - `log_mass`: the logarithm of the sum of their weights before these were normalised.
+    """
+
+    is_prior: Bool[Array, ""]
+    is_chosen: Bool[Array, ""]
+    log_mass: Float[Array, ""]
+
+
+def at_start() -> StartMemory:
+    """The memory of plain draws of x_0."""
+    nothing = jnp.zeros((), default_float())
+    return StartMemory(jnp.asarray(True), jnp.asarray(False), nothing)
+
+
+def started(mixture: ParticleMixture) -> ParticleMixture:
+    """The mixture of a filter that has used its choice of x_0."""
+    memory = StartMemory(jnp.asarray(False), jnp.asarray(False), jnp.zeros((), default_float()))
+    return mixture.replace(memory=mixture.memory | {START: memory})
+
+
+def leaving_start(mixture: ParticleMixture) -> ParticleMixture:
+    """The mixture before a prediction, after which x_0 is not drawn anew."""
+    if START not in mixture.memory:
+        return mixture
+    memory = mixture.memory[START]._replace(is_prior=jnp.asarray(False))
+    return mixture.replace(memory=mixture.memory | {START: memory})
+
+
+def unless_chosen(moved: ParticleMixture, mixture: ParticleMixture) -> ParticleMixture:
+    """The resampled mixture, or the one before if x_0 is chosen: its weights are needed."""
+    if moved.log_scale is not None and mixture.log_scale is None:
+        mixture = mixture.replace(log_scale=jnp.zeros_like(moved.log_scale))
+    is_chosen = mixture.memory[START].is_chosen
+    return jax.tree.map(lambda new, old: jnp.where(is_chosen, old, new), moved, mixture)
+
+
+def looking_moves(moves: Sequence[Any], starts_empty: bool) -> list[AbstractPropagation]:
+    """The propagations that weigh two draws of x_1; a `ValueError` for others."""
+    found = [move for move in moves if isinstance(move, AbstractPropagation)]
+    known = (Propagate, PropagateMarginalised, PropagateNested)
+    if starts_empty or not found or not all(isinstance(move, known) for move in found):
+        raise ValueError(
+            "initial_draws: x_0 is chosen where Propagate, PropagateMarginalised or"
+            " PropagateNested propagates, and no filter that starts empty has it"
+        )
+    return found
+
+
+def sample_initial(
+    key: Key[Array, ""],
+    model: AbstractStateSpaceModel,
+    num_particles: int,
+    noise: str = "independent",
+) -> PyTree:
+    """The particles of x_0, of this noise if the model can; raises for leaves of another length."""
+    if noise == "independent" or not starts_from_noise(model):
+        particles = model.sample_initial(key, num_particles)
+    else:
+        maker = cast(HasInitialNoise, model)
+        shape = (num_particles, maker.initial_noise_dimension)
+        particles = maker.initial_from_noise(draw_noise(noise, key, shape, default_float()))
+    check_states(particles, model, "sample_initial", num_particles)
+    return with_moments(model, particles)
+
+
+def choose_initial(
+    key: Key[Array, ""],
+    mixture: ParticleMixture,
+    drawn: PyTree,
+    propagations: Sequence[AbstractPropagation],
+    observation: PyTree,
+    noise: str,
+) -> ParticleMixture:
+    """N weighted draws of x_0, chosen for what they say of y_1 among those `drawn`, K N of them.
+
+    Of each x_0 two x_1 are drawn, and ν is the mean of their likelihoods, shrunk towards the mean
+    of all by the share of its variance that is not x_0's (`_trusted`). Particles are kept with
+    probabilities in proportion to ν, and weigh 1 / ν. They represent x_0 as the pool does, and Ẑ
+    stays unbiased. With "rqmc" `noise` they are kept in order along a Hilbert curve.
+    """
+    key_draws, key_kept = split(key, 2)
+    num_draws = jax.tree.leaves(drawn)[0].shape[0] // mixture.num_particles
+    usable = mixture.usable_slots
+    num_drawn = None if usable is None else num_draws * usable
+    pool = single_component(drawn, mixture.num_components, num_drawn)
+    log_factors = _look(key_draws, pool, propagations, observation)
+    trusted = jax.lax.stop_gradient(_trusted(log_factors, pool.occupied))
+    order = None
+    if noise == "rqmc":
+        labels = jnp.where(pool.occupied, 0, pool.num_components)
+        order = sorted_order(pool, labels, HILBERT)
+    kept = _kept(key_kept, trusted, mixture, pool, order)
+    particles = jax.tree.map(lambda leaf: take(leaf, kept), drawn)
+    chosen = single_component(particles, mixture.num_components, usable)
+    log_weights = chosen.log_weights - jnp.log(take(trusted, kept)).astype(default_float())
+    log_mass = log_sum_exp(log_weights)
+    memory = StartMemory(jnp.asarray(False), jnp.asarray(True), log_mass)
+    return chosen.replace(
+        log_weights=log_weights - log_mass, memory=mixture.memory | {START: memory}
+    )
+
+
+def _look(
+    key: Key[Array, ""],
+    pool: ParticleMixture,
+    propagations: Sequence[AbstractPropagation],
+    observation: PyTree,
+) -> Float[Array, "n 2"]:
+    """The logarithms of the weights of two draws of x_1 of each particle, up to a constant."""
+    twice = lambda leaf: jnp.repeat(leaf, 2, axis=0)  # noqa: E731
+    drawn = pool.replace(
+        particles=jax.tree.map(twice, pool.particles),
+        log_weights=twice(pool.log_weights),
+        component_indicators=twice(pool.component_indicators),
+        ancestor_indices=twice(pool.ancestor_indices),
+        usable_slots=None if pool.usable_slots is None else 2 * pool.usable_slots,
+    )
+    for move_key, move in zip(split(key, len(propagations)), propagations, strict=True):
+        drawn = move(move_key, drawn, observation)
+    return drawn.log_weights.reshape(-1, 2)
+
+
+def _trusted(log_factors: Float[Array, "n 2"], occupied: Bool[Array, " n"]) -> Float[Array, " n"]:
+    """ν of each particle, with a mean of 1, from two draws of its likelihood.
+
+    Let r be the correlation of the two draws. The mean of both tells E[L | x_0] with the
+    reliability ρ = 2 r / (1 + r) (Spearman 1910, Brown 1910), and 1 + ρ (L̄_i / L̄ - 1) is its best
+    linear predictor (Kelley 1927). Where x_1 is mostly noise, ρ is near zero and all x_0 are alike.
+    """
+    is_number = occupied[:, None] & (log_factors < jnp.inf)
+    log_factors = jnp.where(is_number, log_factors, -jnp.inf)
+    largest = jnp.max(log_factors)
+    values = jnp.exp(log_factors - jnp.where(largest > -jnp.inf, largest, 0.0))
+    number = jnp.maximum(jnp.sum(occupied, dtype=values.dtype), 1.0)
+    mean = jnp.sum(values) / (2 * number)
+    ratios = values / jnp.where(mean > 0, mean, 1.0)
+    gaps = jnp.where(occupied[:, None] & (mean > 0), ratios - 1, 0.0)
+    shared, total = jnp.sum(gaps[:, 0] * gaps[:, 1]), jnp.sum(gaps**2) / 2
+    correlation = jnp.clip(shared / jnp.where(total > 0, total, 1.0), 0.0, 1.0)
+    trust = jnp.minimum(2 * correlation / (1 + correlation), _MOST_TRUST)
+    return 1 + trust * jnp.mean(gaps, axis=1)
+
+
+def _kept(
+    key: Key[Array, ""],
+    trusted: Float[Array, " p"],
+    mixture: ParticleMixture,
+    pool: ParticleMixture,
+    order: Int[Array, " p"] | None,
+) -> Int[Array, " n"]:
+    """Which particle of the pool each slot takes: systematic draws in proportion to ν."""
+    weights = jnp.where(pool.occupied, trusted, 0.0)
+    weights = weights if order is None else take(weights, order)
+    num_kept = jnp.asarray(mixture.num_usable_slots, weights.dtype)
+    before, _ = sum_before(weights * (num_kept / jnp.sum(weights)))
+    # Slot s has the point s + shift, and takes the particle whose interval holds it.
+    starts = jnp.ceil(before - uniform(key, (), weights.dtype)).astype(jnp.int32)
+    places = count_starts(jnp.maximum(starts, 0), mixture.num_particles)
+    last = jnp.asarray(pool.num_usable_slots, jnp.int32) - 1
+    places = jnp.clip(places, 0, last)
+    return places if order is None else take(order, places)
