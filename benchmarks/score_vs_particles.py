@@ -140,12 +140,13 @@ def build(
 ) -> mpfjax.Filter:
     """The filter of that name; `mixture` are the options of those that are mixtures.
 
-    Components have equal numbers of particles, as in the paper.
+    Components have equal numbers of particles, and x_0 is drawn once, as in the paper.
     """
+    as_there: dict[str, Any] = {"allocation": "equal", "initial_draws": 1, **mixture}
     if name == "pf":
         return mpfjax.particle_filter(model, num_particles)
     if name == "mpf":
-        return mpfjax.mixture_particle_filter(model, num_particles, allocation="equal", **mixture)
+        return mpfjax.mixture_particle_filter(model, num_particles, **as_there)
     regeneration = mpfjax.GaussianRegeneration(noise="stratified")
     if name == "gpf":
         return mpfjax.gaussian_particle_filter(model, num_particles, regeneration=regeneration)
@@ -156,8 +157,7 @@ def build(
     return mpfjax.mixture_particle_filter(
         model,
         num_particles,
-        allocation="equal",
-        **mixture,
+        **as_there,
         proposal=mpfjax.GaussNewtonProposal(model, noise="stratified"),
         sort_by=position,
     )

@@ -48,8 +48,8 @@ class ParticleMixture(eqx.Module):
     - `particles`: a pytree whose leaves have a leading axis n, the states X.
     - `log_weights`: ℓ, shape (n,), -inf in an empty slot.
     - `component_indicators`: C, shape (n,), in [0, num_components).
-    - `ancestor_indices`: shape (n,), the slot of the previous step's mixture that each came from; at
-      the first step of a filter with `initial_draws`, the slot of the x_0 that it chose.
+    - `ancestor_indices`: shape (n,), the slot of the previous step's mixture that each came from;
+      in the first step of a filter with `initial_draws`, that of the x_0 which it chose.
     - `num_components`: M, the most components that there can be, dead ones included; static. The
       filters of the literature call it `max_components`.
     - `memory`: the memory that moves keep from step to step, by the move's name.
