@@ -8,6 +8,7 @@ import pytest
 
 import mpfjax
 from mpfjax.vision import Detections, HSVColours, ObjectTracker
+from mpfjax.vision.colour.sampled_histograms import SampledBoxes
 from mpfjax.vision.tracking.appearance import LearnAppearance
 from mpfjax.vision.tracking.assignment import Assign
 from mpfjax.vision.tracking.births import Births, ShareMass
@@ -326,6 +327,12 @@ def test_what_it_looks_at_beforehand_is_all_that_it_sees_of_a_frame():
     np.testing.assert_array_equal(looked.memory["references"], whole.memory["references"])
     np.testing.assert_allclose(looked.particles.place, whole.particles.place, rtol=1e-5)
     assert tracks.shown.sum() == 2
+
+
+def test_the_default_chain_looks_at_detections_alone():
+    """The whole frame would compile anew for each size, and go to the program in each step."""
+    default = mpfjax.vision.ObjectTracker(M)
+    assert isinstance(default.look(draw([]), detections([])), SampledBoxes)
 
 
 @pytest.mark.parametrize("options", [{"sigma": 0.2}, {"exact_colours": True}])

@@ -372,7 +372,7 @@ def _sees_detections(move: AbstractMove) -> bool:
         Births,
         LearnAppearance,
     )
-    return isinstance(move, (*kinds, FollowCamera, LearnNoise, ShareMass))
+    return isinstance(move, (*kinds, FollowCamera, LearnGuesses, LearnNoise, ShareMass))
 
 
 def _motion(states: ObjectState) -> tuple[PyTree, PyTree]:
