@@ -22,7 +22,7 @@ import numpy as np
 
 import mpfjax
 from mpfjax.console import exit_status, format_table, whole, write_json
-from mpfjax.operations.compiling import wide_vectors
+from mpfjax.operations.compiling import cpu_options
 from mpfjax.vision import RGBColours
 from mpfjax.vision.colour.histograms import integral_histogram
 
@@ -98,7 +98,7 @@ def by_integral(frame: np.ndarray, boxes: np.ndarray) -> Callable[[], np.ndarray
     def count(frame: jax.Array, boxes: jax.Array) -> jax.Array:
         return integral_histogram(frame, COLOURS).counts(boxes)[:, 0]
 
-    program = jax.jit(count, compiler_options=wide_vectors())
+    program = jax.jit(count, compiler_options=cpu_options())
     arrays = jax.block_until_ready((jnp.asarray(frame), jnp.asarray(boxes)))
     return lambda: np.asarray(program(*arrays))
 

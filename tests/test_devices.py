@@ -25,7 +25,8 @@ from mpfjax.operations.across_islands import (
     num_islands,
     over_islands,
 )
-from mpfjax.operations.compiling import in_little_memory, wide_vectors
+from mpfjax.operations.compiling import cpu_options, in_little_memory
+from mpfjax.operations.segments import segment_sum
 from mpfjax.running.devices import choose_devices
 from mpfjax.running.threads import over_threads
 from tests import on_devices
@@ -408,11 +409,38 @@ def draw_with(keys, scale):
     return scale * jax.vmap(lambda key: jax.random.normal(key, (4,)))(keys)
 
 
-def test_the_width_of_vectors_is_left_to_a_flag_that_sets_it(monkeypatch):
+@pytest.fixture
+def optimised():
+    """Compiled as outside of the tests."""
+    setting = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", setting)
+
+
+def test_an_option_is_left_to_a_flag_that_sets_it(monkeypatch, optimised):
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
-    assert wide_vectors() == {"xla_cpu_prefer_vector_width": 512}
+    sums = {"xla_disable_hlo_passes": "tree_reduction_rewriter"}
+    sums = sums if jax.__version_info__ >= (0, 10) else {}
+    assert cpu_options() == {"xla_cpu_prefer_vector_width": 512} | sums
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=128")
-    assert wide_vectors() == {}
+    assert cpu_options() == sums
+    monkeypatch.setenv("XLA_FLAGS", "--xla_disable_hlo_passes=dce")
+    assert cpu_options() == {"xla_cpu_prefer_vector_width": 512}
+    monkeypatch.setenv("XLA_FLAGS", "")
+    jax.config.update("jax_disable_most_optimizations", True)
+    assert cpu_options() == {"xla_cpu_prefer_vector_width": 512}
+
+
+@pytest.mark.parametrize("n", [1000, 4000, 2**20])
+def test_sums_of_many_numbers_stay_exact_with_the_options(n, optimised):
+    """In one piece, but not one number after the other: that would be off by 1e-5 to 1e-3."""
+    values = jnp.full(n, 0.1)
+    every = jax.jit(lambda x: jnp.sum(jnp.where(x > 0, x, 0.0)), compiler_options=cpu_options())
+    odd = jax.jit(lambda x: segment_sum(x, jnp.arange(n) % 2, 2)[1], compiler_options=cpu_options())
+    exact = n * float(np.float32(0.1))
+    np.testing.assert_allclose(every(values), exact, rtol=2e-6)
+    np.testing.assert_allclose(odd(values), exact / 2, rtol=2e-6)
 
 
 def test_little_memory_is_an_option_that_this_compiler_has_or_is_left_out(monkeypatch):

@@ -34,10 +34,10 @@ ORDER = (
 # Inside the folders that hold several floors: files, and folders.
 FLOORS = {
     "operations": (
-        "floats", "gradients", "platforms", "stored", "indexing", "prefix_sums", "logarithms",
-        "segments", "runs", "choices", "matrices", "coordinates", "stacks", "gaussians",
-        "across_islands", "generator", "positions", "sobol", "hilbert", "sorting", "compiling",
-        "kept_programs",
+        "floats", "gradients", "platforms", "stored", "indexing", "prefix_sums", "maxima",
+        "logarithms", "segments", "runs", "choices", "matrices", "coordinates", "stacks",
+        "gaussians", "across_islands", "generator", "positions", "sobol", "hilbert", "sorting",
+        "compiling", "kept_programs",
     ),
     "moves": (
         "base", "local_quadratics", "eve_indices", "sharing", "results", "island_interaction",

@@ -12,6 +12,7 @@ from mpfjax.operations.floats import default_float
 from mpfjax.operations.indexing import count_places, take
 from mpfjax.operations.logarithms import exp, log_sum_exp, softmax
 from mpfjax.operations.matrices import cholesky, draw_columns, row_sums, solve_lower
+from mpfjax.operations.maxima import largest
 from mpfjax.operations.prefix_sums import (
     _blocked_sum_before,
     _scanned_sum_before,
@@ -341,6 +342,32 @@ def test_runs_are_summed_as_their_labels_say(n, m):
         places = np.flatnonzero((labels == label) & mask)
         if places.size:
             assert (firsts[label], lasts[label]) == (places[0], places[-1])
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
+def test_the_largest_number(dtype):
+    """NaN of either sign, infinities, zeros of both signs, the least numbers, and no number."""
+    tiny = np.finfo(dtype).smallest_subnormal
+    cases = [
+        [-1.5, 3.25, 2.0], [-1.5, -3.25, -1.25], [-0.0, 0.0], [0.0, -tiny], [-tiny, -2 * tiny],
+        [tiny, 0.0], [-np.inf, -np.inf], [1.0, np.inf], [np.nan, np.inf], [1.0, -np.nan], [],
+    ]  # fmt: skip
+    with float64():
+        for case in cases:
+            values = np.array(case, dtype)
+            found = jax.jit(largest)(jnp.asarray(values))
+            assert found.dtype == dtype
+            np.testing.assert_array_equal(found, values.max(initial=-np.inf))
+        table = RNG.standard_normal((5, 7)).astype(dtype)
+        np.testing.assert_array_equal(largest(jnp.asarray(table), axis=1), table.max(axis=1))
+        columns = jax.vmap(largest, in_axes=1)(jnp.asarray(table))
+        np.testing.assert_array_equal(columns, table.max(axis=0))
+
+
+def test_the_largest_number_is_a_constant_to_a_derivative():
+    values = jnp.array([1.0, 3.0, 2.0])
+    np.testing.assert_array_equal(jax.grad(largest)(values), np.zeros(3))
+    assert largest(jnp.array([3, 7, 5])) == 7
 
 
 @pytest.mark.parametrize("m", [1, 4, 33, 300])

@@ -13,14 +13,14 @@ from mpfjax.operations import compiling
 def test_threads_that_come_first_share_one_program(monkeypatch):
     """Each once made a jitted function of its own, and now and then a first call took twice as long
     for it."""
-    options, made = compiling.wide_vectors, []
+    options, made = compiling.cpu_options, []
 
     def slowly():
         made.append(threading.get_ident())
         time.sleep(0.2)  # the others come meanwhile
         return options()
 
-    monkeypatch.setattr(compiling, "wide_vectors", slowly)
+    monkeypatch.setattr(compiling, "cpu_options", slowly)
     compiled = compiling.jit_on_wide_vectors(lambda values: 3 * values)
     values, start = jnp.arange(4.0), threading.Barrier(3)
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
-from mpfjax.operations.compiling import wide_vectors
+from mpfjax.operations.compiling import cpu_options
 
 FILTERS = {
     "pf": "PF",
@@ -141,7 +141,7 @@ def compile_cell(cell: Cell) -> Any:
         return mpfjax.monte_carlo(keys, filter, observations, nothing)
 
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), cell.seeds))
-    return jax.jit(run_all, compiler_options=wide_vectors()).lower(keys).compile()
+    return jax.jit(run_all, compiler_options=cpu_options()).lower(keys).compile()
 
 
 def bytes_of(program: Any) -> int:

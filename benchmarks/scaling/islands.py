@@ -10,7 +10,7 @@ import numpy as np
 import mpfjax
 from benchmarks.scaling.cells import FEWEST_REPEATS, SLOW_SECONDS, bytes_of, nothing
 from mpfjax.console import format_table
-from mpfjax.operations.compiling import wide_vectors
+from mpfjax.operations.compiling import cpu_options
 
 NUM_ISLANDS, ISLAND_STEPS = 8, 20
 
@@ -26,7 +26,7 @@ def run_as_islands(num_particles: int, repeats: int) -> dict[str, Any]:
         run = mpfjax.run_islands(key, filter, observations, nothing, num_islands=NUM_ISLANDS)
         return run.log_marginal_likelihood
 
-    program = jax.jit(run_islands, compiler_options=wide_vectors())
+    program = jax.jit(run_islands, compiler_options=cpu_options())
     program = program.lower(jax.random.key(0)).compile()
     seconds = []
     for repeat in range(1 + repeats):

@@ -18,22 +18,34 @@ from jaxtyping import PyTree
 from mpfjax.operations.floats import default_float
 
 _VECTOR_WIDTH = "xla_cpu_prefer_vector_width"
+_WITHOUT_PASSES = "xla_disable_hlo_passes"
+_TREE_SUMS = "tree_reduction_rewriter"
+# Since this version XLA sums on vectors, and long rows by a library, in any order.
+_SUMS_ON_VECTORS = (0, 10)
 _FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
 _settings: Any = jax.config  # whose attributes no type checker knows
 
 
-def wide_vectors() -> dict[str, int]:
-    """The compiler's options for vectors of 512 bits on a CPU; XLA's default is 256.
+def cpu_options() -> dict[str, int | str]:
+    """The compiler's options on a CPU: vectors of 512 bits, and sums in one piece.
 
-    A machine without such vectors uses its widest ones. There are no options on other platforms,
-    or if XLA_FLAGS sets the width.
+    XLA's default is vectors of 256 bits; a machine without wider ones uses its widest. By default
+    XLA also cuts each sum and maximum into pieces of 32, in up to two kernels more, which take
+    longer than the whole. Where JAX is set to optimise little, they stay, since sums are then not
+    on vectors. An option that XLA_FLAGS sets is left out, and there are none on other platforms.
     """
-    is_set = _VECTOR_WIDTH in os.environ.get("XLA_FLAGS", "")
-    return {} if is_set or jax.default_backend() != "cpu" else {_VECTOR_WIDTH: 512}
+    if jax.default_backend() != "cpu":
+        return {}
+    options: dict[str, int | str] = {_VECTOR_WIDTH: 512}
+    optimised = not jax.config.read("jax_disable_most_optimizations")
+    if optimised and jax.__version_info__[:2] >= _SUMS_ON_VECTORS:
+        options[_WITHOUT_PASSES] = _TREE_SUMS
+    flags = os.environ.get("XLA_FLAGS", "")
+    return {name: value for name, value in options.items() if name not in flags}
 
 
 def jit_on_wide_vectors(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """`equinox.filter_jit` with `wide_vectors`, with which random draws take half the time.
+    """`equinox.filter_jit` with `cpu_options`, with which random draws take half the time.
 
     Such options are for a whole program. Within a transformation of the caller, they must be given
     to its own `jax.jit(..., compiler_options=...)`, or in XLA_FLAGS.
@@ -46,7 +58,7 @@ def jit_on_wide_vectors(function: Callable[..., PyTree]) -> Callable[..., PyTree
     def wide() -> Callable[..., PyTree]:
         # Asking JAX for the platform before the first call would keep processes from joining.
         with_options: Any = eqx.filter_jit
-        return with_options(function, compiler_options=wide_vectors())
+        return with_options(function, compiler_options=cpu_options())
 
     @functools.wraps(function)
     def run(*arguments: Any, **named: Any) -> PyTree:

@@ -7,9 +7,10 @@ becomes zero, since a CPU takes a hundred times as long for subnormal numbers.
 
 import math
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from mpfjax.operations.maxima import largest
 
 
 def exp(log_values: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
@@ -37,7 +38,7 @@ def finite_max(log_values: Float[Array, " n"]) -> Float[Array, ""]:
 
     A derivative treats it as a constant.
     """
-    return finite_or_zero(jnp.max(jax.lax.stop_gradient(log_values), initial=-jnp.inf))
+    return finite_or_zero(largest(log_values))
 
 
 def log_sum_exp(log_values: Float[Array, " n"]) -> Float[Array, ""]:

@@ -5,6 +5,7 @@ A block of one label goes to its segment as a whole. Of the others, which hold a
 segment takes its own entries: they can only be in the first and the last block that it stands in.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,8 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import REDUCTIONS, segment_reduce
 from mpfjax.operations.stored import block_size, stored, whole_blocks
+
+_COMBINED = {"add": jnp.add, "max": jnp.maximum, "min": jnp.minimum}
 
 
 class Runs(NamedTuple):
@@ -61,7 +64,7 @@ class Runs(NamedTuple):
         is_own = labels == np.tile(np.arange(m, dtype=labels.dtype), 2)[:, None]
         own = jnp.where(is_own & counts[:, None], take(blocks, ends), nothing)
         of_ends = reduce(own.astype(values.dtype), axis=1)
-        return reduce(jnp.stack([found, of_ends[:m], of_ends[m:]]), axis=0)
+        return functools.reduce(_COMBINED[how], (found, of_ends[:m], of_ends[m:]))
 
 
 def runs_of(labels: Int[Array, " p"], num_segments: int) -> Runs:

@@ -23,6 +23,7 @@ from mpfjax.operations.indexing import (
     take,
 )
 from mpfjax.operations.logarithms import exp, finite_or_zero, log_or_nothing, masked_shares
+from mpfjax.operations.maxima import largest
 from mpfjax.operations.prefix_sums import count_starts, count_upto
 from mpfjax.operations.stored import EXACT_IN_FLOAT32, stored, whole_blocks
 
@@ -43,6 +44,7 @@ _LONGEST_SUM = 2**10
 _COUNTED_BLOCK = 32
 # The segments that occur are kept in the bits of at most this many words.
 _WORD, _MOST_WORDS = 32, 8
+_WORD_BITS = 5  # a word has 2^5 bits
 _MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # eight counts for each particle
 
 
@@ -129,7 +131,7 @@ def segment_max(
     if num_segments > FEW_SEGMENTS and not _is_handful(len(values), num_segments):
         return _scattered("max", values, segments, num_segments, -jnp.inf)
     member = _members(segments, num_segments)
-    return jnp.max(jnp.where(member, values[None], jnp.array(-jnp.inf, values.dtype)), axis=1)
+    return largest(jnp.where(member, values[None], jnp.array(-jnp.inf, values.dtype)), axis=1)
 
 
 def segment_any(
@@ -138,14 +140,16 @@ def segment_any(
     """Which segments have a masked entry; labels are in [0, num_segments)."""
     if num_segments > _MOST_WORDS * _WORD:
         return _scattered("max", mask.astype(jnp.int32), segments, num_segments, 0) > 0
-    bits = jnp.uint32(1) << (segments % _WORD).astype(jnp.uint32)
+    word_of, bit = segments >> _WORD_BITS, (segments & (_WORD - 1)).astype(jnp.uint32)
+    bits = jnp.uint32(1) << bit
     words = []
     for word in range(-(-num_segments // _WORD)):
-        own = jnp.where(mask & (segments // _WORD == word), bits, jnp.uint32(0))
+        own = jnp.where(mask & (word_of == word), bits, jnp.uint32(0))
         words.append(jax.lax.reduce(own, np.uint32(0), jax.lax.bitwise_or, (0,)))
-    label = np.arange(num_segments)
-    shifts = jnp.asarray(label % _WORD, jnp.uint32)
-    return (jnp.stack(words)[label // _WORD] >> shifts) & 1 > 0
+    # Not gathered by label: XLA would read all particles again for each.
+    shifts = jnp.arange(_WORD, dtype=jnp.uint32)
+    found = (jnp.stack(words)[:, None] >> shifts[None]) & 1 > 0
+    return found.reshape(-1)[:num_segments]
 
 
 def segment_reduce(
@@ -229,7 +233,7 @@ def _num_lanes(n: int) -> int:
     return max(_LANES, 1 << max(-(-n // _LONGEST_SUM) - 1, 0).bit_length())
 
 
-REDUCTIONS: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": jnp.max, "min": jnp.min}
+REDUCTIONS: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": largest, "min": jnp.min}
 
 
 def segment_log_sum_exp(
