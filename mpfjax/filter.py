@@ -47,6 +47,7 @@ from mpfjax.moves.results import as_moves, check_result, check_weighed, normalis
 from mpfjax.moves.sharing import give_inputs, tie, untie
 from mpfjax.observations import Fault, faults_of, one_input, one_observation, raise_faults
 from mpfjax.operations.across_islands import island_index, num_islands
+from mpfjax.operations.choices import drawn_once
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.generator import split
 
@@ -178,7 +179,8 @@ class Filter(eqx.Module):
         keys = split_keys(start.key, 1 + len(self._initial_moves))
         particles = start.particles
         if particles is None:
-            particles = self._sample_initial(start.key)
+            draw = self._sample_initial
+            particles = drawn_once(start.key, draw) if self._initial_moves else draw(start.key)
         memory = {}
         for move in self.moves:
             if isinstance(move, AbstractMove):
@@ -384,9 +386,7 @@ def _own_ancestors(mixture: ParticleMixture) -> ParticleMixture:
 
 
 def split_keys(key: Key[Array, ""], num: int) -> list[Key[Array, ""]]:
-    """One key for each move. The first keys do not depend on `num`: a longer chain starts with the
-    same draws.
-    """
+    """A key for each move. The first do not depend on `num`: longer chains start with the same."""
     return list(split(key, num))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpfjax.operations import positions
-from mpfjax.operations.choices import cond_if_any
+from mpfjax.operations.choices import cond_if_any, drawn_once
 from mpfjax.operations.coordinates import coordinates, inner, log_total, transformed
 from mpfjax.operations.floats import default_float
 from mpfjax.operations.indexing import count_places, take
@@ -611,3 +611,26 @@ def test_points_by_their_coordinates(d):
     points[0] = -np.inf
     sums = log_total(coordinates(jnp.asarray(points)))
     np.testing.assert_allclose(sums, np.logaddexp.reduce(points, axis=1), rtol=1e-5, atol=1e-6)
+
+
+def test_draws_that_are_made_once_are_the_same_and_stay_one_branch():
+    """Of any type, with NaN, under `vmap` and in a gradient."""
+
+    def draw(key):
+        normal = jax.random.normal(key, (3,))
+        return {
+            "x": jnp.where(normal > 0, normal, jnp.nan),
+            "n": jax.random.randint(key, (2,), 0, 9),
+        }
+
+    keys = jax.random.split(jax.random.key(0), 4)
+    together = jax.vmap(lambda key: drawn_once(key, draw))
+    for found, wanted in zip(
+        jax.tree.leaves(jax.jit(together)(keys)),
+        jax.tree.leaves(jax.vmap(draw)(keys)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(found, wanted)
+    assert "cond[" in str(jax.make_jaxpr(together)(keys))
+    scaled = lambda a: jnp.sum(drawn_once(keys[0], lambda key: a * jax.random.normal(key, (3,))))  # noqa: E731
+    np.testing.assert_allclose(jax.grad(scaled)(2.0), scaled(1.0), rtol=1e-6)

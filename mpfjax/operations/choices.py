@@ -6,10 +6,11 @@ choose together: if one needs the expensive branch, all take it.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool, Key, PyTree
 
 
 def cond_if_any(
@@ -20,6 +21,20 @@ def cond_if_any(
     For a run that does not need it, `dear()` must give the result of `cheap()`.
     """
     return jax.lax.cond(any_run(is_needed), dear, cheap)
+
+
+def drawn_once(key: Key[Array, ""], draw: Callable[[Key[Array, ""]], PyTree]) -> PyTree:
+    """`draw(key)`, computed once, where XLA would draw again in each operation that uses it.
+
+    It is a branch that is always taken, which XLA cannot know: no word of a key has more bits than
+    32. Unlike `stored`, this takes numbers of any kind, and NaN. Use it where draws are made once
+    in a program and many operations use them: each would take part of a second to compile.
+    """
+    function = partial(draw, key)
+    holds = any_run(jnp.all(jax.lax.population_count(jax.random.key_data(key)) <= 32))
+    shapes = jax.eval_shape(function)
+    nothing = lambda: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)  # noqa: E731
+    return jax.lax.cond(holds, function, nothing)
 
 
 @jax.custom_batching.custom_vmap

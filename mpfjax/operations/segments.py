@@ -1,9 +1,9 @@
 """Sums, maxima and orders by component.
 
 In numpy: `[values[labels == m].sum() for m in range(M)]`, `per_component[labels]` and
-`np.argsort(labels, kind="stable")`. For few components there are M masks, which XLA fuses into its
-loops. For many there is one scatter, shared by lanes, so that neighbours need not wait for each
-other and rounding errors of long sums stay small.
+`np.argsort(labels, kind="stable")`. For few components or particles there are M masks, which XLA
+fuses into its loops. For many there is one scatter, shared by lanes, so that neighbours need not
+wait for each other and rounding errors of long sums stay small.
 """
 
 from collections.abc import Callable
@@ -27,8 +27,10 @@ from mpfjax.operations.maxima import largest
 from mpfjax.operations.prefix_sums import count_starts, count_upto
 from mpfjax.operations.stored import EXACT_IN_FLOAT32, stored, whole_blocks
 
-# Up to this many segments, a sum has a mask for each.
+# Up to this many segments, a sum has a mask for each; with more, up to this many masked entries.
+# Masks run on vectors, and compile in half the time of a scatter. Runs of a `vmap` multiply them.
 FEW_SEGMENTS = 4
+_FEW_MASKED = 10_000
 # One of up to this many values is selected by comparing, which is vectorised; a gather is not.
 FEW_CHOICES = 16
 # Neighbours that are added to the same place go to different lanes, each with a place of its own.
@@ -103,17 +105,23 @@ def column_sums(
         return jnp.sum(jnp.where(member, columns[:, None], jnp.zeros((), columns.dtype)), axis=2).T
     if len(columns) <= _FEW_COLUMNS:
         # A sum of several columns at once would be of columns that are chosen number by number.
-        return jnp.stack([_column_sum(column, segments, num_segments) for column in columns], 1)
-    return jax.vmap(lambda column: _column_sum(column, segments, num_segments))(columns).T
+        few = are_masked(columns.shape[1], num_segments)
+        sums = _masked_sum if few else _scattered_sum
+        return jnp.stack([sums(column, segments, num_segments) for column in columns], 1)
+    sums = _masked_sum if num_segments <= FEW_SEGMENTS else _scattered_sum
+    return jax.vmap(lambda column: sums(column, segments, num_segments))(columns).T
 
 
-def _column_sum(
+def _masked_sum(
     column: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " num_segments"]:
-    if num_segments > FEW_SEGMENTS:
-        return _scattered_sum(stored(column), segments, num_segments)
     member = _members(segments, num_segments)
     return jnp.sum(jnp.where(member, column[None], jnp.zeros((), column.dtype)), axis=1)
+
+
+def are_masked(n: int, num_segments: int) -> bool:
+    """Whether n entries are summed by a mask for each segment."""
+    return num_segments <= FEW_SEGMENTS or n * num_segments <= _FEW_MASKED
 
 
 def _is_handful(n: int, num_segments: int) -> bool:
@@ -128,7 +136,7 @@ def segment_max(
     values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " num_segments"]:
     """The largest value in each segment, -inf in an empty one."""
-    if num_segments > FEW_SEGMENTS and not _is_handful(len(values), num_segments):
+    if not are_masked(len(values), num_segments):
         return _scattered("max", values, segments, num_segments, -jnp.inf)
     member = _members(segments, num_segments)
     return largest(jnp.where(member, values[None], jnp.array(-jnp.inf, values.dtype)), axis=1)
@@ -160,7 +168,7 @@ def segment_reduce(
     nothing: float,
 ) -> Shaped[Array, " num_segments"]:
     """The sum ("add"), "max" or "min" of each segment's values, `nothing` for an empty one."""
-    if num_segments > FEW_SEGMENTS and not _is_handful(len(values), num_segments):
+    if not are_masked(len(values), num_segments):
         return _scattered(how, values, segments, num_segments, nothing)
     own = jnp.where(_members(segments, num_segments), values[None], nothing)
     return REDUCTIONS[how](own.astype(values.dtype), axis=1)
@@ -179,7 +187,7 @@ def segment_counts(
 def _scattered_sum(
     values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " num_segments"]:
-    return _scattered("add", values, segments, num_segments, 0)
+    return _scattered("add", stored(values), segments, num_segments, 0)
 
 
 @_scattered_sum.defjvp
@@ -253,7 +261,7 @@ def segment_softmax(
     values = exp(log_values - spread_finite(shift, segments))
     totals = segment_sum(values, segments, num_segments)
     shares = values / spread_finite(jnp.where(totals == 0, 1.0, totals), segments)
-    if num_segments > FEW_SEGMENTS and not _is_handful(len(values), num_segments):
+    if not are_masked(len(values), num_segments):
         # Otherwise XLA takes the totals by a scatter, one particle after the other.
         shares = stored(shares)
     return masked_shares(log_values, shares)
@@ -270,7 +278,7 @@ def segment_argmax(
     largest = jnp.maximum(segment_max(values, segments, num_segments), limits.min)
     is_largest = values >= spread_finite(largest, segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
-    if num_segments > FEW_SEGMENTS:
+    if not are_masked(n, num_segments):
         return _scattered("min", stored(index, n), segments, num_segments, n - 1)
     member = _members(segments, num_segments)
     return jnp.min(jnp.where(member, index[None], n - 1), axis=1)
@@ -280,7 +288,7 @@ def first_places(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " 
     """The first index with each segment's label, n - 1 for a label that does not occur."""
     n = segments.shape[0]
     index = jnp.arange(n, dtype=jnp.int32)
-    if num_segments > FEW_SEGMENTS:
+    if not are_masked(n, num_segments):
         return _scattered("min", index, segments, num_segments, n - 1)
     return jnp.min(jnp.where(_members(segments, num_segments), index[None], n - 1), axis=1)
 

@@ -12,7 +12,7 @@ from mpfjax.checks import check_callable, check_positive_array, given, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations.floats import as_inexact
 from mpfjax.operations.logarithms import exp, finite_or_zero
-from mpfjax.operations.segments import FEW_SEGMENTS, column_sums, segment_max, spread_finite
+from mpfjax.operations.segments import are_masked, column_sums, segment_max, spread_finite
 from mpfjax.operations.stored import stored
 
 # Up to this many features are multiplied one by one, which runs on vectors, but compiles pair by
@@ -87,7 +87,8 @@ def relative_weights(mixture: ParticleMixture) -> Float[Array, " n"]:
     largest = finite_or_zero(segment_max(log_weights, labels, mixture.num_components))
     weights = exp(log_weights - spread_finite(largest, labels))
     # Otherwise XLA takes the maximum by a scatter, one particle after the other.
-    return weights if mixture.num_components <= FEW_SEGMENTS else stored(weights)
+    is_kept = are_masked(mixture.num_particles, mixture.num_components)
+    return weights if is_kept else stored(weights)
 
 
 def weighted_means(
