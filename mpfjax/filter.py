@@ -167,7 +167,7 @@ class Filter(eqx.Module):
         A filter with `initial_draws` draws x_0 anew when it sees y_1; `choose_initial` has these.
         """
         check_key(key)
-        start = Start(key, self._sample_initial(key))
+        start = Start(key, drawn_once(key, self._sample_initial))
         return with_floats_traced(lambda filter: _from_particles(filter, start), self)
 
     def _sample_initial(self, key: Key[Array, ""]) -> PyTree:

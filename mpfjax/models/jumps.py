@@ -65,10 +65,9 @@ class RandomWalkWithJumps(AbstractRandomWalk):
         """The same, from keys of their own for the jumps and the steps."""
         del previous
         key_noise, key_jump = split(key, 2)
-        jumps = jax.random.bernoulli(
-            fast_key(key_jump), self.jump_probability, (current.shape[0], 1)
-        )
-        return self._moved(jumps, normal(key_noise, current.shape, current.dtype), current)
+        # In one row, which is drawn fast; the numbers are those of n rows.
+        jumps = jax.random.bernoulli(fast_key(key_jump), self.jump_probability, current.shape[:1])
+        return self._moved(jumps[:, None], normal(key_noise, current.shape, current.dtype), current)
 
     def _moved(
         self, jumps: Bool[Array, "n 1"], noise: Float[Array, "n d"], current: Float[Array, "n d"]

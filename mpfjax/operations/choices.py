@@ -10,6 +10,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Key, PyTree
 
 
@@ -28,8 +29,11 @@ def drawn_once(key: Key[Array, ""], draw: Callable[[Key[Array, ""]], PyTree]) ->
 
     It is a branch that is always taken, which XLA cannot know: no word of a key has more bits than
     32. Unlike `stored`, this takes numbers of any kind, and NaN. Use it where draws are made once
-    in a program and many operations use them: each would take part of a second to compile.
+    in a program and many operations use them: each would take part of a second to compile. Outside
+    of a program it is `draw(key)` itself.
     """
+    if not isinstance(key, Tracer):
+        return draw(key)
     function = partial(draw, key)
     holds = any_run(jnp.all(jax.lax.population_count(jax.random.key_data(key)) <= 32))
     shapes = jax.eval_shape(function)
