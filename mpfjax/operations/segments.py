@@ -30,7 +30,7 @@ from mpfjax.operations.stored import EXACT_IN_FLOAT32, stored, whole_blocks
 # Up to this many segments, a sum has a mask for each; with more, up to this many masked entries.
 # Masks run on vectors, and compile in half the time of a scatter. Runs of a `vmap` multiply them.
 FEW_SEGMENTS = 4
-_FEW_MASKED = 10_000
+_FEW_MASKED = 2**12
 # One of up to this many values is selected by comparing, which is vectorised; a gather is not.
 FEW_CHOICES = 16
 # Neighbours that are added to the same place go to different lanes, each with a place of its own.
