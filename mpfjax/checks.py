@@ -20,6 +20,8 @@ _LONGEST = 200
 # Python counts a truth value among its integers, and numpy a duration; JAX has no long doubles.
 _NO_NUMBERS: tuple[type, ...] = (bool, np.timedelta64, np.longdouble)
 _MOST = 2**31 - 1
+# Of the largest entry of a covariance, which rounding may change by this much.
+_ROUNDING = 1e-4
 
 
 def given(**arguments: Any) -> dict[str, Any]:
@@ -266,6 +268,23 @@ def check_not_negative_array(**arguments: Any) -> None:
 def check_finite_array(**arguments: Any) -> None:
     """Each array has numbers, all of them finite, where their values are known."""
     _check_entries(np.isfinite, "finite", arguments)
+
+
+def check_covariance_array(**arguments: Any) -> None:
+    """Each array (..., d, d) is symmetric and positive semidefinite, where its values are known."""
+    check_finite_array(**arguments)
+    for name, array in arguments.items():
+        if isinstance(array, Tracer | jax.ShapeDtypeStruct):
+            continue
+        values = np.asarray(array, float)
+        largest = np.abs(values).max()
+        mirrored = np.swapaxes(values, -1, -2)
+        if np.abs(values - mirrored).max() > _ROUNDING * largest:
+            raise ValueError(f"{name}: {shown(array)} is not symmetric")
+        if np.linalg.eigvalsh(0.5 * (values + mirrored)).min() < -_ROUNDING * largest:
+            raise ValueError(
+                f"{name}: {shown(array)} is no covariance: it has a negative eigenvalue"
+            )
 
 
 def check_shape(shape: str, /, **arguments: Any) -> None:

@@ -113,12 +113,12 @@ def is_marginalised(model: Any) -> bool:
 
 
 def refuse_marginalised(
-    model: Any, needed_by: str, instead: str = "take PropagateMarginalised"
+    model: Any, needed_by: str, instead: str = "take PropagateMarginalised", name: str = "model"
 ) -> None:
     """Raise a `ValueError` for a conditionally linear model, which is not propagated as a whole."""
     if is_marginalised(model):
         raise ValueError(
-            f"model: {model_name(model)} is conditionally linear, and {needed_by} needs states"
+            f"{name}: {model_name(model)} is conditionally linear, and {needed_by} needs states"
             f" that are drawn as a whole; {instead}"
         )
 

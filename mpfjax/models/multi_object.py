@@ -17,6 +17,7 @@ from mpfjax.models.base import (
     is_made_of_noise,
     model_name,
 )
+from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.inputs import replaced, takes_inputs, with_inputs
 from mpfjax.operations.generator import split
 
@@ -48,9 +49,9 @@ class MultiObjectModel(AbstractStateSpaceModel):
       model's draws both ways, without computing them.
 
     Particles have leaves (n, J, ...). Raises `ValueError` for J < 1, an object model that works
-    neither way or, for `per_object=None`, both ways, and one that lacks a method. Use it where
-    objects interact or share particles; without interaction `independent_particle_filters` is
-    better.
+    neither way or, for `per_object=None`, both ways, one that lacks a method, and one that is
+    conditionally linear. Use it where objects interact or share particles; without interaction
+    `independent_particle_filters` is better.
     """
 
     object_model: AbstractStateSpaceModel
@@ -72,6 +73,8 @@ class MultiObjectModel(AbstractStateSpaceModel):
     ) -> None:
         check_whole(num_objects=num_objects)
         check_model(object_model, "MultiObjectModel", "object_model")
+        instead = "give each object a filter of its own"
+        refuse_marginalised(object_model, "MultiObjectModel", instead, "object_model")
         potential = "a function of the states of two objects, such as PairwiseRepulsion(...)"
         check_callable(potential, **given(interaction=interaction))
         check_flag(shared_observation=shared_observation, **given(per_object=per_object))

@@ -9,7 +9,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Key
 
-from mpfjax.checks import check_finite_array, check_not_negative_array, check_shape, shown, to_array
+from mpfjax.checks import (
+    check_covariance_array,
+    check_finite_array,
+    check_not_negative_array,
+    check_shape,
+    shown,
+    to_array,
+)
 from mpfjax.models.conditionally_linear import AbstractConditionallyLinearModel
 from mpfjax.operations.generator import uniform
 from mpfjax.operations.logarithms import log_or_nothing
@@ -40,7 +47,8 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel):
     - `b`, `c`: (d,) or (K, d), and (p,) or (K, p); None is zero.
     - `initial_probabilities`: of z_0, (K,); None makes all equal.
 
-    Raises `ValueError` for shapes that do not fit together, and for rows that are no probabilities.
+    Raises `ValueError` for shapes that do not fit together, for rows that are no probabilities, and
+    for Q, R or P0 that is no covariance.
     Use it for manoeuvring targets, and for regimes of a time series.
     """
 
@@ -75,7 +83,8 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel):
                     f"{name}: shape {array.shape} is neither {shape} nor {(k, *shape)}, for"
                     f" {k} regimes, m0 of shape {self.m0.shape} and H of shape {self.H.shape}"
                 )
-            check_finite_array(**{name: array})
+            check = check_covariance_array if name in ("Q", "R", "P0") else check_finite_array
+            check(**{name: array})
         _check_probabilities(transition_matrix=self.transition_matrix)
         if self.initial_probabilities is not None:
             check_shape(f"{k}", initial_probabilities=self.initial_probabilities)

@@ -1,7 +1,7 @@
 """Moves of a twisted particle filter, whose look-ahead depends on the step."""
 
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -13,13 +13,25 @@ from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     HasInitialNoise,
-    HasTransitionNoise,
     check_moved,
     require_noise,
+)
+from mpfjax.models.conditionally_linear import (
+    AbstractConditionallyLinearModel,
+    is_marginalised,
+    is_mixed,
+    predicted,
+    with_moments,
 )
 from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
 from mpfjax.moves.base import AbstractMove, AbstractPropagation, AbstractRegrouping
 from mpfjax.moves.local_quadratics import LocalQuadratics
+from mpfjax.moves.propagation.marginalised import (
+    PropagateMarginalised,
+    latent_made_of,
+    latent_noise_dimension,
+    seen,
+)
 from mpfjax.moves.propagation.propagate import likelihoods, predict
 from mpfjax.operations.logarithms import log_sum_exp
 
@@ -58,6 +70,31 @@ def features_of(features: Callable[[PyTree], Array] | None, states: PyTree) -> F
         return flatten_states(states)
     found = jnp.asarray(features(states))
     return found.reshape(found.shape[0], -1).astype(noise_dtype(states))
+
+
+def noise_dimension_of(model: Any, states: PyTree) -> int:
+    """How many standard normal numbers the model makes x_t of; of a marginalised one, z_t."""
+    if is_marginalised(model):
+        return latent_noise_dimension(model, states)
+    return model.noise_dimension
+
+
+def made_of(model: Any, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
+    """x_t of each particle, made of this noise; of a marginalised model z_t, with x predicted."""
+    if is_marginalised(model):
+        return predicted(model, latent_made_of(model, noise, states), states)
+    moved = model.transition_from_noise(noise, states)
+    check_moved(moved, states, model, "transition_from_noise")
+    return moved
+
+
+def seen_by(
+    model: Any, observation: PyTree, states: PyTree
+) -> tuple[PyTree, list[Float[Array, " n"]]]:
+    """The states that `made_of` gives, updated if they carry moments, and log L as its factors."""
+    if is_marginalised(model):
+        return seen(model, observation, states)
+    return states, [likelihoods(model, observation, states)]
 
 
 class CountSteps(AbstractMove):
@@ -118,7 +155,7 @@ class TwistInitial(AbstractMove):
         shape, dtype = (mixture.num_particles, model.initial_noise_dimension + 1), psi.slopes.dtype
         noise = draw_noise(self.noise, key, shape, dtype)
         drawn, log_ratio = psi.draw(noise, jnp.zeros((shape[0], 1), dtype))
-        states = model.initial_from_noise(drawn)
+        states = with_moments(model, model.initial_from_noise(drawn))
         check_moved(states, mixture.particles, self.model, "initial_from_noise")
         log_weights = mixture.log_weights + log_ratio.astype(mixture.log_weights.dtype)
         log_mass = log_sum_exp(log_weights)
@@ -149,9 +186,10 @@ class TwistedLookahead(eqx.Module):
 class PropagateTwisted(AbstractPropagation):
     """Draw the noise ε of x_t from q_t(ε | x_{t-1}), and weigh by L(y_t | x_t) N(ε; 0, I) / q_t.
 
-    No density of the dynamics is needed, which may be singular or mixed with discrete draws.
-    `noise` is that of `Propagate`. Raises `ValueError` for a model without
-    `transition_from_noise`, and for unknown noise.
+    No density of the dynamics is needed, which may be singular or mixed with discrete draws. For a
+    conditionally linear model ε is the noise of z_t, and L is p(y_t | z_0, ..., z_t, y_1..y_{t-1}).
+    `noise` is that of `Propagate`. Raises `ValueError` for a model that makes x_t, or z_t,
+    otherwise, and for unknown noise.
     """
 
     model: AbstractStateSpaceModel
@@ -159,7 +197,8 @@ class PropagateTwisted(AbstractPropagation):
     noise: str = eqx.field(static=True, default="independent")
 
     def __check_init__(self) -> None:
-        require_noise(self.model, "PropagateTwisted")
+        if not is_mixed(self.model):
+            require_noise(self.model, "PropagateTwisted")
         check_one_of(NOISES, noise=self.noise)
 
     @property
@@ -171,21 +210,22 @@ class PropagateTwisted(AbstractPropagation):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
-        model, previous = cast(HasTransitionNoise, self.model), mixture.particles
-        shape = (mixture.num_particles, model.noise_dimension + 1)
+        model, previous = self.model, mixture.particles
+        shape = (mixture.num_particles, noise_dimension_of(model, previous) + 1)
         labels, num_components = mixture.component_indicators, mixture.num_components
         dtype = noise_dtype(previous)
         noise = draw_noise(self.noise, key, shape, dtype, labels, num_components)
         psi = self.twist.at(mixture.memory[STEP]["step"])
         drawn, log_ratio = psi.draw(noise, self.twist.features_of(previous))
-        states = model.transition_from_noise(drawn, previous)
-        check_moved(states, previous, self.model, "transition_from_noise")
-        log_factors = likelihoods(self.model, observation, states)
-        return mixture.replace(particles=states).weighed(log_factors, log_ratio)
+        states, log_factors = seen_by(model, observation, made_of(model, drawn, previous))
+        return mixture.replace(particles=states).weighed(*log_factors, log_ratio)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
-        return predict(key, self.model, mixture, "none", self.noise)
+        model = self.model
+        if isinstance(model, AbstractConditionallyLinearModel):
+            return PropagateMarginalised(model, noise=self.noise).predict(key, mixture)
+        return predict(key, model, mixture, "none", self.noise)
 
 
 class RegroupTwisted(AbstractRegrouping):

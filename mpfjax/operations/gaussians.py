@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from mpfjax.operations.stacks import (
     applied,
+    product,
     sandwiched,
     solve_lower,
     symmetric,
@@ -39,6 +40,16 @@ def predict(state: Gaussian, dynamics: Linear) -> Gaussian:
     matrix, offset, noise = _kept(dynamics.matrix), dynamics.offset, dynamics.noise
     covariance = sandwiched(matrix, state.covariance) + noise
     return Gaussian(applied(matrix, state.mean) + offset, _kept(covariance))
+
+
+def through(dynamics: Linear, seen: Linear) -> Linear:
+    """y of F x + b + N(0, Q) as an observation of x: H F x + H b + c + N(0, H Q Hᵀ + R)."""
+    matrix, offset, noise = dynamics
+    return Linear(
+        product(seen.matrix, matrix),
+        applied(seen.matrix, offset) + seen.offset,
+        sandwiched(seen.matrix, noise) + seen.noise,
+    )
 
 
 def update(

@@ -9,9 +9,9 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
+from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.moves.local_quadratics import LocalQuadratics, neutral
-from mpfjax.moves.propagation.propagate import likelihoods
-from mpfjax.moves.twisted import Twist
+from mpfjax.moves.twisted import Twist, made_of, noise_dimension_of, seen_by
 from mpfjax.observations import Series
 
 # The effective number of particles for each coefficient of a regression.
@@ -80,18 +80,21 @@ def _draw_points(
 ) -> _Points:
     """Draw every particle with equal frequency, so that none is lost, with noise from q_t."""
     num_experts, dimension = used.centres.shape
-    num_coefficients = _num_coefficients(dimension + model.noise_dimension)
+    num_noises = noise_dimension_of(model, mixture.particles)
+    num_coefficients = _num_coefficients(dimension + num_noises)
     needed = _PARTICLES_A_COEFFICIENT * num_coefficients
     copies = -(-2 * needed * num_experts // mixture.num_particles)
     repeated = lambda leaf: jnp.repeat(leaf, copies, axis=0)  # noqa: E731
     states = jax.tree.map(repeated, mixture.particles)
     features, log_weights = twist.features_of(states), repeated(mixture.log_weights)
-    shape = (len(log_weights), model.noise_dimension + 1)
+    shape = (len(log_weights), num_noises + 1)
     noise, log_ratio = used.draw(jax.random.normal(key, shape, features.dtype), features)
-    moved = model.transition_from_noise(noise, states)
-    log_likelihoods = likelihoods(model, now.observations, moved)
-    if now.present is not None:
-        log_likelihoods = jnp.where(now.present, log_likelihoods, 0.0)
+    unseen = made_of(model, noise, states)
+    moved, log_factors = seen_by(model, now.observations, unseen)
+    log_likelihoods = sum(log_factors[1:], log_factors[0])
+    if (present := now.present) is not None:
+        log_likelihoods = jnp.where(present, log_likelihoods, 0.0)
+        moved = jax.tree.map(lambda new, old: jnp.where(present, new, old), moved, unseen)
     targets = log_likelihoods + after.log_fitted(twist.features_of(moved))
     is_number = jnp.isfinite(targets)
     targets = jnp.where(is_number, targets, jnp.min(jnp.where(is_number, targets, jnp.inf)))
@@ -170,7 +173,7 @@ def _fit_initial(
         dtype = used.slopes.dtype
         standard = jax.random.normal(key, shape, dtype)
         noise, log_ratio = psi.draw(standard, jnp.zeros((size, 1), dtype))
-        features = twist.features_of(model.initial_from_noise(noise))
+        features = twist.features_of(with_moments(model, model.initial_from_noise(noise)))
         return noise, features, first.log_fitted(features) + log_ratio
 
     noise, features, log_importance = draw(key_used, used)

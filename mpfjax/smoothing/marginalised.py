@@ -1,12 +1,14 @@
 """Rao-Blackwellised backward sampling: latents backward in time, and moments of x given all y.
 
-Lindsten, Bunch, Särkkä, Schön and Godsill (2016). The likelihood of later observations and latents
-as a function of x_s is exp(-x Ω x / 2 + λ x), up to a factor. The index of z_s given the future has
-the probabilities
+Lindsten, Bunch, Särkkä, Schön and Godsill (2016). The likelihood of y_{s+1}, ... and z_{s+1}, ...
+as a function of x_s is exp(-u Ω u / 2 + λ u), up to a factor, with u the distance of x_s from the
+mean of the trajectory's own particle: the terms of u would cancel but for rounding if x itself
+stood there, far from zero. The index of z_s given the future has the probabilities
 
-    W_s^i p(z_{s+1} | z_s^i) ∫ N(x; m_i, P_i) exp(-x Ω x / 2 + λ x) dx,
+    W_s^i p(z_{s+1} | z_s^i) p(y_{s+1} | i) ∫ N(x; m_i, P_i) exp(-u Ω u / 2 + λ u) dx,
 
-with m_i and P_i the prediction of x_{s+1} by particle i.
+with Ω and λ of s + 1, and m_i and P_i of x_{s+1} by particle i, given y_{s+1} too. Only what an
+observation says of the x before it enters Ω, so that R may be singular.
 """
 
 from typing import Any, NamedTuple
@@ -34,6 +36,7 @@ from mpfjax.models.conditionally_linear import (
 )
 from mpfjax.models.inputs import with_inputs
 from mpfjax.moves.propagation.marginalised import log_latent_transition
+from mpfjax.operations import gaussians
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.gaussians import Gaussian, Linear, without_missing
 from mpfjax.operations.generator import split, uniform
@@ -55,10 +58,11 @@ _NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the st
 
 
 class Information(NamedTuple):
-    """A likelihood of x, exp(-x Ω x / 2 + λ x), the trajectories last."""
+    """A likelihood of x, exp(-u Ω u / 2 + λ u) with u = x - centre, the trajectories last."""
 
     precision: Float[Array, "d d #n"]
     vector: Float[Array, "d #n"]
+    centre: Float[Array, "d #n"]
 
 
 def check_marginalised(
@@ -98,10 +102,9 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
         latent, future = carry
         step_key, earlier, observation, now = step
         moved_by = with_inputs(model, now)
-        future = _joined(future, _seen(moved_by, observation, latent, future))
-        indices = _indices(step_key, moved_by, latent, future, earlier)
+        indices = _indices(step_key, moved_by, observation, latent, future, earlier)
         before = jax.tree.map(lambda leaf: take(leaf, indices), earlier.particles)
-        future = _before(moved_by, latent, before, future)
+        future = _before(moved_by, observation, latent, before, future)
         return (before.latent, future), (before.latent, future)
 
     def forth(state: MarginalisedState, step: Any) -> tuple[Any, Any]:
@@ -128,47 +131,61 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
 
 def _nothing(mean: Float[Array, "n d"]) -> Information:
     n, d = mean.shape
-    return Information(jnp.zeros((d, d, n), mean.dtype), jnp.zeros((d, n), mean.dtype))
+    return Information(jnp.zeros((d, d, n), mean.dtype), jnp.zeros((d, n), mean.dtype), mean.T)
 
 
 def _joined(one: Information, other: Information) -> Information:
-    return Information(one.precision + other.precision, one.vector + other.vector)
+    """Both, which have one centre."""
+    return Information(one.precision + other.precision, one.vector + other.vector, one.centre)
 
 
-def _told(target: Float[Array, "p #n"], seen: Linear) -> Information:
-    """The likelihood of y = H x + c + N(0, R) as a function of x."""
-    target, seen, _ = without_missing(target, seen)
-    factor = cholesky(seen.noise, floor=True)
+def _told(target: Float[Array, "p #n"], seen: Linear, law: Gaussian) -> Information:
+    """The likelihood of y = A x + b + N(0, C) as a function of x, around the mean of its law."""
+    known = sandwiched(seen.matrix, law.covariance)
+    factor = cholesky(_with_least_noise(seen.noise, known), floor=True)
     rows = solve_lower(factor, seen.matrix)
-    white = solve_lower(factor, (target - seen.offset)[:, None])[:, 0]
-    return Information(product(transposed(rows), rows), applied(transposed(rows), white))
+    missed = target - seen.offset - applied(seen.matrix, law.mean)
+    white = solve_lower(factor, missed[:, None])[:, 0]
+    return Information(product(transposed(rows), rows), applied(transposed(rows), white), law.mean)
 
 
-def _seen(model: Any, observation: PyTree, latent: PyTree, like: Information) -> Information:
-    """The likelihood of y_s as a function of x_s."""
-    d, n = like.vector.shape
-    state = MarginalisedState(
-        latent, jnp.zeros((n, d), like.vector.dtype), jnp.zeros((n, d, d), like.vector.dtype)
-    )
-    seen = emission_of(model, latent, state)
-    if seen is None:
-        return Information(jnp.zeros_like(like.precision), jnp.zeros_like(like.vector))
-    return _told(observation_rows(model, observation, seen, like.vector.dtype), seen)
+def _with_least_noise(
+    noise: Float[Array, "p p #n"], known: Float[Array, "p p n"]
+) -> Float[Array, "p p n"]:
+    """The noise of y, each variance at least a share of that which x itself makes.
+
+    With less, Ω would round away what is known of x in other directions.
+    """
+    p, share = noise.shape[0], float(jnp.finfo(noise.dtype).eps) ** 0.5
+    own = jnp.stack([noise[j, j] for j in range(p)])
+    least = share * jnp.stack([known[j, j] for j in range(p)])
+    least = jnp.where((own > 0) | (least > 0), least, 1.0)  # an exact y of an x known exactly
+    lacking = jnp.maximum(least - own, 0.0)
+    return noise + jnp.eye(p, dtype=noise.dtype)[:, :, None] * lacking[None]
 
 
 def _before(
-    model: Any, latent: PyTree, before: MarginalisedState, future: Information
+    model: Any, observation: PyTree, latent: PyTree, before: MarginalisedState, future: Information
 ) -> Information:
-    """The likelihood of z_{s+1} and all that follows as a function of x_s, given z_s."""
-    dynamics = dynamics_of(model, latent, before)
-    told = Information(jnp.zeros_like(future.precision), jnp.zeros_like(future.vector))
+    """The likelihood of y_{s+1}, z_{s+1} and all that follows as a function of x_s, given z_s."""
+    dynamics, law = dynamics_of(model, latent, before), gaussian_of(before)
+    told = _nothing(before.mean)
     if is_mixed(model):
         mixed, shared = latent_dynamics_of(model, before)
         rows = latent_rows(model, latent)
-        told = _told(rows, mixed)
+        told = _told(rows, mixed, law)
         dynamics = decorrelated(dynamics, mixed, shared, rows)
+    seen = emission_of(model, latent, before)
+    if seen is not None:
+        target = observation_rows(model, observation, seen, before.mean.dtype)
+        target, seen, _ = without_missing(target, seen)
+        through = gaussians.through(dynamics, seen)
+        told = _joined(told, _told(target, through, law))
+        shared = product(dynamics.noise, transposed(seen.matrix))
+        dynamics = decorrelated(dynamics, through, shared, target)
     matrix, offset, noise = dynamics
-    precision, vector = future
+    precision, vector, centre = future
+    offset = offset + applied(matrix, law.mean) - centre
     vector = vector - applied(precision, offset)
     root = cholesky(noise)
     half = solve_lower(_one_plus(precision, root), transposed(product(precision, root)))
@@ -178,7 +195,7 @@ def _before(
     precision = precision - product(transposed(half), half)
     vector = vector - applied(transposed(half), white)
     back = transposed(matrix)
-    return _joined(told, Information(sandwiched(back, precision), applied(back, vector)))
+    return _joined(told, Information(sandwiched(back, precision), applied(back, vector), law.mean))
 
 
 def _one_plus(
@@ -191,29 +208,39 @@ def _one_plus(
 
 
 def _log_overlap(law: Gaussian, future: Information) -> Float[Array, " n"]:
-    """log ∫ N(x; m, P) exp(-x Ω x / 2 + λ x) dx of each particle."""
-    precision, vector = future
-    root = cholesky(law.covariance)
+    """log ∫ N(x; m, P) exp(-u Ω u / 2 + λ u) dx of each particle."""
+    precision, vector, centre = future
+    root, away = cholesky(law.covariance), law.mean - centre
     factor = _one_plus(precision, root)
-    pulled = applied(precision, law.mean)
+    pulled = applied(precision, away)
     white = solve_lower(factor, applied(transposed(root), vector - pulled)[:, None])[:, 0]
-    at_mean = applied(law.mean[None], vector - 0.5 * pulled)[0]
+    at_mean = applied(away[None], vector - 0.5 * pulled)[0]
     log_volume = sum(jnp.log(factor[j, j]) for j in range(factor.shape[0]))
     return at_mean + 0.5 * applied(white[None], white)[0] - log_volume
 
 
 def _indices(
-    key: Key[Array, ""], model: Any, latent: PyTree, future: Information, earlier: ParticleMixture
+    key: Key[Array, ""],
+    model: Any,
+    observation: PyTree,
+    latent: PyTree,
+    future: Information,
+    earlier: ParticleMixture,
 ) -> Array:
     """The particle of s that each trajectory comes from."""
-    n = earlier.log_weights.shape[0]
+    n, state = earlier.log_weights.shape[0], earlier.particles
 
     def of_one(inputs: Any) -> tuple[Array, Array]:
-        share, own, precision, vector = inputs
+        share, own, *of_future = inputs
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), own)
-        law = predicted_gaussian(model, copies, earlier.particles)
-        one = Information(precision[:, :, None], vector[:, None])
-        log_density = log_latent_transition(model, copies, earlier.particles)
+        law = predicted_gaussian(model, copies, state)
+        log_density = log_latent_transition(model, copies, state)
+        seen = emission_of(model, copies, state)
+        if seen is not None:
+            rows = observation_rows(model, observation, seen, state.mean.dtype)
+            law, log_factor = gaussians.update(law, rows, seen)
+            log_density = log_density + log_factor
+        one = Information(*(part[..., None] for part in of_future))
         log_density = log_density + _log_overlap(law, one)
         log_weights = jnp.where(earlier.occupied, earlier.log_weights + log_density, -jnp.inf)
         largest = jnp.max(log_weights)
@@ -222,9 +249,8 @@ def _indices(
 
     num_states = jax.tree.leaves(latent)[0].shape[0]
     shares = uniform(key, (num_states,), earlier.log_weights.dtype)
-    precision, vector = jnp.moveaxis(future.precision, -1, 0), future.vector.T
     together = max(1, min(num_states, MOST_DENSITIES // (16 * n)))
-    inputs = (shares, latent, precision, vector)
+    inputs = (shares, latent, *(jnp.moveaxis(part, -1, 0) for part in future))
     indices, largest = jax.lax.map(of_one, inputs, batch_size=together)
     return eqx.error_if(indices, jnp.any(~(largest > -jnp.inf)), _NO_PAST)
 
@@ -236,6 +262,6 @@ def _smoothed(state: MarginalisedState, future: Information) -> MarginalisedStat
     factor = _one_plus(future.precision, root)
     half = solve_lower(factor, transposed(root))
     covariance = symmetric(product(transposed(half), half))
-    pull = future.vector - applied(future.precision, law.mean)
+    pull = future.vector - applied(future.precision, law.mean - future.centre)
     mean = law.mean + applied(covariance, pull)
     return MarginalisedState(state.latent, particles_first(mean, n), particles_first(covariance, n))

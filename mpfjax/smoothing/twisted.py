@@ -12,11 +12,12 @@ from jaxtyping import Array, Key, PyTree
 from mpfjax.checks import check_callable, check_key, check_type, check_whole, given
 from mpfjax.filter import Filter
 from mpfjax.models.base import mapped, require_noise, starts_from_noise
-from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.conditionally_linear import is_mixed, with_moments
 from mpfjax.models.noise import noise_dtype
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.every import Every
 from mpfjax.moves.local_quadratics import neutral
+from mpfjax.moves.propagation.marginalised import PropagateMarginalised
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.resample import Resample
@@ -28,6 +29,7 @@ from mpfjax.moves.twisted import (
     TwistedLookahead,
     TwistInitial,
     features_of,
+    noise_dimension_of,
 )
 from mpfjax.observations import as_series
 from mpfjax.running.run import run_filter
@@ -85,8 +87,10 @@ def learn_lookahead(
       model is wrapped by `per_particle`. None is the flattened state.
     - `inputs`, `missing`: those of `run_filter`; steps without an observation are looked over.
 
-    Raises `ValueError` for another filter, and for a model that makes x_t otherwise or is
-    conditionally linear. Use it if all
+    For a conditionally linear model ε is the noise of z_t, L the density of y_t given z_0, ..., z_t
+    and y_1..y_{t-1}, and φ that of the particles: by default of the latent and the mean.
+
+    Raises `ValueError` for another filter, and for a model that makes x_t otherwise. Use it if all
     observations are known from the start: for log Ẑ in `metropolis_hastings` and `smc2`, to compare
     models, and for the masses of modes at the end.
     """
@@ -95,8 +99,8 @@ def learn_lookahead(
     check_whole(num_passes=num_passes, **given(num_particles=num_particles))
     check_callable("features of the states", **given(features=features))
     model: Any = filter.model
-    refuse_marginalised(model, "learn_lookahead", "learn from a model that draws x as well")
-    require_noise(model, "learn_lookahead")
+    if not is_mixed(model):
+        require_noise(model, "learn_lookahead")
     series = as_series(observations, inputs, missing, model)
     twist = _knowing_nothing(key, filter, series.length, mapped(model, features))
     learners = num_particles or _LEARNERS * filter.num_particles
@@ -113,10 +117,12 @@ def _knowing_nothing(
 ) -> Twist:
     """ψ = 1 at every step."""
     model: Any = filter.model
-    states = jax.eval_shape(lambda key: model.sample_initial(key, 2), key)
+    start = lambda key: with_moments(model, model.sample_initial(key, 2))  # noqa: E731
+    states = jax.eval_shape(start, key)
     num_features = jax.eval_shape(partial(features_of, features), states).shape[1]
     size, dtype = filter.num_components, noise_dtype(states)
-    one = neutral(size, num_features, model.noise_dimension, dtype)
+    noise = jax.eval_shape(lambda states: jnp.zeros(noise_dimension_of(model, states)), states)
+    one = neutral(size, num_features, noise.shape[0], dtype)
     steps = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (length + 1, *leaf.shape)), one)
     initial = None
     if starts_from_noise(model):
@@ -150,7 +156,7 @@ def _looking_ahead(move: Any, filter: Filter, twist: Twist) -> Any:
         # Masses of today tell little where ψ knows what is to come: each ψ_t errs by its own fit.
         equally = dataclasses.replace(move, allocation="equal")
         return AuxiliaryResample(equally, TwistedLookahead(twist))
-    if isinstance(move, Propagate) and move.gradient == "none":
+    if isinstance(move, Propagate | PropagateMarginalised) and move.gradient == "none":
         return PropagateTwisted(filter.model, twist, move.noise)
     if isinstance(move, Every):
         return Every(move.num_steps, [_looking_ahead(inner, filter, twist) for inner in move.moves])
@@ -158,5 +164,5 @@ def _looking_ahead(move: Any, filter: Filter, twist: Twist) -> Any:
         return RegroupTwisted(move, twist)
     raise ValueError(
         f"filter: {type(move).__name__}, one of its moves, cannot look ahead; Resample, Propagate"
-        " of gradient 'none' and regrouping can"
+        " or PropagateMarginalised of gradient 'none', and regrouping can"
     )

@@ -108,13 +108,16 @@ def test_draws_of_regimes_follow_the_transition_matrix():
         ("R", EYE),
         ("b", np.zeros(3)),
         ("P0", np.full((2, 2), np.nan)),
+        ("Q: (?s:.*) is not symmetric", np.array([[1.0, 0.5], [0.0, 1.0]])),
+        ("R: (?s:.*) negative eigenvalue", -np.eye(1)),
+        ("P0: (?s:.*) negative eigenvalue", np.stack([EYE, np.array([[1.0, 2.0], [2.0, 1.0]])])),
         ("initial_probabilities", np.array([0.5, 0.6])),
         ("initial_probabilities", np.ones(1)),
     ],
 )
 def test_what_does_not_fit_together_is_named(name, value):
     with pytest.raises(ValueError, match=name):
-        mpfjax.SwitchingLinearGaussianModel(**(GOOD | {name: value}))
+        mpfjax.SwitchingLinearGaussianModel(**(GOOD | {name.split(":")[0]: value}))
 
 
 def test_too_long_a_series_is_refused():

@@ -296,6 +296,8 @@ def test_misuse_is_named():
     for make in (mpfjax.Propagate, mpfjax.Predict, mpfjax.Reweight, mpfjax.PropagateTempered):
         with pytest.raises(ValueError, match=r"model: .* is conditionally linear"):
             make(MODEL)
+    with pytest.raises(ValueError, match=r"object_model: .* is conditionally linear"):
+        mpfjax.MultiObjectModel(MODEL, 2)
     with pytest.raises(ValueError, match=r"model: .* conditionally linear"):
         mpfjax.gaussian_particle_filter(MODEL, 10)
     with pytest.raises((ValueError, TypeError), match="AbstractConditionallyLinearModel"):

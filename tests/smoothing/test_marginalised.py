@@ -1,5 +1,6 @@
 """Rao-Blackwellised backward sampling against all sequences of regimes, and a Kalman smoother."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ from mpfjax import Filter, PropagateRegimes
 from mpfjax.exact import kalman_filter, switching_filter
 from mpfjax.smoothing import conditional_filter, sample_trajectories, smoothed_sums
 from mpfjax.tuning import metropolis_hastings, particle_gibbs, smc2
+from tests.marking import thorough
 from tests.moves import test_marginalised_mixed as tests_mixed
 from tests.moves.test_marginalised_mixed import Mixed, whole
 from tests.smoothing import exact_smoothers
@@ -36,14 +38,36 @@ def assert_close(estimates, expected):
     assert (np.abs(estimates.mean(axis=0) - expected) < 4 * error + 2e-3).all()
 
 
-def test_regimes_and_moments_are_those_of_all_sequences():
-    filter = Filter(MODEL, [PropagateRegimes(MODEL)], 200)
-    found = jax.jit(lambda: smoothed(filter, MODEL, OBSERVATIONS, NUM_RUNS))()
-    exact = switching_filter(MODEL, OBSERVATIONS)
+def far_away(distance):
+    """The same model and observations, with the origin elsewhere."""
+    offset = np.full(2, distance)
+    stays = offset - np.asarray(MODEL.F) @ offset
+    parts = (MODEL.b + jnp.asarray(stays, jnp.float32), MODEL.m0 + distance)
+    return eqx.tree_at(lambda m: (m.b, m.m0), MODEL, parts), OBSERVATIONS + distance
+
+
+def without_errors():
+    """In one regime the position is seen exactly."""
+    return eqx.tree_at(lambda m: m.R, MODEL, MODEL.R.at[2].set(0.0)), OBSERVATIONS
+
+
+CASES = {
+    "near": (MODEL, OBSERVATIONS, 0.0),
+    "far from zero": (*far_away(3000.0), 3000.0),
+    "R singular": (*without_errors(), 0.0),
+}
+
+
+@pytest.mark.parametrize("case", ["near", *thorough(["far from zero", "R singular"])])
+def test_regimes_and_moments_are_those_of_all_sequences(case):
+    model, observations, centre = CASES[case]
+    filter = Filter(model, [PropagateRegimes(model)], 200)
+    found = jax.jit(lambda: smoothed(filter, model, observations, NUM_RUNS))()
+    exact = switching_filter(MODEL if centre else model, observations - centre)
     latent = np.asarray(found.latent)
     shares = np.stack([(latent == k).mean(axis=1) for k in range(NUM_REGIMES)], axis=-1)
     assert_close(shares, np.asarray(exact.smoothed_regime_probabilities))
-    mean, truth = np.asarray(found.mean), np.asarray(exact.smoothed_means)
+    mean, truth = np.asarray(found.mean, float) - centre, np.asarray(exact.smoothed_means)
     assert_close(mean.mean(axis=1), truth)
     squares = np.asarray(found.covariance) + mean[..., :, None] * mean[..., None, :]
     second = np.asarray(exact.smoothed_covariances) + truth[:, :, None] * truth[:, None, :]

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.exact import grid_filter, kalman_filter
+from mpfjax.exact import grid_filter, kalman_filter, switching_filter
 from mpfjax.smoothing import learn_lookahead
 from tests.marking import thorough
+from tests.moves import test_marginalised_mixed as mixed
 from tests.switching import MODEL as REGIMES
+from tests.switching import OBSERVATIONS as SEEN
 
 NUM_RUNS = 400
 GRID = jnp.linspace(-4.0, 4.0, 1601)
@@ -148,6 +150,42 @@ def test_samplers_take_it():
     assert np.isfinite(float(density(density.start, jax.random.key(0))))
 
 
+GAP = mixed.OBSERVATIONS.at[2].set(jnp.nan)
+MARGINALISED = {
+    "mixed form": (mixed.Mixed(), mixed.OBSERVATIONS, 0.5),
+    "mixed form, one missing": (mixed.Mixed(), GAP, 0.6),
+    "regimes": (REGIMES, SEEN, 1.0),
+}
+
+
+@pytest.mark.parametrize("case", ["mixed form", *thorough(["mixed form, one missing", "regimes"])])
+def test_a_conditionally_linear_model_learns_too(case):
+    """E[Ẑ/Z] = 1 and E[Ẑ/Z E[x]] = E[x | y], and the noise of log Ẑ falls to a share of it."""
+    model, observations, share = MARGINALISED[case]
+    plain = mpfjax.particle_filter(model, 60)
+    ahead = learn_lookahead(jax.random.key(0), plain, observations, 3, missing="skip")
+    if model is REGIMES:
+        exact = switching_filter(model, observations)
+    else:
+        exact = kalman_filter(mixed.whole(True), observations, missing="skip")
+
+    def logs(filter):
+        collect = lambda mixture: mixture.mean().mean  # noqa: E731
+        run = mpfjax.monte_carlo(KEYS, filter, observations, collect, missing="skip")
+        gaps = run.log_likelihood_increments - exact.log_likelihood_increments[None]
+        return np.cumsum(np.asarray(gaps), axis=1), np.asarray(run.collected)
+
+    found, means = logs(ahead)
+    ratios = np.exp(found)
+    for values, truth in (
+        (ratios, np.ones(len(observations))),
+        (ratios[..., None] * means, np.asarray(exact.means)[:, -2:]),
+    ):
+        error = values.std(axis=0) / np.sqrt(NUM_RUNS)
+        assert (np.abs(values.mean(axis=0) - truth) <= 4 * error + 1e-3).all()
+    assert found[:, -1].std() < share * logs(plain)[0][:, -1].std()
+
+
 @pytest.mark.usefixtures("as_installed")
 @pytest.mark.parametrize(
     ("make", "named"),
@@ -174,9 +212,11 @@ def test_samplers_take_it():
         ),
         (
             lambda: learn_lookahead(
-                jax.random.key(0), mpfjax.particle_filter(REGIMES, 20), PATH[:, None]
+                jax.random.key(0),
+                mpfjax.Filter(REGIMES, [mpfjax.PropagateRegimes(REGIMES)], 20),
+                PATH[:, None],
             ),
-            "model: .* is conditionally linear, and learn_lookahead needs",
+            "filter: PropagateRegimes, one of its moves, cannot look ahead",
         ),
     ],
 )

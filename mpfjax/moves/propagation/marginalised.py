@@ -110,17 +110,17 @@ class PropagateMarginalised(AbstractPropagation):
         if self.proposal is not None:
             proposal: Any = self.proposal
             return proposal.noise_dimension(mixture.particles)
-        return _own_noise_dimension(self.model, mixture.particles)
+        return latent_noise_dimension(self.model, mixture.particles)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw z_t by its own law and predict, for a step without an observation."""
         state = mixture.particles
         made_of_noise = is_mixed(self.model) or is_made_of_noise(self.model)
         if self.noise != "independent" and made_of_noise:
-            dimension = _own_noise_dimension(self.model, state)
+            dimension = latent_noise_dimension(self.model, state)
             return self._made_of(noise_of_slots(self.noise, key, dimension, mixture), mixture)
         if is_mixed(self.model):
-            shape = (mixture.num_particles, _own_noise_dimension(self.model, state))
+            shape = (mixture.num_particles, latent_noise_dimension(self.model, state))
             return self._made_of(normal(key, shape, noise_dtype(state)), mixture)
         latent = self.model.sample_transition(key, state.latent)
         check_moved(latent, state.latent, self.model)
@@ -128,15 +128,7 @@ class PropagateMarginalised(AbstractPropagation):
 
     def _made_of(self, noise: Float[Array, "n k"], mixture: ParticleMixture) -> ParticleMixture:
         """The prediction with z_t made of this noise."""
-        state = mixture.particles
-        if is_mixed(self.model):
-            return self._moved(latent_from_noise(self.model, noise, state), mixture)
-        who = f"model: {model_name(self.model)}.transition_from_noise"
-        with saying(f"in {who}, of noise of shape {noise.shape}, as noise_dimension says"):
-            maker = cast(HasTransitionNoise, self.model)
-            latent = maker.transition_from_noise(noise, state.latent)
-        check_moved(latent, state.latent, self.model, "transition_from_noise")
-        return self._moved(latent, mixture)
+        return self._moved(latent_made_of(self.model, noise, mixture.particles), mixture)
 
     def _moved(self, latent: PyTree, mixture: ParticleMixture) -> ParticleMixture:
         """The prediction given z_t, and the density of z_t that "stop" differentiates."""
@@ -176,11 +168,38 @@ def log_latent_transition(
     return log_transition(model, latent, state.latent)
 
 
-def _own_noise_dimension(model: AbstractConditionallyLinearModel, state: MarginalisedState) -> int:
-    """k of the model itself; in the mixed form that of z_t."""
+def latent_noise_dimension(
+    model: AbstractConditionallyLinearModel, state: MarginalisedState
+) -> int:
+    """k, the number of standard normal numbers that the model makes z_t of by its own law."""
     if is_mixed(model):
         return latent_rows(model, state.latent).shape[0]
     return cast(HasTransitionNoise, model).noise_dimension
+
+
+def latent_made_of(
+    model: AbstractConditionallyLinearModel, noise: Float[Array, "n k"], state: MarginalisedState
+) -> PyTree:
+    """z_t of each particle, by its own law, made of this noise."""
+    if is_mixed(model):
+        return latent_from_noise(model, noise, state)
+    who = f"model: {model_name(model)}.transition_from_noise"
+    with saying(f"in {who}, of noise of shape {noise.shape}, as noise_dimension says"):
+        latent = cast(HasTransitionNoise, model).transition_from_noise(noise, state.latent)
+    check_moved(latent, state.latent, model, "transition_from_noise")
+    return latent
+
+
+def seen(
+    model: AbstractConditionallyLinearModel, observation: PyTree, state: MarginalisedState
+) -> tuple[MarginalisedState, list[Float[Array, " n"]]]:
+    """The predicted particles updated by y_t, and the factors of log p(y_t | z_0, ..., z_t)."""
+    state, log_density = updated(model, observation, state)
+    log_factors = [likelihoods(model, observation, state.latent)]
+    if log_density is not None:
+        num_particles = state.mean.shape[0]
+        log_factors.append(check_log_density(log_density, model, "emission", num_particles))
+    return state, log_factors
 
 
 def _weighed(
@@ -190,12 +209,7 @@ def _weighed(
     log_ratio: Float[Array, " n"] | None = None,
 ) -> ParticleMixture:
     """The predicted mixture updated by y_t, its weights times p(y_t | z), and times p / q."""
-    state = mixture.particles
-    state, log_density = updated(model, observation, state)
-    log_factors = [likelihoods(model, observation, state.latent)]
-    if log_density is not None:
-        check_log_density(log_density, model, "emission", mixture.num_particles)
-        log_factors.append(log_density)
+    state, log_factors = seen(model, observation, mixture.particles)
     if log_ratio is not None:
         log_factors.append(log_ratio)
     return mixture.replace(particles=state).weighed(*log_factors)
