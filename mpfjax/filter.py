@@ -33,6 +33,7 @@ from mpfjax.moves.initial import (
     StartMemory,
     at_start,
     choose_initial,
+    is_prior,
     leaving_start,
     looking_moves,
     sample_initial,
@@ -165,6 +166,7 @@ class Filter(eqx.Module):
         """The mixture at time 0: draws of x_0 with equal weights, grouped by the initial moves.
 
         A filter with `initial_draws` draws x_0 anew when it sees y_1; `choose_initial` has these.
+        If particles, weights or indicators were replaced by then, it goes on from what they are.
         """
         check_key(key)
         start = Start(key, drawn_once(key, self._sample_initial))
@@ -186,14 +188,12 @@ class Filter(eqx.Module):
             if isinstance(move, AbstractMove):
                 memory |= move.initial_memory(self.num_components)
         mixture = single_component(particles, self.num_components, start.num_particles)
-        if self.initial_draws > 1:
-            memory[START] = at_start()
         mixture = mixture.replace(memory=memory)
         if grouped:
             mixture = self._grouped(keys[1:], mixture)
         if self.starts_empty:
             mixture = mixture.replace(log_weights=jnp.full_like(mixture.log_weights, -jnp.inf))
-        return mixture
+        return at_start(mixture) if self.initial_draws > 1 else mixture
 
     def _grouped(self, keys: Sequence[Key[Array, ""]], mixture: ParticleMixture) -> ParticleMixture:
         for move_key, move in zip(keys, self.initial_moves, strict=True):
@@ -295,8 +295,7 @@ class Filter(eqx.Module):
             )
         if self.initial_draws > 1:
             choose = lambda prior: self.choose_initial(key, prior, observation)  # noqa: E731
-            is_prior = mixture.memory[START].is_prior
-            mixture = jax.lax.cond(is_prior, choose, lambda mixture: mixture, mixture)
+            mixture = jax.lax.cond(is_prior(mixture), choose, lambda kept: kept, mixture)
         mixture = _own_ancestors(mixture)
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)

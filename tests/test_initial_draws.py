@@ -115,6 +115,27 @@ def test_online_steps_draw_the_same():
     np.testing.assert_array_equal(mixture.particles, run.final.particles)
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+def test_what_replaced_x_0_is_what_the_first_step_goes_on_from(compiled):
+    """Particles near 500, which neither the prior nor the observation speaks for."""
+    filter = mpfjax.mixture_particle_filter(Wide(), 50, 3)
+    init = jax.jit(filter.init) if compiled else filter.init
+    mixture = init(KEY)
+    own = mixture.replace(particles=500 + mixture.particles / 1000)
+    moved, _ = filter.step(KEY, own, OBSERVATIONS[0])
+    assert np.all(np.asarray(moved.particles) > 490)
+    one = mixture.replace(particles=mixture.particles.at[7].add(1e-3))
+    few = mixture.replace(component_indicators=0 * mixture.component_indicators)
+    for changed in (one, few):
+        moved, _ = filter.step(KEY, changed, OBSERVATIONS[0])
+        assert not moved.memory[START].is_prior
+        away = np.abs(np.asarray(moved.particles)[:, None] - np.asarray(changed.particles)[None])
+        assert np.max(np.min(away, axis=1)) < 2.0  # all descend from those that were given
+    chosen, _ = filter.step(KEY, mixture, OBSERVATIONS[0])
+    away = np.abs(np.asarray(chosen.particles)[:, None] - np.asarray(mixture.particles)[None])
+    assert np.max(np.min(away, axis=1)) > 2.0
+
+
 def test_a_first_step_without_an_observation_keeps_plain_draws():
     gap = OBSERVATIONS.copy()
     gap[0] = np.nan

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
 
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import (
@@ -40,23 +40,36 @@ class StartMemory(NamedTuple):
     - `is_prior`: the particles are plain draws of x_0, of which nothing was observed.
     - `is_chosen`: they are chosen by the next observation, whose step must not resample them.
     - `log_mass`: the logarithm of the sum of their weights before these were normalised.
+    - `checksum`: of the plain draws, by which a mixture that was changed by hand is known.
     """
 
     is_prior: Bool[Array, ""]
     is_chosen: Bool[Array, ""]
     log_mass: Float[Array, ""]
+    checksum: UInt32[Array, ""]
+
+    @classmethod
+    def used(cls) -> "StartMemory":
+        """Nothing is left to choose."""
+        no, nothing = jnp.asarray(False), jnp.zeros((), default_float())
+        return cls(no, no, nothing, jnp.zeros((), jnp.uint32))
 
 
-def at_start() -> StartMemory:
-    """The memory of plain draws of x_0."""
-    nothing = jnp.zeros((), default_float())
-    return StartMemory(jnp.asarray(True), jnp.asarray(False), nothing)
+def at_start(mixture: ParticleMixture) -> ParticleMixture:
+    """The mixture of plain draws of x_0, marked as such."""
+    memory = StartMemory.used()._replace(is_prior=jnp.asarray(True), checksum=_checksum(mixture))
+    return mixture.replace(memory=mixture.memory | {START: memory})
+
+
+def is_prior(mixture: ParticleMixture) -> Bool[Array, ""]:
+    """Whether the mixture has plain draws of x_0, which nobody has replaced by others."""
+    memory: StartMemory = mixture.memory[START]
+    return memory.is_prior & (memory.checksum == _checksum(mixture))
 
 
 def started(mixture: ParticleMixture) -> ParticleMixture:
     """The mixture of a filter that has used its choice of x_0."""
-    memory = StartMemory(jnp.asarray(False), jnp.asarray(False), jnp.zeros((), default_float()))
-    return mixture.replace(memory=mixture.memory | {START: memory})
+    return mixture.replace(memory=mixture.memory | {START: StartMemory.used()})
 
 
 def leaving_start(mixture: ParticleMixture) -> ParticleMixture:
@@ -135,10 +148,34 @@ def choose_initial(
     chosen = single_component(particles, mixture.num_components, usable)
     log_weights = chosen.log_weights - jnp.log(take(trusted, kept)).astype(default_float())
     log_mass = log_sum_exp(log_weights)
-    memory = StartMemory(jnp.asarray(False), jnp.asarray(True), log_mass)
+    memory = StartMemory.used()._replace(is_chosen=jnp.asarray(True), log_mass=log_mass)
     return chosen.replace(
         log_weights=log_weights - log_mass, memory=mixture.memory | {START: memory}
     )
+
+
+def _checksum(mixture: ParticleMixture) -> UInt32[Array, ""]:
+    """The sum of all bits of particles, weights and indicators, as whole numbers that wrap around.
+
+    Sums of numbers would depend on their order, and so on the program that adds them.
+    """
+    total = jnp.zeros((), jnp.uint32)
+    held = (mixture.particles, mixture.log_weights, mixture.component_indicators)
+    for number, leaf in enumerate(jax.tree.leaves(jax.lax.stop_gradient(held))):
+        bits = _bits(leaf)
+        total += jnp.sum(bits, dtype=jnp.uint32) * jnp.uint32(2 * number + 1)
+    return total
+
+
+def _bits(leaf: Array) -> Array:
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        leaf = jax.random.key_data(leaf)
+    if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
+        leaf = jnp.stack([leaf.real, leaf.imag])
+    if jnp.issubdtype(leaf.dtype, jnp.floating):
+        words = jnp.uint16 if leaf.dtype.itemsize == 2 else jnp.uint32
+        leaf = jax.lax.bitcast_convert_type(leaf, words)
+    return leaf.astype(jnp.uint32)
 
 
 def _look(
