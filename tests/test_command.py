@@ -179,6 +179,20 @@ def test_frames_that_cannot_be_read_on_leave_what_was_done(sequence, tmp_path, c
     assert read_tracks(out / "tracks.txt")[-1, 0] == 4
 
 
+def test_the_cameras_motion_from_pixels_needs_opencv(sequence, tmp_path, capsys, monkeypatch):
+    """By default the command goes on without it; an explicit request is one line."""
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    given = [sequence, "--detections", sequence / "det.txt", *SMALL, "--no-video"]
+    assert run(*given, "--out", tmp_path / "out", "--camera-motion", "pixels") == 2
+    assert "pip install opencv-python-headless" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    tracks = []
+    for name, asked in (("default", ()), ("asked", ("--camera-motion", "detections"))):
+        assert run(*given, "--out", tmp_path / name, *asked) == 0
+        tracks.append((tmp_path / name / "tracks.txt").read_text())
+    assert tracks[0] == tracks[1]
+
+
 def test_what_moves_is_detected(sequence, tmp_path):
     pytest.importorskip("cv2", reason="detecting needs the extra 'video', which 'test' brings")
     assert run(sequence, "--detect", "--out", tmp_path, *SMALL, "--no-video") == 0
@@ -270,6 +284,15 @@ DETECTIONS = ["--detections", "DET"]
         ("argument --box: expected one argument", ["--box", "--offline"]),
         ("--filter: not allowed with --box", ["--box", "1,2,4,4", "--filter", "mpf"]),
         ("--min-score: not allowed with --detect", ["--detect", "--min-score", "1"]),
+        (
+            "--camera-motion: not allowed with --box",
+            ["--box", "1,2,4,4", "--camera-motion", "pixels"],
+        ),
+        (
+            "--camera-motion pixels: not allowed with --detect",
+            ["--detect", "--camera-motion", "pixels"],
+        ),
+        ("invalid choice: 'flow'", [*DETECTIONS, "--camera-motion", "flow"]),
         ("--frames: '7' is not A:B", [*DETECTIONS, "--frames", "7"]),
         ("holds 7 images, and no frame 9", [*DETECTIONS, "--frames", "9:12"]),
         ("invalid choice: 'pf'", [*DETECTIONS, "--filter", "pf"]),

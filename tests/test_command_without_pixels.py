@@ -74,6 +74,7 @@ def test_a_folder_of_detections_is_tracked_and_scored_without_pixels(sequence, t
     [
         ("--detect: ", ["--detect"]),
         ("--box: ", ["--box", "1,2,3,4"]),
+        ("--camera-motion pixels: ", ["--camera-motion", "pixels"]),
         ("holds 9 frames, and no frame 12", ["--frames", "12:"]),
     ],
 )

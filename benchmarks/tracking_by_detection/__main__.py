@@ -97,6 +97,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--no-peers", action="store_true", help="our own trackers alone")
     parser.add_argument("--no-colour", action="store_true", help="ours on the detections alone")
+    parser.add_argument(
+        "--camera-motion", choices=("pixels", "detections"), help="where ours has it from"
+    )
     options = parser.parse_args(arguments)
     if bool(options.sequences) == (options.scene is not None):
         parser.error("one of DIR and --scene is needed, and not both")
@@ -193,7 +196,7 @@ def _ours(
             None if stills is None else clock.over("read", stills), rows, tracker,
             key=jax.random.key(number),
             first=sequence.first, min_score=least, use_colours=not options.no_colour,
-            frame_size=sequence.frame_size,
+            frame_size=sequence.frame_size, camera_motion=_camera_motion(options, sequence),
         )  # fmt: skip
         kept, compiling = [], 0.0
         bar = tqdm(total=sequence.last - sequence.first + 1, desc=OURS[filter], disable=None)
@@ -203,6 +206,11 @@ def _ours(
             bar.update()
         bar.close()
         yield Run(np.concatenate(kept), _rate(len(kept) - 1, clock.seconds["track"] - compiling))
+
+
+def _camera_motion(options: argparse.Namespace, sequence: Sequence) -> str | None:
+    """That of the options, where there are pixels to have it from."""
+    return None if sequence.source is None else options.camera_motion
 
 
 def _theirs(sequence: Sequence, peer: Peer, least: float | None) -> Run:

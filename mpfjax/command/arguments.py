@@ -95,6 +95,11 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         "--no-colour", action="store_true", help="track the detections alone, without pixels"
     )
     track.add_argument(
+        "--camera-motion",
+        choices=("pixels", "detections"),
+        help="what it is found from; by default from pixels, except with --detect and --no-colour",
+    )
+    track.add_argument(
         "--truth", type=Path, metavar="FILE", help="gt.txt to score with, where none is beside img/"
     )
     track.add_argument("--no-video", action="store_true", help="do not draw tracking.mp4")
@@ -108,11 +113,16 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     if not (options.detections or options.detect or options.box) and _has_pixels(options.source):
         track.error("one of the arguments --detections --detect --box is required")
     if options.box is not None:
-        for name in ("filter", "max_objects", "min_score", "no_colour", "offline"):
+        for name in ("filter", "max_objects", "min_score", "no_colour", "camera_motion", "offline"):
             if getattr(options, name):
                 track.error(f"argument --{name.replace('_', '-')}: not allowed with --box")
     if options.detect and options.min_score is not None:
         track.error("argument --min-score: not allowed with --detect, which gives no scores")
+    if options.camera_motion == "pixels":
+        if options.detect:
+            track.error("argument --camera-motion pixels: not allowed with --detect")
+        if not _has_pixels(options.source):
+            track.error(f"argument --camera-motion pixels: {options.source} has no pixels")
     return options
 
 

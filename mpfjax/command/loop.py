@@ -26,6 +26,7 @@ from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import drawing, frames
 from mpfjax.vision.tracking.adapters import LEAST_ROOM, Rows
 from mpfjax.vision.tracking.background import BackgroundSubtraction
+from mpfjax.vision.tracking.optical_flow import OpticalFlow
 from mpfjax.vision.tracking.track import make_tracker, offline_rows, online_rows, track
 from mpfjax.vision.tracking.tracker import Tracks
 
@@ -124,6 +125,8 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
         options.filter or "gm_mpf", options.max_objects or room, source.frames_per_second
     )
     detector = BackgroundSubtraction() if options.detect else None
+    if options.camera_motion == "pixels":
+        OpticalFlow()  # an error before anything is written, where OpenCV is missing
 
     def tracks(stills: Iterable[np.ndarray] | None, clock: Clock) -> Iterator[Tracks]:
         return track(
@@ -135,6 +138,7 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
             min_score=options.min_score,
             use_colours=not options.no_colour,
             frame_size=source.frame_size,
+            camera_motion="detections" if options.detect else options.camera_motion,
         )
 
     return tracks

@@ -44,6 +44,8 @@ from mpfjax.vision.scenes.football import Scene as Scene
 from mpfjax.vision.scenes.football import football_scene as football_scene
 from mpfjax.vision.tracking.background import BackgroundSubtraction as BackgroundSubtraction
 from mpfjax.vision.tracking.detections import Detections as Detections
+from mpfjax.vision.tracking.observation import CameraMotion as CameraMotion
+from mpfjax.vision.tracking.optical_flow import OpticalFlow as OpticalFlow
 from mpfjax.vision.tracking.track import make_tracker as make_tracker
 from mpfjax.vision.tracking.track import offline_rows as offline_rows
 from mpfjax.vision.tracking.track import online_rows as online_rows

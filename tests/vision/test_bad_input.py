@@ -124,7 +124,7 @@ TABLE = {
         vision.track,
         {"frames": None, "detections": np.zeros((0, 7))},
         {"tracker": "kind?", "key": "key?", "first": "count", "min_score": "finite?",
-         "max_detections": "count?", "use_colours": "flag"},
+         "max_detections": "count?", "use_colours": "flag", "camera_motion": "kind?"},
     ),
     "follow_boxes": (
         vision.follow_boxes,

@@ -32,7 +32,11 @@ class FollowCamera(AbstractMove):
     in median boxes, is learned with the forgetting rate `rate`: it tends to zero before a still
     camera.
 
-    The weights do not change. Memory: the last shift, and σ_c. Any motion that objects have in
+    Where the frame's `motion` is known from pixels, every component is carried along by it first,
+    and c is what is left. What is left has a σ_c of its own, learned in these frames, so that
+    detections overrule pixels that prove wrong. In the other frames c is all of the motion.
+
+    The weights do not change. Memory: the last shift, and both σ_c. Any motion that objects have in
     common is taken for the camera's (`approximate` is true). Raises `ValueError` for degrees of
     freedom that are not positive and for a rate outside [0, 1].
     """
@@ -58,14 +62,21 @@ class FollowCamera(AbstractMove):
     def initial_memory(self, num_components: int) -> dict[str, Camera]:
         """A camera that is nearly still."""
         del num_components
-        return {CAMERA: Camera(jnp.zeros(2), jnp.full(2, 0.02, default_float()))}
+        still = jnp.full(2, 0.02, default_float())
+        return {CAMERA: Camera(jnp.zeros(2), still, still)}
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
-        """Estimate the shift, and add it to every component."""
+        """Move every component by the motion from pixels, estimate what is left, and add it."""
         del key
         camera: Camera = mixture.memory[CAMERA]
+        before, motion = mixture.component_averages(mixture.particles.place), observation.motion
+        deviations = camera.deviations
+        if motion is not None:
+            carried = motion.carried(mixture.particles.gaussian)
+            mixture = mixture.replace(particles=ObjectState.of(carried, mixture.particles.label))
+            deviations = jnp.where(motion.known, camera.left, deviations)
         model, noises = self.assign.model, noises_of(mixture, self.assign.model)
         moved = model.predicted(mixture.particles, noises)
         means = mixture.component_averages(moved.place)
@@ -74,22 +85,31 @@ class FollowCamera(AbstractMove):
         sizes = jnp.where(confirmed[:, None], jnp.exp(means[:, 2:]), jnp.inf)
         box = jnp.sort(sizes, axis=0)[(number - 1) // 2]
         box = jnp.where(jnp.isfinite(box), box, 1.0)
-        cost = self.assign.costs(mixture, observation, slack=2 * camera.deviations * box)
+        cost = self.assign.costs(mixture, observation, slack=2 * deviations * box)
         strong = observation.detections.scores >= mixture.memory[SCORES].strong
         cost = jnp.where(confirmed[:, None] & strong[None], cost, jnp.inf)
         paired, partner = _mutual(cost, self.assign.gate)
         gaps = take(places_of(observation.detections.boxes), partner)[:, :2] - means[:, :2]
         spread = mixture.component_averages(moved.spread[:, 0, :2])
         variances = spread + (units(means) * noises.errors[None])[:, :2] ** 2
-        prior = (camera.deviations * box) ** 2
+        prior = (deviations * box) ** 2
         shift, posterior = self._common(gaps, variances, paired, prior)
-        squares = jnp.clip((shift**2 + posterior) / box**2, 1e-6, 0.25)
-        squares = (1 - self.rate) * camera.deviations**2 + self.rate * squares
-        learned = jnp.where(jnp.any(paired), jnp.sqrt(squares), camera.deviations)
-        particles = mixture.particles
+
+        def learned(deviations: Float[Array, "2"], total: Float[Array, "2"]) -> Float[Array, "2"]:
+            squares = jnp.clip((total**2 + posterior) / box**2, 1e-6, 0.25)
+            squares = (1 - self.rate) * deviations**2 + self.rate * squares
+            return jnp.where(jnp.any(paired), jnp.sqrt(squares), deviations)
+
+        particles, total, left = mixture.particles, shift, camera.left
+        if motion is not None:
+            gone = (mixture.component_averages(particles.place) - before)[:, :2]
+            share = paired.astype(gone.dtype) / jnp.maximum(jnp.sum(paired), 1).astype(gone.dtype)
+            total = shift + jnp.sum(jnp.where(paired[:, None], share[:, None] * gone, 0.0), axis=0)
+            left = jnp.where(motion.known, learned(left, shift), left)
+        deviations = learned(camera.deviations, total)
         place = particles.place.at[:, :2].add(shift[None].astype(particles.place.dtype))
         moved = ObjectState(place, particles.velocity, particles.spread, particles.label)
-        return remember(mixture.replace(particles=moved), camera=Camera(shift, learned))
+        return remember(mixture.replace(particles=moved), camera=Camera(shift, deviations, left))
 
     def _common(
         self,

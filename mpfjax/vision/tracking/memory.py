@@ -24,13 +24,15 @@ class Scores(NamedTuple):
 
 
 class Camera(NamedTuple):
-    """Memory of `FollowCamera`: the shift in this frame, and the standard deviation of shifts.
+    """Memory of `FollowCamera`: the shift in this frame, and the standard deviations of shifts.
 
-    - `shift`: in pixels; `deviations`: in boxes.
+    - `shift`: in pixels, beside the motion from pixels where that is known.
+    - `deviations`: of all of the camera's motion; `left`: of what the pixels do not tell; in boxes.
     """
 
     shift: Float[Array, "2"]
     deviations: Float[Array, "2"]
+    left: Float[Array, "2"]
 
 
 class Lives(NamedTuple):

@@ -124,6 +124,8 @@ class LearnNoise(AbstractMove):
 
         errors, place_noise, velocity_noise = self._rivals(places.dtype)
         moments = rivals.moments
+        if CAMERA in mixture.memory and observation.motion is not None:
+            moments = observation.motion.carried(moments)
         if CAMERA in mixture.memory:
             shift = jnp.pad(mixture.memory[CAMERA].shift, (0, 2))
             moments = moments._replace(place=moments.place + shift[None, None])

@@ -21,7 +21,10 @@ from mpfjax.vision.tracking.adapters import (
     Sieve,
     as_detector,
 )
+from mpfjax.vision.tracking.camera import FollowCamera
 from mpfjax.vision.tracking.detections import Detections
+from mpfjax.vision.tracking.observation import CameraMotion
+from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
 from mpfjax.vision.tracking.tracker import RIVALS_PER_OBJECT, ObjectTracker, Tracks
 
 
@@ -36,6 +39,7 @@ def track(
     max_detections: int | None = None,
     use_colours: bool = True,
     frame_size: tuple[int, int] | None = None,
+    camera_motion: str | None = None,
 ) -> Iterator[Tracks]:
     """Track what a detector finds in a video: yields the `Tracks` of each frame as it comes.
 
@@ -60,12 +64,16 @@ def track(
     - `use_colours`: with False the tracker sees no pixels, and only the detector does.
     - `frame_size`: height and width, for detections without frames, to tell which boxes lie
       outside.
+    - `camera_motion`: "pixels" finds the motion of the camera by `OpticalFlow`, and what this
+      leaves from the detections; "detections" has them alone. None takes "pixels" where the tracker
+      sees pixels and OpenCV is installed.
 
     The tracks of each frame are NumPy arrays. Boxes without area or outside the frame are left out
     with a warning, as are detections in frames after the last. Another warning is given where there
     are more detections or objects than there is room for. Raises `ValueError` with the name of the
-    argument for values that cannot be used, at the frame in which they come. An exception of the
-    detector is passed on, with the number of the frame. Use it for recorded videos and for cameras.
+    argument for values that cannot be used, at the frame in which they come, and `ImportError` for
+    "pixels" without OpenCV. An exception of the detector is passed on, with the number of the
+    frame. Use it for recorded videos and for cameras.
     """
     if frames is not None:
         check_type(Iterable, "frames one after the other, or None", frames=frames)
@@ -84,7 +92,26 @@ def track(
     check_key(key)
     room = 2 * tracker.max_objects if max_detections is None else max_detections
     stills = None if frames is None else of_one_kind(frames, first)
-    return _tracked(stills, detector, sieve, tracker, key, first, room, use_colours)
+    flow = _optical_flow(camera_motion, tracker, frames is not None, use_colours)
+    return _tracked(stills, detector, sieve, tracker, key, first, room, use_colours, flow)
+
+
+def _optical_flow(
+    camera_motion: str | None, tracker: ObjectTracker, has_frames: bool, use_colours: bool
+) -> OpticalFlow | None:
+    """What finds the camera's motion from pixels, None where it is left to the detections."""
+    follows = any(isinstance(move, FollowCamera) for move in tracker.moves)
+    if camera_motion is None:
+        wanted = has_frames and use_colours and follows and has_opencv()
+        return OpticalFlow() if wanted else None
+    check_one_of(("pixels", "detections"), camera_motion=camera_motion)
+    if camera_motion == "detections":
+        return None
+    if not has_frames:
+        raise ValueError("camera_motion: 'pixels' needs frames, and frames is None")
+    if not follows:
+        raise ValueError("camera_motion: 'pixels' needs a tracker with the move FollowCamera")
+    return OpticalFlow()
 
 
 def _tracked(
@@ -96,6 +123,7 @@ def _tracked(
     first: int,
     room: int,
     use_colours: bool,
+    flow: OpticalFlow | None,
 ) -> Iterator[Tracks]:
     state, once, advance = tracker.init(), Once(), None
     for number, still, found in _observed(stills, detector, first):
@@ -108,8 +136,9 @@ def _tracked(
             )
         observation = Detections.from_boxes(found.boxes, room, found.scores)
         pixels = tracker.look(still, observation) if use_colours and still is not None else None
+        motion = None if flow is None or still is None else flow(still, found.boxes)
         # An array: each new Python number would compile anew.
-        moving = (np.asarray(number), state, pixels, observation)
+        moving = (np.asarray(number), state, pixels, observation, motion)
         if advance is None:
             advance = kept_program(_advance, (tracker, key), moving, in_little_memory())
         state, tracks = advance(*moving)
@@ -131,9 +160,10 @@ def _advance(
     state: PyTree,
     pixels: Any,
     observation: Detections,
+    motion: CameraMotion | None,
 ) -> tuple[PyTree, Tracks]:
     """A step and the key of its frame, in one program: each call costs half a millisecond."""
-    return tracker.step(jax.random.fold_in(key, number), state, pixels, observation)
+    return tracker.step(jax.random.fold_in(key, number), state, pixels, observation, motion)
 
 
 def _observed(

@@ -42,7 +42,7 @@ from mpfjax.vision.tracking.memory import (
 from mpfjax.vision.tracking.model import DetectedObjectModel, NoObjectYet, ObjectState, Pixels
 from mpfjax.vision.tracking.motion import PropagateObjects
 from mpfjax.vision.tracking.noise import LearnNoise
-from mpfjax.vision.tracking.observation import TrackedFrame
+from mpfjax.vision.tracking.observation import CameraMotion, TrackedFrame
 from mpfjax.vision.tracking.occlusion import ShareDetections
 from mpfjax.vision.tracking.scores import RankScores
 
@@ -241,16 +241,18 @@ class ObjectTracker(eqx.Module):
         state: ParticleMixture,
         frame: UInt8[Array, "h w 3"] | SampledBoxes | None,
         detections: Detections,
+        motion: CameraMotion | None = None,
     ) -> tuple[ParticleMixture, Tracks]:
         """The state after a frame and its detections, and the tracks in it.
 
         The result of `look` may be given in place of the frame. Where `frame` is None detections
-        are tracked alone, without colours. Frames may have any size, but each new size compiles
-        anew, and boxes keep their places in pixels. Raises `ValueError` for a frame that is not (h,
-        w, 3) of type uint8, and for anything but `Detections`.
+        are tracked alone, without colours. `motion` is what `OpticalFlow` makes of the frames; None
+        leaves the camera's motion to the detections. Frames may have any size, but each new size
+        compiles anew, and boxes keep their places in pixels. Raises `ValueError` for a frame that
+        is not (h, w, 3) of type uint8, and for anything but `Detections`.
         """
         check_type(Detections, "Detections, as from_boxes makes them", detections=detections)
-        seen = TrackedFrame(detections, self._pixels(frame))
+        seen = TrackedFrame(detections, self._pixels(frame), motion)
         state, _, _ = step_and_faults(self.filter, key, state, seen)
         return state, Tracks.of(state, detections)
 

@@ -1,0 +1,134 @@
+"""The camera's motion from pixels: corners of what stands still, followed by OpenCV."""
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from mpfjax.checks import to_rows
+from mpfjax.vision.files.frames import check_frame
+from mpfjax.vision.tracking.observation import CameraMotion
+
+_WIDTH = 480  # of the reduced picture, about
+_CORNERS = 200  # the most that are followed
+_WEAKEST = 0.01  # of the strongest corner's strength
+_APART = 1 / 50  # of the width, between corners
+_WINDOW = (15, 15)
+_LEVELS = 4  # of the pyramid: a motion of 80 reduced pixels is followed
+_OFF = 1.0  # reduced pixels within which a corner agrees with the motion
+_FEWEST = 12  # corners that have to agree
+_SMALLEST = 32  # the least side of a reduced picture
+
+
+class OpticalFlow:
+    """The motion of the camera between successive frames, from the pixels outside of boxes.
+
+    Each frame is reduced to a grey picture about 480 pixels wide. Corners (Shi and Tomasi 1994) of
+    the frame before, outside of its boxes, are followed by the pyramidal method of Lucas and Kanade
+    (Bouguet 2001). The similarity that most of them agree with, within a pixel of the reduced
+    picture, is found by RANSAC and refined by least squares over these.
+
+    The motion is unknown in the first frame, where fewer than 12 corners agree, and where they are
+    no majority of those that were followed: after a cut, or without texture. An instance serves one
+    video. The same frames give the same motions. Raises `ImportError` without OpenCV. Use it for
+    the `motion` that `ObjectTracker.step` takes; `track` does so by itself.
+    """
+
+    def __init__(self) -> None:
+        self._cv2: Any = _cv2()
+        self._before: np.ndarray | None = None
+        self._boxes = np.zeros((0, 4))
+
+    def __call__(self, frame: Any, boxes: Any = None) -> CameraMotion:
+        """The motion since the frame before, in pixels of the frame.
+
+        `frame` is (h, w, 3), (h, w, 1) or (h, w). `boxes`, rows (x, y, w, h) with (x, y) the
+        top-left corner, are what may move on its own in this frame. After a frame of another size
+        the motion is unknown. Raises `ValueError` for a frame that is no image of eight bits, and
+        for boxes that are not rows of four numbers.
+        """
+        frame = np.asarray(frame)
+        if frame.ndim == 3 and frame.shape[2] == 1:
+            frame = frame[:, :, 0]
+        check_frame(np.stack([frame] * 3, axis=2) if frame.ndim == 2 else frame)
+        boxes = to_rows(4, "boxes", np.zeros((0, 4)) if boxes is None else boxes)
+        factor = max(round(frame.shape[1] / _WIDTH), 1)
+        picture = self._reduced(frame, factor)
+        before, self._before = self._before, picture
+        left, self._boxes = self._boxes, boxes / factor
+        if before is None or before.shape != picture.shape or min(picture.shape) < _SMALLEST:
+            return CameraMotion.unknown()
+        start, end = self._followed(before, picture, left)
+        away = ~_inside(end, self._boxes)
+        return self._fitted(start[away], end[away], factor)
+
+    def _reduced(self, frame: np.ndarray, factor: int) -> np.ndarray:
+        cv2 = self._cv2
+        if factor > 1:
+            size = max(frame.shape[1] // factor, 1), max(frame.shape[0] // factor, 1)
+            frame = cv2.resize(np.ascontiguousarray(frame), size, interpolation=cv2.INTER_AREA)
+        return frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
+
+    def _followed(
+        self, before: np.ndarray, picture: np.ndarray, boxes: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Corners outside of the boxes, and where they are now."""
+        cv2 = self._cv2
+        free = np.full(before.shape, 255, np.uint8)
+        low = np.maximum(np.floor(boxes[:, :2]), 0).astype(int)
+        high = np.maximum(np.ceil(boxes[:, :2] + boxes[:, 2:]), 0).astype(int)
+        for (left, top), (right, bottom) in zip(low, high, strict=True):
+            free[top:bottom, left:right] = 0
+        apart = _APART * before.shape[1]
+        start = cv2.goodFeaturesToTrack(before, _CORNERS, _WEAKEST, apart, mask=free)
+        if start is None or len(start) < _FEWEST:
+            return np.zeros((0, 2)), np.zeros((0, 2))
+        end, found, _ = cv2.calcOpticalFlowPyrLK(
+            before, picture, start, None, winSize=_WINDOW, maxLevel=_LEVELS
+        )
+        kept = found[:, 0] == 1
+        return start[kept, 0], end[kept, 0]
+
+    def _fitted(self, start: np.ndarray, end: np.ndarray, factor: int) -> CameraMotion:
+        """The similarity between the corners, in pixels of the frame, if most agree with one."""
+        if len(start) < _FEWEST:
+            return CameraMotion.unknown()
+        # The random numbers of OpenCV's RANSAC start alike in each call.
+        matrix, agree = self._cv2.estimateAffinePartial2D(
+            start, end, method=self._cv2.RANSAC, ransacReprojThreshold=_OFF
+        )
+        if matrix is None or agree.sum() < _FEWEST or 2 * agree.sum() <= len(start):
+            return CameraMotion.unknown()
+        # A reduced pixel's centre, (i + 1/2) factor, is not that of the first of its pixels.
+        centre = (factor - 1) / 2
+        shift = factor * matrix[:, 2] + centre - matrix[:, :2] @ [centre, centre]
+        return CameraMotion(
+            matrix[:, 0].astype(np.float32), shift.astype(np.float32), np.asarray(True)
+        )
+
+
+def has_opencv() -> bool:
+    """Whether OpenCV is installed."""
+    try:
+        _cv2()
+    except ImportError:
+        return False
+    return True
+
+
+def _inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Whether each point lies in any of the boxes."""
+    gaps = points[:, None] - boxes[None, :, :2]
+    within = (gaps >= 0) & (gaps <= boxes[None, :, 2:])
+    return np.any(within[..., 0] & within[..., 1], axis=1)
+
+
+def _cv2() -> ModuleType:
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError(
+            "OpenCV is needed for the camera's motion from pixels: pip install"
+            " opencv-python-headless"
+        ) from error
+    return cv2

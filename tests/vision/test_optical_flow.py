@@ -1,0 +1,312 @@
+"""The camera's motion from pixels: against textures and scenes whose motion is known."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpfjax.vision import CameraMotion, Detections, ObjectTracker, football_scene, track
+from mpfjax.vision.tracking.model import Gaussian
+from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
+
+cv2 = pytest.importorskip("cv2", reason="OpenCV comes with the extra 'video', which 'test' brings")
+
+WIDTH, HEIGHT = 480, 320
+
+
+def texture(seed=0, height=HEIGHT, width=WIDTH):
+    """Random values, smooth between pixels, with patterns of several sizes as pictures have."""
+    values = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
+    patterns = [size * cv2.GaussianBlur(values, (0, 0), size) for size in (2.0, 5.0, 12.0)]
+    return np.clip(128 + 100 * sum(patterns), 0, 255).astype(np.uint8)
+
+
+def similarity(angle, scale, shift, centre=(WIDTH / 2, HEIGHT / 2)):
+    """(2, 3) of a turn and a growth about the centre, and a shift."""
+    matrix = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.column_stack([matrix, np.asarray(centre) - matrix @ centre + shift])
+
+
+def warped(frame, matrix):
+    return cv2.warpAffine(frame, matrix, frame.shape[1::-1], borderMode=cv2.BORDER_REFLECT)
+
+
+def errors(motion, matrix, width=WIDTH, height=HEIGHT):
+    """The largest distance between the two motions of the corners of the frame and its centre."""
+    points = np.array([[0, 0], [width, 0], [0, height], [width, height], [width / 2, height / 2]])
+    (a, b), shift = motion.turn, motion.shift
+    got = points @ np.array([[a, -b], [b, a]]).T + shift
+    return np.linalg.norm(got - points @ matrix[:, :2].T - matrix[:, 2], axis=1).max()
+
+
+def flow_between(first, second, before=None, now=None):
+    flow = OpticalFlow()
+    assert not flow(first, before).known
+    return flow(second, now)
+
+
+@pytest.mark.parametrize(
+    ("angle", "scale", "shift"),
+    [
+        (0.0, 1.0, (0.0, 0.0)),
+        (0.0, 1.0, (7.3, -4.6)),
+        (0.0, 1.0, (-40.0, 12.0)),
+        (0.03, 1.0, (0.0, 0.0)),
+        (0.0, 1.04, (0.0, 0.0)),
+        (-0.02, 0.97, (11.0, 5.0)),
+    ],
+)
+def test_a_known_similarity_is_found(angle, scale, shift):
+    """To a quarter of a pixel in the corners of the frame."""
+    frame, matrix = texture(), similarity(angle, scale, shift)
+    motion = flow_between(frame, warped(frame, matrix))
+    assert motion.known
+    assert errors(motion, matrix) < 0.25
+
+
+def test_the_motion_is_in_pixels_of_the_frame_where_the_picture_is_reduced():
+    """A frame four times as wide as the picture; half a pixel of the picture would be two."""
+    frame = cv2.resize(texture(), (4 * WIDTH, 4 * HEIGHT), interpolation=cv2.INTER_CUBIC)
+    matrix = similarity(0.01, 1.02, (21.0, -9.0), (2 * WIDTH, 2 * HEIGHT))
+    motion = flow_between(frame, warped(frame, matrix))
+    assert motion.known
+    assert errors(motion, matrix, 4 * WIDTH, 4 * HEIGHT) < 1.0
+
+
+@pytest.mark.parametrize("boxed", [(True, True), (True, False), (False, True)])
+def test_what_moves_on_its_own_counts_for_nothing_inside_its_box(boxed):
+    """A box over two thirds of the frame moves left while the rest moves right."""
+    ground, crowd = texture(1), texture(2)
+    frames = []
+    for shift in (0, 6):
+        frame = warped(ground, similarity(0, 1, (shift, 0)))
+        frame[:, 40:360] = warped(crowd, similarity(0, 1, (-shift, 0)))[:, 40:360]
+        frames.append(frame)
+    boxes = np.array([[40.0, 0.0, 320.0, HEIGHT]])
+    with_boxes = flow_between(*frames, *(boxes if given else None for given in boxed))
+    assert with_boxes.known
+    assert errors(with_boxes, similarity(0, 1, (6, 0))) < 0.25
+    without = flow_between(*frames)
+    assert not without.known or errors(without, similarity(0, 1, (-6, 0))) < 0.5
+
+
+def test_the_pitch_tells_how_the_camera_of_the_football_scene_pans():
+    """The root mean square of the error is within a fifth of a pixel, of nearly three pixels."""
+    scene = football_scene(jax.random.key(0), 30)
+    flow, gaps, moved = OpticalFlow(), [], []
+    for t, frame in enumerate(scene.frames):
+        motion = flow(frame, scene.tracks[scene.tracks[:, 0] == t + 1, 2:])
+        if t == 0:
+            continue
+        assert motion.known
+        before, after = scene.landmarks[t - 1], scene.landmarks[t]
+        size = frame.shape[1::-1]
+        seen = ((before >= 0) & (before < size)).all(axis=1)
+        a, b = motion.turn
+        got = before @ np.array([[a, -b], [b, a]]).T + motion.shift
+        gaps.append((got - after)[seen])
+        moved.append((after - before)[seen])
+    assert np.sqrt(np.mean(np.concatenate(moved) ** 2, axis=0))[0] > 2
+    assert (np.sqrt(np.mean(np.concatenate(gaps) ** 2, axis=0)) < 0.25).all()
+
+
+NOISE = np.random.default_rng(5)
+
+
+def noisy(level):
+    values = 128 + level * NOISE.standard_normal((HEIGHT, WIDTH, 3))
+    return np.clip(values, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        [np.zeros((HEIGHT, WIDTH, 3), np.uint8)] * 2,
+        [texture(1), texture(2)],
+        [texture(), np.full((HEIGHT, WIDTH), 90, np.uint8)],
+        [noisy(60), noisy(60)],
+        [noisy(2.5), noisy(2.5)],
+        [texture(height=31), texture(height=31)],
+        [texture(height=1, width=1), texture(height=1, width=1)],
+        [texture(), texture(width=WIDTH // 2)],
+    ],
+    ids=["blank", "cut", "dark", "noise", "faint noise", "flat", "one pixel", "another size"],
+)
+def test_no_motion_is_known_where_there_is_none_to_find(frames):
+    """Not as an error, which would end the run, and not as a motion of the objects."""
+    assert not flow_between(*frames).known
+
+
+def test_after_a_cut_the_next_motion_is_known_again():
+    flow, matrix = OpticalFlow(), similarity(0, 1, (3, 0))
+    known = [
+        bool(flow(frame).known) for frame in (texture(1), texture(2), warped(texture(2), matrix))
+    ]
+    assert known == [False, False, True]
+
+
+def test_a_frame_that_boxes_cover_tells_nothing():
+    everything = np.array([[-5.0, -5.0, 2.0 * WIDTH, 2.0 * HEIGHT]])
+    assert not flow_between(texture(), texture(), everything, everything).known
+
+
+def test_grey_frames_and_colour_frames_tell_the_same():
+    frame, matrix = texture(), similarity(0.01, 1.0, (5, 2))
+    pair = frame, warped(frame, matrix)
+    grey = flow_between(*pair)
+    one_channel = flow_between(*(image[:, :, None] for image in pair))
+    colour = flow_between(*(np.repeat(image[:, :, None], 3, axis=2) for image in pair))
+    turned = flow_between(*(np.asfortranarray(image) for image in pair))
+    for other in (one_channel, colour, turned):
+        np.testing.assert_allclose(other.shift, grey.shift, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("frame", "boxes", "message"),
+    [
+        (texture().astype(float), None, "frame: float64 is not uint8"),
+        (texture().astype(np.uint16), None, "frame: uint16 is not uint8"),
+        (np.zeros((4, 4, 4), np.uint8), None, r"frame: \(4, 4, 4\)"),
+        (np.zeros(4, np.uint8), None, r"frame: \(4,\)"),
+        (texture(), np.zeros((2, 3)), "boxes: "),
+    ],
+)
+def test_what_is_no_frame_is_named(frame, boxes, message):
+    with pytest.raises(ValueError, match=message):
+        OpticalFlow()(frame, boxes)
+
+
+# --- what a tracker makes of it -------------------------------------------------------------------
+
+
+def test_moments_are_carried_by_the_matrix_of_the_similarity():
+    """Means by the matrix, variances by the diagonal of R V R', sizes by the scale."""
+    rng = np.random.default_rng(1)
+    parts = [rng.uniform(1, 3, (5, 4)).astype(np.float32) for _ in range(5)]
+    a, b, shift = 1.02, 0.3, np.array([4.0, -7.0])
+    known = np.asarray(True)
+    motion = CameraMotion(np.float32([a, b]), shift.astype(np.float32), known)
+    got = motion.carried(Gaussian(*map(jnp.asarray, parts)))
+    matrix = np.array([[a, -b], [b, a]])
+    np.testing.assert_allclose(got.place[:, :2], parts[0][:, :2] @ matrix.T + shift, rtol=1e-5)
+    np.testing.assert_allclose(
+        got.place[:, 2:], parts[0][:, 2:] + np.log(np.hypot(a, b)), rtol=1e-5
+    )
+    np.testing.assert_allclose(got.velocity[:, :2], parts[1][:, :2] @ matrix.T, rtol=1e-4)
+    for before, after in zip(parts[2:], got[2:], strict=True):
+        for i in range(5):
+            turned = matrix @ np.diag(before[i, :2]) @ matrix.T
+            np.testing.assert_allclose(after[i, :2], np.diag(turned), rtol=1e-5)
+        np.testing.assert_array_equal(after[:, 2:], before[:, 2:])
+    unknown = motion._replace(known=np.asarray(False))
+    for before, after in zip(
+        parts, unknown.carried(Gaussian(*map(jnp.asarray, parts))), strict=True
+    ):
+        np.testing.assert_array_equal(after, before)
+
+
+TRACKER = ObjectTracker(max_objects=6)
+
+
+def shaken(num_frames=24, seed=0):
+    """Textures before a camera that jumps by up to 24 pixels, and four boxes that stand still."""
+    rng = np.random.default_rng(seed)
+    wide = texture(3, HEIGHT + 120, WIDTH + 120)
+    ground = np.array(
+        [[80.0, 90, 30, 60], [200, 120, 30, 60], [300, 100, 30, 60], [380, 180, 30, 60]]
+    )
+    jumps = rng.integers(-12, 13, (num_frames, 2)) * (np.arange(num_frames)[:, None] > 3)
+    frames, boxes = [], []
+    for x, y in 60 + jumps:
+        frames.append(wide[y : y + HEIGHT, x : x + WIDTH])
+        there = ground - [x - 60, y - 60, 0, 0]
+        boxes.append(there + rng.normal(0, 0.5, there.shape))
+    return frames, boxes
+
+
+def run(frames, boxes, **settings):
+    return list(track(frames, boxes, TRACKER, **settings))
+
+
+def distances(tracks, boxes):
+    """How far the nearest confirmed object is from the centre of each box, in pixels."""
+    objects = np.asarray(tracks.boxes)[np.asarray(tracks.confirmed), :2]
+    centres = boxes[:, :2] + boxes[:, 2:] / 2
+    return np.linalg.norm(objects[None] - centres[:, None], axis=2).min(axis=1)
+
+
+def test_objects_keep_their_places_and_names_while_the_camera_jumps():
+    """A jump of most of a box; a predicted box is then within two pixels, found or not."""
+    frames, boxes = shaken()
+    boxes[-1] = boxes[-1][:2]
+    truth = shaken()[1][-1]
+    pixels = run(frames, boxes, camera_motion="pixels")
+    assert sorted(pixels[-1].identities[pixels[-1].confirmed]) == [1, 2, 3, 4]
+    assert distances(pixels[-1], truth).max() < 2.5
+
+
+def test_an_object_without_detections_moves_with_the_picture():
+    """For the last four frames nothing is detected, and so detections cannot tell of jumps."""
+    frames, boxes = shaken(seed=4)
+    found = [rows if number < len(boxes) - 4 else rows[:0] for number, rows in enumerate(boxes)]
+    pixels = run(frames, found, camera_motion="pixels")
+    assert distances(pixels[-1], boxes[-1]).max() < 3
+    detections = run(frames, found, camera_motion="detections")
+    assert distances(detections[-1], boxes[-1]).min() > 6
+
+
+def test_an_unknown_motion_is_left_to_the_detections():
+    """Blank frames with "pixels" give what "detections" does, to rounding."""
+    frames, boxes = shaken()
+    blank = [np.zeros_like(frame) for frame in frames]
+    got = run(blank, boxes, camera_motion="pixels")
+    expected = run(blank, boxes, camera_motion="detections")
+    for one, other in zip(got, expected, strict=True):
+        np.testing.assert_array_equal(one.identities, other.identities)
+        np.testing.assert_allclose(one.boxes, other.boxes, atol=1e-3)
+
+
+def test_wrong_motions_from_pixels_are_overruled_by_the_detections():
+    """Jumps of 5 pixels, which the camera did not make, are taken out again."""
+    boxes = shaken(1)[1][0]
+    rng = np.random.default_rng(2)
+    state = TRACKER.init()
+    rows = Detections.from_boxes(boxes, 12)
+    for number in range(40):
+        jump = np.float32([rng.choice([-5, 5]), 0])
+        wrong = CameraMotion(np.float32([1, 0]), jump, np.asarray(True))
+        state, tracks = TRACKER.step(jax.random.key(number), state, None, rows, wrong)
+    assert sorted(np.asarray(tracks.identities)[np.asarray(tracks.confirmed)]) == [1, 2, 3, 4]
+    assert distances(tracks, boxes).max() < 1.0
+    camera = state.memory["camera"]
+    assert float(camera.left[0]) > 0.03  # of boxes 30 pixels wide
+    assert float(camera.left[1]) < 0.02
+
+
+# --- without OpenCV, and what does not fit -------------------------------------------------------
+
+
+def test_without_opencv_detections_alone_tell_the_motion(monkeypatch):
+    """Silently by default; an explicit request names what is missing."""
+    frames, boxes = shaken(6)
+    expected = run(frames, boxes, camera_motion="detections")
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    assert not has_opencv()
+    for one, other in zip(run(frames, boxes), expected, strict=True):
+        np.testing.assert_array_equal(one.boxes, other.boxes)
+    with pytest.raises(ImportError, match="pip install opencv-python-headless"):
+        track(frames, boxes, TRACKER, camera_motion="pixels")
+
+
+@pytest.mark.parametrize(
+    ("frames", "motion", "message"),
+    [
+        (None, "pixels", "camera_motion: 'pixels' needs frames"),
+        ([texture()], "flow", "camera_motion: 'flow'"),
+    ],
+)
+def test_a_request_that_cannot_be_met_is_named(frames, motion, message):
+    with pytest.raises(ValueError, match=message):
+        track(frames, [np.zeros((0, 4))], TRACKER, camera_motion=motion)
