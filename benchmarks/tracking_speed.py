@@ -43,6 +43,7 @@ class Way(NamedTuple):
     size: tuple[int, int] | None
     detect: bool = False
     fields: tuple[int, int] = FEW
+    motion: str = "detections"  # what the camera's motion is found from
 
     @property
     def num_objects(self) -> int:
@@ -62,6 +63,8 @@ WAYS = (
     Way("no pixels", None),
     Way("no pixels, 60 objects", None, fields=MORE),
     Way("no pixels, 150 objects", None, fields=CROWD),
+    Way("1920 x 1080, camera motion from pixels", LARGE, motion="pixels"),
+    Way("384 x 288, camera motion from pixels", SMALL, motion="pixels"),
 )
 
 
@@ -119,7 +122,8 @@ class Timed:
         else:
             detections = self.clock.over("read", map(street.detected, _count()))
         tracker = make_tracker("gm_mpf", way.room)
-        self.tracked = self.clock.over("track", track(frames, detections, tracker))
+        tracked = track(frames, detections, tracker, camera_motion=way.motion)
+        self.tracked = self.clock.over("track", tracked)
 
     def _detecting(self, background: BackgroundSubtraction) -> Callable[[np.ndarray], np.ndarray]:
         def detect(frame: np.ndarray) -> np.ndarray:

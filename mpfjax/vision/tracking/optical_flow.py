@@ -47,7 +47,7 @@ class OpticalFlow:
         the motion is unknown. Raises `ValueError` for a frame that is no image of eight bits, and
         for boxes that are not rows of four numbers.
         """
-        frame = np.asarray(frame)
+        frame = np.ascontiguousarray(frame)
         if frame.ndim == 3 and frame.shape[2] == 1:
             frame = frame[:, :, 0]
         check_frame(np.stack([frame] * 3, axis=2) if frame.ndim == 2 else frame)
@@ -63,11 +63,12 @@ class OpticalFlow:
         return self._fitted(start[away], end[away], factor)
 
     def _reduced(self, frame: np.ndarray, factor: int) -> np.ndarray:
-        cv2 = self._cv2
-        if factor > 1:
-            size = max(frame.shape[1] // factor, 1), max(frame.shape[0] // factor, 1)
-            frame = cv2.resize(np.ascontiguousarray(frame), size, interpolation=cv2.INTER_AREA)
-        return frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
+        # Grey first: OpenCV reduces one channel in a third of the time of three.
+        frame = frame if frame.ndim == 2 else self._cv2.cvtColor(frame, self._cv2.COLOR_RGB2GRAY)
+        if factor == 1:
+            return frame
+        size = max(frame.shape[1] // factor, 1), max(frame.shape[0] // factor, 1)
+        return self._cv2.resize(frame, size, interpolation=self._cv2.INTER_AREA)
 
     def _followed(
         self, before: np.ndarray, picture: np.ndarray, boxes: np.ndarray
