@@ -27,6 +27,7 @@ nitpick_ignore_regex = [
     ("py:class", r"mpfjax\..*\._\w+"),
     ("py:class", r"mpfjax\.tuning\.(smc2_run|problem|densities)\.\w+"),
     ("py:class", r"mpfjax\.moves\.resampling\.layout\.\w+"),
+    ("py:class", r"mpfjax\.vision\.tracking\.model\.Gaussian"),
 ]
 
 html_theme = "furo"
