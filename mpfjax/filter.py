@@ -44,17 +44,16 @@ from mpfjax.moves.island_interaction import IslandInteraction
 from mpfjax.moves.memory import check_memory
 from mpfjax.moves.parents import runner
 from mpfjax.moves.report import StepInfo, step_info
-from mpfjax.moves.results import as_moves, check_result, check_weighed, normalised
+from mpfjax.moves.results import as_moves, check_result, check_sizes, check_weighed, normalised
 from mpfjax.moves.sharing import give_inputs, tie, untie
 from mpfjax.observations import Fault, faults_of, one_input, one_observation, raise_faults
 from mpfjax.operations.across_islands import island_index, num_islands
 from mpfjax.operations.choices import drawn_once
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
-from mpfjax.operations.generator import split
+from mpfjax.operations.generator import split_keys
 
 # Moves that do not change the total mass; there is nothing to normalise after them.
 _KEEP_MASS = (AbstractRegrouping, AbstractResampling, AbstractMarkovMove, IslandInteraction)
-_FOR_THE_START = 2**31  # folded into the key of the first step
 BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
 
@@ -120,15 +119,8 @@ class Filter(eqx.Module):
         check_model(model, "Filter")
         moves = as_moves(moves, "moves")
         initial_moves = as_moves(initial_moves, "initial_moves")
-        _check_sizes(num_particles, num_components)
+        check_sizes(with_inner(moves), num_particles, num_components)
         check_weighed(moves)
-        for move in with_inner(moves):
-            per_component = getattr(move, "particles_per_component", None)
-            if per_component is not None and per_component * num_components > num_particles:
-                raise ValueError(
-                    f"particles_per_component: {per_component} for each of {num_components}"
-                    f" components needs more than num_particles, {num_particles}"
-                )
         check_memory(moves)
         runner(moves)
         self.model = model
@@ -172,7 +164,7 @@ class Filter(eqx.Module):
         start = Start(key, drawn_once(key, self._sample_initial))
         return with_floats_traced(lambda filter: _from_particles(filter, start), self)
 
-    def _sample_initial(self, key: Key[Array, ""]) -> PyTree:
+    def _sample_initial(self, key: Key[Array, "*num"]) -> PyTree:
         key_initial = split_keys(key, 1 + len(self._initial_moves))[0]
         with saying_that_none_were_given(self.model):
             return sample_initial(key_initial, self.model, self.num_particles, self.initial_noise)
@@ -211,7 +203,7 @@ class Filter(eqx.Module):
 
     def choose_initial(
         self,
-        key: Key[Array, ""],
+        key: Key[Array, "*keys"],
         mixture: ParticleMixture,
         observation: PyTree,
         pool: PyTree = None,
@@ -222,21 +214,32 @@ class Filter(eqx.Module):
         where the history of an online run is kept: ancestor indices of the first step refer to
         it. `pool` are the draws of `sample_pool`, where that was called before.
         """
-        _, key_choice, *move_keys = self._start_keys(key)
+        moves = looking_moves(self.moves, self.starts_empty)
+        _, key_kept, *keys = self._keys(key)[1]
         if pool is None:
             with saying_that_none_were_given(self.model):
                 pool = self.sample_pool(key)
-        moves = looking_moves(self.moves, self.starts_empty)
-        chosen = choose_initial(key_choice, mixture, pool, moves, observation, self.initial_noise)
-        return self._grouped(move_keys, chosen)
+        looks = list(zip(keys, moves, strict=False))
+        chosen = choose_initial(key_kept, mixture, pool, looks, observation, self.initial_noise)
+        return self._grouped(keys[len(moves) :], chosen)
 
-    def sample_pool(self, key: Key[Array, ""]) -> PyTree:
+    def sample_pool(self, key: Key[Array, "*keys"]) -> PyTree:
         """The K N draws of x_0 of the first step, of this key."""
         number = self.initial_draws * self.num_particles
-        return sample_initial(self._start_keys(key)[0], self.model, number, self.initial_noise)
+        return sample_initial(self._keys(key)[1][0], self.model, number, self.initial_noise)
 
-    def _start_keys(self, key: Key[Array, ""]) -> list[Key[Array, ""]]:
-        return split_keys(jax.random.fold_in(key, _FOR_THE_START), 2 + len(self._initial_moves))
+    @property
+    def num_step_keys(self) -> int:
+        """How many keys that of a step is split into: one for each move, and those of the start."""
+        if self.initial_draws == 1:
+            return len(self._moves)
+        looks = looking_moves(self._moves, self.starts_empty)
+        return len(self._moves) + 2 + len(looks) + len(self._initial_moves)
+
+    def _keys(self, key: Key[Array, "*keys"]) -> tuple[list, list]:
+        """The keys of a step's moves, and those of the start."""
+        keys = split_keys(key, self.num_step_keys)
+        return keys[: len(self._moves)], keys[len(self._moves) :]
 
     def with_inputs(self, inputs: PyTree) -> "Filter":
         """The filter at a step whose known inputs are u_t, which every model in it receives.
@@ -286,7 +289,7 @@ class Filter(eqx.Module):
         return raise_faults(tuple(moved), faults)
 
     def _step(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
+        self, key: Key[Array, "*keys"], mixture: ParticleMixture, observation: PyTree
     ) -> tuple[ParticleMixture, StepInfo]:
         if mixture.num_components != self.num_components:
             raise ValueError(
@@ -301,7 +304,7 @@ class Filter(eqx.Module):
         increment = jnp.zeros((), mixture.log_weights.dtype)
         run = runner(self._moves)
         start: StartMemory | None = mixture.memory.get(START)
-        for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
+        for move_key, move in zip(self._keys(key)[0], self.moves, strict=True):
             if start is not None and isinstance(move, AbstractPropagation):
                 increment += start.log_mass.astype(increment.dtype)
                 mixture, start = started(mixture), None
@@ -334,11 +337,11 @@ class Filter(eqx.Module):
         return mixture.replace(memory=memory)
 
     def _predict(
-        self, key: Key[Array, ""], mixture: ParticleMixture
+        self, key: Key[Array, "*keys"], mixture: ParticleMixture
     ) -> tuple[ParticleMixture, StepInfo]:
         mixture = _own_ancestors(mixture)
         mixture = leaving_start(mixture)
-        for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
+        for move_key, move in zip(self._keys(key)[0], self.moves, strict=True):
             if not isinstance(move, AbstractMove):
                 raise ValueError(f"moves: {move!r} does not define predict, for a missing y_t")
             with saying_that_none_were_given(self.model):
@@ -382,17 +385,3 @@ def _own_ancestors(mixture: ParticleMixture) -> ParticleMixture:
     if num_islands() > 1:
         own += mixture.num_particles * island_index()
     return mixture.replace(ancestor_indices=own)
-
-
-def split_keys(key: Key[Array, ""], num: int) -> list[Key[Array, ""]]:
-    """A key for each move. The first do not depend on `num`: longer chains start with the same."""
-    return list(split(key, num))
-
-
-def _check_sizes(num_particles: int, num_components: int) -> None:
-    check_whole(num_particles=num_particles, num_components=num_components)
-    if num_particles < num_components:
-        raise ValueError(
-            f"num_particles: {num_particles} is less than num_components, {num_components};"
-            " every component needs a particle"
-        )

@@ -13,6 +13,7 @@ from mpfjax.operations.generator import (
     normal,
     normal_quantile,
     split,
+    split_for_run,
     threefry,
     uniform,
 )
@@ -47,6 +48,27 @@ class TestTheSameBits:
         keys = jax.random.split(KEY, 3)
         fast = jax.jit(jax.vmap(lambda key: draw(fast_key(key))))
         np.testing.assert_allclose(fast(keys), jax.vmap(draw)(keys), rtol=ROUNDED.get(draw, 0))
+
+
+@pytest.mark.parametrize("impl", ["threefry2x32", "rbg", "unsafe_rbg"])
+@pytest.mark.parametrize("sizes", [(1, 1, 1), (2, 7, 3)])
+def test_the_keys_of_a_run_are_those_of_one_split_after_the_other(impl, sizes):
+    key = jax.random.key(3, impl=impl)
+    num_initial, num_steps, num_moves = sizes
+    key_initial, key_steps = jax.random.split(key)
+    initial, moves = jax.jit(lambda key: split_for_run(key, *sizes))(key)
+    same = lambda a, b: np.testing.assert_array_equal(*map(jax.random.key_data, (a, b)))  # noqa: E731
+    same(initial, jax.random.split(key_initial, num_initial))
+    assert moves.shape == (num_steps, num_moves)
+    for found, step_key in zip(moves, jax.random.split(key_steps, num_steps), strict=True):
+        same(found, jax.random.split(step_key, num_moves))
+
+
+def test_the_keys_of_many_runs_are_those_of_each():
+    keys = jax.random.split(KEY, 3)
+    each = lambda key: split_for_run(key, 2, 4, 3)  # noqa: E731
+    for k, found in enumerate(jax.vmap(each)(keys)[1]):
+        np.testing.assert_array_equal(*map(jax.random.key_data, (found, each(keys[k])[1])))
 
 
 def test_64_bit_draws():

@@ -22,9 +22,10 @@ from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.resampling.ordering import HILBERT, sorted_order
 from mpfjax.operations.floats import default_float
-from mpfjax.operations.generator import split, uniform
+from mpfjax.operations.generator import uniform
 from mpfjax.operations.indexing import take
-from mpfjax.operations.logarithms import log_sum_exp
+from mpfjax.operations.logarithms import exp, finite_or_zero
+from mpfjax.operations.maxima import largest
 from mpfjax.operations.prefix_sums import count_starts, sum_before
 
 # The name of the memory of a filter whose x_0 is chosen.
@@ -121,37 +122,38 @@ def choose_initial(
     key: Key[Array, ""],
     mixture: ParticleMixture,
     drawn: PyTree,
-    propagations: Sequence[AbstractPropagation],
+    looks: Sequence[tuple[Key[Array, ""], AbstractPropagation]],
     observation: PyTree,
     noise: str,
 ) -> ParticleMixture:
     """N weighted draws of x_0, chosen for what they say of y_1 among those `drawn`, K N of them.
 
-    Of each x_0 two x_1 are drawn, and ν is the mean of their likelihoods, shrunk towards the mean
-    of all by the share of its variance that is not x_0's (`_trusted`). Particles are kept with
-    probabilities in proportion to ν, and weigh 1 / ν. They represent x_0 as the pool does, and Ẑ
-    stays unbiased. With "rqmc" `noise` they are kept in order along a Hilbert curve.
+    Of each x_0 two x_1 are drawn, by the moves of `looks` with their keys, and ν is the mean of
+    their likelihoods, shrunk towards the mean of all by the share of its variance that is not x_0's
+    (`_trusted`). Particles are kept with probabilities in proportion to ν, and weigh 1 / ν. They
+    represent x_0 as the pool does, and Ẑ stays unbiased. With "rqmc" `noise` they are kept in order
+    along a Hilbert curve.
     """
-    key_draws, key_kept = split(key, 2)
     num_draws = jax.tree.leaves(drawn)[0].shape[0] // mixture.num_particles
     usable = mixture.usable_slots
     num_drawn = None if usable is None else num_draws * usable
     pool = single_component(drawn, mixture.num_components, num_drawn)
-    log_factors = _look(key_draws, pool, propagations, observation)
+    log_factors = _look(looks, pool, observation)
     trusted = jax.lax.stop_gradient(_trusted(log_factors, pool.occupied))
     order = None
     if noise == "rqmc":
         labels = jnp.where(pool.occupied, 0, pool.num_components)
         order = sorted_order(pool, labels, HILBERT)
-    kept = _kept(key_kept, trusted, mixture, pool, order)
+    kept = _kept(key, trusted, mixture, pool, order)
     particles = jax.tree.map(lambda leaf: take(leaf, kept), drawn)
     chosen = single_component(particles, mixture.num_components, usable)
-    log_weights = chosen.log_weights - jnp.log(take(trusted, kept)).astype(default_float())
-    log_mass = log_sum_exp(log_weights)
+    trust = take(trusted, kept).astype(default_float())
+    # No ν is below a quarter, so that their inverses need no logarithms to be summed.
+    total = jnp.sum(jnp.where(chosen.occupied, 1 / trust, 0.0))
+    log_weights = jnp.where(chosen.occupied, -jnp.log(trust * total), -jnp.inf)
+    log_mass = jnp.log(total / jnp.asarray(chosen.num_usable_slots, total.dtype))
     memory = StartMemory.used()._replace(is_chosen=jnp.asarray(True), log_mass=log_mass)
-    return chosen.replace(
-        log_weights=log_weights - log_mass, memory=mixture.memory | {START: memory}
-    )
+    return chosen.replace(log_weights=log_weights, memory=mixture.memory | {START: memory})
 
 
 def _checksum(mixture: ParticleMixture) -> UInt32[Array, ""]:
@@ -179,9 +181,8 @@ def _bits(leaf: Array) -> Array:
 
 
 def _look(
-    key: Key[Array, ""],
+    looks: Sequence[tuple[Key[Array, ""], AbstractPropagation]],
     pool: ParticleMixture,
-    propagations: Sequence[AbstractPropagation],
     observation: PyTree,
 ) -> Float[Array, "n 2"]:
     """The logarithms of the weights of two draws of x_1 of each particle, up to a constant."""
@@ -193,7 +194,7 @@ def _look(
         ancestor_indices=twice(pool.ancestor_indices),
         usable_slots=None if pool.usable_slots is None else 2 * pool.usable_slots,
     )
-    for move_key, move in zip(split(key, len(propagations)), propagations, strict=True):
+    for move_key, move in looks:
         drawn = move(move_key, drawn, observation)
     return drawn.log_weights.reshape(-1, 2)
 
@@ -207,16 +208,19 @@ def _trusted(log_factors: Float[Array, "n 2"], occupied: Bool[Array, " n"]) -> F
     """
     is_number = occupied[:, None] & (log_factors < jnp.inf)
     log_factors = jnp.where(is_number, log_factors, -jnp.inf)
-    largest = jnp.max(log_factors)
-    values = jnp.exp(log_factors - jnp.where(largest > -jnp.inf, largest, 0.0))
-    number = jnp.maximum(jnp.sum(occupied, dtype=values.dtype), 1.0)
-    mean = jnp.sum(values) / (2 * number)
-    ratios = values / jnp.where(mean > 0, mean, 1.0)
-    gaps = jnp.where(occupied[:, None] & (mean > 0), ratios - 1, 0.0)
-    shared, total = jnp.sum(gaps[:, 0] * gaps[:, 1]), jnp.sum(gaps**2) / 2
+    values = exp(log_factors - finite_or_zero(largest(log_factors)))
+    # All sums in one product: each one alone would be a kernel. Where the likelihoods are so much
+    # alike that it loses their differences to rounding, trust in these does not matter.
+    rows = jnp.stack([*values.T, occupied.astype(values.dtype)])
+    sums = jnp.matmul(rows, rows.T, precision=jax.lax.Precision.HIGHEST)
+    number = jnp.maximum(sums[2, 2], 1.0)
+    mean = (sums[0, 2] + sums[1, 2]) / (2 * number)
+    common = number * mean**2
+    shared, total = sums[0, 1] - common, (sums[0, 0] + sums[1, 1]) / 2 - common
     correlation = jnp.clip(shared / jnp.where(total > 0, total, 1.0), 0.0, 1.0)
-    trust = jnp.minimum(2 * correlation / (1 + correlation), _MOST_TRUST)
-    return 1 + trust * jnp.mean(gaps, axis=1)
+    trust = jnp.where(mean > 0, jnp.minimum(2 * correlation / (1 + correlation), _MOST_TRUST), 0.0)
+    ratios = (values[:, 0] + values[:, 1]) / jnp.where(mean > 0, 2 * mean, 1.0)
+    return 1 + trust * (ratios - 1)
 
 
 def _kept(
@@ -230,9 +234,10 @@ def _kept(
     weights = jnp.where(pool.occupied, trusted, 0.0)
     weights = weights if order is None else take(weights, order)
     num_kept = jnp.asarray(mixture.num_usable_slots, weights.dtype)
-    before, _ = sum_before(weights * (num_kept / jnp.sum(weights)))
+    before, total = sum_before(weights)
     # Slot s has the point s + shift, and takes the particle whose interval holds it.
-    starts = jnp.ceil(before - uniform(key, (), weights.dtype)).astype(jnp.int32)
+    points = before * (num_kept / total) - uniform(key, (), weights.dtype)
+    starts = jnp.ceil(points).astype(jnp.int32)
     places = count_starts(jnp.maximum(starts, 0), mixture.num_particles)
     last = jnp.asarray(pool.num_usable_slots, jnp.int32) - 1
     places = jnp.clip(places, 0, last)

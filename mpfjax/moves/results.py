@@ -1,12 +1,13 @@
 """The moves of a filter, checked: there are some, one weighs, each returns a mixture; its mass."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mpfjax.checks import check_callable, is_series, shown
+from mpfjax.checks import check_callable, check_whole, is_series, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.across_islands import excess_over_islands
 from mpfjax.operations.logarithms import scaled_log_sum_exp
@@ -54,6 +55,23 @@ def check_weighed(moves: tuple[Any, ...]) -> None:
             f"moves: {names} never weigh the particles by what is observed, and log Ẑ would be 0;"
             " Propagate does, or Reweight after Predict"
         )
+
+
+def check_sizes(moves: Iterable[Any], num_particles: int, num_components: int) -> None:
+    """Raise a `ValueError` unless every component has the particles that it needs."""
+    check_whole(num_particles=num_particles, num_components=num_components)
+    if num_particles < num_components:
+        raise ValueError(
+            f"num_particles: {num_particles} is less than num_components, {num_components};"
+            " every component needs a particle"
+        )
+    for move in moves:
+        per_component = getattr(move, "particles_per_component", None)
+        if per_component is not None and per_component * num_components > num_particles:
+            raise ValueError(
+                f"particles_per_component: {per_component} for each of {num_components}"
+                f" components needs more than num_particles, {num_particles}"
+            )
 
 
 def normalised(

@@ -24,7 +24,7 @@ def cond_if_any(
     return jax.lax.cond(any_run(is_needed), dear, cheap)
 
 
-def drawn_once(key: Key[Array, ""], draw: Callable[[Key[Array, ""]], PyTree]) -> PyTree:
+def drawn_once(key: Key[Array, "*num"], draw: Callable[..., PyTree]) -> PyTree:
     """`draw(key)`, computed once, where XLA would draw again in each operation that uses it.
 
     It is a branch that is always taken, which XLA cannot know: no word of a key has more bits than

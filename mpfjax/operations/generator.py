@@ -58,6 +58,64 @@ def split(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
     return jax.random.wrap_key_data(jax.random.key_data(keys), impl=jax.random.key_impl(key))
 
 
+def split_keys(key: Key[Array, "*keys"], num: int) -> list[Key[Array, ""]]:
+    """A key for each move, or those that `key` holds. Longer chains start with the same keys."""
+    return list(key if key.ndim else split(key, num))
+
+
+def split_for_run(
+    key: Key[Array, ""], num_initial: int, num_steps: int, num_moves: int
+) -> tuple[Key[Array, " i"], Key[Array, "t m"]]:
+    """The keys of a run's start and of the moves of each step, as by `split` again and again.
+
+    `split(key, 2)` gives a key for the start, which is split into `num_initial`, and one for the
+    steps, which is split into `num_steps`, and each of these into `num_moves`. On a CPU, one loop
+    over the three generations makes all of them: each `split` compiles a hash of its own.
+    """
+    by_splits = partial(_generations_split, sizes=(num_initial, num_steps, num_moves))
+    if fast_key(key) is key:
+        return by_splits(key)
+    by_loop = partial(_generations_hashed, sizes=(num_initial, num_steps, num_moves))
+    return on_platform(key, cpu=by_loop, default=by_splits)
+
+
+def _generations_split(
+    key: Key[Array, ""], sizes: tuple[int, int, int]
+) -> tuple[Key[Array, " i"], Key[Array, "t m"]]:
+    num_initial, num_steps, num_moves = sizes
+    key_initial, key_steps = split(key, 2)
+    # Not by `vmap`, under which keys of some generators are split differently.
+    moves = jax.lax.map(lambda key: split(key, num_moves), split(key_steps, num_steps))
+    return split(key_initial, num_initial), moves
+
+
+def _generations_hashed(
+    key: Key[Array, ""], sizes: tuple[int, int, int]
+) -> tuple[Key[Array, " i"], Key[Array, "t m"]]:
+    num_initial, num_steps, num_moves = sizes
+    size = num_initial + num_steps * num_moves
+
+    def next_generation(number: Array, words: UInt32[Array, "e 2"]) -> UInt32[Array, "e 2"]:
+        # Counted from the loop's own number: XLA would move what does not depend on it out of the
+        # loop, into kernels of their own.
+        count = jnp.asarray(number, jnp.uint32)
+        index = jax.lax.iota(jnp.uint32, size) + count
+        is_move, place = index >= count + num_initial, index - (count + num_initial)
+        step = place // num_moves
+        step = jnp.where(number == 1, step, place - step * num_moves)
+        low = jnp.where(number == 0, is_move.astype(jnp.uint32), step)
+        low = jnp.where(is_move | (number == 0), low, index - count)
+        hashed = threefry((words[:, 0], words[:, 1]), jnp.zeros_like(low), low)
+        # A start has no third generation.
+        is_last = (number == 2) & ~is_move
+        return jnp.where(is_last[:, None], words, jnp.stack(hashed, axis=1))
+
+    first = jnp.broadcast_to(jax.random.key_data(key), (size, 2))
+    words = jax.lax.fori_loop(0, 3, next_generation, first)
+    keys = jax.random.wrap_key_data(words, impl=jax.random.key_impl(key))
+    return keys[:num_initial], keys[num_initial:].reshape(num_steps, num_moves)
+
+
 def uniform(
     key: Key[Array, ""], shape: tuple[int, ...], dtype: DTypeLike | None = None
 ) -> Float[Array, "..."]:
@@ -168,7 +226,7 @@ def _hashes(
 
 
 def threefry(
-    key: UInt32[Array, " 2"], high: UInt32[Array, " *shape"], low: UInt32[Array, " *shape"]
+    key: Any, high: UInt32[Array, " *shape"], low: UInt32[Array, " *shape"]
 ) -> tuple[UInt32[Array, " *shape"], UInt32[Array, " *shape"]]:
     """Threefry-2x32 with 20 rounds: the counter (high, low) encrypted under `key`."""
     keys = (key[0], key[1], key[0] ^ key[1] ^ jnp.uint32(_PARITY))

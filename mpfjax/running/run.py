@@ -9,11 +9,12 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_flag, check_key, check_whole, given
-from mpfjax.filter import Filter, Start, split_keys
+from mpfjax.filter import Filter, Start
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
+from mpfjax.operations.generator import split_keys
 from mpfjax.running.devices import choose_devices, over_devices
 from mpfjax.running.progress import shown_progress
 from mpfjax.running.scan import FilterRun, check_run, checked, scan

@@ -12,11 +12,12 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import check_callable, check_type, given, saying
-from mpfjax.filter import BROKEN_DENSITY, Filter, Start, StepInfo, split_keys
+from mpfjax.filter import BROKEN_DENSITY, Filter, Start, StepInfo
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.initial import leaving_start
 from mpfjax.observations import Series
 from mpfjax.operations.across_islands import num_islands
+from mpfjax.operations.generator import split_for_run
 from mpfjax.running.progress import Bar, advance_bar
 
 
@@ -45,13 +46,14 @@ def scan(
     bar: Bar | None = None,
 ) -> FilterRun:
     """`run_filter` under the caller's jit, its arguments unchecked."""
-    key_initial, key_steps = split_keys(start.key, 2)
+    num_initial, num_of_step = 1 + len(filter._initial_moves), filter.num_step_keys
+    keys_initial, keys = split_for_run(start.key, num_initial, series.length, num_of_step)
 
     def advance(
         mixture: ParticleMixture, step: tuple[Array, Series, Array | None]
     ) -> tuple[ParticleMixture, PyTree]:
-        step_key, now, number = step
-        mixture, info = step_or_predict(filter, step_key, mixture, now)
+        step_keys, now, number = step
+        mixture, info = step_or_predict(filter, step_keys, mixture, now)
         with saying("in collect, which is called with the mixture after each step"):
             kept = mixture if collect is None else collect(mixture)
         if bar is not None and number is not None:
@@ -59,17 +61,16 @@ def scan(
         return mixture, (kept, report_of(info))
 
     numbers = None if bar is None else jnp.arange(series.length, dtype=jnp.int32)
-    step_keys = jax.random.split(key_steps, series.length)
-    steps = (step_keys, series, numbers)
-    start = start._replace(key=key_initial)
-    initial, filter = first_mixture(start, filter, step_keys[0], series)
+    steps = (keys[:, : len(filter._moves)], series, numbers)
+    start = start._replace(key=keys_initial)
+    initial, filter = first_mixture(start, filter, keys[0], series)
     initial = _share_of_islands(initial)
     final, outputs = jax.lax.scan(advance, initial, steps)
     return run_of(initial, final, *outputs)
 
 
 def first_mixture(
-    start: Start, filter: Filter, key: Key[Array, ""], series: Series
+    start: Start, filter: Filter, key: Key[Array, "*keys"], series: Series
 ) -> tuple[ParticleMixture, Filter]:
     """The mixture of x_0 that the first step, of this `key`, goes on from; and the filter for the
     steps, which need not choose it any more.
@@ -120,7 +121,7 @@ def run_of(
 
 def step_or_predict(
     filter: Filter,
-    key: Key[Array, ""],
+    key: Key[Array, "*keys"],
     mixture: ParticleMixture,
     now: Series,
 ) -> tuple[ParticleMixture, StepInfo]:

@@ -18,7 +18,7 @@ from mpfjax.checks import (
     saying,
     shown,
 )
-from mpfjax.filter import Filter, Start, split_keys
+from mpfjax.filter import Filter, Start
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
@@ -26,7 +26,7 @@ from mpfjax.models.inputs import with_inputs
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.floats import as_inexact
-from mpfjax.operations.generator import split
+from mpfjax.operations.generator import split, split_keys
 from mpfjax.operations.indexing import take
 from mpfjax.running.scan import (
     FilterRun,

@@ -9,13 +9,13 @@ from jax.core import Tracer
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_key, check_one_of, check_whole, given
-from mpfjax.filter import split_keys
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
 from mpfjax.models.inputs import saying_that_none_were_given, with_inputs
 from mpfjax.observations import as_arrays, steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors
+from mpfjax.operations.generator import split_keys
 from mpfjax.operations.indexing import take
 from mpfjax.running.scan import FilterRun
 from mpfjax.smoothing.backward import draw, draw_exactly, propose, walk

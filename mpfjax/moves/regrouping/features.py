@@ -57,7 +57,10 @@ class Features(eqx.Module):
         values = as_inexact(values.reshape(mixture.num_particles, -1))
         if len(self.scale) not in (1, values.shape[1]):
             raise ValueError(f"scale: {len(self.scale)} units for {values.shape[1]} features")
-        values = values / jnp.array(self.scale, values.dtype)[None]
+        if self.scale != (1.0,):
+            # One number is part of the program, where XLA sees that moves have the same.
+            one, *others = self.scale
+            values = values / (jnp.array(self.scale, values.dtype)[None] if others else one)
         return jnp.where(mixture.occupied[:, None], values - origin(values, mixture)[None], 0.0)
 
 
