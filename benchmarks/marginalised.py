@@ -379,7 +379,7 @@ def bearings(options: argparse.Namespace) -> tuple[list[str], list[list[Any]]]:
     taken = milliseconds(runs, options.repeats)
     base, found = taken["MPF", size], []
     for name, (own, filter, spent) in rows.items():
-        errors = measure.errors(own, filter, known, options.runs, 0)
+        errors = measure.summary(measure.results(own, filter, options.runs, 0), known, own.truth)
         ratio = float(np.median(taken[name] / base))
         found.append([*name, errors["mass_rmse"], errors["log_z_rmse"], ratio, spent])
     header = ["filter", "N", "error of masses", "error of log Ẑ", "time of a run", "s to learn"]

@@ -10,6 +10,9 @@ region less than a hundredth, `log_z_sd` the standard deviation of log Ẑ over 
 Masses are judged by symmetry (corridor, mirror), a grid (quadratic, jumps), or a plain filter of a
 million particles, as is log Z without a grid.
 
+A second table sets each filter beside the first one of --filters: by how many standard errors of
+the paired differences it is worse. --keys chooses other keys of the runs for the same scenes.
+
 Into --out DIR go masses.json and masses.png.
 """
 
@@ -33,7 +36,7 @@ _FEWER = {"look-alikes": 10}
 # A picture has room for as many lines as there are colours.
 _IN_THE_TABLE_ONLY = (
     "APF", "APF, rqmc", "MPF, 4 draws", "MPF, tempered", "MPF, look-ahead",
-    "MPF, learned look-ahead",
+    "MPF, rqmc, look-ahead", "MPF, learned look-ahead",
 )  # fmt: skip
 
 
@@ -54,7 +57,10 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         "--reference", type=whole(2), default=1_000_000, metavar="N",
         help="particles of the filter that says what is true, a tenth of it for look-alikes",
     )  # fmt: skip
-    parser.add_argument("--seed", type=seed, default=0)
+    parser.add_argument("--seed", type=seed, default=0, help="of the scenes")
+    parser.add_argument(
+        "--keys", type=seed, metavar="SEED", help="of the filters' runs; by default that of scenes"
+    )
     parser.add_argument("--out", type=Path, default=Path("results/masses"))
     return parser.parse_args(arguments)
 
@@ -84,7 +90,11 @@ def run(options: argparse.Namespace) -> None:
             )
         sure = f"known to within {known.errors.max():.4f}; log Z {known.log_z:.2f}"
         print(f"\n{name}: masses {_numbers(known.masses)}, {sure} ± {known.log_z_error:.2f}")
-        print(table([row for row in rows if row["scene"] == name]))
+        of_scene = [row for row in rows if row["scene"] == name]
+        print(table(of_scene))
+        if len(options.filters) > 1:
+            print(f"\nworse than {options.filters[0]} by so many standard errors:")
+            print(table_of_differences(of_scene))
     write_figure(options.out / "masses.png", picture(rows), dpi=130)
     print(f"written to {options.out}")
 
@@ -97,21 +107,27 @@ def _rows(
     options: argparse.Namespace,
     with_particles: bool,
 ) -> list[dict[str, Any]]:
+    keys = options.seed if options.keys is None else options.keys
     filters = {each: FILTERS[each](scene, num_particles) for each in options.filters}
-    times = measure.milliseconds(scene, filters, options.seed)
-    rows = []
-    for each, filter in filters.items():
-        found = measure.errors(scene, filter, known, options.seeds, options.seed)
-        rows.append({"scene": name, "filter": each, "N": num_particles, **found, "ms": times[each]})
+    times = measure.milliseconds(scene, filters, keys)
+    found = {
+        each: measure.results(scene, filter, options.seeds, keys)
+        for each, filter in filters.items()
+    }
     if with_particles and starts_from_noise(scene.model):
         from benchmarks.masses import through_particles
 
-        found, time = through_particles.errors_and_time(
-            scene, num_particles, known, options.seeds, options.seed
+        found[through_particles.SQMC], times[through_particles.SQMC] = (
+            through_particles.results_and_time(scene, num_particles, options.seeds, keys)
         )
-        rows.append({
-            "scene": name, "filter": through_particles.SQMC, "N": num_particles, **found, "ms": time
-        })  # fmt: skip
+    first = options.filters[0]
+    rows: list[dict[str, Any]] = [
+        {"scene": name, "filter": each, "N": num_particles}
+        | measure.summary(of_runs, known, scene.truth) | {"ms": times[each]}
+        for each, of_runs in found.items()
+    ]  # fmt: skip
+    for row in rows[1:]:
+        row |= measure.worse(found[row["filter"]], found[first], known, scene.truth)
     return rows
 
 
@@ -140,6 +156,19 @@ def table(rows: list[dict[str, Any]]) -> str:
                 f"{row['ms']:.3f}",
             ]
             for row in sorted(rows, key=lambda row: row["N"])
+        ],
+    )
+
+
+def table_of_differences(rows: list[dict[str, Any]]) -> str:
+    """A line for each filter but the first, and N."""
+    return format_table(
+        ["filter", "N", "masses", "log Ẑ", "lost"],
+        [
+            [row["filter"], str(row["N"])]
+            + [f"{row[what]:+.1f}" for what in ("masses_worse", "log_z_worse", "lost_worse")]
+            for row in sorted(rows, key=lambda row: row["N"])
+            if "masses_worse" in row
         ],
     )
 

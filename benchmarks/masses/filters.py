@@ -64,6 +64,7 @@ FILTERS: dict[str, Make] = {
     "MPF, 4 draws": _mixture(num_draws=4),
     "MPF, rqmc, 4 draws": _mixture(noise="rqmc", num_draws=4),
     "MPF, look-ahead": _mixture(ahead=True),
+    "MPF, rqmc, look-ahead": _mixture(ahead=True, noise="rqmc"),
     "MPF, tempered": _tempered,
     "MPF, learned look-ahead": _learned,
 }

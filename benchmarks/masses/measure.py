@@ -17,6 +17,13 @@ LOST = 0.01
 _REPEATS = 5
 
 
+class Found(NamedTuple):
+    """What the runs of a filter say: the masses of the regions, and log Ẑ."""
+
+    masses: np.ndarray  # (runs, regions)
+    log_z: np.ndarray  # (runs,)
+
+
 class Known(NamedTuple):
     """What is true, and how surely: errors are zero where a grid or symmetry tells it."""
 
@@ -50,28 +57,25 @@ def truth(scene: Scene, num_particles: int, seed: int) -> Known:
     return Known(mean, errors, log_z, log_z_error)
 
 
-def errors(
-    scene: Scene, filter: mpfjax.Filter, known: Known, seeds: int, seed: int
-) -> dict[str, float]:
-    """Those of `summary`, over runs of the filter."""
+def results(scene: Scene, filter: mpfjax.Filter, seeds: int, seed: int) -> Found:
+    """Of `seeds` runs of the filter, whose keys are split from that of `seed`."""
     keys = jax.random.split(jax.random.key(seed), seeds)
     run = mpfjax.monte_carlo(keys, filter, scene.observations, _nothing)
-    found = np.asarray(jax.vmap(lambda mixture: masses(scene, mixture))(run.final))
-    return summary(found, np.asarray(run.log_marginal_likelihood), known, scene.truth)
+    found = jax.vmap(lambda mixture: masses(scene, mixture))(run.final)
+    return Found(np.asarray(found), np.asarray(run.log_marginal_likelihood))
 
 
-def summary(found: np.ndarray, logs: np.ndarray, known: Known, region: int) -> dict[str, float]:
-    """Errors of the masses (runs, regions) and of log Ẑ (runs,), with standard errors.
+def summary(found: Found, known: Known, region: int) -> dict[str, float]:
+    """Errors of the masses and of log Ẑ, with standard errors.
 
     `lost` is the share of runs that leave the true `region` less than a hundredth of the mass.
     """
-    squares = np.mean((found - known.masses) ** 2, axis=1)
-    rmse, runs = float(np.sqrt(squares.mean())), len(logs)
-    lost = float(np.mean(found[:, region] < LOST))
-    log_squares = (logs - known.log_z) ** 2
+    squares, log_squares, gone = _losses(found, known, region)
+    rmse, runs = float(np.sqrt(squares.mean())), len(gone)
+    lost = float(gone.mean())
     log_rmse = float(np.sqrt(log_squares.mean()))
     return {
-        "mass_of_truth": float(found[:, region].mean()),
+        "mass_of_truth": float(found.masses[:, region].mean()),
         "lost": lost,
         "lost_error": float(np.sqrt(lost * (1 - lost) / runs)),
         "log_z_rmse": log_rmse,
@@ -80,11 +84,39 @@ def summary(found: np.ndarray, logs: np.ndarray, known: Known, region: int) -> d
         ),
         "mass_rmse": rmse,
         "mass_rmse_error": float(squares.std(ddof=1) / np.sqrt(runs) / max(2 * rmse, 1e-12)),
-        "largest_mass": float(np.median(found.max(axis=1))),
-        "log_z_sd": float(logs.std(ddof=1)),
-        "log_z_sd_error": float(logs.std(ddof=1) / np.sqrt(2 * (runs - 1))),
-        "log_z_mean": float(logs.mean()),
+        "largest_mass": float(np.median(found.masses.max(axis=1))),
+        "log_z_sd": float(found.log_z.std(ddof=1)),
+        "log_z_sd_error": float(found.log_z.std(ddof=1) / np.sqrt(2 * (runs - 1))),
+        "log_z_mean": float(found.log_z.mean()),
     }
+
+
+def worse(found: Found, first: Found, known: Known, region: int) -> dict[str, float]:
+    """By how many standard errors of the paired differences a filter is worse than the `first`.
+
+    In the mean squared errors of the masses and of log Ẑ, and in the share of runs that lost the
+    true `region`. Negative is better.
+    """
+    names = ("masses_worse", "log_z_worse", "lost_worse")
+    losses = zip(_losses(found, known, region), _losses(first, known, region), strict=True)
+    return {
+        name: _standardised(one - other) for name, (one, other) in zip(names, losses, strict=True)
+    }
+
+
+def _losses(found: Found, known: Known, region: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each run: squared errors of the masses and of log Ẑ, and whether the mode is lost."""
+    return (
+        np.mean((found.masses - known.masses) ** 2, axis=1),
+        (found.log_z - known.log_z) ** 2,
+        (found.masses[:, region] < LOST).astype(float),
+    )
+
+
+def _standardised(differences: np.ndarray) -> float:
+    """Their mean in standard errors of it, zero where all are zero."""
+    error = differences.std(ddof=1) / np.sqrt(len(differences))
+    return float(differences.mean() / error) if error > 0 else 0.0
 
 
 def milliseconds(scene: Scene, filters: dict[str, mpfjax.Filter], seed: int) -> dict[str, float]:

@@ -58,13 +58,26 @@ def test_noise_and_draws_have_one_law(name):
 def test_errors_are_those_of_the_numbers():
     found = np.array([[0.5, 0.5], [1.0, 0.0]])
     known = measure.Known(np.array([0.5, 0.5]), np.zeros(2), 2.0, 0.0)
-    entry = measure.summary(found, np.array([1.0, 4.0]), known, 1)
+    entry = measure.summary(measure.Found(found, np.array([1.0, 4.0])), known, 1)
     assert entry["mass_rmse"] == pytest.approx(np.sqrt(0.125))
     assert entry["log_z_sd"] == pytest.approx(np.sqrt(4.5))
     assert entry["log_z_rmse"] == pytest.approx(np.sqrt(2.5))
     assert entry["lost"] == 0.5
     assert entry["mass_of_truth"] == 0.25
     assert entry["largest_mass"] == pytest.approx(0.75)
+
+
+def test_a_filter_is_set_beside_the_first_by_paired_differences():
+    """Of two runs: squared errors of log Z that differ by 1 and 3 have a mean of 2 ± 1."""
+    known = measure.Known(np.array([0.5, 0.5]), np.zeros(2), 0.0, 0.0)
+    masses_of_runs = np.array([[0.5, 0.5], [1.0, 0.0]])
+    first = measure.Found(masses_of_runs, np.sqrt([1.0, 4.0]))
+    other = measure.Found(masses_of_runs[::-1], np.sqrt([2.0, 7.0]))
+    found = measure.worse(other, first, known, 1)
+    assert found["log_z_worse"] == pytest.approx(2.0)
+    assert found["masses_worse"] == found["lost_worse"] == pytest.approx(0.0)
+    assert measure.worse(first, other, known, 1)["log_z_worse"] == pytest.approx(-2.0)
+    assert measure.worse(first, first, known, 1)["log_z_worse"] == 0.0
 
 
 def test_a_reference_without_a_grid_agrees_with_one():
@@ -99,7 +112,7 @@ def test_a_row_for_each_scene_filter_and_size(scenes, tmp_path, monkeypatch, cap
     monkeypatch.setattr(command.importlib.util, "find_spec", lambda name: None)
     arguments = [
         "--scenes", *scenes, "--filters", "PF", "MPF, rqmc", "--particles", "20", "--seeds", "3",
-        "--steps", "3", "--reference", "100", "--out", str(tmp_path),
+        "--steps", "3", "--reference", "100", "--keys", "7", "--out", str(tmp_path),
     ]  # fmt: skip
     assert command.main(arguments) == 0
     rows = json.loads((tmp_path / "masses.json").read_text())["rows"]
@@ -111,4 +124,7 @@ def test_a_row_for_each_scene_filter_and_size(scenes, tmp_path, monkeypatch, cap
         assert row["log_z_sd"] >= 0
         assert row["ms"] > 0
     assert (tmp_path / "masses.png").stat().st_size > 10_000
-    assert "pip install particles" in capsys.readouterr().out
+    assert ["log_z_worse" in row for row in rows] == [False, True] * len(scenes)
+    printed = capsys.readouterr().out
+    assert "pip install particles" in printed
+    assert "worse than PF by so many standard errors" in printed
