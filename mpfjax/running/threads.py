@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
+import jax.core
 import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
@@ -67,8 +68,9 @@ def _threads() -> ThreadPoolExecutor:
 
 
 def _seen_by_thread() -> tuple[Any, ...]:
-    """JAX's settings and the active transformations. In an old JAX, every thread is different."""
-    trace_state = getattr(jax.extend.core, "get_opaque_trace_state", None)
+    """JAX's settings and the active transformations; where JAX does not tell, the thread itself."""
+    name = "get_opaque_trace_state"  # before JAX 0.7 in jax.core
+    trace_state = getattr(jax.extend.core, name, None) or getattr(jax.core, name, None)
     if trace_state is None:
         return (threading.get_ident(),)
     return dict(jax.config.values), trace_state(convention="nnx")
