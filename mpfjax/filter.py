@@ -44,7 +44,14 @@ from mpfjax.moves.island_interaction import IslandInteraction
 from mpfjax.moves.memory import check_memory
 from mpfjax.moves.parents import runner
 from mpfjax.moves.report import StepInfo, step_info
-from mpfjax.moves.results import as_moves, check_result, check_sizes, check_weighed, normalised
+from mpfjax.moves.results import (
+    as_moves,
+    check_result,
+    check_sizes,
+    check_weighed,
+    normalised,
+    same_mass,
+)
 from mpfjax.moves.sharing import give_inputs, tie, untie
 from mpfjax.observations import Fault, faults_of, one_input, one_observation, raise_faults
 from mpfjax.operations.across_islands import island_index, num_islands
@@ -302,7 +309,7 @@ class Filter(eqx.Module):
         mixture = _own_ancestors(mixture)
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
-        run = runner(self._moves)
+        run, is_normalised = runner(self._moves), False
         start: StartMemory | None = mixture.memory.get(START)
         for move_key, move in zip(self._keys(key)[0], self.moves, strict=True):
             if start is not None and isinstance(move, AbstractPropagation):
@@ -320,9 +327,12 @@ class Filter(eqx.Module):
             if after:
                 mixture = moved
                 continue
-            if not isinstance(move, _KEEP_MASS):
+            keeps_mass = isinstance(move, _KEEP_MASS) or (
+                is_normalised and same_mass(moved, mixture)
+            )
+            if not keeps_mass:
                 moved, log_growth = normalised(moved, mixture, self.starts_empty)
-                increment += log_growth
+                increment, is_normalised = increment + log_growth, True
             mixture = self._forgetting(moved)
         return mixture.replace(parents=None), step_info(mixture, increment, resampled)
 

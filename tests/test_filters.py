@@ -600,3 +600,38 @@ def test_a_start_is_what_its_parts_give_one_after_the_other():
     keys = jax.random.split(jax.random.key(0), 3)
     for key in keys:
         chex.assert_trees_all_equal(filter.init(key), filter._init(Start(key)))
+
+
+def test_the_mass_of_a_mixture_given_by_hand_counts_once_whatever_moves_leave_the_weights():
+    """A move that returns the weights that it was given is not normalised again."""
+    model, key = mpfjax.QuadraticModel(), jax.random.key(0)
+    learns = lambda key, mixture, observation: mixture  # noqa: E731
+    only = mpfjax.Filter(model, [mpfjax.Propagate(model), learns, mpfjax.Resample()], 50)
+    before = mpfjax.Filter(model, [learns, mpfjax.Propagate(model), learns], 50)
+    for filter in (only, before, mpfjax.Filter(model, [learns], 50)):
+        given = filter.init(key)
+        heavier = given.replace(log_weights=given.log_weights + 3)
+        (_, info), (mixture, shifted) = (filter.step(key, m, 2.0) for m in (given, heavier))
+        increments = info.log_likelihood_increment, shifted.log_likelihood_increment
+        np.testing.assert_allclose(increments[0] + 3, increments[1], rtol=1e-5)
+        np.testing.assert_allclose(mixture.log_mass, 0, atol=1e-5)
+
+
+@pytest.mark.parametrize("num_components", [4, 64, *thorough([2, 12, 256])])
+def test_any_number_of_components_compiles_alone_in_runs_and_differentiated(num_components):
+    observations = jnp.array([1.5, 0.4])
+
+    def runs(sigma):
+        model = mpfjax.QuadraticModel(sigma, 0.5, -2.0, 2.0)
+        filter = mpfjax.mixture_particle_filter(model, 512, max_components=num_components)
+        keys = jax.random.split(jax.random.key(0), 8)
+        found = mpfjax.monte_carlo(keys, filter, observations).log_marginal_likelihood
+        return jnp.mean(found), found
+
+    (_, many), slope = jax.jit(jax.value_and_grad(runs, has_aux=True))(0.3)
+    model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
+    filter = mpfjax.mixture_particle_filter(model, 512, max_components=num_components)
+    key = jax.random.split(jax.random.key(0), 8)[3]
+    one = mpfjax.run_filter(key, filter, observations).log_marginal_likelihood
+    assert jnp.isfinite(slope)
+    np.testing.assert_allclose(many[3], one, rtol=1e-3)

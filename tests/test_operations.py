@@ -18,6 +18,7 @@ from mpfjax.operations.prefix_sums import (
     _scanned_sum_before,
     count_starts,
     count_upto,
+    few_upto,
     sum_before,
 )
 from mpfjax.operations.runs import runs_of, whole
@@ -146,6 +147,16 @@ def test_count_upto_is_exact(n):
     ones = RNG.integers(0, 2, n)
     for values in (jnp.asarray(ones, jnp.int32), jnp.asarray(ones, bool)):
         np.testing.assert_array_equal(count_upto(values, n), np.cumsum(ones))
+
+
+@pytest.mark.parametrize("n", [1, 24, 64, 65, 1000])
+def test_few_upto_is_a_cumulative_sum_of_whole_numbers(n):
+    counts = RNG.integers(0, 2**20, n)
+    for values in (jnp.asarray(counts, jnp.int32), jnp.asarray(counts % 2, bool)):
+        found = few_upto(values)
+        assert found.dtype == jnp.int32
+        np.testing.assert_array_equal(found, np.cumsum(values))
+        np.testing.assert_array_equal(jax.vmap(few_upto)(values[None, ::-1])[0][-1], found[-1])
 
 
 def test_count_upto_is_exact_where_float32_is_not():
@@ -482,12 +493,27 @@ def test_default_float_follows_the_precision():
         assert default_float() == np.float64
 
 
-def test_cholesky_of_many_small_matrices():
-    factors = np.tril(RNG.normal(size=(50, 4, 4))).astype(np.float32)
+@pytest.mark.parametrize("shape", [(50, 4, 4), (24, 8, 8), (100, 8, 8)])
+def test_cholesky_of_many_small_matrices(shape):
+    """Column by column, or in a loop over the columns where a few have many."""
+    factors = np.tril(RNG.normal(size=shape) + 3 * np.eye(shape[1])).astype(np.float32)
     matrices = factors @ np.swapaxes(factors, 1, 2)
     found = np.asarray(cholesky(jnp.asarray(matrices)))
     np.testing.assert_array_equal(found, np.tril(found))
     np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), matrices, rtol=1e-3, atol=1e-3)
+
+
+def test_cholesky_in_a_loop_has_the_derivative_of_numpys():
+    with float64():
+        factor = np.tril(RNG.normal(size=(6, 6))) + 3 * np.eye(6)
+        matrix, change = factor @ factor.T, RNG.normal(size=(6, 6))
+        total = lambda matrix, factored: jnp.sum(change * factored(matrix[None])[0])  # noqa: E731
+        found, expected = [
+            jax.grad(total)(jnp.asarray(matrix), factored)
+            for factored in (cholesky, jnp.linalg.cholesky)
+        ]
+        symmetric = lambda gradient: gradient + gradient.T  # noqa: E731
+        np.testing.assert_allclose(symmetric(found), symmetric(expected), rtol=1e-9, atol=1e-12)
 
 
 def test_cholesky_does_not_depend_on_the_units():

@@ -74,6 +74,11 @@ def check_sizes(moves: Iterable[Any], num_particles: int, num_components: int) -
             )
 
 
+def same_mass(moved: ParticleMixture, mixture: ParticleMixture) -> bool:
+    """Whether a move has returned the very weights that it was given, as one that only learns."""
+    return moved.log_weights is mixture.log_weights and moved.log_scale is mixture.log_scale
+
+
 def normalised(
     mixture: ParticleMixture, previous: ParticleMixture, may_be_empty: bool
 ) -> tuple[ParticleMixture, Float[Array, ""]]:

@@ -37,11 +37,15 @@ def cpu_options() -> dict[str, int | str]:
     if jax.default_backend() != "cpu":
         return {}
     options: dict[str, int | str] = {_VECTOR_WIDTH: 512}
+    flags = os.environ.get("XLA_FLAGS", "")
+    return {name: value for name, value in (options | _sums_in_one()).items() if name not in flags}
+
+
+def _sums_in_one() -> dict[str, int | str]:
     optimised = not jax.config.read("jax_disable_most_optimizations")
     if optimised and jax.__version_info__[:2] >= _SUMS_ON_VECTORS:
-        options[_WITHOUT_PASSES] = _TREE_SUMS
-    flags = os.environ.get("XLA_FLAGS", "")
-    return {name: value for name, value in options.items() if name not in flags}
+        return {_WITHOUT_PASSES: _TREE_SUMS}
+    return {}
 
 
 def jit_on_wide_vectors(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
@@ -77,17 +81,24 @@ def jit_on_wide_vectors(function: Callable[..., PyTree]) -> Callable[..., PyTree
     return run
 
 
-@functools.cache
-def in_little_memory() -> dict[str, bool]:
+def in_little_memory() -> dict[str, int | str]:
     """The compiler's options by which a large program is compiled in little memory on a CPU.
 
     XLA's newer emitters of fused operations take some 250 MB more for a program of a few thousand
-    operations, which then runs about a fifth faster. There are no options on other platforms, if
-    XLA_FLAGS sets the emitters, or where this XLA has no such option.
+    operations, which then runs about a fifth faster. Sums are in one piece, as by `cpu_options`:
+    use it for short arrays, since these emitters add up long ones one number after the other. There
+    are no options on other platforms, nor any that XLA_FLAGS sets or this XLA does not have.
     """
-    if _FUSION_EMITTERS in os.environ.get("XLA_FLAGS", "") or jax.default_backend() != "cpu":
+    if jax.default_backend() != "cpu":
         return {}
-    options = {_FUSION_EMITTERS: False}
+    flags = os.environ.get("XLA_FLAGS", "")
+    options = _older_emitters() | _sums_in_one()
+    return {name: value for name, value in options.items() if name not in flags}
+
+
+@functools.cache
+def _older_emitters() -> dict[str, int | str]:
+    options: dict[str, int | str] = {_FUSION_EMITTERS: False}
     try:
         jax.jit(jnp.negative, compiler_options=options)(1.0)
     except jax.errors.JaxRuntimeError:

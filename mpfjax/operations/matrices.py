@@ -6,11 +6,17 @@ arithmetic. Here one operation does the same column of all matrices.
 """
 
 import math
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 _FEW_COLUMNS = 16
+# Larger matrices than these, up to so many of them, are factored in a loop over their columns: most
+# of the time until a tracker's first frame is compiling.
+_SMALL = 4
+_FEW_MATRICES = 64
 
 
 def row_sums(values: Float[Array, "n d"]) -> Float[Array, " n"]:
@@ -88,13 +94,23 @@ def cholesky(matrices: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
     """
     d = matrices.shape[-1]
     tiny = 8 * d * jnp.finfo(matrices.dtype).eps * jnp.diagonal(matrices, axis1=1, axis2=2)
-    factors = jnp.zeros_like(matrices)
-    for j in range(d):
+
+    def column(j: Any, factors: Float[Array, "n d d"]) -> Float[Array, "n d"]:
         rest = matrices[:, :, j] - jnp.einsum("nik,nk->ni", factors, factors[:, j])
         positive = rest[:, j] > tiny[:, j]
         pivot = jnp.sqrt(jnp.where(positive, rest[:, j], 1.0))
-        column = jnp.where(positive[:, None], rest / pivot[:, None], 0.0)
-        factors = factors.at[:, j:, j].set(column[:, j:])
+        return jnp.where(positive[:, None], rest / pivot[:, None], 0.0)
+
+    factors = jnp.zeros_like(matrices)
+    if d > _SMALL and len(matrices) <= _FEW_MATRICES:
+
+        def with_column(j: Int[Array, ""], factors: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
+            below = jnp.arange(d) >= j
+            return factors.at[:, :, j].set(jnp.where(below, column(j, factors), 0.0))
+
+        return jax.lax.fori_loop(0, d, with_column, factors)
+    for j in range(d):
+        factors = factors.at[:, j:, j].set(column(j, factors)[:, j:])
     return factors
 
 

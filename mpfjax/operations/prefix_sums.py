@@ -17,6 +17,7 @@ from mpfjax.operations.stored import EXACT_IN_FLOAT32, block_size, stored, to_in
 
 _ONE_BLOCK = 128
 _LANES_OF_ROWS = 4
+_FEW = 64
 
 
 def sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
@@ -93,6 +94,19 @@ def _blocked_count_upto(values: Shaped[Array, " n"]) -> Int[Array, " n"]:
     blocks = blocks + jnp.where(is_first[None], before[:, None], 0.0)
     upto = blocks @ jnp.triu(jnp.ones((size, size), blocks.dtype))
     return to_int(upto).reshape(-1)[:n]
+
+
+def few_upto(values: Shaped[Array, " n"]) -> Int[Array, " n"]:
+    """`jnp.cumsum` of whole numbers or booleans that are few, such as one for each component.
+
+    It compiles as one kernel of masked sums, where XLA's takes up to seven.
+    """
+    n = values.shape[0]
+    if n > _FEW:
+        return jnp.cumsum(values, dtype=jnp.int32)
+    place = jnp.arange(n, dtype=jnp.int32)
+    counts = values.astype(jnp.int32)
+    return jnp.sum(jnp.where(place[None] <= place[:, None], counts[None], 0), 1, jnp.int32)
 
 
 def count_starts(starts: Int[Array, "*rows n"], num_slots: int) -> Int[Array, " num_slots"]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import mpfjax
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import Detections, ObjectTracker, Tracks, football_scene, track
 from mpfjax.vision.boxes.follow_boxes import follow_boxes
@@ -373,12 +374,30 @@ def test_the_second_frame_is_tracked_by_the_program_of_the_first():
 
 def test_trackers_are_made_by_the_name_of_their_filter():
     gaussian, resampling = make_tracker("gm_mpf", 5), make_tracker("mpf", 5, 30.0)
-    names = [[type(move).__name__ for move in one.moves] for one in (gaussian, resampling)]
-    assert "GaussianRegeneration" in names[0]
+    several = make_tracker("gm_mpf", 5, particles_per_object=2)
+    names = [[type(move).__name__ for move in one.moves] for one in (gaussian, resampling, several)]
+    assert not {"GaussianRegeneration", "Resample"} & set(names[0])
     assert "Resample" in names[1]
+    assert "GaussianRegeneration" in names[2]
     assert gaussian.max_objects == resampling.max_objects == 5
     with pytest.raises(ValueError, match="filter: 'pf' is not one of"):
         make_tracker("pf")
+
+
+def test_the_gaussian_of_one_particle_is_that_particle():
+    """The default chain leaves the regeneration out, where each object has one particle."""
+    motion = lambda states: (states.place, states.velocity)  # noqa: E731
+    redraw = mpfjax.GaussianRegeneration(1, where=motion, noise="stratified")
+    found = [
+        list(track(None, walks(20), tracker))
+        for tracker in (ObjectTracker(3), ObjectTracker(3, resampling=redraw))
+    ]
+    assert len(found[0]) == 20
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one.identities, other.identities)
+        np.testing.assert_array_equal(one.shown, other.shown)
+        np.testing.assert_allclose(one.boxes, other.boxes, atol=1e-3)
+    assert found[0][-1].confirmed.sum() == 2
 
 
 @pytest.mark.thorough

@@ -150,6 +150,8 @@ def _first_moments(
 ) -> Float[Array, "c n"]:
     """The weights, and the weighted features, column by column."""
     weights = weights.astype(features.dtype)
+    if len(weights) <= _FEW_PARTICLES:
+        return jnp.concatenate([weights[None], weights[None] * features.T])
     return jnp.stack([weights, *(weights * column for column in features.T)])
 
 

@@ -23,6 +23,7 @@ from mpfjax.operations.choices import cond_if_any
 from mpfjax.operations.gradients import without_gradient
 from mpfjax.operations.indexing import take
 from mpfjax.operations.matrices import row_sums
+from mpfjax.operations.prefix_sums import few_upto
 from mpfjax.operations.segments import segment_argmax, spread_finite
 from mpfjax.operations.stored import VECTOR, stored
 
@@ -199,7 +200,7 @@ def free_labels(
     ties = (priority[:, None] == priority[None]) & earlier
     goes_first = wanted[:, None] & ((priority[:, None] > priority[None]) | ties)
     rank = jnp.sum(goes_first, axis=0, dtype=jnp.int32)
-    free_rank = jnp.cumsum((~active).astype(jnp.int32)) - 1
+    free_rank = few_upto(~active) - 1
     matches = ~active[None] & (rank[:, None] == free_rank[None])
     label = jnp.max(jnp.where(matches, own[None], -1), axis=1)
     return jnp.where(wanted & (label >= 0), label, own)

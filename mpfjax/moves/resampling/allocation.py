@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.logarithms import scaled_exp
+from mpfjax.operations.prefix_sums import few_upto
 from mpfjax.operations.segments import segments_in_order, spread
 from mpfjax.operations.stored import stored
 
@@ -100,7 +101,7 @@ def _evenly(
     pool: Int[Array, ""], due: Bool[Array, " m"], sharers: Int[Array, ""]
 ) -> Int[Array, " m"]:
     """The same number for each, and one more for the first ones if it does not divide evenly."""
-    rank = jnp.cumsum(due.astype(jnp.int32)) - 1
+    rank = few_upto(due) - 1
     share = jax.lax.div(pool, sharers)  # neither is negative
     return share + (rank < pool - share * sharers).astype(jnp.int32)
 
@@ -115,14 +116,14 @@ def _in_proportion(
     parts = jnp.cumsum(asked) / jnp.maximum(jnp.sum(asked), jnp.finfo(asked.dtype).tiny)
     ends = jnp.round(parts * pool.astype(asked.dtype)).astype(jnp.int32)
     # Despite rounding all slots are given, and none to a component that is not due.
-    still_due = jnp.cumsum(due[::-1].astype(jnp.int32))[::-1] - due.astype(jnp.int32)
+    still_due = few_upto(due[::-1])[::-1] - due.astype(jnp.int32)
     ends = jnp.where(still_due > 0, jnp.minimum(ends, pool), pool)
     return jnp.diff(ends, prepend=0)
 
 
 def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:
     """The slots of each component, given their number for each."""
-    firsts = jnp.cumsum(targets) - targets
+    firsts = few_upto(targets) - targets
     slot = jnp.arange(num_particles, dtype=jnp.int32)
     components = segments_in_order(firsts, num_particles)
     return Slots(

@@ -9,6 +9,7 @@ from mpfjax.checks import check_share, check_type, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.indexing import take
+from mpfjax.operations.prefix_sums import few_upto
 from mpfjax.vision.tracking.detections import Detections
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
@@ -103,7 +104,7 @@ class Births(AbstractMove):
             log_weights=jnp.where(filled, log_share, mixture.log_weights),
             component_indicators=jnp.where(filled, seats, mixture.component_indicators),
         )
-        number = jnp.cumsum(born, dtype=jnp.int32)
+        number = few_upto(born)
         at_the_start = born & ~lives.begun
         lives = lives._replace(
             identities=jnp.where(born, lives.last_identity + number, lives.identities),
@@ -138,7 +139,7 @@ class Births(AbstractMove):
         Returns the component of every slot, and whether the slot is one of a new component.
         """
         empty = ~mixture.occupied
-        number = (jnp.cumsum(empty, dtype=jnp.int32) - 1) // self.particles_per_object
+        number = (few_upto(empty) - 1) // self.particles_per_object
         order = jnp.argsort(~born, stable=True).astype(jnp.int32)  # new components first
         filled = empty & (number < jnp.sum(born, dtype=jnp.int32))
         return take(order, jnp.clip(number, 0, len(born) - 1)), filled
@@ -186,6 +187,6 @@ def matched(
     """The index of the wanted row that each free place takes, strongest first, and whether any."""
     ranks = jnp.where(wanted, _ranks(found), len(wanted))
     rows = jnp.argsort(ranks, stable=True).astype(jnp.int32)
-    rank = jnp.cumsum(free, dtype=jnp.int32) - 1
+    rank = few_upto(free) - 1
     taken = free & (rank < jnp.sum(wanted, dtype=jnp.int32))
     return take(rows, jnp.clip(rank, 0, len(wanted) - 1)), taken

@@ -7,6 +7,7 @@ from jaxtyping import Array, Key
 from mpfjax.checks import check_finite, check_share, given
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
+from mpfjax.operations.prefix_sums import few_upto
 from mpfjax.vision.tracking.fates import Fates
 from mpfjax.vision.tracking.memory import FATES, SCORES, Scores, remember
 from mpfjax.vision.tracking.observation import TrackedFrame
@@ -74,7 +75,7 @@ class RankScores(AbstractMove):
         del key
         found, memory = observation.detections, mixture.memory[SCORES]
         # The oldest are overwritten; rows that are no detection are written nowhere.
-        place = (memory.count + jnp.cumsum(found.valid, dtype=jnp.int32) - 1) % _REMEMBERED
+        place = (memory.count + few_upto(found.valid) - 1) % _REMEMBERED
         place = jnp.where(found.valid, place, _REMEMBERED)
         scores = found.scores.astype(memory.recent.dtype)
         recent = memory.recent.at[place].set(scores, mode="drop")

@@ -103,7 +103,8 @@ class ObjectTracker(eqx.Module):
     - `FollowCamera`: the motion that all objects have in common;
     - `Assign`: at most one detection for each component, at the least total cost;
     - `LearnGuesses`: for how long an object without a detection is shown;
-    - a resampling, of the GM-MPF (Lin et al. 2012) or of the MPF (Vermaak et al. 2003);
+    - a resampling, of the GM-MPF (Lin et al. 2012) or of the MPF (Vermaak et al. 2003), unless P is
+      1: the Gaussian of one particle is that particle;
     - `PropagateObjects`: a Kalman prediction and update of each hypothesis, and its weight;
     - `Deaths`: end components without detections, or outside the frame;
     - `Births`: a component for each strong detection that no component explains;
@@ -179,6 +180,7 @@ class ObjectTracker(eqx.Module):
         colours = HSVColours(8, 4, 6) if colours is None else colours
         check_type(AbstractColours, "AbstractColours such as HSVColours()", colours=colours)
         if moves is None:
+            is_alone = resampling is None and particles_per_object == 1
             if resampling is None:
                 resampling = GaussianRegeneration(
                     particles_per_object, where=_motion, noise="stratified"
@@ -197,7 +199,7 @@ class ObjectTracker(eqx.Module):
                 FollowCamera(assign),
                 assign,
                 LearnGuesses(model, deaths),
-                resampling,
+                *(() if is_alone else (resampling,)),
                 PropagateObjects(model, matched=isinstance(resampling, GaussianRegeneration)),
                 deaths,
                 Births(model, particles_per_object),
