@@ -327,13 +327,13 @@ class Filter(eqx.Module):
             if after:
                 mixture = moved
                 continue
-            keeps_mass = isinstance(move, _KEEP_MASS) or (
-                is_normalised and same_mass(moved, mixture)
-            )
-            if not keeps_mass:
+            if not isinstance(move, _KEEP_MASS) and not same_mass(moved, mixture):
                 moved, log_growth = normalised(moved, mixture, self.starts_empty)
                 increment, is_normalised = increment + log_growth, True
             mixture = self._forgetting(moved)
+        if not is_normalised:
+            mixture, log_growth = normalised(mixture, mixture, self.starts_empty)
+            increment += log_growth
         return mixture.replace(parents=None), step_info(mixture, increment, resampled)
 
     def _forgetting(self, mixture: ParticleMixture) -> ParticleMixture:

@@ -22,6 +22,7 @@ _WITHOUT_PASSES = "xla_disable_hlo_passes"
 _TREE_SUMS = "tree_reduction_rewriter"
 # Since this version XLA sums on vectors, and long rows by a library, in any order.
 _SUMS_ON_VECTORS = (0, 10)
+_OPTIMISATION = "xla_backend_optimization_level"
 _FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
 _settings: Any = jax.config  # whose attributes no type checker knows
 
@@ -81,18 +82,22 @@ def jit_on_wide_vectors(function: Callable[..., PyTree]) -> Callable[..., PyTree
     return run
 
 
-def in_little_memory() -> dict[str, int | str]:
+def in_little_memory(soon: bool = False) -> dict[str, int | str]:
     """The compiler's options by which a large program is compiled in little memory on a CPU.
 
     XLA's newer emitters of fused operations take some 250 MB more for a program of a few thousand
     operations, which then runs about a fifth faster. Sums are in one piece, as by `cpu_options`:
-    use it for short arrays, since these emitters add up long ones one number after the other. There
-    are no options on other platforms, nor any that XLA_FLAGS sets or this XLA does not have.
+    use it for short arrays, since these emitters add up long ones one number after the other. Where
+    it is to be compiled `soon`, LLVM optimises less. Use that for arrays of a few dozen numbers,
+    whose operations are over as soon as they have started. There are no options on other platforms,
+    nor any that XLA_FLAGS sets or this XLA does not have.
     """
     if jax.default_backend() != "cpu":
         return {}
     flags = os.environ.get("XLA_FLAGS", "")
     options = _older_emitters() | _sums_in_one()
+    if soon and not jax.config.read("jax_disable_most_optimizations"):
+        options |= {_OPTIMISATION: 1}
     return {name: value for name, value in options.items() if name not in flags}
 
 
