@@ -45,6 +45,7 @@ from mpfjax.moves import KMeans as KMeans
 from mpfjax.moves import Merge as Merge
 from mpfjax.moves import MetropolisAdjustedLangevin as MetropolisAdjustedLangevin
 from mpfjax.moves import Partitioned as Partitioned
+from mpfjax.moves import PilotLookahead as PilotLookahead
 from mpfjax.moves import Pool as Pool
 from mpfjax.moves import Predict as Predict
 from mpfjax.moves import Propagate as Propagate

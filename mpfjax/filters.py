@@ -15,6 +15,7 @@ from mpfjax.moves.every import Every
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.objects.partitioned import Partitioned, check_orders
+from mpfjax.moves.pilot import PilotLookahead
 from mpfjax.moves.propagation.nested import propagation
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
 from mpfjax.moves.regrouping.features import Scale
@@ -71,7 +72,7 @@ def particle_filter(
 def auxiliary_particle_filter(
     model: AbstractStateSpaceModel,
     num_particles: int,
-    lookahead: AbstractProposal | Callable[[PyTree, PyTree], Array],
+    lookahead: AbstractProposal | PilotLookahead | Callable[[PyTree, PyTree], Array],
     *,
     proposal: AbstractProposal | None = None,
     scheme: str = "systematic",
@@ -111,7 +112,7 @@ def mixture_particle_filter(
     max_components: int,
     *,
     proposal: AbstractProposal | None = None,
-    lookahead: AbstractProposal | Callable[[PyTree, PyTree], Array] | None = None,
+    lookahead: AbstractProposal | PilotLookahead | Callable[[PyTree, PyTree], Array] | None = None,
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
     particles_per_component: int | None = None,

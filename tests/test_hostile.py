@@ -98,6 +98,7 @@ BUILT = {
         mpfjax.AuxiliaryResample,
         {"resample": mpfjax.Resample(), "lookahead": mpfjax.GaussNewtonProposal(MODEL)},
     ),
+    "PilotLookahead": (mpfjax.PilotLookahead, {"model": MODEL}),
     "GaussianRegeneration": (
         mpfjax.GaussianRegeneration,
         {"particles_per_component": 2, "where": None, "inflation": 1.0, "noise": "independent"},

@@ -42,7 +42,7 @@ FLOORS = {
     "moves": (
         "base", "local_quadratics", "eve_indices", "sharing", "results", "island_interaction",
         "every", "memory", "regrouping", "resampling", "prune", "propagation", "twisted",
-        "metropolis", "objects", "conditional", "parents", "initial", "report",
+        "metropolis", "objects", "conditional", "parents", "initial", "pilot", "report",
     ),
     "vision": ("files", "colour", "scenes", "tracking", "boxes"),
     "running": (

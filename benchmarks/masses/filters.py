@@ -35,6 +35,14 @@ def _mixture(ahead: bool = False, **options: Any) -> Make:
     return make
 
 
+def _pilot(**options: Any) -> Make:
+    """The mixture filter with a look-ahead that takes nothing but the model."""
+    return lambda scene, num_particles: mpfjax.mixture_particle_filter(
+        scene.model, num_particles, scene.max_components,
+        lookahead=mpfjax.PilotLookahead(scene.model), **scene.grouping, **options,
+    )  # fmt: skip
+
+
 def _tempered(scene: Scene, num_particles: int) -> mpfjax.Filter:
     """The mixture filter with a tempered propagation in place of its own."""
     plain = _mixture()(scene, num_particles)
@@ -65,6 +73,8 @@ FILTERS: dict[str, Make] = {
     "MPF, rqmc, 4 draws": _mixture(noise="rqmc", num_draws=4),
     "MPF, look-ahead": _mixture(ahead=True),
     "MPF, rqmc, look-ahead": _mixture(ahead=True, noise="rqmc"),
+    "MPF, pilot look-ahead": _pilot(),
+    "MPF, rqmc, pilot look-ahead": _pilot(noise="rqmc"),
     "MPF, tempered": _tempered,
     "MPF, learned look-ahead": _learned,
 }

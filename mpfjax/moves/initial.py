@@ -32,7 +32,7 @@ from mpfjax.operations.prefix_sums import count_starts, sum_before
 START = "start"
 # A particle that the first observation tells nothing of keeps a quarter of its chance, so that no
 # weight is more than four times the mean.
-_MOST_TRUST = 3 / 4
+MOST_TRUST = 3 / 4
 
 
 class StartMemory(NamedTuple):
@@ -218,7 +218,7 @@ def _trusted(log_factors: Float[Array, "n 2"], occupied: Bool[Array, " n"]) -> F
     common = number * mean**2
     shared, total = sums[0, 1] - common, (sums[0, 0] + sums[1, 1]) / 2 - common
     correlation = jnp.clip(shared / jnp.where(total > 0, total, 1.0), 0.0, 1.0)
-    trust = jnp.where(mean > 0, jnp.minimum(2 * correlation / (1 + correlation), _MOST_TRUST), 0.0)
+    trust = jnp.where(mean > 0, jnp.minimum(2 * correlation / (1 + correlation), MOST_TRUST), 0.0)
     ratios = (values[:, 0] + values[:, 1]) / jnp.where(mean > 0, 2 * mean, 1.0)
     return 1 + trust * (ratios - 1)
 
