@@ -1,5 +1,7 @@
 """The motion that all objects have in common: the camera's."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,9 +15,22 @@ from mpfjax.operations.indexing import take
 from mpfjax.vision.tracking.assignment import Assign
 from mpfjax.vision.tracking.memory import CAMERA, LIVES, SCORES, Camera, noises_of, remember
 from mpfjax.vision.tracking.model import ObjectState, places_of, units
-from mpfjax.vision.tracking.observation import TrackedFrame
+from mpfjax.vision.tracking.observation import CameraMotion, TrackedFrame
 
 _ROUNDS = 5
+
+
+class _Shift(NamedTuple):
+    """The shift that objects have in common, in pixels.
+
+    - `shift`, `variance`: its posterior mean and variance.
+    - `paired`: which components have told of it; `box`: the median size of confirmed ones.
+    """
+
+    shift: Float[Array, "2"]
+    variance: Float[Array, "2"]
+    paired: Bool[Array, " m"]
+    box: Float[Array, "2"]
 
 
 class FollowCamera(AbstractMove):
@@ -71,12 +86,24 @@ class FollowCamera(AbstractMove):
         """Move every component by the motion from pixels, estimate what is left, and add it."""
         del key
         camera: Camera = mixture.memory[CAMERA]
-        before, motion = mixture.component_averages(mixture.particles.place), observation.motion
-        deviations = camera.deviations
+        motion, deviations, rest = observation.motion, camera.deviations, camera.left
+        mixture, gone = _carried(mixture, motion)
         if motion is not None:
-            carried = motion.carried(mixture.particles.gaussian)
-            mixture = mixture.replace(particles=ObjectState.of(carried, mixture.particles.label))
-            deviations = jnp.where(motion.known, camera.left, deviations)
+            deviations = jnp.where(motion.known, rest, deviations)
+        left = self._left(mixture, observation, deviations)
+        total = left.shift + _mean(gone, left.paired)
+        if motion is not None:
+            rest = jnp.where(motion.known, self._learned(rest, left.shift, left), rest)
+        camera = Camera(left.shift, self._learned(camera.deviations, total, left), rest)
+        particles = mixture.particles
+        place = particles.place.at[:, :2].add(left.shift[None].astype(particles.place.dtype))
+        moved = ObjectState(place, particles.velocity, particles.spread, particles.label)
+        return remember(mixture.replace(particles=moved), camera=camera)
+
+    def _left(
+        self, mixture: ParticleMixture, observation: TrackedFrame, deviations: Float[Array, "2"]
+    ) -> "_Shift":
+        """The shift that the detections tell of, with these prior deviations, in median boxes."""
         model, noises = self.assign.model, noises_of(mixture, self.assign.model)
         moved = model.predicted(mixture.particles, noises)
         means = mixture.component_averages(moved.place)
@@ -92,24 +119,16 @@ class FollowCamera(AbstractMove):
         gaps = take(places_of(observation.detections.boxes), partner)[:, :2] - means[:, :2]
         spread = mixture.component_averages(moved.spread[:, 0, :2])
         variances = spread + (units(means) * noises.errors[None])[:, :2] ** 2
-        prior = (deviations * box) ** 2
-        shift, posterior = self._common(gaps, variances, paired, prior)
+        shift, posterior = self._common(gaps, variances, paired, (deviations * box) ** 2)
+        return _Shift(shift, posterior, paired, box)
 
-        def learned(deviations: Float[Array, "2"], total: Float[Array, "2"]) -> Float[Array, "2"]:
-            squares = jnp.clip((total**2 + posterior) / box**2, 1e-6, 0.25)
-            squares = (1 - self.rate) * deviations**2 + self.rate * squares
-            return jnp.where(jnp.any(paired), jnp.sqrt(squares), deviations)
-
-        particles, total, left = mixture.particles, shift, camera.left
-        if motion is not None:
-            gone = (mixture.component_averages(particles.place) - before)[:, :2]
-            share = paired.astype(gone.dtype) / jnp.maximum(jnp.sum(paired), 1).astype(gone.dtype)
-            total = shift + jnp.sum(jnp.where(paired[:, None], share[:, None] * gone, 0.0), axis=0)
-            left = jnp.where(motion.known, learned(left, shift), left)
-        deviations = learned(camera.deviations, total)
-        place = particles.place.at[:, :2].add(shift[None].astype(particles.place.dtype))
-        moved = ObjectState(place, particles.velocity, particles.spread, particles.label)
-        return remember(mixture.replace(particles=moved), camera=Camera(shift, deviations, left))
+    def _learned(
+        self, deviations: Float[Array, "2"], shift: Float[Array, "2"], left: "_Shift"
+    ) -> Float[Array, "2"]:
+        """The deviations after a frame with this shift."""
+        squares = jnp.clip((shift**2 + left.variance) / left.box**2, 1e-6, 0.25)
+        squares = (1 - self.rate) * deviations**2 + self.rate * squares
+        return jnp.where(jnp.any(left.paired), jnp.sqrt(squares), deviations)
 
     def _common(
         self,
@@ -133,6 +152,24 @@ class FollowCamera(AbstractMove):
 
         shift = jax.lax.fori_loop(0, _ROUNDS, improve, jnp.zeros_like(prior))
         return shift, 1 / (jnp.sum(weights(shift), axis=0) + 1 / prior)
+
+
+def _carried(
+    mixture: ParticleMixture, motion: CameraMotion | None
+) -> tuple[ParticleMixture, Float[Array, "m 2"]]:
+    """The components moved by the motion from pixels, and by how much each."""
+    before = mixture.component_averages(mixture.particles.place)
+    if motion is None:
+        return mixture, jnp.zeros_like(before[:, :2])
+    carried = motion.carried(mixture.particles.gaussian)
+    mixture = mixture.replace(particles=ObjectState.of(carried, mixture.particles.label))
+    return mixture, (mixture.component_averages(mixture.particles.place) - before)[:, :2]
+
+
+def _mean(rows: Float[Array, "m 2"], chosen: Bool[Array, " m"]) -> Float[Array, "2"]:
+    """The mean of the chosen rows, 0 where there are none."""
+    number = jnp.maximum(jnp.sum(chosen), 1).astype(rows.dtype)
+    return jnp.sum(jnp.where(chosen[:, None], rows, 0.0), axis=0) / number
 
 
 def _mutual(cost: Float[Array, "m d"], gate: float) -> tuple[Bool[Array, " m"], Int[Array, " m"]]:
