@@ -24,6 +24,15 @@ def found(rows):
     return Detections(boxes, jnp.arange(ROOM) < len(rows), scores)
 
 
+def judged(frames, lasting=100):
+    """The chains and counts after these frames, whose scores are shares."""
+    fates, after = Fates.none(CHAINS), jax.jit(Fates.after, static_argnums=3)
+    for rows in frames:
+        seen = found(rows)
+        fates = after(fates, seen, seen.scores, lasting)
+    return fates
+
+
 def test_a_chain_is_judged_once_it_is_sure_or_gone():
     """One may be missing in one frame, not in two; a double is nobody."""
     frames = [
@@ -33,10 +42,7 @@ def test_a_chain_is_judged_once_it_is_sure_or_gone():
         [(5, 0.15)],
         [],
     ]
-    fates, after = Fates.none(CHAINS), jax.jit(Fates.after)
-    for rows in frames:
-        seen = found(rows)
-        fates = after(fates, seen, seen.scores)
+    fates = judged(frames)
     kept = 0.995 ** np.arange(5)[::-1]
     good, bad = np.zeros(10), np.zeros(10)
     good[[9, 2, 1]] = kept[0] + kept[2], kept[1], kept[3]
@@ -45,6 +51,21 @@ def test_a_chain_is_judged_once_it_is_sure_or_gone():
     np.testing.assert_allclose(fates.good, good, rtol=1e-6)
     np.testing.assert_allclose(fates.bad, bad, rtol=1e-6)
     np.testing.assert_array_equal(fates.pending, 0)
+
+
+def test_a_chain_that_lasts_is_an_object_whatever_its_scores():
+    """The frames count from its first detection; one that broke off begins anew."""
+    here, there = (0, 0.25), (100, 0.45)
+    frames = [[here, there]] * 4 + [[here]] * 2 + [[here, there]] * 5
+    kept = 0.995 ** np.arange(11)[::-1]
+    fates = judged(frames, lasting=6)
+    good, bad = np.zeros(10), np.zeros(10)
+    good[2] = 6 * kept[5] + np.sum(kept[6:])
+    bad[4] = 4 * kept[5]
+    np.testing.assert_allclose(fates.good, good, rtol=1e-6)
+    np.testing.assert_allclose(fates.bad, bad, rtol=1e-6)
+    fates = judged([*frames, [there]], lasting=6)
+    np.testing.assert_allclose(fates.good[4], 6, rtol=1e-6)
 
 
 def test_rising_is_isotonic_regression():
@@ -83,7 +104,7 @@ STEP = jax.jit(lambda mixture, seen: RankScores()(jax.random.key(0), mixture, se
 
 
 def test_what_is_strong_follows_from_what_became_of_such_scores():
-    """What lasts and never scores more than .6 is none; beside it, .2 may be an object's."""
+    """What comes again and never scores more than .6 is none; beside it, .2 may be an object's."""
     assert recorded(0.6, 1.0) > 0.55
     assert recorded(0.1, 1.0) < 0.35
 

@@ -1,4 +1,4 @@
-"""Which detections, by score, prove to be of objects: those whose chain reaches a sure score."""
+"""Which detections, by score, prove to be of objects: by what becomes of their chains."""
 
 from typing import NamedTuple
 
@@ -27,14 +27,16 @@ class Fates(NamedTuple):
     """Chains of detections that overlap from frame to frame, and counts from ended chains.
 
     - `boxes`: (c, 4), the last box of each chain; `unseen`: frames since its last detection.
-    - `sure`: whether it has reached a sure score; `pending`: (c, bins), its detections by share
+    - `age`: frames since its first detection, which counts as one.
+    - `sure`: whether it has proved to be an object; `pending`: (c, bins), its detections by share
       while it is not yet decided what they are.
-    - `good`, `bad`: (bins,), detections of chains that reached a sure score, and of chains that
-      ended without one.
+    - `good`, `bad`: (bins,), detections of chains that proved to be objects, and of chains that
+      ended before.
     """
 
     boxes: Float[Array, "c 4"]
     unseen: Int[Array, " c"]
+    age: Int[Array, " c"]
     sure: Bool[Array, " c"]
     pending: Float[Array, "c bins"]
     good: Float[Array, " bins"]
@@ -47,14 +49,18 @@ class Fates(NamedTuple):
         return cls(
             jnp.zeros((num_chains, 4)),
             jnp.full(num_chains, _GONE, jnp.int32),
+            jnp.zeros(num_chains, jnp.int32),
             jnp.zeros(num_chains, bool),
             jnp.zeros((num_chains, _BINS), default_float()),
             bins,
             bins,
         )
 
-    def after(self, found: Detections, shares: Float[Array, " d"]) -> "Fates":
-        """Update with the detections of a frame, whose scores are these shares of a sure score."""
+    def after(self, found: Detections, shares: Float[Array, " d"], lasting: int) -> "Fates":
+        """Update with the detections of a frame, whose scores are these shares of a sure score.
+
+        A chain is an object from a sure score on, or once it has lasted for `lasting` frames.
+        """
         doubles = (overlap(found.boxes, found.boxes) > _DOUBLE) & stronger(found)
         single = found.valid & ~jnp.any(doubles & found.valid[:, None], axis=0)
         rows, goes_on = self._continued(found.boxes, single)
@@ -65,7 +71,9 @@ class Fates(NamedTuple):
         bins = jnp.clip((shares * _BINS).astype(jnp.int32), 0, _BINS - 1)
         one = jax.nn.one_hot(take(bins, rows), _BINS, dtype=self.pending.dtype)
         pending = self.pending + jnp.where(seen[:, None], one, 0.0)
-        sure = (self.sure & ~begins) | (seen & (take(shares, rows) >= _SURE))
+        age = jnp.where(begins, 1, self.age + 1)
+        proved = (take(shares, rows) >= _SURE) | (age >= lasting)
+        sure = (self.sure & ~begins) | (seen & proved)
         unseen = jnp.where(seen, 0, jnp.minimum(self.unseen + 1, _GONE))
         ended = (unseen >= _GONE) & ~sure
         good = jnp.sum(jnp.where(sure[:, None], pending, 0.0), axis=0)
@@ -73,6 +81,7 @@ class Fates(NamedTuple):
         return Fates(
             boxes=jnp.where(seen[:, None], take(found.boxes, rows), self.boxes),
             unseen=unseen,
+            age=age,
             sure=sure,
             pending=jnp.where((sure | ended)[:, None], 0.0, pending),
             good=KEPT * self.good + good,

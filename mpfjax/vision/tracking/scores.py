@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Key
 
-from mpfjax.checks import check_finite, check_share, given
+from mpfjax.checks import check_finite, check_share, check_whole, given
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.prefix_sums import few_upto
@@ -26,7 +26,8 @@ class RankScores(AbstractMove):
 
     The share above which a detection is strong is learned from earlier detections (`Fates`).
     Detections that overlap from frame to frame form a chain, with gaps of at most one frame. A
-    chain is an object if it ever reaches nine tenths of a sure score, and none if it ends before.
+    chain is an object if it ever reaches nine tenths of a sure score, or lasts for `lasting`
+    frames: something far away may never be scored highly. It is none if it ends before.
     Let a bin, a tenth of the range of scores, hold g detections of chains that are objects and b of
     chains that are none. A detection in this bin is an object with probability
 
@@ -38,19 +39,22 @@ class RankScores(AbstractMove):
 
     - `strong_share`: the share before anything is learned; `weak_share`: the least that counts.
     - `strong_score`, `weak_score`: thresholds in place of those, where the scale is known.
+    - `lasting`: after so many frames a chain is an object whatever its scores.
 
     The particles do not change. Memory: `Scores` and `Fates`. Raises `ValueError` for shares
-    outside [0, 1], for a threshold that is not finite, and for a weak threshold above the strong
-    one.
+    outside [0, 1], for a threshold that is not finite, for a weak threshold above the strong one,
+    and for a number of frames that is not whole, or below 1.
     """
 
     strong_share: float = eqx.field(static=True, default=0.5)
     weak_share: float = eqx.field(static=True, default=0.25)
     strong_score: float | None = eqx.field(static=True, default=None)
     weak_score: float | None = eqx.field(static=True, default=None)
+    lasting: int = eqx.field(static=True, default=50)
 
     def __check_init__(self) -> None:
         check_share(strong_share=self.strong_share, weak_share=self.weak_share)
+        check_whole(lasting=self.lasting)
         check_finite(**given(strong_score=self.strong_score, weak_score=self.weak_score))
         if self.weak_share > self.strong_share:
             raise ValueError(
@@ -87,7 +91,7 @@ class RankScores(AbstractMove):
         lowest = jnp.minimum(jnp.min(jnp.where(known, recent, jnp.inf)), 0.0)
         spread = sure - lowest
         shares = jnp.where(spread > 0, (scores - lowest) / jnp.where(spread > 0, spread, 1.0), 1.0)
-        fates: Fates = mixture.memory[FATES].after(found, shares)
+        fates: Fates = mixture.memory[FATES].after(found, shares, self.lasting)
         share = fates.strong_share(jnp.asarray(self.strong_share, spread.dtype))
         strong = lowest + share * spread
         weak = lowest + self.weak_share * spread

@@ -195,7 +195,11 @@ class ObjectTracker(eqx.Module):
                 longest_unsure=max(round(0.3 * rate), 1),
             )
             moves = (
-                RankScores(strong_score=strong_score, weak_score=weak_score),
+                RankScores(
+                    lasting=max(round(2 * rate), 10),
+                    strong_score=strong_score,
+                    weak_score=weak_score,
+                ),
                 FollowCamera(assign),
                 assign,
                 LearnGuesses(model, deaths),
