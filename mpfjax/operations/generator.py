@@ -95,7 +95,7 @@ def _generations_hashed(
     num_initial, num_steps, num_moves = sizes
     size = num_initial + num_steps * num_moves
 
-    def next_generation(number: Array, words: UInt32[Array, "e 2"]) -> UInt32[Array, "e 2"]:
+    def next_generation(number: Any, words: UInt32[Array, "e 2"]) -> UInt32[Array, "e 2"]:
         # Counted from the loop's own number: XLA would move what does not depend on it out of the
         # loop, into kernels of their own.
         count = jnp.asarray(number, jnp.uint32)

@@ -104,7 +104,7 @@ def cholesky(matrices: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
     factors = jnp.zeros_like(matrices)
     if d > _SMALL and len(matrices) <= _FEW_MATRICES:
 
-        def with_column(j: Int[Array, ""], factors: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
+        def with_column(j: Any, factors: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
             below = jnp.arange(d) >= j
             return factors.at[:, :, j].set(jnp.where(below, column(j, factors), 0.0))
 

@@ -12,7 +12,10 @@ from mpfjax.operations.prefix_sums import few_upto
 from mpfjax.operations.segments import segments_in_order, spread
 from mpfjax.operations.stored import stored
 
-# Particles that keep a mode alive, and that make an estimate of its variance reliable.
+# Bounds of the share of the slots that is shared equally: the variance of Ẑ is then at most
+# 4/3 of the least one at the first, and twice the least one at the second.
+EQUAL_PARTS = (1 / 4, 1 / 2)
+# Effective particles that keep a mode alive, and that make an estimate of its variance reliable.
 FEWEST = 10
 
 
@@ -65,18 +68,16 @@ def demands_by_variance(
     """The share of the slots that each due component asks for, by mass and variance.
 
     The mean likelihood of k_m particles has a relative variance v_m / k_m, where v_m is estimated
-    by (particles of m) / ESS_m, `counts` over the effective `sample_sizes`. Where a component has
-    few particles, v_m is shrunk towards the mean over all components, as if `FEWEST` more particles
-    had that mean.
+    by (particles of m) / ESS_m, `counts` over the effective `sample_sizes`. The variance of Ẑ is
+    then Σ_m π_m² v_m / k_m, which is least for k_m in proportion to π_m v_m^(1/2) (Neyman 1934).
+    Where a component has few particles, v_m is shrunk towards the mean over all components, as if
+    `FEWEST` more particles had that mean.
 
-    Let Π_m be the mass of component m given all observations, later ones too. The error that is
-    made now adds Σ_m E[Π_m²] v_m / k_m to the variance of Ẑ at the end. Π_m is the last value of a
-    martingale that stands at π_m, so that π_m² <= E[Π_m²] <= π_m: the first if later observations
-    never tell the modes apart, the second if they leave one of them. Halfway between these the sum
-    is least for k_m in proportion to ((π_m + π_m²) v_m / 2)^(1/2) (Neyman 1934).
-
-    A component that asks for less than `FEWEST` slots, or than half of an equal share, gets about
-    the smaller of these. All slots are shared equally if that is `FEWEST` slots or less for each.
+    A mode has to stay alive, and its own moments have an error too. A part e of the slots is
+    therefore shared equally: as much as gives each component `FEWEST` effective particles, within
+    `EQUAL_PARTS`. The variance of Ẑ is then at most 1 / (1 - e) times the least one (a defensive
+    mixture: Hesterberg 1995). All slots are shared equally where this gives `FEWEST` particles or
+    less to each.
     """
     dtype = log_masses.dtype
     sharing = jnp.where(due, counts, 0).astype(dtype)
@@ -85,16 +86,14 @@ def demands_by_variance(
     variances = (sharing * variances + FEWEST * mean_variance) / (sharing + FEWEST)
 
     masses, _ = scaled_exp(jnp.where(due, log_masses, -jnp.inf))
-    total = jnp.sum(masses)
-    masses = masses / jnp.where(total > 0, total, 1.0)
-    demands = jnp.sqrt(masses * (1 + masses) * variances)
-    asked = jnp.sum(demands)
+    demands = masses * jnp.sqrt(variances)
+    total = jnp.sum(demands)
     sharers = jnp.maximum(jnp.sum(due.astype(dtype)), 1.0)
     slots_each = jnp.asarray(num_slots, dtype) / sharers
-    least = jnp.minimum(FEWEST / slots_each, 0.5) / sharers
-    shares = jnp.maximum(demands / jnp.where(asked > 0, asked, 1.0), least)
-    shares = jnp.where((asked > 0) & (slots_each > FEWEST), shares, 1 / sharers)
-    return jnp.where(due, shares, 0.0)
+    equal_part = jnp.clip(FEWEST * mean_variance / slots_each, *EQUAL_PARTS)
+    equal_part = jnp.where((total > 0) & (slots_each > FEWEST), equal_part, 1.0)
+    demands = demands / jnp.where(total > 0, total, 1.0)
+    return jnp.where(due, equal_part / sharers, 0.0) + (1 - equal_part) * demands
 
 
 def _evenly(
