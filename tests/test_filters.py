@@ -605,7 +605,10 @@ def test_a_start_is_what_its_parts_give_one_after_the_other():
 def test_the_mass_of_a_mixture_given_by_hand_counts_once_whatever_moves_leave_the_weights():
     """A move that returns the weights that it was given is not normalised again."""
     model, key = mpfjax.QuadraticModel(), jax.random.key(0)
-    learns = lambda key, mixture, observation: mixture  # noqa: E731
+
+    def learns(key, mixture, observation):
+        return mixture
+
     only = mpfjax.Filter(model, [mpfjax.Propagate(model), learns, mpfjax.Resample()], 50)
     before = mpfjax.Filter(model, [learns, mpfjax.Propagate(model), learns], 50)
     for filter in (only, before, mpfjax.Filter(model, [learns], 50)):

@@ -1,5 +1,7 @@
 """The fast generator draws what the stock one draws, bit for bit."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,7 +59,10 @@ def test_the_keys_of_a_run_are_those_of_one_split_after_the_other(impl, sizes):
     num_initial, num_steps, num_moves = sizes
     key_initial, key_steps = jax.random.split(key)
     initial, moves = jax.jit(lambda key: split_for_run(key, *sizes))(key)
-    same = lambda a, b: np.testing.assert_array_equal(*map(jax.random.key_data, (a, b)))  # noqa: E731
+
+    def same(a, b):
+        np.testing.assert_array_equal(*map(jax.random.key_data, (a, b)))
+
     same(initial, jax.random.split(key_initial, num_initial))
     assert moves.shape == (num_steps, num_moves)
     for found, step_key in zip(moves, jax.random.split(key_steps, num_steps), strict=True):
@@ -66,7 +71,7 @@ def test_the_keys_of_a_run_are_those_of_one_split_after_the_other(impl, sizes):
 
 def test_the_keys_of_many_runs_are_those_of_each():
     keys = jax.random.split(KEY, 3)
-    each = lambda key: split_for_run(key, 2, 4, 3)  # noqa: E731
+    each = partial(split_for_run, num_initial=2, num_steps=4, num_moves=3)
     for k, found in enumerate(jax.vmap(each)(keys)[1]):
         np.testing.assert_array_equal(*map(jax.random.key_data, (found, each(keys[k])[1])))
 

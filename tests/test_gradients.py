@@ -15,7 +15,7 @@ from mpfjax.exact import kalman_filter
 from mpfjax.moves.resampling.resample import GRADIENTS
 from tests.examples import example_mixtures
 from tests.marking import quick_of, thorough
-from tests.user_models import BLINDED, ScalarLinear
+from tests.user_models import BLINDED, Batched, ScalarLinear
 
 NUM_PARTICLES = 48
 NUM_RUNS = 1000
@@ -241,16 +241,6 @@ def test_gradients_are_finite_where_weights_and_components_vanish(gradient):
     ],
 )
 def test_a_model_without_the_density_is_refused(make):
-    class Batched(mpfjax.AbstractStateSpaceModel):
-        def sample_initial(self, key, num_particles):
-            return jax.random.normal(key, (num_particles,))
-
-        def sample_transition(self, key, states):
-            return states + jax.random.normal(key, states.shape)
-
-        def log_likelihood(self, observation, states):
-            return -((observation - states) ** 2)
-
     with pytest.raises(ValueError, match="Batched defines no log_transition, which gradient="):
         make(Batched())
 

@@ -507,13 +507,16 @@ def test_cholesky_in_a_loop_has_the_derivative_of_numpys():
     with float64():
         factor = np.tril(RNG.normal(size=(6, 6))) + 3 * np.eye(6)
         matrix, change = factor @ factor.T, RNG.normal(size=(6, 6))
-        total = lambda matrix, factored: jnp.sum(change * factored(matrix[None])[0])  # noqa: E731
+
+        def total(matrix, factored):
+            return jnp.sum(change * factored(matrix[None])[0])
+
         found, expected = [
             jax.grad(total)(jnp.asarray(matrix), factored)
             for factored in (cholesky, jnp.linalg.cholesky)
         ]
-        symmetric = lambda gradient: gradient + gradient.T  # noqa: E731
-        np.testing.assert_allclose(symmetric(found), symmetric(expected), rtol=1e-9, atol=1e-12)
+        found, expected = (gradient + gradient.T for gradient in (found, expected))
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_cholesky_does_not_depend_on_the_units():

@@ -57,6 +57,19 @@ class Drift(mpfjax.AbstractStateSpaceModel):
     observation_covariance = property(lambda self: jnp.array([[0.49]]))
 
 
+class Batched(mpfjax.AbstractStateSpaceModel):
+    """A random walk with the three methods that a filter needs, and no density."""
+
+    def sample_initial(self, key, num_particles):
+        return jax.random.normal(key, (num_particles,))
+
+    def sample_transition(self, key, states):
+        return states + jax.random.normal(key, states.shape)
+
+    def log_likelihood(self, observation, states):
+        return -((observation - states) ** 2)
+
+
 class TwoSensors(Drift):
     """Both coordinates, each by a sensor that may be missing; what is there is weighed."""
 

@@ -9,6 +9,7 @@ import mpfjax
 from benchmarks.masses import mirror
 from mpfjax import PilotLookahead
 from tests.examples import make_mixture
+from tests.user_models import Batched
 
 
 def ahead(model, observation, states, weights):
@@ -60,15 +61,5 @@ def test_it_halves_the_mean_squared_error_of_log_z_on_the_mirror_image():
 
 
 def test_a_model_that_is_not_made_of_noise_is_refused():
-    class Drawn(mpfjax.AbstractStateSpaceModel):
-        def sample_initial(self, key, num_particles):
-            return jax.random.normal(key, (num_particles,))
-
-        def sample_transition(self, key, states):
-            return states + jax.random.normal(key, states.shape)
-
-        def log_likelihood(self, observation, states):
-            return -((observation - states) ** 2)
-
     with pytest.raises(ValueError, match="transition_from_noise, which PilotLookahead needs"):
-        PilotLookahead(Drawn())
+        PilotLookahead(Batched())

@@ -386,8 +386,9 @@ def test_trackers_are_made_by_the_name_of_their_filter():
 
 def test_the_gaussian_of_one_particle_is_that_particle():
     """The default chain leaves the regeneration out, where each object has one particle."""
-    motion = lambda states: (states.place, states.velocity)  # noqa: E731
-    redraw = mpfjax.GaussianRegeneration(1, where=motion, noise="stratified")
+    redraw = mpfjax.GaussianRegeneration(
+        1, where=lambda states: (states.place, states.velocity), noise="stratified"
+    )
     found = [
         list(track(None, walks(20), tracker))
         for tracker in (ObjectTracker(3), ObjectTracker(3, resampling=redraw))

@@ -60,11 +60,11 @@ class Resample(AbstractAdaptiveResampling):
       leaves the other slots empty, as section 5.2 of the paper does.
     - `allocation`: how the components share the slots, where neither `particles_per_component` nor
       `share_by` says it. "variance" deals component m a number in proportion to
-      ((π_m + π_m²) k_m / ESS_m)^(1/2), which leaves the final Ẑ the least variance if later
-      observations tell the modes apart to a middling degree (Neyman 1934), and at least about ten.
-      Masses are as exact as the plain filter's, or more so, and log Ẑ nearly; docs/masses.md has
-      the reasons. "equal" is the paper's: it keeps modes of little mass longest, and log Ẑ is less
-      exact.
+      (k_m Σ_{c_i = m} exp 2ℓ_i)^(1/2) = π_m (k_m / ESS_m)^(1/2), which leaves Ẑ the least variance
+      (Neyman 1934), and shares a quarter to a half equally, so that every mode stays alive. Its
+      masses are as exact as the plain filter's, or more so, and log Ẑ is in most scenes;
+      docs/masses.md has the reasons. "equal" is the paper's: it keeps modes of little mass
+      longest, and log Ẑ is less exact.
     - `share_by`: a function that gives each particle the whole number of its group, the same within
       a component. Groups with a component that is resampled share the slots equally, and so do the
       components within a group. None makes no groups. Use it where components are rival hypotheses
