@@ -654,6 +654,22 @@ def test_who_is_gone_is_emptied():
         np.testing.assert_array_equal(gone.active, [True, not full, True, False])
 
 
+@pytest.mark.parametrize(
+    ("patience", "full", "stays"), [(1, False, 1), (1, True, 0), (0, False, 0)]
+)
+def test_who_is_not_confirmed_may_be_missed_where_there_is_room(patience, full, stays):
+    """The third has one strong detection before this frame, and none in it."""
+    mixture, frame = tracked()
+    lives = mixture.memory["lives"]._replace(full=jnp.asarray(full))
+    assigned = mixture.memory["assigned"].at[2].set(-1)
+    mixture = mixture.replace(memory=mixture.memory | {"lives": lives, "assigned": assigned})
+    move = Deaths(2, 20, tentative_patience=patience)
+    moved = move(KEY, mixture, frame)
+    np.testing.assert_array_equal(moved.active, [True, True, stays, False])
+    assert not moved.memory["lives"].confirmed[2]
+    np.testing.assert_array_equal(move(KEY, moved, frame).active, [True, True, False, False])
+
+
 def test_masses_are_shared_and_weights_within_components_kept():
     mixture, frame = tracked()
     moved = ShareMass()(KEY, mixture, frame)

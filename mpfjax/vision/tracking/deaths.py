@@ -28,13 +28,14 @@ class Deaths(AbstractMove):
     """Count in how many frames each component had a detection, and end those that have too few.
 
     A component ends if no detection has been assigned to it for more than `patience` frames in a
-    row, or in any single frame while it is not confirmed; if its centre has left the frame; or if
-    all its particles have zero likelihood. It is confirmed after `confirmation` frames with strong
-    detections. Components of the first frame are confirmed at once. Where there is no room for new
-    components, one that was confirmed at once and has had no strong detections since ends as soon
-    as it is no longer shown. Frames in which a component is hidden by another (`ShareDetections`)
-    do not count as frames without a detection. Without pixels, the frame is the smallest rectangle
-    that holds all detections so far.
+    row, or for more than `tentative_patience` while it is not confirmed; if its centre has left the
+    frame; or if all its particles have zero likelihood. It is confirmed after `confirmation` frames
+    with strong detections. Components of the first frame are confirmed at once. Where there is no
+    room for new components, an unconfirmed one ends in its first frame without a detection, and one
+    that was confirmed at once and has had no strong detections since ends as soon as it is no
+    longer shown. Frames in which a component is hidden by another (`ShareDetections`) do not count
+    as frames without a detection. Without pixels, the frame is the smallest rectangle that holds
+    all detections so far.
 
     A component is shown while it is confirmed, for at most `longest_guess` frames without a
     detection, or as many as `LearnGuesses` has learned, and `longest_unsure` frames without a
@@ -49,10 +50,16 @@ class Deaths(AbstractMove):
     patience: int = eqx.field(static=True, default=20)
     longest_guess: int = eqx.field(static=True, default=2)
     longest_unsure: int = eqx.field(static=True, default=8)
+    tentative_patience: int = eqx.field(static=True, default=1)
 
     def __check_init__(self) -> None:
         check_whole(confirmation=self.confirmation, patience=self.patience)
-        check_whole(0, longest_guess=self.longest_guess, longest_unsure=self.longest_unsure)
+        check_whole(
+            0,
+            tentative_patience=self.tentative_patience,
+            longest_guess=self.longest_guess,
+            longest_unsure=self.longest_unsure,
+        )
 
     @property
     def reads(self) -> frozenset[str]:
@@ -99,7 +106,8 @@ class Deaths(AbstractMove):
         # One that was confirmed at once and has had too few detections since makes room.
         in_the_way = lives.full & (seen < self.confirmation)
         patience = jnp.where(in_the_way, self.longest_guess, self.patience)
-        patience = jnp.where(confirmed, patience, 0)
+        tentative = jnp.where(lives.full, 0, self.tentative_patience)
+        patience = jnp.where(confirmed, patience, tentative)
         stays = lives.alive & mixture.active & (unseen <= patience)
         extent = observation.extent(mixture.memory[EXTENT])
         stays &= within(mean_boxes(mixture), extent)

@@ -47,7 +47,7 @@ class RankScores(AbstractMove):
     """
 
     strong_share: float = eqx.field(static=True, default=0.5)
-    weak_share: float = eqx.field(static=True, default=0.25)
+    weak_share: float = eqx.field(static=True, default=0.2)
     strong_score: float | None = eqx.field(static=True, default=None)
     weak_score: float | None = eqx.field(static=True, default=None)
     lasting: int = eqx.field(static=True, default=50)
