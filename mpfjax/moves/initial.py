@@ -130,7 +130,7 @@ def choose_initial(
 
     Of each x_0 two x_1 are drawn, by the moves of `looks` with their keys, and ν is the mean of
     their likelihoods, shrunk towards the mean of all by the share of its variance that is not x_0's
-    (`_trusted`). Particles are kept with probabilities in proportion to ν, and weigh 1 / ν. They
+    (`trusted`). Particles are kept with probabilities in proportion to ν, and weigh 1 / ν. They
     represent x_0 as the pool does, and Ẑ stays unbiased. With "rqmc" `noise` they are kept in order
     along a Hilbert curve.
     """
@@ -139,15 +139,16 @@ def choose_initial(
     num_drawn = None if usable is None else num_draws * usable
     pool = single_component(drawn, mixture.num_components, num_drawn)
     log_factors = _look(looks, pool, observation)
-    trusted = jax.lax.stop_gradient(_trusted(log_factors, pool.occupied))
+    chances = trusted(log_factors, pool.occupied.astype(log_factors.dtype))
+    chances = jax.lax.stop_gradient(chances)
     order = None
     if noise == "rqmc":
         labels = jnp.where(pool.occupied, 0, pool.num_components)
         order = sorted_order(pool, labels, HILBERT)
-    kept = _kept(key, trusted, mixture, pool, order)
+    kept = _kept(key, chances, mixture, pool, order)
     particles = jax.tree.map(lambda leaf: take(leaf, kept), drawn)
     chosen = single_component(particles, mixture.num_components, usable)
-    trust = take(trusted, kept).astype(default_float())
+    trust = take(chances, kept).astype(default_float())
     # No ν is below a quarter, so that their inverses need no logarithms to be summed.
     total = jnp.sum(jnp.where(chosen.occupied, 1 / trust, 0.0))
     log_weights = jnp.where(chosen.occupied, -jnp.log(trust * total), -jnp.inf)
@@ -199,21 +200,22 @@ def _look(
     return drawn.log_weights.reshape(-1, 2)
 
 
-def _trusted(log_factors: Float[Array, "n 2"], occupied: Bool[Array, " n"]) -> Float[Array, " n"]:
-    """ν of each particle, with a mean of 1, from two draws of its likelihood.
+def trusted(log_factors: Float[Array, "n 2"], weights: Float[Array, " n"]) -> Float[Array, " n"]:
+    """ν of each particle, with a weighted mean of 1, from two draws of its likelihood.
 
-    Let r be the correlation of the two draws. The mean of both tells E[L | x_0] with the
-    reliability ρ = 2 r / (1 + r) (Spearman 1910, Brown 1910), and 1 + ρ (L̄_i / L̄ - 1) is its best
-    linear predictor (Kelley 1927). Where x_1 is mostly noise, ρ is near zero and all x_0 are alike.
+    Let r be the correlation of the two draws. The mean of both tells E[L | x] with the reliability
+    ρ = 2 r / (1 + r) (Spearman 1910, Brown 1910), and 1 + ρ (L̄_i / L̄ - 1) is its best linear
+    predictor (Kelley 1927). Where a draw is mostly noise, ρ is near zero and all x are alike.
+    Particles without weight do not count, nor do likelihoods that are no number.
     """
-    is_number = occupied[:, None] & (log_factors < jnp.inf)
-    log_factors = jnp.where(is_number, log_factors, -jnp.inf)
+    counts = (weights > 0)[:, None] & (log_factors < jnp.inf)
+    log_factors = jnp.where(counts, log_factors, -jnp.inf)
     values = exp(log_factors - finite_or_zero(largest(log_factors)))
     # All sums in one product: each one alone would be a kernel. Where the likelihoods are so much
     # alike that it loses their differences to rounding, trust in these does not matter.
-    rows = jnp.stack([*values.T, occupied.astype(values.dtype)])
-    sums = jnp.matmul(rows, rows.T, precision=jax.lax.Precision.HIGHEST)
-    number = jnp.maximum(sums[2, 2], 1.0)
+    rows = jnp.stack([*values.T, jnp.ones_like(weights)])
+    sums = jnp.matmul(weights[None] * rows, rows.T, precision=jax.lax.Precision.HIGHEST)
+    number = jnp.where(sums[2, 2] > 0, sums[2, 2], 1.0)
     mean = (sums[0, 2] + sums[1, 2]) / (2 * number)
     common = number * mean**2
     shared, total = sums[0, 1] - common, (sums[0, 0] + sums[1, 1]) / 2 - common
@@ -225,13 +227,13 @@ def _trusted(log_factors: Float[Array, "n 2"], occupied: Bool[Array, " n"]) -> F
 
 def _kept(
     key: Key[Array, ""],
-    trusted: Float[Array, " p"],
+    chances: Float[Array, " p"],
     mixture: ParticleMixture,
     pool: ParticleMixture,
     order: Int[Array, " p"] | None,
 ) -> Int[Array, " n"]:
     """Which particle of the pool each slot takes: systematic draws in proportion to ν."""
-    weights = jnp.where(pool.occupied, trusted, 0.0)
+    weights = jnp.where(pool.occupied, chances, 0.0)
     weights = weights if order is None else take(weights, order)
     num_kept = jnp.asarray(mixture.num_usable_slots, weights.dtype)
     before, total = sum_before(weights)

@@ -12,9 +12,8 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, HasTransitionNoise, require_noise
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import noise_dtype
-from mpfjax.moves.initial import MOST_TRUST
+from mpfjax.moves.initial import trusted
 from mpfjax.moves.propagation.propagate import likelihoods
-from mpfjax.operations.logarithms import finite_max
 
 
 class PilotLookahead(eqx.Module):
@@ -56,17 +55,4 @@ class PilotLookahead(eqx.Module):
             for noise in (ones, -ones)
         ]
         # Any ν is exact, so that its derivative is not needed.
-        return jax.lax.stop_gradient(jnp.log(_trusted(jnp.stack(seen, axis=1), weights)))
-
-
-def _trusted(log_factors: Float[Array, "n 2"], weights: Float[Array, " n"]) -> Float[Array, " n"]:
-    """ν of each particle, with a weighted mean of 1; impossible particles do not count."""
-    counts = (weights > 0)[:, None] & (log_factors < jnp.inf)
-    log_factors = jnp.where(counts, log_factors, -jnp.inf)
-    values = jnp.exp(log_factors - finite_max(log_factors.ravel()))
-    mean = weights @ jnp.mean(values, axis=1) / jnp.sum(weights)
-    gaps = values / jnp.where(mean > 0, mean, 1.0) - 1
-    shared, total = weights @ (gaps[:, 0] * gaps[:, 1]), weights @ jnp.mean(gaps**2, axis=1)
-    correlation = jnp.clip(shared / jnp.where(total > 0, total, 1.0), 0.0, 1.0)
-    trust = jnp.minimum(2 * correlation / (1 + correlation), MOST_TRUST)
-    return 1 + jnp.where(mean > 0, trust, 0.0) * jnp.mean(gaps, axis=1)
+        return jax.lax.stop_gradient(jnp.log(trusted(jnp.stack(seen, axis=1), weights)))
