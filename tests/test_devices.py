@@ -423,13 +423,14 @@ def test_an_option_is_left_to_a_flag_that_sets_it(monkeypatch, optimised):
     sums = {"xla_disable_hlo_passes": "tree_reduction_rewriter"}
     sums = sums if jax.__version_info__ >= (0, 10) else {}
     assert cpu_options() == {"xla_cpu_prefer_vector_width": 512} | sums
+    assert cpu_options(soon=True) == cpu_options() | {"xla_backend_optimization_level": 1}
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=128")
     assert cpu_options() == sums
     monkeypatch.setenv("XLA_FLAGS", "--xla_disable_hlo_passes=dce")
     assert cpu_options() == {"xla_cpu_prefer_vector_width": 512}
     monkeypatch.setenv("XLA_FLAGS", "")
     jax.config.update("jax_disable_most_optimizations", True)
-    assert cpu_options() == {"xla_cpu_prefer_vector_width": 512}
+    assert cpu_options() == cpu_options(soon=True) == {"xla_cpu_prefer_vector_width": 512}
 
 
 @pytest.mark.parametrize("n", [1000, 4000, 2**20])

@@ -27,25 +27,32 @@ _FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
 _settings: Any = jax.config  # whose attributes no type checker knows
 
 
-def cpu_options() -> dict[str, int | str]:
+def cpu_options(soon: bool = False) -> dict[str, int | str]:
     """The compiler's options on a CPU: vectors of 512 bits, and sums in one piece.
 
     XLA's default is vectors of 256 bits; a machine without wider ones uses its widest. By default
     XLA also cuts each sum and maximum into pieces of 32, in up to two kernels more, which take
     longer than the whole. Where JAX is set to optimise little, they stay, since sums are then not
-    on vectors. An option that XLA_FLAGS sets is left out, and there are none on other platforms.
+    on vectors. Where a program is to be compiled `soon`, LLVM optimises less. An option that
+    XLA_FLAGS sets is left out, and there are none on other platforms.
     """
     if jax.default_backend() != "cpu":
         return {}
-    options: dict[str, int | str] = {_VECTOR_WIDTH: 512}
+    options = {_VECTOR_WIDTH: 512} | _sums_in_one() | _little_optimised(soon)
     flags = os.environ.get("XLA_FLAGS", "")
-    return {name: value for name, value in (options | _sums_in_one()).items() if name not in flags}
+    return {name: value for name, value in options.items() if name not in flags}
 
 
 def _sums_in_one() -> dict[str, int | str]:
     optimised = not jax.config.read("jax_disable_most_optimizations")
     if optimised and jax.__version_info__[:2] >= _SUMS_ON_VECTORS:
         return {_WITHOUT_PASSES: _TREE_SUMS}
+    return {}
+
+
+def _little_optimised(soon: bool) -> dict[str, int | str]:
+    if soon and not jax.config.read("jax_disable_most_optimizations"):
+        return {_OPTIMISATION: 1}
     return {}
 
 
@@ -95,9 +102,7 @@ def in_little_memory(soon: bool = False) -> dict[str, int | str]:
     if jax.default_backend() != "cpu":
         return {}
     flags = os.environ.get("XLA_FLAGS", "")
-    options = _older_emitters() | _sums_in_one()
-    if soon and not jax.config.read("jax_disable_most_optimizations"):
-        options |= {_OPTIMISATION: 1}
+    options = _older_emitters() | _sums_in_one() | _little_optimised(soon)
     return {name: value for name, value in options.items() if name not in flags}
 
 

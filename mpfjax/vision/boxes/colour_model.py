@@ -303,10 +303,10 @@ class ColourModel(AbstractBoxModel):
         return self._contrasted(counts, sides, self.colour_weights[states.reference], references)
 
     def prepare_observation(
-        self, observation: IntegralHistogram | UInt8[Array, "h w 3"]
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], soon: bool = False
     ) -> IntegralHistogram:
         """The frame's integral histogram; a model of several objects builds it only once."""
-        return self._counted(observation)
+        return self._counted(observation, soon)
 
     def squared_distances(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
@@ -317,10 +317,12 @@ class ColourModel(AbstractBoxModel):
         counts = self._counted(observation).counts(self.boxes(states), self.references.shape[1])
         return _distances(counts, *self._own(counts, states))
 
-    def _counted(self, observation: IntegralHistogram | UInt8[Array, "h w 3"]) -> IntegralHistogram:
+    def _counted(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], soon: bool = False
+    ) -> IntegralHistogram:
         if isinstance(observation, IntegralHistogram):
             return observation
-        return integral_histogram(observation, self.colours, self.wide_counts)
+        return integral_histogram(observation, self.colours, self.wide_counts, soon)
 
     def _contrasted(
         self, counts: Array, sides: Array | None, weights: Array, references: Array

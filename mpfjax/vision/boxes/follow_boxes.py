@@ -55,13 +55,14 @@ def _followed(stills: Iterator[np.ndarray], boxes: np.ndarray, key: Array) -> It
     if first is None:
         return
     filter = objects_filters(first, boxes)["mpf"]
-    mixture = kept_program(_begin, (filter,), (key,), cpu_options())(key)
+    options = cpu_options(soon=True)
+    mixture = kept_program(_begin, (filter,), (key,), options)(key)
     advance = None
     for t, still in enumerate(itertools.chain([first], stills)):
         # An array: each new Python number would compile anew.
         moving = (np.asarray(t), mixture, still)
         if advance is None:
-            advance = kept_program(_advance, (filter, len(boxes), key), moving, cpu_options())
+            advance = kept_program(_advance, (filter, len(boxes), key), moving, options)
         mixture, tracks, faults = advance(*moving)
         yield jax.device_get(raise_faults(tracks, faults))
 
@@ -74,8 +75,9 @@ def _advance(
     filter: Filter, num_objects: int, key: Array, t: Array, mixture: ParticleMixture, frame: Array
 ) -> tuple[ParticleMixture, Tracks, tuple[Fault, ...]]:
     step_key = jax.random.fold_in(key, t)
-    mixture, _, faults = step_and_faults(filter, step_key, mixture, frame)
     model: Any = filter.model
+    counted = model.prepare_observation(frame, soon=True)
+    mixture, _, faults = step_and_faults(filter, step_key, mixture, counted)
     best, held = best_components(mixture, num_objects)
     means = mixture.component_averages(model.boxes(mixture.particles))
     identities = jnp.where(held, jnp.arange(1, num_objects + 1, dtype=jnp.int32), 0)

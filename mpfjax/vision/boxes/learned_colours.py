@@ -79,10 +79,10 @@ class LearnedColourModel(AbstractStateSpaceModel):
         return jnp.logaddexp(log_seen, log_hidden)
 
     def prepare_observation(
-        self, observation: IntegralHistogram | UInt8[Array, "h w 3"]
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], soon: bool = False
     ) -> IntegralHistogram:
         """The frame's integral histogram."""
-        return self.colour_model.prepare_observation(observation)
+        return self.colour_model.prepare_observation(observation, soon)
 
     def learned(
         self,
