@@ -102,12 +102,12 @@ class _Program:
         arrays, self.static = eqx.partition(fixed, eqx.is_array)
         self.fixed, self.fixed_structure = jax.tree.flatten(arrays)
         leaves, self.structure = jax.tree.flatten(moving)
-        self.kinds = [_kind(leaf) for leaf in leaves]
+        self.kinds = [_type_of(leaf) for leaf in leaves]
         self.moving = leaves
 
     def takes(self, moving: tuple[PyTree, ...]) -> bool:
         leaves, structure = jax.tree.flatten(moving)
-        return structure == self.structure and [_kind(leaf) for leaf in leaves] == self.kinds
+        return structure == self.structure and [_type_of(leaf) for leaf in leaves] == self.kinds
 
     def key(self, options: dict[str, Any]) -> str:
         """A key that identifies this program; a `PicklingError` for code that is not known."""
@@ -197,10 +197,16 @@ def _described(tree: PyTree, static: PyTree = None) -> PyTree:
 
 
 def _kind(leaf: Any) -> str:
+    """Shape and type of an array in words; a `TypeError` for anything else."""
+    shape, dtype, is_weak = _type_of(leaf)
+    return f"{shape}{dtype}{is_weak}"
+
+
+def _type_of(leaf: Any) -> tuple[tuple[int, ...], Any, bool]:
     """Shape and type of an array; a `TypeError` for anything else."""
-    if not eqx.is_array(leaf) and not hasattr(leaf, "__array__"):
+    if not hasattr(leaf, "__array__"):
         raise TypeError(f"{leaf} is no array")
-    return f"{leaf.shape}{leaf.dtype}{getattr(leaf, 'weak_type', False)}"
+    return leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)
 
 
 def _is_key(leaf: Any) -> bool:

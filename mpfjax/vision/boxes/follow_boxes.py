@@ -13,7 +13,7 @@ from mpfjax.checks import check_key, check_type, to_rows
 from mpfjax.filter import Filter, step_and_faults
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Fault, raise_faults
-from mpfjax.operations.compiling import cpu_options
+from mpfjax.operations.compiling import cpu_options, in_little_memory
 from mpfjax.operations.kept_programs import kept_program
 from mpfjax.vision.boxes.object_moves import best_components
 from mpfjax.vision.boxes.recipes import objects_filters
@@ -55,14 +55,15 @@ def _followed(stills: Iterator[np.ndarray], boxes: np.ndarray, key: Array) -> It
     if first is None:
         return
     filter = objects_filters(first, boxes)["mpf"]
-    options = cpu_options(soon=True)
-    mixture = kept_program(_begin, (filter,), (key,), options)(key)
+    # It runs once, and takes longer to compile than to run.
+    mixture = kept_program(_begin, (filter,), (key,), in_little_memory(soon=True))(key)
     advance = None
     for t, still in enumerate(itertools.chain([first], stills)):
         # An array: each new Python number would compile anew.
         moving = (np.asarray(t), mixture, still)
         if advance is None:
-            advance = kept_program(_advance, (filter, len(boxes), key), moving, options)
+            fixed = (filter, len(boxes), key)
+            advance = kept_program(_advance, fixed, moving, cpu_options(soon=True))
         mixture, tracks, faults = advance(*moving)
         yield jax.device_get(raise_faults(tracks, faults))
 

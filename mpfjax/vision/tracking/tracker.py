@@ -145,6 +145,8 @@ class ObjectTracker(eqx.Module):
     filter: Filter
     colours: AbstractColours
     exact_colours: bool = eqx.field(static=True)
+    # The bands of a box whose colours are learned, where those of detections suffice for a step.
+    _bands: int | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -215,6 +217,9 @@ class ObjectTracker(eqx.Module):
         self.filter = Filter(NoObjectYet(), moves, size, max_objects, starts_empty=True)
         self.colours = colours
         self.exact_colours = bool(exact_colours)
+        learned = [move.num_parts for move in moves if isinstance(move, LearnAppearance)]
+        suffice = not exact_colours and len(learned) == 1 and all(map(_sees_detections, moves))
+        self._bands = learned[0] if suffice else None
 
     @property
     def moves(self) -> tuple[AbstractMove, ...]:
@@ -272,10 +277,9 @@ class ObjectTracker(eqx.Module):
         where colours are exact, and for a chain that holds moves of other kinds than the default
         chain. Raises `ValueError` for a frame as `step` does.
         """
-        learned = [move.num_parts for move in self.moves if isinstance(move, LearnAppearance)]
-        if self.exact_colours or len(learned) != 1 or not all(map(_sees_detections, self.moves)):
+        if self._bands is None:
             return frame
-        return SampledBoxes.of(frame, np.asarray(detections.boxes), self.colours, learned[0])
+        return SampledBoxes.of(frame, np.asarray(detections.boxes), self.colours, self._bands)
 
     def _pixels(self, frame: Any) -> Pixels | None:
         if frame is None or isinstance(frame, SampledBoxes):
