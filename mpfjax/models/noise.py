@@ -141,12 +141,12 @@ def _ranks_and_shifts(
     ranks = jnp.arange(n, dtype=jnp.int32)
     if components is None:
         num_components = 1
-    shifts = stored(bits(key, (num_components, d)) >> _UNUSED, EXACT_IN_FLOAT32)
+    shifts = stored(bits(key, (num_components, d)) >> _UNUSED)
     if components is None or num_components == 1:
         return ranks, shifts.T << _UNUSED
-    ranks = stored(ranks - spread(first_places(components, num_components), components), n)
+    ranks = stored(ranks - spread(first_places(components, num_components), components))
     own = jnp.stack([spread(shifts[:, k], components) for k in range(d)])
-    return ranks, stored(own, EXACT_IN_FLOAT32) << _UNUSED
+    return ranks, stored(own) << _UNUSED
 
 
 def _normal_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:

@@ -82,7 +82,7 @@ def inverse_permutation(places: Int[Array, " n"]) -> Int[Array, " n"]:
         line = jnp.zeros(index.shape, jnp.int32).at[_on_one_line(rows, n)]
         return line.set(index, mode="promise_in_bounds", unique_indices=True).reshape(-1, n)
 
-    return in_rows(scatter)(stored(places, n))
+    return in_rows(scatter)(stored(places))
 
 
 def _on_one_line(rows: Int[Array, "k n"], num_places: int) -> UInt32[Array, " k*n"]:

@@ -122,7 +122,7 @@ def count_starts(starts: Int[Array, "*rows n"], num_slots: int) -> Int[Array, " 
     # Dropped starts share one extra place.
     num_places = whole_blocks(num_slots + 1)
     dtype = jnp.float32 if starts.size < EXACT_IN_FLOAT32 else jnp.int32
-    starts = stored(jnp.minimum(starts, num_slots), num_slots + 1)
+    starts = stored(jnp.minimum(starts, num_slots))
     if starts.ndim == 1 or starts.shape[0] == 1:
         at_start = count_places(starts.reshape(-1), num_places, dtype)
     else:  # a row has long runs without offspring, where the other rows have theirs

@@ -76,7 +76,7 @@ def runs_of(labels: Int[Array, " p"], num_segments: int) -> Runs:
     after = jnp.sum((blocks[:, :1] > label).astype(jnp.int32), axis=0)
     bound = blocks.shape[0] + 1
     ends = jnp.stack([jnp.minimum(before, last), jnp.maximum(last - after, 0)])
-    return Runs(blocks, *stored(ends, bound))
+    return Runs(blocks, *stored(ends))
 
 
 def whole(values: Array, fill: float) -> Array:

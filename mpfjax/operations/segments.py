@@ -80,7 +80,7 @@ def spread_finite(
     """
     if values.shape[0] <= FEW_CHOICES or _is_handful(len(segments), values.shape[0]):
         return spread(values, segments)
-    columns = stored(values.reshape(values.shape[0], -1).T, bound)
+    columns = stored(values.reshape(values.shape[0], -1).T)
     return spread(columns.T.reshape(values.shape), segments)
 
 
@@ -279,7 +279,7 @@ def segment_argmax(
     is_largest = values >= spread_finite(largest, segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
     if not are_masked(n, num_segments):
-        return _scattered("min", stored(index, n), segments, num_segments, n - 1)
+        return _scattered("min", stored(index), segments, num_segments, n - 1)
     member = _members(segments, num_segments)
     return jnp.min(jnp.where(member, index[None], n - 1), axis=1)
 

@@ -34,7 +34,7 @@ def order_by_key(
             word = word | (segments << (_BITS - low))
         if low > 0:
             # Otherwise the gather would compute the keys again, not vectorised.
-            word = take(stored(word & ((1 << digit) - 1), 1 << digit), order)
+            word = take(stored(word & ((1 << digit) - 1)), order)
         ranked = jax.lax.sort((word << index_bits) | index) & ((1 << index_bits) - 1)
         ranked = ranked.astype(jnp.int32)
         order = ranked if low == 0 else take(order, ranked)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
-from mpfjax.operations.platforms import on_platform
+from jax.experimental.xla_metadata import set_xla_metadata
 
 VECTOR = 32
 # Powers of two fill the vectors; sizes far from 32 make more rows or longer products.
@@ -30,29 +30,26 @@ def block_size(n: int) -> int:
     return next(whole, VECTOR)
 
 
-def stored(values: Shaped[Array, "*rest n"], bound: int | None = None) -> Shaped[Array, "*rest n"]:
-    """The same finite numbers, computed once and kept, where XLA on a CPU would not keep them.
+@jax.custom_jvp
+def stored(values: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
+    """The same numbers, computed once and kept, where XLA on a CPU would not keep them.
 
     XLA would compute them again wherever they are used: once for every particle, even if there is
-    one for each component, and without vectors in a scatter or gather over flattened rows. A
-    product with the identity matrix is computed on its own. Whole numbers must be below `bound`;
-    if it is above 2^23, products might not be exact, and the values are returned as they are.
+    one for each component, and without vectors in a scatter or gather over flattened rows. It does
+    not fuse across a call that it must not inline. The call does nothing and takes no time.
     """
-    if bound is not None and bound > EXACT_IN_FLOAT32:
-        return values
-    return on_platform(values, cpu=_times_identity, default=lambda values: values)
+    with set_xla_metadata(inlineable="false"):
+        return _same(values)
 
 
-def _times_identity(values: Array) -> Array:
-    # The blocks are those of the prefix sums, so there is no division within the loop.
-    is_float = jnp.issubdtype(values.dtype, jnp.floating)
-    *rest, n = values.shape
-    size = block_size(n)
-    lines = values if is_float else values.astype(jnp.float32)
-    lines = jnp.pad(lines, [(0, 0)] * len(rest) + [(0, whole_blocks(n) - n)])
-    blocks = lines.reshape(*rest, -1, size)
-    product = (blocks @ jnp.eye(size, dtype=lines.dtype)).reshape(lines.shape)
-    return (product if is_float else to_int(product))[..., :n].astype(values.dtype)
+@stored.defjvp
+def _stored_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    return stored(*primals), tangents[0]
+
+
+@jax.jit
+def _same(values: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
+    return values
 
 
 def to_int(

@@ -214,7 +214,7 @@ def _nearer(
     to_first = features - spread_finite(centres[:m], parent)
     to_second = features - spread_finite(centres[m:], parent)
     is_second = row_sums(to_second**2) < row_sums(to_first**2)
-    is_second = stored(is_second.astype(jnp.int32), 2) > 0
+    is_second = stored(is_second)
     return is_second.astype(jnp.int32), jnp.where(is_second[:, None], to_second, to_first)
 
 

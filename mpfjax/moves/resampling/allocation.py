@@ -55,7 +55,7 @@ def allocate_slots(
     else:
         first = jnp.minimum(pool // sharers, 1)
         share = first + _in_proportion(pool - first * sharers, due, demands)
-    return stored(jnp.where(due, share, kept), num_slots + 1)
+    return stored(jnp.where(due, share, kept))
 
 
 def demands_by_variance(

@@ -182,10 +182,10 @@ class SideBySide(NamedTuple):
 
     def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
         """The particles at these places."""
-        return take(self.order, stored(places, self.order.shape[0]))
+        return take(self.order, stored(places))
 
     def _extents(self, mask: Bool[Array, " p"]) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
-        firsts, lasts = stored(jnp.stack(self.runs.extents(mask)), self.order.shape[0])
+        firsts, lasts = stored(jnp.stack(self.runs.extents(mask)))
         return firsts, lasts
 
 
