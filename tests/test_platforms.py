@@ -24,7 +24,7 @@ FORMS = {
     "sum_before": lambda: sum_before(VALUES),
     "exact_sum_before": lambda: exact_sum_before(VALUES),
     "count_upto": lambda: count_upto((VALUES > 0.5).astype(jnp.int32), 200),
-    "stored": lambda: stored(jnp.arange(200, dtype=jnp.int32), 200),
+    "stored": lambda: stored(jnp.arange(200, dtype=jnp.int32)),
     "normal": lambda: mpfjax.normal(jax.random.key(0), (200,)),
     "resample": lambda: (
         mpfjax.Resample()(

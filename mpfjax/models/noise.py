@@ -9,7 +9,7 @@ from mpfjax.operations.floats import default_float
 from mpfjax.operations.generator import bits, normal, normal_quantile, split, uniform
 from mpfjax.operations.segments import first_places, spread
 from mpfjax.operations.sobol import MOST_DIMENSIONS, scrambled_directions, sobol_points
-from mpfjax.operations.stored import EXACT_IN_FLOAT32, stored
+from mpfjax.operations.stored import stored
 
 NOISES = ("independent", "rqmc", "stratified")
 _UNUSED = 9  # bits of 32 that no draw of 23 bits shows

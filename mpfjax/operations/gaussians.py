@@ -37,9 +37,9 @@ class Linear(NamedTuple):
 
 def predict(state: Gaussian, dynamics: Linear) -> Gaussian:
     """The law of F x + b + N(0, Q)."""
-    matrix, offset, noise = _kept(dynamics.matrix), dynamics.offset, dynamics.noise
+    matrix, offset, noise = stored(dynamics.matrix), dynamics.offset, dynamics.noise
     covariance = sandwiched(matrix, state.covariance) + noise
-    return Gaussian(applied(matrix, state.mean) + offset, _kept(covariance))
+    return Gaussian(applied(matrix, state.mean) + offset, stored(covariance))
 
 
 def through(dynamics: Linear, seen: Linear) -> Linear:
@@ -74,7 +74,7 @@ def update_by_all(
     """The same where no entry of y is missing: what all particles share stays shared."""
     factor, variances = without_correlations(seen.noise)
     rows = solve_lower(factor, seen.matrix)
-    targets = _kept(solve_lower(factor, (observation - seen.offset)[:, None])[:, 0])
+    targets = stored(solve_lower(factor, (observation - seen.offset)[:, None])[:, 0])
     log_density = jnp.asarray(-0.5 * math.log(2 * math.pi) * len(rows), rows.dtype)
     for row, target, variance in zip(rows, targets, variances, strict=True):
         state, log_factor = _update_by_one(state, row, target, variance)
@@ -87,7 +87,7 @@ def _update_by_one(
 ) -> tuple[Gaussian, Float[Array, " n"]]:
     """The same for one number, h x + N(0, r), and log p(y) but for the factor 2 pi."""
     mean, covariance = state
-    seen = _kept(applied(covariance, row))
+    seen = stored(applied(covariance, row))
     known = applied(row[None], seen)[0]
     # Rounding may leave a zero variance slightly negative.
     spread = jnp.maximum(known, 0.0) + variance
@@ -95,7 +95,7 @@ def _update_by_one(
     spread = jnp.where(has_spread, spread, jnp.finfo(mean.dtype).tiny)
     precision, log_spread = _once(1 / spread), _once(jnp.log(spread))
     missed = target - applied(row[None], mean)[0]
-    gain = _kept(jnp.where(has_spread, precision, 0.0)[None] * seen)
+    gain = stored(jnp.where(has_spread, precision, 0.0)[None] * seen)
     left = covariance - gain[:, None] * seen[None]
     both = left - applied(left, row)[:, None] * gain[None]
     both = both + variance[None, None] * gain[:, None] * gain[None]
@@ -103,14 +103,9 @@ def _update_by_one(
     return Gaussian(mean + gain * missed[None], symmetric(both)), log_density
 
 
-def _kept(values: Float[Array, "*rest n"]) -> Float[Array, "*rest n"]:
-    """`stored` numbers: each is used d times, and for each particle, and would be computed anew."""
-    return _once(values) if values.shape[-1] == 1 else stored(values)
-
-
 def _once(values: Float[Array, "*rest n"]) -> Float[Array, "*rest n"]:
-    """The values, `stored` if they are shared: they would be computed anew for each particle."""
-    return stored(values.reshape(-1)).reshape(values.shape) if values.shape[-1] == 1 else values
+    """The values, `stored` if all particles share them, each of which would compute them anew."""
+    return stored(values) if values.shape[-1] == 1 else values
 
 
 def without_missing(

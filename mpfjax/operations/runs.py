@@ -74,7 +74,6 @@ def runs_of(labels: Int[Array, " p"], num_segments: int) -> Runs:
     last = blocks.shape[0] - 1
     before = jnp.sum((blocks[:, -1:] < label).astype(jnp.int32), axis=0)
     after = jnp.sum((blocks[:, :1] > label).astype(jnp.int32), axis=0)
-    bound = blocks.shape[0] + 1
     ends = jnp.stack([jnp.minimum(before, last), jnp.maximum(last - after, 0)])
     return Runs(blocks, *stored(ends))
 

@@ -71,17 +71,16 @@ def spread(
     return jax.lax.select_n(which, *cases)
 
 
-def spread_finite(
-    values: Shaped[Array, "m *rest"], segments: Int[Array, " n"], bound: int | None = None
+def spread_stored(
+    values: Shaped[Array, "m *rest"], segments: Int[Array, " n"]
 ) -> Shaped[Array, "n *rest"]:
-    """`spread` of finite numbers that are computed once, not again for every entry.
+    """`spread` of values that are computed once, not again for every entry.
 
-    Whole numbers must be in [0, bound). A choice between few values runs on vectors anyway.
+    A choice between few values runs on vectors anyway.
     """
     if values.shape[0] <= FEW_CHOICES or _is_handful(len(segments), values.shape[0]):
         return spread(values, segments)
-    columns = stored(values.reshape(values.shape[0], -1).T)
-    return spread(columns.T.reshape(values.shape), segments)
+    return spread(stored(values), segments)
 
 
 def segment_sum(
@@ -249,7 +248,7 @@ def segment_log_sum_exp(
 ) -> Float[Array, " num_segments"]:
     """log Σ exp in each segment, -inf in one that is empty or holds nothing but -inf."""
     shift = finite_or_zero(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
-    total = segment_sum(exp(log_values - spread_finite(shift, segments)), segments, num_segments)
+    total = segment_sum(exp(log_values - spread_stored(shift, segments)), segments, num_segments)
     return log_or_nothing(total) + shift
 
 
@@ -258,9 +257,9 @@ def segment_softmax(
 ) -> Float[Array, " n"]:
     """exp of the values as shares of their segment's sum, zero where that sum is zero."""
     shift = finite_or_zero(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
-    values = exp(log_values - spread_finite(shift, segments))
+    values = exp(log_values - spread_stored(shift, segments))
     totals = segment_sum(values, segments, num_segments)
-    shares = values / spread_finite(jnp.where(totals == 0, 1.0, totals), segments)
+    shares = values / spread_stored(jnp.where(totals == 0, 1.0, totals), segments)
     if not are_masked(len(values), num_segments):
         # Otherwise XLA takes the totals by a scatter, one particle after the other.
         shares = stored(shares)
@@ -276,7 +275,7 @@ def segment_argmax(
     limits = jnp.finfo(values.dtype)
     values = jnp.clip(values, limits.min, limits.max)
     largest = jnp.maximum(segment_max(values, segments, num_segments), limits.min)
-    is_largest = values >= spread_finite(largest, segments)
+    is_largest = values >= spread_stored(largest, segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
     if not are_masked(n, num_segments):
         return _scattered("min", stored(index), segments, num_segments, n - 1)

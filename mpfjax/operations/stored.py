@@ -1,16 +1,17 @@
 """Values that are computed once and kept.
 
 In numpy all of this is `values.copy()` and `values.astype(int)`. XLA fuses a computation into
-everything that uses its result, and then repeats it for every use. It does not fuse across a
-product with the identity matrix.
+everything that uses its result, and then repeats it for every use. It does not fuse across the
+call of a function that it must not inline, and a call that does nothing takes no time.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int, Shaped
 
-from jax.experimental.xla_metadata import set_xla_metadata
+from mpfjax.operations.platforms import on_platform
 
 VECTOR = 32
 # Powers of two fill the vectors; sizes far from 32 make more rows or longer products.
@@ -31,15 +32,13 @@ def block_size(n: int) -> int:
 
 
 @jax.custom_jvp
-def stored(values: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
+def stored(values: Shaped[Array, "*rest n"]) -> Shaped[Array, "*rest n"]:
     """The same numbers, computed once and kept, where XLA on a CPU would not keep them.
 
     XLA would compute them again wherever they are used: once for every particle, even if there is
-    one for each component, and without vectors in a scatter or gather over flattened rows. It does
-    not fuse across a call that it must not inline. The call does nothing and takes no time.
+    one for each component, and without vectors in a scatter or gather over flattened rows.
     """
-    with set_xla_metadata(inlineable="false"):
-        return _same(values)
+    return on_platform(values, cpu=_through_a_call, default=lambda values: values)
 
 
 @stored.defjvp
@@ -47,8 +46,17 @@ def _stored_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return stored(*primals), tangents[0]
 
 
+def _through_a_call(values: Array) -> Array:
+    # In the blocks of the prefix sums, so that there is no division within the loop.
+    *rest, n = values.shape
+    size = block_size(n)
+    blocks = values.reshape(*rest, -1, size) if n % size == 0 else values
+    with set_xla_metadata(inlineable="false"):
+        return _same(blocks).reshape(values.shape)
+
+
 @jax.jit
-def _same(values: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
+def _same(values: Array) -> Array:
     return values
 
 

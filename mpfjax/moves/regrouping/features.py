@@ -12,7 +12,7 @@ from mpfjax.checks import check_callable, check_positive_array, given, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations.floats import as_inexact
 from mpfjax.operations.logarithms import exp, finite_or_zero
-from mpfjax.operations.segments import are_masked, column_sums, segment_max, spread_finite
+from mpfjax.operations.segments import are_masked, column_sums, segment_max, spread_stored
 from mpfjax.operations.stored import stored
 
 # Up to this many features are multiplied one by one, which runs on vectors, but compiles pair by
@@ -88,7 +88,7 @@ def relative_weights(mixture: ParticleMixture) -> Float[Array, " n"]:
     """The weights within each component, in units of its largest; a dead one's are zero."""
     log_weights, labels = mixture.log_weights, mixture.component_indicators
     largest = finite_or_zero(segment_max(log_weights, labels, mixture.num_components))
-    weights = exp(log_weights - spread_finite(largest, labels))
+    weights = exp(log_weights - spread_stored(largest, labels))
     # Otherwise XLA takes the maximum by a scatter, one particle after the other.
     is_kept = are_masked(mixture.num_particles, mixture.num_components)
     return weights if is_kept else stored(weights)
@@ -114,7 +114,7 @@ def summarise(
 ) -> Groups:
     """Weighted mass, mean and covariance of the particles under each label."""
     masses, means = weighted_means(features, weights, labels, num_groups)
-    products, entries = _products(features - spread_finite(means, labels), weights)
+    products, entries = _products(features - spread_stored(means, labels), weights)
     covariances = column_sums(products, labels, num_groups) / _or_one(masses)[:, None]
     return Groups(masses, means, covariances[:, entries])
 

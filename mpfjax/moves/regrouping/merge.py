@@ -18,7 +18,7 @@ from mpfjax.moves.regrouping.features import (
     summarise,
 )
 from mpfjax.operations.indexing import take
-from mpfjax.operations.segments import spread_finite
+from mpfjax.operations.segments import spread_stored
 
 
 class Merge(AbstractRegrouping):
@@ -81,7 +81,7 @@ class Merge(AbstractRegrouping):
             overlap = durations >= self.patience
             memory = memory | {"overlap_durations": durations}
         labels = lowest_connected(overlap)
-        return spread_finite(labels, mixture.component_indicators, len(labels)), memory
+        return spread_stored(labels, mixture.component_indicators), memory
 
     def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
         """Reset the counts of pairs with a dead component."""

@@ -24,7 +24,7 @@ from mpfjax.operations.gradients import without_gradient
 from mpfjax.operations.indexing import take
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.prefix_sums import few_upto
-from mpfjax.operations.segments import segment_argmax, spread_finite
+from mpfjax.operations.segments import segment_argmax, spread_stored
 from mpfjax.operations.stored import VECTOR, stored
 
 
@@ -106,9 +106,9 @@ class Split(AbstractRegrouping):
         parent = mixture.component_indicators
         halves = self._halves(mixture, features)
         labels = free_labels(halves.splits, halves.deviations, active)
-        lighter = spread_finite(halves.lighter, parent, 2)
+        lighter = spread_stored(halves.lighter, parent)
         moves = (halves.side == lighter) & mixture.occupied
-        return jnp.where(moves, spread_finite(labels, parent, mixture.num_components), parent)
+        return jnp.where(moves, spread_stored(labels, parent), parent)
 
     def _halves(self, mixture: ParticleMixture, features: Float[Array, "n k"]) -> "_Halves":
         """Each component cut in two."""
@@ -211,8 +211,8 @@ def _nearer(
 ) -> tuple[Int[Array, " n"], Float[Array, "n k"]]:
     """Which of its own component's two centres each particle is nearer to, and how far from it."""
     m = centres.shape[0] // 2
-    to_first = features - spread_finite(centres[:m], parent)
-    to_second = features - spread_finite(centres[m:], parent)
+    to_first = features - spread_stored(centres[:m], parent)
+    to_second = features - spread_stored(centres[m:], parent)
     is_second = row_sums(to_second**2) < row_sums(to_first**2)
     is_second = stored(is_second)
     return is_second.astype(jnp.int32), jnp.where(is_second[:, None], to_second, to_first)
@@ -222,6 +222,6 @@ def _farthest_members(
     sample: _Particles, points: Float[Array, "m k"], num_components: int
 ) -> Float[Array, "m k"]:
     """In each component, the particle farthest from the component's point."""
-    distance = row_sums((sample.features - spread_finite(points, sample.parent)) ** 2)
+    distance = row_sums((sample.features - spread_stored(points, sample.parent)) ** 2)
     distance = jnp.where(sample.occupied, distance, -1.0)
     return take(sample.features, segment_argmax(distance, sample.parent, num_components))
