@@ -57,13 +57,14 @@ def errors(estimates: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def held(step: Step, truth: np.ndarray) -> np.ndarray:
-    """Whether each run keeps both targets: in all of the last frames at least `LEAST_SHARE` of
-    the particles stand for the target and lie on it.
+    """Whether each run keeps both targets: in all of the last frames the particles that stand for
+    a target and lie on it are at least `LEAST_SHARE` of its equal share, which is half of all.
     """
     gaps = np.abs(step.centres[:, :, None] - truth[None, :, :, None, :2])
     near = (gaps < np.array(REACH) * truth[None, :, :, None, 2:]).all(axis=-1)
     own = step.target[:, :, None] == np.arange(2)[None, None, :, None]
-    return ((near & own).mean(axis=-1)[:, -LAST_FRAMES:] >= LEAST_SHARE).all(axis=(1, 2))
+    shares = 2 * (near & own).mean(axis=-1)
+    return (shares[:, -LAST_FRAMES:] >= LEAST_SHARE).all(axis=(1, 2))
 
 
 def study(

@@ -27,6 +27,7 @@ from mpfjax.operations.indexing import take
 from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.maxima import largest
 from mpfjax.operations.prefix_sums import count_starts, sum_before
+from mpfjax.operations.stored import stored
 
 # The name of the memory of a filter whose x_0 is chosen.
 START = "start"
@@ -140,7 +141,7 @@ def choose_initial(
     pool = single_component(drawn, mixture.num_components, num_drawn)
     log_factors = _look(looks, pool, observation)
     chances = trusted(log_factors, pool.occupied.astype(log_factors.dtype))
-    chances = jax.lax.stop_gradient(chances)
+    chances = stored(jax.lax.stop_gradient(chances))
     order = None
     if noise == "rqmc":
         labels = jnp.where(pool.occupied, 0, pool.num_components)
@@ -187,7 +188,8 @@ def _look(
     observation: PyTree,
 ) -> Float[Array, "n 2"]:
     """The logarithms of the weights of two draws of x_1 of each particle, up to a constant."""
-    twice = lambda leaf: jnp.repeat(leaf, 2, axis=0)  # noqa: E731
+    # Stored, so that x_1 is drawn on vectors, and once, not again wherever its likelihood is used.
+    twice = lambda leaf: stored(jnp.repeat(leaf, 2, axis=0))  # noqa: E731
     drawn = pool.replace(
         particles=jax.tree.map(twice, pool.particles),
         log_weights=twice(pool.log_weights),
@@ -197,7 +199,7 @@ def _look(
     )
     for move_key, move in looks:
         drawn = move(move_key, drawn, observation)
-    return drawn.log_weights.reshape(-1, 2)
+    return stored(drawn.log_weights).reshape(-1, 2)
 
 
 def trusted(log_factors: Float[Array, "n 2"], weights: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -11,7 +11,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Key, PyTree
+from jaxtyping import Array, Bool, Int, Key, PyTree
 
 
 def cond_if_any(
@@ -39,6 +39,21 @@ def drawn_once(key: Key[Array, "*num"], draw: Callable[..., PyTree]) -> PyTree:
     shapes = jax.eval_shape(function)
     nothing = lambda: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)  # noqa: E731
     return jax.lax.cond(holds, function, nothing)
+
+
+@jax.custom_batching.custom_vmap
+def most_of_runs(number: Int[Array, ""]) -> Int[Array, ""]:
+    """The largest of the numbers of the caller's `vmap`, the same for all its runs."""
+    return number
+
+
+@most_of_runs.def_vmap
+def _most_of_many_runs(
+    axis_size: int, in_batched: list[bool], numbers: Int[Array, " b"]
+) -> tuple[Int[Array, ""], bool]:
+    del axis_size, in_batched
+    # A `vmap` around this one combines its own runs.
+    return most_of_runs(jnp.max(numbers)), False
 
 
 @jax.custom_batching.custom_vmap

@@ -111,14 +111,18 @@ def test_what_cannot_be_run_is_named(arguments, named, tmp_path, monkeypatch, ca
 
 
 def test_a_target_is_held_by_its_own_particles_on_it():
-    """Three runs of ten frames: both targets held; the second strayed from; the second starved."""
+    """Runs of ten frames: both targets held; the second strayed from; the second starved; the
+    second with as few particles as still count, and with one less.
+    """
     truth = np.tile(np.array([[50.0, 50, 20, 40], [150.0, 50, 20, 40]]), (10, 1, 1))
-    centres = np.tile(truth[:, [0, 0, 1, 1], :2], (3, 1, 1, 1))
-    target = np.tile([0, 0, 1, 1], (3, 10, 1))
-    centres[1, 9, 2:, 0] += 16.0
-    target[2, :, 2:] = 0
-    step = Step(np.zeros((3, 10, 2, 2)), np.zeros((3, 10)), centres, target)
-    np.testing.assert_array_equal(held(step, truth), [True, False, False])
+    target = np.tile(np.arange(40) // 20, (5, 10, 1))
+    target[2, :, 20:] = 0
+    target[3, :, :38] = 0
+    target[4, :, :39] = 0
+    centres = truth[np.arange(10)[:, None], target, :2]
+    centres[1, 9, 20:, 0] += 16.0
+    step = Step(np.zeros((5, 10, 2, 2)), np.zeros((5, 10)), centres, target)
+    np.testing.assert_array_equal(held(step, truth), [True, False, False, True, False])
 
 
 @pytest.mark.parametrize("labels", [[0, 0, 1, 1], [1, 1, 0, 0]])

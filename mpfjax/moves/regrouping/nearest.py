@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mpfjax.operations.choices import most_of_runs
 from mpfjax.operations.matrices import row_sums
 
 # Centroids in one pass over the particles. A program of all 64 takes seconds to compile.
@@ -15,7 +16,8 @@ def nearest(
 ) -> Int[Array, " n"]:
     """The living centroid nearest to each particle; of equally near ones, the first.
 
-    A running minimum over the centroids: no (m, n) array is made.
+    A running minimum over the centroids: no (m, n) array is made. It ends with the last living one,
+    since the free labels are mostly the last.
     """
     n, m = features.shape[0], centroids.shape[0]
     centroids = jnp.where(alive[:, None], centroids, jnp.inf)
@@ -25,9 +27,10 @@ def nearest(
     padding = -m % _AT_ONCE
     centroids = jnp.pad(centroids, ((0, padding), (0, 0)), constant_values=jnp.inf)
     passes = centroids.reshape(-1, _AT_ONCE, centroids.shape[1])
+    last = jnp.max(jnp.where(alive, jnp.arange(m, dtype=jnp.int32), 0))
     return jax.lax.fori_loop(
         0,
-        len(passes),
+        most_of_runs(last // _AT_ONCE + 1),
         lambda i, found: _nearer(found, features, passes[i], i * _AT_ONCE),
         found,
     )[1]
