@@ -363,12 +363,15 @@ class Filter(eqx.Module):
 
 def step_and_faults(
     filter: Filter,
-    key: Key[Array, ""],
+    key: Key[Array, "*keys"],
     mixture: ParticleMixture,
     observation: PyTree,
     inputs: PyTree = None,
 ) -> tuple[ParticleMixture, StepInfo, tuple[Fault, ...]]:
-    """A step inside a compiled program, and what `raise_faults` needs when that has ended."""
+    """A step inside a compiled program, and what `raise_faults` needs when that has ended.
+
+    `key` may hold the keys of the moves.
+    """
     faults = faults_of(filter.model, observation, inputs)
     moved, info = filter.with_inputs(inputs)._step(key, mixture, observation)
     broken = Fault(~(info.log_likelihood_increment < jnp.inf), BROKEN_DENSITY)

@@ -16,6 +16,7 @@ from mpfjax.operations.generator import (
     normal_quantile,
     split,
     split_for_run,
+    split_once,
     threefry,
     uniform,
 )
@@ -50,6 +51,14 @@ class TestTheSameBits:
         keys = jax.random.split(KEY, 3)
         fast = jax.jit(jax.vmap(lambda key: draw(fast_key(key))))
         np.testing.assert_allclose(fast(keys), jax.vmap(draw)(keys), rtol=ROUNDED.get(draw, 0))
+
+
+@pytest.mark.parametrize("impl", ["threefry2x32", "rbg", "unsafe_rbg"])
+def test_keys_that_are_split_once_are_those_of_split(impl):
+    key = jax.random.key(5, impl=impl)
+    keys = jax.jit(split_once, static_argnums=1)(key, 7)
+    assert keys.dtype == key.dtype
+    np.testing.assert_array_equal(jax.random.key_data(keys), jax.random.key_data(split(key, 7)))
 
 
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg", "unsafe_rbg"])

@@ -90,6 +90,7 @@ def test_nor_does_the_program_that_follows_drawn_boxes():
     filter = objects_filters(frame, np.array([[5.0, 5, 10, 20]]))["mpf"]
     key = jax.random.key(0)
     mixture = eqx.filter_jit(drawn._begin)(filter, key)
-    arguments = (filter, 1, key, jnp.asarray(1), mixture, jnp.asarray(frame))
+    counted = eqx.filter_jit(drawn._counted)(filter.model, jnp.asarray(frame))
+    arguments = (filter, 1, key, jnp.asarray(1), mixture, counted)
     program = eqx.filter_jit(drawn._advance).lower(*arguments)
     assert "callback" not in program.as_text()

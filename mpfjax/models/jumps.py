@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from mpfjax.checks import check_inner_share, check_positive_array, check_rows, check_shape, to_array
 from mpfjax.models.dynamics import AbstractRandomWalk, RandomWalk
-from mpfjax.operations.generator import fast_key, normal, split
+from mpfjax.operations.generator import fast_key, normal, split_once
 
 
 class RandomWalkWithJumps(AbstractRandomWalk):
@@ -64,7 +64,7 @@ class RandomWalkWithJumps(AbstractRandomWalk):
     ) -> Float[Array, "n d"]:
         """The same, from keys of their own for the jumps and the steps."""
         del previous
-        key_noise, key_jump = split(key, 2)
+        key_noise, key_jump = split_once(key, 2)
         # In one row, which is drawn fast; the numbers are those of n rows.
         jumps = jax.random.bernoulli(fast_key(key_jump), self.jump_probability, current.shape[:1])
         return self._moved(jumps[:, None], normal(key_noise, current.shape, current.dtype), current)

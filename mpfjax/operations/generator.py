@@ -58,6 +58,24 @@ def split(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
     return jax.random.wrap_key_data(jax.random.key_data(keys), impl=jax.random.key_impl(key))
 
 
+def split_once(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
+    """`split`, computed once, where XLA on a CPU would hash again in all that uses the keys.
+
+    Use it between two splits: with XLA's older emitters (`in_little_memory`), a draw whose key was
+    split three times takes seconds to compile, since each word of a key is hashed from both words
+    of the one before.
+    """
+    return on_platform(split(key, num), cpu=_kept_keys, default=lambda keys: keys)
+
+
+def _kept_keys(keys: Key[Array, " num"]) -> Key[Array, " num"]:
+    # XLA does not fuse across a product, here with the identity; of whole numbers it is exact.
+    words = jax.lax.bitcast_convert_type(jax.random.key_data(keys), jnp.int32)
+    kept = words @ jnp.eye(words.shape[-1], dtype=jnp.int32)
+    kept = jax.lax.bitcast_convert_type(kept, jnp.uint32)
+    return jax.random.wrap_key_data(kept, impl=jax.random.key_impl(keys))
+
+
 def split_keys(key: Key[Array, "*keys"], num: int) -> list[Key[Array, ""]]:
     """A key for each move, or those that `key` holds. Longer chains start with the same keys."""
     return list(key if key.ndim else split(key, num))

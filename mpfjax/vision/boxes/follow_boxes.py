@@ -14,9 +14,12 @@ from mpfjax.filter import Filter, step_and_faults
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Fault, raise_faults
 from mpfjax.operations.compiling import cpu_options, in_little_memory
+from mpfjax.operations.generator import split_once
 from mpfjax.operations.kept_programs import kept_program
+from mpfjax.vision.boxes.learned_colours import LearnedColourModel
 from mpfjax.vision.boxes.object_moves import best_components
 from mpfjax.vision.boxes.recipes import objects_filters
+from mpfjax.vision.colour.histograms import IntegralHistogram
 from mpfjax.vision.files.frames import of_one_kind
 from mpfjax.vision.tracking.tracker import Tracks
 
@@ -55,15 +58,18 @@ def _followed(stills: Iterator[np.ndarray], boxes: np.ndarray, key: Array) -> It
     if first is None:
         return
     filter = objects_filters(first, boxes)["mpf"]
+    model: Any = filter.model
     # It runs once, and takes longer to compile than to run.
     mixture = kept_program(_begin, (filter,), (key,), in_little_memory(soon=True))(key)
+    # With XLA's newer emitters it takes longer to compile, and half the time to run.
+    count = kept_program(_counted, (model,), (first,), cpu_options(soon=True))
     advance = None
     for t, still in enumerate(itertools.chain([first], stills)):
         # An array: each new Python number would compile anew.
-        moving = (np.asarray(t), mixture, still)
+        moving = (np.asarray(t), mixture, count(still))
         if advance is None:
             fixed = (filter, len(boxes), key)
-            advance = kept_program(_advance, fixed, moving, cpu_options(soon=True))
+            advance = kept_program(_advance, fixed, moving, in_little_memory(soon=True))
         mixture, tracks, faults = advance(*moving)
         yield jax.device_get(raise_faults(tracks, faults))
 
@@ -72,13 +78,21 @@ def _begin(filter: Filter, key: Array) -> ParticleMixture:
     return filter.init(key)
 
 
+def _counted(model: LearnedColourModel, frame: Array) -> IntegralHistogram:
+    return model.prepare_observation(frame, soon=True)
+
+
 def _advance(
-    filter: Filter, num_objects: int, key: Array, t: Array, mixture: ParticleMixture, frame: Array
+    filter: Filter,
+    num_objects: int,
+    key: Array,
+    t: Array,
+    mixture: ParticleMixture,
+    counted: IntegralHistogram,
 ) -> tuple[ParticleMixture, Tracks, tuple[Fault, ...]]:
-    step_key = jax.random.fold_in(key, t)
+    step_keys = split_once(jax.random.fold_in(key, t), filter.num_step_keys)
     model: Any = filter.model
-    counted = model.prepare_observation(frame, soon=True)
-    mixture, _, faults = step_and_faults(filter, step_key, mixture, counted)
+    mixture, _, faults = step_and_faults(filter, step_keys, mixture, counted)
     best, held = best_components(mixture, num_objects)
     means = mixture.component_averages(model.boxes(mixture.particles))
     identities = jnp.where(held, jnp.arange(1, num_objects + 1, dtype=jnp.int32), 0)

@@ -26,7 +26,11 @@ from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
 from mpfjax.vision.boxes.learned_colours import AdaptAppearance, LearnedBoxState, LearnedColourModel
-from mpfjax.vision.boxes.object_moves import ObjectExclusion, PruneHypotheses
+from mpfjax.vision.boxes.object_moves import (
+    ObjectExclusion,
+    OneComponentAnObject,
+    PruneHypotheses,
+)
 from mpfjax.vision.colour.bins import RGBColours
 from mpfjax.vision.files.boxes import check_boxes
 from mpfjax.vision.files.frames import check_frame
@@ -101,12 +105,13 @@ def objects_filters(
     learn = AdaptAppearance(model, rate=0.03)
     num_components = most_components(len(boxes))
     num_particles = PARTICLES_PER_HYPOTHESIS * num_components
+    exclusion = ObjectExclusion(strength=3.0, radius=0.35, scale=(float(size[0]), float(size[1])))
     mixture = Filter(
         model,
         moves=[
             Resample(share_by=_object),
             Propagate(model),
-            ObjectExclusion(strength=3.0, radius=0.35, scale=(float(size[0]), float(size[1]))),
+            *([exclusion] if len(boxes) > 1 else []),
             learn,
             Merge(None, 0.25, patience=10, **apart),
             PruneHypotheses(least_share=1e-15),
@@ -114,7 +119,7 @@ def objects_filters(
         ],
         num_particles=num_particles,
         num_components=num_components,
-        initial_moves=_one_component_a_box(size),
+        initial_moves=[OneComponentAnObject()],
     )
     alone = Filter(model, moves=[Resample(), Propagate(model), learn], num_particles=num_particles)
     return {"pf": alone, "mpf": mixture}

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Shaped, UInt8
 
 from mpfjax.checks import check_flag, check_shape, check_type, check_whole
+from mpfjax.operations.stored import stored
 from mpfjax.vision.colour.bins import AbstractColours
 from mpfjax.vision.files.frames import check_frame
 
@@ -56,7 +57,10 @@ class IntegralHistogram(eqx.Module):
         """
         check_shape("n 4", boxes=boxes)
         check_whole(num_parts=num_parts)
-        rows, columns = box_edges(boxes, num_parts, self.height, self.width)
+        edges = jnp.concatenate(box_edges(boxes, num_parts, self.height, self.width), axis=1)
+        # Otherwise XLA finds them again in each operation that uses the counts.
+        edges = stored(edges.reshape(-1), max(self.height, self.width) + 1).reshape(edges.shape)
+        rows, columns = edges[:, : num_parts + 1], edges[:, num_parts + 1 :]
         corners = self.table.at[rows[:, :, None], columns[:, None, :]].get(mode="clip")
         bands = jnp.diff(corners[:, :, 1] - corners[:, :, 0], axis=1)
         pixels = (rows[:, -1] - rows[:, 0]) * (columns[:, 1] - columns[:, 0])
