@@ -9,11 +9,12 @@ from mpfjax.checks import to_rows
 from mpfjax.vision.files.frames import check_frame
 from mpfjax.vision.tracking.observation import CameraMotion
 
-_WIDTH = 480  # of the reduced picture, about
+_WIDTH = 320  # of the reduced picture, about
 _CORNERS = 200  # the most that are followed
 _WEAKEST = 0.01  # of the strongest corner's strength
 _APART = 1 / 50  # of the width, between corners
-_WINDOW = (15, 15)
+_WINDOW = (11, 11)
+_ROUNDS, _STILL = 10, 0.03  # the most improvements on each level, and the step that ends them
 _LEVELS = 4  # of the pyramid: a motion of 80 reduced pixels is followed
 _OFF = 1.0  # reduced pixels within which a corner agrees with the motion
 _FEWEST = 12  # corners that have to agree
@@ -23,7 +24,7 @@ _SMALLEST = 32  # the least side of a reduced picture
 class OpticalFlow:
     """The motion of the camera between successive frames, from the pixels outside of boxes.
 
-    Each frame is reduced to a grey picture about 480 pixels wide. Corners (Shi and Tomasi 1994) of
+    Each frame is reduced to a grey picture about 320 pixels wide. Corners (Shi and Tomasi 1994) of
     the frame before, outside of its boxes, are followed by the pyramidal method of Lucas and Kanade
     (Bouguet 2001). The similarity that most of them agree with, within a pixel of the reduced
     picture, is found by RANSAC and refined by least squares over these.
@@ -84,8 +85,9 @@ class OpticalFlow:
         start = cv2.goodFeaturesToTrack(before, _CORNERS, _WEAKEST, apart, mask=free)
         if start is None or len(start) < _FEWEST:
             return np.zeros((0, 2)), np.zeros((0, 2))
+        ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ROUNDS, _STILL)
         end, found, _ = cv2.calcOpticalFlowPyrLK(
-            before, picture, start, None, winSize=_WINDOW, maxLevel=_LEVELS
+            before, picture, start, None, winSize=_WINDOW, maxLevel=_LEVELS, criteria=ends
         )
         kept = found[:, 0] == 1
         return start[kept, 0], end[kept, 0]
