@@ -65,15 +65,9 @@ def split_once(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
     split three times takes seconds to compile, since each word of a key is hashed from both words
     of the one before.
     """
-    return on_platform(split(key, num), cpu=_kept_keys, default=lambda keys: keys)
-
-
-def _kept_keys(keys: Key[Array, " num"]) -> Key[Array, " num"]:
-    # XLA does not fuse across a product, here with the identity; of whole numbers it is exact.
-    words = jax.lax.bitcast_convert_type(jax.random.key_data(keys), jnp.int32)
-    kept = words @ jnp.eye(words.shape[-1], dtype=jnp.int32)
-    kept = jax.lax.bitcast_convert_type(kept, jnp.uint32)
-    return jax.random.wrap_key_data(kept, impl=jax.random.key_impl(keys))
+    keys = split(key, num)
+    words = stored(jax.random.key_data(keys))
+    return jax.random.wrap_key_data(words, impl=jax.random.key_impl(keys))
 
 
 def split_keys(key: Key[Array, "*keys"], num: int) -> list[Key[Array, ""]]:

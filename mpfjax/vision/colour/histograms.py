@@ -59,7 +59,7 @@ class IntegralHistogram(eqx.Module):
         check_whole(num_parts=num_parts)
         edges = jnp.concatenate(box_edges(boxes, num_parts, self.height, self.width), axis=1)
         # Otherwise XLA finds them again in each operation that uses the counts.
-        edges = stored(edges.reshape(-1), max(self.height, self.width) + 1).reshape(edges.shape)
+        edges = stored(edges)
         rows, columns = edges[:, : num_parts + 1], edges[:, num_parts + 1 :]
         corners = self.table.at[rows[:, :, None], columns[:, None, :]].get(mode="clip")
         bands = jnp.diff(corners[:, :, 1] - corners[:, :, 0], axis=1)
