@@ -117,10 +117,10 @@ def _generations_hashed(
         step = jnp.where(number == 1, step, place - step * num_moves)
         low = jnp.where(number == 0, is_move.astype(jnp.uint32), step)
         low = jnp.where(is_move | (number == 0), low, index - count)
-        hashed = threefry((words[:, 0], words[:, 1]), jnp.zeros_like(low), low)
+        hashed = _both_halves((words[:, :1], words[:, 1:]), low)
         # A start has no third generation.
         is_last = (number == 2) & ~is_move
-        return jnp.where(is_last[:, None], words, jnp.stack(hashed, axis=1))
+        return jnp.where(is_last[:, None], words, hashed)
 
     first = jnp.broadcast_to(jax.random.key_data(key), (size, 2))
     words = jax.lax.fori_loop(0, 3, next_generation, first)
@@ -227,7 +227,20 @@ def _words(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, ".
 @partial(jax.jit, static_argnames="shape")
 def _keys(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, "..."]:
     """The key of each position: both halves of its hash, side by side."""
-    return jnp.stack(_hashes(key, shape), axis=-1)
+    index = jax.lax.iota(jnp.uint32, math.prod(shape))
+    return _both_halves((key[0], key[1]), index).reshape(*shape, 2)
+
+
+def _both_halves(key: Any, low: UInt32[Array, " n"]) -> UInt32[Array, "n 2"]:
+    """The hash of each counter, its halves side by side.
+
+    Each column hashes for itself and takes its half. If both were stacked, XLA would compile the
+    rounds twice, and compute them as often.
+    """
+    columns = jnp.broadcast_to(low[:, None], (low.shape[0], 2))
+    is_low = jax.lax.broadcasted_iota(jnp.uint32, columns.shape, 1) == 1
+    high, low = threefry(key, jnp.zeros_like(columns), columns)
+    return jnp.where(is_low, low, high)
 
 
 def _hashes(
