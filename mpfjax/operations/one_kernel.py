@@ -9,7 +9,7 @@ from functools import partial
 
 import jax
 from jax.experimental.xla_metadata import set_xla_metadata
-from jaxtyping import Array, Shaped
+from jaxtyping import Array, ArrayLike, Shaped
 
 from mpfjax.operations.gradients import without_gradient
 from mpfjax.operations.platforms import on_platform
@@ -31,7 +31,7 @@ def in_one_kernel(
     and on other platforms it is compiled as usual. The numbers are the same.
     """
 
-    def kept(*arguments: Array) -> Array:
+    def kept(*arguments: ArrayLike) -> Array:
         return stored(function(*arguments), bound)
 
     arguments = without_gradient(arguments)
@@ -44,14 +44,14 @@ def in_one_kernel(
     )
 
     @alone.def_vmap
-    def _(axis_size: int, in_batched: list[bool], *arguments: Array) -> tuple[Array, bool]:
-        del axis_size
+    def _(axis_size: int, in_batched: list[bool], *arguments: ArrayLike) -> tuple[Array, bool]:
+        del axis_size  # constants of the program are numpy's
         axes = [0 if is_batched else None for is_batched in in_batched]
         return jax.vmap(kept, axes)(*arguments), True
 
     return alone(*arguments)
 
 
-def _marked(function: Callable[..., Array], *arguments: Array) -> Array:
+def _marked(function: Callable[..., Array], *arguments: ArrayLike) -> Array:
     with set_xla_metadata(**_AS_ONE_KERNEL):
         return function(*arguments)

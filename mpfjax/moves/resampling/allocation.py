@@ -61,8 +61,16 @@ def allocate_by_variance(
 ) -> Int[Array, " m"]:
     """`allocate_slots` for the demands of `demands_by_variance`, `present` particles in each."""
 
-    def allocated(counts, due, usable, *moments):
-        return _shared(counts, due, usable, demands_by_variance(*moments, due, usable))
+    def allocated(
+        counts: Int[Array, " m"],
+        due: Bool[Array, " m"],
+        usable: Int[Array, ""],
+        log_masses: Float[Array, " m"],
+        sample_sizes: Float[Array, " m"],
+        present: Int[Array, " m"],
+    ) -> Int[Array, " m"]:
+        demands = demands_by_variance(log_masses, sample_sizes, present, due, usable)
+        return _shared(counts, due, usable, demands)
 
     usable = jnp.asarray(mixture.num_usable_slots, jnp.int32)
     arguments = (counts, due, usable, log_masses, sample_sizes, present)
