@@ -64,16 +64,16 @@ def allocate_by_variance(
     def allocated(
         counts: Int[Array, " m"],
         due: Bool[Array, " m"],
-        usable: Int[Array, ""],
         log_masses: Float[Array, " m"],
         sample_sizes: Float[Array, " m"],
         present: Int[Array, " m"],
+        usable: int | Int[Array, ""] = mixture.num_particles,
     ) -> Int[Array, " m"]:
         demands = demands_by_variance(log_masses, sample_sizes, present, due, usable)
         return _shared(counts, due, usable, demands)
 
-    usable = jnp.asarray(mixture.num_usable_slots, jnp.int32)
-    arguments = (counts, due, usable, log_masses, sample_sizes, present)
+    usable = () if mixture.usable_slots is None else (mixture.usable_slots,)
+    arguments = (counts, due, log_masses, sample_sizes, present, *usable)
     return in_one_kernel(allocated, *arguments, bound=mixture.num_particles + 1)
 
 
