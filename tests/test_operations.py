@@ -683,7 +683,7 @@ def _shares_of_pairs(values, counts):
 
 
 def _in_one_kernel(values, counts):
-    return in_one_kernel(_shares_of_pairs, values, counts, bound=10_000)
+    return in_one_kernel(_shares_of_pairs, values, counts)
 
 
 @pytest.mark.parametrize("m", [1, 4, 16, 17, 64])

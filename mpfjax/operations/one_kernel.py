@@ -22,9 +22,9 @@ _AS_ONE_KERNEL = {"inlineable": "false", "xla_cpu_small_call": "true"}
 
 
 def in_one_kernel(
-    function: Callable[..., Shaped[Array, " m"]], *arguments: Array, bound: int | None = None
+    function: Callable[..., Shaped[Array, " m"]], *arguments: Array
 ) -> Shaped[Array, " m"]:
-    """`stored(function(*arguments), bound)`, on a CPU in one kernel where the arrays are short.
+    """`stored(function(*arguments))`, on a CPU in one kernel where the arrays are short.
 
     The function may use pairs of their entries, and nothing but its arguments. A derivative treats
     the result as a constant. Under `vmap`, where the runs multiply the numbers, with more than 16
@@ -32,7 +32,7 @@ def in_one_kernel(
     """
 
     def kept(*arguments: ArrayLike) -> Array:
-        return stored(function(*arguments), bound)
+        return stored(function(*arguments))
 
     arguments = without_gradient(arguments)
     if any(argument.size > _FEW for argument in arguments):

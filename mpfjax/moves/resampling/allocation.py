@@ -74,7 +74,7 @@ def allocate_by_variance(
 
     usable = () if mixture.usable_slots is None else (mixture.usable_slots,)
     arguments = (counts, due, log_masses, sample_sizes, present, *usable)
-    return in_one_kernel(allocated, *arguments, bound=mixture.num_particles + 1)
+    return in_one_kernel(allocated, *arguments)
 
 
 def _shared(
