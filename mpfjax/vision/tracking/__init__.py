@@ -6,6 +6,7 @@ from mpfjax.vision.tracking.births import Births as Births
 from mpfjax.vision.tracking.births import ShareMass as ShareMass
 from mpfjax.vision.tracking.camera import FollowCamera as FollowCamera
 from mpfjax.vision.tracking.deaths import Deaths as Deaths
+from mpfjax.vision.tracking.doubles import LearnDoubles as LearnDoubles
 from mpfjax.vision.tracking.guesses import LearnGuesses as LearnGuesses
 from mpfjax.vision.tracking.model import DetectedObjectModel as DetectedObjectModel
 from mpfjax.vision.tracking.model import ObjectState as ObjectState

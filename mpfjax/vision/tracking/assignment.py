@@ -13,6 +13,7 @@ from mpfjax.vision.colour.histograms import bhattacharyya
 from mpfjax.vision.tracking.detections import Detections
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
+    DOUBLES,
     DOUBTS,
     LIVES,
     REFERENCES,
@@ -42,8 +43,9 @@ class Assign(AbstractMove):
 
     where μ_m and S_m are the mean and covariance of the predicted detection. To this are added
     `colour_cost` times (B² - 1/4), where B² is the mean squared Bhattacharyya distance between the
-    colours of the detection and those of the component; `weak_cost` for a weak detection; and
-    `doubt_cost` for a component that is not yet confirmed. A component without a detection costs
+    colours of the detection and those of the component; `weak_cost` for a weak detection, and for a
+    component that is more probably a double (`LearnDoubles`); and `doubt_cost` for a component that
+    is not yet confirmed. A component without a detection costs
     `gate`, so that no pair with a higher cost is formed: its detection more probably belongs to a
     new object. Because of log |S_m| this happens more often to components that have been unseen for
     long.
@@ -151,6 +153,8 @@ class Assign(AbstractMove):
         cost += self.weak_cost * (found.scores < scores.strong)[None].astype(cost.dtype)
         doubtful = ~lives.confirmed[:, None]
         cost += self.doubt_cost * doubtful.astype(cost.dtype)
+        if DOUBLES in mixture.memory:
+            cost += self.weak_cost * mixture.memory[DOUBLES].doubtful[:, None].astype(cost.dtype)
         counts = found.valid & (found.scores >= scores.weak)
         possible = lives.alive[:, None] & counts[None] & (cost < self.gate)
         return jnp.where(possible, cost, _IMPOSSIBLE)

@@ -11,7 +11,7 @@ from mpfjax.vision.tracking.model import DetectedObjectModel, Noises, boxes_of
 SCORES, ASSIGNED, LIVES, REFERENCES = "scores", "assigned", "lives", "references"
 EXTENT, SHARED, HIDDEN, DOUBTS = "extent", "shared", "hidden", "doubts"
 CAMERA, NOISES, RIVALS, FATES = "camera", "noises", "rivals", "fates"
-GUESSES = "guesses"
+GUESSES, DOUBLES = "guesses", "doubles"
 
 
 class Scores(NamedTuple):
@@ -68,6 +68,23 @@ class Lives(NamedTuple):
     def alive(self) -> Bool[Array, " m"]:
         """Which components stand for an object."""
         return self.identities > 0
+
+
+class Doubles(NamedTuple):
+    """Memory of `LearnDoubles`.
+
+    - `hosts`: the identity of the object beside which each component appeared, 0 for none and for a
+      component that has been apart from it.
+    - `owners`: the identity of each component in the last frame.
+    - `objects`, `doubles`: how many proved to be objects, and how many to be doubles.
+    - `doubtful`: which components are more probably doubles.
+    """
+
+    hosts: Int[Array, " m"]
+    owners: Int[Array, " m"]
+    objects: Float[Array, ""]
+    doubles: Float[Array, ""]
+    doubtful: Bool[Array, " m"]
 
 
 def mean_boxes(mixture: ParticleMixture) -> Float[Array, "m 4"]:

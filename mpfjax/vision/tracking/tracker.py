@@ -31,6 +31,7 @@ from mpfjax.vision.tracking.births import Births, ShareMass
 from mpfjax.vision.tracking.camera import FollowCamera
 from mpfjax.vision.tracking.deaths import Deaths
 from mpfjax.vision.tracking.detections import Detections
+from mpfjax.vision.tracking.doubles import LearnDoubles
 from mpfjax.vision.tracking.guesses import LearnGuesses
 from mpfjax.vision.tracking.memory import (
     LIVES,
@@ -108,6 +109,7 @@ class ObjectTracker(eqx.Module):
     - `PropagateObjects`: a Kalman prediction and update of each hypothesis, and its weight;
     - `Deaths`: end components without detections, or outside the frame;
     - `Births`: a component for each strong detection that no component explains;
+    - `LearnDoubles`: whether what appears beside an object is another one;
     - `LearnNoise`: the detector's errors, and the noises of motion and growth;
     - `LearnAppearance`: the colours of objects that stand alone;
     - `ShareMass`: the same mixture weight for every object.
@@ -209,6 +211,7 @@ class ObjectTracker(eqx.Module):
                 PropagateObjects(model, matched=isinstance(resampling, GaussianRegeneration)),
                 deaths,
                 Births(model, particles_per_object),
+                LearnDoubles(),
                 LearnNoise(model),
                 LearnAppearance(colours),
                 ShareMass(),
@@ -384,7 +387,8 @@ def _sees_detections(move: AbstractMove) -> bool:
         Births,
         LearnAppearance,
     )
-    return isinstance(move, (*kinds, FollowCamera, LearnGuesses, LearnNoise, ShareMass))
+    learning = (LearnDoubles, LearnGuesses, LearnNoise)
+    return isinstance(move, (*kinds, *learning, FollowCamera, ShareMass))
 
 
 def _motion(states: ObjectState) -> tuple[PyTree, PyTree]:
