@@ -35,9 +35,9 @@ ORDER = (
 FLOORS = {
     "operations": (
         "floats", "gradients", "platforms", "stored", "indexing", "prefix_sums", "maxima",
-        "logarithms", "segments", "runs", "choices", "one_kernel", "matrices", "coordinates",
-        "stacks", "gaussians", "across_islands", "generator", "positions", "sobol", "hilbert",
-        "sorting", "compiling", "kept_programs",
+        "logarithms", "segments", "runs", "choices", "matrices", "coordinates", "stacks",
+        "gaussians", "across_islands", "generator", "positions", "sobol", "hilbert", "sorting",
+        "compiling", "kept_programs",
     ),
     "moves": (
         "base", "local_quadratics", "eve_indices", "sharing", "results", "island_interaction",

@@ -1,7 +1,5 @@
 """Each inner operation against its plain numpy definition."""
 
-import contextlib
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,14 +7,12 @@ import pytest
 
 from mpfjax.operations import positions
 from mpfjax.operations.choices import cond_if_any, drawn_once
-from mpfjax.operations.compiling import in_little_memory
 from mpfjax.operations.coordinates import coordinates, inner, log_total, transformed
 from mpfjax.operations.floats import default_float
 from mpfjax.operations.indexing import count_places, take
 from mpfjax.operations.logarithms import exp, log_sum_exp, softmax
 from mpfjax.operations.matrices import cholesky, draw_columns, row_sums, solve_lower
 from mpfjax.operations.maxima import largest
-from mpfjax.operations.one_kernel import in_one_kernel
 from mpfjax.operations.prefix_sums import (
     _blocked_sum_before,
     _scanned_sum_before,
@@ -667,60 +663,3 @@ def test_draws_that_are_made_once_are_the_same_and_stay_one_branch():
     assert "cond[" in str(jax.make_jaxpr(together)(keys))
     scaled = lambda a: jnp.sum(drawn_once(keys[0], lambda key: a * jax.random.normal(key, (3,))))  # noqa: E731
     np.testing.assert_allclose(jax.grad(scaled)(2.0), scaled(1.0), rtol=1e-6)
-
-
-def _shares_of_pairs(values, counts):
-    """Something of each kind that is done with the numbers of components."""
-    later = jnp.sum(jnp.where(values[:, None] > values[None], counts[None], 0), 1, jnp.int32)
-    upto = jnp.cumsum(exp(values - largest(values)))
-    parts = jnp.sqrt(upto) / jnp.maximum(jnp.sum(upto), 1.0)
-    return (
-        jnp.diff(
-            jnp.round(parts * jnp.sum(counts).astype(parts.dtype)).astype(jnp.int32), prepend=0
-        )
-        + later
-    )
-
-
-def _in_one_kernel(values, counts):
-    return in_one_kernel(_shares_of_pairs, values, counts)
-
-
-@pytest.mark.parametrize("m", [1, 4, 16, 17, 64])
-def test_in_one_kernel_is_the_function(m):
-    values, counts = RNG.normal(size=(3, m)), RNG.integers(0, 100, (3, m)).astype(np.int32)
-    for dtype, scope in ((np.float32, contextlib.nullcontext), (np.float64, float64)):
-        with scope():
-            rows = jnp.asarray(values.astype(dtype)), jnp.asarray(counts)
-            expected = [_shares_of_pairs(*row) for row in zip(*rows, strict=True)]
-            for row, of_row in zip(zip(*rows, strict=True), expected, strict=True):
-                np.testing.assert_array_equal(jax.jit(_in_one_kernel)(*row), of_row)
-            np.testing.assert_array_equal(jax.jit(jax.vmap(_in_one_kernel))(*rows), expected)
-            # One of the arrays is the same for all runs.
-            together = jax.jit(jax.vmap(_in_one_kernel, (0, None)))(rows[0], rows[1][0])
-            np.testing.assert_array_equal(together[0], expected[0])
-
-
-def test_in_one_kernel_of_many_runs():
-    # So many that pairs would not fit into one kernel.
-    values, counts = RNG.normal(size=(40, 50, 4)), RNG.integers(0, 100, (40, 50, 4))
-    rows = jnp.asarray(values.astype(np.float32)), jnp.asarray(counts.astype(np.int32))
-    together = jax.jit(jax.vmap(jax.vmap(_in_one_kernel)))(*rows)
-    np.testing.assert_array_equal(
-        together[39, 49], _shares_of_pairs(rows[0][-1, -1], rows[1][-1, -1])
-    )
-
-
-def test_in_one_kernel_is_a_constant_for_a_derivative():
-    def scaled(a):
-        return jnp.sum(in_one_kernel(lambda x: 2 * x, a * jnp.arange(4.0)))
-
-    assert jax.jit(scaled)(1.5) == 18
-    assert jax.grad(jax.jit(scaled))(1.5) == 0
-
-
-@pytest.mark.parametrize("options", [{}, in_little_memory(), in_little_memory(soon=True)])
-def test_in_one_kernel_by_all_options_of_the_library(options):
-    values, counts = jnp.asarray([0.5, -1.0, 2.0, 0.25]), jnp.asarray([7, 0, 90, 3], jnp.int32)
-    run = jax.jit(_in_one_kernel, compiler_options=options)
-    np.testing.assert_array_equal(run(values, counts), _shares_of_pairs(values, counts))

@@ -8,7 +8,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.logarithms import scaled_exp
-from mpfjax.operations.one_kernel import in_one_kernel
 from mpfjax.operations.prefix_sums import few_upto
 from mpfjax.operations.segments import segments_in_order, spread
 from mpfjax.operations.stored import stored
@@ -46,45 +45,9 @@ def allocate_slots(
     if particles_per_component is not None:
         share = jnp.asarray(min(particles_per_component, num_slots), jnp.int32)
         return jnp.where(counts > 0, share, 0)
-    if counts.shape[0] == 1:
-        return jnp.where(due, usable, jnp.where(due, 0, counts))
-    return stored(_shared(counts, due, usable, demands))
-
-
-def allocate_by_variance(
-    counts: Int[Array, " m"],
-    due: Bool[Array, " m"],
-    mixture: ParticleMixture,
-    log_masses: Float[Array, " m"],
-    sample_sizes: Float[Array, " m"],
-    present: Int[Array, " m"],
-) -> Int[Array, " m"]:
-    """`allocate_slots` for the demands of `demands_by_variance`, `present` particles in each."""
-
-    def allocated(
-        counts: Int[Array, " m"],
-        due: Bool[Array, " m"],
-        log_masses: Float[Array, " m"],
-        sample_sizes: Float[Array, " m"],
-        present: Int[Array, " m"],
-        usable: int | Int[Array, ""] = mixture.num_particles,
-    ) -> Int[Array, " m"]:
-        demands = demands_by_variance(log_masses, sample_sizes, present, due, usable)
-        return _shared(counts, due, usable, demands)
-
-    usable = () if mixture.usable_slots is None else (mixture.usable_slots,)
-    arguments = (counts, due, log_masses, sample_sizes, present, *usable)
-    return in_one_kernel(allocated, *arguments)
-
-
-def _shared(
-    counts: Int[Array, " m"],
-    due: Bool[Array, " m"],
-    usable: int | Int[Array, ""],
-    demands: Float[Array, " m"] | None,
-) -> Int[Array, " m"]:
-    """How many of the usable slots each of several components gets."""
     kept = jnp.where(due, 0, counts)
+    if counts.shape[0] == 1:
+        return jnp.where(due, usable, kept)
     pool = usable - jnp.sum(kept, dtype=jnp.int32)
     sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
     if demands is None:
@@ -92,7 +55,7 @@ def _shared(
     else:
         first = jnp.minimum(pool // sharers, 1)
         share = first + _in_proportion(pool - first * sharers, due, demands)
-    return jnp.where(due, share, kept)
+    return stored(jnp.where(due, share, kept))
 
 
 def demands_by_variance(

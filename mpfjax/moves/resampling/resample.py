@@ -22,8 +22,8 @@ from mpfjax.moves.base import AbstractAdaptiveResampling
 from mpfjax.moves.eve_indices import with_offspring
 from mpfjax.moves.resampling.allocation import (
     Slots,
-    allocate_by_variance,
     allocate_slots,
+    demands_by_variance,
     place_slots,
 )
 from mpfjax.moves.resampling.layout import InPlace, SideBySide, as_they_are, side_by_side
@@ -230,18 +230,20 @@ class Resample(AbstractAdaptiveResampling):
 
         Masses and effective sample sizes are those of the `line`, where there is one.
         """
-        demands, each = None, self.particles_per_component
+        demands = None
         if self.share_by is not None:
             demands = _shares_of_groups(mixture, self.share_by(mixture.particles), due)
-        elif each is None and self.allocation != "equal" and mixture.num_components > 1:
+        elif self.allocation != "equal" and mixture.num_components > 1:
             if line is None:
                 log_masses, present = mixture.log_mixture_weights, mixture.component_counts
                 sample_sizes = mixture.component_effective_sample_sizes
             else:
                 log_masses, present = line.log_masses, line.counts
                 sample_sizes = line.effective_sample_sizes
-            return allocate_by_variance(counts, due, mixture, log_masses, sample_sizes, present)
-        return allocate_slots(counts, due, mixture, each, demands)
+            demands = demands_by_variance(
+                log_masses, sample_sizes, present, due, mixture.num_usable_slots
+            )
+        return allocate_slots(counts, due, mixture, self.particles_per_component, demands)
 
     def _log_masses(
         self, mixture: ParticleMixture, line: InPlace | SideBySide
