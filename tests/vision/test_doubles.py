@@ -1,22 +1,24 @@
 """Whether what appears beside an object is another one is learned from what became of the others.
 
-The counts stand against those of a plain loop over a random history of lives, and the tracker
-against the truth of two rendered recordings: of people who walk in pairs, and of a detector that
-gives two boxes for one person.
+The counts stand against those of a plain loop over a random history of lives, the assignment
+against SciPy's in two rounds, and the tracker against the truth of two rendered recordings: of
+people who walk in pairs, and of a detector that gives two boxes for one person.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 
 from mpfjax.metrics import multi_object_scores
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision import track
 from mpfjax.vision.tracking import LearnDoubles
+from mpfjax.vision.tracking.assignment import Assign
 from mpfjax.vision.tracking.detections import Detections
-from mpfjax.vision.tracking.memory import ASSIGNED, DOUBLES, LIVES, Lives
-from mpfjax.vision.tracking.model import Gaussian, ObjectState
+from mpfjax.vision.tracking.memory import ASSIGNED, DOUBLES, LIVES, SCORES, Lives, Scores
+from mpfjax.vision.tracking.model import DetectedObjectModel, Gaussian, ObjectState
 from mpfjax.vision.tracking.observation import TrackedFrame
 from mpfjax.vision.tracking.track import online_rows
 from mpfjax.vision.tracking.tracker import ObjectTracker
@@ -37,7 +39,7 @@ def mixture_at(x, identities, detected, doubles):
         ancestor_indices=labels,
         num_components=M,
         memory={
-            LIVES: Lives.none(M)._replace(identities=identities),
+            LIVES: Lives.none(M)._replace(identities=identities, shown=identities > 0),
             ASSIGNED: jnp.where(detected, labels, -1),
             DOUBLES: doubles,
         },
@@ -95,13 +97,52 @@ def test_what_becomes_of_those_beside_an_object_is_counted_once():
             jnp.asarray(detected),
             doubles,
         )
-        doubles = move(jax.random.key(0), mixture, NOTHING).memory[DOUBLES]
+        memory = move(jax.random.key(0), mixture, NOTHING).memory
+        doubles = memory[DOUBLES]
         np.testing.assert_array_equal(doubles.hosts, [hosts.get(name, 0) for name in names])
         np.testing.assert_allclose([doubles.objects, doubles.doubles], [objects, number], rtol=1e-4)
         probable = (objects + 2.5) / (objects + number + 5) >= 1 / 3
         expected = [name in hosts and not probable for name in names]
         np.testing.assert_array_equal(doubles.doubtful, expected)
+        np.testing.assert_array_equal(memory[LIVES].shown, (names > 0) & ~np.array(expected))
     assert min(decided) > 5
+
+
+def test_who_is_more_probably_a_double_has_what_the_others_leave():
+    """Pairs are SciPy's for all others alone, then for doubles and the detections that are left."""
+    random = np.random.default_rng(2)
+    move = Assign(DetectedObjectModel(), gate=5.0)
+    assign = jax.jit(
+        lambda mixture, frame: move(jax.random.key(0), mixture, frame).memory[ASSIGNED]
+    )
+    costs = jax.jit(lambda mixture, frame: move.costs(mixture, frame))
+    zero, changed = jnp.zeros(()), 0
+    for _ in range(30):
+        doubtful = random.random(M) < 0.5
+        places = jnp.asarray(random.uniform(0, 40, M), jnp.float32)
+        names = jnp.arange(1, M + 1, dtype=jnp.int32)
+        found = np.stack([random.uniform(0, 40, 6), 0 * np.ones(6), *np.full((2, 6), SIDE)], axis=1)
+        boxes = jnp.asarray(found, jnp.float32)
+        frame = TrackedFrame(Detections(boxes, jnp.ones(6, bool), jnp.ones(6)), None)
+
+        def mixture(yielding, places=places, names=names):
+            doubles = LearnDoubles().initial_memory(M)[DOUBLES]._replace(doubtful=yielding)
+            mixture = mixture_at(places, names, names > 0, doubles)
+            scores = Scores(jnp.ones(4), jnp.zeros((), jnp.int32), zero, zero)
+            return mixture.replace(memory=mixture.memory | {SCORES: scores})
+
+        cost = np.asarray(costs(mixture(jnp.zeros(M, bool)), frame), float)
+        expected, left = np.full(M, -1), np.ones(6, bool)
+        for group in (~doubtful, doubtful):
+            rows, columns = np.flatnonzero(group), np.flatnonzero(left)
+            alone = np.full((len(rows), len(rows)), 5.0)
+            table = np.minimum(cost[np.ix_(rows, columns)], 1e4)
+            for row, column in zip(*linear_sum_assignment(np.c_[table, alone]), strict=True):
+                if column < len(columns):
+                    expected[rows[row]], left[columns[column]] = columns[column], False
+        np.testing.assert_array_equal(assign(mixture(jnp.asarray(doubtful)), frame), expected)
+        changed += (expected != np.asarray(assign(mixture(jnp.zeros(M, bool)), frame))).any()
+    assert changed > 5
 
 
 def recording(doubled):
@@ -149,8 +190,8 @@ def scores(doubled, learns):
 def test_doubles_take_fewer_names_where_the_detector_splits_people():
     with_it, without = scores(doubled=True, learns=True), scores(doubled=True, learns=False)
     assert with_it["id_switches"] < 0.7 * without["id_switches"]
-    assert with_it["IDF1"] > without["IDF1"] + 0.02
-    assert with_it["HOTA"] > without["HOTA"] + 0.02
+    assert with_it["IDF1"] > without["IDF1"] + 0.1
+    assert with_it["HOTA"] > without["HOTA"] + 0.1
 
 
 def test_people_who_walk_in_pairs_are_tracked_as_without_it():

@@ -29,6 +29,7 @@ _DIMENSIONS = 4
 _UNDECIDED = 0.25  # B² at which colours are evidence neither for nor against a pair
 _ROUNDS = 15  # iterations of messages; fewer suffice where two rows compete for two columns
 _LEAST = 1e-3  # marginals are at least this
+_YIELDING = 0.01  # of the gain of a pair, where the component takes only what others leave
 _SMALL = 10.0  # log odds at which float32 still resolves a thousandth of 1 added to the odds
 
 
@@ -43,12 +44,12 @@ class Assign(AbstractMove):
 
     where μ_m and S_m are the mean and covariance of the predicted detection. To this are added
     `colour_cost` times (B² - 1/4), where B² is the mean squared Bhattacharyya distance between the
-    colours of the detection and those of the component; `weak_cost` for a weak detection, and for a
-    component that is more probably a double (`LearnDoubles`); and `doubt_cost` for a component that
-    is not yet confirmed. A component without a detection costs
+    colours of the detection and those of the component; `weak_cost` for a weak detection; and
+    `doubt_cost` for a component that is not yet confirmed. A component without a detection costs
     `gate`, so that no pair with a higher cost is formed: its detection more probably belongs to a
     new object. Because of log |S_m| this happens more often to components that have been unseen for
-    long.
+    long. For a component that is more probably a double (`LearnDoubles`), gate - cost is divided by
+    a hundred, so that it takes a detection only from what the others leave.
 
     The probability of a pair under the joint distribution of all assignments, p ∝ Π exp((gate -
     cost) / 2T) over the pairs of an assignment, is computed by `marginals`. A `temperature` T above
@@ -153,10 +154,12 @@ class Assign(AbstractMove):
         cost += self.weak_cost * (found.scores < scores.strong)[None].astype(cost.dtype)
         doubtful = ~lives.confirmed[:, None]
         cost += self.doubt_cost * doubtful.astype(cost.dtype)
-        if DOUBLES in mixture.memory:
-            cost += self.weak_cost * mixture.memory[DOUBLES].doubtful[:, None].astype(cost.dtype)
         counts = found.valid & (found.scores >= scores.weak)
         possible = lives.alive[:, None] & counts[None] & (cost < self.gate)
+        if DOUBLES in mixture.memory:
+            yielding = mixture.memory[DOUBLES].doubtful[:, None]
+            gains = jnp.where(yielding, _YIELDING, 1.0) * (self.gate - cost)
+            cost = self.gate - gains
         return jnp.where(possible, cost, _IMPOSSIBLE)
 
     def _distances(

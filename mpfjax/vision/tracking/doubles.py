@@ -36,11 +36,12 @@ class LearnDoubles(AbstractMove):
 
         (r + n / 2) / (r + w + n),  n = 5
 
-    Counts lose four tenths in a hundred frames. While this probability is below `least`, `Assign`
-    takes a component that has a host for a weak one, so that the host takes the better detection.
+    Counts lose four tenths in a hundred frames. While this probability is below `least`, a
+    component that has a host is not shown, and `Assign` gives it a detection only from what all
+    others leave. It goes on so that its fate can be counted.
 
-    It follows `Births` and changes only its memory, `Doubles`. Use it with any detector. Raises
-    `ValueError` for shares outside [0, 1].
+    It follows `Births` and changes only its memory, `Doubles`, and who is shown. Use it with any
+    detector. Raises `ValueError` for shares outside [0, 1].
     """
 
     beside: float = eqx.field(static=True, default=0.15)
@@ -90,4 +91,8 @@ class LearnDoubles(AbstractMove):
         doubles = KEPT * before.doubles + jnp.sum(ended, dtype=before.doubles.dtype)
         probability = (objects + PRIOR / 2) / (objects + doubles + PRIOR)
         doubtful = (hosts > 0) & (probability < self.least)
-        return remember(mixture, doubles=Doubles(hosts, identities, objects, doubles, doubtful))
+        return remember(
+            mixture,
+            lives=lives._replace(shown=lives.shown & ~doubtful),
+            doubles=Doubles(hosts, identities, objects, doubles, doubtful),
+        )

@@ -222,11 +222,11 @@ def online_rows(number: int, tracks: Tracks) -> Float[np.ndarray, "k 6"]:
 
 
 def offline_rows(kept: Iterable[Tracks], first: int = 1) -> Float[np.ndarray, "r 6"]:
-    """Rows of every object that was confirmed at some time, including its frames before that."""
+    """Rows of every object that was shown at some time, including its unconfirmed frames."""
     kept = list(kept)
     believed = {0}
     for tracks in kept:
-        believed |= set(np.asarray(tracks.identities)[np.asarray(tracks.confirmed)].tolist())
+        believed |= set(np.asarray(tracks.identities)[np.asarray(tracks.shown)].tolist())
     chosen = np.array(sorted(believed - {0}))
     rows = [
         _rows(
