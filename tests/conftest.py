@@ -39,8 +39,8 @@ if quick and "XLA_FLAGS" not in os.environ:
         flags = [flag for flag in flags if known_to_xla(flag)]
     os.environ["XLA_FLAGS"] = " ".join(flags)
 
-# Workers and the processes that tests start take each other's programs, as modules do whose own
-# are dropped when they end (below). The folder is the session's, gone when it ends.
+# Workers and the processes that tests start take each other's programs, as modules do when those
+# from before were dropped (below). The folder is the session's, gone when it ends.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     programs = tempfile.mkdtemp(prefix="programs-of-tests-")
     atexit.register(shutil.rmtree, programs, ignore_errors=True)
@@ -54,7 +54,7 @@ jax.config.update("jax_disable_most_optimizations", quick)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Compiling makes many small objects, few of them garbage: modules are swept as they end, below.
+# Compiling makes many small objects, few of them garbage: it is swept with the programs, below.
 gc.freeze()
 gc.set_threshold(50_000, 20, 50)
 
@@ -78,13 +78,32 @@ def as_installed():
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
+# Every compiled program keeps memory maps, and thousands of them in one process reach the kernel's
+# limit, 65 530 on Linux, at which the compiler crashes. So many programs also take about 2 GB.
+MANY_MAPS = 6_000
+
+
+def num_maps() -> float:
+    """How many memory maps the process has; infinity on systems that do not tell."""
+    try:
+        return Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return float("inf")
+
+
+def pytest_collection_finish():
+    """What was imported to collect the tests stays: sweeps for garbage leave it out."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(autouse=True, scope="module")
 def release_compiled_programs():
-    """Drop each module's programs when it ends.
+    """Drop all programs when a module ends and they have become many.
 
-    Every compiled program keeps memory maps, and thousands of them in one process reach the
-    kernel's limit, at which the compiler crashes.
+    Modules share what they have in common, most of all single operations, until then.
     """
     yield
-    jax.clear_caches()
-    gc.collect()
+    if num_maps() > MANY_MAPS:
+        jax.clear_caches()
+        gc.collect()

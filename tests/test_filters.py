@@ -620,7 +620,7 @@ def test_the_mass_of_a_mixture_given_by_hand_counts_once_whatever_moves_leave_th
         np.testing.assert_allclose(mixture.log_mass, 0, atol=1e-5)
 
 
-@pytest.mark.parametrize("num_components", [4, 64, *thorough([2, 12, 256])])
+@pytest.mark.parametrize("num_components", [64, *thorough([2, 4, 12, 256])])
 def test_any_number_of_components_compiles_alone_in_runs_and_differentiated(num_components):
     observations = jnp.array([1.5, 0.4])
 

@@ -1,5 +1,6 @@
 """Each inner operation against its plain numpy definition."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,6 +38,24 @@ from mpfjax.operations.segments import (
 from mpfjax.operations.stored import to_int, whole_blocks
 from tests.marking import quick_of, thorough
 from tests.precision import float64
+
+# As one program each, as in a filter: to compile operations one by one takes longer.
+_blocked_sum_before, _scanned_sum_before, sum_before = map(
+    eqx.filter_jit, (_blocked_sum_before, _scanned_sum_before, sum_before)
+)
+count_starts, count_upto, few_upto = map(eqx.filter_jit, (count_starts, count_upto, few_upto))
+order_by_segment, segment_any, segment_counts = map(
+    eqx.filter_jit, (order_by_segment, segment_any, segment_counts)
+)
+segment_argmax, segment_max, segment_sum = map(
+    eqx.filter_jit, (segment_argmax, segment_max, segment_sum)
+)
+segment_log_sum_exp, segment_softmax, spread = map(
+    eqx.filter_jit, (segment_log_sum_exp, segment_softmax, spread)
+)
+cholesky, draw_columns, row_sums, solve_lower = map(
+    eqx.filter_jit, (cholesky, draw_columns, row_sums, solve_lower)
+)
 
 RNG = np.random.default_rng(0)
 SIZES = (1, 2, 31, 32, 33, 100, 1024, 1025, 33_000)
@@ -93,7 +112,7 @@ def test_sums_in_two_parts_are_exact(form):
     whole = np.floor(rows)
     parts = np.round((rows - whole) * 2**24)
     both = (jnp.asarray(whole, jnp.float32), jnp.asarray(parts, jnp.float32))
-    before, total = jax.vmap(form)(*both)
+    before, total = jax.jit(jax.vmap(form))(*both)
     exact = np.cumsum(whole + parts / 2**24, axis=1)
     values = np.asarray(before.whole, float) + np.asarray(before.fraction, float)
     np.testing.assert_array_equal(values, exact - (whole + parts / 2**24))
@@ -106,7 +125,7 @@ def test_the_last_position_before_each_point():
     places = np.sort(np.round(rng.random(300) ** 2 * 64 * 2**12) / 2**12)
     points = np.append(rng.random(500) * 64, places)
     parts = lambda values: positions.as_positions(jnp.asarray(values, jnp.float32))  # noqa: E731
-    found = positions.last_before(parts(places), parts(points), 64)
+    found = eqx.filter_jit(positions.last_before)(parts(places), parts(points), 64)
     points = points.astype(np.float32)
     np.testing.assert_array_equal(found, np.searchsorted(places, points, "right") - 1)
 

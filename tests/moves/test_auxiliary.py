@@ -111,11 +111,11 @@ def test_ancestors_are_those_of_the_particles_and_the_promising_have_more():
 class TestEdges:
     def run(self, look, observation=1.0):
         move = AuxiliaryResample(Resample(), look)
-        return move(jax.random.key(0), three_components(), jnp.float32(observation))
+        return eqx.filter_jit(move)(jax.random.key(0), three_components(), jnp.float32(observation))
 
     def test_a_look_ahead_of_zero_throughout_a_component_is_left_out(self):
         nothing = self.run(lambda y, states: jnp.full(30, -jnp.inf))
-        plain = Resample()(jax.random.key(0), three_components())
+        plain = eqx.filter_jit(Resample())(jax.random.key(0), three_components())
         np.testing.assert_array_equal(nothing.particles, plain.particles)
         np.testing.assert_allclose(nothing.log_weights, plain.log_weights, atol=1e-5)
 

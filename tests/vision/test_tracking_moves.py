@@ -33,6 +33,12 @@ MODEL = DetectedObjectModel(
 )
 
 
+@eqx.filter_jit
+def moved_by(move, key, mixture, observation):
+    """The mixture after a move, as one program: one operation after the other compiles longer."""
+    return move(key, mixture, observation)
+
+
 # --- the exact step ------------------------------------------------------------------------------
 
 
@@ -86,7 +92,7 @@ def test_a_step_is_kalmans_where_the_detection_is_its_own(doubt):
     }
     boxes = np.asarray(frame.detections.boxes, float)
     expected, log_z = step_by_hand(mixture, source, boxes, [True, False, True, True, True, False])
-    moved = PropagateObjects(MODEL)(KEY, mixture.replace(memory=memory), frame)
+    moved = moved_by(PropagateObjects(MODEL), KEY, mixture.replace(memory=memory), frame)
     occupied = np.asarray(mixture.occupied)
     got = np.stack(moved.particles.gaussian, axis=2)
     follows = np.abs(got - expected).max(axis=(1, 2)) < 1e-2
@@ -120,8 +126,8 @@ def test_matched_moments_are_those_of_both_branches():
     followed, log_z = step_by_hand(mixture, source, boxes, [True, False, True, True, True, False])
     stays = np.stack(MODEL.predicted(mixture.particles, MODEL.noises).gaussian, axis=2)
     match = PropagateObjects(MODEL, matched=True)
-    got = np.stack(match(KEY, mixture, frame).particles.gaussian, axis=2)
-    again = np.stack(match(jax.random.key(8), mixture, frame).particles.gaussian, axis=2)
+    got = np.stack(moved_by(match, KEY, mixture, frame).particles.gaussian, axis=2)
+    again = np.stack(moved_by(match, jax.random.key(8), mixture, frame).particles.gaussian, axis=2)
     np.testing.assert_array_equal(got, again)
     weights = np.asarray(mixture.component_weights, float)
     for m in range(3):
@@ -149,7 +155,7 @@ def test_colours_are_looked_at_where_a_place_is_drawn():
         frame.detections, nobody, nobody, nobody, jnp.zeros(M), frame.pixels,
         mixture.memory["references"],
     )  # fmt: skip
-    drawn, log_likelihood = model.seen(KEY, assigned, some)
+    drawn, log_likelihood = eqx.filter_jit(model.seen)(KEY, assigned, some)
     before = [np.asarray(moment[0]) for moment in some.gaussian]
     np.testing.assert_allclose(np.var(drawn.place, axis=0), before[2], rtol=0.05)
     total = np.var(drawn.velocity, axis=0) + np.mean(drawn.gaussian.var_velocity, axis=0)
@@ -254,7 +260,7 @@ def test_what_all_have_in_common_is_the_cameras(outlier):
     found = Detections(jnp.asarray(boxes, jnp.float32), jnp.ones(M, bool), jnp.ones(M))
     shifts = []
     for _ in range(30):
-        moved = camera(KEY, mixture, TrackedFrame(found, None))
+        moved = moved_by(camera, KEY, mixture, TrackedFrame(found, None))
         shifts.append(np.asarray(moved.memory["camera"].shift))
         mixture = mixture.replace(memory=moved.memory)
         np.testing.assert_allclose(
@@ -346,7 +352,7 @@ CHANGES = {"scores": ["scores", "fates"], "assign": ["assigned", "doubts"], "lea
 @pytest.mark.parametrize("name", QUIET)
 def test_what_only_remembers_leaves_the_distribution_as_it_is(name):
     mixture, frame = tracked()
-    moved = QUIET[name](KEY, mixture, frame)
+    moved = moved_by(QUIET[name], KEY, mixture, frame)
     for before, after in zip(
         jax.tree.leaves(mixture.replace(memory={})),
         jax.tree.leaves(moved.replace(memory={})),
@@ -381,7 +387,7 @@ GATE = 10.0
 def test_the_assignment_is_scipys():
     """Costs from moments by hand, and the pairs that scipy picks."""
     mixture, frame = tracked()
-    costs = np.asarray(Assign(MODEL, GATE).costs(mixture, frame), float)
+    costs = np.asarray(eqx.filter_jit(Assign(MODEL, GATE).costs)(mixture, frame), float)
     weights = np.asarray(mixture.component_weights, float)
     states = mixture.particles
     place, spread = np.asarray(states.place, float), np.asarray(states.spread, float)
@@ -416,7 +422,7 @@ def test_the_assignment_is_scipys():
     rows, columns = linear_sum_assignment(np.c_[np.where(possible, expected, 1e4), none])
     source = np.full(M, -1)
     source[rows] = np.where(columns < D, columns, -1)
-    assigned = Assign(MODEL, GATE)(KEY, mixture, frame).memory["assigned"]
+    assigned = moved_by(Assign(MODEL, GATE), KEY, mixture, frame).memory["assigned"]
     np.testing.assert_array_equal(assigned, source)
     assert (source >= 0).sum() == 3
 
@@ -481,9 +487,9 @@ def test_doubts_are_what_the_marginals_leave():
     """By summing over all assignments."""
     mixture, frame = tracked()
     move = Assign(MODEL, GATE)
-    moved = move(KEY, mixture, frame)
+    moved = moved_by(move, KEY, mixture, frame)
     source = np.asarray(moved.memory["assigned"])
-    costs = np.asarray(move.costs(mixture, frame), float)
+    costs = np.asarray(eqx.filter_jit(move.costs)(mixture, frame), float)
     probability = brute_force(np.where(costs < 1e4, np.exp((GATE - costs) / 4), 0))
     assert (source[:3] >= 0).all()
     for m in range(3):
@@ -536,7 +542,7 @@ def shared_by(source, boxes, confirmed=(True, True, True), unseen=(0, 0, 0)):
     found = Detections(jnp.asarray(padded), jnp.arange(D) < len(boxes), jnp.ones(D))
     rows = []
     for _ in range(3):
-        mixture = move(KEY, mixture, frame._replace(detections=found))
+        mixture = moved_by(move, KEY, mixture, frame._replace(detections=found))
         rows.append(np.asarray(mixture.memory["shared"]).tolist())
     np.testing.assert_array_equal(mixture.particles.place, place)
     return rows
@@ -605,9 +611,8 @@ def test_equal_scores_are_all_strong(score):
 
 def test_given_thresholds_are_kept():
     found = tracked()[1].detections
-    moved = RankScores(strong_score=7.0, weak_score=2.0)(
-        KEY, tracked()[0], TrackedFrame(found, None)
-    )
+    move = RankScores(strong_score=7.0, weak_score=2.0)
+    moved = moved_by(move, KEY, tracked()[0], TrackedFrame(found, None))
     assert (float(moved.memory["scores"].weak), float(moved.memory["scores"].strong)) == (2, 7)
 
 
@@ -616,7 +621,7 @@ def test_who_founds_is_strong_and_nobodys_and_no_double():
     mixture, frame = tracked()
     move = Births(MODEL, P, 0.4)
     np.testing.assert_array_equal(move.founding(mixture, frame), [0, 0, 0, 0, 1, 0])
-    moved = move(KEY, mixture, frame)
+    moved = moved_by(move, KEY, mixture, frame)
     lives = moved.memory["lives"]
     np.testing.assert_array_equal(lives.identities, [3, 5, 6, 7])
     assert int(lives.last_identity) == 7
@@ -639,11 +644,11 @@ def test_who_founds_is_strong_and_nobodys_and_no_double():
 
 def test_who_is_gone_is_emptied():
     mixture, frame = tracked()
-    moved = Deaths(2, 2)(KEY, mixture, frame)
+    moved = moved_by(Deaths(2, 2), KEY, mixture, frame)
     # The second has been unseen for a third frame; the third is confirmed by its second.
     np.testing.assert_array_equal(moved.active, [True, False, True, False])
     np.testing.assert_array_equal(moved.memory["lives"].confirmed, [True, True, True, False])
-    kept = Deaths(2, 3)(KEY, mixture, frame)
+    kept = moved_by(Deaths(2, 3), KEY, mixture, frame)
     np.testing.assert_array_equal(kept.log_weights, mixture.log_weights)
     # Believed in at once, as in a first frame, and seen no more: waited for while there is room.
     lives = mixture.memory["lives"]
@@ -664,15 +669,17 @@ def test_who_is_not_confirmed_may_be_missed_where_there_is_room(patience, full, 
     assigned = mixture.memory["assigned"].at[2].set(-1)
     mixture = mixture.replace(memory=mixture.memory | {"lives": lives, "assigned": assigned})
     move = Deaths(2, 20, tentative_patience=patience)
-    moved = move(KEY, mixture, frame)
+    moved = moved_by(move, KEY, mixture, frame)
     np.testing.assert_array_equal(moved.active, [True, True, stays, False])
     assert not moved.memory["lives"].confirmed[2]
-    np.testing.assert_array_equal(move(KEY, moved, frame).active, [True, True, False, False])
+    np.testing.assert_array_equal(
+        moved_by(move, KEY, moved, frame).active, [True, True, False, False]
+    )
 
 
 def test_masses_are_shared_and_weights_within_components_kept():
     mixture, frame = tracked()
-    moved = ShareMass()(KEY, mixture, frame)
+    moved = moved_by(ShareMass(), KEY, mixture, frame)
     np.testing.assert_allclose(moved.mixture_weights, [1 / 3, 1 / 3, 1 / 3, 0], rtol=1e-5)
     np.testing.assert_allclose(moved.component_weights, mixture.component_weights, rtol=1e-4)
 
