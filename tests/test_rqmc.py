@@ -195,11 +195,11 @@ class TestWhatGoesWrongEasily:
         whole = make_mixture(np.zeros(4), np.zeros(4), np.zeros(4, int), 1)
         whole = whole.replace(particles=jnp.arange(4))
         with pytest.raises(ValueError, match=r"sort_by: .hilbert.* has none"):
-            mpfjax.Resample(sort_by="hilbert")(KEY, whole)
-        mpfjax.Resample(sort_by=lambda states: states)(KEY, whole)
+            eqx.filter_jit(mpfjax.Resample(sort_by="hilbert"))(KEY, whole)
+        eqx.filter_jit(mpfjax.Resample(sort_by=lambda states: states))(KEY, whole)
         for wrong in (lambda states: states[:2], lambda states: 1.0, lambda states: None):
             with pytest.raises(ValueError, match="sort_by: it returned"):
-                mpfjax.Resample(sort_by=wrong)(KEY, whole)
+                eqx.filter_jit(mpfjax.Resample(sort_by=wrong))(KEY, whole)
         with pytest.raises(ValueError, match="sort_by: 'hilbart'"):
             mpfjax.Resample(sort_by="hilbart")
 

@@ -204,7 +204,7 @@ def test_resampling_works_with_any_pytree_of_particles(name):
     move = WITHIN_COMPONENTS[name]
     if move.sort_by is not None:
         move = Resample(move.scheme, sort_by=lambda states: states["box"][:, 0])
-    after = move(jax.random.key(2), mixture.replace(particles=leaves))
+    after = eqx.filter_jit(move)(jax.random.key(2), mixture.replace(particles=leaves))
     filled = np.asarray(after.occupied)
     copied = np.asarray(after.ancestor_indices)[filled]
     np.testing.assert_array_equal(np.asarray(after.particles["age"][0])[filled], copied)

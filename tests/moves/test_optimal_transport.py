@@ -1,5 +1,6 @@
 """Transport in place of resampling, against Sinkhorn's iteration in numpy."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -87,4 +88,4 @@ def test_what_is_not_due_stays_and_whole_numbers_come_along():
 def test_states_without_floating_point_cannot_be_moved():
     mixture = MIXTURES["ordinary"].replace(particles=jnp.arange(40, dtype=jnp.int32))
     with pytest.raises(ValueError, match="gradient: 'ot' moves particles"):
-        MOVE(KEY, mixture)
+        eqx.filter_jit(MOVE)(KEY, mixture)

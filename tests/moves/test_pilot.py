@@ -1,5 +1,6 @@
 """The look-ahead from a model's own noise; that Ẑ stays unbiased is in `tests/test_chains.py`."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,8 +16,12 @@ from tests.user_models import Batched
 def ahead(model, observation, states, weights):
     """ν of states in one component."""
     mixture = make_mixture(states, np.log(weights), np.zeros(len(weights)), 1)
-    look = PilotLookahead(model).at_step_of(mixture)
-    return np.exp(np.asarray(look(observation, mixture.particles), float))
+
+    @eqx.filter_jit
+    def look(model, observation, mixture):
+        return PilotLookahead(model).at_step_of(mixture)(observation, mixture.particles)
+
+    return np.exp(np.asarray(look(model, observation, mixture), float))
 
 
 def test_it_is_the_mean_of_both_likelihoods_shrunk_by_their_correlation():

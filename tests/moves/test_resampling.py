@@ -307,7 +307,7 @@ def test_what_has_no_mass_gets_none(num_components):
         np.zeros((12, 1)), np.zeros(12), np.arange(12) % num_components, num_components
     )
     mixture = mixture.replace(log_weights=jnp.full(12, -jnp.inf))
-    moved = Resample()(jax.random.key(0), mixture)
+    moved = draw(Resample(), mixture)
     np.testing.assert_array_equal(moved.log_weights, -np.inf)
 
 
