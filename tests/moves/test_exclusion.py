@@ -1,5 +1,6 @@
 """Exclusion does what its formula says, and says that it is approximate."""
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ def test_each_particle_is_weighed_down_by_the_other_components_means():
     states = np.array([[0.0], [1.0], [1.5], [9.0], [7.0]])
     log_weights = np.array([0.0, 1.0, 0.5, 0.0, -np.inf])
     mixture = make_mixture(states, log_weights, [0, 0, 1, 2, 2], 4)
-    moved = Exclusion(3.0, 0.5, scale=2.0)(KEY, mixture, None)
+    moved = eqx.filter_jit(Exclusion(3.0, 0.5, scale=2.0))(KEY, mixture, None)
     means = np.array([0.5, 1.5, 9.0]) / 2
     bumps = np.exp(-((states / 2 - means[None]) ** 2) / (2 * 0.5**2))
     own = np.array([0, 0, 1, 2])
@@ -32,7 +33,7 @@ def test_each_particle_is_weighed_down_by_the_other_components_means():
 
 def test_one_component_alone_is_left_as_it_is():
     mixture = make_mixture(np.zeros((3, 1)), np.zeros(3), [2, 2, 2], 4)
-    moved = Exclusion()(KEY, mixture, None)
+    moved = eqx.filter_jit(Exclusion())(KEY, mixture, None)
     np.testing.assert_array_equal(moved.log_weights, mixture.log_weights)
 
 

@@ -1,5 +1,6 @@
 """Gaussian regeneration redraws each component with its own moments, and keeps its mass."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,7 +55,7 @@ def test_draws_have_the_moments_of_their_component(noise):
 
 def test_every_component_keeps_its_mass_and_the_slots_are_dealt_equally():
     mixture = a_mixture()
-    after = GaussianRegeneration()(jax.random.key(0), mixture)
+    after = eqx.filter_jit(GaussianRegeneration())(jax.random.key(0), mixture)
     np.testing.assert_allclose(after.mixture_weights, mixture.mixture_weights, rtol=1e-5)
     np.testing.assert_array_equal(after.component_counts, [10, 10, 10, 0])
     labels = np.asarray(mixture.component_indicators)[np.asarray(after.ancestor_indices)]
@@ -62,14 +63,16 @@ def test_every_component_keeps_its_mass_and_the_slots_are_dealt_equally():
 
 
 def test_a_fixed_number_leaves_the_other_slots_empty():
-    after = GaussianRegeneration(particles_per_component=4)(jax.random.key(0), a_mixture())
+    after = eqx.filter_jit(GaussianRegeneration(particles_per_component=4))(
+        jax.random.key(0), a_mixture()
+    )
     np.testing.assert_array_equal(after.component_counts, [4, 4, 4, 0])
     assert np.isfinite(after.particles).all()
 
 
 def test_a_component_of_one_particle_stays_where_it_is():
     mixture = a_mixture()
-    after = GaussianRegeneration()(jax.random.key(3), mixture)
+    after = eqx.filter_jit(GaussianRegeneration())(jax.random.key(3), mixture)
     alone = np.asarray(after.particles)[np.asarray(after.component_indicators) == 1]
     np.testing.assert_array_equal(alone, np.broadcast_to(mixture.particles[5], alone.shape))
 
@@ -120,7 +123,7 @@ def test_box_states_of_second_order_keep_the_spread_of_every_coordinate():
 @pytest.mark.thorough
 def test_identical_boxes_and_a_box_of_all_the_weight_are_drawn_again():
     mixture = box_states(np.array([5.0, 5, 0.02, 0.02]))
-    after = GaussianRegeneration(10, where=motion)(jax.random.key(0), mixture)
+    after = eqx.filter_jit(GaussianRegeneration(10, where=motion))(jax.random.key(0), mixture)
     np.testing.assert_array_equal(after.component_counts, [10, 10, 10, 0])
     np.testing.assert_array_equal(after.particles.reference, after.component_indicators)
     for labels, kept in ((1, 10), (2, 20)):

@@ -1,5 +1,6 @@
 """Families of draws; that they are unbiased in every chain is in `tests/test_chains.py`."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -80,7 +81,7 @@ def test_the_evidence_varies_less_than_with_one_draw():
 def test_one_draw_of_a_family_weighs_what_a_plain_draw_weighs():
     move = PropagateNested(Propagate(MODEL, GaussNewtonProposal(MODEL)), 1)
     mixture = make_mixture(np.linspace(-1, 1, 8), np.arange(8) / 8, np.arange(8) % 2, 2)
-    moved = move(jax.random.key(0), mixture, SEEN[0])
+    moved = eqx.filter_jit(move)(jax.random.key(0), mixture, SEEN[0])
     assert moved.particles.shape == (8,)
     assert float(moved.log_mass) < np.inf
     assert np.isfinite(np.asarray(moved.log_weights)).all()
@@ -91,10 +92,10 @@ def test_an_empty_slot_and_a_hopeless_family_stay_without_weight():
     move = PropagateNested(Propagate(Marked(likelihoods)), 3)
     mixture = make_mixture(np.zeros(4), [0.0, -np.inf, 0.0, 0.0], [0, 0, 1, 1], 2)
     marked = mixture.replace(particles=jnp.zeros(4, jnp.int32))
-    moved = move(jax.random.key(0), marked, jnp.float32(0))
+    moved = eqx.filter_jit(move)(jax.random.key(0), marked, jnp.float32(0))
     assert (np.asarray(moved.log_weights) == -np.inf).all()
     move = PropagateNested(Propagate(MODEL), 3)
-    moved = move(jax.random.key(0), mixture, SEEN[0])
+    moved = eqx.filter_jit(move)(jax.random.key(0), mixture, SEEN[0])
     assert list(np.asarray(moved.occupied)) == [True, False, True, True]
 
 

@@ -1,5 +1,6 @@
 """Exclusion between objects, and pruning of hopeless hypotheses within one."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +33,7 @@ def mixture_of(rows, num_components=4):
 def test_exclusion_by_hand():
     mixture = mixture_of(ROWS)
     move = ObjectExclusion(strength=2.0, radius=0.5, scale=(10.0, 5.0))
-    moved = move(jax.random.key(0), mixture, None)
+    moved = eqx.filter_jit(move)(jax.random.key(0), mixture, None)
     penalty = np.asarray(mixture.log_weights - moved.log_weights)
     # Object 0 stands at 1 with 4/5 of its mass and at 50 with 1/5; object 1 at 5, all of it.
     near = lambda a, b: np.exp(-(((a - b) / 10) ** 2) / (2 * 0.5**2))  # noqa: E731
@@ -43,7 +44,7 @@ def test_exclusion_by_hand():
 
 def test_hypotheses_of_one_object_do_not_exclude_each_other():
     mixture = mixture_of([(0, 0, 0.0, 0.5), (1, 0, 0.5, 0.5)])
-    moved = ObjectExclusion()(jax.random.key(0), mixture, None)
+    moved = eqx.filter_jit(ObjectExclusion())(jax.random.key(0), mixture, None)
     np.testing.assert_array_equal(np.asarray(moved.log_weights), np.asarray(mixture.log_weights))
 
 
