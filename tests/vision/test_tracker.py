@@ -20,6 +20,7 @@ from mpfjax.vision.tracking.observation import TrackedFrame
 from mpfjax.vision.tracking.occlusion import ShareDetections
 from mpfjax.vision.tracking.scores import RankScores
 from mpfjax.vision.tracking.tracker import object_model
+from tests.marking import thorough
 
 HEIGHT, WIDTH, ROOM = 48, 64, 6
 M, P = 4, 24
@@ -148,7 +149,7 @@ def test_who_is_found_first_but_later_is_a_newcomer():
     assert [believed(each) for each in tracks] == [[], [], [], [1]]
 
 
-@pytest.mark.parametrize("resampling", ["gaussian", "resample"])
+@pytest.mark.parametrize("resampling", ["gaussian", *thorough(["resample"])])
 def test_components_are_born_confirmed_and_keep_their_identities(resampling):
     """Two walk from the first frame on, a third comes later; every mean box stays on its own."""
     chosen = TRACKER if resampling == "gaussian" else RESAMPLING
@@ -242,7 +243,7 @@ def test_a_first_frame_full_of_people_is_a_full_house():
         assert len(living(tracks)) == M
 
 
-@pytest.mark.parametrize("resampling", ["gaussian", "resample"])
+@pytest.mark.parametrize("resampling", ["gaussian", *thorough(["resample"])])
 def test_nothing_leaks_over_many_random_frames(resampling):
     """Detections that come, go, jump, overlap, and lie outside; every frame is checked."""
     rng = np.random.default_rng(1)
