@@ -2,6 +2,7 @@
 
 import itertools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +21,10 @@ from mpfjax.operations.sobol import (
 from mpfjax.operations.sorting import order_by_key, sortable_bits
 from tests.marking import thorough
 
+# As one program each: to compile operations one by one takes longer.
+hilbert_index, rqmc_normal, order_by_key, sortable_bits = map(
+    eqx.filter_jit, (hilbert_index, rqmc_normal, order_by_key, sortable_bits)
+)
 FLOAT = np.dtype("float32")
 KEYS = jax.random.split(jax.random.key(7), 4000)
 
