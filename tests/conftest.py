@@ -79,7 +79,7 @@ def as_installed():
 
 
 # Every compiled program keeps memory maps, and thousands of them in one process reach the kernel's
-# limit, 65 530 on Linux, at which the compiler crashes. So many programs also take about 2 GB.
+# limit, 65 530 on Linux, at which the compiler crashes. A process with so many takes 3 GB.
 MANY_MAPS = 6_000
 
 
