@@ -61,7 +61,8 @@ class Tracks(NamedTuple):
     - `confirmed`: (m,), whether it has had enough detections to be taken for an object.
     - `unseen`: (m,), frames since its last detection; 0 while it is hidden by another one.
     - `full`: whether a detection that would have started a component found no room.
-    - `shown`: (m,), which are confirmed, and were detected a moment ago or are hidden.
+    - `shown`: (m,), which are confirmed, were detected a moment ago or are hidden, and are not more
+      probably doubles of another one.
     - `detections`: (m,), the row of the detection assigned to each in this frame, in what the
       detector gave; -1 for none. Use it to look up class labels, masks and features.
     """
