@@ -424,6 +424,8 @@ def test_an_option_is_left_to_a_flag_that_sets_it(monkeypatch, optimised):
     sums = sums if jax.__version_info__ >= (0, 10) else {}
     assert cpu_options() == {"xla_cpu_prefer_vector_width": 512} | sums
     assert cpu_options(soon=True) == cpu_options() | {"xla_backend_optimization_level": 1}
+    passes = {"xla_disable_hlo_passes": ",".join([*sums.values(), "cpu-parallel-task-assigner"])}
+    assert cpu_options(one_thread=True) == cpu_options() | passes
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=128")
     assert cpu_options() == sums
     monkeypatch.setenv("XLA_FLAGS", "--xla_disable_hlo_passes=dce")

@@ -15,10 +15,10 @@ def test_threads_that_come_first_share_one_program(monkeypatch):
     for it."""
     options, made = compiling.cpu_options, []
 
-    def slowly():
+    def slowly(**settings):
         made.append(threading.get_ident())
         time.sleep(0.2)  # the others come meanwhile
-        return options()
+        return options(**settings)
 
     monkeypatch.setattr(compiling, "cpu_options", slowly)
     compiled = compiling.jit_on_wide_vectors(lambda values: 3 * values)

@@ -20,6 +20,7 @@ from mpfjax.operations.floats import default_float
 _VECTOR_WIDTH = "xla_cpu_prefer_vector_width"
 _WITHOUT_PASSES = "xla_disable_hlo_passes"
 _TREE_SUMS = "tree_reduction_rewriter"
+_THREADS_OF_ITS_OWN = "cpu-parallel-task-assigner"
 # Since this version XLA sums on vectors, and long rows by a library, in any order.
 _SUMS_ON_VECTORS = (0, 10)
 _OPTIMISATION = "xla_backend_optimization_level"
@@ -27,18 +28,23 @@ _FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
 _settings: Any = jax.config  # whose attributes no type checker knows
 
 
-def cpu_options(soon: bool = False) -> dict[str, int | str]:
+def cpu_options(soon: bool = False, one_thread: bool = False) -> dict[str, int | str]:
     """The compiler's options on a CPU: vectors of 512 bits, and sums in one piece.
 
     XLA's default is vectors of 256 bits; a machine without wider ones uses its widest. By default
     XLA also cuts each sum and maximum into pieces of 32, in up to two kernels more, which take
     longer than the whole. Where JAX is set to optimise little, they stay, since sums are then not
-    on vectors. Where a program is to be compiled `soon`, LLVM optimises less. An option that
-    XLA_FLAGS sets is left out, and there are none on other platforms.
+    on vectors. Where a program is to be compiled `soon`, LLVM optimises less. Where each processor
+    runs a program of its own, none is to be divided among threads (`one_thread`): its parts would
+    only wait for each other. An option that XLA_FLAGS sets is left out, and there are none on other
+    platforms.
     """
     if jax.default_backend() != "cpu":
         return {}
     options = {_VECTOR_WIDTH: 512} | _sums_in_one() | _little_optimised(soon)
+    if one_thread:
+        without = [options.get(_WITHOUT_PASSES), _THREADS_OF_ITS_OWN]
+        options[_WITHOUT_PASSES] = ",".join(filter(None, without))
     flags = os.environ.get("XLA_FLAGS", "")
     return {name: value for name, value in options.items() if name not in flags}
 
@@ -56,7 +62,9 @@ def _little_optimised(soon: bool) -> dict[str, int | str]:
     return {}
 
 
-def jit_on_wide_vectors(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+def jit_on_wide_vectors(
+    function: Callable[..., PyTree], one_thread: bool = False
+) -> Callable[..., PyTree]:
     """`equinox.filter_jit` with `cpu_options`, with which random draws take half the time.
 
     Such options are for a whole program. Within a transformation of the caller, they must be given
@@ -70,7 +78,7 @@ def jit_on_wide_vectors(function: Callable[..., PyTree]) -> Callable[..., PyTree
     def wide() -> Callable[..., PyTree]:
         # Asking JAX for the platform before the first call would keep processes from joining.
         with_options: Any = eqx.filter_jit
-        return with_options(function, compiler_options=cpu_options())
+        return with_options(function, compiler_options=cpu_options(one_thread=one_thread))
 
     @functools.wraps(function)
     def run(*arguments: Any, **named: Any) -> PyTree:

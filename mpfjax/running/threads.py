@@ -49,7 +49,7 @@ def over_threads(
     return _end_to_end(blocks, num_inputs)
 
 
-@jit_on_wide_vectors
+@partial(jit_on_wide_vectors, one_thread=True)
 def _run_block(run, first, size, inputs, arguments):
     index = jnp.minimum(first + np.arange(size), length_of(inputs) - 1)
     return run(jax.tree.map(lambda leaf: leaf[index], inputs), *arguments)
