@@ -79,8 +79,8 @@ def as_installed():
 
 
 # Every compiled program keeps memory maps, and thousands of them in one process reach the kernel's
-# limit, 65 530 on Linux, at which the compiler crashes. A process with so many takes 3 GB.
-MANY_MAPS = 6_000
+# limit, 65 530 on Linux, at which the compiler crashes. A process with so many takes some 2 GB.
+MANY_MAPS = 3_000
 
 
 def num_maps() -> float:
