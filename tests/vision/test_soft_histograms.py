@@ -12,6 +12,7 @@ from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
 from mpfjax.vision.boxes.soft_histograms import SoftColourModel, soft_histograms
 from mpfjax.vision.colour.bins import RGBColours
 from mpfjax.vision.colour.histograms import integral_histogram
+from tests.precision import float64
 
 HEIGHT, WIDTH = 40, 60
 BOXES = np.array([[10.0, 8, 12, 16], [35, 12, 12, 20]])
@@ -73,7 +74,7 @@ def test_derivatives_in_box_image_and_bandwidth_are_those_of_differences(frame):
     def readout(boxes, image, bandwidth):
         return jnp.sum(weights * soft_histograms(image, boxes, 8, bandwidth, 4, 2))
 
-    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+    with float64(), jax.numpy_dtype_promotion("standard"):
         arguments = (jnp.array([[20.23, 17.31, 14.1, 18.3]]), image, jnp.array(0.83))
         arguments = tuple(argument.astype(float) for argument in arguments)
         check_grads(readout, arguments, order=1, modes=["rev"], eps=1e-5, rtol=1e-3)
@@ -93,7 +94,7 @@ def test_the_models_derivatives_are_those_of_differences(frame):
         moved = BoxState(box, state.reference)
         return jnp.sum(changed.log_likelihood(jnp.asarray(frame), moved))
 
-    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+    with float64(), jax.numpy_dtype_promotion("standard"):
         model = jax.tree.map(lambda leaf: leaf.astype(float), model)
         arguments = (
             model.reference_logits + 0.3 * jax.random.normal(jax.random.key(1), (2, 2, 3, 8)),
