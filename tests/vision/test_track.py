@@ -337,8 +337,8 @@ def test_rows_online_are_of_what_was_known_then_and_offline_of_what_is_known_at_
     nobody = [False, False, False]
     kept = [
         said([2, 1, 0], nobody, nobody),
-        said([2, 1, 0], [False, True, False], [False, True, False]),
-        said([0, 1, 3], [False, True, False], nobody),
+        said([2, 1, 3], [False, True, False], [False, True, False]),
+        said([0, 1, 3], [False, True, True], nobody),  # 3 is believed, but for a double
     ]
     online = np.concatenate([online_rows(i, tracks) for i, tracks in enumerate(kept, 5)])
     assert online.tolist() == [[6, 1, 8, 16, 4, 8]]
