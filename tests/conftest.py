@@ -79,7 +79,7 @@ def as_installed():
 
 
 # Every compiled program keeps memory maps, and thousands of them in one process reach the kernel's
-# limit, 65 530 on Linux, at which the compiler crashes. A process with so many takes some 2 GB.
+# limit, 65 530 on Linux, at which the compiler crashes. A process with so many takes up to 2.5 GB.
 MANY_MAPS = 3_000
 
 

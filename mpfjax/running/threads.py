@@ -29,18 +29,21 @@ def over_threads(
     It is for programs of many short operations, which a CPU device runs mostly one after the other.
     The blocks have equal size: the last input is repeated to fill the last block, and the extra
     results are dropped. This thread takes the first block. It takes all of them if other threads
-    would not have its settings of JAX, or a transformation of the caller.
+    would not have its settings of JAX, or a transformation of the caller. The operations of a block
+    use one thread if there is a block for each processor, and otherwise all.
     """
     num_inputs = length_of(inputs)
     size = -(-num_inputs // num_threads)
+    starts = range(0, num_inputs, size)
+    program = _run_block_on_one if len(starts) >= num_processors() else _run_block
     seen = _seen_by_thread()
 
     def run_block(first: int) -> PyTree:
         if _seen_by_thread() == seen:
-            block = _run_block(run, np.asarray(first), size, inputs, arguments)
+            block = program(run, np.asarray(first), size, inputs, arguments)
             return jax.block_until_ready(block)
 
-    first, *others = range(0, num_inputs, size)
+    first, *others = starts
     started = [_threads().submit(run_block, other) for other in others]
     blocks = [run_block(first)]
     for other, thread in zip(others, started, strict=True):
@@ -49,10 +52,13 @@ def over_threads(
     return _end_to_end(blocks, num_inputs)
 
 
-@partial(jit_on_wide_vectors, one_thread=True)
-def _run_block(run, first, size, inputs, arguments):
+def _block_of_runs(run, first, size, inputs, arguments):
     index = jnp.minimum(first + np.arange(size), length_of(inputs) - 1)
     return run(jax.tree.map(lambda leaf: leaf[index], inputs), *arguments)
+
+
+_run_block = jit_on_wide_vectors(_block_of_runs)
+_run_block_on_one = jit_on_wide_vectors(_block_of_runs, one_thread=True)
 
 
 def num_processors() -> int:

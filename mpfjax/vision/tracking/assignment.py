@@ -49,7 +49,8 @@ class Assign(AbstractMove):
     `gate`, so that no pair with a higher cost is formed: its detection more probably belongs to a
     new object. Because of log |S_m| this happens more often to components that have been unseen for
     long. For a component that is more probably a double (`LearnDoubles`), gate - cost is divided by
-    a hundred, so that it takes a detection only from what the others leave.
+    a hundred: it takes a detection only from what the others leave, adds little to their doubts,
+    and follows its own detection by half.
 
     The probability of a pair under the joint distribution of all assignments, p ∝ Π exp((gate -
     cost) / 2T) over the pairs of an assignment, is computed by `marginals`. A `temperature` T above
@@ -158,8 +159,7 @@ class Assign(AbstractMove):
         possible = lives.alive[:, None] & counts[None] & (cost < self.gate)
         if DOUBLES in mixture.memory:
             yielding = mixture.memory[DOUBLES].doubtful[:, None]
-            gains = jnp.where(yielding, _YIELDING, 1.0) * (self.gate - cost)
-            cost = self.gate - gains
+            cost = jnp.where(yielding, self.gate - _YIELDING * (self.gate - cost), cost)
         return jnp.where(possible, cost, _IMPOSSIBLE)
 
     def _distances(
