@@ -83,9 +83,13 @@ def fill_in(
 
 def write_figure(path: Path, figure: Any, dpi: int = 150) -> None:
     """Write a matplotlib figure as PNG, for pages, and beside it as PDF, for print."""
+    layout = figure.get_layout_engine()
     for kind in ("png", "pdf"):
         draw = partial(figure.savefig, format=kind, dpi=dpi)
         write_whole(path.with_suffix(f".{kind}"), draw)
+        # The second picture has the places of the first: finding them takes as long as drawing.
+        figure.set_layout_engine("none")
+    figure.set_layout_engine(layout)
 
 
 def write_json(path: Path, content: Any) -> None:

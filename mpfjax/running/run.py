@@ -134,8 +134,11 @@ def _in_slots(
     num_particles = filter.num_particles
     if slots < num_particles:
         raise ValueError(f"slots: {slots} is no whole number of at least N, {num_particles}")
-    # A model's draws may depend on N, as stratified draws do. So this is a separate program.
-    particles, pool = _sample_each(keys, filter, int(slots), num_steps)
+    # A model's draws may depend on N, as stratified draws do. So these are programs of their own;
+    # all filters of a model share the first one.
+    particles = _sample_each(keys, filter.model, filter.initial_noise, num_particles, int(slots))
+    several = filter.initial_draws > 1
+    pool = _sample_pools(keys, filter, int(slots), num_steps) if several else None
     limits = jnp.full(keys.shape, num_particles, jnp.int32)
     filter = Filter(
         filter.model, filter.moves, int(slots), filter.num_components, filter.initial_moves,
@@ -145,27 +148,35 @@ def _in_slots(
 
 
 @jit_on_wide_vectors
-def _sample_each(keys, filter, slots, num_steps):
-    """x_0 of each run, and the draws that it is chosen from; slots that stay empty hold one of its
-    states as well.
-    """
-    n = filter.num_particles
+def _sample_each(keys, model, noise, num_particles, slots):
+    """x_0 of each run, as `Filter.init` draws it."""
 
-    def filled(particles: PyTree, number: int, slots: int) -> PyTree:
-        index = np.minimum(np.arange(slots), number - 1)
-        return jax.tree.map(lambda leaf: leaf[index], particles)
-
-    def sample(key: Key[Array, ""]) -> tuple[PyTree, PyTree]:
-        key_initial, key_steps = split_keys(key, 2)
-        key_initial = split_keys(key_initial, 1)[0]
-        particles = sample_initial(key_initial, filter.model, n, filter.initial_noise)
-        pool, draws = None, filter.initial_draws
-        if draws > 1:
-            pool = filter.sample_pool(jax.random.split(key_steps, num_steps)[0])
-            pool = filled(pool, draws * n, draws * slots)
-        return filled(particles, n, slots), pool
+    def sample(key: Key[Array, ""]) -> PyTree:
+        key_initial = split_keys(split_keys(key, 2)[0], 1)[0]
+        return _filled(sample_initial(key_initial, model, num_particles, noise), slots)
 
     return jax.vmap(sample)(keys)
+
+
+@jit_on_wide_vectors
+def _sample_pools(keys, filter, slots, num_steps):
+    """The draws that x_0 of each run is chosen from."""
+
+    def sample(key: Key[Array, ""]) -> PyTree:
+        key_steps = split_keys(key, 2)[1]
+        pool = filter.sample_pool(jax.random.split(key_steps, num_steps)[0])
+        return _filled(pool, filter.initial_draws * slots)
+
+    return jax.vmap(sample)(keys)
+
+
+def _filled(particles: PyTree, slots: int) -> PyTree:
+    """The particles in so many slots; those that stay empty hold one of them as well."""
+
+    def fill(leaf: Array) -> Array:
+        return leaf[np.minimum(np.arange(slots), leaf.shape[0] - 1)]
+
+    return jax.tree.map(fill, particles)
 
 
 def _run_each(starts, filter, series, collect, bar=None):
