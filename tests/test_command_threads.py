@@ -5,8 +5,8 @@ import warnings
 
 import pytest
 
-from mpfjax.command import threads
-from mpfjax.command.threads import read_ahead, write_behind
+from mpfjax.vision.files import threads
+from mpfjax.vision.files.threads import read_ahead, write_behind
 
 
 @pytest.fixture(autouse=True)

@@ -1,6 +1,7 @@
 """One run of the command: read, detect, track and write, frame by frame."""
 
 import argparse
+import collections
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -19,14 +20,14 @@ from mpfjax.command.arguments import (
     read_boxes,
 )
 from mpfjax.command.scoring import SCORES, scores_of
-from mpfjax.command.threads import read_ahead, write_behind
 from mpfjax.console import Clock, format_table, peak_memory, write_json
 from mpfjax.vision.boxes.follow_boxes import follow_boxes
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import drawing, frames
+from mpfjax.vision.files.threads import read_ahead, write_behind
 from mpfjax.vision.tracking.adapters import LEAST_ROOM, Rows
 from mpfjax.vision.tracking.background import BackgroundSubtraction
-from mpfjax.vision.tracking.optical_flow import OpticalFlow
+from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv, opencv_on_one_thread
 from mpfjax.vision.tracking.track import make_tracker, offline_rows, online_rows, track
 from mpfjax.vision.tracking.tracker import Tracks
 
@@ -36,8 +37,8 @@ class Results:
 
     def __init__(self, options: argparse.Namespace, source: Source) -> None:
         self.options, self.source = options, source
-        # Reading and writing have their own threads: these are the seconds that the run waits.
-        self.clock = Clock("read", "detect", "track", "write")
+        # Seconds that the run waits, and those of the thread that is ahead of it.
+        self.clock, self.ahead = Clock("track", "write"), Clock("read", "detect")
         self.compiling = 0.0  # seconds of detecting and tracking in the first frame
         self.rows: list[np.ndarray] = []
         self.kept: list[Tracks] = []  # for --offline alone
@@ -58,7 +59,7 @@ class Results:
         return rows
 
     def _working(self) -> float:
-        return self.clock.seconds["detect"] + self.clock.seconds["track"]
+        return self.clock.seconds["track"]
 
     def all_rows(self) -> np.ndarray:
         """The rows of tracks.txt."""
@@ -68,14 +69,15 @@ class Results:
 
     def summary(self) -> dict[str, Any]:
         """The content of summary.json."""
-        rows, clock, n = self.all_rows(), self.clock, self.num_frames
+        rows, n = self.all_rows(), self.num_frames
+        seconds = self.ahead.seconds | self.clock.seconds
         # The first frame includes compiling, and is left out.
         rate = (n - 1) / (self._working() - self.compiling) if n > 1 else 1 / self.compiling
         summary = {
             "frames": n,
             "objects": len(np.unique(rows[:, 1])),
             "frames_without_room": self.without_room,
-            "seconds": {part: round(seconds, 3) for part, seconds in clock.seconds.items()},
+            "seconds": {part: round(taken, 3) for part, taken in seconds.items()},
             "frames_per_second": round(rate, 2),
             "peak_memory_mb": round(peak_memory(), 1),
         }
@@ -109,7 +111,7 @@ def _first_still(source: Source) -> np.ndarray:
 
 
 # What makes tracks of stills that are seen once, one after the other, or without any.
-Start = Callable[[Iterable[np.ndarray] | None, Clock], Iterator[Tracks]]
+Start = Callable[[Iterable[np.ndarray] | None], Iterator[Tracks]]
 
 
 def _start(results: Results, still: np.ndarray | None) -> Start:
@@ -118,7 +120,7 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
     key = jax.random.key(options.seed)
     if options.box is not None and still is not None:
         boxes = results.drawn = read_boxes(options, still)
-        return lambda stills, clock: follow_boxes(stills or (), boxes, key=key)
+        return lambda stills: follow_boxes(stills or (), boxes, key=key)
     rows = None if source.rows is None else Rows(source.rows, source.first, source.last)
     room = LEAST_ROOM if rows is None else rows.most_objects()
     tracker = make_tracker(
@@ -128,10 +130,10 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
     if options.camera_motion == "pixels":
         OpticalFlow()  # an error before anything is written, where OpenCV is missing
 
-    def tracks(stills: Iterable[np.ndarray] | None, clock: Clock) -> Iterator[Tracks]:
+    def tracks(stills: Iterable[np.ndarray] | None) -> Iterator[Tracks]:
         return track(
             stills,
-            rows if detector is None else _timed(detector.detect, clock),
+            rows if detector is None else _timed(detector.detect, results.ahead),
             tracker,
             key=key,
             first=source.first,
@@ -139,6 +141,7 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
             use_colours=not options.no_colour,
             frame_size=source.frame_size,
             camera_motion="detections" if options.detect else options.camera_motion,
+            ahead=source.has_pixels,
         )
 
     return tracks
@@ -155,11 +158,11 @@ def _timed(detect: Callable[[Any], Any], clock: Clock) -> Callable[[Any], Any]:
 def _track(results: Results, start: Start) -> None:
     """The loop over frames."""
     options, source, clock = results.options, results.source, results.clock
-    shown: list[np.ndarray] = []  # the frame that is being tracked in, for the picture
+    unwritten: collections.deque[np.ndarray] = collections.deque()  # frames without tracks as yet
 
     def watched(stills: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
-        for still in clock.over("read", stills):
-            shown[:] = [still]
+        for still in results.ahead.over("read", stills):
+            unwritten.append(still)
             yield still
 
     bar = tqdm(total=source.num_frames, desc="Tracking", unit="frame", disable=None)
@@ -170,7 +173,13 @@ def _track(results: Results, start: Start) -> None:
         if source.has_pixels:
             read = frames.read_frames(source.path, source.first, source.last)
             stills = watched(opened.enter_context(read_ahead(read)))
-        for tracks in clock.over("track", start(stills, clock)):
+            # Detecting may be slow, and is best divided among processors.
+            if not (options.detect or options.box or options.no_colour) and has_opencv():
+                opened.enter_context(opencv_on_one_thread())
+        # Closed before the thread that reads ends: it may wait for a frame.
+        tracked = opened.enter_context(_closed_at_the_end(start(stills)))
+        for tracks in clock.over("track", tracked):
+            still = unwritten.popleft() if source.has_pixels else None
             rows = results.add(tracks)
             with clock.of("write"):
                 if file is None:
@@ -181,8 +190,18 @@ def _track(results: Results, start: Start) -> None:
                 file.write(box_files.format_tracks(rows))
                 file.flush()
                 if draw is not None:
-                    draw(shown[0], rows)
+                    draw(still, rows)
             bar.update()
+
+
+@contextlib.contextmanager
+def _closed_at_the_end(tracked: Iterator[Tracks]) -> Iterator[Iterator[Tracks]]:
+    """The tracks; leaving the block ends whatever makes them."""
+    try:
+        yield tracked
+    finally:
+        close: Callable[[], None] = getattr(tracked, "close", lambda: None)
+        close()
 
 
 @contextlib.contextmanager

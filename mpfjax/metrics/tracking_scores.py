@@ -107,6 +107,8 @@ def remove_ignored(
     for kind in np.setdiff1d(ignored[:, 1], (IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT)):
         raise ValueError(f"ignored: {kind:g} is none of the kinds 1, 2 and 3")
     check_not_negative(min_height=min_height)
+    if len(ignored) == 0 and min_height == 0:
+        return tracks
     regions = ignored[:, 1] == IGNORED_REGION
     labelled = np.concatenate([np.insert(truth[:, [0, *range(2, 6)]], 1, 0, 1), ignored[~regions]])
     kept = np.ones(len(tracks), bool)

@@ -15,6 +15,7 @@ import io
 import os
 import pickle
 import platform
+import re
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -140,6 +141,8 @@ class _Program:
             return arrays
 
         with_options: Any = jax.jit
+        # JAX's own cache would find the operations of a program of other source, too.
+        on_arrays.__name__ = re.sub(r"\W", "_", path.name)
         with _hits() as hits:
             bare = map(_bare, self.fixed + self.moving)
             lowered = with_options(on_arrays, compiler_options=options).lower(*bare)

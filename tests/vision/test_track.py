@@ -1,6 +1,7 @@
 """The loop over frames: any detector, with pixels and without, and what may go wrong on the way."""
 
 import itertools
+import threading
 
 import equinox as eqx
 import jax
@@ -112,6 +113,35 @@ def test_the_key_decides_and_nothing_else(without_pixels):
     assert_same(tracked(None, walks(), key=jax.random.key(0)), without_pixels)
     other = tracked(None, walks(), key=jax.random.key(1))
     assert not np.array_equal(other[-1].boxes, without_pixels[-1].boxes)
+
+
+def test_tracks_are_the_same_where_frames_are_looked_at_ahead(with_pixels):
+    found = tracked(stills(), detector_of(walks()), ahead=True)
+    assert_same(found, with_pixels)
+
+
+def test_frames_ahead_end_with_the_tracks_and_errors_come_in_their_place():
+    read = []
+
+    def camera():
+        for number, still in enumerate(stills(), 1):
+            read.append(number)
+            yield still
+            if number == 6:
+                raise OSError("unplugged")
+
+    before = threading.active_count()
+    tracks = track(camera(), walks(), TRACKER, ahead=True)
+    next(tracks)
+    tracks.close()
+    assert threading.active_count() == before
+    assert 1 <= len(read) <= 6
+    tracks = track(camera(), walks(), TRACKER, ahead=True)
+    for _ in range(6):
+        next(tracks)
+    with pytest.raises(OSError, match="unplugged"):
+        next(tracks)
+    assert threading.active_count() == before
 
 
 def test_a_camera_is_read_one_frame_at_a_time():

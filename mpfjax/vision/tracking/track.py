@@ -1,7 +1,8 @@
 """The loop over frames: from video and detections, or detections alone, to tracks."""
 
+import contextlib
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -13,6 +14,7 @@ from mpfjax.operations.compiling import in_little_memory
 from mpfjax.operations.kept_programs import kept_program
 from mpfjax.vision.files.boxes import top_left
 from mpfjax.vision.files.frames import of_one_kind
+from mpfjax.vision.files.threads import read_ahead
 from mpfjax.vision.tracking.adapters import (
     LEAST_ROOM,
     AbstractDetector,
@@ -43,6 +45,7 @@ def track(
     use_colours: bool = True,
     frame_size: tuple[int, int] | None = None,
     camera_motion: str | None = None,
+    ahead: bool = False,
 ) -> Iterator[Tracks]:
     """Track what a detector finds in a video: yields the `Tracks` of each frame as it comes.
 
@@ -70,6 +73,8 @@ def track(
     - `camera_motion`: "pixels" finds the motion of the camera by `OpticalFlow`, and what this
       leaves from the detections; "detections" has them alone. None takes "pixels" where the tracker
       sees pixels and OpenCV is installed.
+    - `ahead`: read, detect and look at pixels in a thread of its own, up to four frames ahead of
+      the tracks. Use it for recordings, which then take less time; a camera's tracks would be late.
 
     The tracks of each frame are NumPy arrays. Boxes without area or outside the frame are left out
     with a warning, as are detections in frames after the last. Another warning is given where there
@@ -80,7 +85,7 @@ def track(
     """
     if frames is not None:
         check_type(Iterable, "frames one after the other, or None", frames=frames)
-    check_flag(use_colours=use_colours)
+    check_flag(use_colours=use_colours, ahead=ahead)
     check_whole(first=first, **given(max_detections=max_detections))
     if frame_size is not None:
         height, width = frame_size
@@ -96,7 +101,9 @@ def track(
     room = 2 * tracker.max_objects if max_detections is None else max_detections
     stills = None if frames is None else of_one_kind(frames, first)
     flow = _optical_flow(camera_motion, tracker, frames is not None, use_colours)
-    return _tracked(stills, detector, sieve, tracker, key, first, room, use_colours, flow)
+    observed = _observed(stills, detector, first)
+    seen = _seen(observed, sieve, tracker, room, use_colours, flow)
+    return _tracked(seen, tracker, key, ahead)
 
 
 def _optical_flow(
@@ -117,19 +124,27 @@ def _optical_flow(
     return OpticalFlow()
 
 
-def _tracked(
-    stills: Iterator[np.ndarray] | None,
-    detector: AbstractDetector,
+class _Seen(NamedTuple):
+    """All that a step takes of a frame, and the places of its detections in what was found."""
+
+    number: int
+    pixels: Any
+    observation: Detections
+    motion: CameraMotion | None
+    kept: np.ndarray
+
+
+def _seen(
+    observed: Iterator[tuple[int, np.ndarray | None, DetectedBoxes]],
     sieve: Sieve,
     tracker: ObjectTracker,
-    key: Key[Array, ""],
-    first: int,
     room: int,
     use_colours: bool,
     flow: OpticalFlow | None,
-) -> Iterator[Tracks]:
-    state, once, advance = tracker.init(), Once(), None
-    for number, still, found in _observed(stills, detector, first):
+) -> Iterator[_Seen]:
+    """What does not depend on earlier tracks, frame by frame."""
+    once = Once()
+    for number, still, found in observed:
         found, kept = sieve(found, number, still)
         if len(found.boxes) > room:
             once.warn(
@@ -140,21 +155,30 @@ def _tracked(
         observation = Detections.from_boxes(found.boxes, room, found.scores)
         pixels = tracker.look(still, observation) if use_colours and still is not None else None
         motion = None if flow is None or still is None else flow(still, found.boxes)
-        # An array: each new Python number would compile anew.
-        moving = (np.asarray(number), state, pixels, observation, motion)
-        if advance is None:
-            options = in_little_memory(soon=tracker.filter.num_particles <= _FEW_PARTICLES)
-            advance = kept_program(_advance, (tracker, key), moving, options)
-        state, tracks = advance(*moving)
-        tracks = jax.device_get(tracks)
-        if tracks.full:
-            once.warn(
-                "objects",
-                f"tracker: frame {number} has more objects than the {tracker.max_objects} that"
-                " there is room for, max_objects; the strongest are kept",
-            )
-        taken = tracks.detections
-        yield tracks._replace(detections=np.where(taken >= 0, np.append(kept, -1)[taken], -1))
+        yield _Seen(number, pixels, observation, motion, kept)
+
+
+def _tracked(
+    seen: Iterator[_Seen], tracker: ObjectTracker, key: Key[Array, ""], ahead: bool
+) -> Iterator[Tracks]:
+    state, once, advance = tracker.init(), Once(), None
+    with read_ahead(seen) if ahead else contextlib.nullcontext(seen) as coming:
+        for number, pixels, observation, motion, kept in coming:
+            # An array: each new Python number would compile anew.
+            moving = (np.asarray(number), state, pixels, observation, motion)
+            if advance is None:
+                options = in_little_memory(soon=tracker.filter.num_particles <= _FEW_PARTICLES)
+                advance = kept_program(_advance, (tracker, key), moving, options)
+            state, tracks = advance(*moving)
+            tracks = jax.device_get(tracks)
+            if tracks.full:
+                once.warn(
+                    "objects",
+                    f"tracker: frame {number} has more objects than the {tracker.max_objects} that"
+                    " there is room for, max_objects; the strongest are kept",
+                )
+            taken = tracks.detections
+            yield tracks._replace(detections=np.where(taken >= 0, np.append(kept, -1)[taken], -1))
 
 
 def _advance(
