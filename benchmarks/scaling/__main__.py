@@ -28,6 +28,7 @@ from benchmarks.scaling.cells import (
     QUICK,
     Cell,
     Sizes,
+    bytes_of,
     cells_of,
     compile_cells,
     entry_of,
@@ -95,7 +96,10 @@ def run(options: argparse.Namespace) -> None:
         cells = cells_of(axis, options.filters, sizes)
         compile_cells(cells, programs)
         measured = measure({cell: programs[cell] for cell in cells}, options.repeats)
-        entries = [entry_of(axis, cell, *found) for cell, found in measured.items()]
+        entries = [
+            entry_of(axis, cell, seconds, bytes_of(programs[cell]))
+            for cell, seconds in measured.items()
+        ]
         content["results"] += entries
         content["slopes"] += slopes_of(axis, entries)
         write_json(out / "scaling.json", content)

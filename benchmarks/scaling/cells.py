@@ -1,7 +1,7 @@
 """One filter at one size: how it is built, compiled and timed, and what its cost grows with."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -112,9 +112,9 @@ def compile_cells(cells: list[Cell], programs: dict[Cell, Any]) -> None:
         programs.update(zip(new, pool.map(compile_cell, new), strict=True))
 
 
-def measure(programs: Mapping[Cell, Any], repeats: int) -> dict[Cell, tuple[list[float], int]]:
-    """Seconds of each run of every cell, in turns, and the bytes that its program asks for."""
-    cells = list(programs)
+def measure(runs: Mapping[Cell, Callable[[Any], Any]], repeats: int) -> dict[Cell, list[float]]:
+    """Seconds of each run of every cell, in turns; `runs` take the keys of all seeds."""
+    cells = list(runs)
     keys = {
         cell: jax.block_until_ready(jax.random.split(jax.random.key(0), cell.seeds))
         for cell in cells
@@ -127,19 +127,25 @@ def measure(programs: Mapping[Cell, Any], repeats: int) -> dict[Cell, tuple[list
             if sum(elapsed[cell]) > SLOW_SECONDS and len(elapsed[cell]) >= FEWEST_REPEATS:
                 continue
             start = time.perf_counter()
-            jax.block_until_ready(programs[cell](keys[cell]))
+            jax.block_until_ready(runs[cell](keys[cell]))
             if repeat > 0:
                 elapsed[cell].append(time.perf_counter() - start)
-    return {cell: (elapsed[cell], bytes_of(programs[cell])) for cell in cells}
+    return elapsed
+
+
+def all_runs(cell: Cell) -> Callable[[Any], mpfjax.FilterRun]:
+    """A function from the keys of a cell's seeds to their runs, as a user would call it."""
+    filter, observations = build(cell)
+
+    def run_all(keys: Any) -> mpfjax.FilterRun:
+        return mpfjax.monte_carlo(keys, filter, observations, nothing)
+
+    return run_all
 
 
 def compile_cell(cell: Cell) -> Any:
-    """The program that runs a cell, from keys to results."""
-    filter, observations = build(cell)
-
-    def run_all(keys: jax.Array) -> mpfjax.FilterRun:
-        return mpfjax.monte_carlo(keys, filter, observations, nothing)
-
+    """The runs of a cell as one program, from keys to results."""
+    run_all = all_runs(cell)
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), cell.seeds))
     return jax.jit(run_all, compiler_options=cpu_options()).lower(keys).compile()
 

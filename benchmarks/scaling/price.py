@@ -9,8 +9,7 @@ import jax
 import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 
-import mpfjax
-from benchmarks.scaling.cells import Cell, build, compile_cells, fit_slope, measure, nothing
+from benchmarks.scaling.cells import Cell, all_runs, fit_slope, measure
 from mpfjax.console import format_table
 
 PRICED = {
@@ -39,7 +38,8 @@ QUICK_PRICE = PriceSizes([64], [2, 4], 2, 4, 64)
 def price(sizes: PriceSizes, repeats: int) -> list[dict[str, Any]]:
     """Each filter at each size, with the median ratio of its time to the plain filter's.
 
-    Ratios are of runs of one turn, so that what slows the machine slows both.
+    Timed are calls of `monte_carlo`, which divides the seeds among threads. Ratios are of runs of
+    one turn, so that what slows the machine slows both.
     """
     entries = []
     for n in sizes.particles:
@@ -47,9 +47,7 @@ def price(sizes: PriceSizes, repeats: int) -> list[dict[str, Any]]:
         mixtures = [
             Cell(name, n, m, sizes.seeds, sizes.steps) for name in PRICED for m in sizes.components
         ]
-        programs: dict[Cell, Any] = {}
-        compile_cells([plain, *mixtures], programs)
-        elapsed = {cell: seconds for cell, (seconds, _) in measure(programs, repeats).items()}
+        elapsed = measure({cell: all_runs(cell) for cell in [plain, *mixtures]}, repeats)
         for cell in mixtures:
             turns = zip(elapsed[cell], elapsed[plain], strict=False)
             ratio = float(np.median([own / of_plain for own, of_plain in turns]))
@@ -66,10 +64,10 @@ def first_calls(sizes: PriceSizes) -> list[dict[str, Any]]:
     with _nothing_kept():
         for cell in cells:
             jax.clear_caches()
-            filter, observations = build(cell)
+            run_all = all_runs(cell)
             keys = jax.random.split(jax.random.key(0), cell.seeds)
             start = time.perf_counter()
-            jax.block_until_ready(mpfjax.monte_carlo(keys, filter, observations, nothing))
+            jax.block_until_ready(run_all(keys))
             entries.append(cell._asdict() | {"first_call": time.perf_counter() - start})
     return entries
 
