@@ -7,6 +7,7 @@ import pytest
 
 from mpfjax import ParticleMixture, Resample
 from mpfjax.moves.conditional import REFERENCE, ConditionalResample
+from tests.marking import quick_of
 
 NUM_RUNS = 20_000
 # Two components, in turn, with an empty slot: the first is uneven, the second nearly even.
@@ -21,6 +22,13 @@ SCHEMES = {
     "multinomial, adaptive": Resample("multinomial", ess_threshold=0.8),
     "systematic, adaptive": Resample(ess_threshold=0.8),
 }
+# One of each way to place the offspring, to share the slots, and to choose who is due.
+QUICK_SCHEMES = (
+    "systematic",
+    "systematic, fixed number",
+    "multinomial",
+    "systematic, adaptive",
+)
 
 
 def mixture_around(slot):
@@ -35,7 +43,7 @@ def mixture_around(slot):
     )
 
 
-@pytest.fixture(scope="module", params=SCHEMES)
+@pytest.fixture(scope="module", params=quick_of(SCHEMES, QUICK_SCHEMES))
 def drawn(request):
     """Offspring of ordinary resampling, and around references drawn by their weights."""
     move = SCHEMES[request.param]
@@ -74,7 +82,9 @@ def test_references_by_weight_give_the_ordinary_law(drawn):
 
 
 @pytest.mark.parametrize(
-    "drawn", [name for name in SCHEMES if name.startswith("systematic")], indirect=True
+    "drawn",
+    quick_of([name for name in SCHEMES if name.startswith("systematic")], QUICK_SCHEMES),
+    indirect=True,
 )
 def test_systematic_offspring_are_the_expected_number_rounded(drawn):
     """Which a shift that had nothing to do with the reference would not give."""
