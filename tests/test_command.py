@@ -71,6 +71,14 @@ def test_all_that_is_promised_is_written(finished):
     assert summary["peak_memory_mb"] > 50
 
 
+def test_tracks_are_drawn_on_their_own_frames(sequence, finished):
+    """Frames are read ahead of the tracks; each has a noise of its own, by which it is known."""
+    stills = np.stack(list(read_frames(sequence))).astype(float)
+    for number, drawn in enumerate(read_frames(finished / "tracking.mp4")):
+        differences = np.abs(stills - drawn).mean(axis=(1, 2, 3))
+        assert differences.argmin() == number
+
+
 def test_the_summary_is_that_of_the_file(finished):
     rows, summary = read_tracks(finished / "tracks.txt"), summary_in(finished)
     scores = multi_object_scores(rows, two_walkers(NUM_FRAMES), (1, NUM_FRAMES))

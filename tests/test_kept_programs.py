@@ -11,12 +11,6 @@ from mpfjax.operations.kept_programs import kept_program
 from mpfjax.vision.tracking.track import track
 
 TRACED = []
-KEEPING_ALL = {
-    "jax_compilation_cache_dir": None,
-    "jax_persistent_cache_min_compile_time_secs": 0,
-    "jax_persistent_cache_min_entry_size_bytes": -1,
-    "jax_enable_compilation_cache": True,
-}
 
 
 def noisy_sum(fixed, key, values):
@@ -118,11 +112,16 @@ def test_a_program_of_other_source_is_kept_though_jax_has_found_its_operations(
     folder, monkeypatch, tmp_path_factory
 ):
     """After an upgrade of the library that leaves a program as it is."""
-    before = {name: jax.config.values[name] for name in KEEPING_ALL}
+    of_jax = {
+        "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("jax")),
+        "jax_persistent_cache_min_compile_time_secs": 0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+        "jax_enable_compilation_cache": True,
+    }
+    before = {name: jax.config.values[name] for name in of_jax}
     try:
-        for name, value in KEEPING_ALL.items():
+        for name, value in of_jax.items():
             jax.config.update(name, value)
-        jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("jax")))
         compilation_cache.reset_cache()
         run()
         monkeypatch.setattr(kept_programs, "_versions", lambda: b"another")

@@ -3,7 +3,7 @@
 import argparse
 import collections
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ class Results:
         self.options, self.source = options, source
         # Seconds that the run waits, and those of the thread that is ahead of it.
         self.clock, self.ahead = Clock("track", "write"), Clock("read", "detect")
-        self.compiling = 0.0  # seconds of detecting and tracking in the first frame
+        self.compiling = 0.0  # seconds until the first tracks
         self.rows: list[np.ndarray] = []
         self.kept: list[Tracks] = []  # for --offline alone
         self.num_frames = 0
@@ -55,11 +55,8 @@ class Results:
         self.num_frames += 1
         self.without_room += bool(tracks.full)
         if self.num_frames == 1:
-            self.compiling = self._working()
+            self.compiling = self.clock.seconds["track"]
         return rows
-
-    def _working(self) -> float:
-        return self.clock.seconds["track"]
 
     def all_rows(self) -> np.ndarray:
         """The rows of tracks.txt."""
@@ -72,7 +69,8 @@ class Results:
         rows, n = self.all_rows(), self.num_frames
         seconds = self.ahead.seconds | self.clock.seconds
         # The first frame includes compiling, and is left out.
-        rate = (n - 1) / (self._working() - self.compiling) if n > 1 else 1 / self.compiling
+        after = self.clock.seconds["track"] - self.compiling
+        rate = (n - 1) / after if n > 1 else 1 / self.compiling
         summary = {
             "frames": n,
             "objects": len(np.unique(rows[:, 1])),
@@ -111,7 +109,7 @@ def _first_still(source: Source) -> np.ndarray:
 
 
 # What makes tracks of stills that are seen once, one after the other, or without any.
-Start = Callable[[Iterable[np.ndarray] | None], Iterator[Tracks]]
+Start = Callable[[Iterable[np.ndarray] | None], Generator[Tracks, None, None]]
 
 
 def _start(results: Results, still: np.ndarray | None) -> Start:
@@ -130,7 +128,7 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
     if options.camera_motion == "pixels":
         OpticalFlow()  # an error before anything is written, where OpenCV is missing
 
-    def tracks(stills: Iterable[np.ndarray] | None) -> Iterator[Tracks]:
+    def tracks(stills: Iterable[np.ndarray] | None) -> Generator[Tracks, None, None]:
         return track(
             stills,
             rows if detector is None else _timed(detector.detect, results.ahead),
@@ -177,7 +175,7 @@ def _track(results: Results, start: Start) -> None:
             if not (options.detect or options.box or options.no_colour) and has_opencv():
                 opened.enter_context(opencv_on_one_thread())
         # Closed before the thread that reads ends: it may wait for a frame.
-        tracked = opened.enter_context(_closed_at_the_end(start(stills)))
+        tracked = opened.enter_context(contextlib.closing(start(stills)))
         for tracks in clock.over("track", tracked):
             still = unwritten.popleft() if source.has_pixels else None
             rows = results.add(tracks)
@@ -192,16 +190,6 @@ def _track(results: Results, start: Start) -> None:
                 if draw is not None:
                     draw(still, rows)
             bar.update()
-
-
-@contextlib.contextmanager
-def _closed_at_the_end(tracked: Iterator[Tracks]) -> Iterator[Iterator[Tracks]]:
-    """The tracks; leaving the block ends whatever makes them."""
-    try:
-        yield tracked
-    finally:
-        close: Callable[[], None] = getattr(tracked, "close", lambda: None)
-        close()
 
 
 @contextlib.contextmanager

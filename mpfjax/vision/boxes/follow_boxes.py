@@ -1,7 +1,7 @@
 """The loop over frames for boxes drawn in the first frame: one track for each box, in order."""
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from typing import Any
 
 import jax
@@ -29,7 +29,7 @@ def follow_boxes(
     boxes: Float[np.ndarray, "k 4"],
     *,
     key: Key[Array, ""] | None = None,
-) -> Iterator[Tracks]:
+) -> Generator[Tracks, None, None]:
     """Follow boxes (x, y, w, h) of the first frame by their colours: yields `Tracks`, k rows each.
 
     Row j has the identity j + 1. It is the most probable place of box j under the recipe "objects"
@@ -53,7 +53,9 @@ def follow_boxes(
     return _followed(of_one_kind(frames), boxes, key)
 
 
-def _followed(stills: Iterator[np.ndarray], boxes: np.ndarray, key: Array) -> Iterator[Tracks]:
+def _followed(
+    stills: Iterator[np.ndarray], boxes: np.ndarray, key: Array
+) -> Generator[Tracks, None, None]:
     first = next(stills, None)
     if first is None:
         return

@@ -127,6 +127,7 @@ def opencv_on_one_thread() -> Iterator[None]:
 
     By default it divides each operation among all processors. With pictures as small as those of
     `OpticalFlow`, two threads take nearly twice the processor's time, and none less by the clock.
+    Use it around a loop over frames, where nothing else needs OpenCV's threads.
     """
     cv2: Any = _cv2()
     before = cv2.getNumThreads()

@@ -1,7 +1,7 @@
 """The loop over frames: from video and detections, or detections alone, to tracks."""
 
 import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -46,7 +46,7 @@ def track(
     frame_size: tuple[int, int] | None = None,
     camera_motion: str | None = None,
     ahead: bool = False,
-) -> Iterator[Tracks]:
+) -> Generator[Tracks, None, None]:
     """Track what a detector finds in a video: yields the `Tracks` of each frame as it comes.
 
     The tracks of a frame depend on this frame and earlier ones only. Any detector will do:
@@ -74,7 +74,8 @@ def track(
       leaves from the detections; "detections" has them alone. None takes "pixels" where the tracker
       sees pixels and OpenCV is installed.
     - `ahead`: read, detect and look at pixels in a thread of its own, up to four frames ahead of
-      the tracks. Use it for recordings, which then take less time; a camera's tracks would be late.
+      the tracks; `close()`, or the last track, ends the thread. Use it for recordings, which then
+      take less time; a camera's tracks would be late.
 
     The tracks of each frame are NumPy arrays. Boxes without area or outside the frame are left out
     with a warning, as are detections in frames after the last. Another warning is given where there
@@ -160,7 +161,7 @@ def _seen(
 
 def _tracked(
     seen: Iterator[_Seen], tracker: ObjectTracker, key: Key[Array, ""], ahead: bool
-) -> Iterator[Tracks]:
+) -> Generator[Tracks, None, None]:
     state, once, advance = tracker.init(), Once(), None
     with read_ahead(seen) if ahead else contextlib.nullcontext(seen) as coming:
         for number, pixels, observation, motion, kept in coming:
