@@ -8,6 +8,7 @@ from jaxtyping import Array, PyTree
 from mpfjax.checks import check_one_of, check_type, check_whole, given
 from mpfjax.filter import Filter
 from mpfjax.models.base import AbstractStateSpaceModel, mapped
+from mpfjax.models.conditionally_linear import is_marginalised
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import AbstractMove
@@ -33,6 +34,8 @@ from mpfjax.proposals import AbstractProposal
 # K-means starts from the components of a few steps before, and needs few iterations.
 _WARM_ITERATIONS = 2
 _INITIAL_DRAWS = 4
+
+Lookahead = AbstractProposal | PilotLookahead | Callable[[PyTree, PyTree], Array]
 
 
 def particle_filter(
@@ -72,7 +75,7 @@ def particle_filter(
 def auxiliary_particle_filter(
     model: AbstractStateSpaceModel,
     num_particles: int,
-    lookahead: AbstractProposal | PilotLookahead | Callable[[PyTree, PyTree], Array],
+    lookahead: Lookahead,
     *,
     proposal: AbstractProposal | None = None,
     scheme: str = "systematic",
@@ -112,7 +115,7 @@ def mixture_particle_filter(
     max_components: int,
     *,
     proposal: AbstractProposal | None = None,
-    lookahead: AbstractProposal | PilotLookahead | Callable[[PyTree, PyTree], Array] | None = None,
+    lookahead: Lookahead | str | None = "auto",
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
     particles_per_component: int | None = None,
@@ -144,10 +147,14 @@ def mixture_particle_filter(
     are those of `particle_filter`, `lookahead` that of `auxiliary_particle_filter`, `allocation`
     that of `Resample`. `initial_draws` is that of `Filter`; None is four, and one if M is one: the
     plain filter. With `noise="rqmc"` each component has a point set of its own, and the masses of
-    modes are far more accurate. Use it where the filtering distribution has several modes and all
-    of them must be kept.
+    modes are far more accurate. A `lookahead` "auto" is then a `PilotLookahead`, unless there is a
+    proposal, a conditionally linear model or the gradient "ot"; otherwise it is None. Use it where
+    the filtering distribution has several modes and all of them must be kept.
     """
     sort_by = _standing(sort_by, noise)
+    if isinstance(lookahead, str):
+        check_one_of(("auto",), lookahead=lookahead)
+        lookahead = _own_lookahead(model, proposal, noise, gradient)
     resample = Resample(
         scheme, ess_threshold, particles_per_component, sort_by, gradient, allocation=allocation
     )
@@ -358,6 +365,14 @@ def _standing(sort_by: SortBy | None, noise: str) -> SortBy | None:
     """The key by which particles are sorted: point sets need an order of the states."""
     check_one_of(NOISES, noise=noise)
     return HILBERT if sort_by is None and noise == "rqmc" else sort_by
+
+
+def _own_lookahead(
+    model: AbstractStateSpaceModel, proposal: AbstractProposal | None, noise: str, gradient: str
+) -> PilotLookahead | None:
+    """That of the model alone where point sets make x_t: it gains where they do not."""
+    draws = proposal is None and gradient != "ot" and not is_marginalised(model)
+    return PilotLookahead(model) if noise == "rqmc" and draws else None
 
 
 def _mixture_filter(

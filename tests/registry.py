@@ -179,9 +179,7 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
     return {
         "mpf": _mpf(m),
         "mpf rqmc": _mpf(m, noise="rqmc"),
-        "mpf rqmc, pilot look-ahead": lambda model: _mpf(
-            m, noise="rqmc", lookahead=mpfjax.PilotLookahead(model)
-        )(model),
+        "mpf rqmc, no look-ahead": _mpf(m, noise="rqmc", lookahead=None),
         "guided mpf rqmc, adaptive": lambda model: _mpf(
             m, proposal=GaussNewtonProposal(model), noise="rqmc", ess_threshold=0.5
         )(model),

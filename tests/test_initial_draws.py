@@ -175,21 +175,21 @@ def test_likelihoods_are_trusted_by_what_two_draws_have_in_common():
     own = rng.gamma(2.0, size=(4000, 1))
     noisy = own * rng.gamma(0.5, 2.0, size=(4000, 2))
     everywhere = jnp.ones(4000)
-    found = np.asarray(trusted(jnp.log(noisy), everywhere))
+    found = np.asarray(trusted(jnp.log(noisy.T), everywhere))
     np.testing.assert_allclose(found, expected_trust(noisy), rtol=1e-3)
     # Where x_0 says nothing the chances are nearly equal; where it says all they have their bound.
-    nothing_said = trusted(jnp.log(rng.gamma(2.0, size=(4000, 2))), everywhere)
+    nothing_said = trusted(jnp.log(rng.gamma(2.0, size=(2, 4000))), everywhere)
     assert np.std(nothing_said) < 0.05
-    all_said = trusted(jnp.log(np.repeat(own, 2, axis=1)), everywhere)
+    all_said = trusted(jnp.log(np.repeat(own, 2, axis=1).T), everywhere)
     np.testing.assert_allclose(all_said, 0.25 + 0.75 * own[:, 0] / own.mean(), rtol=1e-4)
 
 
 def test_impossible_and_empty_particles():
-    log_factors = jnp.array([[0.0, 0.0], [-jnp.inf, -jnp.inf], [jnp.nan, 0.0], [5.0, 5.0]])
+    log_factors = jnp.array([[0.0, -jnp.inf, jnp.nan, 5.0], [0.0, -jnp.inf, 0.0, 5.0]])
     found = np.asarray(trusted(log_factors, jnp.array([1.0, 1.0, 1.0, 0.0])))
     assert np.all(np.isfinite(found))
     assert found[0] > 1 > found[1] >= 0.25
-    np.testing.assert_array_equal(trusted(jnp.full((3, 2), -jnp.inf), jnp.ones(3)), 1.0)
+    np.testing.assert_array_equal(trusted(jnp.full((2, 3), -jnp.inf), jnp.ones(3)), 1.0)
 
 
 def test_what_cannot_choose_is_refused():

@@ -37,7 +37,7 @@ _FEWER = {"look-alikes": 10}
 _IN_THE_TABLE_ONLY = (
     "APF", "APF, rqmc", "MPF, 4 draws", "MPF, tempered", "MPF, look-ahead",
     "MPF, rqmc, look-ahead", "MPF, learned look-ahead",
-    "MPF, pilot look-ahead", "MPF, rqmc, pilot look-ahead",
+    "MPF, pilot look-ahead", "MPF, rqmc, no look-ahead",
 )  # fmt: skip
 
 

@@ -35,12 +35,9 @@ def _mixture(ahead: bool = False, **options: Any) -> Make:
     return make
 
 
-def _pilot(**options: Any) -> Make:
-    """The mixture filter with a look-ahead that takes nothing but the model."""
-    return lambda scene, num_particles: mpfjax.mixture_particle_filter(
-        scene.model, num_particles, scene.max_components,
-        lookahead=mpfjax.PilotLookahead(scene.model), **scene.grouping, **options,
-    )  # fmt: skip
+def _pilot(scene: Scene, num_particles: int) -> mpfjax.Filter:
+    """The mixture filter with independent noise and the look-ahead that point sets bring along."""
+    return _mixture(lookahead=mpfjax.PilotLookahead(scene.model))(scene, num_particles)
 
 
 def _tempered(scene: Scene, num_particles: int) -> mpfjax.Filter:
@@ -69,12 +66,12 @@ FILTERS: dict[str, Make] = {
     "MPF": _mixture(),
     "MPF, equal slots": _mixture(allocation="equal"),
     "MPF, rqmc": _mixture(noise="rqmc"),
+    "MPF, rqmc, no look-ahead": _mixture(noise="rqmc", lookahead=None),
     "MPF, 4 draws": _mixture(num_draws=4),
     "MPF, rqmc, 4 draws": _mixture(noise="rqmc", num_draws=4),
     "MPF, look-ahead": _mixture(ahead=True),
     "MPF, rqmc, look-ahead": _mixture(ahead=True, noise="rqmc"),
-    "MPF, pilot look-ahead": _pilot(),
-    "MPF, rqmc, pilot look-ahead": _pilot(noise="rqmc"),
+    "MPF, pilot look-ahead": _pilot,
     "MPF, tempered": _tempered,
     "MPF, learned look-ahead": _learned,
 }

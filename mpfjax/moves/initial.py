@@ -186,7 +186,7 @@ def _look(
     looks: Sequence[tuple[Key[Array, ""], AbstractPropagation]],
     pool: ParticleMixture,
     observation: PyTree,
-) -> Float[Array, "n 2"]:
+) -> Float[Array, "2 n"]:
     """The logarithms of the weights of two draws of x_1 of each particle, up to a constant."""
     # Stored, so that x_1 is drawn on vectors, and once, not again wherever its likelihood is used.
     twice = lambda leaf: stored(jnp.repeat(leaf, 2, axis=0))  # noqa: E731
@@ -199,10 +199,10 @@ def _look(
     )
     for move_key, move in looks:
         drawn = move(move_key, drawn, observation)
-    return stored(drawn.log_weights).reshape(-1, 2)
+    return stored(drawn.log_weights).reshape(-1, 2).T
 
 
-def trusted(log_factors: Float[Array, "n 2"], weights: Float[Array, " n"]) -> Float[Array, " n"]:
+def trusted(log_factors: Float[Array, "2 n"], weights: Float[Array, " n"]) -> Float[Array, " n"]:
     """ν of each particle, with a weighted mean of 1, from two draws of its likelihood.
 
     Let r be the correlation of the two draws. The mean of both tells E[L | x] with the reliability
@@ -210,12 +210,15 @@ def trusted(log_factors: Float[Array, "n 2"], weights: Float[Array, " n"]) -> Fl
     predictor (Kelley 1927). Where a draw is mostly noise, ρ is near zero and all x are alike.
     Particles without weight do not count, nor do likelihoods that are no number.
     """
-    counts = (weights > 0)[:, None] & (log_factors < jnp.inf)
-    log_factors = jnp.where(counts, log_factors, -jnp.inf)
-    values = exp(log_factors - finite_or_zero(largest(log_factors)))
+    first, second = (
+        jnp.where((weights > 0) & (draw < jnp.inf), draw, -jnp.inf) for draw in log_factors
+    )
+    highest = finite_or_zero(jnp.maximum(largest(first), largest(second)))
+    # Stored, so that the exponentials are taken on vectors, and once.
+    first, second = (stored(exp(draw - highest)) for draw in (first, second))
     # All sums in one product: each one alone would be a kernel. Where the likelihoods are so much
     # alike that it loses their differences to rounding, trust in these does not matter.
-    rows = jnp.stack([*values.T, jnp.ones_like(weights)])
+    rows = jnp.stack([first, second, jnp.ones_like(weights)])
     sums = jnp.matmul(weights[None] * rows, rows.T, precision=jax.lax.Precision.HIGHEST)
     number = jnp.where(sums[2, 2] > 0, sums[2, 2], 1.0)
     mean = (sums[0, 2] + sums[1, 2]) / (2 * number)
@@ -223,7 +226,7 @@ def trusted(log_factors: Float[Array, "n 2"], weights: Float[Array, " n"]) -> Fl
     shared, total = sums[0, 1] - common, (sums[0, 0] + sums[1, 1]) / 2 - common
     correlation = jnp.clip(shared / jnp.where(total > 0, total, 1.0), 0.0, 1.0)
     trust = jnp.where(mean > 0, jnp.minimum(2 * correlation / (1 + correlation), MOST_TRUST), 0.0)
-    ratios = (values[:, 0] + values[:, 1]) / jnp.where(mean > 0, 2 * mean, 1.0)
+    ratios = (first + second) / jnp.where(mean > 0, 2 * mean, 1.0)
     return 1 + trust * (ratios - 1)
 
 

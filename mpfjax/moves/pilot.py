@@ -55,4 +55,4 @@ class PilotLookahead(eqx.Module):
             for noise in (ones, -ones)
         ]
         # Any ν is exact, so that its derivative is not needed.
-        return jax.lax.stop_gradient(jnp.log(trusted(jnp.stack(seen, axis=1), weights)))
+        return jax.lax.stop_gradient(jnp.log(trusted(jnp.stack(seen), weights)))

@@ -62,7 +62,25 @@ def test_it_halves_the_mean_squared_error_of_log_z_on_the_mirror_image():
         filter = mpfjax.mixture_particle_filter(model, 400, 4, noise="rqmc", **options)
         return np.var(mpfjax.monte_carlo(keys, filter, observations).log_marginal_likelihood)
 
-    assert spread(lookahead=PilotLookahead(model)) < 0.6 * spread()
+    assert spread() < 0.6 * spread(lookahead=None)
+
+
+def test_point_sets_bring_it_along_and_independent_noise_does_not():
+    model = mpfjax.QuadraticModel()
+
+    def of(model, **options):
+        return mpfjax.mixture_particle_filter(model, 20, 2, **options).moves[0]
+
+    move = of(model, noise="rqmc")
+    assert isinstance(move, mpfjax.AuxiliaryResample)
+    assert isinstance(move.lookahead, PilotLookahead)
+    guided = {"proposal": mpfjax.GaussNewtonProposal(model)}
+    for options in ({}, {"noise": "stratified"}):
+        assert isinstance(of(model, **options), mpfjax.Resample), options
+    for options in ({"lookahead": None}, {"gradient": "ot"}, guided):
+        assert isinstance(of(model, noise="rqmc", **options), mpfjax.Resample), options
+    with pytest.raises(ValueError, match="lookahead: 'pilot' is not one of"):
+        of(model, noise="rqmc", lookahead="pilot")
 
 
 def test_a_model_that_is_not_made_of_noise_is_refused():
