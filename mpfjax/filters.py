@@ -8,7 +8,6 @@ from jaxtyping import Array, PyTree
 from mpfjax.checks import check_one_of, check_type, check_whole, given
 from mpfjax.filter import Filter
 from mpfjax.models.base import AbstractStateSpaceModel, mapped
-from mpfjax.models.conditionally_linear import is_marginalised
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import AbstractMove
@@ -16,7 +15,7 @@ from mpfjax.moves.every import Every
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.objects.partitioned import Partitioned, check_orders
-from mpfjax.moves.pilot import PilotLookahead
+from mpfjax.moves.pilot import Lookahead, chosen_lookahead
 from mpfjax.moves.propagation.nested import propagation
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
 from mpfjax.moves.regrouping.features import Scale
@@ -34,8 +33,6 @@ from mpfjax.proposals import AbstractProposal
 # K-means starts from the components of a few steps before, and needs few iterations.
 _WARM_ITERATIONS = 2
 _INITIAL_DRAWS = 4
-
-Lookahead = AbstractProposal | PilotLookahead | Callable[[PyTree, PyTree], Array]
 
 
 def particle_filter(
@@ -152,9 +149,7 @@ def mixture_particle_filter(
     the filtering distribution has several modes and all of them must be kept.
     """
     sort_by = _standing(sort_by, noise)
-    if isinstance(lookahead, str):
-        check_one_of(("auto",), lookahead=lookahead)
-        lookahead = _own_lookahead(model, proposal, noise, gradient)
+    lookahead = chosen_lookahead(lookahead, model, proposal, noise, gradient)
     resample = Resample(
         scheme, ess_threshold, particles_per_component, sort_by, gradient, allocation=allocation
     )
@@ -365,14 +360,6 @@ def _standing(sort_by: SortBy | None, noise: str) -> SortBy | None:
     """The key by which particles are sorted: point sets need an order of the states."""
     check_one_of(NOISES, noise=noise)
     return HILBERT if sort_by is None and noise == "rqmc" else sort_by
-
-
-def _own_lookahead(
-    model: AbstractStateSpaceModel, proposal: AbstractProposal | None, noise: str, gradient: str
-) -> PilotLookahead | None:
-    """That of the model alone where point sets make x_t: it gains where they do not."""
-    draws = proposal is None and gradient != "ot" and not is_marginalised(model)
-    return PilotLookahead(model) if noise == "rqmc" and draws else None
 
 
 def _mixture_filter(

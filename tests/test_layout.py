@@ -37,7 +37,7 @@ FLOORS = {
         "floats", "gradients", "platforms", "stored", "indexing", "prefix_sums", "maxima",
         "logarithms", "segments", "runs", "choices", "matrices", "coordinates", "stacks",
         "gaussians", "across_islands", "generator", "positions", "sobol", "hilbert", "sorting",
-        "compiling", "kept_programs",
+        "compiling", "functions", "kept_programs",
     ),
     "moves": (
         "base", "local_quadratics", "eve_indices", "sharing", "results", "island_interaction",

@@ -8,12 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from mpfjax.checks import check_one_of
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, HasTransitionNoise, require_noise
-from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.conditionally_linear import is_marginalised, refuse_marginalised
 from mpfjax.models.noise import noise_dtype
 from mpfjax.moves.initial import trusted
 from mpfjax.moves.propagation.propagate import likelihoods
+from mpfjax.proposals import AbstractProposal
 
 
 class PilotLookahead(eqx.Module):
@@ -56,3 +58,24 @@ class PilotLookahead(eqx.Module):
         ]
         # Any ν is exact, so that its derivative is not needed.
         return jax.lax.stop_gradient(jnp.log(trusted(jnp.stack(seen), weights)))
+
+
+Lookahead = AbstractProposal | PilotLookahead | Callable[[PyTree, PyTree], Array]
+
+
+def chosen_lookahead(
+    lookahead: Lookahead | str | None,
+    model: AbstractStateSpaceModel,
+    proposal: AbstractProposal | None,
+    noise: str,
+    gradient: str,
+) -> Lookahead | None:
+    """The look-ahead itself, or what "auto" means: where point sets make x_t, that of the model.
+
+    None where a proposal knows y_t already, and where it could not be used.
+    """
+    if not isinstance(lookahead, str):
+        return lookahead
+    check_one_of(("auto",), lookahead=lookahead)
+    usable = proposal is None and gradient != "ot" and not is_marginalised(model)
+    return PilotLookahead(model) if noise == "rqmc" and usable else None

@@ -14,6 +14,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
+from mpfjax.operations.functions import interned
 from mpfjax.operations.generator import split_keys
 from mpfjax.running.devices import choose_devices, over_devices
 from mpfjax.running.progress import shown_progress
@@ -61,6 +62,7 @@ def run_filter(
     """
     check_key(key)
     check_run(filter, collect)
+    collect = interned(collect)
     check_flag(progress=progress)
     series = as_series(observations, inputs, missing, filter.model)
     with shown_progress(progress, series.length, (key, filter, series)) as bar:
@@ -103,6 +105,7 @@ def monte_carlo(
     """
     check_key(keys, "keys", batch=True)
     check_run(filter, collect)
+    collect = interned(collect)
     check_flag(progress=progress)
     check_whole(**given(slots=slots))
     series = as_series(observations, inputs, missing, filter.model)

@@ -23,6 +23,7 @@ from mpfjax.models.base import mapped_draw
 from mpfjax.moves.sharing import give_inputs
 from mpfjax.observations import steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
+from mpfjax.operations.functions import interned
 
 
 class Forecast(eqx.Module):
@@ -72,7 +73,8 @@ def forecast(
     check_callable(
         "a function of a key and states", **given(simulate_observation=simulate_observation)
     )
-    simulate = mapped_draw(filter.model, simulate_observation) if simulate_observation else None
+    simulate = interned(simulate_observation)
+    simulate = mapped_draw(filter.model, simulate) if simulate else None
     inputs = steps_of_inputs(inputs, num_steps, filter.model, "forecast")
     options = (num_steps, simulate)
     return with_floats_traced(
