@@ -170,7 +170,8 @@ def _sampled(particles: _Particles, most: int, mixture: ParticleMixture) -> _Par
     places = stride * jnp.arange(-(-number // VECTOR) * VECTOR, dtype=jnp.int32)
     inside = places < room
     places = jnp.minimum(places, mixture.num_particles - 1)
-    sample = jax.tree.map(lambda values: take(values, places), particles)
+    # Stored, since a gather for several runs has them on its second axis, off vectors.
+    sample = jax.tree.map(lambda values: stored(take(values, places).T).T, particles)
     return sample._replace(
         weights=jnp.where(inside, sample.weights, 0.0), occupied=sample.occupied & inside
     )
@@ -215,7 +216,9 @@ def _nearer(
     to_second = features - spread_stored(centres[m:], parent)
     is_second = row_sums(to_second**2) < row_sums(to_first**2)
     is_second = stored(is_second)
-    return is_second.astype(jnp.int32), jnp.where(is_second[:, None], to_second, to_first)
+    # Column by column: XLA would choose numbers of rows of one number one after the other.
+    gaps = jnp.where(is_second[None], to_second.T, to_first.T).T
+    return is_second.astype(jnp.int32), gaps
 
 
 def _farthest_members(
