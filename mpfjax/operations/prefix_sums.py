@@ -106,7 +106,8 @@ def few_upto(values: Shaped[Array, " n"]) -> Int[Array, " n"]:
         return jnp.cumsum(values, dtype=jnp.int32)
     place = jnp.arange(n, dtype=jnp.int32)
     counts = values.astype(jnp.int32)
-    return jnp.sum(jnp.where(place[None] <= place[:, None], counts[None], 0), 1, jnp.int32)
+    # Over the first axis, so that the sums run on vectors.
+    return jnp.sum(jnp.where(place[:, None] <= place[None], counts[:, None], 0), 0, jnp.int32)
 
 
 def count_starts(starts: Int[Array, "*rows n"], num_slots: int) -> Int[Array, " num_slots"]:

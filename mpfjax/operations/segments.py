@@ -209,7 +209,7 @@ def _scattered(
     Segments of many values are shared by lanes.
     """
     n = values.shape[0]
-    num_lanes = _num_lanes(n) if n >= _LANES * num_segments else 1
+    num_lanes = _num_lanes(n, num_segments)
     padding = ((0, 0), (0, -n % num_lanes))
 
     def scatter(
@@ -233,8 +233,13 @@ def _scattered(
     return in_rows(scatter)(values, segments)
 
 
-def _num_lanes(n: int) -> int:
-    """A power of two: enough lanes that the rounding error of each lane's sum stays small."""
+def _num_lanes(n: int, num_segments: int) -> int:
+    """A power of two: enough lanes that the rounding error of each lane's sum stays small.
+
+    Half of them for segments of few values, and one for hardly any.
+    """
+    if n < _LANES * num_segments:
+        return _LANES // 2 if n >= _LANES // 2 * num_segments else 1
     if n % _LANES and n % (_LANES // 2) == 0 and n // (_LANES // 2) <= _LONGEST_SUM:
         return _LANES // 2  # rather than to fill up the last row
     return max(_LANES, 1 << max(-(-n // _LONGEST_SUM) - 1, 0).bit_length())
