@@ -18,6 +18,8 @@ from mpfjax.operations.stored import EXACT_IN_FLOAT32, block_size, stored, to_in
 _ONE_BLOCK = 128
 _LANES_OF_ROWS = 4
 _FEW = 64
+# A sum of so few numbers takes no vector.
+_FEWEST = 16
 
 
 def sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
@@ -106,8 +108,11 @@ def few_upto(values: Shaped[Array, " n"]) -> Int[Array, " n"]:
         return jnp.cumsum(values, dtype=jnp.int32)
     place = jnp.arange(n, dtype=jnp.int32)
     counts = values.astype(jnp.int32)
-    # Over the first axis, so that the sums run on vectors.
-    return jnp.sum(jnp.where(place[:, None] <= place[None], counts[:, None], 0), 0, jnp.int32)
+    if n <= _FEWEST:
+        return jnp.sum(jnp.where(place[None] <= place[:, None], counts[None], 0), 1, jnp.int32)
+    # Over the first axis the sums run on vectors, but XLA would repeat them for every use.
+    sums = jnp.sum(jnp.where(place[:, None] <= place[None], counts[:, None], 0), 0, jnp.int32)
+    return stored(sums)
 
 
 def count_starts(starts: Int[Array, "*rows n"], num_slots: int) -> Int[Array, " num_slots"]:

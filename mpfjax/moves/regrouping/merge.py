@@ -122,8 +122,7 @@ def lowest_connected(adjacent: Bool[Array, "m m"]) -> Int[Array, " m"]:
 
     def lower(state: tuple[Array, Array]) -> tuple[Array, Array]:
         labels, _ = state
-        # Over the first axis, so that the minima run on vectors: the graph is symmetric.
-        lowest = jnp.min(jnp.where(reach, labels[:, None], m), axis=0)
+        lowest = jnp.min(jnp.where(reach, labels[None], m), axis=1)
         lowest = take(lowest, lowest)
         return lowest, jnp.any(lowest != labels)
 

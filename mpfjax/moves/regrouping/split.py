@@ -202,9 +202,8 @@ def free_labels(
     goes_first = wanted[:, None] & ((priority[:, None] > priority[None]) | ties)
     rank = jnp.sum(goes_first, axis=0, dtype=jnp.int32)
     free_rank = few_upto(~active) - 1
-    # Over the first axis, so that the maxima run on vectors.
-    matches = ~active[:, None] & (rank[None] == free_rank[:, None])
-    label = jnp.max(jnp.where(matches, own[:, None], -1), axis=0)
+    matches = ~active[None] & (rank[:, None] == free_rank[None])
+    label = jnp.max(jnp.where(matches, own[None], -1), axis=1)
     return jnp.where(wanted & (label >= 0), label, own)
 
 

@@ -122,7 +122,7 @@ def _in_proportion(
 
 def place_slots(targets: Int[Array, " m"], num_particles: int) -> Slots:
     """The slots of each component, given their number for each."""
-    firsts = stored(few_upto(targets) - targets)
+    firsts = few_upto(targets) - targets
     slot = jnp.arange(num_particles, dtype=jnp.int32)
     components = segments_in_order(firsts, num_particles)
     return Slots(
