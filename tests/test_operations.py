@@ -328,23 +328,25 @@ def test_a_handful_of_entries_is_summed_by_masks():
     np.testing.assert_allclose(segment_sum(shares, arrays[1], 50), held, rtol=1e-5)
 
 
-def test_runs_of_one_segment_are_added_up_in_lanes():
-    """Enough entries a segment for the lanes, and both ways through `vmap` and its gradient."""
+@pytest.mark.parametrize(("m", "n"), [(7, 200), (60, 1000), (200, 1102), (600, 1102)])
+def test_runs_of_one_segment_are_added_up_in_lanes(m, n):
+    """From many entries a segment to hardly any, both ways through `vmap`, and its gradient."""
     rng = np.random.default_rng(5)
-    labels = np.sort(rng.integers(-1, 8, (3, 200)), axis=1)
-    values = rng.normal(size=(3, 200)).astype(np.float32)
-    own = jax.vmap(lambda v, s: segment_sum(v, s, 7))
-    shared = jax.vmap(lambda v, s: segment_sum(v, s, 7), (0, None))
-    largest = jax.vmap(lambda v, s: segment_max(v, s, 7))
-    expected = [[v[s == m].sum() for m in range(7)] for v, s in zip(values, labels, strict=True)]
+    labels = np.sort(rng.integers(-1, m + 1, (3, n)), axis=1)
+    values = rng.normal(size=(3, n)).astype(np.float32)
+    own = jax.jit(jax.vmap(lambda v, s: segment_sum(v, s, m)))
+    shared = jax.jit(jax.vmap(lambda v, s: segment_sum(v, s, m), (0, None)))
+    largest = jax.jit(jax.vmap(lambda v, s: segment_max(v, s, m)))
+    each = [[v[s == k] for k in range(m)] for v, s in zip(values, labels, strict=True)]
+    sums = [[own.sum() for own in row] for row in each]
     every = jnp.asarray(values), jnp.asarray(labels, jnp.int32)
-    np.testing.assert_allclose(own(*every), expected, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(shared(every[0], every[1][1])[1], expected[1], rtol=1e-4)
-    expected = [[v[s == m].max() for m in range(7)] for v, s in zip(values, labels, strict=True)]
+    np.testing.assert_allclose(own(*every), sums, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(shared(every[0], every[1][1])[1], sums[1], rtol=1e-4, atol=1e-5)
+    expected = [[own.max(initial=-np.inf) for own in row] for row in each]
     np.testing.assert_array_equal(largest(*every), np.float32(expected))
-    weights = jnp.arange(1.0, 8.0)
+    weights = jnp.arange(1.0, m + 1.0)
     gradient = jax.grad(lambda v: jnp.sum(own(v, every[1]) * weights[None]))(every[0])
-    inside = (labels >= 0) & (labels < 7)
+    inside = (labels >= 0) & (labels < m)
     np.testing.assert_array_equal(gradient, np.where(inside, labels + 1, 0))
 
 
