@@ -8,6 +8,7 @@ import pytest
 
 import mpfjax
 from mpfjax.moves.initial import START, trusted
+from tests.marking import thorough
 
 KEY = jax.random.key(0)
 OBSERVATIONS = np.array([3.0, 3.3, 3.1], np.float32)
@@ -87,7 +88,7 @@ def test_the_chosen_particles_represent_the_prior(runs):
         assert abs(found.mean() - exact) < 4 * found.std(ddof=1) / np.sqrt(len(found)) + 1e-4
 
 
-@pytest.mark.parametrize("noise", ["stratified", "rqmc"])
+@pytest.mark.parametrize("noise", ["rqmc", *thorough(["stratified"])])
 def test_particles_descend_from_those_of_the_run(noise):
     """Without noise in the dynamics x_1 is x_0 of its ancestor, where the run says it was."""
     model = mpfjax.LinearGaussianModel(

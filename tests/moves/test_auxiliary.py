@@ -11,6 +11,7 @@ import mpfjax
 from mpfjax import AuxiliaryResample, GaussNewtonProposal, NetworkProposal, Resample
 from mpfjax.exact import kalman_filter
 from tests.examples import make_mixture
+from tests.marking import thorough
 
 TWO = mpfjax.LinearGaussianModel(
     A=[[1.0, 0.5], [0.0, 0.8]], Q=[[0.2, 0.1], [0.1, 0.3]], H=[[1.0, 0.0], [0.5, 1.0]],
@@ -69,7 +70,7 @@ def three_components():
     return make_mixture(rng.normal(size=30), rng.normal(size=30), np.arange(30) % 3, 3)
 
 
-@pytest.mark.parametrize("ess_threshold", [1.0, 0.6])
+@pytest.mark.parametrize("ess_threshold", [1.0, *thorough([0.6])])
 def test_what_is_expected_stays_the_same_in_every_component(ess_threshold):
     """E[Σ_{c_i = m} exp(ℓ_i) φ(x_i)] is what it was, whatever the look-ahead."""
     mixture = three_components()

@@ -52,6 +52,7 @@ def test_where_a_step_is_narrow_three_quarters_of_the_likelihood_are_trusted():
     np.testing.assert_allclose(found, 1 / 4 + 3 / 4 * likelihoods / likelihoods.mean(), rtol=1e-2)
 
 
+@pytest.mark.thorough
 def test_it_halves_the_mean_squared_error_of_log_z_on_the_mirror_image():
     """Of 60 runs with keys that nothing was chosen on; the ratio expected is .36."""
     model = mirror.MirrorModel()

@@ -8,6 +8,7 @@ import pytest
 import mpfjax
 from mpfjax import forecast
 from mpfjax.exact import kalman_filter
+from tests.marking import thorough
 from tests.user_models import DriftOfOne
 
 LINEAR = mpfjax.LinearGaussianModel(
@@ -21,7 +22,7 @@ def observe(key, states):
     return states + np.sqrt(0.4) * jax.random.normal(key, states.shape)
 
 
-@pytest.mark.parametrize("make", ["pf", "mpf"])
+@pytest.mark.parametrize("make", ["mpf", *thorough(["pf"])])
 def test_moments_are_the_kalman_filters(make):
     filters = {
         "pf": mpfjax.particle_filter(LINEAR, 100),
