@@ -252,6 +252,16 @@ def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
             f" {len(advances)}; moves of other kinds that propagate cannot keep a trajectory, but"
             " particle_filter and mixture_particle_filter can, on any model"
         )
+    proposal = getattr(advances[0], "proposal", None)
+    if proposal is not None:
+        require(proposal, "log_density", needed_by, "proposal")
+    for name, draws in (("filter", advances[0]), ("proposal", proposal)):
+        noise = getattr(draws, "noise", "independent")
+        if noise != "independent":
+            raise ValueError(
+                f"{name}: {needed_by} needs draws that are independent of each other, and not"
+                f" noise={noise!r}; take noise='independent'"
+            )
     for move in filter.moves:
         if isinstance(move, Resample):
             _check_resample(move)
@@ -263,16 +273,6 @@ def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
             raise ValueError(
                 f"filter: {type(move).__name__} cannot keep a trajectory, as {needed_by} does;"
                 " regrouping moves, Resample, Propagate, Predict and Reweight can"
-            )
-    proposal = getattr(advances[0], "proposal", None)
-    if proposal is not None:
-        require(proposal, "log_density", needed_by, "proposal")
-    for name, draws in (("filter", advances[0]), ("proposal", proposal)):
-        noise = getattr(draws, "noise", "independent")
-        if noise != "independent":
-            raise ValueError(
-                f"{name}: {needed_by} needs draws that are independent of each other, and not"
-                f" noise={noise!r}; take noise='independent'"
             )
 
 

@@ -230,6 +230,10 @@ class TestBadInput:
                 "proposal: .*noise='stratified'",
             ),
             (
+                lambda: mpfjax.mixture_particle_filter(LINEAR, 6, 2, noise="rqmc"),
+                "filter: .*independent of each other, and not noise='rqmc'",
+            ),
+            (
                 lambda: mpfjax.particle_filter(LINEAR, 6, proposal=WithoutDensity()),
                 "proposal: WithoutDensity defines no log_density",
             ),
