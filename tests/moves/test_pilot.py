@@ -78,10 +78,12 @@ def test_point_sets_bring_it_along_and_independent_noise_does_not():
     guided = {"proposal": mpfjax.GaussNewtonProposal(model)}
     for options in ({}, {"noise": "stratified"}):
         assert isinstance(of(model, **options), mpfjax.Resample), options
-    for options in ({"lookahead": None}, {"gradient": "ot"}, guided):
+    for options in ({"lookahead": None}, guided):
         assert isinstance(of(model, noise="rqmc", **options), mpfjax.Resample), options
     with pytest.raises(ValueError, match="lookahead: 'pilot' is not one of"):
         of(model, noise="rqmc", lookahead="pilot")
+    pytest.importorskip("ott", reason="gradient 'ot' needs the extra 'ot', which 'test' brings")
+    assert isinstance(of(model, noise="rqmc", gradient="ot"), mpfjax.Resample)
 
 
 def test_a_model_that_is_not_made_of_noise_is_refused():
