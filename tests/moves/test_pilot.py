@@ -66,24 +66,28 @@ def test_it_halves_the_mean_squared_error_of_log_z_on_the_mirror_image():
     assert spread() < 0.6 * spread(lookahead=None)
 
 
+def first_move(model, **options):
+    return mpfjax.mixture_particle_filter(model, 20, 2, **options).moves[0]
+
+
 def test_point_sets_bring_it_along_and_independent_noise_does_not():
     model = mpfjax.QuadraticModel()
-
-    def of(model, **options):
-        return mpfjax.mixture_particle_filter(model, 20, 2, **options).moves[0]
-
-    move = of(model, noise="rqmc")
+    move = first_move(model, noise="rqmc")
     assert isinstance(move, mpfjax.AuxiliaryResample)
     assert isinstance(move.lookahead, PilotLookahead)
     guided = {"proposal": mpfjax.GaussNewtonProposal(model)}
     for options in ({}, {"noise": "stratified"}):
-        assert isinstance(of(model, **options), mpfjax.Resample), options
+        assert isinstance(first_move(model, **options), mpfjax.Resample), options
     for options in ({"lookahead": None}, guided):
-        assert isinstance(of(model, noise="rqmc", **options), mpfjax.Resample), options
+        assert isinstance(first_move(model, noise="rqmc", **options), mpfjax.Resample), options
     with pytest.raises(ValueError, match="lookahead: 'pilot' is not one of"):
-        of(model, noise="rqmc", lookahead="pilot")
+        first_move(model, noise="rqmc", lookahead="pilot")
+
+
+def test_optimal_transport_draws_no_ancestors_and_goes_without_it():
     pytest.importorskip("ott", reason="gradient 'ot' needs the extra 'ot', which 'test' brings")
-    assert isinstance(of(model, noise="rqmc", gradient="ot"), mpfjax.Resample)
+    move = first_move(mpfjax.QuadraticModel(), noise="rqmc", gradient="ot")
+    assert isinstance(move, mpfjax.Resample)
 
 
 def test_a_model_that_is_not_made_of_noise_is_refused():
