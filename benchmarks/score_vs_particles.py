@@ -142,11 +142,8 @@ def build(
 
     Components have equal numbers of particles, and x_0 is drawn once, as in the paper.
     """
-    as_there: dict[str, Any] = {"allocation": "equal", "initial_draws": 1, **mixture}
     if name == "pf":
         return mpfjax.particle_filter(model, num_particles)
-    if name == "mpf":
-        return mpfjax.mixture_particle_filter(model, num_particles, **as_there)
     regeneration = mpfjax.GaussianRegeneration(noise="stratified")
     if name == "gpf":
         return mpfjax.gaussian_particle_filter(model, num_particles, regeneration=regeneration)
@@ -154,12 +151,12 @@ def build(
         return mpfjax.gaussian_mixture_particle_filter(
             model, num_particles, regeneration=regeneration, **mixture
         )
-    return mpfjax.mixture_particle_filter(
-        model,
-        num_particles,
-        **as_there,
-        proposal=mpfjax.GaussNewtonProposal(model, noise="stratified"),
-        sort_by=position,
+    options: dict[str, Any] = {"allocation": "equal", **mixture}
+    if name == "guided_mpf":
+        options["proposal"] = mpfjax.GaussNewtonProposal(model, noise="stratified")
+        options["sort_by"] = position
+    return mpfjax.with_selected_start(
+        mpfjax.mixture_particle_filter(model, num_particles, **options), 1
     )
 
 

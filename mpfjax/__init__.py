@@ -61,6 +61,7 @@ from mpfjax.moves import RandomWalkMetropolis as RandomWalkMetropolis
 from mpfjax.moves import RegimeProposal as RegimeProposal
 from mpfjax.moves import Resample as Resample
 from mpfjax.moves import Reweight as Reweight
+from mpfjax.moves import SelectInitial as SelectInitial
 from mpfjax.moves import Split as Split
 from mpfjax.operations.compiling import keep_programs as keep_programs
 from mpfjax.operations.generator import normal as normal
@@ -78,6 +79,7 @@ from mpfjax.running.studies import Study as Study
 from mpfjax.running.studies import read_study as read_study
 from mpfjax.running.studies import run_study as run_study
 from mpfjax.smoothing.forecasts import forecast as forecast
+from mpfjax.transforms import with_selected_start as with_selected_start
 
 # The one place that says it: pyproject.toml reads it from here.
 __version__ = "0.1.0"

@@ -1,21 +1,13 @@
 """A filter: a chain of moves on a particle mixture, one step at a time."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, Key, PyTree
 
-from mpfjax.checks import (
-    check_flag,
-    check_key,
-    check_numbered,
-    check_one_of,
-    check_type,
-    check_whole,
-)
+from mpfjax.checks import check_flag, check_key, check_one_of, check_type
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, check_model
 from mpfjax.models.inputs import saying_that_none_were_given
@@ -23,23 +15,11 @@ from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import (
     AbstractMarkovMove,
     AbstractMove,
-    AbstractPropagation,
     AbstractRegrouping,
     AbstractResampling,
 )
 from mpfjax.moves.every import Every, with_inner
-from mpfjax.moves.initial import (
-    START,
-    StartMemory,
-    at_start,
-    choose_initial,
-    is_prior,
-    leaving_start,
-    looking_moves,
-    sample_initial,
-    started,
-    unless_chosen,
-)
+from mpfjax.moves.initial import sample_initial, waiting_for_choice
 from mpfjax.moves.island_interaction import IslandInteraction
 from mpfjax.moves.memory import check_memory
 from mpfjax.moves.parents import runner
@@ -70,9 +50,9 @@ class Start(NamedTuple):
     key: Key[Array, "*seeds"]
     particles: PyTree = None
     """one for each slot; the slots after the first `num_particles` are empty."""
-    pool: PyTree = None
-    """the draws of x_0 that a filter with `initial_draws` chooses from, likewise."""
     num_particles: Int[Array, "*seeds"] | None = None
+    mixture: ParticleMixture | None = None
+    """the whole mixture of x_0."""
 
 
 class Filter(eqx.Module):
@@ -87,20 +67,16 @@ class Filter(eqx.Module):
     - `num_particles`: N.
     - `num_components`: M, the most components; the filters of the literature call it
       `max_components`.
-    - `initial_moves`: regrouping of x_0, such as `KMeans(reseed=True)`.
+    - `initial_moves`: moves of x_0, which are given y_1 where it is known: regrouping, such as
+      `KMeans(reseed=True)`, and `SelectInitial`. What they weigh is part of the first increment.
     - `initial_noise`: the noise of x_0 where the model has `initial_from_noise`: "independent", as
       the model's own `sample_initial` draws it, "rqmc" or "stratified"; see `Propagate`.
-    - `initial_draws`: K. With more than one, the first step draws x_0 anew, K N times, and keeps N
-      by what they say of y_1 (`choose_initial`): a wide prior is covered as by K N particles, at
-      the cost of 2 K more draws of x_1 in the whole run. A run's `initial` has those that were
-      kept, and their weights. A first step that only predicts leaves x_0 as it is.
     - `starts_empty`: at time 0 no slot holds a particle, and later all may become empty again.
       Moves start components, as the births of a tracker. A step without any mass has an increment
       of zero.
 
     Raises `ValueError` for N < 1, M < 1, N < M, no moves, moves that never use an observation, or
-    fewer slots than `particles_per_component` asks for; and for K > 1 with `starts_empty`, or with
-    propagations other than `Propagate`, `PropagateMarginalised` and `PropagateNested`.
+    fewer slots than `particles_per_component` asks for.
     """
 
     model: AbstractStateSpaceModel
@@ -110,7 +86,6 @@ class Filter(eqx.Module):
     num_components: int = eqx.field(static=True)
     initial_noise: str = eqx.field(static=True)
     starts_empty: bool = eqx.field(static=True)
-    initial_draws: int = eqx.field(static=True)
 
     def __init__(
         self,
@@ -121,7 +96,6 @@ class Filter(eqx.Module):
         initial_moves: Iterable[AbstractMove] = (),
         initial_noise: str = "independent",
         starts_empty: bool = False,
-        initial_draws: int = 1,
     ) -> None:
         check_model(model, "Filter")
         moves = as_moves(moves, "moves")
@@ -139,12 +113,6 @@ class Filter(eqx.Module):
         check_flag(starts_empty=starts_empty)
         self.initial_noise = initial_noise
         self.starts_empty = bool(starts_empty)
-        check_whole(initial_draws=initial_draws)
-        if initial_draws > 1:
-            num_drawn = 2 * initial_draws * num_particles
-            check_numbered("draws up to", num_drawn, initial_draws=initial_draws)
-            looking_moves(moves, starts_empty)
-        self.initial_draws = int(initial_draws)
 
     @property
     def moves(self) -> tuple[Any, ...]:
@@ -153,7 +121,7 @@ class Filter(eqx.Module):
 
     @property
     def initial_moves(self) -> tuple[Any, ...]:
-        """The moves that group x_0."""
+        """The moves of x_0."""
         return untie(self._initial_moves, self.model)
 
     @property
@@ -161,22 +129,46 @@ class Filter(eqx.Module):
         """Whether any move departs from the exact recursion."""
         return any(getattr(move, "approximate", True) for move in self.moves)
 
-    def init(self, key: Key[Array, ""]) -> ParticleMixture:
-        """The mixture at time 0: draws of x_0 with equal weights, grouped by the initial moves.
+    def replace(self, **changes: Any) -> "Filter":
+        """The filter with other arguments; moves that share its model share the new one."""
+        model = changes.get("model", self.model)
+        own = {
+            "model": model,
+            "moves": untie(self._moves, model),
+            "num_particles": self.num_particles,
+            "num_components": self.num_components,
+            "initial_moves": untie(self._initial_moves, model),
+            "initial_noise": self.initial_noise,
+            "starts_empty": self.starts_empty,
+        }
+        return Filter(**own | changes)
 
-        A filter with `initial_draws` draws x_0 anew when it sees y_1; `choose_initial` has these.
-        If particles, weights or indicators were replaced by then, it goes on from what they are.
+    def init(
+        self, key: Key[Array, ""], observation: PyTree = None, *, inputs: PyTree = None
+    ) -> ParticleMixture:
+        """The mixture of x_0: draws with equal weights, changed by the initial moves.
+
+        Give it y_1, and u_1 if there are inputs, where an initial move looks at them, such as
+        `SelectInitial`; without y_1 that move does nothing. y_1 is then given to `step` as well.
         """
         check_key(key)
+        if observation is not None:
+            observation = one_observation(observation)
+        inputs = one_input(inputs, self.model)
         start = Start(key, drawn_once(key, self._sample_initial))
-        return with_floats_traced(lambda filter: _from_particles(filter, start), self)
+        mixture, faults = with_floats_traced(
+            lambda filter: _from_particles(filter, start, observation, inputs), self
+        )
+        return raise_faults(mixture, faults)
 
     def _sample_initial(self, key: Key[Array, "*num"]) -> PyTree:
         key_initial = split_keys(key, 1 + len(self._initial_moves))[0]
         with saying_that_none_were_given(self.model):
             return sample_initial(key_initial, self.model, self.num_particles, self.initial_noise)
 
-    def _init(self, start: Start, grouped: bool = True) -> ParticleMixture:
+    def _init(self, start: Start, observation: PyTree = None) -> ParticleMixture:
+        if start.mixture is not None:
+            return start.mixture
         keys = split_keys(start.key, 1 + len(self._initial_moves))
         particles = start.particles
         if particles is None:
@@ -188,65 +180,20 @@ class Filter(eqx.Module):
                 memory |= move.initial_memory(self.num_components)
         mixture = single_component(particles, self.num_components, start.num_particles)
         mixture = mixture.replace(memory=memory)
-        if grouped:
-            mixture = self._grouped(keys[1:], mixture)
+        for move_key, move in zip(keys[1:], self.initial_moves, strict=True):
+            with saying_that_none_were_given(self.model):
+                mixture = move(move_key, mixture, observation)
+        if self.looks_at_first:
+            mixture, log_mass = normalised(mixture, mixture, self.starts_empty)
+            mixture = mixture.replace(log_scale=log_mass)
         if self.starts_empty:
             mixture = mixture.replace(log_weights=jnp.full_like(mixture.log_weights, -jnp.inf))
-        return at_start(mixture) if self.initial_draws > 1 else mixture
-
-    def _grouped(self, keys: Sequence[Key[Array, ""]], mixture: ParticleMixture) -> ParticleMixture:
-        for move_key, move in zip(keys, self.initial_moves, strict=True):
-            mixture = move(move_key, mixture)
         return mixture
 
-    def with_one_draw(self) -> "Filter":
-        """The filter with `initial_draws` of one, for runs that keep plain draws of x_0."""
-        if self.initial_draws == 1:
-            return self
-        return Filter(
-            self.model, self.moves, self.num_particles, self.num_components,
-            self.initial_moves, self.initial_noise,
-        )  # fmt: skip
-
-    def choose_initial(
-        self,
-        key: Key[Array, "*keys"],
-        mixture: ParticleMixture,
-        observation: PyTree,
-        pool: PyTree = None,
-    ) -> ParticleMixture:
-        """The mixture of x_0 that the first step, of this key and observation, goes on from.
-
-        `step` calls it, and draws the same from this mixture as from that of `init`. Call it before
-        where the history of an online run is kept: ancestor indices of the first step refer to
-        it. `pool` are the draws of `sample_pool`, where that was called before.
-        """
-        moves = looking_moves(self.moves, self.starts_empty)
-        _, key_kept, *keys = self._keys(key)[1]
-        if pool is None:
-            with saying_that_none_were_given(self.model):
-                pool = self.sample_pool(key)
-        looks = list(zip(keys, moves, strict=False))
-        chosen = choose_initial(key_kept, mixture, pool, looks, observation, self.initial_noise)
-        return self._grouped(keys[len(moves) :], chosen)
-
-    def sample_pool(self, key: Key[Array, "*keys"]) -> PyTree:
-        """The K N draws of x_0 of the first step, of this key."""
-        number = self.initial_draws * self.num_particles
-        return sample_initial(self._keys(key)[1][0], self.model, number, self.initial_noise)
-
     @property
-    def num_step_keys(self) -> int:
-        """How many keys that of a step is split into: one for each move, and those of the start."""
-        if self.initial_draws == 1:
-            return len(self._moves)
-        looks = looking_moves(self._moves, self.starts_empty)
-        return len(self._moves) + 2 + len(looks) + len(self._initial_moves)
-
-    def _keys(self, key: Key[Array, "*keys"]) -> tuple[list, list]:
-        """The keys of a step's moves, and those of the start."""
-        keys = split_keys(key, self.num_step_keys)
-        return keys[: len(self._moves)], keys[len(self._moves) :]
+    def looks_at_first(self) -> bool:
+        """Whether the initial moves may weigh x_0, by y_1 or otherwise."""
+        return any(getattr(move, "weighs", True) for move in self._initial_moves)
 
     def with_inputs(self, inputs: PyTree) -> "Filter":
         """The filter at a step whose known inputs are u_t, which every model in it receives.
@@ -303,26 +250,17 @@ class Filter(eqx.Module):
                 f"mixture: its num_components, {mixture.num_components}, is not the filter's,"
                 f" {self.num_components}"
             )
-        if self.initial_draws > 1:
-            choose = lambda prior: self.choose_initial(key, prior, observation)  # noqa: E731
-            mixture = jax.lax.cond(is_prior(mixture), choose, lambda kept: kept, mixture)
         mixture = _own_ancestors(mixture)
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
         run, is_normalised = runner(self._moves), False
-        start: StartMemory | None = mixture.memory.get(START)
-        for move_key, move in zip(self._keys(key)[0], self.moves, strict=True):
-            if start is not None and isinstance(move, AbstractPropagation):
-                increment += start.log_mass.astype(increment.dtype)
-                mixture, start = started(mixture), None
+        moves = waiting_for_choice(self.moves, self.initial_moves)
+        for move_key, move in zip(split_keys(key, len(moves)), moves, strict=True):
             if isinstance(move, AbstractMove):
-                due = move.would_resample(mixture, observation)
-                resampled |= due if start is None else due & ~start.is_chosen
+                resampled |= move.would_resample(mixture, observation)
             after = (self._forgetting,) if isinstance(move, Every) else ()
             with saying_that_none_were_given(self.model):
                 moved = run(move, move_key, mixture, observation, *after)
-            if start is not None:
-                moved = unless_chosen(moved, mixture)
             moved = check_result(moved, mixture, move)
             if after:
                 mixture = moved
@@ -350,8 +288,7 @@ class Filter(eqx.Module):
         self, key: Key[Array, "*keys"], mixture: ParticleMixture
     ) -> tuple[ParticleMixture, StepInfo]:
         mixture = _own_ancestors(mixture)
-        mixture = leaving_start(mixture)
-        for move_key, move in zip(self._keys(key)[0], self.moves, strict=True):
+        for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
             if not isinstance(move, AbstractMove):
                 raise ValueError(f"moves: {move!r} does not define predict, for a missing y_t")
             with saying_that_none_were_given(self.model):
@@ -382,9 +319,10 @@ _step_and_faults = jit_on_wide_vectors(step_and_faults)
 
 
 @jit_on_wide_vectors
-def _from_particles(filter, start):
+def _from_particles(filter, start, observation, inputs):
     # Not with the draws of x_0, whose last digits depend on the program that they are part of.
-    return filter._init(start)
+    faults = faults_of(filter.model, observation, inputs)
+    return filter.with_inputs(inputs)._init(start, observation), faults
 
 
 @jit_on_wide_vectors

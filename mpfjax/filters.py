@@ -29,6 +29,7 @@ from mpfjax.moves.resampling.gaussian import GaussianRegeneration
 from mpfjax.moves.resampling.ordering import HILBERT, SortBy
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.proposals import AbstractProposal
+from mpfjax.transforms import with_selected_start
 
 # K-means starts from the components of a few steps before, and needs few iterations.
 _WARM_ITERATIONS = 2
@@ -45,7 +46,6 @@ def particle_filter(
     sort_by: SortBy | None = None,
     noise: str = "independent",
     num_draws: int = 1,
-    initial_draws: int = 1,
     gradient: str = "none",
 ) -> Filter:
     """The standard particle filter: resample, propagate.
@@ -56,7 +56,7 @@ def particle_filter(
     `num_draws` is that of `PropagateNested`: each particle draws this many x_t and keeps one.
     `noise` is that of `Propagate`. With "rqmc", particles are ordered along a Hilbert curve of
     their state unless `sort_by` is given, and the filter is sequential quasi-Monte Carlo (Gerber
-    and Chopin 2015). `initial_draws` is that of `Filter`.
+    and Chopin 2015).
     """
     sort_by = _standing(sort_by, noise)
     resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
@@ -65,7 +65,6 @@ def particle_filter(
         moves=[resample, propagation(model, proposal, gradient, noise, num_draws)],
         num_particles=num_particles,
         initial_noise=noise,
-        initial_draws=initial_draws,
     )
 
 
@@ -120,7 +119,6 @@ def mixture_particle_filter(
     sort_by: SortBy | None = None,
     noise: str = "independent",
     num_draws: int = 1,
-    initial_draws: int | None = None,
     gradient: str = "none",
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
@@ -142,10 +140,11 @@ def mixture_particle_filter(
     `regroup_every` is k where they run at every k-th step (see `Every`): take 1 where modes move
     fast, or where a `Merge` counts frames with its `patience`. `gradient`, `noise` and `num_draws`
     are those of `particle_filter`, `lookahead` that of `auxiliary_particle_filter`, `allocation`
-    that of `Resample`. `initial_draws` is that of `Filter`; None is four, and one if M is one: the
-    plain filter. With `noise="rqmc"` each component has a point set of its own, and the masses of
-    modes are far more accurate. A `lookahead` "auto" is then a `PilotLookahead`, unless there is a
-    proposal, a conditionally linear model or the gradient "ot"; otherwise it is None. Use it where
+    that of `Resample`. If M is more than one, x_0 is chosen by y_1 among four draws a particle;
+    `with_selected_start` changes their number. With `noise="rqmc"` each component has a point set
+    of its own, and the masses of modes are far more accurate. A `lookahead` "auto" is then a
+    `PilotLookahead`, unless there is a proposal, a conditionally linear model or the gradient "ot";
+    otherwise it is None. Use it where
     the filtering distribution has several modes and all of them must be kept.
     """
     sort_by = _standing(sort_by, noise)
@@ -158,12 +157,11 @@ def mixture_particle_filter(
     moves = [resampling(resample, lookahead), propagate]
     seen: dict[str, Any] = {"features": mapped(model, features), "scale": scale}
     kmeans = KMeans(_WARM_ITERATIONS, **seen) if kmeans is None else kmeans
-    if initial_draws is None:
-        initial_draws = 1 if max_components == 1 else _INITIAL_DRAWS
-    return _mixture_filter(
+    filter = _mixture_filter(
         model, num_particles, max_components, moves, features, scale,
-        merge, split, kmeans, initial_kmeans, regroup_every, noise, initial_draws,
+        merge, split, kmeans, initial_kmeans, regroup_every, noise,
     )  # fmt: skip
+    return filter if max_components == 1 else with_selected_start(filter, _INITIAL_DRAWS)
 
 
 def gaussian_particle_filter(
@@ -375,7 +373,6 @@ def _mixture_filter(
     initial_kmeans: KMeans | None,
     regroup_every: int,
     noise: str,
-    initial_draws: int = 1,
 ) -> Filter:
     """The given moves, then regrouping; x_0 grouped by K-means from seeds."""
     check_whole(max_components=max_components, regroup_every=regroup_every)
@@ -394,7 +391,4 @@ def _mixture_filter(
     ]
     if regroup_every > 1:
         regroup = [Every(regroup_every, regroup)]
-    return Filter(
-        model, [*moves, *regroup], num_particles, max_components,
-        [initial_kmeans], noise, initial_draws=initial_draws,
-    )  # fmt: skip
+    return Filter(model, [*moves, *regroup], num_particles, max_components, [initial_kmeans], noise)

@@ -48,8 +48,7 @@ class ParticleMixture(eqx.Module):
     - `particles`: a pytree whose leaves have a leading axis n, the states X.
     - `log_weights`: ℓ, shape (n,), -inf in an empty slot.
     - `component_indicators`: C, shape (n,), in [0, num_components).
-    - `ancestor_indices`: shape (n,), the slot of the previous step's mixture that each came from;
-      in the first step of a filter with `initial_draws`, that of the x_0 which it chose.
+    - `ancestor_indices`: shape (n,), the slot of the previous step's mixture that each came from.
     - `num_components`: M, the most components that there can be, dead ones included; static. The
       filters of the literature call it `max_components`.
     - `memory`: the memory that moves keep from step to step, by the move's name.
@@ -57,9 +56,9 @@ class ParticleMixture(eqx.Module):
       `monte_carlo(..., slots=...)` sets it.
     - `parents`: within a step, x_{t-1} of each particle after the propagation, where a move of the
       chain asks for it (`AbstractMove.needs_parents`). Elsewhere it is None.
-    - `log_scale`: within a step, the logarithm of a common factor of all weights. It is kept apart
-      from ℓ, which would lose its digits if a log-likelihood of a million were added. After a step
-      it is None, which stands for zero.
+    - `log_scale`: the logarithm of a common factor of all weights. It is kept apart from ℓ, which
+      would lose its digits if a log-likelihood of a million were added. After a step it is zero.
+      In a mixture of x_0 it is what the initial moves leave to the first increment.
 
     The properties are those of one mixture. For a stack of mixtures, as `monte_carlo` and
     `collect=None` return, they raise a `ValueError` that says to `jax.vmap` over the leading axes.
@@ -72,7 +71,7 @@ class ParticleMixture(eqx.Module):
     num_components: int = eqx.field(static=True)
     memory: dict[str, PyTree] = eqx.field(default_factory=dict)
     usable_slots: Int[Array, ""] | None = None
-    log_scale: Float[Array, ""] | None = None
+    log_scale: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), default_float()))
     parents: PyTree = None
 
     @property
@@ -102,8 +101,7 @@ class ParticleMixture(eqx.Module):
     def log_mass(self) -> Float[Array, ""]:
         """log Σ exp ℓ: zero once normalised, and the step's growth of mass before."""
         self._require_one()
-        log_mass = log_sum_exp(self.log_weights)
-        return log_mass if self.log_scale is None else log_mass + self.log_scale
+        return log_sum_exp(self.log_weights) + self.log_scale
 
     @property
     def log_mixture_weights(self) -> Float[Array, " m"]:
@@ -238,7 +236,7 @@ class ParticleMixture(eqx.Module):
             factors = factors.astype(log_weights.dtype)
             common = finite_max(jnp.where(self.occupied, factors, -jnp.inf))
             log_weights = log_weights + (factors - common)
-            log_scale = common if log_scale is None else log_scale + common
+            log_scale = log_scale + common
         log_weights = jnp.where(self.occupied, log_weights, -jnp.inf)
         return self.replace(log_weights=log_weights, log_scale=log_scale)
 

@@ -107,6 +107,10 @@ def _pf(**options) -> Callable[..., Filter]:
     return lambda model: mpfjax.particle_filter(model, NUM_PARTICLES, **options)
 
 
+def _selecting(num_draws: int, **options) -> Callable[..., Filter]:
+    return lambda model: mpfjax.with_selected_start(_pf(**options)(model), num_draws)
+
+
 def _mpf(m: int = NUM_COMPONENTS, **options) -> Callable[..., Filter]:
     return lambda model: mpfjax.mixture_particle_filter(model, NUM_PARTICLES, m, **options)
 
@@ -235,8 +239,8 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "pf adaptive": _pf(ess_threshold=0.5),
     "pf ssp": _pf(scheme="ssp"),
     "pf rqmc": _pf(noise="rqmc"),
-    "pf of many initial draws": _pf(initial_draws=5),
-    "pf rqmc of many initial draws": _pf(noise="rqmc", num_draws=2, initial_draws=3),
+    "pf of many initial draws": _selecting(5),
+    "pf rqmc of many initial draws": _selecting(3, noise="rqmc", num_draws=2),
     "auxiliary pf, adaptive": lambda model: mpfjax.auxiliary_particle_filter(
         model, NUM_PARTICLES, GaussNewtonProposal(model), ess_threshold=0.5
     ),

@@ -172,13 +172,13 @@ BUILT = {
     "Filter": (
         mpfjax.Filter,
         {"model": MODEL, "moves": [mpfjax.Propagate(MODEL)], "num_particles": 4,
-         "num_components": 1, "initial_moves": (), "initial_noise": "rqmc", "initial_draws": 2},
+         "num_components": 1, "initial_moves": (), "initial_noise": "rqmc"},
     ),
     "particle_filter": (
         mpfjax.particle_filter,
         {"model": MODEL, "num_particles": 4, "proposal": None, "scheme": "systematic",
          "ess_threshold": 1.0, "sort_by": None, "noise": "rqmc", "num_draws": 2,
-         "initial_draws": 2, "gradient": "none"},
+         "gradient": "none"},
     ),
     "auxiliary_particle_filter": (
         mpfjax.auxiliary_particle_filter,
@@ -192,7 +192,6 @@ BUILT = {
          "lookahead": None,
          "scheme": "systematic", "ess_threshold": 1.0, "particles_per_component": None,
          "allocation": "equal", "sort_by": "hilbert", "noise": "rqmc", "num_draws": 2,
-         "initial_draws": None,
          "gradient": "none", "features": None,
          "scale": 1.0, "merge": None, "split": None, "kmeans": None, "initial_kmeans": None,
          "regroup_every": 1},

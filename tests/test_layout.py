@@ -19,6 +19,7 @@ ORDER = (
     "moves",
     "observations",
     "filter",
+    "transforms",
     "filters",
     "running",
     "smoothing",

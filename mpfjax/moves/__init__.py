@@ -6,6 +6,7 @@ from mpfjax.moves.base import AbstractPropagation as AbstractPropagation
 from mpfjax.moves.base import AbstractRegrouping as AbstractRegrouping
 from mpfjax.moves.base import AbstractResampling as AbstractResampling
 from mpfjax.moves.every import Every as Every
+from mpfjax.moves.initial import SelectInitial as SelectInitial
 from mpfjax.moves.island_interaction import IslandInteraction as IslandInteraction
 from mpfjax.moves.metropolis import AbstractMetropolis as AbstractMetropolis
 from mpfjax.moves.metropolis import MetropolisAdjustedLangevin as MetropolisAdjustedLangevin

@@ -31,6 +31,14 @@ class AbstractMove(eqx.Module):
         return True
 
     @property
+    def looks_ahead(self) -> bool:
+        """Whether its weights, as an initial move, wait for the likelihood that it has looked at.
+
+        The particles of x_0 are then not resampled before they have been weighed by it.
+        """
+        return False
+
+    @property
     def needs_parents(self) -> bool:
         """Whether the move looks at `mixture.parents`, x_{t-1} of each particle that has x_t.
 

@@ -1,12 +1,13 @@
-"""x_0: its draws, and which of many draws a filter keeps once it sees the first observation."""
+"""x_0: its draws, and the choice among many draws by the first observation."""
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from mpfjax.checks import check_numbered, check_one_of, check_type, check_whole
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -15,91 +16,24 @@ from mpfjax.models.base import (
     starts_from_noise,
 )
 from mpfjax.models.conditionally_linear import with_moments
-from mpfjax.models.noise import draw_noise
-from mpfjax.moves.base import AbstractPropagation
+from mpfjax.models.noise import NOISES, draw_noise
+from mpfjax.moves.base import AbstractMove, AbstractResampling
 from mpfjax.moves.propagation.marginalised import PropagateMarginalised
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.resampling.ordering import HILBERT, sorted_order
+from mpfjax.operations.choices import any_run
 from mpfjax.operations.floats import default_float
-from mpfjax.operations.generator import uniform
+from mpfjax.operations.generator import split, uniform
 from mpfjax.operations.indexing import take
 from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.maxima import largest
 from mpfjax.operations.prefix_sums import count_starts, sum_before
 from mpfjax.operations.stored import stored
 
-# The name of the memory of a filter whose x_0 is chosen.
-START = "start"
 # A particle that the first observation tells nothing of keeps a quarter of its chance, so that no
 # weight is more than four times the mean.
 MOST_TRUST = 3 / 4
-
-
-class StartMemory(NamedTuple):
-    """How far the choice of x_0 has got.
-
-    - `is_prior`: the particles are plain draws of x_0, of which nothing was observed.
-    - `is_chosen`: they are chosen by the next observation, whose step must not resample them.
-    - `log_mass`: the logarithm of the sum of their weights before these were normalised.
-    - `checksum`: of the plain draws, by which a mixture that was changed by hand is known.
-    """
-
-    is_prior: Bool[Array, ""]
-    is_chosen: Bool[Array, ""]
-    log_mass: Float[Array, ""]
-    checksum: UInt32[Array, ""]
-
-    @classmethod
-    def used(cls) -> "StartMemory":
-        """Nothing is left to choose."""
-        no, nothing = jnp.asarray(False), jnp.zeros((), default_float())
-        return cls(no, no, nothing, jnp.zeros((), jnp.uint32))
-
-
-def at_start(mixture: ParticleMixture) -> ParticleMixture:
-    """The mixture of plain draws of x_0, marked as such."""
-    memory = StartMemory.used()._replace(is_prior=jnp.asarray(True), checksum=_checksum(mixture))
-    return mixture.replace(memory=mixture.memory | {START: memory})
-
-
-def is_prior(mixture: ParticleMixture) -> Bool[Array, ""]:
-    """Whether the mixture has plain draws of x_0, which nobody has replaced by others."""
-    memory: StartMemory = mixture.memory[START]
-    return memory.is_prior & (memory.checksum == _checksum(mixture))
-
-
-def started(mixture: ParticleMixture) -> ParticleMixture:
-    """The mixture of a filter that has used its choice of x_0."""
-    return mixture.replace(memory=mixture.memory | {START: StartMemory.used()})
-
-
-def leaving_start(mixture: ParticleMixture) -> ParticleMixture:
-    """The mixture before a prediction, after which x_0 is not drawn anew."""
-    if START not in mixture.memory:
-        return mixture
-    memory = mixture.memory[START]._replace(is_prior=jnp.asarray(False))
-    return mixture.replace(memory=mixture.memory | {START: memory})
-
-
-def unless_chosen(moved: ParticleMixture, mixture: ParticleMixture) -> ParticleMixture:
-    """The resampled mixture, or the one before if x_0 is chosen: its weights are needed."""
-    if moved.log_scale is not None and mixture.log_scale is None:
-        mixture = mixture.replace(log_scale=jnp.zeros_like(moved.log_scale))
-    is_chosen = mixture.memory[START].is_chosen
-    return jax.tree.map(lambda new, old: jnp.where(is_chosen, old, new), moved, mixture)
-
-
-def looking_moves(moves: Sequence[Any], starts_empty: bool) -> list[AbstractPropagation]:
-    """The propagations that weigh two draws of x_1; a `ValueError` for others."""
-    found = [move for move in moves if isinstance(move, AbstractPropagation)]
-    known = (Propagate, PropagateMarginalised, PropagateNested)
-    if starts_empty or not found or not all(isinstance(move, known) for move in found):
-        raise ValueError(
-            "initial_draws: x_0 is chosen where Propagate, PropagateMarginalised or"
-            " PropagateNested propagates, and no filter that starts empty has it"
-        )
-    return found
 
 
 def sample_initial(
@@ -119,87 +53,130 @@ def sample_initial(
     return with_moments(model, particles)
 
 
-def choose_initial(
-    key: Key[Array, ""],
-    mixture: ParticleMixture,
-    drawn: PyTree,
-    looks: Sequence[tuple[Key[Array, ""], AbstractPropagation]],
-    observation: PyTree,
-    noise: str,
-) -> ParticleMixture:
-    """N weighted draws of x_0, chosen for what they say of y_1 among those `drawn`, K N of them.
+class SelectInitial(AbstractMove):
+    """An initial move that draws x_0 many times, and keeps the draws that y_1 speaks for.
 
-    Of each x_0 two x_1 are drawn, by the moves of `looks` with their keys, and ν is the mean of
-    their likelihoods, shrunk towards the mean of all by the share of its variance that is not x_0's
-    (`trusted`). Particles are kept with probabilities in proportion to ν, and weigh 1 / ν. They
-    represent x_0 as the pool does, and Ẑ stays unbiased. With "rqmc" `noise` they are kept in order
-    along a Hilbert curve.
+    K N draws of x_0 take the place of the mixture's N. From each, x_1 is drawn twice, and ν is the
+    mean of the two likelihoods of y_1, shrunk towards the mean of all by the share of its variance
+    that is not x_0's (`trusted`). N particles are kept with probabilities in proportion to ν, and
+    weigh 1 / ν, so that they represent x_0 as all draws do. Their mass is part of the first
+    increment, and Ẑ stays unbiased. A wide prior is covered as by K N particles, at the cost of
+    2 K more draws of x_1 in the whole run.
+
+    Without an observation it does nothing. A `Resample` of the first step waits: it would undo the
+    choice before y_1 has weighed the particles.
+
+    - `propagation`: draws x_1, and weighs it: a `Propagate`, `PropagateMarginalised` or
+      `PropagateNested`, usually the filter's own.
+    - `num_draws`: K.
+    - `noise`: that of the draws of x_0, as `Filter.initial_noise`. With "rqmc" they are kept in
+      order along a Hilbert curve.
+
+    Put it first among `initial_moves`, before those that regroup. Raises `ValueError` for another
+    propagation, K < 1 and unknown noise. Use it where the prior is wide beside the likelihood.
     """
-    num_draws = jax.tree.leaves(drawn)[0].shape[0] // mixture.num_particles
-    usable = mixture.usable_slots
-    num_drawn = None if usable is None else num_draws * usable
-    pool = single_component(drawn, mixture.num_components, num_drawn)
-    log_factors = _look(looks, pool, observation)
-    chances = trusted(log_factors, pool.occupied.astype(log_factors.dtype))
-    chances = stored(jax.lax.stop_gradient(chances))
-    order = None
-    if noise == "rqmc":
-        labels = jnp.where(pool.occupied, 0, pool.num_components)
-        order = sorted_order(pool, labels, HILBERT)
-    kept = _kept(key, chances, mixture, pool, order)
-    particles = jax.tree.map(lambda leaf: take(leaf, kept), drawn)
-    chosen = single_component(particles, mixture.num_components, usable)
-    trust = take(chances, kept).astype(default_float())
-    # No ν is below a quarter, so that their inverses need no logarithms to be summed.
-    total = jnp.sum(jnp.where(chosen.occupied, 1 / trust, 0.0))
-    log_weights = jnp.where(chosen.occupied, -jnp.log(trust * total), -jnp.inf)
-    log_mass = jnp.log(total / jnp.asarray(chosen.num_usable_slots, total.dtype))
-    memory = StartMemory.used()._replace(is_chosen=jnp.asarray(True), log_mass=log_mass)
-    return chosen.replace(log_weights=log_weights, memory=mixture.memory | {START: memory})
+
+    propagation: Propagate | PropagateMarginalised | PropagateNested
+    num_draws: int = eqx.field(static=True, default=4)
+    noise: str = eqx.field(static=True, default="independent")
+
+    def __check_init__(self) -> None:
+        kinds = (Propagate, PropagateMarginalised, PropagateNested)
+        what = "a Propagate, PropagateMarginalised or PropagateNested"
+        check_type(kinds, what, propagation=self.propagation)
+        check_whole(num_draws=self.num_draws)
+        check_one_of(NOISES, noise=self.noise)
+
+    @property
+    def looks_ahead(self) -> bool:
+        """True: the weights undo a choice by the next observation."""
+        return True
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+    ) -> ParticleMixture:
+        """The mixture of the chosen x_0, in one component; without y_1 the one given."""
+        if observation is None:
+            return mixture
+        key_drawn, key_look, key_kept = split(key, 3)
+        num_drawn = self.num_draws * mixture.num_particles
+        check_numbered("draws up to", 2 * num_drawn, num_draws=self.num_draws)
+        drawn = sample_initial(key_drawn, self._model, num_drawn, self.noise)
+        pool = single_component(drawn, mixture.num_components)
+        log_factors = self._look(key_look, pool, observation)
+        chances = trusted(log_factors, pool.occupied.astype(log_factors.dtype))
+        chances = stored(jax.lax.stop_gradient(chances))
+        order = None
+        if self.noise == "rqmc":
+            order = sorted_order(pool, pool.component_indicators, HILBERT)
+        kept = _kept(key_kept, chances, mixture.num_particles, order)
+        trust = take(chances, kept).astype(default_float())
+        # No ν is below a quarter, so that their inverses need no logarithms to be summed.
+        total = jnp.sum(1 / trust)
+        particles = jax.tree.map(lambda leaf: take(leaf, kept), drawn)
+        return single_component(particles, mixture.num_components).replace(
+            log_weights=-jnp.log(trust * total),
+            log_scale=jnp.log(total / mixture.num_particles),
+            memory=mixture.memory,
+        )
+
+    @property
+    def _model(self) -> AbstractStateSpaceModel:
+        nested = isinstance(self.propagation, PropagateNested)
+        return (self.propagation.propagate if nested else self.propagation).model
+
+    def _look(
+        self, key: Key[Array, ""], pool: ParticleMixture, observation: PyTree
+    ) -> Float[Array, "2 n"]:
+        """The logarithms of the weights of two draws of x_1 of each particle, up to a constant."""
+        # Stored, so that x_1 is drawn on vectors, and once, not wherever its likelihood is used.
+        twice = lambda leaf: stored(jnp.repeat(leaf, 2, axis=0))  # noqa: E731
+        drawn = pool.replace(
+            particles=jax.tree.map(twice, pool.particles),
+            log_weights=twice(pool.log_weights),
+            component_indicators=twice(pool.component_indicators),
+            ancestor_indices=twice(pool.ancestor_indices),
+        )
+        drawn = self.propagation(key, drawn, observation)
+        return stored(drawn.log_weights).reshape(-1, 2).T
 
 
-def _checksum(mixture: ParticleMixture) -> UInt32[Array, ""]:
-    """The sum of all bits of particles, weights and indicators, as whole numbers that wrap around.
+class Waiting(AbstractResampling):
+    """A resampling that waits while the weights of x_0 are not those of an observation yet.
 
-    Sums of numbers would depend on their order, and so on the program that adds them.
+    `SelectInitial` leaves a mass for the first increment. Until the propagation has weighed its
+    particles, to resample by their weights would undo the choice.
     """
-    total = jnp.zeros((), jnp.uint32)
-    held = (mixture.particles, mixture.log_weights, mixture.component_indicators)
-    for number, leaf in enumerate(jax.tree.leaves(jax.lax.stop_gradient(held))):
-        bits = _bits(leaf)
-        total += jnp.sum(bits, dtype=jnp.uint32) * jnp.uint32(2 * number + 1)
-    return total
+
+    move: AbstractResampling
+
+    @property
+    def approximate(self) -> bool:
+        """Whether the move is."""
+        return self.move.approximate
+
+    def would_resample(
+        self, mixture: ParticleMixture, observation: PyTree = None
+    ) -> Bool[Array, " m"]:
+        """Which components the move would resample, unless it waits."""
+        return self.move.would_resample(mixture, observation) & (mixture.log_scale == 0)
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+    ) -> ParticleMixture:
+        """The resampled mixture, or the one given; all runs of a `vmap` decide together."""
+        return jax.lax.cond(
+            any_run(mixture.log_scale != 0),
+            lambda: mixture,
+            lambda: self.move(key, mixture, observation),
+        )
 
 
-def _bits(leaf: Array) -> Array:
-    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        leaf = jax.random.key_data(leaf)
-    if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
-        leaf = jnp.stack([leaf.real, leaf.imag])
-    if jnp.issubdtype(leaf.dtype, jnp.floating):
-        words = jnp.uint16 if leaf.dtype.itemsize == 2 else jnp.uint32
-        leaf = jax.lax.bitcast_convert_type(leaf, words)
-    return leaf.astype(jnp.uint32)
-
-
-def _look(
-    looks: Sequence[tuple[Key[Array, ""], AbstractPropagation]],
-    pool: ParticleMixture,
-    observation: PyTree,
-) -> Float[Array, "2 n"]:
-    """The logarithms of the weights of two draws of x_1 of each particle, up to a constant."""
-    # Stored, so that x_1 is drawn on vectors, and once, not again wherever its likelihood is used.
-    twice = lambda leaf: stored(jnp.repeat(leaf, 2, axis=0))  # noqa: E731
-    drawn = pool.replace(
-        particles=jax.tree.map(twice, pool.particles),
-        log_weights=twice(pool.log_weights),
-        component_indicators=twice(pool.component_indicators),
-        ancestor_indices=twice(pool.ancestor_indices),
-        usable_slots=None if pool.usable_slots is None else 2 * pool.usable_slots,
-    )
-    for move_key, move in looks:
-        drawn = move(move_key, drawn, observation)
-    return stored(drawn.log_weights).reshape(-1, 2).T
+def waiting_for_choice(moves: tuple[Any, ...], initial_moves: tuple[Any, ...]) -> tuple[Any, ...]:
+    """The moves of a step; after an initial move that looks ahead, the resampling ones wait."""
+    if not any(getattr(move, "looks_ahead", False) for move in initial_moves):
+        return moves
+    return tuple(Waiting(move) if isinstance(move, AbstractResampling) else move for move in moves)
 
 
 def trusted(log_factors: Float[Array, "2 n"], weights: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -233,19 +210,15 @@ def trusted(log_factors: Float[Array, "2 n"], weights: Float[Array, " n"]) -> Fl
 def _kept(
     key: Key[Array, ""],
     chances: Float[Array, " p"],
-    mixture: ParticleMixture,
-    pool: ParticleMixture,
+    num_kept: int,
     order: Int[Array, " p"] | None,
 ) -> Int[Array, " n"]:
     """Which particle of the pool each slot takes: systematic draws in proportion to ν."""
-    weights = jnp.where(pool.occupied, chances, 0.0)
-    weights = weights if order is None else take(weights, order)
-    num_kept = jnp.asarray(mixture.num_usable_slots, weights.dtype)
+    weights = chances if order is None else take(chances, order)
     before, total = sum_before(weights)
     # Slot s has the point s + shift, and takes the particle whose interval holds it.
     points = before * (num_kept / total) - uniform(key, (), weights.dtype)
     starts = jnp.ceil(points).astype(jnp.int32)
-    places = count_starts(jnp.maximum(starts, 0), mixture.num_particles)
-    last = jnp.asarray(pool.num_usable_slots, jnp.int32) - 1
-    places = jnp.clip(places, 0, last)
+    places = count_starts(jnp.maximum(starts, 0), num_kept)
+    places = jnp.clip(places, 0, weights.shape[0] - 1)
     return places if order is None else take(order, places)

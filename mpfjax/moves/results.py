@@ -89,8 +89,7 @@ def normalised(
     be lost to rounding.
     """
     log_sum, log_largest = scaled_log_sum_exp(mixture.log_weights)
-    own_scale = jnp.zeros_like(log_sum) if mixture.log_scale is None else mixture.log_scale
-    log_excess, log_total, log_scale = excess_over_islands(own_scale, log_largest, log_sum)
+    log_excess, log_total, log_scale = excess_over_islands(mixture.log_scale, log_largest, log_sum)
     has_mass = log_total > -jnp.inf
     log_share = log_excess - jnp.where(has_mass, log_total, 0.0)
     shares = (mixture.log_weights - log_largest) + log_share
@@ -101,4 +100,5 @@ def normalised(
     log_growth = log_scale + log_total
     if may_be_empty:
         log_growth = jnp.where(keep, log_growth, 0.0)
-    return mixture.replace(log_weights=log_weights, log_scale=None), log_growth
+    normalised = mixture.replace(log_weights=log_weights, log_scale=jnp.zeros_like(log_total))
+    return normalised, log_growth

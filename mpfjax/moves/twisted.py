@@ -106,43 +106,33 @@ class CountSteps(AbstractMove):
         return False
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """The number of the step, and the mass of x_0, which the first observed step adds to Ẑ."""
+        """The number of the step."""
         del num_components
-        return {STEP: {"step": jnp.zeros((), jnp.int32), "log_mass": jnp.zeros(())}}
+        return {STEP: {"step": jnp.zeros((), jnp.int32)}}
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
-        """Count the step, and add the mass of x_0 if no step has yet."""
-        del key, observation
-        own = mixture.memory[STEP]
-        log_mass = own["log_mass"]
-        counted = {"step": own["step"] + 1, "log_mass": jnp.zeros_like(log_mass)}
-        return mixture.replace(memory=mixture.memory | {STEP: counted}).weighed(log_mass[None])
+        """Count the step."""
+        del observation
+        return self.predict(key, mixture)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """Count the step; the mass of x_0 waits for one with an observation."""
+        """Count the step."""
         del key
-        own = mixture.memory[STEP]
-        counted = own | {"step": own["step"] + 1}
+        counted = {"step": mixture.memory[STEP]["step"] + 1}
         return mixture.replace(memory=mixture.memory | {STEP: counted})
 
 
 class TwistInitial(AbstractMove):
     """Draws x_0 anew: its noise from q_0, with the weights N(ε; 0, I) / q_0(ε).
 
-    The weights are normalised. `CountSteps` adds their sum in the first step that has an
-    observation, so that Ẑ stays unbiased.
+    Their mass is part of the first increment, so that Ẑ stays unbiased.
     """
 
     model: AbstractStateSpaceModel
     twist: Twist
     noise: str = eqx.field(static=True, default="independent")
-
-    @property
-    def reads(self) -> frozenset[str]:
-        """The memory of `CountSteps`."""
-        return frozenset({STEP})
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
@@ -157,14 +147,7 @@ class TwistInitial(AbstractMove):
         drawn, log_ratio = psi.draw(noise, jnp.zeros((shape[0], 1), dtype))
         states = with_moments(model, model.initial_from_noise(drawn))
         check_moved(states, mixture.particles, self.model, "initial_from_noise")
-        log_weights = mixture.log_weights + log_ratio.astype(mixture.log_weights.dtype)
-        log_mass = log_sum_exp(log_weights)
-        waiting = mixture.memory[STEP] | {"log_mass": log_mass}
-        return mixture.replace(
-            particles=states,
-            log_weights=log_weights - log_mass,
-            memory=mixture.memory | {STEP: waiting},
-        )
+        return mixture.replace(particles=states).weighed(log_ratio)
 
 
 class TwistedLookahead(eqx.Module):

@@ -86,8 +86,6 @@ def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any
 
 def _run_block(keys, filter, series, collect):
     """The islands of one device."""
-    # Every island is normalised by the mass of all, and would need that of their choices.
-    filter = filter.with_one_draw()
     run_one = lambda key: scan(Start(key), filter, series, collect)  # noqa: E731
     return jax.vmap(run_one, axis_name=ISLAND_AXIS)(keys)
 

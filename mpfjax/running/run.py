@@ -12,13 +12,13 @@ from mpfjax.checks import check_flag, check_key, check_whole, given
 from mpfjax.filter import Filter, Start
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.initial import sample_initial
-from mpfjax.observations import as_series
+from mpfjax.observations import Series, as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.functions import interned
-from mpfjax.operations.generator import split_keys
+from mpfjax.operations.generator import split, split_keys
 from mpfjax.running.devices import choose_devices, over_devices
 from mpfjax.running.progress import shown_progress
-from mpfjax.running.scan import FilterRun, check_run, checked, scan
+from mpfjax.running.scan import FilterRun, check_run, checked, first_mixture, scan
 from mpfjax.running.threads import num_processors, over_threads
 
 # How many particles, with the temporaries of a step, fit into a CPU's caches. Few components
@@ -113,7 +113,7 @@ def monte_carlo(
     def run(filter: Filter) -> FilterRun:
         starts = Start(keys)
         if slots is not None:
-            starts, filter = _in_slots(keys, filter, slots, series.length)
+            starts, filter = _in_slots(keys, filter, slots, series)
         arguments = (filter, series, collect, *bars)
         leave_to_caller = devices is None and is_traced((starts, arguments))
         chosen = None if leave_to_caller else choose_devices(devices)
@@ -131,7 +131,7 @@ def _run(key, filter, series, collect, bar=None):
 
 
 def _in_slots(
-    keys: Key[Array, " seeds"], filter: Filter, slots: int, num_steps: int
+    keys: Key[Array, " seeds"], filter: Filter, slots: int, series: Series
 ) -> tuple[Start, Filter]:
     """The starts of the runs and the filter, both with this number of slots whatever N is."""
     num_particles = filter.num_particles
@@ -139,15 +139,11 @@ def _in_slots(
         raise ValueError(f"slots: {slots} is no whole number of at least N, {num_particles}")
     # A model's draws may depend on N, as stratified draws do. So these are programs of their own;
     # all filters of a model share the first one.
+    larger = filter.replace(num_particles=int(slots))
+    if filter.looks_at_first:
+        return Start(keys, mixture=_start_each(keys, filter, series, int(slots))), larger
     particles = _sample_each(keys, filter.model, filter.initial_noise, num_particles, int(slots))
-    several = filter.initial_draws > 1
-    pool = _sample_pools(keys, filter, int(slots), num_steps) if several else None
-    limits = jnp.full(keys.shape, num_particles, jnp.int32)
-    filter = Filter(
-        filter.model, filter.moves, int(slots), filter.num_components, filter.initial_moves,
-        filter.initial_noise, initial_draws=filter.initial_draws,
-    )  # fmt: skip
-    return Start(keys, particles, pool, limits), filter
+    return Start(keys, particles, jnp.full(keys.shape, num_particles, jnp.int32)), larger
 
 
 @jit_on_wide_vectors
@@ -162,15 +158,24 @@ def _sample_each(keys, model, noise, num_particles, slots):
 
 
 @jit_on_wide_vectors
-def _sample_pools(keys, filter, slots, num_steps):
-    """The draws that x_0 of each run is chosen from."""
+def _start_each(keys, filter, series, slots):
+    """The mixture of x_0 of each run, where y_1 has a part in it."""
+    num_initial = 1 + len(filter._initial_moves)
 
-    def sample(key: Key[Array, ""]) -> PyTree:
-        key_steps = split_keys(key, 2)[1]
-        pool = filter.sample_pool(jax.random.split(key_steps, num_steps)[0])
-        return _filled(pool, filter.initial_draws * slots)
+    def start(key: Key[Array, ""]) -> ParticleMixture:
+        keys_initial = split(split_keys(key, 2)[0], num_initial)
+        mixture = first_mixture(Start(keys_initial), filter, series)
+        is_empty = jnp.arange(slots) >= filter.num_particles
+        log_weights = _filled(mixture.log_weights, slots)
+        return mixture.replace(
+            particles=_filled(mixture.particles, slots),
+            log_weights=jnp.where(is_empty, -jnp.inf, log_weights),
+            component_indicators=_filled(mixture.component_indicators, slots),
+            ancestor_indices=jnp.arange(slots, dtype=jnp.int32),
+            usable_slots=jnp.asarray(filter.num_particles, jnp.int32),
+        )
 
-    return jax.vmap(sample)(keys)
+    return jax.vmap(start)(keys)
 
 
 def _filled(particles: PyTree, slots: int) -> PyTree:

@@ -14,7 +14,6 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from mpfjax.checks import check_callable, check_type, given, saying
 from mpfjax.filter import BROKEN_DENSITY, Filter, Start, StepInfo
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.initial import leaving_start
 from mpfjax.observations import Series
 from mpfjax.operations.across_islands import num_islands
 from mpfjax.operations.generator import split_for_run
@@ -46,8 +45,8 @@ def scan(
     bar: Bar | None = None,
 ) -> FilterRun:
     """`run_filter` under the caller's jit, its arguments unchecked."""
-    num_initial, num_of_step = 1 + len(filter._initial_moves), filter.num_step_keys
-    keys_initial, keys = split_for_run(start.key, num_initial, series.length, num_of_step)
+    num_initial, num_moves = 1 + len(filter._initial_moves), len(filter._moves)
+    keys_initial, keys = split_for_run(start.key, num_initial, series.length, num_moves)
 
     def advance(
         mixture: ParticleMixture, step: tuple[Array, Series, Array | None]
@@ -61,34 +60,28 @@ def scan(
         return mixture, (kept, report_of(info))
 
     numbers = None if bar is None else jnp.arange(series.length, dtype=jnp.int32)
-    steps = (keys[:, : len(filter._moves)], series, numbers)
-    start = start._replace(key=keys_initial)
-    initial, filter = first_mixture(start, filter, keys[0], series)
-    initial = _share_of_islands(initial)
-    final, outputs = jax.lax.scan(advance, initial, steps)
+    initial = first_mixture(start._replace(key=keys_initial), filter, series)
+    final, outputs = jax.lax.scan(advance, initial, (keys, series, numbers))
     return run_of(initial, final, *outputs)
 
 
-def first_mixture(
-    start: Start, filter: Filter, key: Key[Array, "*keys"], series: Series
-) -> tuple[ParticleMixture, Filter]:
-    """The mixture of x_0 that the first step, of this `key`, goes on from; and the filter for the
-    steps, which need not choose it any more.
+def first_mixture(start: Start, filter: Filter, series: Series) -> ParticleMixture:
+    """The mixture of x_0 that the first step goes on from, given y_1 where it is there.
 
-    A run has y_1 before it starts, so that its `initial` is what the particles descend from.
+    On islands it has the share of one of them in the mass of all.
     """
-    if filter.initial_draws == 1:
-        return filter._init(start), filter
+    log_islands = math.log(num_islands())
+    if not filter.looks_at_first:
+        mixture = filter._init(start)
+        return mixture.replace(log_weights=mixture.log_weights - log_islands)
     first = jax.tree.map(lambda leaf: leaf[0], series)
     given = filter.with_inputs(first.inputs)
-
-    def choose(initial: ParticleMixture) -> ParticleMixture:
-        return given.choose_initial(key, initial, first.observations, start.pool)
-
+    look = lambda: given._init(start, first.observations)  # noqa: E731
     if first.present is None:
-        return choose(filter._init(start, grouped=False)), filter.with_one_draw()
-    initial = jax.lax.cond(first.present, choose, leaving_start, filter._init(start))
-    return initial, filter.with_one_draw()
+        mixture = look()
+    else:
+        mixture = jax.lax.cond(first.present, look, lambda: given._init(start))
+    return mixture.replace(log_scale=mixture.log_scale - log_islands)
 
 
 class StepReport(NamedTuple):
@@ -134,13 +127,6 @@ def step_or_predict(
         lambda: filter._step(key, mixture, now.observations),
         lambda: filter._predict(key, mixture),
     )
-
-
-def _share_of_islands(mixture: ParticleMixture) -> ParticleMixture:
-    """The mixture with its mass divided by the number of islands, as a part of the whole."""
-    if num_islands() == 1:
-        return mixture
-    return mixture.replace(log_weights=mixture.log_weights - math.log(num_islands()))
 
 
 def checked(run: FilterRun) -> FilterRun:

@@ -91,8 +91,9 @@ def conditional_filter(
       in the last steps, unless N is large.
     - `observations`, `inputs`, `missing`: as for `run_filter`.
 
-    x_0 is drawn one particle at a time, also where the model would draw it in strata. The model's
-    `sample_transition` must draw particles independently of each other.
+    x_0 is drawn one particle at a time, also where the model would draw it in strata, and no
+    `SelectInitial` chooses it. The model's `sample_transition` must draw particles independently of
+    each other.
 
     Raises `ValueError` for a filter that is no chain of regrouping moves, `Resample` (systematic,
     stratified or multinomial), `Propagate`, `Predict` and `Reweight`; a conditionally linear model;
@@ -175,12 +176,10 @@ def _around(filter: Filter, trajectory: PyTree, first_slot: Int[Array, ""]) -> F
             return ConditionalPropagation(move, trajectory, first_slot)
         return ConditionalResample(move) if isinstance(move, Resample) else move
 
-    return Filter(
-        filter.model,
-        [around(move) for move in filter.moves],
-        filter.num_particles,
-        filter.num_components,
-        filter.initial_moves,
+    return filter.replace(
+        moves=[around(move) for move in filter.moves],
+        # x_0 is one of N draws of the model's.
+        initial_moves=[move for move in filter.initial_moves if not move.weighs],
     )
 
 

@@ -116,7 +116,7 @@ def _smooth(key, filter, series, options):
     key_initial, key_steps, key_backward = split_keys(key, 3)
     length = series.length
     step_keys = jax.random.split(key_steps, length)
-    initial, filter = first_mixture(Start(key_initial), filter, step_keys[0], series)
+    initial = first_mixture(Start(key_initial), filter, series)
     num_kept = 1 if lag is None else lag + 1
     shapes = _shapes(function, initial.particles)
     kept = jax.tree.map(lambda leaf: jnp.zeros((num_kept, *leaf.shape), leaf.dtype), shapes)

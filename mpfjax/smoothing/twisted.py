@@ -75,7 +75,7 @@ def learn_lookahead(
     than those of `filter`. The filter is good for these observations alone; for another series of
     the same length it is exact, but no better. With other parameters of the model it is exact too,
     and good as long as the posterior of the states is similar. `eqx.tree_at` changes its `model`,
-    and so do the samplers of `mpfjax.tuning`.
+    and so do the samplers of `mpfjax.tuning`. No `SelectInitial` chooses x_0, since ψ does.
 
     - `filter`: of moves `Resample` (or `AuxiliaryResample`, whose look-ahead is replaced),
       `Propagate` and regrouping; its components get equal slots. Its model makes x_t of noise,
@@ -137,15 +137,11 @@ def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
     for kind, needed in ((AuxiliaryResample, "Resample"), (PropagateTwisted, "Propagate")):
         if sum(isinstance(move, kind) for move in moves) != 1:
             raise ValueError(f"filter: its moves need one {needed}, in the chain itself")
-    regroupings = [_looking_ahead(move, filter, twist) for move in filter.initial_moves]
+    kept = [move for move in filter.initial_moves if not getattr(move, "looks_ahead", False)]
+    regroupings = [_looking_ahead(move, filter, twist) for move in kept]
     initial: list[Any] = [TwistInitial(filter.model, twist, filter.initial_noise), *regroupings]
-    return Filter(
-        filter.model,
-        [CountSteps(), *moves],
-        num_particles,
-        filter.num_components,
-        initial,
-        filter.initial_noise,
+    return filter.replace(
+        moves=[CountSteps(), *moves], num_particles=num_particles, initial_moves=initial
     )
 
 

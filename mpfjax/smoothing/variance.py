@@ -55,7 +55,8 @@ class _KeepFirstAncestors(AbstractRegrouping):
 def with_first_ancestors(filter: Filter) -> Filter:
     """The same filter, which also remembers the first ancestor of each particle.
 
-    Draws and weights are the same to the bit. A step takes O(N) more memory and time, and the runs
+    Draws and weights are the same to the bit, but that no `SelectInitial` chooses x_0: what it
+    keeps are no independent draws. A step takes O(N) more memory and time, and the runs
     can be given to `log_marginal_likelihood_variance` and `mixture_weight_errors`. `StepInfo` then
     has both errors at every step. Raises `ValueError` for anything but a filter, for a filter whose
     particles have no single ancestors or whose Ẑ is not unbiased (one with an approximate move,
@@ -75,14 +76,8 @@ def with_first_ancestors(filter: Filter) -> Filter:
     _require_independent_draws(filter)
     if any(isinstance(move, _KeepFirstAncestors) for move in filter.initial_moves):
         return filter
-    return Filter(
-        filter.model,
-        filter.moves,
-        filter.num_particles,
-        filter.num_components,
-        [*filter.initial_moves, _KeepFirstAncestors()],
-        filter.initial_noise,
-    )
+    kept = [move for move in filter.initial_moves if not move.weighs]
+    return filter.replace(initial_moves=[*kept, _KeepFirstAncestors()])
 
 
 def _require_independent_draws(filter: Filter) -> None:

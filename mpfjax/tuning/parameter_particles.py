@@ -14,7 +14,7 @@ from mpfjax.moves.resampling.resample import Resample
 from mpfjax.observations import Series
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.logarithms import log_sum_exp
-from mpfjax.running.scan import step_or_predict
+from mpfjax.running.scan import first_mixture, step_or_predict
 from mpfjax.tuning.chains import chosen
 from mpfjax.tuning.densities import Evaluated, Prior, evaluated, is_invalid, number_or_zero
 from mpfjax.tuning.problem import Problem, Reals
@@ -37,14 +37,14 @@ class FilterOf(eqx.Module):
 
     def start(self, key: Key[Array, ""], filter: Filter) -> ParticleMixture:
         """The mixture of x_0."""
-        return filter.with_one_draw()._init(Start(key))
+        return first_mixture(Start(key), filter, self.series)
 
     def step(
         self, key: Key[Array, ""], filter: Filter, mixture: ParticleMixture, t: Int[Array, ""]
     ) -> tuple[ParticleMixture, Float[Array, ""]]:
         """The mixture after one more observation, and the increment of log Ẑ."""
         now = jax.tree.map(lambda leaf: jnp.asarray(leaf)[t], self.series)
-        mixture, info = step_or_predict(filter.with_one_draw(), key, mixture, now)
+        mixture, info = step_or_predict(filter, key, mixture, now)
         return mixture, info.log_likelihood_increment
 
     def __call__(
@@ -84,11 +84,7 @@ class Sampler(eqx.Module):
 
     def with_particles(self, num_particles: int) -> "Sampler":
         """The same with filters of another number of particles."""
-        filter = self.problem.tree
-        resized = Filter(
-            filter.model, filter.moves, num_particles, filter.num_components,
-            filter.initial_moves, filter.initial_noise,
-        )  # fmt: skip
+        resized = self.problem.tree.replace(num_particles=num_particles)
         problem = self.problem.with_structure(jax.tree.structure(resized))
         return eqx.tree_at(lambda sampler: sampler.problem, self, problem)
 

@@ -81,8 +81,7 @@ def test_what_is_expected_stays_the_same_in_every_component(ess_threshold):
     move = AuxiliaryResample(Resample("multinomial", ess_threshold), look)
 
     def sums(mixture):
-        scaled = mixture.replace(log_scale=None).weights
-        scaled = scaled * (1.0 if mixture.log_scale is None else jnp.exp(mixture.log_scale))
+        scaled = mixture.weights * jnp.exp(mixture.log_scale)
         values = jnp.stack([jnp.ones(30), mixture.particles, mixture.particles**2], axis=1)
         return mixture.component_sums(scaled[:, None] * values)
 

@@ -60,7 +60,7 @@ def test_weights_are_means_and_draws_are_kept_by_theirs(noise):
 
 def test_each_particle_keeps_one_of_its_own_draws():
     still = mpfjax.QuadraticModel(1e-4, 0.5, -2.0, 2.0)
-    filter = mpfjax.mixture_particle_filter(still, 30, 3, num_draws=4, initial_draws=1)
+    filter = mpfjax.mixture_particle_filter(still, 30, 3, num_draws=4)
     before = filter.init(jax.random.key(0))
     after, _ = filter.step(jax.random.key(1), before, SEEN[0])
     parents = np.asarray(before.particles)[np.asarray(after.ancestor_indices)]

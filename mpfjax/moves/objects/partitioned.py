@@ -102,7 +102,6 @@ class Partitioned(AbstractPropagation):
     ) -> ParticleMixture:
         """Propagate and weigh the objects of every particle in its component's order."""
         num_objects = self.model.num_objects
-        mixture = mixture.replace(log_scale=jnp.zeros((), mixture.log_weights.dtype))
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = split(key, 2 * num_objects + 1)
         orders = self._orders(keys[-1], mixture.num_components)

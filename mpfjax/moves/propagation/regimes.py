@@ -141,8 +141,7 @@ class PropagateRegimes(AbstractPropagation):
         latents, log_priors = [latent for latent, _ in pairs], jnp.stack([log for _, log in pairs])
         moved = self._chosen(key, mixture, latents, log_priors)
         # A common factor of the transition probabilities must not add to the mass.
-        scale = jnp.zeros(()) if moved.log_scale is None else moved.log_scale
-        log_weights = moved.log_weights + scale
+        log_weights = moved.log_weights + (moved.log_scale - mixture.log_scale)
         return moved.replace(log_weights=log_weights, log_scale=mixture.log_scale)
 
     def _chosen(

@@ -165,7 +165,7 @@ class ShareMass(AbstractMove):
         del key, observation
         number = jnp.maximum(jnp.sum(mixture.active), 1).astype(mixture.log_weights.dtype)
         log_weights = mixture.log_component_weights - jnp.log(number)
-        return mixture.replace(log_weights=log_weights, log_scale=None)
+        return mixture.replace(log_weights=log_weights, log_scale=jnp.zeros(()))
 
 
 def _ranks(found: Detections) -> Int[Array, " d"]:

@@ -1,4 +1,4 @@
-"""A filter that chooses x_0 among K N draws by the first observation."""
+"""x_0 chosen among K N draws by the first observation: an ordinary initial move."""
 
 import equinox as eqx
 import jax
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.moves.initial import START, trusted
-from tests.marking import thorough
+from mpfjax.moves.initial import trusted
+from mpfjax.smoothing import conditional_filter, with_first_ancestors
 
 KEY = jax.random.key(0)
 OBSERVATIONS = np.array([3.0, 3.3, 3.1], np.float32)
@@ -44,10 +44,15 @@ class Wide(mpfjax.AbstractStateSpaceModel):
         return log_z, mean
 
 
-def make(num_draws, num_particles=100, model=None, **options):
-    return mpfjax.particle_filter(
-        Wide() if model is None else model, num_particles, initial_draws=num_draws, **options
-    )
+def make(num_draws, num_particles=100, **options):
+    plain = mpfjax.particle_filter(Wide(), num_particles, **options)
+    return mpfjax.with_selected_start(plain, num_draws)
+
+
+def is_near(ratios, exact=1.0):
+    """Whether the mean of independent estimates is within four standard errors of what it is of."""
+    ratios = np.asarray(ratios, np.float64)
+    return abs(ratios.mean() - exact) < 4 * ratios.std(ddof=1) / np.sqrt(len(ratios))
 
 
 def nothing(mixture):
@@ -71,30 +76,30 @@ def test_a_wide_prior_is_covered_as_by_more_particles(runs):
 def test_evidence_and_moments_stay_unbiased(runs):
     log_z, mean = Wide().kalman()
     ratios = np.exp(np.asarray(runs[8].log_marginal_likelihood, np.float64) - log_z)
-    ends = ratios * np.asarray(jax.vmap(lambda mixture: mixture.mean())(runs[8].final))
-    for found, exact in ((ratios, 1.0), (ends, mean)):
-        assert abs(found.mean() - exact) < 4 * found.std(ddof=1) / np.sqrt(len(found))
+    assert is_near(ratios)
+    assert is_near(
+        ratios * np.asarray(jax.vmap(lambda mixture: mixture.mean())(runs[8].final)), mean
+    )
 
 
 def test_the_chosen_particles_represent_the_prior(runs):
-    initial, log_mass = runs[8].initial, runs[8].initial.memory[START].log_mass
+    initial = runs[8].initial
     np.testing.assert_allclose(jax.vmap(lambda m: m.weights.sum())(initial), 1.0, atol=1e-5)
     # More of them are near the observation than of plain draws, and weigh less.
     near = np.abs(initial.particles - 3.0) < 0.5
     assert near.mean() > 5 * np.mean(np.abs(runs[1].initial.particles - 3.0) < 0.5)
-    weights = np.asarray(jax.vmap(lambda m: m.weights)(initial)) * np.exp(log_mass)[:, None]
+    weights = np.asarray(jax.vmap(lambda m: m.weights)(initial))
+    weights = weights * np.exp(initial.log_scale)[:, None]
     for function, exact in ((near, 0.01325), (initial.particles > 0, 0.5), (weights > 0, 1.0)):
-        found = np.sum(weights * np.asarray(function), axis=1)
-        assert abs(found.mean() - exact) < 4 * found.std(ddof=1) / np.sqrt(len(found)) + 1e-4
+        assert is_near(np.sum(weights * np.asarray(function), axis=1), exact)
 
 
-@pytest.mark.parametrize("noise", ["rqmc", *thorough(["stratified"])])
-def test_particles_descend_from_those_of_the_run(noise):
+def test_particles_descend_from_those_of_the_run():
     """Without noise in the dynamics x_1 is x_0 of its ancestor, where the run says it was."""
     model = mpfjax.LinearGaussianModel(
         np.eye(2), 1e-12 * np.eye(2), np.eye(2), np.eye(2), np.zeros(2), np.eye(2)
     )
-    filter = mpfjax.mixture_particle_filter(model, 40, 3, noise=noise)
+    filter = mpfjax.mixture_particle_filter(model, 40, 3, noise="rqmc", lookahead=None)
     run = mpfjax.run_filter(KEY, filter, np.ones((2, 2), np.float32))
     first = jax.tree.map(lambda leaf: leaf[0], run.collected)
     assert len(np.unique(first.ancestor_indices)) == 40  # no particle of x_0 is resampled
@@ -108,7 +113,7 @@ def test_online_steps_draw_the_same():
     filter = mpfjax.mixture_particle_filter(Wide(), 50, 3)
     run = mpfjax.run_filter(KEY, filter, OBSERVATIONS, nothing)
     key_initial, key_steps = jax.random.split(KEY)
-    mixture, total = filter.init(key_initial), 0.0
+    mixture, total = filter.init(key_initial, OBSERVATIONS[0]), 0.0
     for key, observation in zip(jax.random.split(key_steps, 3), OBSERVATIONS, strict=True):
         mixture, info = filter.step(key, mixture, observation)
         total += float(info.log_likelihood_increment)
@@ -116,51 +121,111 @@ def test_online_steps_draw_the_same():
     np.testing.assert_array_equal(mixture.particles, run.final.particles)
 
 
-@pytest.mark.parametrize("compiled", [False, True])
-def test_what_replaced_x_0_is_what_the_first_step_goes_on_from(compiled):
-    """Particles near 500, which neither the prior nor the observation speaks for."""
+@pytest.mark.parametrize(
+    "changed",
+    [
+        lambda m: m.replace(particles=500 + m.particles / 1000),
+        lambda m: m.replace(particles=-m.particles),
+        lambda m: m.replace(particles=2 * m.particles),
+        lambda m: m.replace(component_indicators=0 * m.component_indicators),
+    ],
+    ids=["elsewhere", "mirrored", "scaled", "in one component"],
+)
+def test_a_mixture_changed_by_hand_is_what_the_first_step_goes_on_from(changed):
     filter = mpfjax.mixture_particle_filter(Wide(), 50, 3)
-    init = jax.jit(filter.init) if compiled else filter.init
-    mixture = init(KEY)
-    own = mixture.replace(particles=500 + mixture.particles / 1000)
-    moved, _ = filter.step(KEY, own, OBSERVATIONS[0])
-    assert np.all(np.asarray(moved.particles) > 490)
-    one = mixture.replace(particles=mixture.particles.at[7].add(1e-3))
-    few = mixture.replace(component_indicators=0 * mixture.component_indicators)
-    for changed in (one, few):
-        moved, _ = filter.step(KEY, changed, OBSERVATIONS[0])
-        assert not moved.memory[START].is_prior
-        away = np.abs(np.asarray(moved.particles)[:, None] - np.asarray(changed.particles)[None])
-        assert np.max(np.min(away, axis=1)) < 2.0  # all descend from those that were given
-    chosen, _ = filter.step(KEY, mixture, OBSERVATIONS[0])
-    away = np.abs(np.asarray(chosen.particles)[:, None] - np.asarray(mixture.particles)[None])
-    assert np.max(np.min(away, axis=1)) > 2.0
+    given = changed(filter.init(KEY))
+    moved, _ = filter.step(KEY, given, OBSERVATIONS[0])
+    away = np.abs(np.asarray(moved.particles)[:, None] - np.asarray(given.particles)[None])
+    assert np.max(np.min(away, axis=1)) < 2.0
 
 
-def test_a_first_step_without_an_observation_keeps_plain_draws():
+def test_without_an_observation_it_does_nothing():
     gap = OBSERVATIONS.copy()
     gap[0] = np.nan
     run, plain = (mpfjax.run_filter(KEY, make(k), gap, missing="skip") for k in (4, 1))
-    np.testing.assert_array_equal(run.collected.particles, plain.collected.particles)
-    np.testing.assert_array_equal(run.log_likelihood_increments, plain.log_likelihood_increments)
-    predicted, _ = make(4).predict(KEY, make(4).init(KEY))
-    same, _ = make(1).predict(KEY, make(1).init(KEY))
-    moved, _ = make(4).step(KEY, predicted, OBSERVATIONS[1])
-    expected, _ = make(1).step(KEY, same, OBSERVATIONS[1])
-    np.testing.assert_array_equal(moved.particles, expected.particles)
+    np.testing.assert_array_equal(run.initial.log_weights, plain.initial.log_weights)
+    assert run.initial.log_scale == 0
+    mixture = make(4).init(KEY)
+    assert not np.any(np.asarray(mixture.log_weights) + np.log(100) > 1e-6)
 
 
-def test_with_slots_the_draws_are_the_same():
+def test_what_a_chain_weighs_before_it_propagates_counts():
+    """x_0 is seen once more, with an error of 2, by a move at the head of the chain."""
+
+    def tilt(key, mixture, observation):
+        log_factors = jax.scipy.stats.norm.logpdf(observation, mixture.particles, 2.0)
+        return mixture.weighed(log_factors)
+
+    model, observation = Wide(wide=3.0), 1.5
+    propagate = mpfjax.Propagate(model)
+    filter = mpfjax.Filter(
+        model, [tilt, mpfjax.Resample(), propagate], 200,
+        initial_moves=[mpfjax.SelectInitial(propagate, 8)],
+    )  # fmt: skip
+    keys = jax.random.split(KEY, 400)
+    found = mpfjax.monte_carlo(keys, filter, np.array([observation], np.float32), nothing)
+    # Both observations are normal given x_0 of variance 9.
+    covariance = np.array([[9 + 4, 9], [9, 9 + 0.09 + 0.09]])
+    seen = np.full(2, observation)
+    log_z = -0.5 * (seen @ np.linalg.solve(covariance, seen) + np.linalg.slogdet(covariance)[1])
+    log_z -= np.log(2 * np.pi)
+    assert is_near(np.exp(np.asarray(found.log_marginal_likelihood, np.float64) - log_z))
+
+
+def test_every_second_step_is_the_second_and_the_fourth():
+    model = Wide()
+    propagate = mpfjax.Propagate(model)
+    filter = mpfjax.Filter(
+        model, [mpfjax.Every(2, [mpfjax.Resample()]), propagate], 100,
+        initial_moves=[mpfjax.SelectInitial(propagate, 4)],
+    )  # fmt: skip
+    run = mpfjax.run_filter(KEY, filter, np.full(5, 3.0, np.float32))
+    np.testing.assert_array_equal(run.resampled[:, 0], [False, True, False, True, False])
+
+
+def test_on_islands_the_masses_of_their_choices_count():
+    log_z, _ = Wide().kalman()
+    keys = jax.random.split(KEY, 300)
+
+    def log_evidence(num_draws):
+        run = lambda key: mpfjax.run_islands(  # noqa: E731
+            key, make(num_draws, 50), OBSERVATIONS, nothing, num_islands=2
+        )
+        return np.asarray(jax.jit(jax.vmap(run))(keys).log_marginal_likelihood, np.float64) - log_z
+
+    chosen, plain = log_evidence(8), log_evidence(1)
+    assert is_near(np.exp(chosen))
+    assert np.sqrt(np.mean(chosen**2)) < 0.6 * np.sqrt(np.mean(plain**2))
+
+
+def test_where_x_0_must_be_a_plain_draw_it_is_one():
+    trajectory = np.full(4, 3.0, np.float32)
+    found = conditional_filter(KEY, make(8), OBSERVATIONS, trajectory)
+    same = conditional_filter(KEY, make(1), OBSERVATIONS, trajectory)
+    np.testing.assert_array_equal(found.trajectory, same.trajectory)
+    chosen = make(8, scheme="multinomial")
+    assert not with_first_ancestors(chosen).looks_at_first
+
+
+def test_in_slots_the_choice_is_that_of_a_run_without():
     keys = jax.random.split(KEY, 2)
     filter = mpfjax.mixture_particle_filter(mpfjax.QuadraticModel(), 30, 2)
     plain = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, nothing)
     in_slots = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, nothing, slots=48)
     np.testing.assert_allclose(
-        in_slots.log_marginal_likelihood, plain.log_marginal_likelihood, rtol=1e-4
-    )
-    np.testing.assert_allclose(
         in_slots.initial.particles[:, :30], plain.initial.particles, rtol=1e-5
     )
+    np.testing.assert_allclose(in_slots.initial.log_scale, plain.initial.log_scale, atol=1e-6)
+
+
+def test_a_filter_is_replaced_by_its_own_arguments():
+    model, other = Wide(), Wide(wide=1.0)
+    filter = mpfjax.with_selected_start(mpfjax.mixture_particle_filter(model, 20, 2), 3)
+    changed = filter.replace(model=other, num_particles=50)
+    assert changed.num_particles == 50
+    for held in (changed.model, changed.moves[1].model, changed.initial_moves[0].propagation.model):
+        assert held is other
+    assert changed.initial_moves[0].num_draws == 3
 
 
 def expected_trust(values):
@@ -195,8 +260,8 @@ def test_impossible_and_empty_particles():
 
 def test_what_cannot_choose_is_refused():
     joint = mpfjax.MultiObjectModel(mpfjax.QuadraticModel(), 2)
-    partitioned = [mpfjax.Resample(), mpfjax.Partitioned(joint)]
-    with pytest.raises(ValueError, match="initial_draws: x_0 is chosen where Propagate"):
-        mpfjax.Filter(joint, partitioned, 10, initial_draws=2)
-    with pytest.raises(ValueError, match="initial_draws"):
+    partitioned = mpfjax.partitioned_sampling(joint, 10)
+    with pytest.raises(ValueError, match="filter: x_0 is chosen where Propagate"):
+        mpfjax.with_selected_start(partitioned, 2)
+    with pytest.raises(ValueError, match="num_draws"):
         make(0)
