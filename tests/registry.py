@@ -107,8 +107,8 @@ def _pf(**options) -> Callable[..., Filter]:
     return lambda model: mpfjax.particle_filter(model, NUM_PARTICLES, **options)
 
 
-def _selecting(num_draws: int, **options) -> Callable[..., Filter]:
-    return lambda model: mpfjax.with_selected_start(_pf(**options)(model), num_draws)
+def _selecting(initial: int, **options) -> Callable[..., Filter]:
+    return lambda model: mpfjax.with_selected_start(_pf(**options)(model), initial)
 
 
 def _mpf(m: int = NUM_COMPONENTS, **options) -> Callable[..., Filter]:
