@@ -104,6 +104,39 @@ def test_kalman_smoother_conditions_the_joint_gaussian(parts, observations):
     np.testing.assert_allclose(filtered.means[-1], means[-1], rtol=1e-3, atol=1e-4)
 
 
+ROTATED = np.array([[0.8, -0.6], [0.6, 0.8]])
+WALK = np.array([[1.0, 0.5], [0.0, 0.9]])
+
+
+@pytest.mark.parametrize("rotation", [np.eye(2), ROTATED])
+@pytest.mark.parametrize(
+    ("Q", "P0"),
+    [
+        (np.diag([0.0, 0.3]), np.zeros((2, 2))),
+        *thorough([(np.zeros((2, 2)), np.diag([0.0, 4.0])), (np.zeros((2, 2)), np.zeros((2, 2)))]),
+    ],
+)
+def test_what_is_known_for_sure_has_no_nan(rotation, Q, P0):
+    """x_0 that is known, and a speed alone that is pushed, in any coordinates."""
+    turned = lambda matrix: rotation @ matrix @ rotation.T  # noqa: E731
+    parts = {
+        "A": turned(WALK), "Q": turned(Q), "H": np.array([[1.0, 0.0]]) @ rotation.T,
+        "R": [[0.2]], "m0": rotation @ [0.1, 0.2], "P0": turned(P0),
+    }  # fmt: skip
+    y = OBSERVATIONS[:, :1]
+    run = kalman_smoother(mpfjax.LinearGaussianModel(**parts), jnp.asarray(y))
+    mean, covariance = joint_gaussian(**parts, length=3, with_first=True)
+    gain = covariance[:8, 8:] @ np.linalg.inv(covariance[8:, 8:])
+    means = mean[:8] + gain @ (y[:, 0] - mean[8:])
+    blocks = (covariance[:8, :8] - gain @ covariance[8:, :8]).reshape(4, 2, 4, 2)
+    np.testing.assert_allclose(run.means.ravel(), means, rtol=1e-3, atol=1e-4)
+    for s in range(4):
+        np.testing.assert_allclose(run.covariances[s], blocks[s, :, s], rtol=1e-3, atol=1e-4)
+    for s in range(3):
+        lagged = run.lagged_covariances[s]
+        np.testing.assert_allclose(lagged, blocks[s + 1, :, s], rtol=1e-3, atol=1e-4)
+
+
 @pytest.mark.thorough
 def test_kalman_smoother_of_several_series_at_once_and_its_derivative():
     model, batch = mpfjax.LinearGaussianModel(**MODEL), np.stack([OBSERVATIONS, -OBSERVATIONS])
