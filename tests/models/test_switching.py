@@ -129,6 +129,7 @@ def test_too_long_a_series_is_refused():
         switching_filter(mpfjax.QuadraticModel(), OBSERVATIONS)
 
 
+@pytest.mark.usefixtures("as_installed")
 def test_a_list_is_a_series_and_an_infinity_is_none():
     """Of the observations, as for `kalman_filter`."""
     run = switching_filter(MODEL, [[0.3], [1.2]])
