@@ -179,15 +179,14 @@ def on_a_grid(parts, observations, grid, **options):
     return grid_filter(model, observations, grid, log_initial, state_shape=(1,), **options)
 
 
-@pytest.mark.parametrize("num_points", [31, *thorough([201, 1001]), 3001])
+@pytest.mark.parametrize("num_points", [201, *thorough([1001]), 3001])
 def test_a_finer_grid_is_no_worse(num_points):
     """Neighbouring points differ by a rounded number, which would count t times."""
     seen = jnp.asarray(np.random.default_rng(0).normal(0.0, 1.2, (30, 1)), jnp.float32)
     run = on_a_grid(SCALAR, seen, jnp.linspace(-8.0, 8.0, num_points))
     exact = kalman_filter(mpfjax.LinearGaussianModel(**SCALAR), seen)
-    bound = 5e-5 if num_points > 100 else 4e-2
-    assert abs(run.log_marginal_likelihood - exact.log_marginal_likelihood) < bound
-    np.testing.assert_allclose(run.means, exact.means[:, 0], atol=2e-2 * bound**0.5)
+    assert abs(run.log_marginal_likelihood - exact.log_marginal_likelihood) < 5e-5
+    np.testing.assert_allclose(run.means, exact.means[:, 0], atol=1e-5)
 
 
 @pytest.mark.parametrize("ends", [[298.5, 301.5], *thorough([[298.3, 301.9]])])
