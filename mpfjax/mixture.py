@@ -48,7 +48,8 @@ class ParticleMixture(eqx.Module):
     - `particles`: a pytree whose leaves have a leading axis n, the states X.
     - `log_weights`: ℓ, shape (n,), -inf in an empty slot.
     - `component_indicators`: C, shape (n,), in [0, num_components).
-    - `ancestor_indices`: shape (n,), the slot of the previous step's mixture that each came from.
+    - `ancestor_indices`: shape (n,), the slot of the previous step's mixture that each came from,
+      -1 for a particle that came from no single one (`AbstractMove.keeps_parents`).
     - `num_components`: M, the most components that there can be, dead ones included; static. The
       filters of the literature call it `max_components`.
     - `memory`: the memory that moves keep from step to step, by the move's name.
@@ -253,6 +254,11 @@ class ParticleMixture(eqx.Module):
                 " property of its own; jax.vmap over the leading axes, as in"
                 " jax.vmap(lambda mixture: mixture.mean())(mixtures)"
             )
+
+
+def no_ancestors(mixture: ParticleMixture) -> Int[Array, " n"]:
+    """The ancestor indices of particles that come from no single one."""
+    return jnp.full_like(mixture.ancestor_indices, -1)
 
 
 def single_component(

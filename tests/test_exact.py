@@ -8,6 +8,7 @@ import scipy.stats
 
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter, kalman_smoother
+from tests import switching
 from tests.marking import thorough
 from tests.user_models import ScalarLinear
 
@@ -104,6 +105,39 @@ def test_kalman_smoother_conditions_the_joint_gaussian(parts, observations):
     np.testing.assert_allclose(filtered.means[-1], means[-1], rtol=1e-3, atol=1e-4)
 
 
+ROTATED = np.array([[0.8, -0.6], [0.6, 0.8]])
+WALK = np.array([[1.0, 0.5], [0.0, 0.9]])
+
+
+@pytest.mark.parametrize("rotation", [np.eye(2), ROTATED])
+@pytest.mark.parametrize(
+    ("Q", "P0"),
+    [
+        (np.diag([0.0, 0.3]), np.zeros((2, 2))),
+        *thorough([(np.zeros((2, 2)), np.diag([0.0, 4.0])), (np.zeros((2, 2)), np.zeros((2, 2)))]),
+    ],
+)
+def test_what_is_known_for_sure_has_no_nan(rotation, Q, P0):
+    """x_0 that is known, and a speed alone that is pushed, in any coordinates."""
+    turned = lambda matrix: rotation @ matrix @ rotation.T  # noqa: E731
+    parts = {
+        "A": turned(WALK), "Q": turned(Q), "H": np.array([[1.0, 0.0]]) @ rotation.T,
+        "R": [[0.2]], "m0": rotation @ [0.1, 0.2], "P0": turned(P0),
+    }  # fmt: skip
+    y = OBSERVATIONS[:, :1]
+    run = kalman_smoother(mpfjax.LinearGaussianModel(**parts), jnp.asarray(y))
+    mean, covariance = joint_gaussian(**parts, length=3, with_first=True)
+    gain = covariance[:8, 8:] @ np.linalg.inv(covariance[8:, 8:])
+    means = mean[:8] + gain @ (y[:, 0] - mean[8:])
+    blocks = (covariance[:8, :8] - gain @ covariance[8:, :8]).reshape(4, 2, 4, 2)
+    np.testing.assert_allclose(run.means.ravel(), means, rtol=1e-3, atol=1e-4)
+    for s in range(4):
+        np.testing.assert_allclose(run.covariances[s], blocks[s, :, s], rtol=1e-3, atol=1e-4)
+    for s in range(3):
+        lagged = run.lagged_covariances[s]
+        np.testing.assert_allclose(lagged, blocks[s + 1, :, s], rtol=1e-3, atol=1e-4)
+
+
 @pytest.mark.thorough
 def test_kalman_smoother_of_several_series_at_once_and_its_derivative():
     model, batch = mpfjax.LinearGaussianModel(**MODEL), np.stack([OBSERVATIONS, -OBSERVATIONS])
@@ -135,6 +169,64 @@ def test_grid_filter_agrees_with_the_kalman_filter():
     np.testing.assert_allclose(run.variances, exact.covariances[:, 0, 0], atol=1e-3)
     expected = scipy.stats.norm(exact.means[:, 0], np.sqrt(exact.covariances[:, 0, 0])).sf(0.3)
     np.testing.assert_allclose(run.mass_above(0.3), expected, atol=1e-3)
+
+
+def on_a_grid(parts, observations, grid, **options):
+    """The grid filter of a scalar linear-Gaussian model."""
+    law = scipy.stats.norm(parts["m0"][0], np.sqrt(parts["P0"][0][0]))
+    log_initial = jnp.asarray(law.logpdf(np.asarray(grid, float)), jnp.float32)
+    model = mpfjax.LinearGaussianModel(**parts)
+    return grid_filter(model, observations, grid, log_initial, state_shape=(1,), **options)
+
+
+@pytest.mark.parametrize("num_points", [201, *thorough([1001]), 3001])
+def test_a_finer_grid_is_no_worse(num_points):
+    """Neighbouring points differ by a rounded number, which would count t times."""
+    seen = jnp.asarray(np.random.default_rng(0).normal(0.0, 1.2, (30, 1)), jnp.float32)
+    run = on_a_grid(SCALAR, seen, jnp.linspace(-8.0, 8.0, num_points))
+    exact = kalman_filter(mpfjax.LinearGaussianModel(**SCALAR), seen)
+    assert abs(run.log_marginal_likelihood - exact.log_marginal_likelihood) < 5e-5
+    np.testing.assert_allclose(run.means, exact.means[:, 0], atol=1e-5)
+
+
+@pytest.mark.parametrize("ends", [[298.5, 301.5], *thorough([[298.3, 301.9]])])
+def test_far_from_zero_the_moments_are_as_good(ends):
+    parts = SCALAR | {"A": [[1.0]], "H": [[1.0]], "Q": [[0.01]], "R": [[0.02]]}
+    parts |= {"m0": [300.0], "P0": [[0.05]]}
+    seen = jnp.asarray([[300.1], [299.8], [299.9]], jnp.float32)
+    run = on_a_grid(parts, seen, jnp.linspace(*ends, 1601))
+    exact = kalman_filter(mpfjax.LinearGaussianModel(**parts), seen)
+    np.testing.assert_allclose(run.variances, exact.covariances[:, 0, 0], rtol=2e-3)
+    np.testing.assert_allclose(run.means, exact.means[:, 0], atol=1e-4)
+    np.testing.assert_allclose(run.mass_above(300.0), scipy.stats.norm.sf(
+        300.0, exact.means[:, 0], np.sqrt(exact.covariances[:, 0, 0])
+    ), atol=2e-3)  # fmt: skip
+    increments = exact.log_likelihood_increments
+    np.testing.assert_allclose(run.log_likelihood_increments, increments, atol=1e-3)
+
+
+def test_a_missing_observation_is_skipped_on_a_grid_too():
+    seen, grid = jnp.asarray([[0.4], [NAN], [0.1], [1.0]]), jnp.linspace(-6.0, 6.0, 301)
+    run = on_a_grid(SCALAR, seen, grid, missing="skip")
+    exact = kalman_filter(mpfjax.LinearGaussianModel(**SCALAR), seen, missing="skip")
+    increments = exact.log_likelihood_increments
+    np.testing.assert_allclose(run.log_likelihood_increments, increments, atol=1e-5)
+    np.testing.assert_allclose(run.variances, exact.covariances[:, 0, 0], atol=1e-5)
+    with pytest.raises(ValueError, match="observations: NaN or infinite at index 1"):
+        on_a_grid(SCALAR, seen, grid)
+
+
+@pytest.mark.usefixtures("as_installed")
+@pytest.mark.parametrize(
+    "grid",
+    [
+        np.linspace(5.0, -5.0, 101), np.geomspace(0.01, 5.0, 101), np.zeros(9),
+        np.append(np.linspace(-5.0, 5.0, 101), 5.05), np.array([0.0, np.inf]),
+    ],
+)  # fmt: skip
+def test_a_grid_that_is_not_even_is_refused(grid):
+    with pytest.raises(ValueError, match="grid: "):
+        on_a_grid(SCALAR, jnp.zeros((2, 1)), grid)
 
 
 def test_grid_filter_agrees_with_quadrature_on_the_quadratic_model():
@@ -195,5 +287,9 @@ def test_bad_input_is_named():
             exact(mpfjax.QuadraticModel(), GAPS)
     with pytest.raises(ValueError, match="grid: shape"):
         grid_filter(mpfjax.QuadraticModel(), jnp.zeros(2), jnp.zeros(1))
+    with pytest.raises(ValueError, match=r"log_initial: shape \(8,\) is not \(9\)"):
+        grid_filter(ScalarLinear(), jnp.zeros(2), jnp.linspace(-1.0, 1.0, 9), jnp.zeros(8))
+    with pytest.raises(ValueError, match=r"Switching.* conditionally linear, and grid_filter"):
+        grid_filter(switching.MODEL, jnp.zeros((2, 1)), jnp.linspace(-1.0, 1.0, 9))
     with pytest.raises(ValueError, match="model: ScalarLinear defines no log_initial"):
         grid_filter(ScalarLinear(), jnp.zeros(2), jnp.linspace(-1.0, 1.0, 9))

@@ -5,13 +5,17 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.checks import real_arrays
-from mpfjax.models.base import require
+from mpfjax.checks import check_finite_array, real_arrays, shown
+from mpfjax.models.base import check_log_density, require
+from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.inputs import saying_that_none_were_given, with_inputs
-from mpfjax.observations import as_arrays, steps_of_inputs
-from mpfjax.operations.logarithms import log_sum_exp
+from mpfjax.models.steps import likelihoods
+from mpfjax.observations import Series, as_series
+from mpfjax.operations.logarithms import log_or_nothing, log_sum_exp, softmax
 
 
 class GridFilterRun(eqx.Module):
@@ -26,16 +30,17 @@ class GridFilterRun(eqx.Module):
     @property
     def means(self) -> Float[Array, " t"]:
         """E[x_t | y_1..y_t]."""
-        return self.probabilities @ self.grid
+        middle = self.grid[len(self.grid) // 2]
+        return middle + self.probabilities @ (self.grid - middle)
 
     @property
     def variances(self) -> Float[Array, " t"]:
         """Var[x_t | y_1..y_t]."""
-        return self.probabilities @ self.grid**2 - self.means**2
+        return jnp.sum(self.probabilities * (self.grid[None] - self.means[:, None]) ** 2, axis=1)
 
     def mass_above(self, threshold: float) -> Float[Array, " t"]:
         """P(x_t > threshold | y_1..y_t); of the cell at the threshold, the part above it counts."""
-        cell = self.grid[1] - self.grid[0]
+        cell = _width(self.grid)
         return self.probabilities @ jnp.clip((self.grid - threshold) / cell + 0.5, 0.0, 1.0)
 
 
@@ -47,6 +52,7 @@ def grid_filter(
     *,
     state_shape: tuple[int, ...] = (),
     inputs: PyTree = None,
+    missing: str = "error",
 ) -> GridFilterRun:
     """The recursion of Vermaak et al. (2003), eqs. 1 and 2, by quadrature on an even grid.
 
@@ -56,57 +62,81 @@ def grid_filter(
       the smallest standard deviation of the model. The error then falls faster than any power of
       the spacing.
     - `log_initial`: log p(x_0) at the grid points; None calls the model's own `log_initial`.
-    - `inputs`: u_1, ..., u_t, as for `run_filter`.
+    - `inputs`, `missing`: as for `run_filter`.
 
     Costs O(t g²). Differentiable in the model's parameters. Raises `ValueError` for a grid that is
-    not one ascending row, or a model without these densities. Use it as the reference for a scalar
-    model.
+    not one row of evenly spaced, ascending numbers, a `log_initial` of another length, a
+    conditionally linear model or one without these densities, and for data as `run_filter` does.
+    Use it as the reference for a scalar model.
     """
-    observations = jax.tree.map(jnp.asarray, as_arrays(observations))
-    grid = real_arrays("...", grid=grid)
-    if grid.ndim != 1 or grid.shape[0] < 2:
-        raise ValueError(f"grid: shape {grid.shape} is not one row of at least two points")
+    points, width = _checked_grid(grid)
     for density in ("log_transition", "log_likelihood"):
         require(model, density, "grid_filter")
+    refuse_marginalised(model, "grid_filter", "switching_filter takes one with regimes")
     if log_initial is None:
         require(model, "log_initial", "grid_filter without log_initial")
     else:
-        log_initial = real_arrays("g", log_initial=log_initial)
-    length = jax.tree.leaves(observations)[0].shape[0]
-    inputs = steps_of_inputs(inputs, length, model)
+        log_initial = real_arrays(str(len(points)), log_initial=log_initial)
+    series = as_series(observations, inputs, missing, model)
     with saying_that_none_were_given(model):
-        return _grid_filter(model, observations, grid, log_initial, state_shape, inputs)
+        return _grid_filter(model, series, points, width, log_initial, state_shape)
+
+
+def _width(grid: Any) -> Any:
+    """The width of a cell, from both ends: that of two neighbours is mostly rounding."""
+    if not isinstance(grid, Tracer):
+        grid = np.asarray(grid, float)
+    return (grid[-1] - grid[0]) / (grid.shape[0] - 1)
+
+
+def _checked_grid(grid: Any) -> tuple[Float[Array, " g"], Any]:
+    """The points and the width; a `ValueError` unless they ascend evenly, as far as is known."""
+    points = real_arrays("...", grid=grid)
+    if points.ndim != 1 or points.shape[0] < 2:
+        raise ValueError(f"grid: shape {points.shape} is not one row of at least two points")
+    width = _width(grid)
+    if isinstance(points, Tracer):
+        return points, width
+    check_finite_array(grid=points)
+    even = float(points[0]) + width * np.arange(len(points))
+    rounding = 4 * np.finfo(points.dtype).eps * np.abs(even).max()
+    if not (width > rounding and np.abs(np.asarray(points) - even).max() <= rounding):
+        raise ValueError(f"grid: {shown(grid)} does not ascend in even steps")
+    return points, width
 
 
 @eqx.filter_jit
-def _grid_filter(model, observations, grid, log_initial, state_shape, inputs):
+def _grid_filter(model, series, grid, width, log_initial, state_shape):
     num_points = grid.shape[0]
     states = grid.reshape(-1, *state_shape)
     log_prior = model.log_initial(states) if log_initial is None else log_initial
-    log_cell = jnp.log(grid[1] - grid[0])
+    cell = jnp.asarray(width, grid.dtype)
 
     def kernel_of(model: Any) -> Float[Array, "g g"]:
         def row(previous: Float[Array, "..."]) -> Float[Array, " g"]:
             copies = jnp.broadcast_to(previous, (num_points, *state_shape))
-            return model.log_transition(states, copies)
+            values = model.log_transition(states, copies)
+            return check_log_density(values, model, "log_transition", num_points)
 
-        return jnp.exp(log_cell + jax.vmap(row)(states))
+        return cell * jnp.exp(jax.vmap(row)(states))
 
-    shared = None if inputs is not None else kernel_of(model)
+    shared = None if series.inputs is not None else kernel_of(model)
 
     def advance(
-        probabilities: Float[Array, " g"], step: tuple[Float[Array, "..."], PyTree]
+        probabilities: Float[Array, " g"], now: Series
     ) -> tuple[Float[Array, " g"], tuple[Float[Array, " g"], Float[Array, ""]]]:
-        observation, now = step
-        given = with_inputs(model, now)
-        predicted = probabilities @ (kernel_of(given) if shared is None else shared)
-        positive = predicted > 0
-        log_predicted = jnp.where(positive, jnp.log(jnp.where(positive, predicted, 1.0)), -jnp.inf)
-        log_joint = log_predicted + given.log_likelihood(observation, states)
+        given = with_inputs(model, now.inputs)
+        kernel = kernel_of(given) if shared is None else shared
+        predicted = jnp.matmul(probabilities, kernel, precision="highest")
+        log_factors = likelihoods(given, now.observations, states)
+        if now.present is not None:
+            log_factors = jnp.where(now.present, log_factors, 0.0)
+        log_joint = log_or_nothing(predicted) + log_factors
         increment = log_sum_exp(log_joint)
-        updated = jnp.exp(log_joint - increment)
+        if now.present is not None:
+            increment = jnp.where(now.present, increment, 0.0)
+        updated = softmax(log_joint)
         return updated, (updated, increment)
 
-    initial = jnp.exp(log_prior - log_sum_exp(log_prior))
-    _, (probabilities, increments) = jax.lax.scan(advance, initial, (observations, inputs))
+    _, (probabilities, increments) = jax.lax.scan(advance, softmax(log_prior), series)
     return GridFilterRun(grid, probabilities, increments, jnp.sum(increments))

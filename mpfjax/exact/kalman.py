@@ -14,6 +14,7 @@ from mpfjax.checks import as_numbers, check_one_of, check_type
 from mpfjax.models.inputs import with_inputs
 from mpfjax.models.linear_gaussian import LinearGaussianModel
 from mpfjax.observations import steps_of_inputs
+from mpfjax.operations.matrices import cholesky
 
 
 class LinearStep(NamedTuple):
@@ -106,10 +107,18 @@ def _checked(
     model: Any, observations: Any, inputs: PyTree, missing: str
 ) -> tuple[Float[Array, "t p"], PyTree]:
     check_type(LinearGaussianModel, "a LinearGaussianModel", model=model)
+    rows = checked_rows(observations, model.H.shape[0], missing, model.m0.dtype)
+    return rows, steps_of_inputs(inputs, rows.shape[0], model)
+
+
+def checked_rows(
+    observations: Any, num_rows: int, missing: str, dtype: jnp.dtype
+) -> Float[Array, "t p"]:
+    """y_1..y_t as an array of this type; a `ValueError` for other numbers or shapes."""
     check_one_of(("error", "skip"), missing=missing)
     rows = jnp.asarray(as_numbers("observations", observations, floating=True))
-    if rows.ndim != 2 or rows.shape[1] != model.H.shape[0]:
-        raise ValueError(f"observations: shape {rows.shape} is not (t, {model.H.shape[0]})")
+    if rows.ndim != 2 or rows.shape[1] != num_rows:
+        raise ValueError(f"observations: shape {rows.shape} is not (t, {num_rows})")
     if not isinstance(rows, Tracer):
         values = np.asarray(rows)
         usable = ~np.isinf(values) if missing == "skip" else np.isfinite(values)
@@ -117,7 +126,7 @@ def _checked(
             what = "infinite" if missing == "skip" else "NaN or infinite"
             first = int(np.argmin(usable.all(axis=1)))
             raise ValueError(f"observations: {what} at index {first} of the leading axis")
-    return rows.astype(model.m0.dtype), steps_of_inputs(inputs, rows.shape[0], model)
+    return rows.astype(dtype)
 
 
 @eqx.filter_jit
@@ -179,6 +188,16 @@ def filtered_moments(
     return (means, covariances), increments
 
 
+def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """The Cholesky factor, in which a direction without variance counts as independent.
+
+    What is multiplied by the inverse has nothing in that direction either, so that any will do.
+    """
+    factor, variances = cholesky(covariance[None])[0], jnp.diagonal(covariance)
+    scales = jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
+    return factor + jnp.diag(jnp.where(jnp.diagonal(factor) == 0, scales, 0.0))
+
+
 def smoothed_moments(
     filtered: Moments, step_of: StepOf, told: PyTree
 ) -> tuple[Moments, Float[Array, "t d d"]]:
@@ -190,7 +209,7 @@ def smoothed_moments(
         (later_mean, later_covariance), (mean, covariance, now) = later, earlier
         step = step_of(now)
         predicted = step.F @ covariance @ step.F.T + step.Q
-        gain = jnp.linalg.solve(predicted, step.F @ covariance).T
+        gain = jax.scipy.linalg.cho_solve((_root(predicted), True), step.F @ covariance).T
         left = identity - gain @ step.F
         mean = mean + gain @ (later_mean - (step.F @ mean + step.b))
         covariance = left @ covariance @ left.T + gain @ (step.Q + later_covariance) @ gain.T

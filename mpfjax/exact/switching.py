@@ -9,7 +9,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mpfjax.checks import check_type
-from mpfjax.exact.kalman import LinearStep, Moments, filtered_moments, smoothed_moments
+from mpfjax.exact.kalman import (
+    LinearStep,
+    Moments,
+    checked_rows,
+    filtered_moments,
+    smoothed_moments,
+)
 from mpfjax.models.switching import SwitchingLinearGaussianModel
 from mpfjax.operations.logarithms import log_sum_exp
 
@@ -45,16 +51,14 @@ def switching_filter(model: Any, observations: Float[Array, "t ..."]) -> Switchi
     (t, p), and for more than a million sequences. Use it as the reference for a short series.
     """
     check_type(SwitchingLinearGaussianModel, "a SwitchingLinearGaussianModel", model=model)
-    num_rows, k = model.H.shape[-2], model.num_regimes
-    if observations.ndim != 2 or observations.shape[1] != num_rows:
-        raise ValueError(f"observations: shape {observations.shape} is not (t, {num_rows})")
-    length = observations.shape[0]
+    rows = checked_rows(observations, model.H.shape[-2], "skip", model.m0.dtype)
+    length, k = rows.shape[0], model.num_regimes
     if k ** (length + 1) > _MOST_SEQUENCES:
         raise ValueError(
             f"observations: {length} steps of {k} regimes are {k}^{length + 1} sequences, more than"
             f" {_MOST_SEQUENCES}"
         )
-    return _enumerated(model, observations)
+    return _enumerated(model, rows)
 
 
 @eqx.filter_jit

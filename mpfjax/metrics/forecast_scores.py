@@ -5,7 +5,8 @@ from jaxtyping import Array, Float, PyTree
 
 from mpfjax.checks import check_not_negative_array, check_type, real_arrays
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, check_log_density, check_model
+from mpfjax.models.base import AbstractStateSpaceModel, check_model
+from mpfjax.models.steps import likelihoods
 from mpfjax.observations import one_observation
 from mpfjax.operations.logarithms import log_sum_exp
 
@@ -62,7 +63,6 @@ def log_score(
     check_model(model, "log_score")
     check_type(ParticleMixture, "a mixture, as in a Forecast", mixture=mixture)
     observation = one_observation(observation)
-    values = model.log_likelihood(observation, mixture.particles)
-    values = check_log_density(values, model, "log_likelihood", mixture.num_particles)
+    values = likelihoods(model, observation, mixture.particles)
     joint = jnp.where(mixture.occupied, mixture.log_weights + values, -jnp.inf)
     return -log_sum_exp(joint)

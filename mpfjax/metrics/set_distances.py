@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mpfjax.checks import check_callable, check_finite, check_positive, check_shape, real_arrays
@@ -39,16 +40,35 @@ class GOSPA(NamedTuple):
 
 
 class _Pairing(NamedTuple):
-    """The cheapest pairing; costs are in units of cutoff^order, one entry a pair."""
+    """The cheapest pairing, one entry a pair; distances in units of the cutoff, at most one."""
 
-    costs: Float[Array, " s"]
+    distances: Float[Array, " s"]
     is_estimate: Bool[Array, " s"]
     is_truth: Bool[Array, " s"]
+
+    @property
+    def is_pair(self) -> Bool[Array, " s"]:
+        """Which entries have both; the others are alone, or nothing at all."""
+        return self.is_estimate & self.is_truth
+
+    def distance(self, order: float, cost_alone: float) -> Float[Array, ""]:
+        """(Σ d^order + cost_alone times the number alone)^(1 / order)."""
+        distances, num_alone = self.distances, jnp.sum(self.is_estimate ^ self.is_truth)
+        # Powers of shares of the largest neither underflow nor have an infinite derivative.
+        largest = jnp.max(jnp.where(self.is_pair, distances, 0.0), initial=0.0)
+        largest = jax.lax.stop_gradient(jnp.where(num_alone > 0, 1.0, largest))
+        nothing = largest == 0
+        unit = jnp.where(nothing, 1.0, largest)
+        powers = jnp.where(self.is_pair, (distances / unit) ** order, 0.0)
+        total = jnp.sum(powers) + cost_alone * num_alone.astype(unit.dtype)
+        return jnp.where(nothing, 0.0, unit * jnp.where(nothing, 1.0, total) ** (1.0 / order))
 
 
 def euclidean(estimates: Float[Array, "k d"], truths: Float[Array, "l d"]) -> Float[Array, "k l"]:
     """The Euclidean distance of every estimate from every true position."""
-    return jnp.sqrt(jnp.sum((estimates[:, None] - truths[None]) ** 2, axis=-1))
+    squares = jnp.sum((estimates[:, None] - truths[None]) ** 2, axis=-1)
+    coincide = squares == 0  # where the derivative of the root is not finite
+    return jnp.where(coincide, 0.0, jnp.sqrt(jnp.where(coincide, 1.0, squares)))
 
 
 def ospa(
@@ -75,12 +95,11 @@ def ospa(
     """
     estimates, truths = _checked_sets(estimates, truths, estimate_mask, truth_mask)
     _check_numbers(cutoff, order, base_distance)
-    pairing = _cheapest_pairing(
-        base_distance(estimates, truths) / cutoff, estimate_mask, truth_mask, order, 1.0
-    )
+    distances = base_distance(estimates, truths) / cutoff
+    pairing = _cheapest_pairing(distances, estimate_mask, truth_mask, order)
     size = jnp.maximum(jnp.sum(pairing.is_estimate), jnp.sum(pairing.is_truth))
-    total = jnp.sum(pairing.costs)
-    return cutoff * (total / jnp.maximum(size, 1).astype(total.dtype)) ** (1.0 / order)
+    size = jnp.maximum(size, 1).astype(pairing.distances.dtype)
+    return cutoff * pairing.distance(order, 1.0) / size ** (1.0 / order)
 
 
 def gospa(
@@ -111,22 +130,29 @@ def gospa(
     check_positive(alpha=alpha)
     if alpha > 2:
         raise ValueError(f"alpha: {alpha} is not in (0, 2]")
-    pairing = _cheapest_pairing(
-        base_distance(estimates, truths) / cutoff, estimate_mask, truth_mask, order, 1.0 / alpha
-    )
-    costs, is_estimate, is_truth = pairing
-    near = is_estimate & is_truth & ~(costs >= 1.0)
-    localisation = jnp.sum(jnp.where(near, costs, 0.0))
-    apart = jnp.where(is_estimate & is_truth, costs / 2.0, costs)
-    missed = jnp.sum(jnp.where(is_truth & ~near, apart, 0.0))
-    false = jnp.sum(jnp.where(is_estimate & ~near, apart, 0.0))
-    scale = cutoff**order
+    distances = base_distance(estimates, truths) / cutoff
+    pairing = _cheapest_pairing(distances, estimate_mask, truth_mask, order)
+    near = pairing.is_pair & ~(pairing.distances >= 1.0)
+    localisation = jnp.sum(jnp.where(near, (cutoff * pairing.distances) ** order, 0.0))
+    dtype = localisation.dtype
+    with np.errstate(over="ignore"):
+        scale = jnp.asarray(np.float64(cutoff) ** order, dtype)
+
+    def cost(is_there: Bool[Array, " s"]) -> Float[Array, ""]:
+        shares = jnp.where(pairing.is_pair, 0.5, 1.0 / alpha)
+        share = jnp.sum(jnp.where(is_there & ~near, shares, 0.0), dtype=dtype)
+        return jnp.where(share > 0, scale, 0.0) * share
+
     return GOSPA(
-        distance=cutoff * jnp.sum(costs) ** (1.0 / order),
-        localisation=scale * localisation,
-        missed=scale * missed,
-        false=scale * false,
+        distance=cutoff * pairing.distance(order, 1.0 / alpha),
+        localisation=localisation,
+        missed=cost(pairing.is_truth),
+        false=cost(pairing.is_estimate),
     )
+
+
+# Costs below this share of the largest are lost in the sums of the search.
+_FINE = 1e-3
 
 
 def _cheapest_pairing(
@@ -134,26 +160,39 @@ def _cheapest_pairing(
     estimate_mask: Bool[Array, " k"] | None,
     truth_mask: Bool[Array, " l"] | None,
     order: float,
-    cost_alone: float,
 ) -> _Pairing:
-    """Pair all entries, in a square matrix in which those that are not there cost nothing.
+    """Pair as many entries as possible, in a square matrix whose other entries are not there.
 
-    A pair of entries that exist costs at most 1. To leave both without a partner costs at least 1,
-    since alpha is at most 2. So the cheapest pairing leaves as few entries alone as possible.
+    The search is repeated with the largest distance that it found below the cutoff as the unit, in
+    which the powers of those that compete are numbers that it can add. An entry alone, or one of
+    more than all of these together, costs `most`: how much more makes no difference.
     """
     num_estimates, num_truths = distances.shape
     size = max(num_estimates, num_truths)
     rows, columns = (0, size - num_estimates), (0, size - num_truths)
     is_estimate = jnp.pad(_all_unless_given(estimate_mask, num_estimates), rows)
     is_truth = jnp.pad(_all_unless_given(truth_mask, num_truths), columns)
-    capped = jnp.pad(jnp.minimum(distances, 1.0) ** order, (rows, columns))
-    alone = jnp.where(is_estimate[:, None] ^ is_truth[None], cost_alone, 0.0)
-    costs = jnp.where(is_estimate[:, None] & is_truth[None], capped, alone.astype(capped.dtype))
+    is_pair, is_alone = is_estimate[:, None] & is_truth[None], is_estimate[:, None] ^ is_truth[None]
+    capped = jnp.where(is_pair, jnp.pad(jnp.minimum(distances, 1.0), (rows, columns)), 0.0)
     # The search for the pairing would not end on a NaN, so it never sees one.
-    costs = jnp.where(jnp.any(jnp.isnan(costs)), jnp.nan, costs)
-    # It works in the default precision, and under strict promotion it converts nothing itself.
-    i, j = _assign(jnp.nan_to_num(costs).astype(float))
-    return _Pairing(costs[i, j], is_estimate[i], is_truth[j])
+    known, most = jax.lax.stop_gradient(jnp.nan_to_num(capped)), size + 1.0
+
+    def search(unit: Float[Array, ""]) -> tuple[Array, Array, Array, Array]:
+        costs = jnp.minimum((known / unit) ** order, most)
+        costs = jnp.where(is_alone, most, costs)
+        # It works in the default precision, and under strict promotion it converts nothing itself.
+        i, j = _assign(costs.astype(float))
+        found = known[i, j]
+        return unit, jnp.max(jnp.where(found < 1.0, found, 0.0), initial=0.0), i, j
+
+    def is_coarse(found: tuple[Array, Array, Array, Array]) -> Bool[Array, ""]:
+        unit, largest, _, _ = found
+        return (largest > 0) & ((largest / unit) ** order < _FINE)
+
+    first = search(jnp.ones((), known.dtype))
+    _, _, i, j = jax.lax.while_loop(is_coarse, lambda found: search(found[1]), first)
+    capped = jnp.where(jnp.any(jnp.isnan(capped)), jnp.nan, capped)
+    return _Pairing(capped[i, j], is_estimate[i], is_truth[j])
 
 
 def _all_unless_given(mask: Bool[Array, " k"] | None, size: int) -> Bool[Array, " k"]:

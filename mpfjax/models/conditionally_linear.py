@@ -210,19 +210,6 @@ def updated(
     return MarginalisedState(state.latent, mean, covariance), jnp.broadcast_to(log_density, (n,))
 
 
-def log_predictive(
-    model: Any, observation: PyTree, latent: PyTree, state: MarginalisedState
-) -> Float[Array, " n"]:
-    """log p(y_t | z_t, z, y_1..y_{t-1}) of each particle, what is seen of z_t included."""
-    log_density = model.log_likelihood(observation, latent)
-    seen = emission_of(model, latent, state)
-    if seen is None:
-        return log_density
-    law = predicted_gaussian(model, latent, state)
-    rows = observation_rows(model, observation, seen, state.mean.dtype)
-    return log_density + gaussians.update(law, rows, seen)[1]
-
-
 def latent_law(model: Any, state: MarginalisedState) -> Gaussian:
     """N(f + A m, A P Aᵀ + V), the law of z_t in the mixed form, the particles last."""
     mixed, _ = latent_dynamics_of(model, state)

@@ -46,6 +46,15 @@ class AbstractMove(eqx.Module):
         """
         return False
 
+    @property
+    def keeps_parents(self) -> bool:
+        """Whether each particle comes from one particle of the mixture that the move was given.
+
+        Where it does not, the move sets its ancestor index to -1, and what follows ancestors
+        refuses it.
+        """
+        return True
+
     @abc.abstractmethod
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree

@@ -62,6 +62,11 @@ class Every(AbstractMove):
         return any(move.needs_parents for move in self.moves)
 
     @property
+    def keeps_parents(self) -> bool:
+        """Whether all of the moves do."""
+        return all(move.keeps_parents for move in self.moves)
+
+    @property
     def name(self) -> str:
         """The name under which the number of the step is kept."""
         return f"every {self.num_steps}: {', '.join(type(move).__name__ for move in self.moves)}"

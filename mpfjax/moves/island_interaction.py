@@ -43,6 +43,11 @@ class IslandInteraction(AbstractMove):
         """False: the observation changes no weight."""
         return False
 
+    @property
+    def keeps_parents(self) -> bool:
+        """False: those of a particle that was dealt to an island are on another one."""
+        return False
+
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, ""]:
         """Whether the masses of the islands are uneven enough; the result is the same on each."""
         log_masses = over_islands(mixture.log_mass)

@@ -12,8 +12,9 @@ from mpfjax.checks import check_exponent, check_inner_share, check_one_of, check
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.steps import likelihoods
 from mpfjax.moves.base import AbstractMarkovMove
-from mpfjax.moves.propagation.propagate import likelihoods, log_transition
+from mpfjax.moves.propagation.propagate import log_transition
 from mpfjax.operations.generator import normal, split, uniform
 from mpfjax.operations.gradients import add_gradient, without_gradient
 

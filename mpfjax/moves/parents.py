@@ -1,6 +1,6 @@
 """x_{t-1} of every particle, for the moves after the propagation that need it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -9,15 +9,8 @@ from jaxtyping import Array, Key
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractPropagation, AbstractRegrouping
-from mpfjax.moves.every import Every
-from mpfjax.moves.island_interaction import IslandInteraction
-from mpfjax.moves.objects.clusters import PropagateInClusters
-from mpfjax.moves.objects.independent import PropagateIndependently
-from mpfjax.moves.resampling.gaussian import GaussianRegeneration
+from mpfjax.moves.every import Every, with_inner
 from mpfjax.operations.indexing import take
-
-# After these a particle has more than one parent, or one on another island.
-_NO_PARENT = (PropagateInClusters, PropagateIndependently, IslandInteraction)
 
 
 def runner(moves: tuple[Any, ...]) -> Callable[..., ParticleMixture]:
@@ -27,20 +20,25 @@ def runner(moves: tuple[Any, ...]) -> Callable[..., ParticleMixture]:
     """
     if not any(_needs_parents(move) for move in moves):
         return lambda move, *arguments: move(*arguments)
-    propagated = False
+    first = next((t for t, move in enumerate(moves) if isinstance(move, AbstractPropagation)), None)
+    check_keep_parents("moves", moves[first:], "another move")
     for move in moves:
-        propagated |= isinstance(move, AbstractPropagation)
-        if isinstance(move, _NO_PARENT) or (propagated and isinstance(move, GaussianRegeneration)):
-            raise ValueError(
-                f"moves: {type(move).__name__} leaves no particle one parent x_(t-1), which another"
-                " move needs"
-            )
         inner = move.moves if isinstance(move, Every) and _needs_parents(move) else ()
         if not all(_needs_parents(m) or isinstance(m, AbstractRegrouping) for m in inner):
             raise ValueError(
                 "moves: an Every with a move that needs x_(t-1) may only regroup beside it"
             )
     return _run_with_parents
+
+
+def check_keep_parents(argument: str, moves: Iterable[Any], needed_by: str) -> None:
+    """Raise a `ValueError` that names a move after which particles have no single parents."""
+    for move in with_inner(moves):
+        if not isinstance(move, Every) and not getattr(move, "keeps_parents", True):
+            raise ValueError(
+                f"{argument}: {type(move).__name__} leaves no particle one parent x_(t-1), which"
+                f" {needed_by} needs"
+            )
 
 
 def _needs_parents(move: Any) -> bool:
@@ -52,7 +50,9 @@ def _run_with_parents(
 ) -> ParticleMixture:
     """Run the move, and keep the parents of the particles in their new slots."""
     before = mixture.parents
-    if before is None and isinstance(move, AbstractPropagation):
+    if before is None:
+        if not isinstance(move, AbstractPropagation):
+            return move(key, mixture, *arguments)
         before = mixture.particles
     # The slots that this move alone takes the particles from.
     own = jnp.arange(mixture.num_particles, dtype=jnp.int32)

@@ -13,8 +13,8 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, HasTransitionNoise, require_noise
 from mpfjax.models.conditionally_linear import is_marginalised, refuse_marginalised
 from mpfjax.models.noise import noise_dtype
+from mpfjax.models.steps import likelihoods
 from mpfjax.moves.initial import trusted
-from mpfjax.moves.propagation.propagate import likelihoods
 from mpfjax.proposals import AbstractProposal
 
 

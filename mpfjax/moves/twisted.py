@@ -24,15 +24,15 @@ from mpfjax.models.conditionally_linear import (
     with_moments,
 )
 from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
+from mpfjax.models.steps import seen
 from mpfjax.moves.base import AbstractMove, AbstractPropagation, AbstractRegrouping
 from mpfjax.moves.local_quadratics import LocalQuadratics
 from mpfjax.moves.propagation.marginalised import (
     PropagateMarginalised,
     latent_made_of,
     latent_noise_dimension,
-    seen,
 )
-from mpfjax.moves.propagation.propagate import likelihoods, predict
+from mpfjax.moves.propagation.propagate import predict
 from mpfjax.operations.logarithms import log_sum_exp
 
 STEP = "twisted"
@@ -86,15 +86,6 @@ def made_of(model: Any, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
     moved = model.transition_from_noise(noise, states)
     check_moved(moved, states, model, "transition_from_noise")
     return moved
-
-
-def seen_by(
-    model: Any, observation: PyTree, states: PyTree
-) -> tuple[PyTree, list[Float[Array, " n"]]]:
-    """The states that `made_of` gives, updated if they carry moments, and log L as its factors."""
-    if is_marginalised(model):
-        return seen(model, observation, states)
-    return states, [likelihoods(model, observation, states)]
 
 
 class CountSteps(AbstractMove):
@@ -200,7 +191,7 @@ class PropagateTwisted(AbstractPropagation):
         noise = draw_noise(self.noise, key, shape, dtype, labels, num_components)
         psi = self.twist.at(mixture.memory[STEP]["step"])
         drawn, log_ratio = psi.draw(noise, self.twist.features_of(previous))
-        states, log_factors = seen_by(model, observation, made_of(model, drawn, previous))
+        states, log_factors = seen(model, observation, made_of(model, drawn, previous))
         return mixture.replace(particles=states).weighed(*log_factors, log_ratio)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:

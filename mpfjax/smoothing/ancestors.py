@@ -9,7 +9,7 @@ from mpfjax.checks import check_numbered
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.indexing import count_places, take
 from mpfjax.running.scan import FilterRun
-from mpfjax.smoothing.history import mixtures_of
+from mpfjax.smoothing.history import mixtures_of, with_parents
 
 
 class Genealogy(eqx.Module):
@@ -32,11 +32,12 @@ def trace_ancestors(mixtures: FilterRun | ParticleMixture) -> Genealogy:
     """Follow the ancestor indices of a run back from its end.
 
     `mixtures` is a run of `run_filter(..., collect=None)`, whose first time is then x_0, or the
-    mixtures that it collected, whose first time is x_1. Raises `ValueError` for anything else. Use
-    it to see how far back the history of a mode goes. Resampling leaves few ancestors at early
+    mixtures that it collected, whose first time is x_1. Raises `ValueError` for anything else, and
+    where particles have no single ancestors (index -1; RuntimeError within jit). Use it to see how
+    far back the history of a mode goes. Resampling leaves few ancestors at early
     times; `sample_trajectories` draws new ones.
     """
-    return _trace(mixtures_of(mixtures))
+    return _trace(with_parents(mixtures_of(mixtures), "trace_ancestors"))
 
 
 @eqx.filter_jit

@@ -2,8 +2,10 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from mpfjax.checks import shown
 from mpfjax.mixture import ParticleMixture
@@ -37,3 +39,19 @@ def mixtures_of(run: Any) -> ParticleMixture:
         initial,
         mixtures,
     )
+
+
+def with_parents(mixtures: ParticleMixture, needed_by: str) -> ParticleMixture:
+    """The mixtures; an error where a particle comes from no single one of the step before."""
+    is_orphan = (mixtures.ancestor_indices < 0) & (mixtures.log_weights > -jnp.inf)
+    found = jnp.any(is_orphan[1:])
+    message = (
+        f"mixtures: {needed_by} follows ancestors, and some particles have none, or more than one"
+        " (index -1), as after PropagateIndependently; sample_trajectories with method 'exact' does"
+        " without"
+    )
+    if isinstance(found, Tracer):
+        return eqx.error_if(mixtures, found, message)
+    if found:
+        raise ValueError(message)
+    return mixtures

@@ -10,8 +10,9 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.conditionally_linear import with_moments
+from mpfjax.models.steps import seen
 from mpfjax.moves.local_quadratics import LocalQuadratics, neutral
-from mpfjax.moves.twisted import Twist, made_of, noise_dimension_of, seen_by
+from mpfjax.moves.twisted import Twist, made_of, noise_dimension_of
 from mpfjax.observations import Series
 
 # The effective number of particles for each coefficient of a regression.
@@ -90,7 +91,7 @@ def _draw_points(
     shape = (len(log_weights), num_noises + 1)
     noise, log_ratio = used.draw(jax.random.normal(key, shape, features.dtype), features)
     unseen = made_of(model, noise, states)
-    moved, log_factors = seen_by(model, now.observations, unseen)
+    moved, log_factors = seen(model, now.observations, unseen)
     log_likelihoods = sum(log_factors[1:], log_factors[0])
     if (present := now.present) is not None:
         log_likelihoods = jnp.where(present, log_likelihoods, 0.0)

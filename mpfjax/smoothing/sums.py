@@ -23,6 +23,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.inputs import with_inputs
+from mpfjax.moves.parents import check_keep_parents
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.floats import as_inexact
@@ -88,9 +89,10 @@ def smoothed_sums(
     - `observations`, `inputs`, `missing`: as in `run_filter`.
 
     Raises `ValueError` for a model without `log_transition`, values that are not one a particle,
-    and as `run_filter` does; a RuntimeError where no particle can have moved to the next. Use it
-    for the sums that scores and EM need, and for series too long to keep. `sample_trajectories`
-    needs the mixtures of all steps, and serves every function at once.
+    "mcmc" where a move leaves no single ancestors, and as `run_filter` does; a RuntimeError where
+    no particle can have moved to the next. Use it for the sums that scores and EM need, and for
+    series too long to keep. `sample_trajectories` needs the mixtures of all steps, and serves every
+    function at once.
     """
     check_key(key)
     check_type(Filter, "a Filter", filter=filter)
@@ -100,6 +102,8 @@ def smoothed_sums(
     if lag is not None:
         check_whole(0, lag=lag)
     check_one_of(("exact", "mcmc"), method=method)
+    if method == "mcmc":
+        check_keep_parents("filter", filter.moves, "smoothed_sums with method 'mcmc'")
     check_whole(num_draws=num_draws)
     series = as_series(observations, inputs, missing, filter.model)
     if lag is not None:

@@ -20,7 +20,7 @@ from mpfjax.operations.indexing import take
 from mpfjax.running.scan import FilterRun
 from mpfjax.smoothing.backward import draw, draw_exactly, propose, walk
 from mpfjax.smoothing.distinct import warn_of_few
-from mpfjax.smoothing.history import mixtures_of
+from mpfjax.smoothing.history import mixtures_of, with_parents
 from mpfjax.smoothing.marginalised import check_marginalised, sample_marginalised
 
 
@@ -59,7 +59,8 @@ def sample_trajectories(
       each x_s given these and y_1..y_t. It needs a whole run, with x_0, and method "exact".
 
     Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
-    that is not there or dead, and for `num_steps` with "exact"; a RuntimeError where no particle
+    that is not there or dead, for `num_steps` with "exact", and for "mcmc" where particles have no
+    single ancestors (index -1; RuntimeError within jit); a RuntimeError where no particle
     can have moved to the next. If the backward weights degenerate, so that at some time fewer than
     a tenth of the trajectories are distinct, a RuntimeWarning names the share. Use it for estimates
     of the past. The genealogy of the particles (`trace_ancestors`) is exact as well, but has few
@@ -90,8 +91,9 @@ def sample_trajectories(
         return drawn
     if method == "exact":
         num_steps = 0
-    elif num_steps is None:
-        num_steps = 1
+    else:
+        stacked = with_parents(stacked, "sample_trajectories with method 'mcmc'")
+        num_steps = 1 if num_steps is None else num_steps
     options = (num_trajectories, component, num_steps)
     with saying_that_none_were_given(model):
         drawn = draw_trajectories(key, model, stacked, inputs, *options)

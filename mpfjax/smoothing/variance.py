@@ -17,9 +17,8 @@ from mpfjax.moves.eve_indices import (
     mass_variances,
     with_new_eve_indices,
 )
-from mpfjax.moves.island_interaction import IslandInteraction
-from mpfjax.moves.objects.clusters import PropagateInClusters
-from mpfjax.moves.objects.independent import PropagateIndependently
+from mpfjax.moves.every import with_inner
+from mpfjax.moves.parents import check_keep_parents
 from mpfjax.moves.propagation.regimes import PropagateRegimes
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.running.scan import FilterRun
@@ -30,8 +29,6 @@ _INDEPENDENT = {
     "noise": "independent",
     "initial_noise": "independent",
 }
-# After these a particle has no one ancestor, or one on another island.
-_NO_EVE_INDICES = (PropagateIndependently, PropagateInClusters, PropagateRegimes, IslandInteraction)
 
 
 class _KeepFirstAncestors(AbstractRegrouping):
@@ -64,14 +61,14 @@ def with_first_ancestors(filter: Filter) -> Filter:
     not independent: a scheme other than "multinomial", or a noise other than "independent".
     """
     check_type(Filter, "a Filter", filter=filter)
-    for move in filter.moves:
-        redraws = isinstance(move, AbstractResampling | AbstractMarkovMove) and not isinstance(
-            move, Resample
-        )
-        if getattr(move, "approximate", True) or redraws or isinstance(move, _NO_EVE_INDICES):
+    check_keep_parents("filter", filter.moves, "with_first_ancestors")
+    for move in with_inner(filter.moves):
+        kinds = AbstractResampling | AbstractMarkovMove | PropagateRegimes
+        redraws = isinstance(move, kinds) and not isinstance(move, Resample)
+        if getattr(move, "approximate", True) or redraws:
             raise ValueError(
-                f"filter: {type(move).__name__}, one of its moves, is approximate or leaves a"
-                " particle without one ancestor; the variance of log Ẑ is not known from one run"
+                f"filter: {type(move).__name__}, one of its moves, is approximate or draws in a way"
+                " of its own; the variance of log Ẑ is not known from one run"
             )
     _require_independent_draws(filter)
     if any(isinstance(move, _KeepFirstAncestors) for move in filter.initial_moves):

@@ -24,6 +24,7 @@ from mpfjax.checks import (
 from mpfjax.filter import Filter, Start
 from mpfjax.models.base import require
 from mpfjax.models.inputs import with_inputs
+from mpfjax.models.steps import likelihoods
 from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import Series, as_series
 from mpfjax.operations.functions import interned
@@ -220,7 +221,7 @@ class LogJoint(eqx.Module):
 
         def log_likelihood(observation: PyTree, inputs: PyTree, state: PyTree) -> Float[Array, ""]:
             one = jax.tree.map(lambda leaf: leaf[None], state)
-            return with_inputs(model, inputs).log_likelihood(observation, one)[0]
+            return likelihoods(with_inputs(model, inputs), observation, one)[0]
 
         seen = jax.vmap(log_likelihood)(self.series.observations, self.series.inputs, after)
         if self.series.present is not None:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_key, check_whole, given, shown
 from mpfjax.models.base import AbstractStateSpaceModel, require
+from mpfjax.models.steps import likelihoods, moved
 
 
 class LabelLikelihood(eqx.Module):
@@ -78,7 +79,7 @@ def label_log_posteriors(
         states = jax.tree.map(lambda a, b: jnp.concatenate([a[:, None], b], axis=1), label, rivals)
         k, n = jax.tree.leaves(states)[0].shape[:2]
         flat = jax.tree.map(lambda leaf: leaf.reshape(k * n, *leaf.shape[2:]), states)
-        logs = model.log_likelihood(observation, flat).reshape(k, n)
+        logs = likelihoods(model, observation, flat).reshape(k, n)
         return logs[:, 0] - logsumexp(logs, axis=1) + jnp.log(jnp.asarray(n, logs.dtype))
 
     return jax.lax.map(of_frame, (observations, labels, candidates))
@@ -104,7 +105,7 @@ def transition_candidates(
         lambda leaf: jnp.repeat(leaf[:-1].reshape((t - 1) * k, *leaf.shape[2:]), lead[2], axis=0),
         labels,
     )
-    drawn = model.sample_transition(key, before)
+    drawn = moved(key, model, before)
     return jax.tree.map(lambda leaf: leaf.reshape(*lead, *leaf.shape[1:]), drawn)
 
 

@@ -7,6 +7,7 @@ import pytest
 
 import mpfjax
 from mpfjax.metrics import crps, log_score
+from tests import switching
 
 
 def by_definition(values, weights, y):
@@ -74,3 +75,13 @@ class TestLogScore:
             np.asarray(model.log_likelihood(jnp.asarray(0.8), mixture.particles), float)
         )
         assert float(score) == pytest.approx(-np.log(by_hand), abs=1e-4)
+
+    def test_of_a_conditionally_linear_model_x_is_integrated_out(self):
+        """The sum over all sequences of regimes has -log p(y_4 | y_1..y_3)."""
+        filter = mpfjax.mixture_particle_filter(switching.MODEL, 4000, 2)
+        run = mpfjax.run_filter(jax.random.key(0), filter, switching.OBSERVATIONS[:3])
+        ahead = mpfjax.forecast(jax.random.key(1), filter, run.final, 1)
+        mixture = jax.tree.map(lambda leaf: leaf[0], ahead.mixtures)
+        score = log_score(switching.MODEL, mixture, switching.OBSERVATIONS[3])
+        exact = -np.diff(switching.truth().log_evidence)[2]
+        assert float(score) == pytest.approx(exact, abs=0.05)

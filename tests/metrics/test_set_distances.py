@@ -203,6 +203,42 @@ def test_large_cutoffs_and_orders_do_not_overflow():
     assert ospa(far, jnp.full((1, 2), jnp.inf), cutoff=1e5, order=10.0) == pytest.approx(1e5)
 
 
+@pytest.mark.parametrize(("order", "cutoff"), [(30.0, 20.0), (30.0, 200.0), (2.0, 5000.0)])
+def test_distances_far_below_the_cutoff_pair_as_well(order, cutoff):
+    """Their powers are no numbers in float32, or lost beside that of the cutoff; in float64."""
+    rng, pairs = np.random.default_rng(0), []
+    for num_far in (0, 0, 1, 1, 2):
+        truths = rng.uniform(0.0, 3.0, (4, 2))
+        estimates = truths[rng.permutation(4)] + rng.normal(0.0, 0.7, (4, 2))
+        estimates[:num_far] += 1e4
+        pairs.append((estimates.astype(np.float32), truths.astype(np.float32)))
+    found = masked(gospa, pairs, cutoff=cutoff, order=order)
+    some = masked(ospa, pairs, cutoff=cutoff, order=order)
+    pairs = [(x.astype(float), y.astype(float)) for x, y in pairs]
+    best = [every_pairing(*pair, cutoff, order, 0.0) for pair in pairs]
+    np.testing.assert_allclose(found.distance, np.power(best, 1 / order), rtol=2e-5)
+    np.testing.assert_allclose(some, np.power(np.divide(best, 4), 1 / order), rtol=2e-5)
+    apart = [every_pairing(x[x[:, 0] < 1e3], y, cutoff, order, 0.0) for x, y in pairs]
+    np.testing.assert_allclose(found.localisation, apart, rtol=2e-4)
+    num_far = np.array([0, 0, 1, 1, 2])
+    for part in (found.missed, found.false):
+        np.testing.assert_allclose(part[num_far == 0], 0.0)
+
+
+@pytest.mark.parametrize("order", [1.0, 2.0, 30.0])
+@pytest.mark.parametrize("metric", [ospa, gospa])
+def test_the_gradient_is_finite_where_sets_coincide(metric, order):
+    def value(estimates, truths):
+        found = metric(estimates, truths, cutoff=7.0, order=order)
+        return found if metric is ospa else found.distance + found.localisation
+
+    truths = jnp.array([[0.0, 0.0], [3.0, 4.0]])
+    np.testing.assert_array_equal(jax.grad(value)(truths, truths), 0.0)
+    one_off = jax.grad(value)(truths.at[0, 0].add(0.5), truths)
+    assert one_off[0, 0] > 0
+    np.testing.assert_array_equal(one_off[1], 0.0)
+
+
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_both_precisions(dtype):
     with float64():

@@ -127,3 +127,13 @@ def test_too_long_a_series_is_refused():
         switching_filter(MODEL, jnp.zeros(7))
     with pytest.raises(ValueError, match="model:"):
         switching_filter(mpfjax.QuadraticModel(), OBSERVATIONS)
+
+
+@pytest.mark.usefixtures("as_installed")
+def test_a_list_is_a_series_and_an_infinity_is_none():
+    """Of the observations, as for `kalman_filter`."""
+    run = switching_filter(MODEL, [[0.3], [1.2]])
+    same = switching_filter(MODEL, OBSERVATIONS[:2])
+    np.testing.assert_array_equal(run.means, same.means)
+    with pytest.raises(ValueError, match="observations: infinite at index 1"):
+        switching_filter(MODEL, np.array([[0.3], [np.inf]]))

@@ -10,6 +10,7 @@ import mpfjax
 from mpfjax import (
     Every,
     Filter,
+    GaussianRegeneration,
     IslandInteraction,
     KMeans,
     MetropolisAdjustedLangevin,
@@ -129,7 +130,10 @@ class TestArguments:
     def test_chains_without_one_parent_are_named(self):
         move = RandomWalkMetropolis(MODEL)
         with pytest.raises(ValueError, match="IslandInteraction leaves no particle one parent"):
-            Filter(MODEL, [IslandInteraction(), Propagate(MODEL), move], 8)
+            Filter(MODEL, [Propagate(MODEL), IslandInteraction(), move], 8)
+        regenerated = Every(2, [GaussianRegeneration()])
+        with pytest.raises(ValueError, match="GaussianRegeneration leaves no particle one parent"):
+            Filter(MODEL, [Propagate(MODEL), regenerated, move], 8)
         with pytest.raises(ValueError, match="may only regroup beside it"):
             Filter(MODEL, [Propagate(MODEL), Every(2, [Resample(), move])], 8)
         with pytest.raises(ValueError, match="comes before any propagation"):

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.smoothing import sample_trajectories, trace_ancestors
+from mpfjax.exact import kalman_smoother
+from mpfjax.smoothing import (
+    sample_trajectories,
+    smoothed_sums,
+    trace_ancestors,
+    with_first_ancestors,
+)
 
 QUADRATIC = mpfjax.QuadraticModel(0.3, 0.4, -2.0, 2.0)
 SQUARES = np.array([1.2, 0.8, 1.5, 1.0], np.float32)
@@ -79,6 +85,51 @@ class NoTransition(mpfjax.AbstractStateSpaceModel):
 
     def log_likelihood(self, observation, states):
         return -((observation - states) ** 2)
+
+
+OBJECTS = mpfjax.MultiObjectModel(
+    mpfjax.LinearGaussianModel(A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.4]], m0=[0.0], P0=[[1.0]]), 2
+)
+SEEN = jnp.array([[[0.8], [-0.5]], [[1.3], [-0.2]], [[0.9], [0.3]]])
+NO_PARENTS = {
+    "objects": (OBJECTS, mpfjax.independent_particle_filters(OBJECTS, 2000), SEEN),
+    "clusters": (OBJECTS, mpfjax.clustered_particle_filter(OBJECTS, 50), SEEN),
+    "Gaussian": (QUADRATIC, mpfjax.gaussian_particle_filter(QUADRATIC, 50), jnp.full(3, 1.5)),
+}
+
+
+class TestParticlesWithoutOneParent:
+    """Each object comes from a particle of its own: what follows ancestors refuses them."""
+
+    @pytest.mark.parametrize("name", NO_PARENTS)
+    def test_is_said_by_name(self, name):
+        model, filter, observations = NO_PARENTS[name]
+        run = mpfjax.run_filter(jax.random.key(0), filter, observations)
+        assert (run.collected.ancestor_indices == -1).all()
+        key, sum_of_all = jax.random.key(1), lambda before, states: states.sum(axis=1)
+        for follow, named in (
+            (lambda run: trace_ancestors(run), "trace_ancestors follows"),
+            (lambda run: sample_trajectories(key, model, run, 9, method="mcmc"), "method 'mcmc'"),
+        ):
+            with pytest.raises(ValueError, match=f"mixtures: .*{named}"):
+                follow(run)
+            with pytest.raises(RuntimeError, match=named):
+                jax.block_until_ready(jax.jit(follow)(run))
+        with pytest.raises(ValueError, match=r"leaves no particle one parent.* smoothed_sums"):
+            smoothed_sums(key, filter, observations, sum_of_all, method="mcmc")
+        with pytest.raises(ValueError, match=r"leaves no particle one parent.* with_first"):
+            with_first_ancestors(filter)
+
+    def test_what_follows_none_is_right(self):
+        """Backward sampling by all weights, against each object's Kalman smoother."""
+        model, filter, observations = NO_PARENTS["objects"]
+        run = mpfjax.run_filter(jax.random.key(0), filter, observations)
+        drawn = sample_trajectories(jax.random.key(1), model, run, 2000)
+        sums = smoothed_sums(jax.random.key(0), filter, observations, lambda x, _: x[..., 0]).sums
+        for j in range(2):
+            exact = kalman_smoother(OBJECTS.object_model, observations[:, j]).means[:, 0]
+            np.testing.assert_allclose(drawn[:, :, j, 0].mean(axis=0), exact, atol=0.12)
+            assert float(sums[-1, j]) == pytest.approx(float(exact[:3].sum()), abs=0.2)
 
 
 @pytest.mark.usefixtures("as_installed")

@@ -8,6 +8,7 @@ import optax
 import pytest
 from jax.scipy.stats import norm
 
+import mpfjax
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.tuning import (
     LabelLikelihood,
@@ -16,6 +17,7 @@ from mpfjax.tuning import (
     maximise,
     transition_candidates,
 )
+from tests import switching
 
 
 class Unnormalised(AbstractStateSpaceModel):
@@ -70,6 +72,31 @@ def test_each_label_has_its_own_candidates():
             expected = np.log(likelihoods[0] / likelihoods.mean())
             assert found[t, k] == pytest.approx(expected, abs=1e-4)
             assert found[t, k] <= np.log(6) + 1e-5
+
+
+def test_of_a_conditionally_linear_model_labels_carry_moments():
+    """A known x has no variance: L is then N(y; H x + c, R) of the regime, in numpy."""
+    model, y = switching.MODEL, switching.OBSERVATIONS[:2]
+    regimes, places = np.array([[0], [2]], np.int32), np.array([[[0.5, 0.0]], [[-0.3, 0.2]]])
+    labels = mpfjax.MarginalisedState(
+        jnp.asarray(regimes), jnp.asarray(places, jnp.float32), jnp.zeros((2, 1, 2, 2))
+    )
+    rivals = transition_candidates(jax.random.key(0), model, labels, 50)
+    last = jax.tree.map(lambda leaf: leaf[1:], labels)
+    found = label_log_posteriors(model, y[1:], last, rivals)
+    latents = np.append(regimes[1], rivals.latent)
+    means = np.concatenate([places[1], np.asarray(rivals.mean).reshape(50, 2)])[:, 0]
+    variances = np.append(0.0, np.asarray(rivals.covariance)[..., 0, 0])
+    noise = np.ravel(switching.PARTS["R"])[latents]
+    logs = norm.logpdf(float(y[1, 0]), means, np.sqrt(variances + noise))
+    expected = logs[0] - np.log(np.mean(np.exp(logs)))
+    np.testing.assert_allclose(found[0, 0], expected, atol=1e-4)
+    Q, F, b = (np.array(switching.PARTS[name]) for name in "QFb")
+    z = np.ravel(rivals.latent)
+    np.testing.assert_allclose(rivals.mean[0, 0], F[z] @ places[0, 0] + b[z], atol=1e-5)
+    np.testing.assert_allclose(rivals.covariance[0, 0], Q[z], atol=1e-6)
+    with pytest.raises(ValueError, match="MarginalisedState"):
+        label_log_posteriors(model, y[1:], last.mean, rivals.mean)
 
 
 def test_the_scale_has_a_best_value_and_a_factor_of_y_none():

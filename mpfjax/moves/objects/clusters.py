@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.checks import check_one_of, check_whole, given
-from mpfjax.mixture import ParticleMixture, single_component
+from mpfjax.mixture import ParticleMixture, no_ancestors, single_component
 from mpfjax.models.base import require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
@@ -71,9 +71,8 @@ class PropagateInClusters(AbstractPropagation):
     transition densities and J² N² potentials where there is a cluster of several.
 
     Particle i holds row i of every cluster. The move needs particles of equal weight, as x_0 has
-    and as it returns them. A row has no single ancestor, so every particle is named as its own
-    ancestor. `memory["clusters"]["labels"]`, (J,), holds the first object of each object's
-    cluster.
+    and as it returns them. A row has no single ancestor, and -1 for its index.
+    `memory["clusters"]["labels"]`, (J,), holds the first object of each object's cluster.
 
     Clusters need `log_transition` of the object model. A model whose state holds more than x_t,
     such as x_{t-1}, also needs `with_history(states, previous_states)`: the states with their past
@@ -101,6 +100,11 @@ class PropagateInClusters(AbstractPropagation):
     def approximate(self) -> bool:
         """Whether clusters are split again."""
         return self.split_after is not None
+
+    @property
+    def keeps_parents(self) -> bool:
+        """False: each cluster of a particle has a parent of its own."""
+        return False
 
     @property
     def _may_be_joint(self) -> bool:
@@ -151,7 +155,9 @@ class PropagateInClusters(AbstractPropagation):
             particles = _rows_of_each(points, rows)
         particles = _shifted(key_shift, particles, memory["labels"])
         moved = mixture.replace(
-            particles=particles, memory=mixture.memory | {"clusters": memory}
+            particles=particles,
+            ancestor_indices=no_ancestors(mixture),
+            memory=mixture.memory | {"clusters": memory},
         ).weighed(log_growth[None], jnp.sum(common)[None])
         return jax.lax.cond(
             log_growth == -jnp.inf, lambda: self._unweighted(key, mixture), lambda: moved

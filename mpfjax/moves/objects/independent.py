@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.checks import check_one_of
-from mpfjax.mixture import ParticleMixture, single_component
+from mpfjax.mixture import ParticleMixture, no_ancestors, single_component
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling.allocation import require_equal_rows
@@ -21,8 +21,8 @@ class PropagateIndependently(AbstractPropagation):
     For every object j: x_t^j ~ D, weights L(y_t | x_t^j), resampled by these weights alone.
     Objects that do not interact are independent given the observations, so the product of their
     N-particle clouds is the joint cloud, with Ẑ = Π_j Ẑ_j. Particle i holds the i-th particle
-    of every object: it is one of N^J combinations of equal weight. It has no single ancestor, so
-    every particle is named as its own ancestor.
+    of every object: it is one of N^J combinations of equal weight. It has no single ancestor, and
+    -1 for its index.
 
     The move needs particles of equal weight, as x_0 has and as it returns them; the chain needs no
     other resampling. It ignores an interaction of the model, and `approximate` is then true.
@@ -41,6 +41,11 @@ class PropagateIndependently(AbstractPropagation):
     def approximate(self) -> bool:
         """Whether the model has an interaction, which this move ignores."""
         return self.model.interaction is not None
+
+    @property
+    def keeps_parents(self) -> bool:
+        """False: each object of a particle has a parent of its own."""
+        return False
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -70,7 +75,8 @@ class PropagateIndependently(AbstractPropagation):
             mixture.particles,
             jnp.arange(num_objects, dtype=jnp.int32),
         )
-        return mixture.replace(particles=particles).weighed(jnp.sum(log_growths)[None])
+        moved = mixture.replace(particles=particles, ancestor_indices=no_ancestors(mixture))
+        return moved.weighed(jnp.sum(log_growths)[None])
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) of all objects."""

@@ -10,7 +10,6 @@ from mpfjax.checks import check_type, saying
 from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.base import (
     HasTransitionNoise,
-    check_log_density,
     check_model,
     check_moved,
     is_made_of_noise,
@@ -25,14 +24,13 @@ from mpfjax.models.conditionally_linear import (
     log_latent_density,
     predicted,
     require_marginalised,
-    updated,
 )
 from mpfjax.models.noise import noise_dtype
+from mpfjax.models.steps import seen
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation.propagate import (
     check_noise,
     check_propagated_gradient,
-    likelihoods,
     log_transition,
     noise_of_slots,
 )
@@ -188,18 +186,6 @@ def latent_made_of(
         latent = cast(HasTransitionNoise, model).transition_from_noise(noise, state.latent)
     check_moved(latent, state.latent, model, "transition_from_noise")
     return latent
-
-
-def seen(
-    model: AbstractConditionallyLinearModel, observation: PyTree, state: MarginalisedState
-) -> tuple[MarginalisedState, list[Float[Array, " n"]]]:
-    """The predicted particles updated by y_t, and the factors of log p(y_t | z_0, ..., z_t)."""
-    state, log_density = updated(model, observation, state)
-    log_factors = [likelihoods(model, observation, state.latent)]
-    if log_density is not None:
-        num_particles = state.mean.shape[0]
-        log_factors.append(check_log_density(log_density, model, "emission", num_particles))
-    return state, log_factors
 
 
 def _weighed(

@@ -23,6 +23,7 @@ from mpfjax.models.base import (
 )
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
+from mpfjax.models.steps import likelihoods
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.operations.gradients import add_gradient
 from mpfjax.operations.logarithms import finite_max
@@ -278,19 +279,6 @@ def log_transition(
     values = cast(HasTransitionDensity, model).log_transition(states, previous_states)
     num_particles = jax.tree.leaves(states)[0].shape[0]
     return check_log_density(values, model, "log_transition", num_particles)
-
-
-def likelihoods(
-    model: AbstractStateSpaceModel, observation: PyTree, states: PyTree
-) -> Float[Array, " n"]:
-    """log L of each particle, checked."""
-    leaves = [f"{leaf.dtype}{list(leaf.shape)}" for leaf in jax.tree.leaves(observation)]
-    seen = f"{', '.join(leaves)} in {jax.tree.structure(observation)}"
-    who = f"model: {model_name(model)}.log_likelihood"
-    with saying(f"in {who}, of an observation (a step of the observations) that is {seen}"):
-        values = model.log_likelihood(observation, states)
-    num_particles = jax.tree.leaves(states)[0].shape[0]
-    return check_log_density(values, model, "log_likelihood", num_particles)
 
 
 def _weigh(

@@ -13,11 +13,11 @@ from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.models.conditionally_linear import (
     AbstractConditionallyLinearModel,
-    log_predictive,
     predicted,
     require_marginalised,
     updated,
 )
+from mpfjax.models.steps import log_predictive
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.regrouping.group_by import GroupBy
 from mpfjax.moves.resampling.resample import Resample

@@ -12,8 +12,9 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, check_model, require_noise
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import noise_dtype
+from mpfjax.models.steps import likelihoods
 from mpfjax.moves.base import AbstractPropagation
-from mpfjax.moves.propagation.propagate import likelihoods, predict
+from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.generator import normal, split, uniform
 from mpfjax.operations.logarithms import finite_max

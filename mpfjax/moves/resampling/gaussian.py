@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_callable, check_one_of, check_positive, check_whole, given
-from mpfjax.mixture import ParticleMixture, flatten_states
+from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
 from mpfjax.models.noise import NOISES, draw_noise
 from mpfjax.moves.base import AbstractResampling
 from mpfjax.moves.regrouping.features import origin, summarise
@@ -65,6 +65,11 @@ class GaussianRegeneration(AbstractResampling):
         """True: each component is replaced by a Gaussian."""
         return True
 
+    @property
+    def keeps_parents(self) -> bool:
+        """False: a draw of a Gaussian comes from all particles of its component."""
+        return False
+
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
     ) -> ParticleMixture:
@@ -74,15 +79,15 @@ class GaussianRegeneration(AbstractResampling):
         if self.where is None:
             vacated = self._vacated(mixture)
             drawn = self._draw(key_noise, mixture.particles, mixture, vacated)
-            return self._in_line(vacated.replace(particles=drawn))
+            return self._in_line(vacated, drawn)
         resample = Resample(particles_per_component=self.particles_per_component)
         vacated = resample(key_rest, mixture)
         drawn = self._draw(key_noise, self.where(mixture.particles), mixture, vacated)
-        drawn = eqx.tree_at(self.where, vacated.particles, drawn)
-        return self._in_line(vacated.replace(particles=drawn))
+        return self._in_line(vacated, eqx.tree_at(self.where, vacated.particles, drawn))
 
-    def _in_line(self, mixture: ParticleMixture) -> ParticleMixture:
-        """The same mixture, ordered if the next noise is a point set over its slots."""
+    def _in_line(self, vacated: ParticleMixture, drawn: PyTree) -> ParticleMixture:
+        """The mixture of these draws, ordered if the next noise is a point set over its slots."""
+        mixture = vacated.replace(particles=drawn, ancestor_indices=no_ancestors(vacated))
         if self.noise != "rqmc":
             return mixture
         labels = mixture.component_indicators
@@ -92,7 +97,6 @@ class GaussianRegeneration(AbstractResampling):
             particles=jax.tree.map(lambda leaf: take(leaf, order), mixture.particles),
             log_weights=take(mixture.log_weights, order),
             component_indicators=take(mixture.component_indicators, order),
-            ancestor_indices=take(mixture.ancestor_indices, order),
         )
 
     def _redrawn(self, particles: PyTree) -> Float[Array, "n d"]:
@@ -112,7 +116,6 @@ class GaussianRegeneration(AbstractResampling):
             particles=jax.tree.map(lambda leaf: take(leaf, parents), mixture.particles),
             log_weights=jnp.where(slots.filled, log_weights, -jnp.inf),
             component_indicators=slots.components,
-            ancestor_indices=take(mixture.ancestor_indices, parents),
         )
 
     def _draw(

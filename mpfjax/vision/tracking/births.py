@@ -68,6 +68,11 @@ class Births(AbstractMove):
         """True: a birth adds probability mass at a detection."""
         return True
 
+    @property
+    def keeps_parents(self) -> bool:
+        """False: the particles of a new object come from none."""
+        return False
+
     def founding(self, mixture: ParticleMixture, observation: TrackedFrame) -> Bool[Array, " d"]:
         """Which detections would start a component if there were room for all."""
         found, source = observation.detections, mixture.memory[ASSIGNED]
@@ -103,6 +108,7 @@ class Births(AbstractMove):
             particles=particles,
             log_weights=jnp.where(filled, log_share, mixture.log_weights),
             component_indicators=jnp.where(filled, seats, mixture.component_indicators),
+            ancestor_indices=jnp.where(filled, -1, mixture.ancestor_indices),
         )
         number = few_upto(born)
         at_the_start = born & ~lives.begun
