@@ -92,7 +92,7 @@ def _advance(
     mixture: ParticleMixture,
     counted: IntegralHistogram,
 ) -> tuple[ParticleMixture, Tracks, tuple[Fault, ...]]:
-    step_keys = split_once(jax.random.fold_in(key, t), filter.num_step_keys)
+    step_keys = split_once(jax.random.fold_in(key, t), len(filter.moves))
     model: Any = filter.model
     mixture, _, faults = step_and_faults(filter, step_keys, mixture, counted)
     best, held = best_components(mixture, num_objects)
