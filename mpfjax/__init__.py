@@ -28,6 +28,7 @@ from mpfjax.models import RandomWalk as RandomWalk
 from mpfjax.models import RandomWalkWithJumps as RandomWalkWithJumps
 from mpfjax.models import SwitchingLinearGaussianModel as SwitchingLinearGaussianModel
 from mpfjax.models import WalkWithVelocity as WalkWithVelocity
+from mpfjax.models import check_model as check_model
 from mpfjax.models import per_particle as per_particle
 from mpfjax.moves import AbstractMarkovMove as AbstractMarkovMove
 from mpfjax.moves import AbstractMetropolis as AbstractMetropolis

@@ -9,7 +9,7 @@ from jaxtyping import Array, Int, Key, PyTree
 
 from mpfjax.checks import check_flag, check_key, check_one_of, check_type
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import AbstractStateSpaceModel, check_model
+from mpfjax.models.base import AbstractStateSpaceModel, require_model
 from mpfjax.models.inputs import saying_that_none_were_given
 from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import (
@@ -97,7 +97,7 @@ class Filter(eqx.Module):
         initial_noise: str = "independent",
         starts_empty: bool = False,
     ) -> None:
-        check_model(model, "Filter")
+        require_model(model, "Filter")
         moves = as_moves(moves, "moves")
         initial_moves = as_moves(initial_moves, "initial_moves")
         check_sizes(with_inner(moves), num_particles, num_components)

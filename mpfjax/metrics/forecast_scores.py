@@ -5,7 +5,7 @@ from jaxtyping import Array, Float, PyTree
 
 from mpfjax.checks import check_not_negative_array, check_type, real_arrays
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, check_model
+from mpfjax.models.base import AbstractStateSpaceModel, require_model
 from mpfjax.models.steps import likelihoods
 from mpfjax.observations import one_observation
 from mpfjax.operations.logarithms import log_sum_exp
@@ -60,7 +60,7 @@ def log_score(
     Raises `ValueError` for anything but a model and a mixture, and for a likelihood of another
     shape.
     """
-    check_model(model, "log_score")
+    require_model(model, "log_score")
     check_type(ParticleMixture, "a mixture, as in a Forecast", mixture=mixture)
     observation = one_observation(observation)
     values = likelihoods(model, observation, mixture.particles)

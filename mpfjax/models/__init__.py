@@ -16,4 +16,5 @@ from mpfjax.models.quadratic import QuadraticModel as QuadraticModel
 from mpfjax.models.switching import (
     SwitchingLinearGaussianModel as SwitchingLinearGaussianModel,
 )
+from mpfjax.models.trial import check_model as check_model
 from mpfjax.models.velocity import WalkWithVelocity as WalkWithVelocity

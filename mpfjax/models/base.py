@@ -190,7 +190,7 @@ def model_name(model: Any) -> str:
     return type(model.model if isinstance(model, _PerParticleModel) else model).__name__
 
 
-def check_model(model: Any, needed_by: str, argument: str = "model") -> None:
+def require_model(model: Any, needed_by: str, argument: str = "model") -> None:
     """Raise a `ValueError` for anything but a model, and for one written for a single particle."""
     if isinstance(model, type):
         raise ValueError(f"{argument}: {shown(model)} is a class; write {model.__name__}(...)")

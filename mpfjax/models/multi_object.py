@@ -13,9 +13,9 @@ from mpfjax.checks import check_callable, check_flag, check_whole, given, shown
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     check_log_density,
-    check_model,
     is_made_of_noise,
     model_name,
+    require_model,
 )
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.inputs import replaced, takes_inputs, with_inputs
@@ -73,7 +73,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
         shared_inputs: bool = True,
     ) -> None:
         check_whole(num_objects=num_objects)
-        check_model(object_model, "MultiObjectModel", "object_model")
+        require_model(object_model, "MultiObjectModel", "object_model")
         instead = "give each object a filter of its own"
         refuse_marginalised(object_model, "MultiObjectModel", instead, "object_model")
         potential = "a function of the states of two objects, such as PairwiseRepulsion(...)"

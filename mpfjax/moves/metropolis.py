@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import check_exponent, check_inner_share, check_one_of, check_whole
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
+from mpfjax.models.base import AbstractStateSpaceModel, require, require_model
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.steps import likelihoods
 from mpfjax.moves.base import AbstractMarkovMove
@@ -59,7 +59,7 @@ class AbstractMetropolis(AbstractMarkovMove):
 
     def __check_init__(self) -> None:
         who = type(self).__name__
-        check_model(self.model, who)
+        require_model(self.model, who)
         refuse_marginalised(self.model, who)
         require(self.model, "log_transition", who)
         check_whole(num_steps=self.num_steps)

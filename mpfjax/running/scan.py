@@ -1,6 +1,7 @@
 """One run of a filter as one scan, and its result."""
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -130,13 +131,26 @@ def step_or_predict(
 
 
 def checked(run: FilterRun) -> FilterRun:
-    """The run, or an error where a density of the model was NaN or infinite."""
+    """The run, or an error where a density of the model was NaN or infinite.
+
+    A RuntimeWarning, one for all runs, where no step of a run had any likelihood.
+    """
     increments = run.log_likelihood_increments
     if isinstance(increments, Tracer):
         return eqx.error_if(run, ~(increments < jnp.inf), BROKEN_DENSITY)
     bad = ~(np.asarray(increments) < np.inf).all(axis=tuple(range(increments.ndim - 1)))
     if bad.any():
         raise RuntimeError(f"{BROKEN_DENSITY}, first at index {int(np.argmax(bad))} of the steps")
+    degenerate = np.asarray(run.degenerate)
+    is_blind = degenerate.any(axis=-1) & (degenerate | (np.asarray(increments) == 0)).all(axis=-1)
+    if is_blind.any():
+        which = f" in {is_blind.sum()} of {is_blind.size} runs" if is_blind.ndim else ""
+        warnings.warn(
+            f"every step with an observation was degenerate{which}: no particle had any likelihood,"
+            " and the particles follow the dynamics alone; mpfjax.check_model tries a model out",
+            RuntimeWarning,
+            stacklevel=3,
+        )
     return run
 
 

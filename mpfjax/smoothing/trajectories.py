@@ -10,7 +10,7 @@ from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_key, check_one_of, check_whole, given
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, check_model, require
+from mpfjax.models.base import AbstractStateSpaceModel, require, require_model
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
 from mpfjax.models.inputs import saying_that_none_were_given, with_inputs
 from mpfjax.observations import as_arrays, steps_of_inputs
@@ -67,7 +67,7 @@ def sample_trajectories(
     distinct states at early times.
     """
     check_key(key)
-    check_model(model, "sample_trajectories")
+    require_model(model, "sample_trajectories")
     if not is_mixed(model):
         require(model, "log_transition", "sample_trajectories")
     check_whole(num_trajectories=num_trajectories)

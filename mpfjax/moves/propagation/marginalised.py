@@ -10,11 +10,11 @@ from mpfjax.checks import check_type, saying
 from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.base import (
     HasTransitionNoise,
-    check_model,
     check_moved,
     is_made_of_noise,
     model_name,
     require,
+    require_model,
 )
 from mpfjax.models.conditionally_linear import (
     AbstractConditionallyLinearModel,
@@ -70,7 +70,7 @@ class PropagateMarginalised(AbstractPropagation):
 
     def __check_init__(self) -> None:
         require_marginalised(self.model, "PropagateMarginalised")
-        check_model(self.model, "PropagateMarginalised")
+        require_model(self.model, "PropagateMarginalised")
         # The mixed form has the law of z_t and its noise whatever the model's methods are.
         own = None if is_mixed(self.model) else self.model
         check_propagated_gradient(self.gradient, own)

@@ -14,11 +14,11 @@ from mpfjax.models.base import (
     HasTransitionDensity,
     HasTransitionNoise,
     check_log_density,
-    check_model,
     check_moved,
     is_made_of_noise,
     model_name,
     require,
+    require_model,
     require_noise,
 )
 from mpfjax.models.conditionally_linear import refuse_marginalised
@@ -192,7 +192,7 @@ class Reweight(AbstractPropagation):
 
 def _check_whole_states(model: Any, needed_by: str) -> None:
     """Raise a `ValueError` for what is no model, or one whose particles carry moments."""
-    check_model(model, needed_by)
+    require_model(model, needed_by)
     refuse_marginalised(model, needed_by)
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_inner_share, check_type, check_whole, shown
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, check_model, require_noise
+from mpfjax.models.base import AbstractStateSpaceModel, require_model, require_noise
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import noise_dtype
 from mpfjax.models.steps import likelihoods
@@ -73,7 +73,7 @@ class PropagateTempered(AbstractPropagation):
         num_moves: int = 1,
         least_step: float = 0.02,
     ) -> None:
-        check_model(model, "PropagateTempered")
+        require_model(model, "PropagateTempered")
         refuse_marginalised(model, "PropagateTempered")
         require_noise(model, "PropagateTempered")
         self.model = model

@@ -1,0 +1,214 @@
+"""A model tried out before it is run: what would go wrong without a word is said by name."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.checks import as_numbers, check_key, shown
+from mpfjax.models.base import (
+    check_log_density,
+    check_states,
+    is_made_of_noise,
+    model_name,
+    require_model,
+    require_noise,
+)
+from mpfjax.models.conditionally_linear import (
+    is_marginalised,
+    is_mixed,
+    log_latent_density,
+    with_moments,
+)
+from mpfjax.models.inputs import saying_that_none_were_given, takes_inputs, with_inputs
+from mpfjax.models.steps import likelihoods, moved
+
+_KEYS, _PLACES, _DRAWS = 64, 4, 32  # of the draws that must differ
+_FAMILIES, _SIBLINGS = 8, 128  # of those that log_transition must know
+# Of a right model, variances and errors are beyond these once in a million keys.
+_MOST_RATIO, _MOST_ERRORS = 4.0, 5.0
+
+
+def check_model(
+    key: Key[Array, ""], model: Any, observation: PyTree, *, inputs: PyTree = None
+) -> None:
+    """Try a model out on one observation, y_1; a `ValueError` names the first fault found.
+
+    Call it once for a model that you have written. It finds what a filter would not notice:
+
+    - methods that are missing, and draws or densities of other shapes or types than they must have;
+    - noise that particles share. One key serves all particles: `jax.random.normal(key)`, without
+      their number in its shape, moves all of them alike;
+    - draws that are the same for every key;
+    - a draw, or a density at a draw of the model, that is NaN; a likelihood that is zero for all
+      particles; a density of a particle that depends on the other particles;
+    - a `log_transition` that is not the density of `sample_transition`, but for a constant factor.
+      Given x_1 and some possible x_0, the one that it came from must be as likely as it says.
+
+    The last two look at a few thousand random draws, of x_0 and of the first two steps: they accept
+    a right model, and may accept one that is wrong by a few percent. `inputs` are u_1.
+    """
+    check_key(key)
+    require_model(model, "check_model")
+    if inputs is not None and not takes_inputs(model):
+        raise ValueError(f"inputs: {model_name(model)} has no place for them, a field inputs")
+    if not jax.tree.leaves(observation):
+        raise ValueError(f"observation: {shown(observation)} holds no array")
+    observation = jax.tree.map(lambda leaf: as_numbers("observation", leaf), observation)
+    if is_made_of_noise(model):
+        require_noise(model, "check_model")
+    keys = jax.random.split(key, 5)
+    with saying_that_none_were_given(model):
+        _check_initial(keys[0], model)
+        states = jax.jit(lambda: _initial(keys[1], model, _FAMILIES))()
+        model = with_inputs(model, inputs)
+        _check_draws(keys[2], model, states)
+        _check_likelihood(keys[3], model, observation, states)
+        if is_mixed(model) or callable(getattr(model, "log_transition", None)):
+            _check_transition(keys[4], model, states)
+
+
+def _initial(key: Key[Array, ""], model: Any, number: int) -> PyTree:
+    drawn = model.sample_initial(key, number)
+    check_states(drawn, model, "sample_initial", number)
+    return with_moments(model, drawn)
+
+
+def _check_initial(key: Key[Array, ""], model: Any) -> None:
+    """x_0: its draws, and its density at them."""
+    draw = jax.vmap(lambda key: _initial(key, model, _DRAWS))
+    _require_own_noise(jax.jit(draw)(jax.random.split(key, _KEYS)), model, "sample_initial")
+    if callable(getattr(model, "log_initial", None)):
+        drawn = model.sample_initial(key, _DRAWS)
+        values = check_log_density(model.log_initial(drawn), model, "log_initial", _DRAWS)
+        if not np.isfinite(values).all():
+            raise ValueError(
+                f"model: {model_name(model)}.log_initial is NaN or infinite at draws of"
+                " sample_initial"
+            )
+
+
+def _check_draws(key: Key[Array, ""], model: Any, states: PyTree) -> None:
+    """x_1, drawn many times from the same few states."""
+    same = jax.tree.map(lambda leaf: jnp.repeat(leaf[:_PLACES], _DRAWS, axis=0), states)
+    draw = jax.vmap(lambda key: moved(key, model, same))
+    draws = jax.jit(draw)(jax.random.split(key, _KEYS))
+    _require_own_noise(draws, model, "sample_transition")
+    for column in _columns(draws):
+        by_place = column.reshape(_KEYS, _PLACES, _DRAWS)
+        if (column == column[:1]).all() and (by_place != by_place[:, :, :1]).any():
+            raise ValueError(
+                f"model: {model_name(model)}.sample_transition gives the same draws for every key;"
+                " draw with the key that it is given"
+            )
+
+
+def _require_own_noise(draws: PyTree, model: Any, method: str) -> None:
+    """Raise a `ValueError` where the mean over particles varies more than that of independent ones.
+
+    The leaves are (keys, particles, ...), with the particles of a place side by side.
+    """
+    for column in _columns(draws):
+        if np.isnan(column).any():
+            raise ValueError(f"model: {model_name(model)}.{method} draws NaN")
+        by_place = column.reshape(_KEYS, -1, _DRAWS)
+        of_means = by_place.mean(axis=2).var(axis=0, ddof=1).mean()
+        expected = by_place.var(axis=2, ddof=1).mean() / _DRAWS
+        rounding = (1e-5 * np.abs(column).max()) ** 2
+        if of_means > _MOST_RATIO * expected + rounding:
+            raise ValueError(
+                f"model: {model_name(model)}.{method} draws noise that particles share; one key"
+                " serves all of them, so that the shape of what is drawn must begin with their"
+                " number, as jax.random.normal(key, states.shape) does"
+            )
+
+
+def _columns(draws: PyTree) -> list[np.ndarray]:
+    """Each number of the state, (keys, particles)."""
+    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(draws)]
+    rows = [leaf.reshape(*leaf.shape[:2], -1) for leaf in leaves]
+    return [row[:, :, k] for row in rows for k in range(row.shape[2])]
+
+
+def _check_likelihood(key: Key[Array, ""], model: Any, observation: PyTree, states: PyTree) -> None:
+    """log L of draws of x_1."""
+    states = jax.tree.map(lambda leaf: jnp.repeat(leaf, _DRAWS, axis=0), states)
+    states = jax.jit(lambda: moved(key, model, states))()
+    values = _own_values(lambda states: likelihoods(model, observation, states), states, model)
+    if (values == -np.inf).all():
+        raise ValueError(
+            f"model: {model_name(model)}.log_likelihood of the observation is -inf at all of"
+            f" {len(values)} draws of x_1: no particle explains it"
+        )
+
+
+def _own_values(
+    density: Callable[[PyTree], Float[Array, " n"]], states: PyTree, model: Any
+) -> np.ndarray:
+    """The log-likelihoods, none of them NaN and each that of its own particle alone."""
+    values = np.asarray(jax.jit(density)(states), float)
+    half = len(values) // 2
+    alone = jax.tree.map(lambda leaf: leaf[half:], states)
+    others = np.asarray(jax.jit(density)(alone), float)
+    who = f"model: {model_name(model)}.log_likelihood"
+    if not (values < np.inf).all():
+        raise ValueError(f"{who} is NaN or +inf at a draw of x_1")
+    if not np.allclose(values[half:], others, rtol=1e-3, atol=1e-3):
+        raise ValueError(f"{who} of a particle depends on the other particles")
+    return values
+
+
+def _check_transition(key: Key[Array, ""], model: Any, states: PyTree) -> None:
+    """log D of a draw given its own x_{t-1}, beside that given its siblings."""
+    key_parents, key_children = jax.random.split(key)
+    rows, columns = np.divmod(np.arange(_SIBLINGS**2), _SIBLINGS)
+
+    def of_family(keys: Key[Array, "2"], state: PyTree) -> tuple[Float[Array, "s s"], PyTree]:
+        one = jax.tree.map(lambda leaf: jnp.repeat(leaf[None], _SIBLINGS, axis=0), state)
+        parents = moved(keys[0], model, one)
+        children = moved(keys[1], model, parents)
+        pair = [jax.tree.map(lambda leaf: leaf[rows], children)]
+        pair += [jax.tree.map(lambda leaf: leaf[columns], parents)]
+        return _log_transition(model, *pair).reshape(_SIBLINGS, _SIBLINGS), parents
+
+    keys = [jax.random.split(key, _FAMILIES) for key in (key_parents, key_children)]
+    of_each = lambda pair: of_family(*pair)  # noqa: E731
+    found = jax.jit(lambda: jax.lax.map(of_each, (jnp.stack(keys, 1), states)))()
+    logs, parents = np.asarray(found[0], float), found[1]
+    own = np.diagonal(logs, axis1=1, axis2=2)
+    who = f"model: {model_name(model)}.log_transition"
+    if np.isnan(logs).any() or not np.isfinite(own).all():
+        raise ValueError(f"{who} is NaN, or infinite at a draw of sample_transition")
+    shares = np.exp(logs - logs.max(axis=2, keepdims=True))
+    shares /= shares.sum(axis=2, keepdims=True)
+    # Where the shares are right, the expectation of the own value is that of the siblings' values.
+    scores = own - np.sum(shares * np.where(shares > 0, logs, 0.0), axis=2)
+    mean, error = scores.mean(), scores.std() / np.sqrt(scores.size)
+    if abs(mean) > _MOST_ERRORS * error + 1e-3:
+        far = "nearer to" if mean > 0 else "further from"
+        raise ValueError(
+            f"{who} is not the density of sample_transition: draws are {far} what it expects, by"
+            f" {abs(mean):.2g} ± {error:.2g} in log D"
+        )
+    for column in _columns(parents):
+        scores = column - np.einsum("fij,fj->fi", shares, column)
+        error = scores.std() / np.sqrt(scores.size)
+        if abs(scores.mean()) > _MOST_ERRORS * error + 1e-3 * column.std():
+            raise ValueError(
+                f"{who} is not the density of sample_transition: draws come from other x_(t-1) than"
+                " it says; does a factor that depends on x_(t-1) lack?"
+            )
+
+
+def _log_transition(model: Any, states: PyTree, previous: PyTree) -> Float[Array, " n"]:
+    """log D, of a conditionally linear model that of its latent."""
+    if is_mixed(model):
+        return log_latent_density(model, states.latent, previous)
+    if is_marginalised(model):
+        states, previous = states.latent, previous.latent
+    values = model.log_transition(states, previous)
+    number = jax.tree.leaves(states)[0].shape[0]
+    return check_log_density(values, model, "log_transition", number)
