@@ -58,8 +58,7 @@ def test_every_component_keeps_its_mass_and_the_slots_are_dealt_equally():
     after = eqx.filter_jit(GaussianRegeneration())(jax.random.key(0), mixture)
     np.testing.assert_allclose(after.mixture_weights, mixture.mixture_weights, rtol=1e-5)
     np.testing.assert_array_equal(after.component_counts, [10, 10, 10, 0])
-    labels = np.asarray(mixture.component_indicators)[np.asarray(after.ancestor_indices)]
-    np.testing.assert_array_equal(labels, after.component_indicators)
+    np.testing.assert_array_equal(after.ancestor_indices, -1)
 
 
 def test_a_fixed_number_leaves_the_other_slots_empty():
