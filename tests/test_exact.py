@@ -125,7 +125,10 @@ def test_what_is_known_for_sure_has_no_nan(rotation, Q, P0):
         "R": [[0.2]], "m0": rotation @ [0.1, 0.2], "P0": turned(P0),
     }  # fmt: skip
     y = OBSERVATIONS[:, :1]
-    run = kalman_smoother(mpfjax.LinearGaussianModel(**parts), jnp.asarray(y))
+    model = mpfjax.LinearGaussianModel(**parts)
+    run = kalman_smoother(model, jnp.asarray(y))
+    drawn = mpfjax.run_filter(jax.random.key(0), mpfjax.particle_filter(model, 4000), y)
+    assert abs(drawn.log_marginal_likelihood - run.log_marginal_likelihood) < 0.1
     mean, covariance = joint_gaussian(**parts, length=3, with_first=True)
     gain = covariance[:8, 8:] @ np.linalg.inv(covariance[8:, 8:])
     means = mean[:8] + gain @ (y[:, 0] - mean[8:])

@@ -5,13 +5,14 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_finite_array, check_shape, to_array
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.operations.generator import normal
-from mpfjax.operations.matrices import row_sums, solve_lower
+from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
 
 _IN_TIME = ("A", "Q", "H", "R", "B", "inputs")
 
@@ -24,8 +25,9 @@ def _if_given(name: str) -> Callable[[Any], Array | None]:
 class LinearGaussianModel(AbstractStateSpaceModel):
     """x_t = A x_{t-1} + B u_t + N(0, Q), y_t = H x_t + N(0, R), x_0 ~ N(m0, P0).
 
-    - `A`, `Q`: (d, d); `H`: (p, d); `R`: (p, p); `m0`: (d,); `P0`: (d, d). Covariances are
-      positive definite. States have shape (n, d), observations (p,).
+    - `A`, `Q`: (d, d); `H`: (p, d); `R`: (p, p); `m0`: (d,); `P0`: (d, d). R is positive definite;
+      P0 and Q may be singular, but x_0 or x_t then has no density. States have shape (n, d),
+      observations (p,).
     - `B`: (d, k), the control matrix, for inputs u_t, (k,). None leaves B u_t out.
 
     Inputs are u_t alone, or a dict of the fields that change in time by their names, such as
@@ -97,7 +99,7 @@ class LinearGaussianModel(AbstractStateSpaceModel):
 
     def initial_from_noise(self, noise: Float[Array, "n d"]) -> Float[Array, "n d"]:
         """x_0 ~ N(m0, P0)."""
-        return self.m0[None] + noise @ jnp.linalg.cholesky(self.P0).T
+        return self.m0[None] + noise @ _root(self.P0).T
 
     @property
     def noise_dimension(self) -> int:
@@ -109,7 +111,7 @@ class LinearGaussianModel(AbstractStateSpaceModel):
     ) -> Float[Array, "n d"]:
         """x_t ~ N(A x_{t-1} + B u_t, Q)."""
         check_shape(f"n {self.noise_dimension}", noise=noise)
-        return self.transition_mean(states) + noise @ jnp.linalg.cholesky(self.Q).T
+        return self.transition_mean(states) + noise @ _root(self.Q).T
 
     def log_likelihood(
         self, observation: Float[Array, " p"], states: Float[Array, "n d"]
@@ -127,7 +129,7 @@ class LinearGaussianModel(AbstractStateSpaceModel):
     ) -> Float[Array, "n p"]:
         """y_t ~ N(H x_t, R) of every state."""
         noise = normal(key, (len(states), self.R.shape[0]), self.R.dtype)
-        return self.observation_mean(states) + noise @ jnp.linalg.cholesky(self.R).T
+        return self.observation_mean(states) + noise @ _root(self.R).T
 
     def log_transition(
         self, states: Float[Array, "n d"], previous_states: Float[Array, "n d"]
@@ -157,6 +159,13 @@ class LinearGaussianModel(AbstractStateSpaceModel):
     def observation_covariance(self) -> Float[Array, "p p"]:
         """R."""
         return self.R
+
+
+def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """A lower triangular L with L Lᵀ = covariance, which may be singular."""
+    is_definite = jnp.all(jnp.isfinite(jnp.linalg.cholesky(jax.lax.stop_gradient(covariance))))
+    semidefinite = lambda matrix: cholesky(matrix[None])[0]  # noqa: E731
+    return jax.lax.cond(is_definite, jnp.linalg.cholesky, semidefinite, covariance)
 
 
 def _log_normal(
