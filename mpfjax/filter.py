@@ -7,40 +7,30 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Int, Key, PyTree
 
+from mpfjax.chain import (
+    as_moves,
+    check_chain,
+    forgetting,
+    give_inputs,
+    moved_by,
+    normalised,
+    own_ancestors,
+    tie,
+    untie,
+)
 from mpfjax.checks import check_flag, check_key, check_one_of, check_type
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, require_model
 from mpfjax.models.inputs import saying_that_none_were_given
 from mpfjax.models.noise import NOISES
-from mpfjax.moves.base import (
-    AbstractMarkovMove,
-    AbstractMove,
-    AbstractRegrouping,
-    AbstractResampling,
-)
-from mpfjax.moves.every import Every, with_inner
+from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.initial import sample_initial, waiting_for_choice
-from mpfjax.moves.island_interaction import IslandInteraction
-from mpfjax.moves.memory import check_memory
-from mpfjax.moves.parents import runner
 from mpfjax.moves.report import StepInfo, step_info
-from mpfjax.moves.results import (
-    as_moves,
-    check_result,
-    check_sizes,
-    check_weighed,
-    normalised,
-    same_mass,
-)
-from mpfjax.moves.sharing import give_inputs, tie, untie
 from mpfjax.observations import Fault, faults_of, one_input, one_observation, raise_faults
-from mpfjax.operations.across_islands import island_index, num_islands
 from mpfjax.operations.choices import drawn_once
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.generator import split_keys
 
-# Moves that do not change the total mass; there is nothing to normalise after them.
-_KEEP_MASS = (AbstractRegrouping, AbstractResampling, AbstractMarkovMove, IslandInteraction)
 BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
 
@@ -100,10 +90,7 @@ class Filter(eqx.Module):
         require_model(model, "Filter")
         moves = as_moves(moves, "moves")
         initial_moves = as_moves(initial_moves, "initial_moves")
-        check_sizes(with_inner(moves), num_particles, num_components)
-        check_weighed(moves)
-        check_memory(moves)
-        runner(moves)
+        check_chain(moves, num_particles, num_components)
         self.model = model
         self._moves = tie(moves, model)
         self._initial_moves = tie(initial_moves, model)
@@ -127,7 +114,7 @@ class Filter(eqx.Module):
     @property
     def approximate(self) -> bool:
         """Whether any move departs from the exact recursion."""
-        return any(getattr(move, "approximate", True) for move in self.moves)
+        return any(move.approximate for move in self.moves)
 
     def replace(self, **changes: Any) -> "Filter":
         """The filter with other arguments; moves that share its model share the new one."""
@@ -176,8 +163,7 @@ class Filter(eqx.Module):
             particles = drawn_once(start.key, draw) if self._initial_moves else draw(start.key)
         memory = {}
         for move in self.moves:
-            if isinstance(move, AbstractMove):
-                memory |= move.initial_memory(self.num_components)
+            memory |= move.initial_memory(self.num_components)
         mixture = single_component(particles, self.num_components, start.num_particles)
         mixture = mixture.replace(memory=memory)
         for move_key, move in zip(keys[1:], self.initial_moves, strict=True):
@@ -193,7 +179,7 @@ class Filter(eqx.Module):
     @property
     def looks_at_first(self) -> bool:
         """Whether the initial moves may weigh x_0, by y_1 or otherwise."""
-        return any(getattr(move, "weighs", True) for move in self._initial_moves)
+        return any(move.weighs for move in self._initial_moves)
 
     def with_inputs(self, inputs: PyTree) -> "Filter":
         """The filter at a step whose known inputs are u_t, which every model in it receives.
@@ -217,14 +203,7 @@ class Filter(eqx.Module):
         increment is -inf, the particles keep the weights that they had before, and `degenerate`
         is true.
         """
-        check_key(key)
-        check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
-        observation = one_observation(observation)
-        inputs = one_input(inputs, self.model)
-        *moved, faults = with_floats_traced(
-            lambda filter: _step_and_faults(filter, key, mixture, observation, inputs), self
-        )
-        return raise_faults(tuple(moved), faults)
+        return self._run(key, mixture, one_observation(observation), inputs)
 
     def predict(
         self, key: Key[Array, ""], mixture: ParticleMixture, *, inputs: PyTree = None
@@ -234,68 +213,42 @@ class Filter(eqx.Module):
         Use it for a missing y_t, or to forecast. The increment is zero. Raises `ValueError` for a
         move without a method `predict`.
         """
+        return self._run(key, mixture, None, inputs)
+
+    def _run(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree, inputs: PyTree
+    ) -> tuple[ParticleMixture, StepInfo]:
         check_key(key)
         check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
-        inputs = one_input(inputs, self.model)
-        *moved, faults = with_floats_traced(
-            lambda filter: _predict_and_faults(filter, key, mixture, inputs), self
-        )
-        return raise_faults(tuple(moved), faults)
-
-    def _step(
-        self, key: Key[Array, "*keys"], mixture: ParticleMixture, observation: PyTree
-    ) -> tuple[ParticleMixture, StepInfo]:
         if mixture.num_components != self.num_components:
             raise ValueError(
                 f"mixture: its num_components, {mixture.num_components}, is not the filter's,"
                 f" {self.num_components}"
             )
-        mixture = _own_ancestors(mixture)
+        inputs = one_input(inputs, self.model)
+        *moved, faults = with_floats_traced(
+            lambda filter: _step_and_faults(filter, key, mixture, observation, inputs), self
+        )
+        return raise_faults(tuple(moved), faults)
+
+    def _step(
+        self, key: Key[Array, "*keys"], mixture: ParticleMixture, observation: PyTree = None
+    ) -> tuple[ParticleMixture, StepInfo]:
+        """A step within a program; without an observation it only predicts."""
+        moves = waiting_for_choice(self.moves, self.initial_moves)
+        mixture = own_ancestors(mixture)
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
-        run, is_normalised = runner(self._moves), False
-        moves = waiting_for_choice(self.moves, self.initial_moves)
         for move_key, move in zip(split_keys(key, len(moves)), moves, strict=True):
-            if isinstance(move, AbstractMove):
-                resampled |= move.would_resample(mixture, observation)
-            after = (self._forgetting,) if isinstance(move, Every) else ()
             with saying_that_none_were_given(self.model):
-                moved = run(move, move_key, mixture, observation, *after)
-            moved = check_result(moved, mixture, move)
-            if after:
-                mixture = moved
-                continue
-            if not isinstance(move, _KEEP_MASS) and not same_mass(moved, mixture):
+                if observation is not None:
+                    resampled |= move.would_resample(mixture, observation)
+                moved = moved_by(move, move_key, mixture, observation, moves)
+            if observation is not None and not move.keeps_mass:
                 moved, log_growth = normalised(moved, mixture, self.starts_empty)
-                increment, is_normalised = increment + log_growth, True
-            mixture = self._forgetting(moved)
-        if not is_normalised:
-            mixture, log_growth = normalised(mixture, mixture, self.starts_empty)
-            increment += log_growth
+                increment += log_growth
+            mixture = forgetting(moves, moved)
         return mixture.replace(parents=None), step_info(mixture, increment, resampled)
-
-    def _forgetting(self, mixture: ParticleMixture) -> ParticleMixture:
-        """The mixture without any memory of components that have died."""
-        if not mixture.memory:
-            return mixture
-        memory, dead = mixture.memory, ~mixture.active
-        for move in self.moves:
-            if isinstance(move, AbstractMove):
-                memory = move.forget(memory, dead)
-        return mixture.replace(memory=memory)
-
-    def _predict(
-        self, key: Key[Array, "*keys"], mixture: ParticleMixture
-    ) -> tuple[ParticleMixture, StepInfo]:
-        mixture = _own_ancestors(mixture)
-        for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
-            if not isinstance(move, AbstractMove):
-                raise ValueError(f"moves: {move!r} does not define predict, for a missing y_t")
-            with saying_that_none_were_given(self.model):
-                moved = move.predict(move_key, mixture)
-            mixture = self._forgetting(check_result(moved, mixture, move))
-        increment = jnp.zeros((), mixture.log_weights.dtype)
-        return mixture, step_info(mixture, increment, jnp.zeros(self.num_components, bool))
 
 
 def step_and_faults(
@@ -323,16 +276,3 @@ def _from_particles(filter, start, observation, inputs):
     # Not with the draws of x_0, whose last digits depend on the program that they are part of.
     faults = faults_of(filter.model, observation, inputs)
     return filter.with_inputs(inputs)._init(start, observation), faults
-
-
-@jit_on_wide_vectors
-def _predict_and_faults(filter, key, mixture, inputs):
-    moved, info = filter.with_inputs(inputs)._predict(key, mixture)
-    return moved, info, faults_of(filter.model, None, inputs)
-
-
-def _own_ancestors(mixture: ParticleMixture) -> ParticleMixture:
-    own = jnp.arange(mixture.num_particles, dtype=jnp.int32)
-    if num_islands() > 1:
-        own += mixture.num_particles * island_index()
-    return mixture.replace(ancestor_indices=own)

@@ -274,6 +274,7 @@ class TestSlots:
         def evidence(num_particles):
             model = TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0)
             filter = mpfjax.mixture_particle_filter(model, num_particles, 2)
+            filter = mpfjax.with_selected_start(filter, 1)
             run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean, slots=61)
             return run.log_marginal_likelihood
 

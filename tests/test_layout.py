@@ -18,6 +18,7 @@ ORDER = (
     "proposals",
     "moves",
     "observations",
+    "chain",
     "filter",
     "transforms",
     "filters",
@@ -41,9 +42,9 @@ FLOORS = {
         "compiling", "functions", "kept_programs",
     ),
     "moves": (
-        "base", "local_quadratics", "eve_indices", "sharing", "results", "island_interaction",
-        "every", "memory", "regrouping", "resampling", "prune", "propagation", "twisted",
-        "metropolis", "objects", "conditional", "parents", "initial", "pilot", "report",
+        "base", "local_quadratics", "eve_indices", "island_interaction", "every",
+        "regrouping", "resampling", "prune", "propagation", "twisted",
+        "metropolis", "objects", "conditional", "initial", "pilot", "report",
     ),
     "vision": ("files", "colour", "scenes", "tracking", "boxes"),
     "running": (

@@ -20,40 +20,29 @@ class AbstractMove(eqx.Module):
     the marginal likelihood is then no longer unbiased.
     """
 
-    @property
-    def approximate(self) -> bool:
-        """Whether the move departs from the exact recursion."""
-        return False
-
-    @property
-    def weighs(self) -> bool:
-        """Whether the move may change the weights by what was observed; a filter needs one."""
-        return True
-
-    @property
-    def looks_ahead(self) -> bool:
-        """Whether its weights, as an initial move, wait for the likelihood that it has looked at.
-
-        The particles of x_0 are then not resampled before they have been weighed by it.
-        """
-        return False
-
-    @property
-    def needs_parents(self) -> bool:
-        """Whether the move looks at `mixture.parents`, x_{t-1} of each particle that has x_t.
-
-        If one of its moves does, a filter keeps them during the step. Otherwise they cost nothing.
-        """
-        return False
-
-    @property
-    def keeps_parents(self) -> bool:
-        """Whether each particle comes from one particle of the mixture that the move was given.
-
-        Where it does not, the move sets its ancestor index to -1, and what follows ancestors
-        refuses it.
-        """
-        return True
+    approximate = False
+    """whether the move departs from the exact recursion."""
+    weighs = True
+    """whether it may change the weights by what was observed; a filter needs one that does."""
+    keeps_mass = False
+    """whether the mass of all particles stays what it was, so that nothing is to be normalised."""
+    propagates = False
+    """whether it takes the particles from t-1 to t."""
+    regroups = False
+    """whether it changes the indicators and nothing else."""
+    resamples = False
+    """whether it redraws the particles by their weights."""
+    needs_parents = False
+    """whether it looks at `mixture.parents`, x_{t-1} of each particle that has x_t. If one of its
+    moves does, a filter keeps them during the step. Otherwise they cost nothing."""
+    keeps_parents = True
+    """whether each particle comes from one particle of the mixture that the move was given. Where
+    it does not, the move sets its ancestor index to -1, and what follows ancestors refuses it."""
+    looks_ahead = False
+    """whether its weights, as an initial move, wait for the likelihood that it has looked at. The
+    particles of x_0 are then not resampled before they have been weighed by it."""
+    particles_per_component = None
+    """the slots that each component gets, where the move fixes their number."""
 
     @abc.abstractmethod
     def __call__(
@@ -78,6 +67,11 @@ class AbstractMove(eqx.Module):
         """The names of the memory of other moves that this move needs."""
         return frozenset()
 
+    @property
+    def own_memory(self) -> frozenset[str]:
+        """The names of the memory that the move keeps."""
+        return frozenset(eqx.filter_eval_shape(self.initial_memory, 1))
+
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
         """The initial memory of the move, under its own name; most moves have none."""
         del num_components
@@ -99,10 +93,9 @@ class AbstractRegrouping(AbstractMove):
     mixture has the same distribution as the old one, whatever the new indicators are.
     """
 
-    @property
-    def weighs(self) -> bool:
-        """False: the observation changes no weight."""
-        return False
+    weighs = False
+    keeps_mass = True
+    regroups = True
 
     @abc.abstractmethod
     def regroup(
@@ -128,10 +121,9 @@ class AbstractResampling(AbstractMove):
     instead, and is `approximate`.
     """
 
-    @property
-    def weighs(self) -> bool:
-        """False: the observation changes no weight."""
-        return False
+    weighs = False
+    keeps_mass = True
+    resamples = True
 
 
 class AbstractAdaptiveResampling(AbstractResampling):
@@ -156,11 +148,11 @@ class AbstractMarkovMove(AbstractMove):
     Weights, component indicators and ancestor indices stay, so that it is exact.
     """
 
-    @property
-    def weighs(self) -> bool:
-        """False: the observation changes no weight."""
-        return False
+    weighs = False
+    keeps_mass = True
 
 
 class AbstractPropagation(AbstractMove):
     """A move that draws x_t and multiplies the weights by L D / q, so that the mass changes."""
+
+    propagates = True

@@ -10,16 +10,10 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import check_whole, is_series, shown
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import (
-    AbstractMarkovMove,
-    AbstractMove,
-    AbstractRegrouping,
-    AbstractResampling,
-)
+from mpfjax.moves.base import AbstractMove
 from mpfjax.operations.generator import split
 
 _MOST_STEPS = 2**31 - 1  # that int32 counts
-_INNER = (AbstractRegrouping, AbstractResampling, AbstractMarkovMove)
 
 
 class Every(AbstractMove):
@@ -51,10 +45,8 @@ class Every(AbstractMove):
         """Whether any of the moves departs from the exact recursion."""
         return any(move.approximate for move in self.moves)
 
-    @property
-    def weighs(self) -> bool:
-        """Whether any of the moves does."""
-        return any(move.weighs for move in self.moves)
+    weighs = False
+    keeps_mass = True
 
     @property
     def needs_parents(self) -> bool:
@@ -70,6 +62,11 @@ class Every(AbstractMove):
     def name(self) -> str:
         """The name under which the number of the step is kept."""
         return f"every {self.num_steps}: {', '.join(type(move).__name__ for move in self.moves)}"
+
+    @property
+    def own_memory(self) -> frozenset[str]:
+        """The number of the step; that of the moves is their own."""
+        return frozenset({self.name})
 
     def would_resample(
         self, mixture: ParticleMixture, observation: PyTree = None
@@ -101,7 +98,7 @@ class Every(AbstractMove):
                 moved = after(move(move_key, moved, observation))
             return moved
 
-        if not all(isinstance(move, AbstractRegrouping) for move in self.moves):
+        if not all(move.regroups for move in self.moves):
             return jax.lax.cond(runs, run, lambda: mixture)
 
         # Only what they may change goes through the condition, which copies its operands.
@@ -144,7 +141,7 @@ def _as_inner_moves(moves: Any) -> tuple[AbstractMove, ...]:
     if not moves:
         raise ValueError("moves: there must be at least one to run at every k-th step")
     for move in moves:
-        if not isinstance(move, (*_INNER, Every)):
+        if not (isinstance(move, AbstractMove) and move.keeps_mass):
             raise ValueError(
                 f"moves: {shown(move)} neither regroups, resamples nor moves by a Markov kernel;"
                 " a propagation belongs into the chain, since without it the state would not move"

@@ -87,10 +87,8 @@ class SelectInitial(AbstractMove):
         check_whole(num_draws=self.num_draws)
         check_one_of(NOISES, noise=self.noise)
 
-    @property
-    def looks_ahead(self) -> bool:
-        """True: the weights undo a choice by the next observation."""
-        return True
+    looks_ahead = True
+    """the weights undo a choice by the next observation."""
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
@@ -101,7 +99,7 @@ class SelectInitial(AbstractMove):
         key_drawn, key_look, key_kept = split(key, 3)
         num_drawn = self.num_draws * mixture.num_particles
         check_numbered("draws up to", 2 * num_drawn, num_draws=self.num_draws)
-        drawn = sample_initial(key_drawn, self._model, num_drawn, self.noise)
+        drawn = sample_initial(key_drawn, self.propagation.model, num_drawn, self.noise)
         pool = single_component(drawn, mixture.num_components)
         log_factors = self._look(key_look, pool, observation)
         chances = trusted(log_factors, pool.occupied.astype(log_factors.dtype))
@@ -119,11 +117,6 @@ class SelectInitial(AbstractMove):
             log_scale=jnp.log(total / mixture.num_particles),
             memory=mixture.memory,
         )
-
-    @property
-    def _model(self) -> AbstractStateSpaceModel:
-        nested = isinstance(self.propagation, PropagateNested)
-        return (self.propagation.propagate if nested else self.propagation).model
 
     def _look(
         self, key: Key[Array, ""], pool: ParticleMixture, observation: PyTree
@@ -174,9 +167,9 @@ class Waiting(AbstractResampling):
 
 def waiting_for_choice(moves: tuple[Any, ...], initial_moves: tuple[Any, ...]) -> tuple[Any, ...]:
     """The moves of a step; after an initial move that looks ahead, the resampling ones wait."""
-    if not any(getattr(move, "looks_ahead", False) for move in initial_moves):
+    if not any(move.looks_ahead for move in initial_moves):
         return moves
-    return tuple(Waiting(move) if isinstance(move, AbstractResampling) else move for move in moves)
+    return tuple(Waiting(move) if move.resamples else move for move in moves)
 
 
 def trusted(log_factors: Float[Array, "2 n"], weights: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -38,15 +38,12 @@ class IslandInteraction(AbstractMove):
     def __check_init__(self) -> None:
         check_share(threshold=self.threshold)
 
-    @property
-    def weighs(self) -> bool:
-        """False: the observation changes no weight."""
-        return False
+    weighs = False
+    keeps_mass = True
+    """the observation changes no weight."""
 
-    @property
-    def keeps_parents(self) -> bool:
-        """False: those of a particle that was dealt to an island are on another one."""
-        return False
+    keeps_parents = False
+    """those of a particle that was dealt to an island are on another one."""
 
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, ""]:
         """Whether the masses of the islands are uneven enough; the result is the same on each."""

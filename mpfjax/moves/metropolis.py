@@ -67,10 +67,8 @@ class AbstractMetropolis(AbstractMarkovMove):
         check_exponent(exponent=self.exponent)
         check_one_of(("none", "stop"), gradient=self.gradient)
 
-    @property
-    def needs_parents(self) -> bool:
-        """True: the target of x_t is given x_{t-1}."""
-        return True
+    needs_parents = True
+    """the target of x_t is given x_{t-1}."""
 
     @abc.abstractmethod
     def propose(

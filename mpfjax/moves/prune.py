@@ -27,15 +27,11 @@ class Prune(AbstractMove):
     def __check_init__(self) -> None:
         check_inner_share(least_share=self.least_share)
 
-    @property
-    def approximate(self) -> bool:
-        """True: the mass of the pruned components is lost."""
-        return True
+    approximate = True
+    """the mass of the pruned components is lost."""
 
-    @property
-    def weighs(self) -> bool:
-        """False: the observation changes no weight."""
-        return False
+    weighs = False
+    """the observation changes no weight."""
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None

@@ -91,10 +91,8 @@ def made_of(model: Any, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
 class CountSteps(AbstractMove):
     """Keeps the number of the step, at the head of a chain whose look-ahead depends on it."""
 
-    @property
-    def weighs(self) -> bool:
-        """False: the observation changes no weight."""
-        return False
+    weighs = False
+    keeps_mass = True
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
         """The number of the step."""

@@ -126,7 +126,7 @@ def step_or_predict(
     return jax.lax.cond(
         now.present,
         lambda: filter._step(key, mixture, now.observations),
-        lambda: filter._predict(key, mixture),
+        lambda: filter._step(key, mixture),
     )
 
 

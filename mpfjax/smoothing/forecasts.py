@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
+from mpfjax.chain import give_inputs
 from mpfjax.checks import (
     check_callable,
     check_key,
@@ -20,7 +21,6 @@ from mpfjax.checks import (
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped_draw
-from mpfjax.moves.sharing import give_inputs
 from mpfjax.observations import steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.functions import interned
@@ -91,7 +91,7 @@ def _forecast(key, filter, mixture, inputs, options):
     ) -> tuple[ParticleMixture, Any]:
         key, now = step
         key_step, key_observation = jax.random.split(key)
-        mixture, _ = filter.with_inputs(now)._predict(key_step, mixture)
+        mixture, _ = filter.with_inputs(now)._step(key_step, mixture)
         observations = None
         if simulate_observation is not None:
             simulate = give_inputs(simulate_observation, filter.model, now)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Key, PyTree
 
+from mpfjax.chain import check_keep_parents
 from mpfjax.checks import (
     check_callable,
     check_key,
@@ -23,7 +24,6 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.inputs import with_inputs
-from mpfjax.moves.parents import check_keep_parents
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.floats import as_inexact

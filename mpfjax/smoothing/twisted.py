@@ -137,7 +137,7 @@ def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
     for kind, needed in ((AuxiliaryResample, "Resample"), (PropagateTwisted, "Propagate")):
         if sum(isinstance(move, kind) for move in moves) != 1:
             raise ValueError(f"filter: its moves need one {needed}, in the chain itself")
-    kept = [move for move in filter.initial_moves if not getattr(move, "looks_ahead", False)]
+    kept = [move for move in filter.initial_moves if not move.looks_ahead]
     regroupings = [_looking_ahead(move, filter, twist) for move in kept]
     initial: list[Any] = [TwistInitial(filter.model, twist, filter.initial_noise), *regroupings]
     return filter.replace(

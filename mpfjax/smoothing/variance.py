@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
+from mpfjax.chain import check_keep_parents
 from mpfjax.checks import check_type, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
@@ -18,7 +19,6 @@ from mpfjax.moves.eve_indices import (
     with_new_eve_indices,
 )
 from mpfjax.moves.every import with_inner
-from mpfjax.moves.parents import check_keep_parents
 from mpfjax.moves.propagation.regimes import PropagateRegimes
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.running.scan import FilterRun
@@ -65,7 +65,7 @@ def with_first_ancestors(filter: Filter) -> Filter:
     for move in with_inner(filter.moves):
         kinds = AbstractResampling | AbstractMarkovMove | PropagateRegimes
         redraws = isinstance(move, kinds) and not isinstance(move, Resample)
-        if getattr(move, "approximate", True) or redraws:
+        if move.approximate or redraws:
             raise ValueError(
                 f"filter: {type(move).__name__}, one of its moves, is approximate or draws in a way"
                 " of its own; the variance of log Ẑ is not known from one run"

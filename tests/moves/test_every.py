@@ -108,7 +108,6 @@ def test_a_label_that_dies_within_and_is_used_again_has_no_past():
         ("moves: there must be at least one", 2, []),
         ("moves: .* is not a list of moves", 2, KMeans()),
         ("moves: (?s:.*) neither regroups, resamples nor", 2, [KMeans(), Propagate(MODEL)]),
-        ("moves: (?s:.*) neither regroups, resamples nor", 2, [mpfjax.IslandInteraction()]),
     ],
 )
 def test_what_will_not_do_is_named(as_installed, message, num_steps, moves):

@@ -101,10 +101,8 @@ class PropagateInClusters(AbstractPropagation):
         """Whether clusters are split again."""
         return self.split_after is not None
 
-    @property
-    def keeps_parents(self) -> bool:
-        """False: each cluster of a particle has a parent of its own."""
-        return False
+    keeps_parents = False
+    """each cluster of a particle has a parent of its own."""
 
     @property
     def _may_be_joint(self) -> bool:

@@ -22,15 +22,11 @@ class AbstractExclusion(AbstractPropagation):
     strength: eqx.AbstractVar[float]
     radius: eqx.AbstractVar[float]
 
-    @property
-    def approximate(self) -> bool:
-        """True: components interact in a way that the model does not have."""
-        return True
+    approximate = True
+    """components interact in a way that the model does not have."""
 
-    @property
-    def weighs(self) -> bool:
-        """False: the observation changes no weight."""
-        return False
+    weighs = False
+    """the observation changes no weight."""
 
     def nearness(self, squared_distances: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
         """exp(-d² / (2 radius²)), of squared distances to a mean."""

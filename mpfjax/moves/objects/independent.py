@@ -42,10 +42,8 @@ class PropagateIndependently(AbstractPropagation):
         """Whether the model has an interaction, which this move ignores."""
         return self.model.interaction is not None
 
-    @property
-    def keeps_parents(self) -> bool:
-        """False: each object of a particle has a parent of its own."""
-        return False
+    keeps_parents = False
+    """each object of a particle has a parent of its own."""
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree

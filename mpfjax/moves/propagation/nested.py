@@ -49,6 +49,11 @@ class PropagateNested(AbstractPropagation):
         if self.propagate.gradient == "stop":
             raise ValueError("propagate: gradient 'stop' does not see which draw is kept")
 
+    @property
+    def model(self) -> AbstractStateSpaceModel:
+        """That of the propagation."""
+        return self.propagate.model
+
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:

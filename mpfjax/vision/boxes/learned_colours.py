@@ -135,10 +135,8 @@ class AdaptAppearance(AbstractPropagation):
         check_type(LearnedColourModel, "a LearnedColourModel", model=self.model)
         check_share(rate=self.rate)
 
-    @property
-    def approximate(self) -> bool:
-        """True: appearances are learned from the same data that they explain."""
-        return True
+    approximate = True
+    """appearances are learned from the same data that they explain."""
 
     def __call__(
         self,

@@ -89,10 +89,8 @@ class PruneHypotheses(AbstractPropagation):
     def __check_init__(self) -> None:
         check_inner_share(least_share=self.least_share)
 
-    @property
-    def approximate(self) -> bool:
-        """True: the mass of the pruned components is lost."""
-        return True
+    approximate = True
+    """the mass of the pruned components is lost."""
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
