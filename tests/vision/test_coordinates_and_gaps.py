@@ -72,15 +72,15 @@ def test_who_leaves_a_frame_of_known_size_ends_and_who_enters_there_is_another()
 
 @pytest.mark.parametrize("given", ["frames", "size"])
 def test_what_bounds_the_tracks_is_the_frame_with_pixels_and_without(given):
-    """The prediction leaves a frame of 64 x 48; past detections reach beyond where it is then."""
-    found = [np.array([[50 - 8.0 * (t == 0) + 3 * t, 10, 10, 20]]) for t in range(4)]
+    """The last detection, at the border of 64 x 48, reaches beyond where the prediction leaves."""
+    found = [np.array([[46 + 3.0 * t, 10, 10, 20]]) for t in range(5)]
     found += [np.zeros((0, 4))] * 6
     frames = np.zeros((len(found), 48, 64, 3), np.uint8)
     if given == "frames":
         tracks = list(track(frames, iter(found), TRACKER, use_colours=False))
     else:
         tracks = list(track(None, iter(found), TRACKER, frame_size=(48, 64)))
-    assert living(tracks[3]) == [1]
+    assert living(tracks[4]) == [1]
     assert living(tracks[-1]) == []
 
 
