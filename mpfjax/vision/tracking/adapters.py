@@ -3,6 +3,7 @@
 import abc
 import warnings
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mpfjax.checks import check_finite, check_whole, given, is_series, saying, shown
+from mpfjax.vision.files.boxes import read_detections
 from mpfjax.vision.tracking.detections import to_masked_rows
 
 # MOTChallenge's columns: frame, id, x, y, w, h, and the score, where there is one.
@@ -54,6 +56,8 @@ def as_detector(detections: Any, first: int = 1) -> AbstractDetector:
     """
     if isinstance(detections, AbstractDetector):
         return detections
+    if isinstance(detections, str | Path):
+        detections = read_detections(detections)
     if isinstance(detections, np.ndarray | jax.Array):
         return Rows(np.asanyarray(detections), first)
     if callable(detections) and not isinstance(detections, type):
@@ -62,7 +66,7 @@ def as_detector(detections: Any, first: int = 1) -> AbstractDetector:
         return _Streamed(iter(detections))
     raise ValueError(
         f"detections: {shown(detections)} is neither a detector to call with a frame, nor an array"
-        " of rows frame,id,x,y,w,h,score, nor the boxes of one frame after the other"
+        " or a file of rows frame,id,x,y,w,h,score, nor the boxes of one frame after the other"
     )
 
 
@@ -94,7 +98,7 @@ class Rows(AbstractDetector):
                 f"detections: row {number} lies in frame {rows[number, 0]:.0f}, and frames count"
                 " from 1"
             )
-        rows = rows[~rows.mask[:, 0]]
+        rows = rows[~np.ma.getmaskarray(rows)[:, 0]]
         self.first = first
         self.frames = rows.data[:, 0].astype(int)
         self.last = int(self.frames.max(initial=0)) if last is None else last
@@ -235,7 +239,7 @@ def _as_scores(scores: Any, number: int) -> np.ndarray:
 def _present(found: DetectedBoxes, number: int) -> tuple[DetectedBoxes, Bool[np.ndarray, " k"]]:
     """The boxes and scores without masks, and which of them are detections."""
     boxes, scores = np.ma.getdata(found.boxes), found.scores
-    present = ~np.ma.getmaskarray(found.boxes).any(axis=1)
+    present = np.logical_not(np.any(np.ma.getmaskarray(found.boxes), axis=1))
     if not np.isfinite(boxes[present]).all():
         raise ValueError(f"detections: frame {number}: {shown(boxes)} is not finite")
     if scores is not None:

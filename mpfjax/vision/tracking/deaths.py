@@ -28,12 +28,12 @@ class Deaths(AbstractMove):
 
     A component ends if no detection has been assigned to it for more than `patience` frames in a
     row, or for more than `tentative_patience` while it is not confirmed; if it has left the frame,
-    of an object without a detection the centre; or if all its particles have zero likelihood. It is confirmed after `confirmation` frames
-    with strong detections. Components of the first frame are confirmed at once. Where there is no
-    room for new components, an unconfirmed one ends in its first frame without a detection, and one
-    that was confirmed at once and has had no strong detections since ends as soon as it is no
-    longer shown. Frames in which a component is hidden by another (`ShareDetections`) do not count
-    as frames without a detection.
+    or its centre while it has no detection; or if all its particles have zero likelihood. It is
+    confirmed after `confirmation` frames with strong detections. Components of the first frame are
+    confirmed at once. Where there is no room for new components, an unconfirmed one ends in its
+    first frame without a detection, and one that was confirmed at once and has had no strong
+    detections since ends as soon as it is no longer shown. Frames in which a component is hidden by
+    another (`ShareDetections`) do not count as frames without a detection.
 
     A component is shown while it is confirmed, for at most `longest_guess` frames without a
     detection, or as many as `LearnGuesses` has learned, and `longest_unsure` frames without a

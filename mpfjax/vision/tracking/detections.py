@@ -60,7 +60,7 @@ class Detections(eqx.Module):
         if len(rows) > 0 and np.ndim(boxes) != 2:
             raise ValueError(f"boxes: shape {np.shape(boxes)} is not (k, 4), of boxes x,y,w,h")
         strengths = _checked_scores(scores, len(rows))
-        present = np.flatnonzero(~rows.mask.any(axis=1))
+        present = np.flatnonzero(~np.any(np.ma.getmaskarray(rows), axis=1))
         rows, strengths = centred(rows.data[present]), strengths[present]
         corner = np.zeros(2) if origin is None else np.asarray(origin, float)
         rows[:, :2] -= corner

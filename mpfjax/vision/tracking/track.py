@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Generator, Iterable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.compiling import in_little_memory
 from mpfjax.operations.kept_programs import kept_program
 from mpfjax.vision.files.boxes import centred, top_left
-from mpfjax.vision.files.frames import of_one_kind
+from mpfjax.vision.files.frames import of_one_kind, read_frames
 from mpfjax.vision.files.threads import read_ahead
 from mpfjax.vision.tracking.adapters import (
     LEAST_ROOM,
@@ -34,7 +35,7 @@ _FEW_PARTICLES = 32
 
 
 def track(
-    frames: Iterable[UInt8[np.ndarray, "..."]] | None,
+    frames: Iterable[UInt8[np.ndarray, "..."]] | str | Path | None,
     detections: Any,
     tracker: ObjectTracker | None = None,
     *,
@@ -56,11 +57,13 @@ def track(
         track(frames, BackgroundSubtraction().detect)      # what moves before a still camera
         track(None, rows)                                  # without pixels, for speed or radar
 
-    - `frames`: RGB images of eight bits, or grey ones, all of one size, in any iterable; None where
-      there are only detections.
+    - `frames`: RGB images of eight bits, or grey ones, all of one size, in any iterable, or the
+      path of a video or of a folder of images, from frame `first` on; None where there are only
+      detections.
     - `detections`: a function from a frame to its boxes (x, y, w, h), top-left corner first, in
       pixels, or to a tuple of boxes and scores; or an iterable of these, one item for each frame;
-      or an array of rows (frame, id, x, y, w, h, score) whose frames count from 1.
+      or an array of rows (frame, id, x, y, w, h, score) whose frames count from 1, or the path of a
+      MOTChallenge file of these.
     - `tracker`: None takes `ObjectTracker()`, with more room where a frame has more rows.
     - `key`: of the random numbers; None takes `jax.random.key(0)`.
     - `first`: the number of the first frame, by which rows are found.
@@ -85,6 +88,8 @@ def track(
     in which they come, and `ImportError` for "pixels" without OpenCV. An exception of the detector
     is passed on, with the number of the frame. Use it for recorded videos and for cameras.
     """
+    if isinstance(frames, str | Path):
+        frames = read_frames(frames, first)
     if frames is not None:
         check_type(Iterable, "frames one after the other, or None", frames=frames)
     check_flag(use_colours=use_colours, ahead=ahead)
