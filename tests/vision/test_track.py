@@ -324,7 +324,6 @@ def test_frames_that_will_not_do_are_an_error(message, frames):
     [
         ("frames: 3 is not frames", {"frames": 3}),
         ("detections: 3 is neither", {"detections": 3}),
-        ("detections: 'det.txt' is neither", {"detections": "det.txt"}),
         ("detections: shape", {"detections": np.zeros((3, 5))}),
         ("a detector needs frames, and frames is None", {"detections": len}),
         ("tracker: 3 is not an ObjectTracker", {"tracker": 3}),

@@ -11,7 +11,9 @@ from mpfjax.checks import as_numbers, check_whole, shown, to_array, to_rows
 from mpfjax.operations.indexing import take
 from mpfjax.vision.files.boxes import centred, top_left
 
-_UNBOUNDED = (-np.inf, -np.inf, np.inf, np.inf)
+# Finite, as observations have to be.
+_FAR = float(np.finfo(np.float32).max)
+_UNBOUNDED = (-_FAR, -_FAR, _FAR, _FAR)
 # The largest step between neighbours in float32, in boxes: within the errors of detectors.
 _FINEST = 0.1
 
@@ -23,7 +25,7 @@ class Detections(eqx.Module):
     - `valid`: (d,), which rows are detections.
     - `scores`: (d,), how sure the detector was of each, on any scale, higher for surer.
     - `rows`: (d,), the row of each in what the detector gave; None counts them as they stand here.
-    - `extent`: left, top, right, bottom of the frame; infinite where it is not known.
+    - `extent`: left, top, right, bottom of the frame; as far as can be where not known.
     """
 
     boxes: Float[Array, "d 4"] = eqx.field(converter=to_array("boxes"))

@@ -72,7 +72,7 @@ class TrackedFrame(NamedTuple):
 
     @property
     def extent(self) -> Float[Array, "4"]:
-        """Left, top, right, bottom of the frame; infinite where it is not known."""
+        """Left, top, right, bottom of the frame; as far as can be where not known."""
         if self.pixels is None:
             return self.detections.extent
         size = [0, 0, self.pixels.width, self.pixels.height]
