@@ -204,7 +204,8 @@ def test_masked_scores_are_an_error():
     with pytest.raises(ValueError, match=r"score.* masked"):
         list(track(None, rows, TRACKER))
     found = [
-        (boxes, np.ma.array(scores, mask=[0, 1, 0, 0])) for boxes, scores in by_frame(crowd(3))
+        (boxes, np.ma.masked_where(np.arange(4) == 1, scores))
+        for boxes, scores in by_frame(crowd(3))
     ]
     with pytest.raises(ValueError, match=r"frame 1: scores .* masked"):
         list(track(None, iter(found), TRACKER))

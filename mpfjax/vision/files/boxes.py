@@ -106,7 +106,9 @@ def read_detections(path: str | Path) -> Float[np.ndarray, "rows columns"]:
     """
     check_type((str, Path), "a path", path=path)
     form = "frame,id,x,y,w,h,score and up to three more columns"
-    rows = {n: row[:7] for n, row in read_rows(path, form, range(6, 11)).items()}
+    rows = {
+        n: row[:7] for n, row in read_rows(path, form, range(6, 11), holds="detections").items()
+    }
     width = len(next(iter(rows.values())))
     for number, row in rows.items():
         if len(row) != width:
@@ -148,7 +150,7 @@ def boxes_of_frame(rows: Float[np.ndarray, "rows 6"], frame: int) -> dict[int, n
 
 
 def read_rows(
-    path: str | Path, form: str, columns: range, *, may_be_empty: bool = False
+    path: str | Path, form: str, columns: range, *, holds: str | None = "boxes"
 ) -> dict[int, list[float]]:
     """The rows of a text file by the numbers of their lines, from 1.
 
@@ -157,7 +159,7 @@ def read_rows(
     lines, comments after "#", "%" or "//", and a header that names the columns of MOTChallenge are
     left out. Raises `ValueError` with the file and the line for any other text, also for a header
     of other columns, where `form` says what was expected; and for a file without any row, unless
-    it may be empty.
+    `holds`, the name of what it should hold, is None.
     """
     rows: dict[int, list[float]] = {}
     for number, line in enumerate(read_text(path).splitlines(), 1):
@@ -177,8 +179,8 @@ def read_rows(
                 f"{path}, line {number}: lies in frame {values[0]:.0f}, and frames count from 1"
             )
         rows[number] = values
-    if not rows and not may_be_empty:
-        raise ValueError(f"{path}: holds no boxes")
+    if not rows and holds is not None:
+        raise ValueError(f"{path}: holds no {holds}")
     return rows
 
 

@@ -26,19 +26,9 @@ _PERSON_ON_VEHICLE, _VEHICLE, _STATIC_PERSON, _DISTRACTOR, _REFLECTION = 2, 6, 7
 _NOT_TO_BLAME = {_PERSON_ON_VEHICLE, _STATIC_PERSON, _DISTRACTOR, _REFLECTION}
 # Their names where a labels.txt has them, from 1 on.
 _LABELS = (
-    "pedestrian",
-    "person on vehicle",
-    "car",
-    "bicycle",
-    "motorbike",
-    "non motorized vehicle",
-    "static person",
-    "distractor",
-    "occluder",
-    "occluder on the ground",
-    "occluder full",
-    "reflection",
-)
+    "pedestrian,person on vehicle,car,bicycle,motorbike,non motorized vehicle,static person,"
+    "distractor,occluder,occluder on the ground,occluder full,reflection"
+).split(",")
 # VisDrone's categories: the first are regions without labels, the last other objects.
 _CATEGORIES = range(12)
 _KITTI_HEIGHT = 25.0
@@ -122,7 +112,7 @@ def read_truth(path: str | Path, *, format: str | None = None) -> Truth:
         counted[:] = True
         beside = path.with_name(re.sub(r"gt(_whole)?\.txt$", "gt_ignore.txt", path.name))
         if beside != path and beside.is_file():
-            regions = read_rows(beside, TRACK_FORM, range(6, TRACK_COLUMNS.stop), may_be_empty=True)
+            regions = read_rows(beside, TRACK_FORM, range(6, TRACK_COLUMNS.stop), holds=None)
             ignored = _as_ignored([row[:6] for row in regions.values()], IGNORED_REGION)
     for (number, row), counts in zip(rows.items(), counted, strict=True):
         if counts:
@@ -148,7 +138,7 @@ def _format_of(path: Path, name: str, table: Float[np.ndarray, "r 10"]) -> str:
     labels = path.with_name("labels.txt")
     if labels.is_file():
         lines = [line.strip().lower() for line in read_text(labels).splitlines() if line.strip()]
-        return "motchallenge" if tuple(lines[: len(_LABELS)]) == _LABELS else "cvat"
+        return "motchallenge" if lines[: len(_LABELS)] == _LABELS else "cvat"
     flags, classes, truncations, occlusions = table[:, _FLAG:].T
     has_classes = np.isin(classes, _CLASSES).all() and np.any(classes == _PEDESTRIAN)
     if has_classes and re.match(r"mot(16|17|20)", name):
@@ -183,7 +173,7 @@ def _as_ignored(boxes: Any, kind: int) -> Float[np.ndarray, "r 6"]:
 def _ignore_file(path: Path) -> Float[np.ndarray, "r 6"]:
     """The rows of an ignore.txt; none where there is no such file."""
     form = "frame,kind,x,y,w,h with the kind 1 or 2"
-    rows = read_rows(path, form, range(6, 7), may_be_empty=True) if path.is_file() else {}
+    rows = read_rows(path, form, range(6, 7), holds=None) if path.is_file() else {}
     for number, row in rows.items():
         if row[1] not in (IGNORED_OBJECT, IGNORED_REGION):
             raise ValueError(f"{path}, line {number}: {shown(row)} is not {form}")
