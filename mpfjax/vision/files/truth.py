@@ -25,10 +25,11 @@ _PEDESTRIAN = 1
 _PERSON_ON_VEHICLE, _VEHICLE, _STATIC_PERSON, _DISTRACTOR, _REFLECTION = 2, 6, 7, 8, 12
 _NOT_TO_BLAME = {_PERSON_ON_VEHICLE, _STATIC_PERSON, _DISTRACTOR, _REFLECTION}
 # Their names where a labels.txt has them, from 1 on.
-_LABELS = (
-    "pedestrian,person on vehicle,car,bicycle,motorbike,non motorized vehicle,static person,"
-    "distractor,occluder,occluder on the ground,occluder full,reflection"
-).split(",")
+_LABELS = [
+    *("pedestrian", "person on vehicle", "car", "bicycle", "motorbike", "non motorized vehicle"),
+    *("static person", "distractor", "occluder", "occluder on the ground", "occluder full"),
+    "reflection",
+]
 # VisDrone's categories: the first are regions without labels, the last other objects.
 _CATEGORIES = range(12)
 _KITTI_HEIGHT = 25.0
