@@ -26,7 +26,7 @@ from mpfjax.vision.tracking.observation import TrackedFrame
 
 _NONE, _IMPOSSIBLE = -1, 1e4
 _DIMENSIONS = 4
-_WIDEST = -2.0  # log |S| counts as at most this: a detection at the prediction forms a pair
+_WIDEST = -0.5  # log |S| counts as at most this: a detection at the prediction forms a pair
 _UNDECIDED = 0.25  # B² at which colours are evidence neither for nor against a pair
 _ROUNDS = 15  # iterations of messages; fewer suffice where two rows compete for two columns
 _LEAST = 1e-3  # marginals are at least this
@@ -49,7 +49,7 @@ class Assign(AbstractMove):
     `doubt_cost` for a component that is not yet confirmed. A component without a detection costs
     `gate`, so that no pair with a higher cost is formed: its detection more probably belongs to a
     new object. Because of log |S_m| this happens more often to components that have been unseen for
-    long; it counts as at most -2, so that a detection at the very prediction forms a pair. For a
+    long; it counts as at most -1/2, so that a detection at the very prediction forms a pair. For a
     component that is more probably a double (`LearnDoubles`), gate - cost is divided by a hundred:
     it takes a detection only from what the others leave, adds little to their doubts, and follows
     its own detection by half.
