@@ -320,6 +320,24 @@ def test_bad_arguments_are_named_before_anything_is_written(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("options", [[], ["--detect"], ["--camera-motion", "pixels"]])
+@pytest.mark.parametrize("source", ["nowhere.mp4", "nowhere.txt", "nowhere"])
+def test_a_source_that_is_not_there_is_named_whatever_else_is_asked(
+    tmp_path, capsys, source, options
+):
+    assert run(tmp_path / source, "--out", tmp_path / "out", *options) == 2
+    assert f"{source}: no such file or folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["words", "words.mp4", "words.dat"])
+def test_text_that_is_no_video_is_named(tmp_path, capsys, name):
+    (tmp_path / name).write_text("1,-1,10,20,30,40,1\n2,-1,11,20,30,40,1\n")
+    assert run(tmp_path / name, "--out", tmp_path / "out") == 2
+    assert f"{name} is text, and no video" in capsys.readouterr().err
+    assert run(tmp_path / name, "--out", tmp_path / "out", "--detect") == 2
+    assert f"{name}: cannot be read as a video" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("source", "options", "named"),
     [

@@ -69,7 +69,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    track.add_argument("source", type=Path, metavar="SOURCE", help=SOURCE)
+    track.add_argument("source", type=_existing, metavar="SOURCE", help=SOURCE)
     track.add_argument("--out", type=Path, required=True, metavar="DIR", help="where results go")
     what = track.add_mutually_exclusive_group()
     what.add_argument(
@@ -111,6 +111,11 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     given = sys.argv[1:] if arguments is None else arguments
     options = parser.parse_args(_with_boxes_joined(given))
     if not (options.detections or options.detect or options.box) and _has_pixels(options.source):
+        if _is_text(options.source):
+            track.error(
+                f"argument SOURCE: {options.source} is text, and no video; the name of a file of"
+                " detections ends in .txt or .csv"
+            )
         track.error("one of the arguments --detections --detect --box is required")
     if options.box is not None:
         for name in ("filter", "max_objects", "min_score", "no_colour", "camera_motion", "offline"):
@@ -124,6 +129,22 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         if not _has_pixels(options.source):
             track.error(f"argument --camera-motion pixels: {options.source} has no pixels")
     return options
+
+
+def _existing(text: str) -> Path:
+    path = Path(text)
+    if not path.exists():
+        raise argparse.ArgumentTypeError(f"{path}: no such file or folder")
+    return path
+
+
+def _is_text(path: Path) -> bool:
+    """Whether a file begins as no video does, with neither a zero nor a byte of 255."""
+    if path.is_dir():
+        return False
+    with path.open("rb") as file:
+        start = file.read(1024)
+    return bool(start) and b"\0" not in start and b"\xff" not in start
 
 
 def _with_boxes_joined(arguments: list[str]) -> list[str]:
@@ -144,8 +165,6 @@ def open_source(options: argparse.Namespace) -> Source:
     """The source of the frames; a `ValueError` for one that cannot be read."""
     first, last = frames.parse_range(options.frames, "--frames")
     path, has_pixels = options.source, _has_pixels(options.source)
-    if not path.exists():
-        raise ValueError(f"SOURCE: {path} is neither a video nor a folder of images")
     detections = options.detections if has_pixels else _detections_alone(options)
     written = [name for name in OUTPUTS if name != VIDEO or (has_pixels and not options.no_video)]
     refuse_overwriting(

@@ -15,6 +15,7 @@ from mpfjax.vision import Detections, ObjectTracker, Tracks, football_scene, tra
 from mpfjax.vision.boxes.follow_boxes import follow_boxes
 from mpfjax.vision.boxes.object_moves import best_components
 from mpfjax.vision.boxes.recipes import objects_filters
+from mpfjax.vision.files.frames import write_image
 from mpfjax.vision.tracking.adapters import LEAST_ROOM, MOST_ROOM, Rows
 from mpfjax.vision.tracking.track import make_tracker, offline_rows, online_rows
 
@@ -90,6 +91,32 @@ def test_each_object_keeps_one_identity_and_its_place(with_pixels, without_pixel
 @pytest.mark.parametrize("wrap", [by_frame, detector_of], ids=["iterable", "callable"])
 def test_every_kind_of_detector_gives_the_same_tracks(wrap, with_pixels):
     assert_same(tracked(iter(stills()), wrap(walks())), with_pixels)
+
+
+def test_files_are_tracked_by_their_paths(tmp_path, with_pixels, without_pixels):
+    write_detections(tmp_path / "det.txt")
+    for path in (tmp_path / "det.txt", str(tmp_path / "det.txt")):
+        assert_same(tracked(None, path), without_pixels)
+    for number, still in enumerate(stills(), 1):
+        write_image(tmp_path / f"{number}.png", still)
+    assert_same(tracked(tmp_path, walks()), with_pixels)
+
+
+def test_files_that_are_not_there_or_hold_something_else_are_named(tmp_path):
+    (tmp_path / "words.mp4").write_text("four words of text, and nothing to look at")
+    for name, error, said in (
+        ("nowhere.mp4", FileNotFoundError, "nowhere"),
+        ("words.mp4", ValueError, "cannot be read as a video"),
+    ):
+        with pytest.raises(error, match=said):
+            list(track(tmp_path / name, walks(), TRACKER))
+    for name, error in (("nowhere.txt", FileNotFoundError), ("words.mp4", ValueError)):
+        with pytest.raises(error, match=name):
+            list(track(None, str(tmp_path / name), TRACKER))
+
+
+def write_detections(path):
+    path.write_text("".join(",".join(map(str, row)) + "\n" for row in walks()))
 
 
 def test_boxes_alone_are_detections_of_equal_scores():
@@ -297,7 +324,6 @@ def test_frames_that_will_not_do_are_an_error(message, frames):
     [
         ("frames: 3 is not frames", {"frames": 3}),
         ("detections: 3 is neither", {"detections": 3}),
-        ("detections: 'det.txt' is neither", {"detections": "det.txt"}),
         ("detections: shape", {"detections": np.zeros((3, 5))}),
         ("a detector needs frames, and frames is None", {"detections": len}),
         ("tracker: 3 is not an ObjectTracker", {"tracker": 3}),

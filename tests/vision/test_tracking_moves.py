@@ -326,7 +326,6 @@ def tracked(seed=0):
             "shared": jnp.full(M, -1, jnp.int32),
             "hidden": jnp.zeros(M, jnp.int32),
             "references": jnp.asarray(references, jnp.float32),
-            "extent": jnp.array([0, 0, 80, 60], jnp.float32),
         },
     )
     boxes = [[20.5, 20, 7, 12], [27, 22, 8, 12], [59, 41, 7, 13], [21, 19, 7, 11], [70, 10, 7, 12]]

@@ -1,8 +1,8 @@
 """Boxes as users and MOTChallenge files write them: (x, y) of the top-left corner, w, h."""
 
 import codecs
+import re
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,20 @@ from jaxtyping import Float
 
 from mpfjax.checks import check_type, check_whole, shown, to_rows
 
-_COLUMNS = range(7, 11)
+_COMMENTS = ("#", "%", "//")
+# The names that a header may give to the first seven columns, in lower case and without "_".
+_BOX = "(bb|bbox|box)?"
+_NAMES = (
+    "f|t|frame(id|index|idx|number|no)?",
+    ".*id|identity|track|target|object",
+    f"{_BOX}(x|left|x[01]|xmin|xtl|topleftx)",
+    f"{_BOX}(y|top|y[01]|ymin|ytl|toplefty)",
+    f"{_BOX}(w|width)",
+    f"{_BOX}(h|height)",
+    "conf.*|score.*|prob.*|flag|mark|valid|active|consider.*|(not)?ignored?|outofview",
+)
+TRACK_FORM = "frame,id,x,y,w,h and one to four more columns"
+TRACK_COLUMNS = range(7, 11)
 
 
 def parse_box(text: str, argument: str = "box") -> Float[np.ndarray, "4"]:
@@ -59,15 +72,18 @@ def top_left(boxes: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k 4"]:
 def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     """Read a MOTChallenge file into rows (frame, id, x, y, w, h), (x, y) the top-left corner.
 
-    Frames count from 1. Every row is read, and further columns are ignored. For a ground truth,
-    where flags and classes say which rows count, use `read_truth`. Raises `ValueError` for a line
-    that cannot be read, with the file and the line, and for a file without any box. Warns where the
-    seventh column is that of a ground truth of which some rows do not count.
+    Frames count from 1. Every row is read, and further columns are ignored. Columns may be parted
+    by tabs, semicolons or blanks as well; comments, and a header that names these columns, are left
+    out. For a ground truth, where flags and classes say which rows count, use `read_truth`. Raises
+    `ValueError` for a line that cannot be read, with the file and the line, and for a file without
+    any box. Warns where the seventh column is that of a ground truth of which some rows do not
+    count.
     """
     check_type((str, Path), "a path", path=path)
-    rows = [parse_track(path, number, line) for number, line in numbered_lines(path)]
-    if not rows:
-        raise ValueError(f"{path}: holds no boxes")
+    found = read_rows(path, TRACK_FORM, TRACK_COLUMNS)
+    for number, row in found.items():
+        check_identity(path, number, row)
+    rows = list(found.values())
     flags = [row[6] for row in rows]
     if set(flags) == {0.0, 1.0}:
         warnings.warn(
@@ -83,38 +99,37 @@ def read_detections(path: str | Path) -> Float[np.ndarray, "rows columns"]:
     """Read a MOTChallenge file of detections into rows (frame, id, x, y, w, h, score).
 
     The id, -1 in such files, has no meaning. For a file of six columns, without scores, the result
-    has six columns too. Raises `ValueError` with the file and the line for a row that cannot be
-    parsed, holds a number that is not finite, lies in a frame before 1, or has a score where other
-    rows have none; and for a file without any detection.
+    has six columns too. Separators, comments and headers are those of `read_tracks`. Raises
+    `ValueError` with the file and the line for a row that cannot be parsed, holds a number that is
+    not finite, lies in a frame before 1, or has a score where other rows have none; and for a file
+    without any detection.
     """
     check_type((str, Path), "a path", path=path)
-    rows: list[list[float]] = []
-    for number, line in numbered_lines(path):
-        row = _parse_detection(path, number, line)
-        if row[0] < 1:
-            raise ValueError(
-                f"{path}, line {number}: lies in frame {row[0]:.0f}, and frames count from 1"
-            )
-        if rows and len(row) != len(rows[0]):
+    form = "frame,id,x,y,w,h,score and up to three more columns"
+    rows = {
+        n: row[:7] for n, row in read_rows(path, form, range(6, 11), holds="detections").items()
+    }
+    width = len(next(iter(rows.values())))
+    for number, row in rows.items():
+        if len(row) != width:
             raise ValueError(
                 f"{path}, line {number}: has a score, or none, unlike the lines before it"
             )
-        rows.append(row)
-    if not rows:
-        raise ValueError(f"{path}: holds no detections")
-    return np.array(rows)
+        if not np.all(np.isfinite(row)):
+            raise ValueError(f"{path}, line {number}: {shown(row)} is not {form}")
+    return np.array(list(rows.values()))
 
 
 def write_tracks(path: str | Path, rows: Float[np.ndarray, "rows 6"]) -> None:
     """Write rows (frame, id, x, y, w, h) in MOTChallenge form, in the order of the frames.
 
     Raises `ValueError` for rows that `read_tracks` could not read: rows that are not six finite
-    numbers, or with a frame or an id that is not a whole number from 0 on.
+    numbers, or with a frame or an id that is not a whole number, from 1 and 0 on.
     """
     check_type((str, Path), "a path", path=path)
     rows = to_rows(6, "rows", rows)
     for row in rows:
-        if not np.all(np.isfinite(row)) or np.any(row[:2] < 0) or np.any(row[:2] % 1):
+        if not np.all(np.isfinite(row)) or np.any(row[:2] < [1, 0]) or np.any(row[:2] % 1):
             raise ValueError(f"rows: {shown(row)} is not frame,id,x,y,w,h")
     ordered = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
     Path(path).write_text(format_tracks(ordered), encoding="utf-8")
@@ -134,34 +149,80 @@ def boxes_of_frame(rows: Float[np.ndarray, "rows 6"], frame: int) -> dict[int, n
     return {int(row[1]): row[2:6] for row in rows if row[0] == frame}
 
 
-def numbered_lines(path: str | Path) -> Iterator[tuple[int, str]]:
-    """The lines of a text file that are not blank, and their numbers from 1.
+def read_rows(
+    path: str | Path, form: str, columns: range, *, holds: str | None = "boxes"
+) -> dict[int, list[float]]:
+    """The rows of a text file by the numbers of their lines, from 1.
 
-    A byte order mark, which Windows puts before UTF-8 and UTF-16, is no part of the text.
+    Columns are parted by commas, semicolons, tabs or blanks. The first six, of which the first is
+    a frame from 1 on, are finite; further ones may be NaN, also where they are no numbers. Blank
+    lines, comments after "#", "%" or "//", and a header that names the columns of MOTChallenge are
+    left out. Raises `ValueError` with the file and the line for any other text, also for a header
+    of other columns, where `form` says what was expected; and for a file without any row, unless
+    `holds`, the name of what it should hold, is None.
     """
+    rows: dict[int, list[float]] = {}
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        text = line.strip()
+        commented = text.startswith(_COMMENTS)
+        fields = _fields(text.lstrip("#%/ ") if commented else text.partition("#")[0])
+        values = [_number(field) for field in fields]
+        if not rows and _is_header(fields, values, commented):
+            _check_header(f"{path}, line {number}", fields)
+            continue
+        if commented or not fields:
+            continue
+        if len(fields) not in columns or not np.all(np.isfinite(values[:6])) or values[0] % 1:
+            raise ValueError(f"{path}, line {number}: {shown(text)} is not {form}")
+        if values[0] < 1:
+            raise ValueError(
+                f"{path}, line {number}: lies in frame {values[0]:.0f}, and frames count from 1"
+            )
+        rows[number] = values
+    if not rows and holds is not None:
+        raise ValueError(f"{path}: holds no {holds}")
+    return rows
+
+
+def read_text(path: str | Path) -> str:
+    """The text of a file, without the byte order mark that Windows puts before it."""
     content = Path(path).read_bytes()
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    text = content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
-    return ((number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip())
+    return content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
 
 
-def parse_track(path: str | Path, number: int, line: str) -> list[float]:
-    """The numbers of a row frame,id,x,y,w,h,... of seven to ten columns; further ones may be NaN.
+def check_identity(path: str | Path, number: int, values: list[float]) -> None:
+    """Raise `ValueError` with the file and the line for an id that is not whole, or below 0."""
+    if values[1] % 1 or values[1] < 0:
+        raise ValueError(f"{path}, line {number}: {values[1]:g} is no id, a whole number from 0 on")
 
-    Raises `ValueError` with the file and the line for any other text.
-    """
-    fields = line.split(",")
-    try:
-        values = [float(field) for field in fields[:6]]
-        whole = all(value == int(value) and value >= 0 for value in values[:2])
-    except (ValueError, OverflowError):
-        values, whole = [], False
-    if len(fields) not in _COLUMNS or not whole or not np.all(np.isfinite(values)):
+
+def _fields(text: str) -> list[str]:
+    """The columns of a line; a separator at its end begins none."""
+    mark = next((mark for mark in ",;\t" if mark in text), None)
+    fields = [field.strip().strip("\"'") for field in text.split(mark)]
+    return fields[:-1] if fields and not fields[-1] else fields
+
+
+def _is_header(fields: list[str], values: list[float], commented: bool) -> bool:
+    """Whether these are names: no numbers, and in a comment those of columns from a frame on."""
+    if not fields or not np.all(np.isnan(values)) or re.match(r"[-+.\d]", fields[0]):
+        return False
+    return not commented or (len(fields) >= 6 and _named(_NAMES[0], fields[0]))
+
+
+def _check_header(line: str, fields: list[str]) -> None:
+    known = all(map(_named, _NAMES, fields))
+    if not known or len(fields) < 6:
         raise ValueError(
-            f"{path}, line {number}: {shown(line.strip())} is not frame,id,x,y,w,h and one to four"
-            " more columns"
+            f"{line}: {shown(','.join(fields))} is a header, and its columns are not"
+            " frame,id,x,y,w,h and, if any, a score"
         )
-    return values + [_number(field) for field in fields[6:]]
+
+
+def _named(pattern: str, field: str) -> bool:
+    """Whether a column has such a name, whatever its case and what stands between its words."""
+    return re.fullmatch(pattern, re.sub(r"[\W_]", "", field.lower())) is not None
 
 
 def _number(field: str) -> float:
@@ -169,18 +230,3 @@ def _number(field: str) -> float:
         return float(field)
     except ValueError:
         return np.nan
-
-
-def _parse_detection(path: str | Path, number: int, line: str) -> list[float]:
-    fields = line.split(",")
-    try:
-        values = [float(field) for field in fields[:7]]
-        whole = values[0] == int(values[0])
-    except (ValueError, OverflowError):
-        values, whole = [], False
-    if not 6 <= len(fields) <= 10 or not whole or not np.all(np.isfinite(values)):
-        raise ValueError(
-            f"{path}, line {number}: {shown(line.strip())} is not frame,id,x,y,w,h,score and up to"
-            " three more columns"
-        )
-    return values

@@ -1,10 +1,14 @@
 """The metadata of a sequence's folder: its `seqinfo.ini`, and its files of detections."""
 
+import configparser
 import re
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+
+from mpfjax.checks import shown
+from mpfjax.vision.files.boxes import read_text
 
 _INFO = "seqinfo.ini"
 
@@ -23,16 +27,30 @@ class SequenceInfo(NamedTuple):
 
 
 def read_sequence_info(*folders: Path) -> SequenceInfo:
-    """Read the `seqinfo.ini` in the first of these folders that has one."""
+    """Read the `seqinfo.ini` in the first of these folders that has one.
+
+    Keys may have any case. Raises `ValueError` with the file and the key for what is no number.
+    """
     path = next((folder / _INFO for folder in folders if (folder / _INFO).is_file()), None)
     if path is None:
         return SequenceInfo()
-    text = path.read_text(encoding="utf-8", errors="replace")
+    parser = configparser.ConfigParser(
+        interpolation=None, strict=False, allow_no_value=True, inline_comment_prefixes=("#", ";")
+    )
+    parser.optionxform = lambda optionstr: re.sub(r"[\W_]", "", optionstr.lower())
+    # Keys before the first section, and indented ones, are keys too.
+    lines = ["[Sequence]", *(line.strip() for line in read_text(path).splitlines())]
+    try:
+        parser.read_string("\n".join(lines))
+    except configparser.Error as error:
+        raise ValueError(f"{path}: {error}") from error
+    values = {key: value for name in parser.sections() for key, value in parser.items(name)}
     rate, length, height, width = (
-        _number(text, key) for key in ("frameRate", "seqLength", "imHeight", "imWidth")
+        _number(path, key, values.get(key.lower()))
+        for key in ("frameRate", "seqLength", "imHeight", "imWidth")
     )
     return SequenceInfo(
-        name=_value(text, "name", r"\S+"),
+        name=values.get("name") or None,
         frame_rate=rate,
         length=None if length is None else int(length),
         size=None if height is None or width is None else (int(height), int(width)),
@@ -61,11 +79,10 @@ def _is_among(file: Path, folder: Path) -> bool:
     return file.absolute() in detection_files(folder)
 
 
-def _number(text: str, key: str) -> float | None:
-    found = _value(text, key, r"\d+(?:\.\d+)?")
-    return float(found) or None if found else None
-
-
-def _value(text: str, key: str, pattern: str) -> str | None:
-    found = re.search(rf"^{key}\s*=\s*({pattern})\s*$", text, re.MULTILINE)
-    return found[1] if found else None
+def _number(path: Path, key: str, value: str | None) -> float | None:
+    """A positive number, None where there is none."""
+    try:
+        number = float(value or 0)
+    except ValueError:
+        raise ValueError(f"{path}: {key}: {shown(value)} is not a number") from None
+    return number if 0 < number < np.inf else None

@@ -3,13 +3,16 @@
 import abc
 import warnings
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from mpfjax.checks import check_finite, check_whole, given, is_series, saying, shown, to_rows
+from mpfjax.checks import check_finite, check_whole, given, is_series, saying, shown
+from mpfjax.vision.files.boxes import read_detections
+from mpfjax.vision.tracking.detections import to_masked_rows
 
 # MOTChallenge's columns: frame, id, x, y, w, h, and the score, where there is one.
 _BOX, _SCORE = slice(2, 6), 6
@@ -18,7 +21,10 @@ LEAST_ROOM, MOST_ROOM = 24, 1024
 
 
 class DetectedBoxes(NamedTuple):
-    """The boxes (x, y, w, h) detected in one frame, and a score for each, or None."""
+    """The boxes (x, y, w, h) detected in one frame, and a score for each, or None.
+
+    Boxes with a masked entry are no detections.
+    """
 
     boxes: Float[np.ndarray, "k 4"]
     scores: Float[np.ndarray, " k"] | None
@@ -50,15 +56,17 @@ def as_detector(detections: Any, first: int = 1) -> AbstractDetector:
     """
     if isinstance(detections, AbstractDetector):
         return detections
+    if isinstance(detections, str | Path):
+        detections = read_detections(detections)
     if isinstance(detections, np.ndarray | jax.Array):
-        return Rows(np.asarray(detections), first)
+        return Rows(np.asanyarray(detections), first)
     if callable(detections) and not isinstance(detections, type):
         return _Called(detections)
     if is_series(detections):
         return _Streamed(iter(detections))
     raise ValueError(
         f"detections: {shown(detections)} is neither a detector to call with a frame, nor an array"
-        " of rows frame,id,x,y,w,h,score, nor the boxes of one frame after the other"
+        " or a file of rows frame,id,x,y,w,h,score, nor the boxes of one frame after the other"
     )
 
 
@@ -77,20 +85,22 @@ class Rows(AbstractDetector):
                 f"detections: shape {rows.shape} is not that of rows frame,id,x,y,w,h and,"
                 " if any, a score"
             )
-        rows = to_rows(rows.shape[1], "detections", rows) if rows.size else np.zeros((0, 7))
+        rows = rows if rows.size else np.zeros((0, 7))
+        rows = to_masked_rows(rows.shape[1], "detections", rows)
         bad = ~np.isfinite(rows[:, : _SCORE + 1]).all(axis=1) | (rows[:, 0] % 1 != 0)
-        for number in np.flatnonzero(bad)[:1]:
+        for number in np.flatnonzero(bad.filled(False))[:1]:
             raise ValueError(
-                f"detections: row {number}, {shown(rows[number])}, is not finite, or its frame is"
-                " no whole number"
+                f"detections: row {number}, {shown(rows.data[number])}, is not finite, or its"
+                " frame is no whole number"
             )
-        for number in np.flatnonzero(rows[:, 0] < 1)[:1]:
+        for number in np.flatnonzero((rows[:, 0] < 1).filled(False))[:1]:
             raise ValueError(
                 f"detections: row {number} lies in frame {rows[number, 0]:.0f}, and frames count"
                 " from 1"
             )
+        rows = rows[~np.ma.getmaskarray(rows)[:, 0]]
         self.first = first
-        self.frames = rows[:, 0].astype(int)
+        self.frames = rows.data[:, 0].astype(int)
         self.last = int(self.frames.max(initial=0)) if last is None else last
         order = np.argsort(self.frames, kind="stable")
         self._rows, self._sorted = rows[order], self.frames[order]
@@ -168,8 +178,7 @@ class Sieve:
         self, found: DetectedBoxes, number: int, frame: np.ndarray | None
     ) -> tuple[DetectedBoxes, Int[np.ndarray, " k"]]:
         """The detections of a frame that can be tracked, and the row of each among all of them."""
-        boxes, scores = _checked(found, number)
-        keep = np.ones(len(boxes), bool)
+        (boxes, scores), keep = _present(found, number)
         if self.min_score is not None and len(boxes):
             if scores is None:
                 raise ValueError(
@@ -214,33 +223,36 @@ def _as_found(value: Any, number: int) -> DetectedBoxes:
     boxes, scores = value if isinstance(value, tuple) and len(value) == 2 else (value, None)
     if boxes is None:
         raise ValueError(f"detections: frame {number}: None is no array; [] has no detections")
-    rows = to_rows(4, f"detections: frame {number}", boxes)
+    rows = to_masked_rows(4, f"detections: frame {number}", boxes)
     return DetectedBoxes(rows, None if scores is None else _as_scores(scores, number))
 
 
 def _as_scores(scores: Any, number: int) -> np.ndarray:
     try:
-        return np.asarray(scores, float).reshape(-1)
+        return np.asanyarray(scores, float).reshape(-1)
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"detections: frame {number}: scores {shown(scores)} are no numbers"
         ) from error
 
 
-def _checked(found: DetectedBoxes, number: int) -> DetectedBoxes:
-    if not np.isfinite(found.boxes).all():
-        raise ValueError(f"detections: frame {number}: {shown(found.boxes)} is not finite")
-    if found.scores is not None:
-        if len(found.scores) != len(found.boxes):
+def _present(found: DetectedBoxes, number: int) -> tuple[DetectedBoxes, Bool[np.ndarray, " k"]]:
+    """The boxes and scores without masks, and which of them are detections."""
+    boxes, scores = np.ma.getdata(found.boxes), found.scores
+    present = np.logical_not(np.any(np.ma.getmaskarray(found.boxes), axis=1))
+    if not np.isfinite(boxes[present]).all():
+        raise ValueError(f"detections: frame {number}: {shown(boxes)} is not finite")
+    if scores is not None:
+        if len(scores) != len(boxes):
             raise ValueError(
-                f"detections: frame {number}: {len(found.scores)} scores for"
-                f" {len(found.boxes)} boxes"
+                f"detections: frame {number}: {len(scores)} scores for {len(boxes)} boxes"
             )
-        if not np.isfinite(found.scores).all():
-            raise ValueError(
-                f"detections: frame {number}: scores {shown(found.scores)} are not finite"
-            )
-    return found
+        if np.ma.is_masked(scores[present]):
+            raise ValueError(f"detections: frame {number}: scores {shown(scores)} are masked")
+        scores = np.ma.getdata(scores)
+        if not np.isfinite(scores[present]).all():
+            raise ValueError(f"detections: frame {number}: scores {shown(scores)} are not finite")
+    return DetectedBoxes(boxes, scores), present
 
 
 def _warn(message: str) -> None:

@@ -26,6 +26,7 @@ from mpfjax.vision.tracking.observation import TrackedFrame
 
 _NONE, _IMPOSSIBLE = -1, 1e4
 _DIMENSIONS = 4
+_WIDEST = -0.5  # log |S| counts as at most this: a detection at the prediction forms a pair
 _UNDECIDED = 0.25  # B² at which colours are evidence neither for nor against a pair
 _ROUNDS = 15  # iterations of messages; fewer suffice where two rows compete for two columns
 _LEAST = 1e-3  # marginals are at least this
@@ -48,9 +49,10 @@ class Assign(AbstractMove):
     `doubt_cost` for a component that is not yet confirmed. A component without a detection costs
     `gate`, so that no pair with a higher cost is formed: its detection more probably belongs to a
     new object. Because of log |S_m| this happens more often to components that have been unseen for
-    long. For a component that is more probably a double (`LearnDoubles`), gate - cost is divided by
-    a hundred: it takes a detection only from what the others leave, adds little to their doubts,
-    and follows its own detection by half.
+    long; it counts as at most -1/2, so that a detection at the very prediction forms a pair. For a
+    component that is more probably a double (`LearnDoubles`), gate - cost is divided by a hundred:
+    it takes a detection only from what the others leave, adds little to their doubts, and follows
+    its own detection by half.
 
     The probability of a pair under the joint distribution of all assignments, p ∝ Π exp((gate -
     cost) / 2T) over the pairs of an assignment, is computed by `marginals`. A `temperature` T above
@@ -151,7 +153,9 @@ class Assign(AbstractMove):
         scores = mixture.memory[SCORES]
         squares, volumes = self._distances(mixture, found.boxes, slack)
         tails = (self.freedom + _DIMENSIONS) * jnp.log1p(squares / self.freedom)
-        cost = tails + volumes[:, None] + self._unlikeness(mixture, observation)
+        cost = (
+            tails + jnp.minimum(volumes, _WIDEST)[:, None] + self._unlikeness(mixture, observation)
+        )
         cost += self.weak_cost * (found.scores < scores.strong)[None].astype(cost.dtype)
         doubtful = ~lives.confirmed[:, None]
         cost += self.doubt_cost * doubtful.astype(cost.dtype)

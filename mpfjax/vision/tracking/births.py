@@ -13,7 +13,6 @@ from mpfjax.operations.prefix_sums import few_upto
 from mpfjax.vision.tracking.detections import Detections
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
-    EXTENT,
     LIVES,
     SCORES,
     Lives,
@@ -61,7 +60,7 @@ class Births(AbstractMove):
     @property
     def reads(self) -> frozenset[str]:
         """The memory that it needs of other moves."""
-        return frozenset({ASSIGNED, LIVES, SCORES, EXTENT})
+        return frozenset({ASSIGNED, LIVES, SCORES})
 
     @property
     def approximate(self) -> bool:
@@ -81,7 +80,7 @@ class Births(AbstractMove):
         free = jnp.ones(len(found.valid), bool).at[rows].set(False, mode="drop")
         strong = found.valid & (found.scores >= mixture.memory[SCORES].strong)
         covered = overlap(mean_boxes(mixture), found.boxes) > self.birth_overlap
-        wanted = free & strong & within(found.boxes, mixture.memory[EXTENT])
+        wanted = free & strong & within(found.boxes, observation.extent)
         wanted &= ~jnp.any(covered & lives.alive[:, None], axis=0)
         # One that a stronger one covers is a double, even where the stronger one starts none.
         doubles = (overlap(found.boxes, found.boxes) > self.birth_overlap) & wanted[:, None]

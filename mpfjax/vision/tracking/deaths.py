@@ -11,7 +11,6 @@ from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import spread
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
-    EXTENT,
     GUESSES,
     HIDDEN,
     LIVES,
@@ -28,19 +27,17 @@ class Deaths(AbstractMove):
     """Count in how many frames each component had a detection, and end those that have too few.
 
     A component ends if no detection has been assigned to it for more than `patience` frames in a
-    row, or for more than `tentative_patience` while it is not confirmed; if its centre has left the
-    frame; or if all its particles have zero likelihood. It is confirmed after `confirmation` frames
-    with strong detections. Components of the first frame are confirmed at once. Where there is no
-    room for new components, an unconfirmed one ends in its first frame without a detection, and one
-    that was confirmed at once and has had no strong detections since ends as soon as it is no
-    longer shown. Frames in which a component is hidden by another (`ShareDetections`) do not count
-    as frames without a detection. Without pixels, the frame is the smallest rectangle that holds
-    all detections so far.
+    row, or for more than `tentative_patience` while it is not confirmed; if it has left the frame,
+    or its centre while it has no detection; or if all its particles have zero likelihood. It is
+    confirmed after `confirmation` frames with strong detections. Components of the first frame are
+    confirmed at once. Where there is no room for new components, an unconfirmed one ends in its
+    first frame without a detection, and one that was confirmed at once and has had no strong
+    detections since ends as soon as it is no longer shown. Frames in which a component is hidden by
+    another (`ShareDetections`) do not count as frames without a detection.
 
     A component is shown while it is confirmed, for at most `longest_guess` frames without a
     detection, or as many as `LearnGuesses` has learned, and `longest_unsure` frames without a
-    strong one. Memory: `Lives`, together with
-    `Births`, and the extent of the frame.
+    strong one. Memory: `Lives`, together with `Births`.
 
     Deaths are decided and not sampled (`approximate` is true). Raises `ValueError` for a number of
     frames that is not whole, or below 1.
@@ -73,8 +70,7 @@ class Deaths(AbstractMove):
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
         """No component is alive yet."""
-        nothing = jnp.array([jnp.inf, jnp.inf, -jnp.inf, -jnp.inf])
-        return {LIVES: Lives.none(num_components), EXTENT: nothing}
+        return {LIVES: Lives.none(num_components)}
 
     def forget(self, memory: dict, dead: Bool[Array, " m"]) -> dict:
         """Dead components have no identity and no counts."""
@@ -109,8 +105,10 @@ class Deaths(AbstractMove):
         tentative = jnp.where(lives.full, 0, self.tentative_patience)
         patience = jnp.where(confirmed, patience, tentative)
         stays = lives.alive & mixture.active & (unseen <= patience)
-        extent = observation.extent(mixture.memory[EXTENT])
-        stays &= within(mean_boxes(mixture), extent)
+        boxes = mean_boxes(mixture)
+        # Of an object that is not detected the centre has to be inside.
+        sides = jnp.where(borne_out[:, None], boxes[:, 2:], 0.0)
+        stays &= within(jnp.concatenate([boxes[:, :2], sides], axis=1), observation.extent)
         dies = ~spread(stays, mixture.component_indicators)
         log_weights = jnp.where(dies, -jnp.inf, mixture.log_weights)
         guesses = unseen + jnp.where(shared_detections(mixture) < 0, self._hidden(mixture), 0)
@@ -122,7 +120,7 @@ class Deaths(AbstractMove):
             confirmed=confirmed,
             shown=confirmed & stays & recent,
         )
-        return remember(mixture.replace(log_weights=log_weights), lives=lives, extent=extent)
+        return remember(mixture.replace(log_weights=log_weights), lives=lives)
 
     def _longest_guess(self, mixture: ParticleMixture) -> Int[Array, ""] | int:
         guesses = mixture.memory.get(GUESSES)

@@ -9,7 +9,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.checks import as_numbers, check_whole, shown, to_array, to_rows
 from mpfjax.operations.indexing import take
-from mpfjax.vision.files.boxes import centred
+from mpfjax.vision.files.boxes import centred, top_left
+
+# Finite, as observations have to be.
+_FAR = float(np.finfo(np.float32).max)
+_UNBOUNDED = (-_FAR, -_FAR, _FAR, _FAR)
+# The largest step between neighbours in float32, in boxes: within the errors of detectors.
+_FINEST = 0.1
 
 
 class Detections(eqx.Module):
@@ -19,12 +25,14 @@ class Detections(eqx.Module):
     - `valid`: (d,), which rows are detections.
     - `scores`: (d,), how sure the detector was of each, on any scale, higher for surer.
     - `rows`: (d,), the row of each in what the detector gave; None counts them as they stand here.
+    - `extent`: left, top, right, bottom of the frame; as far as can be where not known.
     """
 
     boxes: Float[Array, "d 4"] = eqx.field(converter=to_array("boxes"))
     valid: Bool[Array, " d"] = eqx.field(converter=to_array("valid", floating=False))
     scores: Float[Array, " d"] = eqx.field(converter=to_array("scores"))
     rows: Int[Array, " d"] | None = None
+    extent: Float[Array, "4"] = eqx.field(converter=to_array("extent"), default=_UNBOUNDED)
 
     @classmethod
     def from_boxes(
@@ -32,38 +40,78 @@ class Detections(eqx.Module):
         boxes: Float[np.ndarray, "k 4"],
         max_detections: int,
         scores: Float[np.ndarray, " k"] | None = None,
+        *,
+        frame_size: tuple[int, int] | None = None,
+        origin: Float[np.ndarray, "2"] | None = None,
     ) -> "Detections":
         """Boxes (x, y, w, h), top-left corner first, and a score for each; all 1 where None.
 
         The boxes stay in their order. If there are too many, the strongest are kept, and of equally
-        strong ones the largest. They may leave the frame in part or as a whole. Raises `ValueError`
-        for boxes that are not four finite numbers each, or have no area, for scores that are not
-        one finite number for each box, and for a size below one.
+        strong ones the largest. They may leave the frame in part or as a whole. Rows of a masked
+        array with a masked entry are no detections. `frame_size` is height and width, where known.
+        A tracker counts in float32: `origin`, the (x, y) of a point near the boxes, is subtracted
+        from coordinates that are large, as those of maps are; add it to the tracks again.
+
+        Raises `ValueError` for boxes that are not four finite numbers each, have no area, or are
+        finer than float32 where they are; for scores that are masked, or not one finite number for
+        each box; and for a size below one.
         """
         check_whole(max_detections=max_detections)
-        rows = to_rows(4, "boxes", boxes).astype(np.float32)
+        rows = to_masked_rows(4, "boxes", boxes)
         # A single box without its axis is more likely a slip than meant.
         if len(rows) > 0 and np.ndim(boxes) != 2:
             raise ValueError(f"boxes: shape {np.shape(boxes)} is not (k, 4), of boxes x,y,w,h")
-        for row in rows[~(np.isfinite(rows).all(axis=1) & (rows[:, 2:] > 0).all(axis=1))]:
-            raise ValueError(f"boxes: {row.tolist()} has no area, or is not finite")
         strengths = _checked_scores(scores, len(rows))
+        present = np.flatnonzero(~np.any(np.ma.getmaskarray(rows), axis=1))
+        rows, strengths = centred(rows.data[present]), strengths[present]
+        corner = np.zeros(2) if origin is None else np.asarray(origin, float)
+        rows[:, :2] -= corner
+        _check_float32(rows)
         strongest = np.lexsort((-rows[:, 2] * rows[:, 3], -strengths))[:max_detections]
         kept = np.sort(strongest)
         padded = np.ones((max_detections, 4), np.float32)
-        padded[: len(kept)] = centred(rows[kept])
+        padded[: len(kept)] = rows[kept]
         padded_scores = np.zeros(max_detections, np.float32)
         padded_scores[: len(kept)] = strengths[kept]
         padded_rows = np.full(max_detections, -1, np.int32)
-        padded_rows[: len(kept)] = kept
+        padded_rows[: len(kept)] = present[kept]
         valid = np.arange(max_detections) < len(kept)
-        return cls(*map(jnp.asarray, (padded, valid, padded_scores, padded_rows)))
+        extent = _UNBOUNDED
+        if frame_size is not None:
+            height, width = frame_size
+            extent = np.array([*-corner, *([width, height] - corner)], np.float32)
+        return cls(*map(jnp.asarray, (padded, valid, padded_scores, padded_rows, extent)))
 
     def rows_of(self, indices: Int[Array, " m"]) -> Int[Array, " m"]:
         """The rows, in what the detector gave, of detections by their indices; -1 stays -1."""
         if self.rows is None:
             return indices
         return jnp.where(indices >= 0, take(self.rows, jnp.maximum(indices, 0)), -1)
+
+
+def to_masked_rows(width: int, name: str, value: Any) -> np.ma.MaskedArray:
+    """The argument as rows of `width` numbers, of which masked ones stay masked."""
+    if isinstance(value, list | tuple) and any(map(np.ma.is_masked, value)):
+        value = np.ma.array(value)
+    mask: Any = False
+    if isinstance(value, np.ma.MaskedArray):
+        value, mask = value.data, np.ma.getmaskarray(value)
+    rows = to_rows(width, name, value)
+    return np.ma.array(rows, mask=np.broadcast_to(mask, rows.shape))
+
+
+def _check_float32(boxes: Float[np.ndarray, "k 4"]) -> None:
+    """Boxes by their centres have areas, are finite, and are not lost to rounding."""
+    rounded = boxes.astype(np.float32)
+    sound = np.isfinite(rounded).all(axis=1) & (rounded[:, 2:] > 0).all(axis=1)
+    for row in boxes[~sound]:
+        raise ValueError(f"boxes: {top_left(row[None])[0].tolist()} has no area, or is not finite")
+    steps = np.spacing(np.abs(rounded[:, :2]))
+    for row in boxes[(steps > _FINEST * rounded[:, 2:]).any(axis=1)]:
+        raise ValueError(
+            f"boxes: {top_left(row[None])[0].tolist()} is too fine for float32 at its place; give"
+            " an origin near the boxes"
+        )
 
 
 def _checked_scores(scores: Any, number: int) -> np.ndarray:

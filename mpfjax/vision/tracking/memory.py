@@ -9,7 +9,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.vision.tracking.model import DetectedObjectModel, Noises, boxes_of
 
 SCORES, ASSIGNED, LIVES, REFERENCES = "scores", "assigned", "lives", "references"
-EXTENT, SHARED, HIDDEN, DOUBTS = "extent", "shared", "hidden", "doubts"
+SHARED, HIDDEN, DOUBTS = "shared", "hidden", "doubts"
 CAMERA, NOISES, RIVALS, FATES = "camera", "noises", "rivals", "fates"
 GUESSES, DOUBLES = "guesses", "doubles"
 

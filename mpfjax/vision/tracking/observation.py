@@ -70,24 +70,19 @@ class TrackedFrame(NamedTuple):
         assert self.pixels is not None
         return normalise(self.pixels.counts(self.detections.boxes, num_parts))
 
-    def extent(self, known: Float[Array, "4"]) -> Float[Array, "4"]:
-        """Left, top, right, bottom of the frame; without pixels, of `known` and the detections."""
-        if self.pixels is not None:
-            size = [0, 0, self.pixels.width, self.pixels.height]
-            return jnp.stack([jnp.asarray(side, known.dtype) for side in size])
-        valid, boxes = self.detections.valid[:, None], self.detections.boxes
-        low, high = boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2
-        lowest = jnp.min(jnp.where(valid, low, jnp.inf), axis=0, initial=jnp.inf)
-        highest = jnp.max(jnp.where(valid, high, -jnp.inf), axis=0, initial=-jnp.inf)
-        return jnp.concatenate(
-            [jnp.minimum(known[:2], lowest), jnp.maximum(known[2:], highest)]
-        ).astype(known.dtype)
+    @property
+    def extent(self) -> Float[Array, "4"]:
+        """Left, top, right, bottom of the frame; as far as can be where not known."""
+        if self.pixels is None:
+            return self.detections.extent
+        size = [0, 0, self.pixels.width, self.pixels.height]
+        return jnp.stack([jnp.asarray(side, self.detections.extent.dtype) for side in size])
 
 
 def within(boxes: Float[Array, "k 4"], extent: Float[Array, "4"]) -> Bool[Array, " k"]:
-    """Whether the centre of each box lies inside left, top, right and bottom."""
-    centres = boxes[:, :2]
-    return jnp.all((centres >= extent[None, :2]) & (centres <= extent[None, 2:]), axis=1)
+    """Whether any part of each box lies inside left, top, right and bottom."""
+    low, high = boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2
+    return jnp.all((high > extent[None, :2]) & (low < extent[None, 2:]), axis=1)
 
 
 def overlap(a: Float[Array, "m 4"], b: Float[Array, "d 4"]) -> Float[Array, "m d"]:

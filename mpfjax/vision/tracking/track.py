@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Generator, Iterable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -12,8 +13,8 @@ from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.compiling import in_little_memory
 from mpfjax.operations.kept_programs import kept_program
-from mpfjax.vision.files.boxes import top_left
-from mpfjax.vision.files.frames import of_one_kind
+from mpfjax.vision.files.boxes import centred, top_left
+from mpfjax.vision.files.frames import of_one_kind, read_frames
 from mpfjax.vision.files.threads import read_ahead
 from mpfjax.vision.tracking.adapters import (
     LEAST_ROOM,
@@ -34,7 +35,7 @@ _FEW_PARTICLES = 32
 
 
 def track(
-    frames: Iterable[UInt8[np.ndarray, "..."]] | None,
+    frames: Iterable[UInt8[np.ndarray, "..."]] | str | Path | None,
     detections: Any,
     tracker: ObjectTracker | None = None,
     *,
@@ -56,11 +57,13 @@ def track(
         track(frames, BackgroundSubtraction().detect)      # what moves before a still camera
         track(None, rows)                                  # without pixels, for speed or radar
 
-    - `frames`: RGB images of eight bits, or grey ones, all of one size, in any iterable; None where
-      there are only detections.
+    - `frames`: RGB images of eight bits, or grey ones, all of one size, in any iterable, or the
+      path of a video or of a folder of images, from frame `first` on; None where there are only
+      detections.
     - `detections`: a function from a frame to its boxes (x, y, w, h), top-left corner first, in
       pixels, or to a tuple of boxes and scores; or an iterable of these, one item for each frame;
-      or an array of rows (frame, id, x, y, w, h, score) whose frames count from 1.
+      or an array of rows (frame, id, x, y, w, h, score) whose frames count from 1, or the path of a
+      MOTChallenge file of these.
     - `tracker`: None takes `ObjectTracker()`, with more room where a frame has more rows.
     - `key`: of the random numbers; None takes `jax.random.key(0)`.
     - `first`: the number of the first frame, by which rows are found.
@@ -68,8 +71,8 @@ def track(
     - `max_detections`: the most detections in a frame; if there are more, the strongest are kept.
       None takes twice the tracker's `max_objects`.
     - `use_colours`: with False the tracker sees no pixels, and only the detector does.
-    - `frame_size`: height and width, for detections without frames, to tell which boxes lie
-      outside.
+    - `frame_size`: height and width, for detections without frames, to tell which boxes and
+      objects lie outside; None where there is no border.
     - `camera_motion`: "pixels" finds the motion of the camera by `OpticalFlow`, and what this
       leaves from the detections; "detections" has them alone. None takes "pixels" where the tracker
       sees pixels and OpenCV is installed.
@@ -77,13 +80,16 @@ def track(
       the tracks; `close()`, or the last track, ends the thread. Use it for recordings, which then
       take less time; a camera's tracks would be late.
 
-    The tracks of each frame are NumPy arrays. Boxes without area or outside the frame are left out
-    with a warning, as are detections in frames after the last. Another warning is given where there
-    are more detections or objects than there is room for. Raises `ValueError` with the name of the
-    argument for values that cannot be used, at the frame in which they come, and `ImportError` for
-    "pixels" without OpenCV. An exception of the detector is passed on, with the number of the
-    frame. Use it for recorded videos and for cameras.
+    The tracks of each frame are NumPy arrays. Without pixels coordinates may be large, as those of
+    maps are. Rows of a masked array with a masked entry are no detections. Boxes without area or
+    outside the frame are left out with a warning, as are detections in frames after the last.
+    Another warning is given where there are more detections or objects than there is room for.
+    Raises `ValueError` with the name of the argument for values that cannot be used, at the frame
+    in which they come, and `ImportError` for "pixels" without OpenCV. An exception of the detector
+    is passed on, with the number of the frame. Use it for recorded videos and for cameras.
     """
+    if isinstance(frames, str | Path):
+        frames = read_frames(frames, first)
     if frames is not None:
         check_type(Iterable, "frames one after the other, or None", frames=frames)
     check_flag(use_colours=use_colours, ahead=ahead)
@@ -133,6 +139,7 @@ class _Seen(NamedTuple):
     observation: Detections
     motion: CameraMotion | None
     kept: np.ndarray
+    origin: np.ndarray
 
 
 def _seen(
@@ -144,7 +151,7 @@ def _seen(
     flow: OpticalFlow | None,
 ) -> Iterator[_Seen]:
     """What does not depend on earlier tracks, frame by frame."""
-    once = Once()
+    once, origin = Once(), None
     for number, still, found in observed:
         found, kept = sieve(found, number, still)
         if len(found.boxes) > room:
@@ -153,10 +160,18 @@ def _seen(
                 f"detections: frame {number} has {len(found.boxes)}, more than the {room} that"
                 " there is room for, max_detections; the strongest are kept",
             )
-        observation = Detections.from_boxes(found.boxes, room, found.scores)
+        if still is not None and (use_colours or flow is not None):
+            origin = np.zeros(2)  # that of the pixels
+        elif origin is None and len(found.boxes):
+            origin = np.median(centred(found.boxes)[:, :2], axis=0)
+        corner = np.zeros(2) if origin is None else origin
+        size = sieve.frame_size if still is None else still.shape[:2]
+        observation = Detections.from_boxes(
+            found.boxes, room, found.scores, frame_size=size, origin=corner
+        )
         pixels = tracker.look(still, observation) if use_colours and still is not None else None
         motion = None if flow is None or still is None else flow(still, found.boxes)
-        yield _Seen(number, pixels, observation, motion, kept)
+        yield _Seen(number, pixels, observation, motion, kept, corner)
 
 
 def _tracked(
@@ -164,7 +179,7 @@ def _tracked(
 ) -> Generator[Tracks, None, None]:
     state, once, advance = tracker.init(), Once(), None
     with read_ahead(seen) if ahead else contextlib.nullcontext(seen) as coming:
-        for number, pixels, observation, motion, kept in coming:
+        for number, pixels, observation, motion, kept, origin in coming:
             # An array: each new Python number would compile anew.
             moving = (np.asarray(number), state, pixels, observation, motion)
             if advance is None:
@@ -179,7 +194,10 @@ def _tracked(
                     " there is room for, max_objects; the strongest are kept",
                 )
             taken = tracks.detections
-            yield tracks._replace(detections=np.where(taken >= 0, np.append(kept, -1)[taken], -1))
+            yield tracks._replace(
+                boxes=tracks.boxes + np.append(origin, [0, 0]),
+                detections=np.where(taken >= 0, np.append(kept, -1)[taken], -1),
+            )
 
 
 def _advance(

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt8
 
@@ -90,9 +89,10 @@ class Tracks(NamedTuple):
         )
 
     @property
-    def corner_boxes(self) -> Float[Array, "m 4"]:
+    def corner_boxes(self) -> Float[Array | np.ndarray, "m 4"]:
         """The boxes (x, y, w, h) with (x, y) the top-left corner, as files have them."""
-        return jnp.concatenate([self.boxes[:, :2] - self.boxes[:, 2:] / 2, self.boxes[:, 2:]], 1)
+        sides = self.boxes[:, np.array([2, 3, 2, 3])]
+        return self.boxes - sides * np.array([[0.5, 0.5, 0, 0]], self.boxes.dtype)
 
 
 class ObjectTracker(eqx.Module):

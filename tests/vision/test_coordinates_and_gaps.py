@@ -1,0 +1,222 @@
+"""What `track` makes of far origins, of masked arrays, and of gaps between detections."""
+
+import numpy as np
+import pytest
+
+from mpfjax.vision import Detections, ObjectTracker, track
+
+TRACKER = ObjectTracker(6, frames_per_second=25)
+NUM_FRAMES = 40
+
+
+def crowd(num_frames=NUM_FRAMES):
+    """Rows of four objects of .6 x 1.8 that walk, with errors of a few hundredths."""
+    rng, rows = np.random.default_rng(0), []
+    for frame in range(1, num_frames + 1):
+        for number in range(4):
+            x, y = 3 * number + 0.05 * frame, 2.5 * number
+            rows.append([frame, -1, *(rng.normal([x, y], 0.02)), 0.6, 1.8, 1])
+    return np.array(rows)
+
+
+def placed(rows, x=0.0, y=0.0):
+    return rows + np.array([0, 0, x, y, 0, 0, 0])
+
+
+def alone(boxes):
+    """The identities in each frame of one box a frame, None for no detection."""
+    found = [np.zeros((0, 4)) if box is None else np.array([box], float) for box in boxes]
+    return [living(tracks) for tracks in track(None, iter(found), TRACKER)]
+
+
+def living(tracks):
+    identities = np.asarray(tracks.identities)
+    return sorted(identities[identities > 0].tolist())
+
+
+def by_frame(rows):
+    for frame in range(1, int(rows[:, 0].max()) + 1):
+        here = rows[rows[:, 0] == frame]
+        yield here[:, 2:6], here[:, 6]
+
+
+# --- gaps ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", [(6.0, 0.0), (-6.0, 0.0), (0.0, 9.0), (0.0, -9.0)])
+def test_a_gap_at_the_border_of_all_detections_so_far_ends_nobody(step):
+    """An object that walks outward is at the border of what was detected at all times."""
+    box = np.array([300.0, 200, 20, 40])
+    boxes = [None if 5 <= t < 11 else box + t * np.array([*step, 0, 0]) for t in range(14)]
+    assert alone(boxes) == [[1]] * 14
+
+
+def test_a_detection_beyond_all_others_so_far_is_an_object():
+    rows = np.array([[t, -1, 100 + 50 * t * (t > 3), 100, 20, 40, 1] for t in range(1, 4)])
+    far = np.array([[t, -1, 900.0 + t, 700, 20, 40, 1] for t in range(4, 9)])
+    tracks = list(track(None, np.concatenate([rows, far]), TRACKER))
+    assert 2 in np.asarray(tracks[-1].identities)[np.asarray(tracks[-1].shown)]
+
+
+def test_who_leaves_a_frame_of_known_size_ends_and_who_enters_there_is_another():
+    """The centre passes the right border, at 640, in the ninth frame."""
+    leaving = [[580.0 + 6 * t, 200, 20, 40] for t in range(8)]
+    gap = [np.zeros((0, 4))] * 8
+    entering = [[615.0 - 6 * t, 200, 20, 40] for t in range(6)]
+    found = [np.array([box]) for box in leaving] + gap + [np.array([box]) for box in entering]
+    tracks = list(track(None, iter(found), TRACKER, frame_size=(480, 640)))
+    assert living(tracks[6]) == [1]
+    assert living(tracks[13]) == []
+    assert living(tracks[-1]) == [2]
+
+
+@pytest.mark.parametrize("given", ["frames", "size"])
+def test_what_bounds_the_tracks_is_the_frame_with_pixels_and_without(given):
+    """The last detection, at the border of 64 x 48, reaches beyond where the prediction leaves."""
+    found = [np.array([[46 + 3.0 * t, 10, 10, 20]]) for t in range(5)]
+    found += [np.zeros((0, 4))] * 6
+    frames = np.zeros((len(found), 48, 64, 3), np.uint8)
+    if given == "frames":
+        tracks = list(track(frames, iter(found), TRACKER, use_colours=False))
+    else:
+        tracks = list(track(None, iter(found), TRACKER, frame_size=(48, 64)))
+    assert living(tracks[4]) == [1]
+    assert living(tracks[-1]) == []
+
+
+@pytest.mark.parametrize("every", [2, 7, 12, 13, 14, 15, 19, 24, 25])
+def test_a_motionless_object_that_is_rarely_detected_is_one_object(every):
+    boxes = [(100, 100, 10, 20) if t % every == 0 else None for t in range(12 * every + 1)]
+    identities = alone(boxes)
+    assert [identities[t] for t in range(0, len(boxes), every)] == [[1]] * 13
+
+
+def test_a_motionless_object_that_is_detected_at_random_is_one_object():
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        seen = np.cumsum(rng.integers(1, 25, 20))
+        boxes = [(100, 100, 10, 20) if t == 0 or t in seen else None for t in range(seen[-1] + 1)]
+        identities = alone(boxes)
+        assert [identities[t] for t in seen] == [[1]] * 20
+
+
+# --- coordinates ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("origin", [(5e6, 5e6), (-5e6, 3e5), (4e8, 2e9)])
+@pytest.mark.parametrize("form", ["rows", "iterable"])
+def test_the_origin_of_the_coordinates_changes_nothing(origin, form):
+    def tracked(rows):
+        return list(track(None, rows if form == "rows" else by_frame(rows), TRACKER))
+
+    near, far = tracked(crowd()), tracked(placed(crowd(), *origin))
+    for here, there in zip(near, far, strict=True):
+        np.testing.assert_array_equal(there.identities, here.identities)
+        np.testing.assert_array_equal(there.shown, here.shown)
+        np.testing.assert_array_equal(there.detections, here.detections)
+        alive = np.asarray(here.identities) > 0
+        moved = np.asarray(there.corner_boxes, float) - np.array([*origin, 0, 0])
+        # An ulp of a float64 at 2e9 is 2e-7.
+        np.testing.assert_allclose(moved[alive], here.corner_boxes[alive], atol=1e-5)
+    assert max(max(living(tracks)) for tracks in far) == 4
+
+
+def test_boxes_in_degrees_are_tracked_as_those_in_metres_are():
+    """Boxes of some metres, at 48 degrees north: a ten thousandth of a degree."""
+    rows = crowd()
+    degrees = rows * np.array([1, 1, 1e-5, 1e-5, 1e-5, 1e-5, 1])
+    tracks = list(track(None, placed(degrees, 48.2, 16.4), TRACKER))
+    assert all(living(one) == [1, 2, 3, 4] for one in tracks)
+
+
+def test_the_origin_moves_the_bounds_of_the_frame_too():
+    """A lone object leaves on the right, with coordinates that are large and a frame that is so."""
+    side = 10_000_000
+    found = [np.array([[side - 60.0 + 6 * t, side - 500.0, 20, 40]]) for t in range(8)]
+    found += [np.zeros((0, 4))] * 8
+    tracks = list(track(None, iter(found), TRACKER, frame_size=(side, side)))
+    assert living(tracks[6]) == [1]
+    assert living(tracks[-1]) == []
+
+
+def test_boxes_finer_than_float32_at_their_place_are_refused_by_name():
+    with pytest.raises(ValueError, match=r"boxes: .*float32.*origin"):
+        Detections.from_boxes(np.array([[5e6, 5e6, 0.6, 1.8]]), 2)
+    Detections.from_boxes(np.array([[5e6, 5e6, 600, 1800]]), 2)
+
+
+# --- masked arrays -------------------------------------------------------------------------
+
+
+def masked(rows, which, columns):
+    mask = np.zeros(rows.shape, bool)
+    mask[np.ix_(which, columns)] = True
+    return np.ma.array(rows, mask=mask)
+
+
+def same(some, others):
+    for a, b in zip(some, others, strict=True):
+        for name in ("identities", "shown", "boxes"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def spoilt(rows):
+    """Two rows more in every frame, far off, and which they are."""
+    bad = np.concatenate([placed(rows[rows[:, 2] < 5], 50.0 + n, 70) for n in range(2)])
+    rows = np.concatenate([bad, rows])
+    order = np.argsort(rows[:, 0], kind="stable")
+    return rows[order], np.flatnonzero(order < len(bad))
+
+
+@pytest.mark.parametrize("columns", [range(7), range(2, 6), [3]])
+def test_masked_rows_are_no_detections(columns):
+    rows, bad = spoilt(crowd(8))
+    expected = list(track(None, crowd(8), TRACKER))
+    same(list(track(None, masked(rows, bad, columns), TRACKER)), expected)
+
+
+def test_masked_boxes_of_a_frame_are_no_detections_and_rows_are_those_given():
+    rows = crowd(8)
+    found = []
+    for boxes, scores in by_frame(rows):
+        more = np.concatenate([boxes[:1] + 50, boxes])
+        found.append((masked(more, [0], range(4)), np.concatenate([[0.5], scores])))
+    tracks = list(track(None, iter(found), TRACKER))
+    expected = list(track(None, rows, TRACKER))
+    same(tracks, expected)
+    for a, b in zip(tracks, expected, strict=True):
+        np.testing.assert_array_equal(
+            a.detections, np.where(b.detections < 0, -1, b.detections + 1)
+        )
+
+
+def test_masked_boxes_given_to_a_step_are_no_detections():
+    boxes = np.array([[10.0, 10, 5, 9], [90, 90, 5, 9], [40, 40, 5, 9]])
+    found = Detections.from_boxes(masked(boxes, [1], range(4)), 4, np.array([1, 2, 3.0]))
+    expected = Detections.from_boxes(boxes[[0, 2]], 4, np.array([1, 3.0]))
+    np.testing.assert_array_equal(found.boxes, expected.boxes)
+    np.testing.assert_array_equal(found.scores, expected.scores)
+    assert np.asarray(found.rows)[:2].tolist() == [0, 2]
+
+
+def test_masked_scores_are_an_error():
+    rows = masked(crowd(3), [5], [6])
+    with pytest.raises(ValueError, match=r"score.* masked"):
+        list(track(None, rows, TRACKER))
+    found = [
+        (boxes, np.ma.masked_where(np.arange(4) == 1, scores))
+        for boxes, scores in by_frame(crowd(3))
+    ]
+    with pytest.raises(ValueError, match=r"frame 1: scores .* masked"):
+        list(track(None, iter(found), TRACKER))
+    with pytest.raises(ValueError, match=r"scores: .* masked"):
+        Detections.from_boxes(found[0][0], 4, found[0][1])
+
+
+def test_a_masked_frame_is_no_detection_and_a_mask_without_entries_changes_nothing():
+    rows = crowd(8)
+    expected = list(track(None, rows, TRACKER))
+    same(list(track(None, np.ma.array(rows), TRACKER)), expected)
+    more, bad = spoilt(rows)
+    same(list(track(None, masked(more, bad, [0]), TRACKER)), expected)
+    same(list(track(None, masked(rows, range(9), [1]), TRACKER)), expected)  # the id is not read

@@ -1,0 +1,275 @@
+"""Files of other benchmarks and of labelling tools: each read rightly, or refused by name."""
+
+import numpy as np
+import pytest
+
+from mpfjax.metrics import multi_object_scores
+from mpfjax.metrics.tracking_scores import IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT
+from mpfjax.vision import read_detections, read_tracks, read_truth
+from mpfjax.vision.files.boxes import write_tracks
+from mpfjax.vision.files.sequences import SequenceInfo, read_sequence_info
+
+
+def truth_of(folder, lines, name="gt.txt", **options):
+    (folder / name).write_text("".join(f"{line}\n" for line in lines))
+    return read_truth(folder / name, **options)
+
+
+def ids(rows):
+    return sorted(set(rows[:, 1].tolist()))
+
+
+# --- what the eighth column means ----------------------------------------------------------
+
+BOXES = ["10,10,20,40", "60,10,20,40", "110,10,20,40", "160,10,20,40"]
+
+
+def rows_with(*lasts):
+    return [
+        f"{frame},{id},{box},{last}"
+        for frame in (1, 2, 3)
+        for id, (box, last) in enumerate(zip(BOXES, lasts, strict=True), 1)
+    ]
+
+
+CASES = {
+    "MOT17: a pedestrian, a rider, a car, a pedestrian that does not count": (
+        {"gt.txt": rows_with("1,1,1", "0,2,.8", "0,3,1", "0,1,.2")},
+        ([1], {2: IGNORED_OBJECT, 3: UNSCORED_OBJECT, 4: UNSCORED_OBJECT}),
+    ),
+    "eight columns are somebody's classes": (
+        {"gt.txt": rows_with("1,1", "1,2", "1,3", "0,1")},
+        ([1, 2, 3], {}),
+    ),
+    "eight columns of MOT16, by its name": (
+        {
+            "gt.txt": rows_with("1,1", "1,2", "1,3", "0,1"),
+            "seqinfo.ini": ["[Sequence]", "NAME : MOT16-02"],
+        },
+        ([1], {2: IGNORED_OBJECT, 3: UNSCORED_OBJECT, 4: UNSCORED_OBJECT}),
+    ),
+    "classes beyond MOTChallenge's": (
+        {"gt.txt": rows_with("1,1,1", "1,14,1", "1,3,1", "0,1,1")},
+        ([1, 2, 3], {}),
+    ),
+    "nine columns, whose last is no visibility": (
+        {"gt.txt": rows_with("1,1,4", "1,2,1", "1,3,2", "0,1,3")},
+        ([1, 2, 3], {}),
+    ),
+    "VisDrone": (
+        {"gt.txt": rows_with("1,4,0,2", "1,11,1,0", "0,0,0,0", "0,1,0,1")},
+        ([1], dict.fromkeys((2, 3, 4), IGNORED_REGION)),
+    ),
+    "VisDrone: pedestrians and cars count alike": (
+        {"gt.txt": rows_with("1,1,0,0", "1,4,0,0", "1,10,1,2", "0,0,0,0")},
+        ([1, 2, 3], {4: IGNORED_REGION}),
+    ),
+    "MOT15: places in metres": (
+        {"gt.txt": rows_with("1,3.5,1,0", "1,-2,0,0", "0,1,1,0", "1,1,1,0")},
+        ([1, 2, 4], {}),
+    ),
+    "CVAT: labels.txt names the classes": (
+        {
+            "gt.txt": rows_with("1,1,1.0", "1,2,1.0", "1,3,0.0", "0,1,1.0"),
+            "labels.txt": ["cat", "dog", "person"],
+        },
+        ([1, 2, 3], {}),
+    ),
+    "CVAT: the classes of MOTChallenge": (
+        {
+            "gt.txt": rows_with("1,1,1.0", "1,2,1.0", "1,3,0.0", "0,1,1.0"),
+            "labels.txt": [
+                *("pedestrian", "person on vehicle", "car", "bicycle", "motorbike"),
+                *("non motorized vehicle", "static person", "distractor", "occluder"),
+                *("occluder on the ground", "occluder full", "reflection"),
+            ],
+        },
+        ([1], {2: IGNORED_OBJECT, 3: UNSCORED_OBJECT, 4: UNSCORED_OBJECT}),
+    ),
+    "UAVDT: out of view, occlusion and category": (
+        {
+            "M0203_gt_whole.txt": rows_with("1,1,1", "1,2,1", "2,3,1", "3,1,1"),
+            "M0203_gt_ignore.txt": ["1,-1,300,10,50,50,1,-1,-1", "2,-1,300,10,50,50,1,-1,-1"],
+        },
+        ([1, 2, 3, 4], {-1: IGNORED_REGION}),
+    ),
+    "UAVDT: in view and occlusion": (
+        {"M0203_gt.txt": rows_with("1,1,1", "1,2,1", "1,3,1", "1,-1,-1")},
+        ([1, 2, 3, 4], {}),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_eighth_column_is_read_for_what_the_files_say_that_it_is(tmp_path, name):
+    files, (counted, ignored) = CASES[name]
+    for file, lines in files.items():
+        (tmp_path / file).write_text("\r\n".join(lines))
+    truth = read_truth(tmp_path / next(iter(files)))
+    assert ids(truth.objects) == counted
+    assert len(truth.objects) == 3 * len(counted)
+    places = {float(box.split(",")[0]): id for id, box in enumerate(BOXES, 1)}
+    assert {places.get(row[2], -1): row[1] for row in truth.ignored} == ignored
+
+
+def test_scores_on_a_truth_with_regions_count_what_lies_outside_of_them(tmp_path):
+    """Seven boxes of cars, of which one is missed and one track is false; five in a region."""
+    cars = [f"{t},1,{10 + t},10,20,20,1,4,0,0" for t in range(1, 8)]
+    region = [f"{t},0,200,0,100,100,0,0,0,0" for t in range(1, 8)]
+    truth = truth_of(tmp_path, cars + region)
+    tracks = np.array(
+        [[t, 1, 10 + t, 10, 20, 20] for t in range(1, 7)]
+        + [[t, 2, 210, 10, 20, 20] for t in range(1, 6)]
+        + [[3, 3, 100, 10, 20, 20.0]]
+    )
+    scores = multi_object_scores(tracks, truth.objects, (1, 7), ignored=truth.ignored)
+    assert scores["MOTA"] == pytest.approx(1 - 2 / 7)
+
+
+@pytest.mark.parametrize(
+    ("format", "counted"),
+    [
+        ("motchallenge", [1, 4]),
+        ("cvat", [1, 2, 4]),
+        ("visdrone", [1, 2, 4]),
+        ("uavdt", [1, 2, 3, 4]),
+    ],
+)
+def test_the_format_may_be_said(tmp_path, format, counted):
+    lines = rows_with("1,1", "1,2", "0,1", "1,1")
+    assert ids(truth_of(tmp_path, lines, format=format).objects) == counted
+
+
+def test_a_format_that_does_not_fit_is_refused_by_the_line(tmp_path):
+    lines = rows_with("1,1,1", "1,2,1", "0,14,1", "1,1,1")
+    for format, line in {"motchallenge": 3, "visdrone": 3}.items():
+        with pytest.raises(ValueError, match=rf"gt\.txt, line {line}: has no class from"):
+            truth_of(tmp_path, lines, format=format)
+    with pytest.raises(ValueError, match="format: 'coco' is not one of"):
+        truth_of(tmp_path, lines, format="coco")
+
+
+def test_an_object_without_an_identity_is_refused_by_the_line(tmp_path):
+    """CVAT writes -1 for shapes that are no tracks."""
+    with pytest.raises(ValueError, match=r"gt\.txt, line 2: -1 is no id"):
+        truth_of(tmp_path, ["1,1,5,5,9,9,1,1,1", "1,-1,5,5,9,9,1,1,1"])
+    assert len(truth_of(tmp_path, ["1,1,5,5,9,9,1", "1,-1,5,5,9,9,0"]).objects) == 1
+
+
+# --- what a line may look like --------------------------------------------------------------
+
+READERS = {
+    "truth": lambda path: read_truth(path).objects,
+    "tracks": read_tracks,
+    "detections": lambda path: read_detections(path)[:, :6],
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1,7,10,20,30,40,1\n2,7,11,21,30,40,1\n",
+        "1,7,10,20,30,40,1\r2,7,11,21,30,40,1",
+        "\n\n1, 7, 10, 20, 30, 40, 1,\r\n\r\n2, 7, 11, 21, 30, 40, 1,\r\n",
+        "1\t7\t10\t20\t30\t40\t1\n2\t7\t11\t21\t30\t40\t1\n",
+        "1 7  10 20 30 40 1\n2 7  11 21 30 40 1\n",
+        "1;7;10;20;30;40;1\n2;7;11;21;30;40;1\n",
+        '"1","7","10","20","30","40","1"\n2,7,11,21,30,40,1\n',
+        "frame,id,x,y,w,h,score\n1,7,10,20,30,40,1\n2,7,11,21,30,40,1\n",
+        "\ufeffFrame;Track ID;bb_left;bb_top;bb_width;bb_height;Conf\n1;7;10;20;30;40;1\n"
+        "2;7;11;21;30;40;1",
+        '# frame_id, track_id, x, y, w, h, "not ignored", class_id\n1,7,10,20,30,40,1\n'
+        "2,7,11,21,30,40,1",
+        "<frame_index>,<target_id>,<bbox_left>,<bbox_top>,<bbox_width>,<bbox_height>,<score>\n"
+        "1,7,10,20,30,40,1\n2,7,11,21,30,40,1\n",
+        "% the street, on a Monday\n1,7,10,20,30,40,1\n// later\n2,7,11,21,30,40,1 # the same\n",
+        "1.0,7.0,10,20,30,40,1\n2e0,7,11,21,30,40,1\n",
+    ],
+)
+def test_separators_headers_and_comments_are_read(tmp_path, reader, text):
+    path = tmp_path / "gt.txt"
+    path.write_bytes(text.encode())
+    expected = [[1, 7, 10, 20, 30, 40], [2, 7, 11, 21, 30, 40]]
+    np.testing.assert_array_equal(READERS[reader](path), expected)
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "frame,id,x1,y1,x2,y2,score\n1,7,10,20,30,40,1",
+            "line 1: .* is a header, and its columns",
+        ),
+        (
+            "# frame,id,cx,cy,w,h,score\n1,7,10,20,30,40,1",
+            "line 1: .* is a header, and its columns",
+        ),
+        ("id,frame,x,y,w,h,score\n1,7,10,20,30,40,1", "line 1: .* is a header, and its columns"),
+        ("frame,id,x,y,w,h,class\n1,7,10,20,30,40,1", "line 1: .* is a header, and its columns"),
+        ("frame,id,x,y\n1,7,10,20,30,40,1", "line 1: .* is a header, and its columns"),
+        ("1,7,1,1,3,4,1\nframe,id,x,y,w,h,score\n2,7,1,1,3,4,1", "line 2: 'frame,id.* is not"),
+        ("0,7,1,1,3,4,1\n1,7,1,1,3,4,1", "line 1: lies in frame 0, and frames count from 1"),
+        ("\n1,7,1,1,3,4,1\n-1,7,1,1,3,4,1", "line 3: lies in frame -1, and frames count from 1"),
+        ("1;7;10,5;20;30;40;1", "line 1: .* is not frame"),
+        ("1,7,1,1,3,,1", "line 1: .* is not frame"),
+        ("frame,id,x,y,w,h,score\n", "holds no (boxes|detections)"),
+        ("# nothing\n", "holds no (boxes|detections)"),
+    ],
+)
+def test_other_headers_and_frames_are_refused_by_the_line(tmp_path, reader, text, said):
+    path = tmp_path / "gt.txt"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=rf"gt\.txt(:|,) ?{said}"):
+        READERS[reader](path)
+
+
+def test_what_is_ignored_in_frame_0_is_refused_and_an_empty_list_is_none(tmp_path):
+    (tmp_path / "ignore.txt").write_text("# frame,kind\n")
+    assert len(truth_of(tmp_path, ["1,1,5,5,9,9,1"]).ignored) == 0
+    (tmp_path / "ignore.txt").write_text("0,2,5,5,9,9\n")
+    with pytest.raises(ValueError, match=r"ignore\.txt, line 1: lies in frame 0"):
+        truth_of(tmp_path, ["1,1,5,5,9,9,1"])
+
+
+def test_tracks_of_frame_0_are_not_written(tmp_path):
+    with pytest.raises(ValueError, match=r"rows: .* is not frame,id"):
+        write_tracks(tmp_path / "tracks.txt", np.array([[0, 1, 5, 5, 9, 9.0]]))
+
+
+# --- seqinfo.ini ----------------------------------------------------------------------------
+
+INFO = SequenceInfo("MOT17-02", 30.0, 600, (1080, 1920))
+LINES = "name=MOT17-02\nframeRate=30\nseqLength=600\nimWidth=1920\nimHeight=1080\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"[Sequence]\n{LINES}",
+        f"[Sequence]\n{LINES.upper()}",
+        f"[sequence]\r\n; of a street\r\n{LINES.lower()}".replace("mot", "MOT"),
+        LINES,
+        f"\ufeff[Sequence]\n{LINES}imExt=.jpg\nimDir=img1\nnote=100%\n",
+        "[Sequence]\n" + LINES.replace("=", " : "),
+        "[Sequence]\n" + LINES.replace("\n", "   # as published\n"),
+        "[Sequence]\n" + LINES.replace("name", "  name").replace("frame", "\tframe"),
+        "[Sequence]\n\n" + LINES.replace("600", "600.0") + "\n[More]\nauthor=somebody\n",
+    ],
+)
+def test_the_metadata_of_a_sequence_are_read_however_they_are_written(tmp_path, text):
+    (tmp_path / "seqinfo.ini").write_bytes(text.encode())
+    assert read_sequence_info(tmp_path) == INFO
+
+
+def test_names_may_hold_blanks_and_what_is_missing_is_none(tmp_path):
+    (tmp_path / "seqinfo.ini").write_text("[Sequence]\nname = A street: two\nframeRate=\n")
+    assert read_sequence_info(tmp_path) == SequenceInfo(name="A street: two")
+
+
+@pytest.mark.parametrize("line", ["frameRate=thirty", "frameRate=29,97", "= 30"])
+def test_metadata_that_are_no_numbers_are_refused_by_name(tmp_path, line):
+    (tmp_path / "seqinfo.ini").write_text(f"[Sequence]\n{line}\n")
+    with pytest.raises(ValueError, match=r"seqinfo\.ini"):
+        read_sequence_info(tmp_path)
