@@ -399,7 +399,7 @@ def test_every_public_constructor_and_runner_is_tried():
     assert others == {
         "FilterRun", "StepInfo", "ParticleMixture", "MarginalisedState", "Pool", "join_processes",
         "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
-        "NetworkProposal", "keep_programs",
+        "NetworkProposal", "keep_programs", "check_model",
     } - tried  # fmt: skip
 
 
