@@ -2,8 +2,10 @@
 
 import itertools
 from collections.abc import Generator, Iterable, Iterator
+from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +17,6 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Fault, raise_faults
 from mpfjax.operations.compiling import cpu_options, in_little_memory
 from mpfjax.operations.generator import split_once
-from mpfjax.operations.kept_programs import kept_program
 from mpfjax.vision.boxes.learned_colours import LearnedColourModel
 from mpfjax.vision.boxes.object_moves import best_components
 from mpfjax.vision.boxes.recipes import objects_filters
@@ -62,17 +63,15 @@ def _followed(
     filter = objects_filters(first, boxes)["mpf"]
     model: Any = filter.model
     # It runs once, and takes longer to compile than to run.
-    mixture = kept_program(_begin, (filter,), (key,), in_little_memory(soon=True))(key)
+    compiled: Any = eqx.filter_jit
+    little = in_little_memory(soon=True)
+    mixture = compiled(_begin, compiler_options=little)(filter, key)
     # With XLA's newer emitters it takes longer to compile, and half the time to run.
-    count = kept_program(_counted, (model,), (first,), cpu_options(soon=True))
-    advance = None
+    count = partial(compiled(_counted, compiler_options=cpu_options(soon=True)), model)
+    advance = partial(compiled(_advance, compiler_options=little), filter, len(boxes), key)
     for t, still in enumerate(itertools.chain([first], stills)):
         # An array: each new Python number would compile anew.
-        moving = (np.asarray(t), mixture, count(still))
-        if advance is None:
-            fixed = (filter, len(boxes), key)
-            advance = kept_program(_advance, fixed, moving, in_little_memory(soon=True))
-        mixture, tracks, faults = advance(*moving)
+        mixture, tracks, faults = advance(np.asarray(t), mixture, count(still))
         yield jax.device_get(raise_faults(tracks, faults))
 
 

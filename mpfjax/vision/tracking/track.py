@@ -2,8 +2,10 @@
 
 import contextlib
 from collections.abc import Generator, Iterable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree, UInt8
@@ -11,7 +13,6 @@ from jaxtyping import Array, Float, Key, PyTree, UInt8
 from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole, given
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.compiling import in_little_memory
-from mpfjax.operations.kept_programs import kept_program
 from mpfjax.vision.files.boxes import top_left
 from mpfjax.vision.files.frames import of_one_kind
 from mpfjax.vision.files.threads import read_ahead
@@ -169,7 +170,8 @@ def _tracked(
             moving = (np.asarray(number), state, pixels, observation, motion)
             if advance is None:
                 options = in_little_memory(soon=tracker.filter.num_particles <= _FEW_PARTICLES)
-                advance = kept_program(_advance, (tracker, key), moving, options)
+                compiled: Any = eqx.filter_jit(_advance, compiler_options=options)
+                advance = partial(compiled, tracker, key)
             state, tracks = advance(*moving)
             tracks = jax.device_get(tracks)
             if tracks.full:
