@@ -50,6 +50,7 @@ _WORD_BITS = 5  # a word has 2^5 bits
 _MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # eight counts for each particle
 
 
+@jax.jit
 def spread(
     values: Shaped[Array, "m *rest"], segments: Int[Array, " n"]
 ) -> Shaped[Array, "n *rest"]:
