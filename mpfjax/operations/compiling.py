@@ -62,6 +62,14 @@ def _little_optimised(soon: bool) -> dict[str, int | str]:
     return {}
 
 
+def jit_with(
+    options: dict[str, int | str], function: Callable[..., PyTree]
+) -> Callable[..., PyTree]:
+    """`equinox.filter_jit` with options of the compiler."""
+    with_options: Any = eqx.filter_jit  # whose type does not have them
+    return with_options(function, compiler_options=options)
+
+
 def jit_on_wide_vectors(
     function: Callable[..., PyTree], one_thread: bool = False
 ) -> Callable[..., PyTree]:
@@ -77,8 +85,7 @@ def jit_on_wide_vectors(
     @functools.cache
     def wide() -> Callable[..., PyTree]:
         # Asking JAX for the platform before the first call would keep processes from joining.
-        with_options: Any = eqx.filter_jit
-        return with_options(function, compiler_options=cpu_options(one_thread=one_thread))
+        return jit_with(cpu_options(one_thread=one_thread), function)
 
     @functools.wraps(function)
     def run(*arguments: Any, **named: Any) -> PyTree:
@@ -140,7 +147,8 @@ def keep_programs(folder: str | Path | None = None) -> Path:
     """
     if folder is None:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        folder = _settings.jax_compilation_cache_dir or caches / "mpfjax"
+        own: str | None = _settings.jax_compilation_cache_dir
+        folder = own or caches / "mpfjax"
     kept = Path(folder)
     kept.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

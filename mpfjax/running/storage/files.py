@@ -104,10 +104,12 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     with open(path, "rb") as file:
         try:
             found = np.load(file, allow_pickle=False)
-            arrays = dict(found) if isinstance(found, Mapping) else {"a .npy file": None}
-            for name, array in arrays.items():
-                if not isinstance(array, np.ndarray):
-                    raise ValueError(f"{name} is no array of it")
+            if not isinstance(found, Mapping):
+                raise ValueError("it holds one array")
+            arrays: dict[str, np.ndarray] = dict(found)
+            others = [name for name in arrays if not isinstance(arrays[name], np.ndarray)]
+            if others:
+                raise ValueError(f"{others[0]} is no array")
         except _DAMAGE as error:
             raise ValueError(f"{path}: cut off, damaged or no .npz file ({error})") from error
     return arrays

@@ -2,10 +2,8 @@
 
 import itertools
 from collections.abc import Generator, Iterable, Iterator
-from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +13,7 @@ from mpfjax.checks import check_key, check_type, to_rows
 from mpfjax.filter import Filter, step_and_faults
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Fault, raise_faults
-from mpfjax.operations.compiling import cpu_options, in_little_memory
+from mpfjax.operations.compiling import cpu_options, in_little_memory, jit_with
 from mpfjax.operations.generator import split_once
 from mpfjax.vision.boxes.learned_colours import LearnedColourModel
 from mpfjax.vision.boxes.object_moves import best_components
@@ -63,15 +61,15 @@ def _followed(
     filter = objects_filters(first, boxes)["mpf"]
     model: Any = filter.model
     # It runs once, and takes longer to compile than to run.
-    compiled: Any = eqx.filter_jit
     little = in_little_memory(soon=True)
-    mixture = compiled(_begin, compiler_options=little)(filter, key)
+    mixture = jit_with(little, _begin)(filter, key)
     # With XLA's newer emitters it takes longer to compile, and half the time to run.
-    count = partial(compiled(_counted, compiler_options=cpu_options(soon=True)), model)
-    advance = partial(compiled(_advance, compiler_options=little), filter, len(boxes), key)
+    count = jit_with(cpu_options(soon=True), _counted)
+    advance = jit_with(little, _advance)
     for t, still in enumerate(itertools.chain([first], stills)):
         # An array: each new Python number would compile anew.
-        mixture, tracks, faults = advance(np.asarray(t), mixture, count(still))
+        counted = count(model, still)
+        mixture, tracks, faults = advance(filter, len(boxes), key, np.asarray(t), mixture, counted)
         yield jax.device_get(raise_faults(tracks, faults))
 
 
