@@ -49,7 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(options: argparse.Namespace) -> None:
-    """All of it; a run that was broken off goes on where it was."""
+    """All of it; with --resume, a run that was broken off goes on where it was."""
     out = Path(options.out)
     model = mpfjax.QuadraticModel(SIGMA, SIGMA, LOW, HIGH)
     truth, observations = simulate(options.data_seed)
@@ -70,6 +70,7 @@ def run(options: argparse.Namespace) -> None:
         cells = mpfjax.run_study(
             study,
             unfinished,
+            resume=options.resume,
             seeds_at_once=SEEDS_AT_ONCE,
             cells_at_once=2,
             slots=shared_slots(options.particles),
@@ -114,6 +115,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         "--regroup-every", type=whole(), default=1, metavar="K", help="steps, not at every one"
     )
     parser.add_argument("--out", default="results/score_vs_particles", metavar="DIR")
+    parser.add_argument(
+        "--resume", action="store_true", help="take over what an interrupted run has finished"
+    )
     parser.add_argument("--seed", type=seed, default=0, help="of all the runs")
     parser.add_argument(
         "--data-seed",

@@ -70,7 +70,6 @@ from mpfjax.proposals import AbstractProposal as AbstractProposal
 from mpfjax.proposals import GaussNewtonProposal as GaussNewtonProposal
 from mpfjax.proposals import NetworkProposal as NetworkProposal
 from mpfjax.running.islands import run_islands as run_islands
-from mpfjax.running.processes import join_processes as join_processes
 from mpfjax.running.run import monte_carlo as monte_carlo
 from mpfjax.running.run import run_filter as run_filter
 from mpfjax.running.scan import FilterRun as FilterRun

@@ -5,6 +5,7 @@ A number out of range is an error of argparse, with exit status 2.
 
 import argparse
 import contextlib
+import gc
 import json
 import math
 import os
@@ -138,6 +139,9 @@ def exit_status(run: Callable[[], None], arguments: Sequence[str] | None = ()) -
     """
     with contextlib.suppress(OSError, RuntimeError):  # the latter where there is no home
         keep_programs()
+    # Tracing leaves so many objects that Python's collector takes a third of the time before a
+    # first result, by going through them again and again.
+    gc.set_threshold(100_000, 20, 20)
     try:
         run()
     except (ValueError, OSError, ImportError) as error:

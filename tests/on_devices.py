@@ -120,7 +120,7 @@ def leaves(**runs):
 def main(file, port=None, process="0"):
     jax.config.update("jax_enable_x64", True)
     if port is not None:
-        mpfjax.join_processes(f"localhost:{port}", 2, int(process), timeout_seconds=60)
+        jax.distributed.initialize(f"localhost:{port}", 2, int(process), initialization_timeout=60)
     runs = leaves(replicates=replicates(), islands=islands())
     told: dict = {"devices": len(jax.devices())}
     if port is not None:

@@ -40,4 +40,4 @@ def run_in_process(directory, num_cells, compiled):
     jax.config.update("jax_compilation_cache_dir", str(compiled))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-    mpfjax.run_study(small_study(num_cells), directory)
+    mpfjax.run_study(small_study(num_cells), directory, resume=True)

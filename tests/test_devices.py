@@ -98,29 +98,6 @@ def on_one_device():
         return on_devices.leaves(replicates=on_devices.replicates(), islands=on_devices.islands())
 
 
-class TestJoiningProcesses:
-    def test_without_a_cluster_or_the_others_it_ends_with_a_clear_error(self):
-        script = (
-            "import mpfjax, sys\n"
-            "try: mpfjax.join_processes()\n"
-            "except ValueError as error: print(error, file=sys.stderr)\n"
-            f"mpfjax.join_processes('localhost:{free_port()}', 2, 0, timeout_seconds=0.5)\n"
-            "print('joined', file=sys.stderr)"
-        )
-        process = start(program=("-c", script))
-        _, error = process.communicate(timeout=60)
-        assert process.returncode == 1
-        assert "coordinator_address, num_processes, process_id: " in error
-        assert "process 0 of 2 has waited 0.5 s for all processes to join at localhost" in error
-        assert "joined" not in error
-
-    def test_bad_arguments(self):
-        with pytest.raises(ValueError, match="timeout_seconds: 0 is not positive"):
-            mpfjax.join_processes(timeout_seconds=0)
-        with pytest.raises(ValueError, match=r"process_id: 2 is not in \[0, 2\)"):
-            mpfjax.join_processes("localhost:1", 2, 2)
-
-
 MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
 OBSERVATIONS = jnp.array(on_devices.OBSERVATIONS)
 

@@ -10,7 +10,6 @@ import pytest
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser, SkipParser
 
-from mpfjax.operations import compiling
 from tests.marking import quick_of
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -35,7 +34,6 @@ def stem(page: Path) -> str:
 @pytest.mark.parametrize("page", quick_of(WITH_CODE, QUICK_PAGES), ids=stem)
 def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     """All blocks of a page in their order, as a reader runs them: without the tests' strictness."""
-    monkeypatch.setattr(compiling, "_kept_folders", [])  # where `keep_programs` notes its folder
     document = sybil.parse(page)
     if page.parent.name == "gallery":  # there the code draws the page's picture
         monkeypatch.chdir(tmp_path)

@@ -11,7 +11,6 @@ from scipy.stats import multivariate_normal
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter
 from mpfjax.filter import Start
-from mpfjax.operations.functions import interned
 from tests.marking import thorough
 from tests.precision import float64
 from tests.registry import CHAINS
@@ -529,7 +528,7 @@ class TestWhatAUserHandsIt:
         regrouping = [m for m in (*filter.moves, *filter._initial_moves) if hasattr(m, "features")]
         assert len(regrouping) == 4
         for move in regrouping:
-            assert move.features.function is interned(first)
+            assert move.features.function is first
             assert move.features.scale == (3.0,)
         own = mpfjax.KMeans(2, features=lambda states: states[:, 1])
         filter = getattr(mpfjax, make)(Drift(), 20, 2, features=first, kmeans=own, regroup_every=1)

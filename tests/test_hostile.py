@@ -397,7 +397,7 @@ def test_every_public_constructor_and_runner_is_tried():
     others = {name for name in public - tried if not name.startswith(("Abstract", "_"))}
     # Records of results, what takes no argument to check, and what other tests are about.
     assert others == {
-        "FilterRun", "StepInfo", "ParticleMixture", "MarginalisedState", "Pool", "join_processes",
+        "FilterRun", "StepInfo", "ParticleMixture", "MarginalisedState", "Pool",
         "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
         "NetworkProposal", "keep_programs", "check_model",
     } - tried  # fmt: skip

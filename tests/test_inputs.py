@@ -374,7 +374,7 @@ class TestRunners:
             study.filters, [32], self.KEY[None], OBSERVATIONS, inputs=repeated(built_in())
         )
         with pytest.raises(ValueError, match=r"holds another study \(inputs"):
-            mpfjax.run_study(other, tmp_path)
+            mpfjax.run_study(other, tmp_path, resume=True)
         island = mpfjax.run_islands(
             self.KEY, self.FILTER, OBSERVATIONS, nothing, num_islands=1, inputs=INPUTS
         )

@@ -53,7 +53,7 @@ def test_the_folder_is_the_users_own_unless_jax_has_one(settings, tmp_path):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path / "of jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 7.0)
     assert keep_programs() == tmp_path / "of jax"
-    assert CONFIG.jax_persistent_cache_min_compile_time_secs == 7.0
+    assert CONFIG.jax_persistent_cache_min_compile_time_secs == 0.0  # every program is kept
     jax.config.update("jax_compilation_cache_dir", None)
     assert keep_programs() == tmp_path / "caches" / "mpfjax"
     assert CONFIG.jax_compilation_cache_dir == str(tmp_path / "caches" / "mpfjax")

@@ -39,7 +39,7 @@ FLOORS = {
         "floats", "gradients", "platforms", "stored", "indexing", "prefix_sums", "maxima",
         "logarithms", "segments", "runs", "choices", "matrices", "coordinates", "stacks",
         "gaussians", "across_islands", "generator", "positions", "sobol", "hilbert", "sorting",
-        "compiling", "functions", "kept_programs",
+        "compiling",
     ),
     "moves": (
         "base", "local_quadratics", "eve_indices", "island_interaction", "every",
@@ -48,8 +48,7 @@ FLOORS = {
     ),
     "vision": ("files", "colour", "scenes", "tracking", "boxes"),
     "running": (
-        "storage", "processes", "devices", "threads", "progress", "scan", "run", "islands",
-        "studies",
+        "storage", "devices", "threads", "progress", "scan", "run", "islands", "studies",
     ),
 }  # fmt: skip
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")

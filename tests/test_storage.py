@@ -4,7 +4,6 @@ import errno
 import io
 import os
 import struct
-import tracemalloc
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
 
@@ -158,6 +157,13 @@ class TestFiles:
         with pytest.raises(ValueError, match="cut off, damaged"):
             load_arrays(path)
 
+    def test_one_array_of_numpy_is_no_archive(self, path):
+        path.parent.mkdir()
+        with path.open("wb") as file:
+            np.save(file, np.ones(3))
+        with pytest.raises(ValueError, match=r"checkpoint.npz: cut off, damaged or no .npz file"):
+            load_arrays(path)
+
     @pytest.mark.parametrize("is_compressed", [False, True])
     def test_whichever_bit_flips_there_is_no_other_error(self, path, is_compressed):
         write_arrays(path, {"x": np.arange(3.0)})
@@ -242,43 +248,19 @@ class TestHeadersThatLie:
             npy((2, 10**30), content=bytes(16)),
             npy((10**9, 10**9, 10**9)),
             npy((3,), content=bytes(16)),
-            npy((1,), content=bytes(16)),
             npy((-1, -2), content=bytes(16)),
             npy((0, 10**30)),
-            npy((10**12,), "<U0"),
             npy((1,), "|O", bytes(8)),
             b"\x93NUMPY\x01\x00" + struct.pack("<H", 9000) + b"-" * 8999 + b"1",
             b"\x93NUMPY\x09\x00" + bytes(100),
             b"",
         ],
-        ids=range(13),
+        ids=range(11),
     )
     @pytest.mark.parametrize("compression", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
     def test_are_errors_that_name_the_file(self, path, content, compression):
         write_archive(path, {"x": content}, compression)
         with pytest.raises(ValueError, match=r"checkpoint.npz: cut off, damaged"):
-            load_arrays(path)
-
-    @pytest.mark.parametrize("both", [False, True])
-    def test_allocate_nothing(self, path, both):
-        """Also where the archive's own table claims as much as the header."""
-        size = 300_000_000
-        write_archive(path, {"x": npy((size,), "|u1", bytes(16))})
-        if both:
-            told = len(npy((size,), "|u1")) + size
-            content, true = path.read_bytes(), len(npy((size,), "|u1")) + 16
-            path.write_bytes(content.replace(struct.pack("<L", true), struct.pack("<L", told)))
-        tracemalloc.start()
-        try:
-            with pytest.raises(ValueError, match="cut off, damaged"):
-                load_arrays(path)
-            assert tracemalloc.get_traced_memory()[1] < 10_000_000
-        finally:
-            tracemalloc.stop()
-
-    def test_an_unusual_compression_is_refused(self, path):
-        write_archive(path, {"x": npy((2,), content=bytes(16))}, zipfile.ZIP_LZMA)
-        with pytest.raises(ValueError, match=r"checkpoint.npz: cut off, damaged.*compress"):
             load_arrays(path)
 
     @pytest.mark.parametrize("order", ["C", "F"])

@@ -145,10 +145,8 @@ def introduce(options: argparse.Namespace) -> dict[str, Any]:
         if options.devices is not None:
             jax.config.update("jax_num_cpu_devices", options.devices)
         if options.processes is not None:
-            import mpfjax
-
             address, number, index = options.processes
-            mpfjax.join_processes(address, int(number), int(index))
+            jax.distributed.initialize(address, int(number), int(index))
         found["devices"] = [device.device_kind for device in jax.devices()]
     libraries.prepare(options.library, JOBS[options.job], 2, 2)
     return found

@@ -15,7 +15,6 @@ from mpfjax.checks import (
     to_array,
 )
 from mpfjax.mixture import flatten_states
-from mpfjax.operations.functions import interned
 from mpfjax.operations.matrices import row_sums
 
 
@@ -39,9 +38,7 @@ class PairwiseRepulsion(eqx.Module):
 
     strength: Float[Array, ""] = eqx.field(converter=to_array("strength"))
     radius: Float[Array, ""] = eqx.field(converter=to_array("radius"))
-    position: Callable[[PyTree], Array] | None = eqx.field(
-        static=True, default=None, converter=interned
-    )
+    position: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None)
     compact: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self) -> None:

@@ -19,7 +19,6 @@ from mpfjax.models.base import (
 )
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.inputs import replaced, takes_inputs, with_inputs
-from mpfjax.operations.functions import interned
 from mpfjax.operations.generator import split
 
 # A number of particles that is hardly ever the length of a parameter's axis.
@@ -83,7 +82,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
         self.shared_inputs = shared_inputs
         self.object_model = object_model
         self.num_objects = int(num_objects)
-        self.interaction = interned(interaction)
+        self.interaction = interaction
         self.shared_observation = shared_observation
         if per_object is None:
             per_object = _finds_object_axis(object_model, self.num_objects)

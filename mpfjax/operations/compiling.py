@@ -1,4 +1,4 @@
-"""Compilation: on wide vectors, once for all values of a model's floats, and kept in files."""
+"""Compilation: on wide vectors, once for all values of a model's floats, and JAX's own cache."""
 
 import functools
 import os
@@ -62,6 +62,14 @@ def _little_optimised(soon: bool) -> dict[str, int | str]:
     return {}
 
 
+def jit_with(
+    options: dict[str, int | str], function: Callable[..., PyTree]
+) -> Callable[..., PyTree]:
+    """`equinox.filter_jit` with options of the compiler."""
+    with_options: Any = eqx.filter_jit  # whose type does not have them
+    return with_options(function, compiler_options=options)
+
+
 def jit_on_wide_vectors(
     function: Callable[..., PyTree], one_thread: bool = False
 ) -> Callable[..., PyTree]:
@@ -77,8 +85,7 @@ def jit_on_wide_vectors(
     @functools.cache
     def wide() -> Callable[..., PyTree]:
         # Asking JAX for the platform before the first call would keep processes from joining.
-        with_options: Any = eqx.filter_jit
-        return with_options(function, compiler_options=cpu_options(one_thread=one_thread))
+        return jit_with(cpu_options(one_thread=one_thread), function)
 
     @functools.wraps(function)
     def run(*arguments: Any, **named: Any) -> PyTree:
@@ -127,11 +134,10 @@ def _older_emitters() -> dict[str, int | str]:
 def keep_programs(folder: str | Path | None = None) -> Path:
     """Keep compiled programs in a folder: a later process that needs the same ones starts sooner.
 
-    This is JAX's persistent compilation cache, for programs of any size; those of `track` and
-    `follow_boxes` are kept in a form that need not even be traced. A program is found again if the
-    code, the shapes and types, the options, JAX and the processor are the same; numbers in a model
-    may differ. Nothing is ever deleted, but you may delete the folder at any time. Its content is
-    executed: do not let others write to it.
+    This switches on JAX's persistent compilation cache, for every program of the process, whatever
+    its size and its time to compile. A program is traced and then found by its operations, its
+    options, JAX and the processor; numbers in a model may differ. Nothing is ever deleted, but you
+    may delete the folder at any time. Its content is executed: do not let others write to it.
 
     - `folder`: None takes `jax_compilation_cache_dir` if that is set, and otherwise `mpfjax` in the
       user's folder of caches ($XDG_CACHE_HOME, or ~/.cache).
@@ -145,22 +151,13 @@ def keep_programs(folder: str | Path | None = None) -> Path:
         folder = own or caches / "mpfjax"
     kept = Path(folder)
     kept.mkdir(parents=True, exist_ok=True)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     if str(kept) != _settings.jax_compilation_cache_dir:
         jax.config.update("jax_compilation_cache_dir", str(kept))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
         # An earlier compilation may have decided that there is no cache.
         compilation_cache.reset_cache()
-    _kept_folders[:] = [kept]
     return kept
-
-
-_kept_folders: list[Path] = []
-
-
-def kept_folder() -> Path | None:
-    """The folder that `keep_programs` was last given in this process, None where it was not."""
-    return _kept_folders[0] if _kept_folders else None
 
 
 def is_traced(tree: PyTree) -> bool:

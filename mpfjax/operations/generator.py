@@ -257,11 +257,19 @@ def threefry(
     keys = (key[0], key[1], key[0] ^ key[1] ^ jnp.uint32(_PARITY))
     high, low = high + keys[0], low + keys[1]
     for group in range(5):
-        for rotation in _ROTATIONS[group % 2]:
-            high = high + low
-            low = high ^ _rotate_left(low, rotation)
+        high, low = _rounds(high, low, _ROTATIONS[group % 2])
         high = high + keys[(group + 1) % 3]
         low = low + keys[(group + 2) % 3] + jnp.uint32(group + 1)
+    return high, low
+
+
+@partial(jax.jit, static_argnums=2)
+def _rounds(
+    high: UInt32[Array, " *shape"], low: UInt32[Array, " *shape"], rotations: tuple[int, ...]
+) -> tuple[UInt32[Array, " *shape"], UInt32[Array, " *shape"]]:
+    for rotation in rotations:
+        high = high + low
+        low = high ^ _rotate_left(low, rotation)
     return high, low
 
 

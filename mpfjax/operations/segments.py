@@ -50,6 +50,7 @@ _WORD_BITS = 5  # a word has 2^5 bits
 _MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # eight counts for each particle
 
 
+@jax.jit
 def spread(
     values: Shaped[Array, "m *rest"], segments: Int[Array, " n"]
 ) -> Shaped[Array, "n *rest"]:
@@ -83,6 +84,7 @@ def spread_stored(
     return spread(stored(values), segments)
 
 
+@partial(jax.jit, static_argnames="num_segments")
 def segment_sum(
     values: Float[Array, "n *rest"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, "num_segments *rest"]:
@@ -131,6 +133,7 @@ def _is_handful(n: int, num_segments: int) -> bool:
     return n <= num_segments and n * num_segments <= _HANDFUL
 
 
+@partial(jax.jit, static_argnames="num_segments")
 def segment_max(
     values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " num_segments"]:
@@ -141,6 +144,7 @@ def segment_max(
     return largest(jnp.where(member, values[None], jnp.array(-jnp.inf, values.dtype)), axis=1)
 
 
+@partial(jax.jit, static_argnames="num_segments")
 def segment_any(
     mask: Bool[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Bool[Array, " num_segments"]:
@@ -173,6 +177,7 @@ def segment_reduce(
     return REDUCTIONS[how](own.astype(values.dtype), axis=1)
 
 
+@partial(jax.jit, static_argnames="num_segments")
 def segment_counts(
     mask: Bool[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Int[Array, " num_segments"]:
@@ -257,6 +262,7 @@ def segment_log_sum_exp(
     return log_or_nothing(total) + shift
 
 
+@partial(jax.jit, static_argnames="num_segments")
 def segment_softmax(
     log_values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " n"]:

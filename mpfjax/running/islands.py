@@ -13,7 +13,6 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import as_series
 from mpfjax.operations.across_islands import DEVICE_AXIS, ISLAND_AXIS
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
-from mpfjax.operations.functions import interned
 from mpfjax.running.devices import choose_devices, over_devices
 from mpfjax.running.scan import FilterRun, check_run, checked, scan
 
@@ -58,7 +57,6 @@ def run_islands(
     """
     check_key(key)
     check_run(filter, collect)
-    collect = interned(collect)
     check_whole(num_islands=num_islands)
     series = as_series(observations, inputs, missing, filter.model)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_islands, dtype=jnp.uint32))

@@ -14,7 +14,6 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import Series, as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
-from mpfjax.operations.functions import interned
 from mpfjax.operations.generator import split, split_keys
 from mpfjax.running.devices import choose_devices, over_devices
 from mpfjax.running.progress import shown_progress
@@ -62,7 +61,6 @@ def run_filter(
     """
     check_key(key)
     check_run(filter, collect)
-    collect = interned(collect)
     check_flag(progress=progress)
     series = as_series(observations, inputs, missing, filter.model)
     with shown_progress(progress, series.length, (key, filter, series)) as bar:
@@ -89,11 +87,11 @@ def monte_carlo(
     `run_filter`; run k equals `run_filter(keys[k], ...)`.
 
     - `devices`: the devices that share the runs. None is every device, of all processes after
-      `join_processes`. A number means the first few, a sequence those of `jax.devices()`. The
-      number of keys need not be a multiple of theirs. Devices exchange nothing. The result is
-      gathered on the first one, and each process has all of it. Under the caller's own jit, grad
-      or vmap, None is one device. On one CPU device, the runs are shared by a thread for each
-      processor, if there is enough to do.
+      `jax.distributed.initialize`. A number means the first few, a sequence those of
+      `jax.devices()`. The number of keys need not be a multiple of theirs. Devices exchange
+      nothing. The result is gathered on the first one, and each process has all of it. Under the
+      caller's own jit, grad or vmap, None is one device. On one CPU device, the runs are shared by
+      a thread for each processor, if there is enough to do.
     - `slots`: the length of the particle arrays, at least N; the slots after the first N stay
       empty. None is N. Filters that differ in N alone compile once if they have the same `slots`:
       1000, for example, for N = 50, 200 and 1000; but the choice of x_0 by y_1 among more draws
@@ -106,7 +104,6 @@ def monte_carlo(
     """
     check_key(keys, "keys", batch=True)
     check_run(filter, collect)
-    collect = interned(collect)
     check_flag(progress=progress)
     check_whole(**given(slots=slots))
     series = as_series(observations, inputs, missing, filter.model)

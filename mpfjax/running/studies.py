@@ -1,6 +1,8 @@
 """Monte Carlo studies over filters, numbers of particles and settings; they can be interrupted."""
 
+import datetime
 import hashlib
+import importlib
 import itertools
 import json
 import os
@@ -17,22 +19,37 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 from tqdm import tqdm
 
-from mpfjax.checks import check_callable, check_key, check_type, check_whole, given, shown
+from mpfjax.checks import (
+    check_callable,
+    check_flag,
+    check_key,
+    check_type,
+    check_whole,
+    given,
+    shown,
+)
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import as_series, check_series
+from mpfjax.operations.floats import default_float
 from mpfjax.running.run import monte_carlo
 from mpfjax.running.scan import FilterRun
 from mpfjax.running.storage.descriptions import describe, differences, fingerprint, named
-from mpfjax.running.storage.files import as_path, load_arrays, write_arrays, write_whole
+from mpfjax.running.storage.files import (
+    as_path,
+    load_arrays,
+    read_description,
+    write_arrays,
+    write_whole,
+)
 
 Values = Sequence[Any] | np.ndarray | Array
 
 _MANIFEST = "study.json"
 _CELL = "cell"
-_TAKEN = ("filter", "num_particles", _CELL)
-# Names as `_cells` makes them; none of them leads out of the folder.
-_CELL_FILE = re.compile(r"\d+-[\w.+-]*\.npz")
+_STUDY = "study"
+_TAKEN = ("filter", "num_particles", _CELL, _STUDY)
+_CELL_FILE = re.compile(r"(\d+)-[\w.+-]*\.npz")  # as `_cells` names them
 
 
 def log_evidence(run: FilterRun) -> dict[str, Array]:
@@ -100,11 +117,12 @@ def run_study(
     study: Study,
     directory: str | os.PathLike[str],
     *,
+    resume: bool = False,
     seeds_at_once: int | None = None,
     cells_at_once: int = 1,
     slots: int | None = None,
 ) -> list[dict[str, Any]]:
-    """Run every cell of a study, and go on where an earlier call was interrupted or killed.
+    """Run every cell of a study; with `resume`, go on where it was interrupted or killed.
 
     Each cell is written to a file of its own in `directory` as soon as it is finished, so only
     unfinished cells can be lost. Returns one dict for each cell: its `filter`, `num_particles`,
@@ -116,6 +134,10 @@ def run_study(
                              observations, settings={"noise": [0.1, 0.3]})
         results = mpfjax.run_study(study, "results/circle")
 
+    - `resume`: take over the finished cells that `directory` holds, and print how many these are
+      and of which day. They are of this study if names (of filters, `measure` and `collect`),
+      sizes, settings, keys, data and versions are the same. What functions do cannot be compared:
+      take a new directory after you change one. False refuses a directory that holds cells.
     - `seeds_at_once`: how many seeds share one `vmap`; None is all. Set it if memory is short.
     - `cells_at_once`: with 2, one cell compiles while another runs; a kill may lose both. Several
       processes must work on the same cell, and so run one cell at a time.
@@ -124,40 +146,41 @@ def run_study(
       where the study spends more time on compiling than on running. A filter that fills every
       slot, such as `independent_particle_filters`, raises an error.
 
-    Raises `ValueError` before anything runs: for an argument of another kind, for the `directory`
-    of another study, naming what differs, and for files in it that are cut off. Delete such files,
-    and only their cells run again. Raises `OSError` if a cell cannot be written, for example on a
-    full disk; finished cells stay. Filters are compared by their structure and numbers, `measure`
-    and `collect` only by their names: use a new directory after you change their code. Several
-    processes share one directory, which the first one writes. Use it where a loop over
-    `monte_carlo` would take long.
+    Raises `ValueError` before anything runs: for an argument of another kind, for a `directory`
+    that holds cells, and with `resume` for one of another study, naming what differs, and for files
+    in it that are cut off. Delete such files, and only their cells run again. Raises `OSError` if a
+    cell cannot be written, for example on a full disk; finished cells stay. Several processes share
+    one directory, which the first one writes. Use it where a loop over `monte_carlo` would take
+    long.
     """
     check_type(Study, "a Study", study=study)
-    check_whole(**given(seeds_at_once=seeds_at_once, slots=slots))
-    check_whole(cells_at_once=cells_at_once)
+    check_whole(**given(seeds_at_once=seeds_at_once, slots=slots), cells_at_once=cells_at_once)
+    check_flag(resume=resume)
     directory = _as_directory(directory)
     cells = _cells(study)
-    manifest = _claim(directory, study, cells)
-    results = _finished(directory, manifest)
-    pending = [cell for cell in cells if cell.file not in results]
+    digest = _claim(directory, _manifest(study), resume)
+    results = _finished(directory, digest)
+    pending = [cell for cell in cells if cell.text not in results]
+    if results and jax.process_index() == 0:
+        print(f"{directory}: {_said(directory)} taken over, {len(pending)} to run")
     if jax.process_count() > 1:
         cells_at_once = 1
 
-    def finish(cell: _Cell) -> str:
+    def finish(cell: _Cell) -> None:
         try:
             measured = _measure(study, cell, seeds_at_once, slots)
         except Exception as error:
             error.add_note(f"in the cell {cell.description}")
             raise
         if jax.process_index() == 0:
-            write_arrays(directory / cell.file, measured | {_CELL: _mark(manifest, cell.file)})
-        results[cell.file] = measured
-        return cell.file
+            mark = {_CELL: np.array(json.dumps({_STUDY: digest} | cell.description))}
+            write_arrays(directory / cell.file, measured | mark)
+        results[cell.text] = cell.description | measured
 
     with tqdm(total=len(cells), initial=len(results), unit="cell", disable=None) as bar:
         for _ in _in_turn(finish, pending, cells_at_once):
             bar.update()
-    return [cell.description | results[cell.file] for cell in cells]
+    return [results[cell.text] for cell in cells]
 
 
 def read_study(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
@@ -168,10 +191,7 @@ def read_study(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
     another study.
     """
     directory = _as_directory(directory)
-    manifest = _read_manifest(directory / _MANIFEST)
-    results = _finished(directory, manifest)
-    cells = manifest["cells"]
-    return [cells[file]["is"] | results[file] for file in cells if file in results]
+    return list(_finished(directory, _digest(_read_manifest(directory / _MANIFEST))).values())
 
 
 @dataclass(frozen=True)
@@ -180,6 +200,7 @@ class _Cell:
 
     file: str
     description: dict[str, Any]
+    text: str
     filter: Filter
 
 
@@ -200,7 +221,7 @@ def _cells(study: Study) -> list[_Cell]:
         as_series(study.observations, study.inputs, study.missing, filter.model)
         words = [name, f"N{num_particles}", *(f"{k}_{v}" for k, v in settings.items())]
         stem = re.sub(r"[^\w.+-]+", "_", "-".join([f"{index:04d}", *words]))[:100]
-        cells.append(_Cell(f"{stem}.npz", description, filter))
+        cells.append(_Cell(f"{stem}.npz", description, json.dumps(description), filter))
     return cells
 
 
@@ -237,8 +258,10 @@ def _plain(name: str, value: Any) -> Any:
     return value
 
 
-def _manifest(study: Study, cells: list[_Cell]) -> dict[str, Any]:
+def _manifest(study: Study) -> dict[str, Any]:
     """All that identifies the study of a directory, in a form that JSON can hold."""
+    package = importlib.import_module(__name__.partition(".")[0])
+    versions = [f"mpfjax {package.__version__}", f"jax {jax.__version__}"]
     manifest = {
         "axes": _axes(study),
         "keys": _summary(study.keys),
@@ -246,11 +269,8 @@ def _manifest(study: Study, cells: list[_Cell]) -> dict[str, Any]:
         "measure": named(study.measure),
         "collect": named(study.collect),
         "missing": study.missing,
-        **({} if study.inputs is None else {"inputs": _summary(study.inputs)}),
-        "cells": {
-            cell.file: {"is": cell.description, "filter": fingerprint(cell.filter)}
-            for cell in cells
-        },
+        "inputs": None if study.inputs is None else _summary(study.inputs),
+        "versions": [*versions, str(default_float())],
     }
     return json.loads(json.dumps(manifest))
 
@@ -260,55 +280,39 @@ def _summary(tree: PyTree) -> str:
     return f"{shapes} ({fingerprint(tree)[:16]})"
 
 
-def _claim(directory: Path, study: Study, cells: list[_Cell]) -> dict[str, Any]:
-    """The manifest of this study, written into its directory unless it is there already."""
-    manifest, path = _manifest(study, cells), directory / _MANIFEST
-    if path.exists():
+def _digest(manifest: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
+
+
+def _claim(directory: Path, manifest: dict[str, Any], resume: bool) -> str:
+    """The digest of this study, whose manifest the directory then holds."""
+    path = directory / _MANIFEST
+    if _cell_files(directory) and not resume:
+        raise ValueError(
+            f"directory: {directory} holds {_said(directory)}; say resume to take over those of"
+            " this study, or take another directory"
+        )
+    if resume and path.exists():
         there = _read_manifest(path)
-        # As text, in which a NaN is equal to itself.
-        if json.dumps(there, sort_keys=True) != json.dumps(manifest, sort_keys=True):
+        # By their digests, since a NaN is equal to itself only as text.
+        if _digest(there) != _digest(manifest):
+            found, own = ({**each.pop("axes"), **each} for each in (there, manifest.copy()))
             raise ValueError(
-                f"directory: {directory} holds another study ({_difference(there, manifest)});"
+                f"directory: {directory} holds another study ({differences(found, own)});"
                 " take another directory, or delete that one"
             )
     elif jax.process_index() == 0:
         content = json.dumps(manifest, indent=1) + "\n"
         write_whole(path, lambda file: file.write(content.encode()))
-    return manifest
-
-
-def _difference(there: dict[str, Any], here: dict[str, Any]) -> str:
-    """What differs, by name; the filters' inside where nothing else does."""
-    there, here = there.copy(), here.copy()
-    cells, own = there.pop("cells"), here.pop("cells")
-    there |= there.pop("axes")
-    here |= here.pop("axes")
-    if there != here:
-        return differences(there, here)
-    other = [file for file in own if cells.get(file) != own[file]]
-    return f"the filters of {len(other)} cells have other moves or numbers, first {other[0]}"
+    return _digest(manifest)
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
+        return manifest | {"axes": dict(manifest["axes"])}
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise ValueError(f"{path}: cut off, damaged or no study ({error})") from error
-    axes, cells = (_mapping(manifest, name) for name in ("axes", "cells"))
-    if not axes or not cells:
-        raise ValueError(f"{path}: damaged or no study, for it has no axes or no cells")
-    for file, cell in cells.items():
-        if not _CELL_FILE.fullmatch(file):
-            raise ValueError(f"{path}: damaged or no study, for {file!r} is no name of a cell")
-        if _mapping(cell, "is").keys() != axes.keys() or not isinstance(cell.get("filter"), str):
-            raise ValueError(f"{path}: damaged or no study, for {file!r} is {shown(cell)}")
-    return manifest
-
-
-def _mapping(content: Any, name: str) -> dict[str, Any]:
-    """The mapping in JSON by this name; empty if it is something else."""
-    found = content.get(name) if isinstance(content, dict) else None
-    return found if isinstance(found, dict) else {}
 
 
 def _as_directory(directory: str | os.PathLike[str]) -> Path:
@@ -318,28 +322,34 @@ def _as_directory(directory: str | os.PathLike[str]) -> Path:
     return path
 
 
-def _mark(manifest: dict[str, Any], file: str) -> np.ndarray:
-    """The text that identifies the study and the cell of a file."""
-    digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
-    return np.array(json.dumps({"study": digest} | manifest["cells"][file]["is"]))
+def _cell_files(directory: Path) -> list[Path]:
+    """The files of finished cells, in the order of the cells."""
+    found = [(_CELL_FILE.fullmatch(path.name), path) for path in directory.glob("*.npz")]
+    return [path for _, path in sorted((int(name[1]), path) for name, path in found if name)]
 
 
-def _finished(directory: Path, manifest: dict[str, Any]) -> dict[str, dict[str, np.ndarray]]:
-    """The measured arrays of the cells that are there, by file."""
+def _said(directory: Path) -> str:
+    """How many cells the directory holds, and of which day."""
+    times = [path.stat().st_mtime for path in _cell_files(directory)]
+    days = sorted({str(datetime.date.fromtimestamp(time)) for time in (min(times), max(times))})
+    return f"{len(times)} finished cells of {' to '.join(days)}"
+
+
+def _finished(directory: Path, digest: str) -> dict[str, dict[str, Any]]:
+    """The finished cells, described and with what was measured, by the text of the description."""
     # An error, not a warning and a second run: if one file is damaged, others may be as well.
     results, faults = {}, []
-    for file in manifest["cells"]:
-        path = directory / file
-        if not path.exists():
-            continue
+    for path in _cell_files(directory):
         try:
             arrays = load_arrays(path)
+            description = read_description(path, arrays, _CELL)
+            del arrays[_CELL]
         except ValueError as error:
             faults.append(str(error))
             continue
-        if str(arrays.pop(_CELL, None)) != str(_mark(manifest, file)):
-            faults.append(f"{path}: results of another study or cell")
-        results[file] = arrays
+        if description.pop(_STUDY, None) != digest:
+            faults.append(f"{path}: results of another study")
+        results[json.dumps(description)] = description | arrays
     if faults:
         raise ValueError("; ".join([*faults, "delete these, and only their cells are run again"]))
     return results
@@ -376,7 +386,7 @@ def _measure(
     return {name: np.concatenate([part[name] for part in parts])[:num_seeds] for name in parts[0]}
 
 
-def _in_turn(finish: Callable[[_Cell], str], cells: list[_Cell], at_once: int) -> Iterator[str]:
+def _in_turn(finish: Callable[[_Cell], None], cells: list[_Cell], at_once: int) -> Iterator[None]:
     """Finish the cells, several at once; an error ends it after the cells that are running."""
     if at_once == 1:
         yield from map(finish, cells)

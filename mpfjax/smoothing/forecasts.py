@@ -23,7 +23,6 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped_draw
 from mpfjax.observations import steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
-from mpfjax.operations.functions import interned
 
 
 class Forecast(eqx.Module):
@@ -73,8 +72,7 @@ def forecast(
     check_callable(
         "a function of a key and states", **given(simulate_observation=simulate_observation)
     )
-    simulate = interned(simulate_observation)
-    simulate = mapped_draw(filter.model, simulate) if simulate else None
+    simulate = mapped_draw(filter.model, simulate_observation) if simulate_observation else None
     inputs = steps_of_inputs(inputs, num_steps, filter.model, "forecast")
     options = (num_steps, simulate)
     return with_floats_traced(

@@ -27,7 +27,6 @@ from mpfjax.models.inputs import with_inputs
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.floats import as_inexact
-from mpfjax.operations.functions import interned
 from mpfjax.operations.generator import split, split_keys
 from mpfjax.operations.indexing import take
 from mpfjax.running.scan import (
@@ -108,7 +107,7 @@ def smoothed_sums(
     series = as_series(observations, inputs, missing, filter.model)
     if lag is not None:
         lag = min(lag, series.length - 1)
-    options = (mapped(filter.model, interned(function)), lag, method, num_draws)
+    options = (mapped(filter.model, function), lag, method, num_draws)
     sums = with_floats_traced(lambda filter: _smooth(key, filter, series, options), filter)
     return SmoothedSums(sums.sums, sums.terms, checked(sums.run))
 

@@ -27,7 +27,6 @@ from mpfjax.models.inputs import with_inputs
 from mpfjax.models.steps import likelihoods
 from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import Series, as_series
-from mpfjax.operations.functions import interned
 from mpfjax.running.scan import scan
 from mpfjax.running.storage.checkpoints import check_checkpoint
 from mpfjax.running.storage.descriptions import fingerprint
@@ -178,9 +177,7 @@ def particle_gibbs(
         for density in ("log_transition", "log_initial"):
             require(filter.model, density, "particle_gibbs with log_prior")
         prior = starts.checked(log_prior)
-    kernel = _Kernel(
-        problem, joint, prior, draw, interned(collect), int(num_metropolis_steps), backward
-    )
+    kernel = _Kernel(problem, joint, prior, draw, collect, int(num_metropolis_steps), backward)
     if draw is not None:
         _check_draw(kernel, problem.start())
     settings = {

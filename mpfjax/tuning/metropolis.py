@@ -108,8 +108,8 @@ def metropolis_hastings(
     - `checkpoint`: a .npz file, without pickles. It is written every `checkpoint_every` steps, and
       when the chains end or are interrupted. If the file exists, the chains go on from it, the same
       to the bit as without the interruption; with a larger `num_steps`, further. All other
-      arguments must be the same; functions are compared by their code, or by `checkpoint_name` as
-      in `fit`.
+      arguments must be the same; functions are compared by their names and by what they hold, or
+      by `checkpoint_name`, as in `fit`.
     - `observations`, `parameters`, `transforms`, `inputs`, `missing`: as for `fit`.
 
     A proposal with a prior or likelihood that is NaN or +inf is rejected, and counted in

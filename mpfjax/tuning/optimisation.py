@@ -96,10 +96,9 @@ def fit(
       returned as it ended. To go on, take a larger `num_steps`, or another `patience` or
       `tolerance`. An optimisation that ended at a number that is not finite stays there. All else
       must be the same: the filter and the observations to the bit, the parameters, transforms, key
-      and seeds, and the optimiser with the numbers in its closures and schedules. Your own
-      functions are compared by their code; classes and functions of libraries by their names. Take
-      a new file after you change what those do. With another version of Python or optax, the file
-      may be refused.
+      and seeds, and the optimiser with the numbers in its closures and schedules. Functions and
+      classes are compared by their names and by what they hold: take a new file after you change
+      what they do. With another version of optax, the file may be refused.
     - `checkpoint_name`: what the optimisation is called, such as "adam, cosine". Its file is then
       recognised by this name, and functions and the optimiser are not compared; numbers and arrays
       are. Use it for functions that change what they hold, and across versions.

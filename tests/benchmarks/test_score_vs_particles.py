@@ -75,7 +75,9 @@ def test_an_interruption_leaves_what_was_finished_and_the_next_run_goes_on(
     names = [(entry["filter"], entry["particles"]) for entry in written["results"]]
     assert names == [("pf", 20), ("mpf", 20), ("guided_mpf", 20)]
     assert "interrupted" in capsys.readouterr().err
-    assert benchmark.main([*arguments, "--seed", "1"]) == 2
+    assert benchmark.main(arguments) == 2
+    assert "unfinished holds 3 finished cells of 2" in capsys.readouterr().err
+    assert benchmark.main([*arguments, "--resume", "--seed", "1"]) == 2
     assert "holds another study (keys is" in capsys.readouterr().err
 
     def noted(keys, filter, *rest, **options):
@@ -84,7 +86,8 @@ def test_an_interruption_leaves_what_was_finished_and_the_next_run_goes_on(
 
     built.clear()
     monkeypatch.setattr(mpfjax.running.studies, "monte_carlo", noted)
-    assert benchmark.main(arguments) == 0
+    assert benchmark.main([*arguments, "--resume"]) == 0
+    assert "taken over, 3 to run" in capsys.readouterr().out
     assert built == [40, 40, 40]
     assert json.loads((tmp_path / "score_vs_particles.json").read_text()) == study[1]
     assert {path.name for path in tmp_path.iterdir()} == {path.name for path in study[0].iterdir()}

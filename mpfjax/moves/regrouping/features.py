@@ -11,7 +11,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from mpfjax.checks import check_callable, check_positive_array, given, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations.floats import as_inexact
-from mpfjax.operations.functions import interned
 from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.segments import are_masked, column_sums, segment_max, spread_stored
 from mpfjax.operations.stored import stored
@@ -41,9 +40,7 @@ class Features(eqx.Module):
     Raises `ValueError` for a scale that is not positive.
     """
 
-    function: Callable[[PyTree], Array] | None = eqx.field(
-        static=True, default=None, converter=interned
-    )
+    function: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None)
     scale: tuple[float, ...] = eqx.field(static=True, default=(1.0,), converter=_as_units)
 
     def __check_init__(self) -> None:

@@ -12,7 +12,6 @@ from jaxtyping import Array, Int, Key, PyTree
 from mpfjax.checks import check_callable, saying, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
-from mpfjax.operations.functions import interned
 
 
 class GroupBy(AbstractRegrouping):
@@ -32,7 +31,7 @@ class GroupBy(AbstractRegrouping):
     not.
     """
 
-    function: Callable[[PyTree], Int[Array, " n"]] = eqx.field(static=True, converter=interned)
+    function: Callable[[PyTree], Int[Array, " n"]] = eqx.field(static=True)
 
     def __check_init__(self) -> None:
         check_callable("a function of the particles", function=self.function)

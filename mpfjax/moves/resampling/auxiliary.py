@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +12,6 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.functions import interned
 from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import spread
 from mpfjax.proposals import AbstractProposal
@@ -44,7 +42,7 @@ class AuxiliaryResample(AbstractMove):
     """
 
     resample: Resample
-    lookahead: Any = eqx.field(converter=interned)
+    lookahead: Any
 
     def __check_init__(self) -> None:
         check_type(Resample, "a Resample", resample=self.resample)

@@ -16,7 +16,6 @@ from mpfjax.moves.regrouping.features import origin, summarise
 from mpfjax.moves.resampling.allocation import allocate_slots, place_slots
 from mpfjax.moves.resampling.ordering import sorted_order
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.functions import interned
 from mpfjax.operations.generator import split
 from mpfjax.operations.indexing import take
 from mpfjax.operations.matrices import cholesky
@@ -48,9 +47,7 @@ class GaussianRegeneration(AbstractResampling):
     """
 
     particles_per_component: int | None = eqx.field(static=True, default=None)
-    where: Callable[[PyTree], PyTree] | None = eqx.field(
-        static=True, default=None, converter=interned
-    )
+    where: Callable[[PyTree], PyTree] | None = eqx.field(static=True, default=None)
     inflation: float = eqx.field(static=True, default=1.0)
     noise: str = eqx.field(static=True, default="independent")
 

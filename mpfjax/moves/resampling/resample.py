@@ -30,7 +30,6 @@ from mpfjax.moves.resampling.layout import InPlace, SideBySide, as_they_are, sid
 from mpfjax.moves.resampling.optimal_transport import require_ott, transport
 from mpfjax.moves.resampling.ordering import SortBy, check_sort_by
 from mpfjax.moves.resampling.schemes import SCHEMES
-from mpfjax.operations.functions import interned
 from mpfjax.operations.gradients import add_gradient
 from mpfjax.operations.indexing import take
 from mpfjax.operations.prefix_sums import count_starts
@@ -110,14 +109,12 @@ class Resample(AbstractAdaptiveResampling):
     scheme: str = eqx.field(static=True, default="systematic")
     ess_threshold: float = eqx.field(static=True, default=1.0)
     particles_per_component: int | None = eqx.field(static=True, default=None)
-    sort_by: SortBy | None = eqx.field(static=True, default=None, converter=interned)
+    sort_by: SortBy | None = eqx.field(static=True, default=None)
     gradient: str = eqx.field(static=True, default="none")
     softness: float = eqx.field(static=True, default=0.5)
     regularisation: float = eqx.field(static=True, default=0.5)
     allocation: str = eqx.field(static=True, default="variance")
-    share_by: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(
-        static=True, default=None, converter=interned
-    )
+    share_by: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
         check_one_of(SCHEMES, scheme=self.scheme)

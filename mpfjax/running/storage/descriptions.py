@@ -14,8 +14,6 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-# Functions of these libraries are compared by name, others by their code as well.
-_LIBRARIES = ("chex", "equinox", "jax", "jaxlib", "mpfjax", "numpy", "optax")
 _MOST_SHOWN = 4
 
 
@@ -99,8 +97,7 @@ def contents_of(name: str, value: Any) -> dict[str, str]:
 
     Numbers are described by their values, arrays by their `fingerprint`, classes by their names.
     Functions are described by their names and by what they hold: closures, bound arguments, and
-    the object of a method. Functions outside the libraries are also described by their code, and
-    by the numbers and functions of their modules that it names.
+    the object of a method. What their code does cannot be compared.
     """
     found: dict[str, str] = {}
     _collect(name, value, found, {})
@@ -130,8 +127,7 @@ def _collect(name: str, value: Any, found: dict[str, str], seen: dict[int, Any])
 def _title(value: Any) -> str:
     """What kind of thing it is."""
     if isinstance(value, types.FunctionType):
-        title = f"{value.__module__}.{value.__qualname__}"
-        return title if _of_library(value) else f"{title}, code {_digest(value.__code__)}"
+        return f"{value.__module__}.{value.__qualname__}"
     return type(value).__name__
 
 
@@ -168,38 +164,7 @@ def _parts_of_function(function: types.FunctionType) -> dict[str, Any]:
         parts[f".{variable}"] = float(held) if _is_count(held) else held
     parts |= {f".default {i}": value for i, value in enumerate(function.__defaults__ or ())}
     parts |= {f".{name}": value for name, value in (function.__kwdefaults__ or {}).items()}
-    if _of_library(function):
-        return parts
-    for variable in sorted(_names(function.__code__)):
-        value = function.__globals__.get(variable)
-        own_function = isinstance(value, types.FunctionType) and not _of_library(value)
-        if own_function or is_data(value) or isinstance(value, str):
-            parts[f".{variable}"] = value
     return parts
-
-
-def _of_library(function: types.FunctionType) -> bool:
-    return (function.__module__ or "").split(".")[0] in _LIBRARIES
-
-
-def _names(code: types.CodeType) -> set[str]:
-    """The names from outside that code uses, functions in it included."""
-    inner = (_names(const) for const in code.co_consts if isinstance(const, types.CodeType))
-    return set(code.co_names).union(*inner)
-
-
-def _digest(code: types.CodeType) -> str:
-    """A digest of the code of a function, wherever it is written."""
-    digest = hashlib.sha256(code.co_code + repr((code.co_names, code.co_varnames)).encode())
-    for const in code.co_consts:
-        if isinstance(const, types.CodeType):
-            text = _digest(const)
-        elif isinstance(const, frozenset):
-            text = repr(sorted(map(repr, const)))
-        else:
-            text = repr(const)
-        digest.update(text.encode())
-    return digest.hexdigest()[:12]
 
 
 def _is_count(value: Any) -> bool:

@@ -13,9 +13,8 @@ from mpfjax.checks import check_key, check_type, to_rows
 from mpfjax.filter import Filter, step_and_faults
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Fault, raise_faults
-from mpfjax.operations.compiling import cpu_options, in_little_memory
+from mpfjax.operations.compiling import cpu_options, in_little_memory, jit_with
 from mpfjax.operations.generator import split_once
-from mpfjax.operations.kept_programs import kept_program
 from mpfjax.vision.boxes.learned_colours import LearnedColourModel
 from mpfjax.vision.boxes.object_moves import best_components
 from mpfjax.vision.boxes.recipes import objects_filters
@@ -62,17 +61,15 @@ def _followed(
     filter = objects_filters(first, boxes)["mpf"]
     model: Any = filter.model
     # It runs once, and takes longer to compile than to run.
-    mixture = kept_program(_begin, (filter,), (key,), in_little_memory(soon=True))(key)
+    little = in_little_memory(soon=True)
+    mixture = jit_with(little, _begin)(filter, key)
     # With XLA's newer emitters it takes longer to compile, and half the time to run.
-    count = kept_program(_counted, (model,), (first,), cpu_options(soon=True))
-    advance = None
+    count = jit_with(cpu_options(soon=True), _counted)
+    advance = jit_with(little, _advance)
     for t, still in enumerate(itertools.chain([first], stills)):
         # An array: each new Python number would compile anew.
-        moving = (np.asarray(t), mixture, count(still))
-        if advance is None:
-            fixed = (filter, len(boxes), key)
-            advance = kept_program(_advance, fixed, moving, in_little_memory(soon=True))
-        mixture, tracks, faults = advance(*moving)
+        counted = count(model, still)
+        mixture, tracks, faults = advance(filter, len(boxes), key, np.asarray(t), mixture, counted)
         yield jax.device_get(raise_faults(tracks, faults))
 
 

@@ -11,8 +11,7 @@ from jaxtyping import Array, Float, Key, PyTree, UInt8
 
 from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole, given
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.compiling import in_little_memory
-from mpfjax.operations.kept_programs import kept_program
+from mpfjax.operations.compiling import in_little_memory, jit_with
 from mpfjax.vision.files.boxes import centred, top_left
 from mpfjax.vision.files.frames import of_one_kind, read_frames
 from mpfjax.vision.files.threads import read_ahead
@@ -177,15 +176,14 @@ def _seen(
 def _tracked(
     seen: Iterator[_Seen], tracker: ObjectTracker, key: Key[Array, ""], ahead: bool
 ) -> Generator[Tracks, None, None]:
-    state, once, advance = tracker.init(), Once(), None
+    state, once = tracker.init(), Once()
+    options = in_little_memory(soon=tracker.filter.num_particles <= _FEW_PARTICLES)
+    advance = jit_with(options, _advance)
     with read_ahead(seen) if ahead else contextlib.nullcontext(seen) as coming:
         for number, pixels, observation, motion, kept, origin in coming:
             # An array: each new Python number would compile anew.
-            moving = (np.asarray(number), state, pixels, observation, motion)
-            if advance is None:
-                options = in_little_memory(soon=tracker.filter.num_particles <= _FEW_PARTICLES)
-                advance = kept_program(_advance, (tracker, key), moving, options)
-            state, tracks = advance(*moving)
+            arguments = (np.asarray(number), state, pixels, observation, motion)
+            state, tracks = advance(tracker, key, *arguments)
             tracks = jax.device_get(tracks)
             if tracks.full:
                 once.warn(
