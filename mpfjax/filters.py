@@ -148,7 +148,7 @@ def mixture_particle_filter(
     the filtering distribution has several modes and all of them must be kept.
     """
     sort_by = _standing(sort_by, noise)
-    lookahead = chosen_lookahead(lookahead, model, proposal, noise, gradient)
+    lookahead = chosen_lookahead(lookahead, model, proposal, noise)
     resample = Resample(
         scheme, ess_threshold, particles_per_component, sort_by, gradient, allocation=allocation
     )
