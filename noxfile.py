@@ -24,7 +24,6 @@ CORE = (
     "tests/models",
     "tests/smoothing",
     "tests/moves",
-    "--ignore=tests/moves/test_optimal_transport.py",
     "tests/test_bad_input.py",
     "tests/test_chains.py",
     "tests/test_checks.py",

@@ -143,12 +143,11 @@ def mixture_particle_filter(
     that of `Resample`. If M is more than one, x_0 is chosen by y_1 among four draws a particle;
     `with_selected_start` changes their number. With `noise="rqmc"` each component has a point set
     of its own, and the masses of modes are far more accurate. A `lookahead` "auto" is then a
-    `PilotLookahead`, unless there is a proposal, a conditionally linear model or the gradient "ot";
-    otherwise it is None. Use it where
-    the filtering distribution has several modes and all of them must be kept.
+    `PilotLookahead`, unless there is a proposal or a conditionally linear model; otherwise it is
+    None. Use it where the filtering distribution has several modes and all of them must be kept.
     """
     sort_by = _standing(sort_by, noise)
-    lookahead = chosen_lookahead(lookahead, model, proposal, noise, gradient)
+    lookahead = chosen_lookahead(lookahead, model, proposal, noise)
     resample = Resample(
         scheme, ess_threshold, particles_per_component, sort_by, gradient, allocation=allocation
     )

@@ -95,8 +95,6 @@ WITHIN_COMPONENTS: dict[str, AbstractResampling] = {
     "residual, fixed number, adaptive": Resample("residual", 0.5, 5),
     "systematic, shared equally": Resample(allocation="equal"),
     "residual, adaptive": Resample("residual", 0.5),
-    "soft": Resample(gradient="soft"),
-    "soft, fixed number, adaptive": Resample("residual", 0.5, 5, gradient="soft", softness=0.3),
     "gaussian": GaussianRegeneration(),
     "gaussian, fixed number, stratified": GaussianRegeneration(5, noise="stratified"),
     "gaussian, point sets": GaussianRegeneration(noise="rqmc"),

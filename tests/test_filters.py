@@ -9,9 +9,11 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import mpfjax
+from mpfjax import Filter, Resample
 from mpfjax.exact import grid_filter, kalman_filter
 from mpfjax.filter import Start
-from tests.marking import thorough
+from mpfjax.moves.resampling.ancestors import SCHEMES
+from tests.marking import quick_of, thorough
 from tests.precision import float64
 from tests.registry import CHAINS
 from tests.user_models import (
@@ -42,10 +44,6 @@ LINEAR_2D = mpfjax.LinearGaussianModel(
 
 def mean(mixture):
     return mixture.mean()
-
-
-def occupied_particles(mixture):
-    return mixture.particles, mixture.occupied
 
 
 def assert_same(run, other, **tolerance):
@@ -231,41 +229,52 @@ class TestMissing:
         assert abs(ratios.mean() - 1) < 4 * ratios.std() / np.sqrt(200)
 
 
+# Every scheme, alone and with each Markov move, and with components that share the slots.
+IN_SLOTS = {
+    **{scheme: ([Resample(scheme)], 1) for scheme in SCHEMES},
+    **{f"{scheme}, adaptive, mixture": ([Resample(scheme, 0.7)], 3) for scheme in SCHEMES},
+    "random walk": ([Resample()], 1),
+    "langevin": ([Resample("stratified")], 1),
+    "langevin, mixture": ([Resample("ssp")], 3),
+}
+
+
 class TestSlots:
-    """A filter of N particles among more slots draws what it draws in N slots."""
+    """A filter of N particles among more slots has the law that it has in N slots."""
 
     @pytest.mark.parametrize(
-        "chain",
-        [
-            "pf adaptive",
-            *thorough(
-                [
-                    "mpf",
-                    "dps",
-                    "random labels, residual",
-                    "gaussian mixture",
-                    "ps adaptive, random order",
-                ]
-            ),
-        ],
+        "name", quick_of(IN_SLOTS, ["residual", "ssp, adaptive, mixture", "langevin"])
     )
-    def test_that_stay_empty_change_nothing(self, chain):
-        keys = jax.random.split(jax.random.key(20), 6)
-        with float64():
-            filter = CHAINS[chain](mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0))
-            observations = jnp.asarray(np.asarray(OBSERVATIONS), jnp.float64)
-            own = mpfjax.monte_carlo(keys, filter, observations, occupied_particles)
-            shared = mpfjax.monte_carlo(keys, filter, observations, occupied_particles, slots=70)
-        np.testing.assert_allclose(
-            shared.log_likelihood_increments, own.log_likelihood_increments, rtol=1e-9, atol=1e-9
+    def test_that_stay_empty_leave_evidence_and_moments_unbiased(self, name):
+        """E[Ẑ/Z] = 1 and E[Ẑ/Z φ̂] = E[φ | y] for N = 50 in 200 slots, against a grid."""
+        model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
+        resample, m = IN_SLOTS[name]
+        markov = [mpfjax.RandomWalkMetropolis(model)] if "walk" in name else []
+        if "langevin" in name:
+            markov = [mpfjax.MetropolisAdjustedLangevin(model)]
+        moves = [*resample, mpfjax.Propagate(model), *markov, *[mpfjax.KMeans()] * (m > 1)]
+        filter = Filter(
+            model, moves, 50, m, initial_moves=[mpfjax.KMeans(3, reseed=True)] * (m > 1)
         )
-        n = filter.num_particles
-        particles, occupied = map(np.asarray, shared.collected)
-        alone, filled = map(np.asarray, own.collected)
-        assert occupied.shape[-1] == 70
-        assert not occupied[..., n:].any()
-        np.testing.assert_array_equal(occupied[..., :n], filled)
-        np.testing.assert_allclose(particles[occupied], alone[filled], rtol=1e-9, atol=1e-9)
+        keys = jax.random.split(jax.random.key(20), 1000)
+
+        def collect(mixture):
+            states = mixture.particles
+            return mixture.average(states), mixture.average(states**2), mixture.occupied
+
+        run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, collect, slots=200)
+        exact = grid_filter(model, OBSERVATIONS, jnp.linspace(-5.0, 5.0, 1001))
+        ratios = np.exp(
+            np.cumsum(np.asarray(run.log_likelihood_increments), axis=1)
+            - np.cumsum(np.asarray(exact.log_likelihood_increments))
+        )
+        *found, occupied = map(np.asarray, run.collected)
+        assert not occupied[..., 50:].any()
+        first, second = np.asarray(exact.means), np.asarray(exact.variances + exact.means**2)
+        for values, expected in ((1.0, 1.0), *zip(found, (first, second), strict=True)):
+            error = (ratios * values).std(axis=0) / np.sqrt(len(keys))
+            assert (error < 0.05).all()
+            assert (np.abs((ratios * values).mean(axis=0) - expected) < 4 * error).all()
 
     def test_are_one_program_whatever_the_number_of_particles(self):
         keys = jax.random.split(jax.random.key(21), 3)

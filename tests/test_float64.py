@@ -119,3 +119,35 @@ def test_particle_gibbs_runs():
     )  # fmt: skip
     assert chain.parameters["sigma_y"].dtype == np.float64
     assert np.isfinite(chain.parameters["sigma_y"]).all()
+
+
+class OfSingle(mpfjax.AbstractStateSpaceModel):
+    """States in float32, and a parameter that is a Python float."""
+
+    deviation: float = 0.5
+
+    def sample_initial(self, key, num_particles):
+        return jax.random.normal(key, (num_particles,), jnp.float32)
+
+    def sample_transition(self, key, states):
+        noise = jax.random.normal(key, states.shape, jnp.float32)
+        return 0.9 * states + self.deviation * noise
+
+    def log_likelihood(self, observation, states):
+        z = (observation.astype(jnp.float32) - states) / self.deviation
+        return -0.5 * z**2 - jnp.log(self.deviation * jnp.sqrt(2 * jnp.pi))
+
+
+def test_states_in_float32_stay_so_beside_a_python_float():
+    """As they do in JAX; and Ẑ is that of the Kalman filter."""
+    seen, one = jnp.array([0.4, -0.2, 0.7]), jnp.ones((1, 1))
+    filter = mpfjax.particle_filter(OfSingle(), 100)
+    keys = jax.random.split(KEY, 500)
+    run = mpfjax.monte_carlo(keys, filter, seen, lambda mixture: mixture.particles)
+    assert run.collected.dtype == jnp.float32
+    linear = mpfjax.LinearGaussianModel(
+        A=0.9 * one, Q=0.25 * one, H=one, R=0.25 * one, m0=jnp.zeros(1), P0=one
+    )
+    exact = mpfjax.exact.kalman_filter(linear, seen[:, None]).log_marginal_likelihood
+    ratios = np.exp(np.asarray(run.log_marginal_likelihood - exact))
+    assert abs(ratios.mean() - 1) < 4 * ratios.std() / np.sqrt(len(keys))

@@ -1,6 +1,5 @@
 """The scores of the filters: the derivatives of log Ẑ against those of the Kalman filter."""
 
-import sys
 from functools import cache
 
 import chex
@@ -12,7 +11,6 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.resampling.resample import GRADIENTS
 from tests.examples import example_mixtures
 from tests.marking import quick_of, thorough
 from tests.user_models import BLINDED, Batched, ScalarLinear
@@ -131,10 +129,9 @@ def test_resampling_with_stopped_gradients_is_the_same_to_the_bit(options):
             eqx.filter_jit(mpfjax.Resample(gradient=gradient, **options))(
                 jax.random.key(5), mixture
             )
-            for gradient in ("none", "stop", "straight_through")
+            for gradient in ("none", "stop")
         ]
-        for other in moved[1:]:
-            chex.assert_trees_all_equal(moved[0], other)
+        chex.assert_trees_all_equal(*moved)
 
 
 @pytest.mark.parametrize("kind", ["bootstrap", "guided", "halves", "partitioned"])
@@ -198,24 +195,21 @@ class Window(mpfjax.QuadraticModel):
         return jnp.where(jnp.abs(observation - states**2) < 0.4, honest, -jnp.inf)
 
 
-@pytest.mark.parametrize("gradient", quick_of(GRADIENTS[1:], ("stop",)))
-def test_gradients_are_finite_where_weights_and_components_vanish(gradient):
+def test_gradients_are_finite_where_weights_and_components_vanish():
     """In float32, with empty slots, dead components, and a step of zero likelihood throughout."""
     observations = jnp.array([1.5, 1.0, BLINDED, 0.4, 0.9])
 
     def log_evidence(model):
-        resample = mpfjax.Resample("systematic", 0.7, 4, gradient=gradient)
-        propagate = mpfjax.Propagate(model, None, "stop" if gradient == "stop" else "none")
+        resample = mpfjax.Resample("systematic", 0.7, 4, gradient="stop")
+        propagate = mpfjax.Propagate(model, None, "stop")
         partition = [mpfjax.RandomPartition()]
         filter = mpfjax.Filter(model, [resample, propagate], 24, 6, initial_moves=partition)
         run = mpfjax.run_filter(jax.random.key(6), filter, observations)
         seen = jnp.isfinite(run.log_likelihood_increments)
         return jnp.sum(jnp.where(seen, run.log_likelihood_increments, 0.0)), run
 
-    # The transport solver's own derivative is written for the default promotion.
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-        score = eqx.filter_jit(eqx.filter_grad(log_evidence, has_aux=True))
-        grads, run = score(Window(0.3, 0.5))
+    score = eqx.filter_jit(eqx.filter_grad(log_evidence, has_aux=True))
+    grads, run = score(Window(0.3, 0.5))
     assert run.degenerate.tolist() == [False, False, True, False, False]
     assert (np.asarray(run.collected.log_weights)[-1] == -np.inf).any()
     assert not np.asarray(run.final.active).all()
@@ -245,26 +239,11 @@ def test_a_model_without_the_density_is_refused(make):
         make(Batched())
 
 
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        ({"gradient": "reinforce"}, "gradient: 'reinforce'"),
-        ({"softness": 0.0}, "softness: 0.0"),
-        ({"softness": 1.5}, "softness: 1.5"),
-        ({"regularisation": 0.0}, "regularisation: 0.0"),
-    ],
-)
-def test_bad_options_are_refused_by_name(options, named):
-    with pytest.raises(ValueError, match=named):
-        mpfjax.Resample(**options)
+def test_an_unknown_gradient_is_refused_by_name():
+    with pytest.raises(ValueError, match="gradient: 'soft' is not one of"):
+        mpfjax.Resample(gradient="soft")
     with pytest.raises(ValueError, match="gradient: 'soft' is not one of"):
         mpfjax.Propagate(MODEL, gradient="soft")
-
-
-def test_transport_without_its_library_is_an_error_that_says_how_to_install_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ott", None)
-    with pytest.raises(ImportError, match="pip install ott-jax"):
-        mpfjax.particle_filter(MODEL, 10, gradient="ot")
 
 
 REGROUPED = {
@@ -290,9 +269,10 @@ def log_evidence_by_sigma(make, gradient, m):
 # label or a shift is a constant in every order of differentiating.
 @pytest.mark.parametrize(
     ("make", "gradient", "m"),
-    thorough([("mpf", "none", 3), ("gm-mpf", "none", 3), ("gm-mpf", "none", 6), ("mpf", "soft", 6),
-              ("mpf", "straight_through", 6)]),
-)  # fmt: skip
+    thorough(
+        [("mpf", "none", 3), ("gm-mpf", "none", 3), ("gm-mpf", "none", 6), ("mpf", "stop", 6)]
+    ),
+)
 def test_derivatives_are_the_same_in_both_modes(make, gradient, m):
     log_evidence = log_evidence_by_sigma(make, gradient, m)
     reverse, forward = jax.jit(lambda s: (jax.grad(log_evidence)(s), jax.jacfwd(log_evidence)(s)))(

@@ -91,8 +91,7 @@ BUILT = {
     "Resample": (
         mpfjax.Resample,
         {"scheme": "systematic", "ess_threshold": 0.5, "particles_per_component": 2,
-         "allocation": "equal", "share_by": None, "sort_by": None, "gradient": "none",
-         "softness": 0.5, "regularisation": 0.5},
+         "allocation": "equal", "share_by": None, "sort_by": None, "gradient": "none"},
     ),
     "AuxiliaryResample": (
         mpfjax.AuxiliaryResample,

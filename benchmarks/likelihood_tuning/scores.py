@@ -25,17 +25,11 @@ from mpfjax.exact import kalman_filter
 
 ESTIMATORS = {
     "none": "plain derivative",
-    "soft": "soft resampling",
-    "straight_through": "straight-through",
-    "ot": "entropic transport",
     "pathwise": "stop-gradient, draws differentiated",
     "stop": "stop-gradient",
 }
 FILTERS = ("pf", "mpf")
 MODELS = {"linear_gaussian": ("a", "log q", "log r"), "quadratic": ("log σ_x", "log σ_y")}
-# Transport costs O(N²) an iteration and step.
-LARGEST_TRANSPORT = 100
-MOST_TRANSPORTS = 20
 LINEAR_GAUSSIAN_STEPS = 50
 
 
@@ -57,7 +51,6 @@ def run_scores(options: argparse.Namespace, settings: dict[str, Any], out: Path)
         for n in options.particles
         for filter in options.filters
         for estimator in options.estimators
-        if estimator != "ot" or n <= LARGEST_TRANSPORT
     ]
     results = []
     for cell in tqdm(cells, disable=not sys.stderr.isatty(), unit="cell"):
@@ -119,8 +112,6 @@ def measure(
         run = mpfjax.run_filter(key, built, task.observations, nothing)
         return run.log_marginal_likelihood
 
-    if estimator == "ot":
-        num_runs = min(num_runs, MOST_TRANSPORTS)
     keys = jax.random.split(jax.random.key(seed), num_runs)
     run = compiled(jax.vmap(log_evidence, in_axes=(None, 0)), task.point, keys)
     score = compiled(jax.vmap(jax.grad(log_evidence), in_axes=(None, 0)), task.point, keys)

@@ -98,9 +98,10 @@ def _checked_grid(grid: Any) -> tuple[Float[Array, " g"], Any]:
     if isinstance(points, Tracer):
         return points, width
     check_finite_array(grid=points)
-    even = float(points[0]) + width * np.arange(len(points))
-    rounding = 4 * np.finfo(points.dtype).eps * np.abs(even).max()
-    if not (width > rounding and np.abs(np.asarray(points) - even).max() <= rounding):
+    known = np.asarray(points)  # within a caller's jit, too
+    even = float(known[0]) + width * np.arange(len(known))
+    rounding = 4 * np.finfo(known.dtype).eps * np.abs(even).max()
+    if not (width > rounding and np.abs(known - even).max() <= rounding):
         raise ValueError(f"grid: {shown(grid)} does not ascend in even steps")
     return points, width
 

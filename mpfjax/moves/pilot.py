@@ -68,7 +68,6 @@ def chosen_lookahead(
     model: AbstractStateSpaceModel,
     proposal: AbstractProposal | None,
     noise: str,
-    gradient: str,
 ) -> Lookahead | None:
     """The look-ahead itself, or what "auto" means: where point sets make x_t, that of the model.
 
@@ -77,5 +76,5 @@ def chosen_lookahead(
     if not isinstance(lookahead, str):
         return lookahead
     check_one_of(("auto",), lookahead=lookahead)
-    usable = proposal is None and gradient != "ot" and not is_marginalised(model)
+    usable = proposal is None and not is_marginalised(model)
     return PilotLookahead(model) if noise == "rqmc" and usable else None

@@ -15,8 +15,6 @@ from jax.core import Tracer
 from jax.experimental.compilation_cache import compilation_cache
 from jaxtyping import PyTree
 
-from mpfjax.operations.floats import default_float
-
 _VECTOR_WIDTH = "xla_cpu_prefer_vector_width"
 _WITHOUT_PASSES = "xla_disable_hlo_passes"
 _TREE_SUMS = "tree_reduction_rewriter"
@@ -177,13 +175,12 @@ def with_floats_traced(run: Callable[[PyTree], PyTree], filter: PyTree) -> PyTre
     """`run(filter)`, compiled once for all values of the Python floats in it.
 
     Otherwise such a number would be a constant of the program, and every value would compile again.
-    It stays a constant if the model uses its value in Python, as in `if self.phi > 0`.
+    It stays a constant if the model uses its value in Python, as in `if self.phi > 0`. Its type is
+    weak, as that of any Python number: states that it is multiplied with keep theirs.
     """
     if not any(type(leaf) is float for leaf in jax.tree.leaves(filter)):
         return run(filter)
-    arrays = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, default_float()) if type(leaf) is float else leaf, filter
-    )
+    arrays = jax.tree.map(lambda leaf: jnp.asarray(leaf) if type(leaf) is float else leaf, filter)
     try:
         return run(arrays)
     except _NEEDS_VALUE:

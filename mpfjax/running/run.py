@@ -95,9 +95,9 @@ def monte_carlo(
     - `slots`: the length of the particle arrays, at least N; the slots after the first N stay
       empty. None is N. Filters that differ in N alone compile once if they have the same `slots`:
       1000, for example, for N = 50, 200 and 1000; but the choice of x_0 by y_1 among more draws
-      compiles for each N. Each then costs as much as 1000 particles. The
-      particles are those of a run without `slots`, up to rounding. `collect` sees the empty slots
-      as well, with `occupied` false.
+      compiles for each N. Each then costs as much as 1000 particles. A run has the law of one
+      without `slots`, though not the same particles. `collect` sees the empty slots as well, with
+      `occupied` false.
 
     Raises `ValueError` for more devices than there are, fewer slots than particles, and `slots`
     with the moves that need every slot, `PropagateIndependently` and `PropagateInClusters`.

@@ -16,7 +16,6 @@ from mpfjax.models.base import AbstractStateSpaceModel, model_name, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.conditional import (
-    CONDITIONAL_SCHEMES,
     REFERENCE,
     ConditionalPropagation,
     ConditionalResample,
@@ -95,8 +94,8 @@ def conditional_filter(
     `SelectInitial` chooses it. The model's `sample_transition` must draw particles independently of
     each other.
 
-    Raises `ValueError` for a filter that is no chain of regrouping moves, `Resample` (systematic,
-    stratified or multinomial), `Propagate`, `Predict` and `Reweight`; a conditionally linear model;
+    Raises `ValueError` for a filter that is no chain of regrouping moves, `Resample`, `Propagate`,
+    `Predict` and `Reweight`; a conditionally linear model;
     a proposal without `log_density`; noise that is not independent; a model without
     `log_transition`, unless `backward` is false; a trajectory of other shapes or types than the
     model's states, or of density zero (RuntimeError within jit). Use it in a Gibbs sampler of your
@@ -262,30 +261,15 @@ def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
                 f" noise={noise!r}; take noise='independent'"
             )
     for move in filter.moves:
-        if isinstance(move, Resample):
-            _check_resample(move)
-        elif isinstance(move, Every) and all(isinstance(m, AbstractRegrouping) for m in move.moves):
+        if isinstance(move, Every) and all(isinstance(m, AbstractRegrouping) for m in move.moves):
             continue
         elif not isinstance(
-            move, AbstractRegrouping | Propagate | Predict | Reweight | IslandInteraction
+            move, AbstractRegrouping | Resample | Propagate | Predict | Reweight | IslandInteraction
         ):
             raise ValueError(
                 f"filter: {type(move).__name__} cannot keep a trajectory, as {needed_by} does;"
                 " regrouping moves, Resample, Propagate, Predict and Reweight can"
             )
-
-
-def _check_resample(move: Resample) -> None:
-    if move.scheme not in CONDITIONAL_SCHEMES:
-        raise ValueError(
-            f"scheme: {move.scheme!r} cannot keep a trajectory; one of"
-            f" {list(CONDITIONAL_SCHEMES)} can"
-        )
-    if move.approximate:
-        raise ValueError(
-            f"gradient: {move.gradient!r} draws other particles than their weights say, and keeps"
-            " no trajectory; take 'none'"
-        )
 
 
 def _as_states(trajectory: Any, model: AbstractStateSpaceModel, length: int) -> PyTree:

@@ -27,7 +27,7 @@ def test_scores_are_written_with_their_bias_and_cost(tmp_path, capsys):
 
 def test_derivatives_that_overflow_are_said_to():
     entry = {
-        "estimator": "straight_through", "filter": "pf", "particles": 10, "runs": 5,
+        "estimator": "none", "filter": "pf", "particles": 10, "runs": 5,
         "finite_runs": 3, "exact": [1.0], "bias": None, "milliseconds": 1.0, "cost_in_runs": 2.0,
     }  # fmt: skip
     assert "overflows in 2 runs" in scores.as_score_row(entry)

@@ -31,7 +31,6 @@ QUICK_REJUVENATIONS = (
     "systematic, along a Hilbert curve",
     "residual, fixed number, adaptive",
     "residual, adaptive",
-    "soft, fixed number, adaptive",
     "gaussian",
     "gaussian, point sets",
 )
@@ -42,11 +41,7 @@ over_regroupings = pytest.mark.parametrize("name", REGROUPINGS)
 over_moves_within_components = pytest.mark.parametrize(
     "name", quick_of(WITHIN_COMPONENTS, QUICK_REJUVENATIONS)
 )
-RESAMPLINGS = [
-    name
-    for name, move in WITHIN_COMPONENTS.items()
-    if isinstance(move, Resample) and not move.approximate
-]
+RESAMPLINGS = [name for name, move in WITHIN_COMPONENTS.items() if isinstance(move, Resample)]
 over_resamplings = pytest.mark.parametrize("name", quick_of(RESAMPLINGS, QUICK_REJUVENATIONS))
 
 
@@ -131,8 +126,7 @@ class TestWithinComponents:
             return
         parents = after.ancestor_indices[filled]
         assert np.asarray(before.occupied)[parents].all()
-        is_soft = getattr(WITHIN_COMPONENTS[name], "gradient", None) == "soft"  # draws from all
-        if all_due(name, before) and not is_soft:
+        if all_due(name, before):
             assert not weightless[parents].any()
 
     def test_fills_the_slots_that_it_should(self, name, example):

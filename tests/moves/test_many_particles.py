@@ -13,8 +13,9 @@ import mpfjax
 from mpfjax import Resample
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.resampling.allocation import place_slots
-from mpfjax.moves.resampling.layout import side_by_side
-from mpfjax.moves.resampling.schemes import SCHEMES as SCHEMES_BY_NAME
+from mpfjax.moves.resampling.ancestors import SCHEMES as SCHEMES_BY_NAME
+from mpfjax.moves.resampling.ancestors import Dealt
+from mpfjax.moves.resampling.line import in_line
 from mpfjax.operations import positions
 from mpfjax.smoothing.backward import draw
 from tests.examples import make_mixture
@@ -113,10 +114,10 @@ def in_few_slots(n, counts):
 def test_components_of_any_size_fill_their_slots_from_their_own_particles(scheme):
     n, counts = 2**18, [1, 2**17, 3, 40_000]
     mixture, targets = in_few_slots(n, counts)
-    line = side_by_side(mixture, None, None, without_gaps=False)
+    line = in_line(mixture)
     slots = place_slots(targets, n)
     expected = line.expected(targets)
-    before, _ = line.positions(expected, targets, slots)
+    before, _ = line.positions(expected, targets, slots.firsts)
     weights = np.exp(np.asarray(mixture.log_weights, float)).reshape(4, -1)
     upto = np.cumsum(weights / weights.sum(axis=1, keepdims=True), axis=1)
     exact = np.pad(upto[:, :-1], ((0, 0), (1, 0))) * np.asarray(counts)[:, None]
@@ -127,7 +128,8 @@ def test_components_of_any_size_fill_their_slots_from_their_own_particles(scheme
         np.diff(found.reshape(4, -1), axis=1)[:, 1000:1002] * (n // 4) / np.array(counts)[:, None]
     )
     np.testing.assert_allclose(np.sort(widths, axis=1), [[0.6, 1.4]] * 4, rtol=1e-4)
-    starts = SCHEMES_BY_NAME[scheme](jax.random.key(0), expected, before, targets, slots, line)
+    dealt = Dealt(line, targets, slots, expected, before, None)
+    starts = SCHEMES_BY_NAME[scheme](jax.random.key(0), dealt)
     offspring = np.diff(np.append(np.asarray(starts), sum(counts))).reshape(4, -1).sum(axis=1)
     np.testing.assert_array_equal(offspring, counts)
 

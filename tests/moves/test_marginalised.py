@@ -56,7 +56,7 @@ FILTERS = {
     ),
     "all children, in components": lambda: Filter(
         MODEL,
-        [PropagateRegimes(MODEL, scheme="stratified"), KMeans(2)],
+        [PropagateRegimes(MODEL), KMeans(2)],
         NUM_PARTICLES,
         2,
         initial_moves=[KMeans(2, reseed=True)],
@@ -343,10 +343,52 @@ def test_optimal_resampling_keeps_heavy_children_and_none_twice():
     assert (np.abs(light.mean(axis=0) - weights[~heavy]) <= error).all()
 
 
-def test_by_regime_each_keeps_its_share_of_the_slots():
-    filter = FILTERS["all children, by regime"]()
-    run = mpfjax.run_filter(KEY, filter, 5 + 0 * OBSERVATIONS, lambda m: m.component_counts)
-    assert (np.asarray(run.collected) == NUM_PARTICLES // NUM_REGIMES).all()
+@pytest.mark.parametrize("name", ["all children, by regime", "all children, in components"])
+def test_no_child_is_kept_twice_and_every_component_keeps_its_mass(name):
+    """Wherever the children stand, and whether y is there or not."""
+    filter = FILTERS[name]()
+    start = mpfjax.run_filter(KEY, filter, OBSERVATIONS[:3], lambda mixture: None).final
+    move, keys = filter.moves[0], jax.random.split(KEY, 200)
+    own = start.replace(ancestor_indices=jnp.arange(NUM_PARTICLES, dtype=jnp.int32))
+    seen = jax.jit(jax.vmap(lambda key: move(key, own, OBSERVATIONS[3])))(keys)
+    unseen = jax.jit(jax.vmap(lambda key: move.predict(key, own)))(keys)
+    for after in jax.tree.map(np.asarray, (seen, unseen)):
+        child = after.ancestor_indices * NUM_REGIMES + after.particles.latent
+        filled = after.log_weights > -np.inf
+        assert all(len(set(c[f])) == f.sum() for c, f in zip(child, filled, strict=True))
+        labels = after.component_indicators[:, :, None] == np.arange(start.num_components)
+        masses = (np.exp(after.log_weights)[:, :, None] * labels).sum(axis=1)
+        np.testing.assert_allclose(masses, np.tile(masses[:1], (len(keys), 1)), rtol=1e-4)
+    np.testing.assert_allclose(masses.sum(axis=1), 1, rtol=1e-4)
+
+
+@pytest.mark.thorough
+def test_regimes_have_their_share_without_components_too():
+    """Children of a regime stand side by side: in turn, Ẑ would have three times the deviation."""
+    one, many = (
+        np.exp(runs(name).log_marginal_likelihood - truth().log_evidence[-1]).std()
+        for name in ("all children", "all children, by regime")
+    )
+    assert one < 1.5 * many
+
+
+def test_more_slots_than_children_stay_empty():
+    """Copies would have the moments that they copy: with every child, the filter is exact."""
+    filter = Filter(MODEL, [PropagateRegimes(MODEL)], NUM_REGIMES**4)
+    every = filter.init(KEY)
+    one = every.particles._replace(latent=jnp.zeros_like(every.particles.latent))
+    first = jnp.arange(filter.num_particles) == 0
+    start = every.replace(particles=one, log_weights=jnp.where(first, 0.0, -jnp.inf))
+    probabilities = jnp.asarray([1.0, 0, 0])
+    known = eqx.tree_at(lambda model: model.initial_probabilities, MODEL, probabilities)
+    exact = switching_filter(known, OBSERVATIONS[:4])
+    keys = jax.random.split(KEY, 4)
+    for step, key in enumerate(keys):
+        start, info = filter.step(key, start, OBSERVATIONS[step])
+        assert int(start.occupied.sum()) == NUM_REGIMES ** (step + 1)
+        np.testing.assert_allclose(
+            info.log_likelihood_increment, exact.log_likelihood_increments[step], rtol=1e-4
+        )
 
 
 def test_regimes_need_a_model_that_lists_them():

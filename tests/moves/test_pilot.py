@@ -84,12 +84,6 @@ def test_point_sets_bring_it_along_and_independent_noise_does_not():
         first_move(model, noise="rqmc", lookahead="pilot")
 
 
-def test_optimal_transport_draws_no_ancestors_and_goes_without_it():
-    pytest.importorskip("ott", reason="gradient 'ot' needs the extra 'ot', which 'test' brings")
-    move = first_move(mpfjax.QuadraticModel(), noise="rqmc", gradient="ot")
-    assert isinstance(move, mpfjax.Resample)
-
-
 def test_a_model_that_is_not_made_of_noise_is_refused():
     with pytest.raises(ValueError, match="transition_from_noise, which PilotLookahead needs"):
         PilotLookahead(Batched())

@@ -10,7 +10,7 @@ import pytest
 
 from mpfjax import Resample
 from mpfjax.moves.resampling.allocation import place_slots
-from mpfjax.moves.resampling.schemes import random_points
+from mpfjax.moves.resampling.ancestors import random_points
 from mpfjax.operations import positions
 from tests.examples import make_mixture
 from tests.marking import quick_of, thorough
@@ -309,24 +309,6 @@ def test_what_has_no_mass_gets_none(num_components):
     mixture = mixture.replace(log_weights=jnp.full(12, -jnp.inf))
     moved = draw(Resample(), mixture)
     np.testing.assert_array_equal(moved.log_weights, -np.inf)
-
-
-def test_soft_resampling_draws_from_the_softened_weights_and_weighs_by_the_ratio():
-    """w / q on offspring drawn from q = 0.7 w + 0.3 / k, within each of two components."""
-    labels = np.repeat([0, 1], [4, 6])
-    mixture = make_mixture(np.zeros((10, 1)), np.linspace(-4.0, 1.0, 10), labels, 2)
-    move = Resample("multinomial", gradient="soft", softness=0.3)
-    keys = jax.random.split(jax.random.key(0), 4000)
-    moved = jax.jit(jax.vmap(lambda key: move(key, mixture)))(keys)
-    weights = np.exp(np.asarray(mixture.log_component_weights))
-    softened = 0.7 * weights + 0.3 / np.repeat([4, 6], [4, 6])
-    drawn = np.bincount(np.asarray(moved.ancestor_indices).ravel(), minlength=10) / 4000
-    np.testing.assert_allclose(drawn, 5 * softened, atol=4 * np.sqrt(5 / 4000))
-    ratios = (weights / softened)[moved.ancestor_indices]
-    ours = np.asarray(moved.component_indicators) == 0
-    mass = float(mixture.mixture_weights[0])
-    expected = mass * ratios / (ratios * ours).sum(axis=1, keepdims=True)
-    np.testing.assert_allclose(np.exp(moved.log_weights)[ours], expected[ours], rtol=1e-4)
 
 
 @pytest.mark.parametrize("word", [0, 2**32 - 1])

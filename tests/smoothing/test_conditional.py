@@ -220,8 +220,6 @@ class TestBadInput:
         ("make", "named"),
         [
             (lambda: mpfjax.particle_filter(NoTransition(), 6), "defines no log_transition"),
-            (lambda: mpfjax.particle_filter(Walled(), 6, scheme="residual"), "scheme: 'residual'"),
-            (lambda: mpfjax.particle_filter(Walled(), 6, gradient="soft"), "gradient: 'soft'"),
             (
                 lambda: mpfjax.particle_filter(LINEAR, 6, proposal=eqx.tree_at(
                     lambda proposal: proposal, GUIDED,

@@ -216,7 +216,6 @@ class TestBadInput:
             mpfjax.gaussian_particle_filter(ONE, 20),
             mpfjax.distributed_partitioned_sampling(OBJECTS, 20),
             mpfjax.independent_particle_filters(OBJECTS, 20),
-            mpfjax.particle_filter(ONE, 20, gradient="soft"),
             Filter(ONE, [lambda key, mixture, observation: mixture], 20),
         ],
     )

@@ -13,8 +13,8 @@ from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.objects.coupling import connected, coupled, together
 from mpfjax.moves.objects.recombination import recombined, rotated, scores
 from mpfjax.moves.resampling.allocation import require_equal_rows
+from mpfjax.moves.resampling.ancestors import SCHEMES
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.moves.resampling.schemes import SCHEMES
 from mpfjax.operations.floats import default_float
 from mpfjax.operations.generator import split
 from mpfjax.operations.indexing import take

@@ -10,8 +10,8 @@ from mpfjax.mixture import ParticleMixture, no_ancestors, single_component
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling.allocation import require_equal_rows
+from mpfjax.moves.resampling.ancestors import SCHEMES
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.moves.resampling.schemes import SCHEMES
 from mpfjax.operations.generator import split
 
 

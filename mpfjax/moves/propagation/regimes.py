@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import logsumexp, ndtr
@@ -20,9 +19,12 @@ from mpfjax.models.conditionally_linear import (
 from mpfjax.models.steps import log_predictive
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.regrouping.group_by import GroupBy
+from mpfjax.moves.resampling.ancestors import draw_ancestors
+from mpfjax.moves.resampling.line import Line, in_line
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.generator import uniform
 from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import log_or_nothing
 from mpfjax.operations.segments import spread
 from mpfjax.proposals import AbstractProposal
 
@@ -103,7 +105,6 @@ class PropagateRegimes(AbstractPropagation):
       parents' components. With a group by the regime, every regime has its share of the slots at
       every step, however improbable it is: the IMM particle filter (Blom and Bloem 2007) with
       Kalman filters for particles.
-    - `scheme`: of `Resample`, usually "systematic" or "stratified".
 
     A derivative treats the probabilities of being kept as constants, as that of
     `Resample(gradient="stop")` does, so that derivatives of Ẑ are unbiased. Without an observation,
@@ -113,12 +114,10 @@ class PropagateRegimes(AbstractPropagation):
 
     model: AbstractConditionallyLinearModel
     group: GroupBy | None = None
-    scheme: str = eqx.field(static=True, default="systematic")
 
     def __check_init__(self) -> None:
         require_finite(self.model, "PropagateRegimes")
         check_type(GroupBy, "a GroupBy", **given(group=self.group))
-        Resample(self.scheme)
 
     def would_resample(
         self, mixture: ParticleMixture, observation: PyTree = None
@@ -132,60 +131,69 @@ class PropagateRegimes(AbstractPropagation):
     ) -> ParticleMixture:
         """Propagate, and weigh by y_t."""
         latents, _, log_factors = children(self.model, observation, mixture.particles)
-        moved = self._chosen(key, mixture, latents, log_factors)
+        family = self._family(mixture, latents).weighed(log_factors.reshape(-1))
+        moved = self._chosen(key, mixture, family)
         return moved.replace(particles=updated(self.model, observation, moved.particles)[0])
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """The same with no observation to weigh by."""
         pairs = self.model.all_transitions(mixture.particles.latent)  # pyright: ignore
-        latents, log_priors = [latent for latent, _ in pairs], jnp.stack([log for _, log in pairs])
-        moved = self._chosen(key, mixture, latents, log_priors)
-        # A common factor of the transition probabilities must not add to the mass.
-        log_weights = moved.log_weights + (moved.log_scale - mixture.log_scale)
-        return moved.replace(log_weights=log_weights, log_scale=mixture.log_scale)
+        family = self._family(mixture, [latent for latent, _ in pairs])
+        log_priors = jnp.concatenate([log for _, log in pairs])
+        family = family.replace(log_weights=family.log_weights + log_priors)
+        return self._chosen(key, mixture, family)
 
-    def _chosen(
-        self,
-        key: Key[Array, ""],
-        mixture: ParticleMixture,
-        latents: list[PyTree],
-        log_factors: Float[Array, "k n"],
-    ) -> ParticleMixture:
-        """N of the N K children, their moments predicted."""
-        n, k, state = mixture.num_particles, len(latents), mixture.particles
-        latent = jax.tree.map(lambda *rows: _flat(jnp.stack(rows, axis=1)), *latents)
-        parents = jnp.arange(n * k, dtype=jnp.int32) // k
-        family = mixture.replace(
+    def _family(self, mixture: ParticleMixture, latents: list[PyTree]) -> ParticleMixture:
+        """All children, those of a regime side by side, with their parents' weights and moments.
+
+        Where one point of the line follows the other, each regime then has its share of them.
+        """
+        n, state = mixture.num_particles, mixture.particles
+        parents = jnp.tile(jnp.arange(n, dtype=jnp.int32), len(latents))
+        return mixture.replace(
             particles=MarginalisedState(
-                latent, take(state.mean, parents), take(state.covariance, parents)
+                jax.tree.map(lambda *rows: jnp.concatenate(rows), *latents),
+                take(state.mean, parents),
+                take(state.covariance, parents),
             ),
             log_weights=take(mixture.log_weights, parents),
             component_indicators=take(mixture.component_indicators, parents),
             ancestor_indices=take(mixture.ancestor_indices, parents),
             memory={},
-            usable_slots=jnp.asarray(mixture.num_usable_slots, jnp.int32),
-        ).weighed(log_factors.T.reshape(-1))
+        )
+
+    def _chosen(
+        self, key: Key[Array, ""], mixture: ParticleMixture, family: ParticleMixture
+    ) -> ParticleMixture:
+        """N of the N K children, their moments predicted."""
         if self.group is not None:
             family = self.group(key, family)
-        chances = jax.lax.stop_gradient(_chances(family, Resample(self.scheme)))
-        log_chances = jnp.where(
-            chances > 0, jnp.log(jnp.where(chances > 0, chances, 1.0)), -jnp.inf
+        line = in_line(jax.lax.stop_gradient(family))
+        targets = Resample().deal(mixture, line, family.active)
+        # More slots than children are of no use: a copy would have the moments that it copies.
+        num_children = line.sums((line.weights > 0).astype(line.weights.dtype))
+        targets = jnp.minimum(targets, num_children.astype(jnp.int32))
+        threshold = _threshold(line, targets)
+        least = line.of_places(threshold)
+        heavy = (line.weights > 0).astype(line.weights.dtype)
+        chances = jnp.where(line.weights >= least, heavy, line.weights / least)
+        chosen = draw_ancestors(
+            key,
+            line._replace(weights=chances, totals=targets.astype(chances.dtype)),
+            targets,
+            "systematic",
+            num_slots=mixture.num_particles,
         )
-        places = jnp.arange(n * k, dtype=jnp.int32)
-        chosen = Resample(self.scheme)(
-            key, family.replace(particles=places, log_weights=log_chances)
-        )
-        place = chosen.particles[:n]
-        log_ratios = jnp.where(chances > 0, family.log_weights - log_chances, 0.0)
-        log_weights = chosen.log_weights[:n] + take(log_ratios, place)
-        own = place // k
-        parent = jax.tree.map(lambda leaf: take(leaf, own), state)
-        drawn = jax.tree.map(lambda leaf: take(leaf, place), latent)
+        slots, places = chosen.slots, chosen.particles
+        log_weights = take(family.log_weights, places)
+        log_least = spread(log_or_nothing(threshold) + line.log_units, slots.components)
+        gain = jax.lax.stop_gradient(jnp.maximum(log_least - log_weights, 0.0))
+        latent, mean, covariance = jax.tree.map(lambda leaf: take(leaf, places), family.particles)
         return mixture.replace(
-            particles=predicted(self.model, drawn, parent),
-            log_weights=log_weights,
-            component_indicators=chosen.component_indicators[:n],
-            ancestor_indices=chosen.ancestor_indices[:n],
+            particles=predicted(self.model, latent, MarginalisedState(latent, mean, covariance)),
+            log_weights=jnp.where(slots.filled, log_weights + gain, -jnp.inf),
+            component_indicators=slots.components,
+            ancestor_indices=take(family.ancestor_indices, places),
             log_scale=family.log_scale,
         )
 
@@ -200,33 +208,30 @@ def children(
     return latents, log_priors, log_priors + jnp.stack(log_densities)
 
 
-def _chances(family: ParticleMixture, resample: Resample) -> Float[Array, " c"]:
-    """min(w / c, 1) of each child: the chance to be kept, which sums to its component's slots.
+def _threshold(line: Line, targets: Int[Array, " m"]) -> Float[Array, " m"]:
+    """c of each component, for which the chances min(w / c, 1) of its children sum to its slots.
 
     With all children for which w >= c kept, c is what the others weigh over the slots that are
     left. It starts with no child kept, and c only falls, until no more are kept: as many steps as
     there are different sets, mostly fewer than ten.
     """
-    weights, labels = family.component_weights, family.component_indicators
-    slots = resample.deal(family, family.active, family.component_counts).astype(weights.dtype)
+    weights = line.weights
+    slots = targets.astype(weights.dtype)
 
-    def thresholds(previous: Float[Array, " m"]) -> Float[Array, " m"]:
-        is_heavy = weights >= spread(previous, labels)
-        columns = jnp.stack([is_heavy.astype(weights.dtype), jnp.where(is_heavy, 0.0, weights)], 1)
-        num_heavy, rest = family.component_sums(columns).T
-        left = slots - num_heavy
-        lower = jnp.where(left >= 1, rest / jnp.maximum(left, 1.0), previous)
-        return jnp.minimum(previous, lower)
+    def lowered(previous: Float[Array, " m"]) -> Float[Array, " m"]:
+        is_heavy = weights >= line.of_places(previous)
+        left = slots - line.sums(is_heavy.astype(weights.dtype))
+        rest = line.sums(jnp.where(is_heavy, 0.0, weights))
+        return jnp.minimum(previous, jnp.where(left >= 1, rest / jnp.maximum(left, 1.0), previous))
 
     def is_falling(pair: tuple[Array, Array]) -> Bool[Array, ""]:
         return jnp.any(pair[1] < pair[0])
 
-    first = 1 / jnp.maximum(slots, 1.0)
+    first = line.totals / jnp.maximum(slots, 1.0)
     _, threshold = jax.lax.while_loop(
-        is_falling, lambda pair: (pair[1], thresholds(pair[1])), (first, thresholds(first))
+        is_falling, lambda pair: (pair[1], lowered(pair[1])), (first, lowered(first))
     )
-    own = spread(threshold, labels)
-    return jnp.where(weights >= own, (weights > 0).astype(weights.dtype), weights / own)
+    return threshold
 
 
 def require_finite(model: Any, needed_by: str) -> None:
@@ -242,8 +247,3 @@ def _row(table: Array, rows: Int[Array, " n"]) -> Array:
         is_row = (rows == k).reshape(-1, *[1] * (found.ndim - 1))
         found = jnp.where(is_row, table[k], found)
     return found
-
-
-def _flat(leaf: Array) -> Array:
-    """(n, k, ...) as (n k, ...)."""
-    return leaf.reshape(-1, *leaf.shape[2:])

@@ -53,9 +53,8 @@ class PropagateTempered(AbstractPropagation):
     A step evaluates the likelihood 1 + `num_moves` (stages - 1) times for each particle. A
     derivative treats the moves that were accepted as given, as with gradient "none" of `Resample`.
     Raises `ValueError` for a model without `transition_from_noise`, for exponents that do not rise
-    to 1, for a resampling with gradient "ot", which moves every particle, and for one that sorts,
-    since no point set follows. Use it where the likelihood is much narrower than the dynamics, and
-    no proposal is known.
+    to 1, and for a resampling that sorts, since no point set follows. Use it where the likelihood
+    is much narrower than the dynamics, and no proposal is known.
     """
 
     model: AbstractStateSpaceModel
@@ -79,8 +78,6 @@ class PropagateTempered(AbstractPropagation):
         self.model = model
         self.resample = Resample() if resample is None else resample
         check_type(Resample, "a Resample", resample=self.resample)
-        if self.resample.gradient == "ot":
-            raise ValueError("resample: gradient 'ot' moves particles between the stages")
         if self.resample.sort_by is not None:
             raise ValueError("resample: sort_by has no use between the stages")
         self.exponents = _rising(exponents)
@@ -88,11 +85,6 @@ class PropagateTempered(AbstractPropagation):
         self.num_moves = int(num_moves)
         check_inner_share(least_step=least_step)
         self.least_step = float(least_step)
-
-    @property
-    def approximate(self) -> bool:
-        """Whether the resampling is."""
-        return self.resample.approximate
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree

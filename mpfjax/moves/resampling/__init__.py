@@ -1,1 +1,1 @@
-"""Resampling within components: schemes, allocation of slots, ordering, optimal transport."""
+"""Resampling within components: particles in line, ancestors by scheme, allocation of slots."""

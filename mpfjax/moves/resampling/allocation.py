@@ -29,26 +29,24 @@ class Slots(NamedTuple):
 
 
 def allocate_slots(
-    counts: Int[Array, " m"],
+    kept: Int[Array, " m"],
     due: Bool[Array, " m"],
-    mixture: ParticleMixture,
+    num_slots: int | Int[Array, ""],
     particles_per_component: int | None,
     demands: Float[Array, " m"] | None = None,
 ) -> Int[Array, " m"]:
     """How many slots each component gets.
 
-    Components that are not due keep their slots, `counts`. The others share the rest of the usable
-    slots equally; or, given `demands`, in proportion to these with at least one each; or get
+    Components that are not due keep theirs, `kept`. The others share the rest of the slots equally;
+    or, given `demands`, in proportion to these with at least one each; or get
     `particles_per_component` each.
     """
-    usable, num_slots = mixture.num_usable_slots, mixture.num_particles
     if particles_per_component is not None:
-        share = jnp.asarray(min(particles_per_component, num_slots), jnp.int32)
-        return jnp.where(counts > 0, share, 0)
-    kept = jnp.where(due, 0, counts)
-    if counts.shape[0] == 1:
-        return jnp.where(due, usable, kept)
-    pool = usable - jnp.sum(kept, dtype=jnp.int32)
+        share = jnp.minimum(jnp.asarray(particles_per_component, jnp.int32), num_slots)
+        return jnp.where(due, share, kept)
+    if kept.shape[0] == 1:
+        return jnp.where(due, num_slots, kept)
+    pool = num_slots - jnp.sum(kept, dtype=jnp.int32)
     sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
     if demands is None:
         share = _evenly(pool, due, sharers)
@@ -94,6 +92,15 @@ def demands_by_variance(
     equal_part = jnp.where((total > 0) & (slots_each > FEWEST), equal_part, 1.0)
     demands = demands / jnp.where(total > 0, total, 1.0)
     return jnp.where(due, equal_part / sharers, 0.0) + (1 - equal_part) * demands
+
+
+def demands_of_groups(
+    mixture: ParticleMixture, groups: Int[Array, " n"], due: Bool[Array, " m"]
+) -> Float[Array, " m"]:
+    """For each component, one over the number of components of its group that share slots."""
+    group = jnp.round(mixture.component_averages(groups)).astype(jnp.int32)
+    rivals = jnp.sum((group[:, None] == group[None]) & due[None], axis=1)
+    return 1 / jnp.maximum(rivals, 1).astype(mixture.log_weights.dtype)
 
 
 def _evenly(

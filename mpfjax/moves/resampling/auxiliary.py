@@ -36,9 +36,9 @@ class AuxiliaryResample(AbstractMove):
       few particles. Where ν is zero for all particles of a component, the component is resampled
       by w alone.
 
-    Without an observation nothing is resampled. Raises `ValueError` for a `resample` with gradient
-    "ot", which draws nothing, and for a look-ahead that is neither function nor such a proposal.
-    Use it, with a proposal of the same kind, where the likelihood is narrow.
+    Without an observation nothing is resampled. Raises `ValueError` for a look-ahead that is
+    neither function nor such a proposal. Use it, with a proposal of the same kind, where the
+    likelihood is narrow.
     """
 
     resample: Resample
@@ -46,18 +46,11 @@ class AuxiliaryResample(AbstractMove):
 
     def __check_init__(self) -> None:
         check_type(Resample, "a Resample", resample=self.resample)
-        if self.resample.gradient == "ot":
-            raise ValueError("resample: gradient 'ot' draws no ancestors that could be weighed")
         if isinstance(self.lookahead, AbstractProposal):
             require(self.lookahead, "log_normaliser", "AuxiliaryResample", "lookahead")
         elif not hasattr(self.lookahead, "at_step_of"):
             what = "a function of an observation and states, nor a proposal"
             check_callable(what, lookahead=self.lookahead)
-
-    @property
-    def approximate(self) -> bool:
-        """Whether the resampling is."""
-        return self.resample.approximate
 
     @property
     def weighs(self) -> bool:
@@ -89,12 +82,8 @@ class AuxiliaryResample(AbstractMove):
         broken = jnp.any(mixture.occupied & ~(log_factors < jnp.inf))
         due = self.resample.is_due(mixture.weighed(log_factors))
         log_factors = jnp.where(spread(due, mixture.component_indicators), log_factors, 0.0)
-        own = jnp.arange(mixture.num_particles, dtype=mixture.ancestor_indices.dtype)
-        ahead = mixture.replace(ancestor_indices=own).weighed(log_factors)
-        drawn = self.resample.redraw(key, ahead, due)
-        parents = drawn.ancestor_indices
-        drawn = drawn.replace(ancestor_indices=take(mixture.ancestor_indices, parents))
-        drawn = drawn.weighed(-take(log_factors, parents))
+        drawn, ancestors = self.resample.redraw(key, mixture.weighed(log_factors), due)
+        drawn = drawn.weighed(-take(log_factors, ancestors.particles))
         return drawn.replace(log_weights=jnp.where(broken, jnp.nan, drawn.log_weights))
 
     def _log_factors(self, mixture: ParticleMixture, observation: PyTree) -> Float[Array, " n"]:

@@ -103,7 +103,10 @@ class GaussianRegeneration(AbstractResampling):
     def _vacated(self, mixture: ParticleMixture) -> ParticleMixture:
         """The slots dealt anew, each holding its component's heaviest particle."""
         m, counts = mixture.num_components, mixture.component_counts
-        targets = allocate_slots(counts, counts > 0, mixture, self.particles_per_component)
+        targets = allocate_slots(
+            jnp.zeros_like(counts), counts > 0, mixture.num_usable_slots,
+            self.particles_per_component,
+        )  # fmt: skip
         slots = place_slots(targets, mixture.num_particles)
         shares = jnp.maximum(targets, 1).astype(mixture.log_weights.dtype)
         log_weights = spread(mixture.log_mixture_weights - jnp.log(shares), slots.components)

@@ -1,0 +1,288 @@
+"""Drawing ancestors: the particle that each slot takes, by one of several schemes.
+
+A scheme returns the first slot of every particle's offspring. Each particle has an interval of the
+line, as long as its expected number of offspring k_m w_i, and the scheme places one point in the
+unit interval of each slot. To add a scheme, write such a function and name it in `SCHEMES`.
+
+A particle may be kept, as conditional SMC does: it then has one offspring at least. The offspring
+of all have their ordinary law, given that one slot of its component, each with equal probability,
+has the kept particle for its parent. So the numbers of offspring have their ordinary law weighed by
+that of the kept particle, and its slot is any of its offspring. Points get this law if one of them
+is drawn uniformly from the particle's own interval.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from mpfjax.moves.resampling.allocation import Slots, place_slots
+from mpfjax.moves.resampling.line import Line
+from mpfjax.operations.generator import split, uniform
+from mpfjax.operations.indexing import count_places, take
+from mpfjax.operations.positions import Positions, last_before, random_positions
+from mpfjax.operations.prefix_sums import count_starts, count_upto
+from mpfjax.operations.segments import spread
+from mpfjax.operations.stored import stored, whole_blocks
+
+_MOST_LEVELS = 31  # of the pairs of a component, whose particles are counted in 31 bits
+
+
+class Ancestors(NamedTuple):
+    """The particle that each slot takes."""
+
+    particles: Int[Array, " n"]
+    slots: Slots
+    kept: Int[Array, ""] | None  # the slot of the offspring that was to be kept
+
+
+class Kept(NamedTuple):
+    """A particle that has one offspring at least."""
+
+    place: Int[Array, ""]
+    component: Int[Array, ""]
+    shares: Float[Array, " levels"]  # independent uniform numbers
+
+    def point(self, before: Positions, distance: Float[Array, ""]) -> Positions:
+        """The point at a distance from the start of its interval."""
+        start = Positions(before.whole[self.place], before.fraction[self.place])
+        return start.moved_by(distance)
+
+
+class Dealt(NamedTuple):
+    """What a scheme draws from: a line, and the slots that its components have."""
+
+    line: Line
+    targets: Int[Array, " m"]  # how many slots
+    slots: Slots
+    expected: Float[Array, " p"]  # the expected number of offspring of each particle
+    before: Positions  # the start of its interval
+    kept: Kept | None
+
+
+def draw_ancestors(
+    key: Key[Array, ""],
+    line: Line,
+    targets: Int[Array, " m"],
+    scheme: str,
+    *,
+    num_slots: int,
+    due: Bool[Array, " m"] | None = None,
+    keep: Int[Array, ""] | None = None,
+) -> Ancestors:
+    """The parents of the slots: `targets` of each component, side by side, the empty ones last.
+
+    Where a component is not `due`, its particles stay as they are; None resamples every one. The
+    particle `keep` has an offspring whatever is drawn; it must be drawn from, or stay, in `line`.
+    """
+    slots = place_slots(targets, num_slots)
+    expected = line.expected(targets)
+    before, is_inside = line.positions(expected, targets, slots.firsts)
+    kept = None
+    if keep is not None:
+        key, key_kept = split(key, 2)
+        place = line.place_of(keep)
+        own = jnp.zeros((), jnp.int32) if line.components is None else line.components[place]
+        kept = Kept(place, own, uniform(key_kept, (_MOST_LEVELS + 2,), expected.dtype))
+    starts = SCHEMES[scheme](key, Dealt(line, targets, slots, expected, before, kept))
+    # Rounding must not give a slot to particles after the last weight, nor cross a border.
+    num_filled = jnp.sum(targets, dtype=jnp.int32)
+    starts = jnp.where(is_inside, jnp.minimum(starts, num_filled), num_filled)
+    firsts, lasts = (spread(ends, slots.components) for ends in line.extents(drawn=True))
+    parents = jnp.clip(count_starts(starts, num_slots), firsts, lasts)
+    if due is not None:
+        parents = jnp.where(spread(due, slots.components), parents, firsts + slots.ranks)
+    slot = None
+    if kept is not None:
+        # Rounding may leave it without any: it then takes the slot where its interval starts.
+        is_own = slots.filled & (parents == kept.place)
+        number = jnp.sum(is_own, dtype=jnp.int32)
+        choice = (kept.shares[-1] * number.astype(expected.dtype)).astype(jnp.int32)
+        slot = jnp.argmax(is_own).astype(jnp.int32) + jnp.minimum(choice, number - 1)
+        slot = jnp.where(number > 0, slot, starts[kept.place])
+        first, most = slots.firsts[kept.component], targets[kept.component]
+        slot = jnp.clip(slot, first, first + jnp.maximum(most, 1) - 1)
+        parents = parents.at[slot].set(kept.place)
+    return Ancestors(line.particles_at(parents), slots, slot)
+
+
+def systematic(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
+    shift = stored(uniform(key, dealt.targets.shape, dealt.expected.dtype))
+    if dealt.kept is not None:
+        shift = shift.at[dealt.kept.component].set(_own_point(dealt).fraction)
+    return _points_before(dealt.before, dealt.line.of_places(shift))
+
+
+def stratified(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
+    shift = uniform(key, dealt.slots.components.shape, dealt.expected.dtype)
+    if dealt.kept is not None:
+        own = _own_point(dealt)
+        shift = shift.at[own.whole].set(own.fraction, mode="drop")
+    slot = jnp.clip(dealt.before.whole, 0, shift.shape[0] - 1)
+    return _points_before(dealt.before, take(shift, slot))
+
+
+def _own_point(dealt: Dealt) -> Positions:
+    """A point drawn uniformly from the interval of the kept particle."""
+    assert dealt.kept is not None
+    return dealt.kept.point(dealt.before, dealt.kept.shares[0] * dealt.expected[dealt.kept.place])
+
+
+def _points_before(before: Positions, shift: Float[Array, " #p"]) -> Int[Array, " p"]:
+    """How many of the points s + shift, one in each slot s, come before a particle's interval."""
+    return before.whole + (shift < before.fraction).astype(jnp.int32)
+
+
+def multinomial(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
+    points = random_points(key, dealt.slots, dealt.targets)
+    if dealt.kept is not None:
+        points = _with_point(points, _own_point(dealt), dealt.slots.firsts[dealt.kept.component])
+    return _random_points_before(points, dealt.before, dealt.slots)
+
+
+def residual(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
+    _, targets, slots, expected, _, kept = dealt
+    whole = _certain(expected)
+    copies = whole.astype(jnp.int32)
+    certain = count_upto(copies, 2 * expected.shape[0]) - copies
+    left = jnp.maximum(targets - dealt.line.sums(whole).astype(jnp.int32), 0)
+    rest = place_slots(left, slots.components.shape[0])
+    rests_before, _ = dealt.line.positions(jnp.maximum(expected - whole, 0.0), left, rest.firsts)
+    points = random_points(key, rest, left)
+    if kept is not None:
+        # Its offspring is one of the certain ones, or one of those that are drawn.
+        distance = kept.shares[0] * expected[kept.place] - whole[kept.place]
+        is_drawn = (distance >= 0) & (left[kept.component] > 0)
+        point = kept.point(rests_before, jnp.maximum(distance, 0.0))
+        nowhere = slots.components.shape[0]
+        slot = jnp.where(is_drawn, rest.firsts[kept.component], nowhere)
+        points = _with_point(points, point, slot)
+    return certain + _random_points_before(points, rests_before, rest)
+
+
+def _certain(expected: Float[Array, " p"]) -> Float[Array, " p"]:
+    """The whole part of each expected number of offspring."""
+    # In floating point, k times a weight of 1 / k may be a little less than 1; it must count as 1.
+    return jnp.floor(expected * (1 + 16 * jnp.finfo(expected.dtype).eps))
+
+
+def ssp(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
+    """Srinivasan's process: fractions are paired until each is 0 or 1 (Gerber et al. 2019).
+
+    Of two fractions with the sum s, one becomes 0 and the other s; or, if s >= 1, one becomes 1 and
+    the other s - 1. The choice is random, such that each keeps its mean. Every particle thus has
+    the floor or the ceiling of its expected number of offspring. The pairs form a tree over each
+    component, and all pairs of a level are settled at once: O(log N) levels.
+    """
+    line, expected = dealt.line, dealt.expected
+    # Includes particles that are never drawn, so that every place has a rank from 0 on.
+    firsts, lasts = line.extents(drawn=False)
+    places = _Stretches(*map(line.of_places, (firsts, lasts - firsts + 1)))
+    whole = _certain(expected)
+    uniforms = uniform(key, expected.shape, expected.dtype)
+    is_up = _settle(jnp.maximum(expected - whole, 0.0), uniforms, places, _up(dealt, whole))
+    offspring = whole.astype(jnp.int32) + is_up.astype(jnp.int32)
+    # Relative to the component's first, so that rounding errors stay within the component.
+    earlier = jnp.cumsum(offspring) - offspring
+    return earlier - take(earlier, places.firsts) + line.of_places(dealt.slots.firsts)
+
+
+class _Stretches(NamedTuple):
+    """For each place, where its component's places start, and how many these are."""
+
+    firsts: Int[Array, " #p"]
+    counts: Int[Array, " #p"]
+
+
+class _Up(NamedTuple):
+    """A place whose fraction becomes 1, where that `is_due`."""
+
+    kept: Kept
+    is_due: Bool[Array, ""]
+
+
+def _up(dealt: Dealt, whole: Float[Array, " p"]) -> _Up | None:
+    """The kept particle, unless its offspring is one of those that are certain."""
+    kept = dealt.kept
+    if kept is None:
+        return None
+    return _Up(kept, kept.shares[0] * dealt.expected[kept.place] >= whole[kept.place])
+
+
+def _settle(
+    fractions: Float[Array, " p"],
+    uniforms: Float[Array, " p"],
+    places: _Stretches,
+    up: _Up | None = None,
+) -> Bool[Array, " p"]:
+    """Which of the fractions become 1, where those of each component sum to a whole number."""
+    p = fractions.shape[0]
+    ranks = jnp.arange(p, dtype=jnp.int32) - places.firsts
+
+    def at(values: Array, rank: Int[Array, " p"]) -> Array:
+        return take(values, jnp.clip(places.firsts + rank, 0, p - 1))
+
+    levels = []
+    left_over, length = fractions, 1
+    while length < p:
+        # The pair of the blocks 2r and 2r + 1 of a component stands at its rank r.
+        has_right = (2 * ranks + 1) * length < places.counts
+        left = at(left_over, 2 * ranks)
+        right = jnp.where(has_right, at(left_over, 2 * ranks + 1), 0.0)
+        total = left + right
+        one_is_up = total >= 1
+        # The middle of a pair's interval belongs to no other pair.
+        draw = at(uniforms, (2 * ranks + 1) * length) * jnp.where(one_is_up, 2.0 - total, total)
+        left_stays = draw < jnp.where(one_is_up, 1 - left, left)
+        if up is not None:
+            # Its own block becomes 1 at once, or stays with what is left over; but never 0.
+            rank, share = ranks[up.kept.place], up.kept.shares[1 + len(levels)]
+            is_left = (rank // length) % 2 == 0
+            own, other = jnp.where(is_left, left, right), jnp.where(is_left, right, left)
+            leaves = one_is_up & (share * own * (2 - total) < 1 - other)
+            pair = up.kept.place - rank + rank // (2 * length)
+            is_pair = up.is_due & (jnp.arange(p, dtype=jnp.int32) == pair)
+            left_stays = jnp.where(is_pair, leaves != is_left, left_stays)
+            up = up._replace(is_due=up.is_due & ~leaves[pair])
+        levels.append((left_stays, one_is_up))
+        left_over, length = total - one_is_up.astype(total.dtype), 2 * length
+    is_up = left_over > 0.5
+    for left_stays, one_is_up in reversed(levels):
+        stays = at(left_stays, ranks // 2) == (ranks % 2 == 0)
+        is_up = jnp.where(stays, at(is_up, ranks // 2), at(one_is_up, ranks // 2))
+    return is_up & (ranks < places.counts)
+
+
+def random_points(key: Key[Array, ""], slots: Slots, targets: Int[Array, " m"]) -> Positions:
+    """For each slot an independent uniform point on its component's interval of slots."""
+    lengths = jnp.maximum(spread(targets, slots.components), 1)
+    points = random_positions(key, lengths)
+    return Positions(points.whole + spread(slots.firsts, slots.components), points.fraction)
+
+
+def _with_point(points: Positions, point: Positions, slot: Int[Array, ""]) -> Positions:
+    """The points with another one for a slot."""
+    return Positions(
+        points.whole.at[slot].set(point.whole, mode="drop"),
+        points.fraction.at[slot].set(point.fraction, mode="drop"),
+    )
+
+
+def _random_points_before(points: Positions, before: Positions, slots: Slots) -> Int[Array, " p"]:
+    """How many of the points come before a particle's interval."""
+    num_places, num_slots = before.whole.shape[0], slots.components.shape[0]
+    parents = jnp.maximum(last_before(before, points, num_slots), 0)
+    # The points of empty slots are in no particle's interval.
+    places = jnp.where(slots.filled, parents, num_places)
+    offspring = count_places(places, whole_blocks(num_places + 1))[:num_places]
+    return count_upto(offspring, num_slots) - offspring
+
+
+SCHEMES: dict[str, Callable[[Key[Array, ""], Dealt], Int[Array, " p"]]] = {
+    "systematic": systematic,
+    "stratified": stratified,
+    "multinomial": multinomial,
+    "residual": residual,
+    "ssp": ssp,
+}

@@ -1,0 +1,190 @@
+"""The particles in line for resampling, component by component.
+
+Imagine the particles on a line, each with an interval as long as its expected number of offspring.
+Every slot has a point on the line and takes the particle whose interval holds it. The particles of
+a component must be neighbours. After resampling they are, and until they are regrouped nothing has
+to be sorted.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Shaped
+
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.resampling.ordering import SortBy, sorted_order
+from mpfjax.operations.choices import cond_if_any
+from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import exp, finite_or_zero, log_or_nothing
+from mpfjax.operations.positions import (
+    Positions,
+    as_positions,
+    exact_sum_before,
+    growths,
+    in_slots,
+    needs_two_parts,
+    scales,
+    unit_shift,
+)
+from mpfjax.operations.prefix_sums import sum_before
+from mpfjax.operations.runs import Runs, runs_of, whole
+from mpfjax.operations.segments import order_by_segment, segment_counts, spread
+from mpfjax.operations.stored import stored
+
+
+class Line(NamedTuple):
+    """The particles in a line of p places, those of a component side by side.
+
+    p is a multiple of the block length of the prefix sums. The particles of a single component
+    that nothing sorts stand where they are: `order`, `components` and `runs` are then None.
+    """
+
+    num_particles: int
+    weights: Float[Array, " p"]  # in a unit of the component's own, zero at an empty place
+    totals: Float[Array, " m"]  # of the weights, zero for a dead component
+    log_units: Float[Array, " m"]
+    is_drawn: Bool[Array, " p"]  # at which places a particle may be drawn, or stays as it is
+    order: Int[Array, " p"] | None = None  # which particle stands at each place
+    components: Int[Array, " p"] | None = None
+    runs: Runs | None = None
+
+    @property
+    def counts(self) -> Int[Array, " m"]:
+        """How many places each component has."""
+        if self.components is None:
+            return jnp.full(1, self.num_particles, jnp.int32)
+        return segment_counts(self.is_drawn, self.components, self.totals.shape[0])
+
+    @property
+    def log_masses(self) -> Float[Array, " m"]:
+        """The logarithm of each component's mass."""
+        return log_or_nothing(self.totals) + self.log_units
+
+    @property
+    def effective_sample_sizes(self) -> Float[Array, " m"]:
+        """(Σ w)² / Σ w² of each component, zero for a dead one."""
+        squares = self.sums(self.weights**2)
+        return self.totals**2 / jnp.where(squares > 0, squares, 1.0)
+
+    def sums(self, values: Float[Array, " p"]) -> Float[Array, " m"]:
+        """The sum over each component's places."""
+        return jnp.sum(values, keepdims=True) if self.runs is None else self.runs.sums(values)
+
+    def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, " #p"]:
+        """The value of the component at each place."""
+        return values if self.components is None else spread(stored(values), self.components)
+
+    def extents(self, drawn: bool) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
+        """The first and the last place of each component: of those `drawn` from, or of all."""
+        if self.runs is None:
+            return jnp.zeros(1, jnp.int32), jnp.full(1, self.weights.shape[0] - 1, jnp.int32)
+        mask = self.is_drawn if drawn else jnp.ones_like(self.is_drawn)
+        firsts, lasts = stored(jnp.stack(self.runs.extents(mask)))
+        return firsts, lasts
+
+    def expected(self, targets: Int[Array, " m"]) -> Float[Array, " p"]:
+        """The expected number of offspring of each particle."""
+        shares = targets.astype(self.totals.dtype) / jnp.where(self.totals > 0, self.totals, 1.0)
+        return self.weights * self.of_places(shares)
+
+    def positions(
+        self, values: Float[Array, " p"], lengths: Int[Array, " m"], first_slots: Int[Array, " m"]
+    ) -> tuple[Positions, Bool[Array, " p"]]:
+        """The start of each interval, in slots, and which of them are not after the last slot.
+
+        The values are the lengths of the intervals; they sum to each component's length up to
+        rounding.
+        """
+        if needs_two_parts(values.shape[0], values.dtype):
+            return _sums_in_two_parts(self, values, lengths, first_slots)
+        before, total = sum_before(values)
+        return as_positions(before), before < total
+
+    def particles_at(self, places: Int[Array, " n"]) -> Int[Array, " n"]:
+        """The particles at these places."""
+        places = jnp.clip(places, 0, self.num_particles - 1)
+        return places if self.order is None else take(self.order, stored(places))
+
+    def place_of(self, particle: Int[Array, ""]) -> Int[Array, ""]:
+        """The place of a particle."""
+        if self.order is None:
+            return particle
+        return jnp.argmax(self.order == particle).astype(jnp.int32)
+
+
+def _sums_in_two_parts(
+    line: Line,
+    values: Float[Array, " p"],
+    lengths: Int[Array, " m"],
+    first_slots: Int[Array, " m"],
+) -> tuple[Positions, Bool[Array, " p"]]:
+    """The sums from each component's own first slot, without the rounding errors of others."""
+    num_places = values.shape[0]
+    firsts, lasts = line.extents(drawn=False)
+    shift = unit_shift(lengths, lasts - firsts + 1)
+    scale = scales(line.sums(values), lengths << shift, num_places)
+    before, total = exact_sum_before(values * line.of_places(scale))
+    starts, nexts = before.at(firsts), before.at(jnp.minimum(lasts + 1, num_places - 1))
+    is_end = lasts == num_places - 1
+    ends = Positions(*(jnp.where(is_end, *pair) for pair in zip(total, nexts, strict=True)))
+    growth = growths(ends.after(starts), lengths << shift)
+    starts = Positions(*map(line.of_places, starts))
+    within = in_slots(before.after(starts), line.of_places(growth), line.of_places(shift))
+    is_inside = (before.whole < total.whole) | (before.fraction < total.fraction)
+    positions = Positions(within.whole + line.of_places(first_slots), within.fraction)
+    # A place after a component's last weight is exactly at its end.
+    ends = Positions(*map(line.of_places, ends))
+    is_after = (before.whole == ends.whole) & (before.fraction == ends.fraction)
+    end = line.of_places(first_slots + lengths)
+    whole = jnp.where(is_after, end, positions.whole)
+    return Positions(whole, jnp.where(is_after, 0.0, positions.fraction)), is_inside
+
+
+def in_line(
+    mixture: ParticleMixture, stays: Bool[Array, " n"] | None = None, sort_by: SortBy | None = None
+) -> Line:
+    """The particles in line, within each component by `sort_by` or as they are.
+
+    A weight may underflow to zero where its logarithm does not. Such a particle is not drawn where
+    its component is resampled, and has a place among its component's where it `stays` as it is.
+    """
+    n, m = mixture.num_particles, mixture.num_components
+    if m == 1 and sort_by is None:
+        weights = whole(mixture.component_weights, 0.0)
+        log_masses = mixture.log_mixture_weights
+        return Line(n, weights, jnp.ones(1, weights.dtype), log_masses, weights > 0)
+    labels = mixture.component_indicators
+    if stays is not None or sort_by is not None:
+        # Particles that stay by rank need their component's as neighbours.
+        stands = mixture.component_weights > 0
+        if stays is not None:
+            stands |= mixture.occupied & stays
+        labels = jnp.where(stands, labels, m)
+    log_weights, labels = whole(mixture.log_weights, -jnp.inf), whole(labels, m)
+
+    def in_order(order: Int[Array, " p"]) -> tuple[Array, Array, Array]:
+        own = take(labels, order)
+        # Labels without particles come last.
+        return order, jnp.where(own < m, take(log_weights, order), -jnp.inf), own
+
+    def by_component() -> tuple[Array, Array, Array]:
+        return in_order(order_by_segment(labels, m)[0])
+
+    def as_they_are() -> tuple[Array, Array, Array]:
+        return jnp.arange(labels.shape[0], dtype=jnp.int32), log_weights, labels
+
+    if sort_by is None:
+        is_mixed = jnp.any(labels[1:] < labels[:-1])
+        order, log_weights, labels = cond_if_any(is_mixed, by_component, as_they_are)
+    else:
+        order = sorted_order(mixture, labels[:n], sort_by)
+        order, log_weights, labels = in_order(whole(order, labels.shape[0] - 1))
+    runs = runs_of(labels, m)
+    labels = jnp.minimum(labels, m - 1)
+    log_largest = finite_or_zero(runs.maxima(log_weights))
+    relative = exp(log_weights - spread(stored(log_largest), labels))
+    is_drawn = relative > 0
+    if stays is not None:
+        is_drawn |= (log_weights > -jnp.inf) & take(whole(stays, False), order)
+    totals = runs.sums(relative)
+    return Line(n, relative, totals, log_largest, is_drawn, order, labels, runs)
