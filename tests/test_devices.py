@@ -245,7 +245,9 @@ class TestExchange:
         log_weights = rng.normal(size=(g, n)) + np.asarray(log_masses)[:, None]
         states, labels = rng.normal(size=g * n), rng.integers(0, 3, g * n)
         whole = make_mixture(states, log_weights.ravel(), labels, 3)
-        islands = jax.tree.map(lambda leaf: leaf.reshape(g, n, *leaf.shape[1:]), whole)
+        islands = whole.replace(log_scale=jnp.zeros(g * n))
+        islands = jax.tree.map(lambda leaf: leaf.reshape(g, n, *leaf.shape[1:]), islands)
+        islands = islands.replace(log_scale=jnp.zeros(g))
         move = mpfjax.IslandInteraction(threshold)
         return islands, on_islands(lambda part: move(jax.random.key(0), part), islands)
 

@@ -173,6 +173,14 @@ BUILT = {
         {"model": MODEL, "moves": [mpfjax.Propagate(MODEL)], "num_particles": 4,
          "num_components": 1, "initial_moves": (), "initial_noise": "rqmc"},
     ),
+    "SelectInitial": (
+        mpfjax.SelectInitial,
+        {"propagation": mpfjax.Propagate(MODEL), "num_draws": 2, "noise": "rqmc"},
+    ),
+    "with_selected_start": (
+        mpfjax.with_selected_start,
+        {"filter": mpfjax.particle_filter(MODEL, 4), "num_draws": 2},
+    ),
     "particle_filter": (
         mpfjax.particle_filter,
         {"model": MODEL, "num_particles": 4, "proposal": None, "scheme": "systematic",
