@@ -60,6 +60,11 @@ class AuxiliaryResample(AbstractMove):
         return self.resample.approximate
 
     @property
+    def sorts(self) -> bool:
+        """Whether the resampling does."""
+        return self.resample.sorts
+
+    @property
     def weighs(self) -> bool:
         """False: the weights are divided by the look-ahead again."""
         return False

@@ -139,6 +139,11 @@ class Resample(AbstractAdaptiveResampling):
         """Whether the weights are normalised after soft draws, or the particles transported."""
         return self.gradient in ("soft", "ot")
 
+    @property
+    def sorts(self) -> bool:
+        """Whether particles are sorted, those that are not resampled as well."""
+        return self.sort_by is not None
+
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
         if self.ess_threshold == 1.0:
