@@ -50,7 +50,8 @@ def test_forecasts_have_the_right_variance(size):
 @pytest.mark.parametrize("size", SIZES)
 def test_the_evidence_after_a_missing_observation(size):
     """y_1 and y_3 are jointly normal; independent noise has an error of 1.1 / √N."""
-    exact = scipy.stats.multivariate_normal([0, 0], [[3, 2], [2, 5]]).logpdf([0.7, 1.5])
+    covariance = np.array([[3.0, 2.0], [2.0, 5.0]])
+    exact = scipy.stats.multivariate_normal.logpdf([0.7, 1.5], np.zeros(2), covariance)
     filter = mpfjax.particle_filter(WALK, size, noise="rqmc")
     run = runs_of(filter, [[0.7], [NAN], [1.5]], lambda mixture: None)
     assert rms(run.log_marginal_likelihood - exact) < 0.8 / np.sqrt(size)
