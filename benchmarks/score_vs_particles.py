@@ -157,16 +157,10 @@ def build(
         )
     options: dict[str, Any] = {"allocation": "equal", **mixture}
     if name == "guided_mpf":
-        options["proposal"] = mpfjax.GaussNewtonProposal(model, noise="stratified")
-        options["sort_by"] = position
+        options |= {"proposal": mpfjax.GaussNewtonProposal(model), "noise": "rqmc"}
     return mpfjax.with_selected_start(
         mpfjax.mixture_particle_filter(model, num_particles, **options), 1
     )
-
-
-def position(particles: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Where a particle stands in line for resampling: by its scalar state."""
-    return particles
 
 
 def collect(mixture: mpfjax.ParticleMixture) -> dict[str, Array]:

@@ -60,7 +60,7 @@ class Filter(eqx.Module):
     - `initial_moves`: moves of x_0, which are given y_1 where it is known: regrouping, such as
       `KMeans(reseed=True)`, and `SelectInitial`. What they weigh is part of the first increment.
     - `initial_noise`: the noise of x_0 where the model has `initial_from_noise`: "independent", as
-      the model's own `sample_initial` draws it, "rqmc" or "stratified"; see `Propagate`.
+      the model's own `sample_initial` draws it, or "rqmc"; see `Propagate`.
     - `starts_empty`: at time 0 no slot holds a particle, and later all may become empty again.
       Moves start components, as the births of a tracker. A step without any mass has an increment
       of zero.
@@ -247,8 +247,11 @@ class Filter(eqx.Module):
             if observation is not None and not move.keeps_mass:
                 moved, log_growth = normalised(moved, mixture, self.starts_empty)
                 increment += log_growth
+            in_order = move.sorts or (moved.in_order and not move.propagates)
             mixture = forgetting(moves, moved)
-        return mixture.replace(parents=None), step_info(mixture, increment, resampled)
+            mixture = mixture.replace(in_order=in_order and observation is not None)
+        mixture = mixture.replace(parents=None, in_order=False)
+        return mixture, step_info(mixture, increment, resampled)
 
 
 def step_and_faults(

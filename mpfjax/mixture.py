@@ -57,6 +57,8 @@ class ParticleMixture(eqx.Module):
       `monte_carlo(..., slots=...)` sets it.
     - `parents`: within a step, x_{t-1} of each particle after the propagation, where a move of the
       chain asks for it (`AbstractMove.needs_parents`). Elsewhere it is None.
+    - `in_order`: within a step, whether a move has put each component's particles in an order
+      (`AbstractMove.sorts`), along which the propagation then spreads its point sets.
     - `log_scale`: the logarithm of a common factor of all weights. It is kept apart from ℓ, which
       would lose its digits if a log-likelihood of a million were added. After a step it is zero.
       In a mixture of x_0 it is what the initial moves leave to the first increment.
@@ -74,6 +76,7 @@ class ParticleMixture(eqx.Module):
     usable_slots: Int[Array, ""] | None = None
     log_scale: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), default_float()))
     parents: PyTree = None
+    in_order: bool = eqx.field(static=True, default=False)
 
     @property
     def num_particles(self) -> int:

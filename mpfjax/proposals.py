@@ -14,7 +14,6 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import (
     check_callable,
     check_key,
-    check_one_of,
     check_positive,
     check_positive_array,
     check_whole,
@@ -22,7 +21,7 @@ from mpfjax.checks import (
 )
 from mpfjax.models.base import model_name, require
 from mpfjax.models.inputs import has_attribute
-from mpfjax.models.noise import NOISES, draw_noise, independent_normal
+from mpfjax.operations.generator import normal
 from mpfjax.operations.matrices import cholesky, solve_lower
 
 
@@ -94,7 +93,7 @@ class NetworkProposal(AbstractProposal):
     ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
         """x_t from the network's Gaussian of every particle, and its log density."""
         shape = (previous_states.shape[0], self.noise_dimension(previous_states))
-        noise = independent_normal(key, shape, previous_states.dtype)
+        noise = normal(key, shape, previous_states.dtype)
         return self.propose_from_noise(noise, observation, previous_states)
 
     def noise_dimension(self, previous_states: Float[Array, "n ..."]) -> int:
@@ -146,9 +145,6 @@ class GaussNewtonProposal(AbstractProposal):
 
     - `model`: has `transition_mean`, `observation_mean`, `transition_covariance`, (d, d), and
       `observation_covariance`, (p, p). States are one array, (n,) or (n, d); Q is invertible.
-    - `noise`: "independent", or "stratified" or "rqmc", which spread the draws of all particles
-      evenly. The distribution of each draw stays the same, so the filter stays unbiased.
-      `Propagate(noise="rqmc")` spreads those of each component.
 
     Raises `ValueError` for a model without these, no iterations, or an inflation not above 0. Use
     it where bootstrap particles mostly miss the likelihood.
@@ -157,7 +153,6 @@ class GaussNewtonProposal(AbstractProposal):
     model: Any
     num_iterations: int = eqx.field(static=True, default=4)
     inflation: float = eqx.field(static=True, default=1.1)
-    noise: str = eqx.field(static=True, default="independent")
 
     def __check_init__(self) -> None:
         for method in ("transition_mean", "observation_mean"):
@@ -170,14 +165,13 @@ class GaussNewtonProposal(AbstractProposal):
                 )
         check_whole(num_iterations=self.num_iterations)
         check_positive(inflation=self.inflation)
-        check_one_of(NOISES, noise=self.noise)
 
     def propose(
         self, key: Key[Array, ""], observation: PyTree, previous_states: Float[Array, "n ..."]
     ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
         """x_t from the fitted Gaussian of every particle, and its log density."""
         shape = (previous_states.shape[0], self.noise_dimension(previous_states))
-        noise = draw_noise(self.noise, key, shape, previous_states.dtype)
+        noise = normal(key, shape, previous_states.dtype)
         return self.propose_from_noise(noise, observation, previous_states)
 
     def noise_dimension(self, previous_states: Float[Array, "n ..."]) -> int:

@@ -47,7 +47,7 @@ NUM_COMPONENTS, MANY_COMPONENTS = 3, 6
 OTHERWISE_OF_MANY = (
     "mpf",
     "mpf rqmc",
-    "guided, sorted, stratified noise",
+    "guided, sorted",
     "split only, adaptive",
     "random labels, multinomial",
     "random labels, residual",
@@ -152,7 +152,7 @@ def _in_stages(m: int) -> Callable[..., Filter]:
         NUM_PARTICLES,
         m,
         initial_moves=[KMeans(3, reseed=True)],
-        initial_noise="stratified",
+        initial_noise="rqmc",
     )
 
 
@@ -190,10 +190,10 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
         ),
         "mpf fixed number": _mpf(m, particles_per_component=36 // m),
         "guided mpf": lambda model: _mpf(m, proposal=GaussNewtonProposal(model))(model),
-        "guided, sorted, stratified noise": _chain(
+        "guided, sorted": _chain(
             Resample(sort_by=lambda states: states.reshape(NUM_PARTICLES, -1)[:, 0]),
             m=m,
-            proposal=lambda model: GaussNewtonProposal(model, noise="stratified"),
+            proposal=GaussNewtonProposal,
             then=[KMeans(2)],
         ),
         "patient merge": _chain(Resample(), m=m, then=[Merge(2.0, 1.0, patience=2)]),
@@ -260,7 +260,9 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "resampled every second step": _chain(Every(2, [Resample("stratified"), KMeans(2)])),
     "in stages": _in_stages(1),
     "pf of families": _pf(num_draws=3),
-    "pf of families, stratified": _pf(num_draws=4, noise="stratified"),
+    "point sets without an order": lambda model: Filter(
+        model, [Resample(ess_threshold=0.5), Propagate(model, noise="rqmc")], NUM_PARTICLES
+    ),
     "guided mpf rqmc of families": lambda model: _mpf(
         proposal=GaussNewtonProposal(model), noise="rqmc", num_draws=3
     )(model),

@@ -86,7 +86,7 @@ BUILT = {
     ),
     "GaussNewtonProposal": (
         mpfjax.GaussNewtonProposal,
-        {"model": MODEL, "num_iterations": 2, "inflation": 1.1, "noise": "independent"},
+        {"model": MODEL, "num_iterations": 2, "inflation": 1.1},
     ),
     "Resample": (
         mpfjax.Resample,
@@ -125,7 +125,7 @@ BUILT = {
     "Propagate": (
         mpfjax.Propagate, {"model": MODEL, "proposal": None, "gradient": "none", "noise": "rqmc"}
     ),
-    "Predict": (mpfjax.Predict, {"model": MODEL, "gradient": "none", "noise": "stratified"}),
+    "Predict": (mpfjax.Predict, {"model": MODEL, "gradient": "none", "noise": "rqmc"}),
     "PropagateMarginalised": (
         mpfjax.PropagateMarginalised,
         {"model": SWITCHING, "proposal": None, "gradient": "none", "noise": "rqmc"},

@@ -1,5 +1,7 @@
 """The Gauss-Newton proposal and its noise, and the proposal that is learned."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,7 @@ import scipy.stats
 import mpfjax
 from mpfjax import GaussNewtonProposal, NetworkProposal
 from mpfjax.exact import grid_filter, kalman_filter
-from mpfjax.models.noise import independent_normal, stratified_normal, stratified_uniform
+from mpfjax.models.noise import draw_noise, stratified_normal, stratified_uniform
 from tests.precision import float64
 
 LINEAR = mpfjax.LinearGaussianModel(
@@ -41,10 +43,9 @@ def gaussian_fit(model, previous, observation):
     return information @ covariance, covariance
 
 
-@pytest.mark.parametrize("noise", ["independent", "stratified"])
 @pytest.mark.parametrize("inflation", [1.0, 1.3])
-def test_the_log_density_is_that_of_the_gaussian_it_draws_from(inflation, noise):
-    proposal = GaussNewtonProposal(LINEAR, inflation=inflation, noise=noise)
+def test_the_log_density_is_that_of_the_gaussian_it_draws_from(inflation):
+    proposal = GaussNewtonProposal(LINEAR, inflation=inflation)
     previous = LINEAR.sample_initial(jax.random.key(0), 20)
     states, log_density = propose(proposal, jax.random.key(1), OBSERVATION, previous)
     means, covariance = gaussian_fit(LINEAR, previous, OBSERVATION)
@@ -113,10 +114,9 @@ def test_works_in_float64():
     with float64():
         model = mpfjax.QuadraticModel(0.5, 0.1)
         previous = jnp.array([1.2, -1.2])
-        for noise in ("independent", "stratified"):
-            proposal = GaussNewtonProposal(model, noise=noise)
-            states, log_density = propose(proposal, jax.random.key(6), jnp.array(1.0), previous)
-            assert states.dtype == log_density.dtype == np.float64
+        proposal = GaussNewtonProposal(model)
+        states, log_density = propose(proposal, jax.random.key(6), jnp.array(1.0), previous)
+        assert states.dtype == log_density.dtype == np.float64
 
 
 class TestStratifiedNormal:
@@ -139,7 +139,7 @@ class TestStratifiedNormal:
             draws = jax.jit(jax.vmap(lambda key: draw(key, (100, 1), FLOAT)))(self.KEYS)
             return float(np.asarray(draws).mean(axis=(1, 2)).std())
 
-        assert error(stratified_normal) < 0.35 * error(independent_normal)
+        assert error(stratified_normal) < 0.35 * error(partial(draw_noise, "independent"))
 
     def test_columns_are_uncorrelated_over_keys(self):
         draw = jax.jit(jax.vmap(lambda key: stratified_normal(key, (5, 2), FLOAT)))
@@ -182,7 +182,7 @@ class TestBadInput:
 
     @pytest.mark.parametrize(
         ("name", "value"),
-        [("num_iterations", 0), ("inflation", 0.0), ("inflation", float("nan")), ("noise", "pink")],
+        [("num_iterations", 0), ("inflation", 0.0), ("inflation", float("nan"))],
     )
     def test_options_out_of_range_are_named(self, name, value):
         with pytest.raises(ValueError, match=f"{name}: "):

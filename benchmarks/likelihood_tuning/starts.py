@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 import mpfjax
 from benchmarks.likelihood_tuning.quadratic import COARSE_GRID, GRID, OBSERVATIONS, exact_quadratic
-from benchmarks.score_vs_particles import HIGH, LOW, position
+from benchmarks.score_vs_particles import HIGH, LOW
 from mpfjax import plotting
 from mpfjax.console import format_table, write_figure, write_json
 from mpfjax.tuning import Positive, TuningRun, fit
@@ -94,8 +94,8 @@ def optimisation(key: Array, start: np.ndarray, num_steps: int) -> TuningRun:
         model,
         TUNED_PARTICLES,
         max_components=2,
-        proposal=mpfjax.GaussNewtonProposal(model, noise="stratified"),
-        sort_by=position,
+        proposal=mpfjax.GaussNewtonProposal(model),
+        noise="rqmc",
         gradient="stop",
     )
     return fit(

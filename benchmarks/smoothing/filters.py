@@ -1,7 +1,6 @@
 """The jobs as models of mpfjax, and the filters that are smoothed."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -25,22 +24,14 @@ def observations_of(job: Job) -> np.ndarray:
     return seen[:, None] if isinstance(job, Linear) else seen
 
 
-def _first(states: Any) -> Any:
-    return states.reshape(states.shape[0], -1)[:, 0]
-
-
 def _auxiliary(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:
-    proposal = mpfjax.GaussNewtonProposal(model, noise="stratified")
-    return mpfjax.mixture_particle_filter(
-        model, num_particles, 2, lookahead=proposal, sort_by=_first
-    )
+    proposal = mpfjax.GaussNewtonProposal(model)
+    return mpfjax.mixture_particle_filter(model, num_particles, 2, lookahead=proposal, noise="rqmc")
 
 
 def _guided(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:
-    proposal = mpfjax.GaussNewtonProposal(model, noise="stratified")
-    return mpfjax.mixture_particle_filter(
-        model, num_particles, 2, proposal=proposal, sort_by=_first
-    )
+    proposal = mpfjax.GaussNewtonProposal(model)
+    return mpfjax.mixture_particle_filter(model, num_particles, 2, proposal=proposal, noise="rqmc")
 
 
 FILTERS: dict[str, Callable[[mpfjax.AbstractStateSpaceModel, int], mpfjax.Filter]] = {

@@ -14,7 +14,7 @@ from mpfjax.checks import (
     check_shape,
     to_array,
 )
-from mpfjax.models.noise import independent_normal
+from mpfjax.operations.generator import normal
 from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
 
 
@@ -58,7 +58,7 @@ class AbstractDynamics(eqx.Module):
     ) -> Float[Array, "n d"]:
         """x_t given x_{t-1}, and x_{t-2} where the order is 2: `from_noise` of fresh noise."""
         shape = (current.shape[0], self.noise_dimension)
-        return self.from_noise(independent_normal(key, shape, current.dtype), current, previous)
+        return self.from_noise(normal(key, shape, current.dtype), current, previous)
 
     @abc.abstractmethod
     def log_density(

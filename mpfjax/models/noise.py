@@ -1,5 +1,7 @@
 """Standard normal and uniform draws: independent, or spread evenly over particles."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,10 +10,15 @@ from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 from mpfjax.operations.floats import default_float
 from mpfjax.operations.generator import bits, normal, normal_quantile, split, uniform
 from mpfjax.operations.segments import first_places, spread
-from mpfjax.operations.sobol import MOST_DIMENSIONS, scrambled_directions, sobol_points
+from mpfjax.operations.sobol import (
+    MOST_DIMENSIONS,
+    scrambled_directions,
+    shuffled,
+    sobol_points,
+)
 from mpfjax.operations.stored import stored
 
-NOISES = ("independent", "rqmc", "stratified")
+NOISES = ("independent", "rqmc")
 _UNUSED = 9  # bits of 32 that no draw of 23 bits shows
 
 
@@ -22,20 +29,15 @@ def draw_noise(
     dtype: jnp.dtype,
     components: Int[Array, " n"] | None = None,
     num_components: int = 1,
+    shuffle: bool = False,
 ) -> Float[Array, "n d"]:
     """Standard normal noise of one of the kinds in `NOISES`, one row a particle.
 
-    Each row is exactly normal for every kind. "rqmc" draws a point set for each component.
+    Each row is exactly normal for every kind. "rqmc" draws a point set for each component; the
+    other arguments are those of `rqmc_normal`.
     """
     if kind == "rqmc":
-        return rqmc_normal(key, shape, dtype, components, num_components)
-    return (stratified_normal if kind == "stratified" else independent_normal)(key, shape, dtype)
-
-
-def independent_normal(
-    key: Key[Array, ""], shape: tuple[int, ...], dtype: jnp.dtype
-) -> Float[Array, "n d"]:
-    """Independent standard normal draws."""
+        return rqmc_normal(key, shape, dtype, components, num_components, shuffle)
     return normal(key, shape, dtype)
 
 
@@ -46,14 +48,14 @@ def stratified_normal(
 
     Row i is the Gaussian quantile of the fractional part of i α + U: a lattice shifted by one
     uniform number U in each dimension. α_j = φ_d^{-j}, where φ_d solves x^{d+1} = x + 1; for d = 1
-    it is the golden ratio. Every single row is exactly normal and independent of the past, so a
-    sum over particles keeps its expectation. Rows are negatively dependent, so the sum has less
-    variance. Most is gained among the offspring of one parent, which are neighbours after
-    resampling.
+    it is the golden ratio. The points are dealt to the rows anew each time (`shuffled`). Every
+    single row is exactly normal and independent of the past, so a sum over particles keeps its
+    expectation. Rows are negatively dependent, so the sum has less variance.
     """
     n, d = shape
-    shift = bits(key, (d,))
-    points = jnp.arange(n, dtype=jnp.uint32)[:, None] * _multipliers(d)[None] + shift[None]
+    key_shift, key_rows = split(key, 2)
+    shift, rows = bits(key_shift, (d,)), _shuffled_ranks(key_rows, jnp.arange(n, dtype=jnp.int32))
+    points = rows.astype(jnp.uint32)[:, None] * _multipliers(d)[None] + shift[None]
     return _normal_of(points, dtype)
 
 
@@ -63,6 +65,7 @@ def rqmc_normal(
     dtype: jnp.dtype,
     components: Int[Array, " n"] | None = None,
     num_components: int = 1,
+    shuffle: bool = False,
 ) -> Float[Array, "n d"]:
     """Standard normal draws, one row a particle, from a randomised point set for each component.
 
@@ -76,55 +79,52 @@ def rqmc_normal(
     components is independent. Every single row is exactly normal and independent of the past, so
     a sum over particles keeps its expectation.
 
+    Where particles stand as they did when they were last moved, the same slot would get the same
+    point again, and two steps would be functions of each other. `shuffle` deals the points anew.
+
     Raises `ValueError` for more dimensions than the table of direction numbers holds.
     """
     n, d = shape
     key_matrix, key_shift = split(key, 2)
-    ranks, shifts = _ranks_and_shifts(key_shift, shape, components, num_components)
+    ranks, shifts = _ranks_and_shifts(key_shift, shape, components, num_components, shuffle)
     if d == 1:
         points = (ranks.astype(jnp.uint32) * _multipliers(1))[None] + shifts
     else:
-        directions = scrambled_directions(key_matrix, d, max((n - 1).bit_length(), 1))
+        directions = scrambled_directions(key_matrix, d, _num_digits(n))
         points = sobol_points(ranks, directions) ^ shifts
     # Drawn row by row, then transposed: operations on short rows are not vectorised.
     return stored(_normal_of(points, dtype)).T
 
 
 def draw_family_noise(
-    kind: str,
     key: Key[Array, ""],
     shape: tuple[int, int],
     num_draws: int,
     dtype: jnp.dtype,
     components: Int[Array, " n"],
     num_components: int,
+    shuffle: bool = False,
 ) -> tuple[Float[Array, "nk d"], Float[Array, " n"]]:
     """Noise for K draws of each particle, side by side, and a uniform number for each particle.
 
-    They are made of one point set of d + 1 dimensions, "rqmc" or "stratified". In the first, the K
-    draws of a particle fill K strata, in order: a draw's noise on its own is not normal, but one of
-    the K at random is. So an average over the draws keeps its expectation. The last dimension is
-    the uniform number, by which one of the draws is kept. Each particle's share of the point set
-    is independent of the past, and its uniform number of its noise.
+    They are made of one point set of d + 1 dimensions. In the first, the K draws of a particle fill
+    K strata, in order: a draw's noise on its own is not normal, but one of the K at random is. So
+    an average over the draws keeps its expectation. The last dimension is the uniform number, by
+    which one of the draws is kept. Each particle's share of the point set is independent of the
+    past, and its uniform number of its noise. `shuffle` is that of `rqmc_normal`.
     """
     n, d = shape
     key_matrix, key_shift = split(key, 2)
-    within = components if kind == "rqmc" else None
-    ranks, shifts = _ranks_and_shifts(key_shift, (n, d + 1), within, num_components)
+    ranks, shifts = _ranks_and_shifts(key_shift, (n, d + 1), components, num_components, shuffle)
     draw = jnp.arange(num_draws, dtype=jnp.int32)[None]
     draws = jnp.ravel(ranks[:, None] * num_draws + draw)
     shift_of_draws = jnp.repeat(shifts[1:d], num_draws if shifts.shape[1] > 1 else 1, axis=1)
-    if kind == "rqmc":
-        num_digits = max((n * num_draws - 1).bit_length(), 1)
-        directions = scrambled_directions(key_matrix, min(d + 1, MOST_DIMENSIONS), num_digits)
-        first = sobol_points(ranks, directions[:1])[0] ^ shifts[0]
-        last = sobol_points(ranks, directions[-1:])[0] ^ shifts[d]
-        rest = sobol_points(draws, directions[1:d]) ^ shift_of_draws
-    else:
-        multipliers, own = _multipliers(d + 1), ranks.astype(jnp.uint32)
-        first = own * multipliers[0] + shifts[0]
-        last = own * multipliers[d] + shifts[d]
-        rest = draws.astype(jnp.uint32)[None] * multipliers[1:d, None] + shift_of_draws
+    # A shuffled rank may be any number that has the digits of the largest.
+    num_digits = _num_digits((num_draws << _num_digits(n)) if shuffle else num_draws * n)
+    directions = scrambled_directions(key_matrix, min(d + 1, MOST_DIMENSIONS), num_digits)
+    first = sobol_points(ranks, directions[:1])[0] ^ shifts[0]
+    last = sobol_points(ranks, directions[-1:])[0] ^ shifts[d]
+    rest = sobol_points(draws, directions[1:d]) ^ shift_of_draws
     strata = draw.astype(jnp.uint32) * np.uint32((2**32 // num_draws) % 2**32)
     points = jnp.concatenate([jnp.ravel(first[:, None] // num_draws + strata)[None], rest])
     return stored(_normal_of(points, dtype)).T, _uniform_of(last, dtype)
@@ -135,18 +135,29 @@ def _ranks_and_shifts(
     shape: tuple[int, int],
     components: Int[Array, " n"] | None,
     num_components: int,
+    shuffle: bool,
 ) -> tuple[Int[Array, " n"], UInt32[Array, "d #n"]]:
     """The rank of each slot in its component, and the shift of the component's points."""
     n, d = shape
     ranks = jnp.arange(n, dtype=jnp.int32)
+    dealt = partial(_shuffled_ranks, jax.random.fold_in(key, 1)) if shuffle else lambda own: own
     if components is None:
         num_components = 1
     shifts = stored(bits(key, (num_components, d)) >> _UNUSED)
     if components is None or num_components == 1:
-        return ranks, shifts.T << _UNUSED
+        return dealt(ranks), shifts.T << _UNUSED
     ranks = stored(ranks - spread(first_places(components, num_components), components))
     own = jnp.stack([spread(shifts[:, k], components) for k in range(d)])
-    return ranks, stored(own) << _UNUSED
+    return dealt(ranks), stored(own) << _UNUSED
+
+
+def _shuffled_ranks(key: Key[Array, ""], ranks: Int[Array, " n"]) -> Int[Array, " n"]:
+    dealt = shuffled(ranks, bits(key, ()), _num_digits(ranks.shape[0]))
+    return stored(dealt.astype(jnp.int32))
+
+
+def _num_digits(num_ranks: int) -> int:
+    return max((num_ranks - 1).bit_length(), 1)
 
 
 def _normal_of(points: Array, dtype: jnp.dtype) -> Float[Array, "..."]:

@@ -32,6 +32,9 @@ class AbstractMove(eqx.Module):
     """whether it changes the indicators and nothing else."""
     resamples = False
     """whether it redraws the particles by their weights."""
+    sorts = False
+    """whether it leaves each component's particles side by side in an order of its own, along which
+    a propagation that follows in the same step spreads its point sets."""
     needs_parents = False
     """whether it looks at `mixture.parents`, x_{t-1} of each particle that has x_t. If one of its
     moves does, a filter keeps them during the step. Otherwise they cost nothing."""

@@ -148,6 +148,11 @@ class Waiting(AbstractResampling):
         """Whether the move is."""
         return self.move.approximate
 
+    @property
+    def sorts(self) -> bool:
+        """Whether the move does; while it waits, particles stand as `SelectInitial` left them."""
+        return self.move.sorts
+
     def would_resample(
         self, mixture: ParticleMixture, observation: PyTree = None
     ) -> Bool[Array, " m"]:

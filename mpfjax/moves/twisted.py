@@ -32,7 +32,7 @@ from mpfjax.moves.propagation.marginalised import (
     latent_made_of,
     latent_noise_dimension,
 )
-from mpfjax.moves.propagation.propagate import predict
+from mpfjax.moves.propagation.propagate import noise_of_slots, predict
 from mpfjax.operations.logarithms import log_sum_exp
 
 STEP = "twisted"
@@ -183,10 +183,7 @@ class PropagateTwisted(AbstractPropagation):
     ) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
         model, previous = self.model, mixture.particles
-        shape = (mixture.num_particles, noise_dimension_of(model, previous) + 1)
-        labels, num_components = mixture.component_indicators, mixture.num_components
-        dtype = noise_dtype(previous)
-        noise = draw_noise(self.noise, key, shape, dtype, labels, num_components)
+        noise = noise_of_slots(self.noise, key, noise_dimension_of(model, previous) + 1, mixture)
         psi = self.twist.at(mixture.memory[STEP]["step"])
         drawn, log_ratio = psi.draw(noise, self.twist.features_of(previous))
         states, log_factors = seen(model, observation, made_of(model, drawn, previous))

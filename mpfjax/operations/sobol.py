@@ -88,6 +88,30 @@ def sobol_points(
     return points
 
 
+def shuffled(
+    indices: Int[Array, " n"], seed: UInt32[Array, ""], num_digits: int
+) -> UInt32[Array, " n"]:
+    """The indices below 2^num_digits under a random permutation of these, another for each seed.
+
+    It maps every block of 2^k from a multiple of 2^k on onto such a block: Owen's nested scramble
+    of the index, by the hash of Laine and Karras (2011). So neighbours get points that are spread
+    as evenly as before, but which of them gets which is drawn anew: of two point sets whose indices
+    were shuffled, none is a function of the other.
+    """
+    digits = _reversed_bits(indices.astype(jnp.uint32)) + seed
+    # The factors are even, so that each digit changes by those above it alone.
+    for factor in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
+        digits = digits ^ (digits * jnp.uint32(factor))
+    return _reversed_bits(digits) & jnp.uint32((1 << num_digits) - 1)
+
+
+def _reversed_bits(words: UInt32[Array, " n"]) -> UInt32[Array, " n"]:
+    masks = (0xFFFF, 0x00FF00FF, 0x0F0F0F0F, 0x33333333, 0x55555555)
+    for shift, mask in zip((16, 8, 4, 2, 1), map(jnp.uint32, masks), strict=True):
+        words = ((words >> shift) & mask) | ((words & mask) << shift)
+    return words
+
+
 def scrambled_directions(
     key: Key[Array, ""], dimension: int, num_digits: int
 ) -> UInt32[Array, "d digits"]:

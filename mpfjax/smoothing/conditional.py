@@ -253,13 +253,11 @@ def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
     proposal = getattr(advances[0], "proposal", None)
     if proposal is not None:
         require(proposal, "log_density", needed_by, "proposal")
-    for name, draws in (("filter", advances[0]), ("proposal", proposal)):
-        noise = getattr(draws, "noise", "independent")
-        if noise != "independent":
-            raise ValueError(
-                f"{name}: {needed_by} needs draws that are independent of each other, and not"
-                f" noise={noise!r}; take noise='independent'"
-            )
+    if advances[0].noise != "independent":
+        raise ValueError(
+            f"filter: {needed_by} needs draws that are independent of each other, and not"
+            f" noise={advances[0].noise!r}; take noise='independent'"
+        )
     for move in filter.moves:
         if isinstance(move, Every) and all(isinstance(m, AbstractRegrouping) for m in move.moves):
             continue

@@ -76,8 +76,7 @@ def test_point_sets_bring_it_along_and_independent_noise_does_not():
     assert isinstance(move, mpfjax.AuxiliaryResample)
     assert isinstance(move.lookahead, PilotLookahead)
     guided = {"proposal": mpfjax.GaussNewtonProposal(model)}
-    for options in ({}, {"noise": "stratified"}):
-        assert isinstance(first_move(model, **options), mpfjax.Resample), options
+    assert isinstance(first_move(model), mpfjax.Resample)
     for options in ({"lookahead": None}, guided):
         assert isinstance(first_move(model, noise="rqmc", **options), mpfjax.Resample), options
     with pytest.raises(ValueError, match="lookahead: 'pilot' is not one of"):

@@ -2,7 +2,6 @@
 
 import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -220,13 +219,6 @@ class TestBadInput:
         ("make", "named"),
         [
             (lambda: mpfjax.particle_filter(NoTransition(), 6), "defines no log_transition"),
-            (
-                lambda: mpfjax.particle_filter(LINEAR, 6, proposal=eqx.tree_at(
-                    lambda proposal: proposal, GUIDED,
-                    mpfjax.GaussNewtonProposal(LINEAR, noise="stratified"),
-                )),
-                "proposal: .*noise='stratified'",
-            ),
             (
                 lambda: mpfjax.mixture_particle_filter(LINEAR, 6, 2, noise="rqmc"),
                 "filter: .*independent of each other, and not noise='rqmc'",

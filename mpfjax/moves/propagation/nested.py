@@ -29,10 +29,10 @@ class PropagateNested(AbstractPropagation):
     of K N particles that keeps one child of each parent. Ẑ is that of K N particles, and unbiased.
     The model is evaluated K N times, but only N particles are resampled, sorted and regrouped.
 
-    - `propagate`: the `Propagate`, or `PropagateMarginalised`, that draws. With its noise "rqmc" or
-      "stratified" the draws of a family fill K strata of the first dimension of the noise, and one
-      more dimension of the same point set says which of them is kept. So what is kept is spread
-      over slot and noise as well.
+    - `propagate`: the `Propagate`, or `PropagateMarginalised`, that draws. With its noise "rqmc"
+      the draws of a family fill K strata of the first dimension of the noise, and one more
+      dimension of the same point set says which of them is kept. So what is kept is spread over
+      slot and noise as well.
     - `num_draws`: K.
 
     Raises `ValueError` for K < 1, and for gradient "stop", which does not see which draw was
@@ -92,8 +92,8 @@ class PropagateNested(AbstractPropagation):
             return propagate(key_draws, repeated, observation), shares
         shape, dtype = (n, propagate.noise_dimension(mixture)), noise_dtype(mixture.particles)
         noise, shares = draw_family_noise(
-            propagate.noise, key, shape, k, dtype,
-            mixture.component_indicators, mixture.num_components,
+            key, shape, k, dtype,
+            mixture.component_indicators, mixture.num_components, not mixture.in_order,
         )  # fmt: skip
         return propagate.from_noise(noise, repeated, observation), shares
 

@@ -44,12 +44,13 @@ class Propagate(AbstractPropagation):
       through its density, and parameters of q have none. The draw of x_0 is still
       differentiated.
     - `noise`: what x_t is made of. "independent": each particle has noise of its own, as the
-      model's `sample_transition` or the proposal draws it. "rqmc" and "stratified" spread the noise
-      evenly over neighbours: over the slots of each component, or of all. Every particle's own law
-      stays the same, so Ẑ stays unbiased. "rqmc" is a randomised point set over slot and noise,
-      of Sobol for noise of two dimensions or more (L'Ecuyer, Lécot and Tuffin 2008; Gerber and
-      Chopin 2015). It needs particles that stand in order, as after `Resample(sort_by="hilbert")`.
-      Take it where masses and likelihoods must be accurate.
+      model's `sample_transition` or the proposal draws it. "rqmc" spreads the noise evenly over
+      the slots of each component. Every particle's own law stays the same, so Ẑ stays unbiased.
+      It is a randomised point set over slot and noise, of Sobol for noise of two dimensions or
+      more (L'Ecuyer, Lécot and Tuffin 2008; Gerber and Chopin 2015). Most is gained where a
+      `Resample(sort_by="hilbert")` has put the particles in order in the same step. Where none
+      has, as without an observation, the points are dealt to the particles anew, and errors are
+      about those of independent noise. Take it where masses and likelihoods must be accurate.
 
     Raises `ValueError` for another gradient or noise; for a proposal, or "stop", with a model that
     has no `log_transition`; for noise that is not independent, with a model that has no
@@ -225,7 +226,8 @@ def noise_of_slots(
     """Noise for every slot; its points are those of the slot's component."""
     shape, dtype = (mixture.num_particles, dimension), noise_dtype(mixture.particles)
     labels, num_components = mixture.component_indicators, mixture.num_components
-    return draw_noise(kind, key, shape, dtype, labels, num_components)
+    shuffle = not mixture.in_order
+    return draw_noise(kind, key, shape, dtype, labels, num_components, shuffle)
 
 
 def predict(

@@ -53,6 +53,11 @@ class AuxiliaryResample(AbstractMove):
             check_callable(what, lookahead=self.lookahead)
 
     @property
+    def sorts(self) -> bool:
+        """Whether the resampling does."""
+        return self.resample.sorts
+
+    @property
     def weighs(self) -> bool:
         """False: the weights are divided by the look-ahead again."""
         return False

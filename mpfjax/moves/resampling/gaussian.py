@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_callable, check_one_of, check_positive, check_whole, given
 from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
-from mpfjax.models.noise import NOISES, draw_noise
+from mpfjax.models.noise import NOISES, draw_noise, stratified_normal
 from mpfjax.moves.base import AbstractResampling
 from mpfjax.moves.regrouping.features import origin, summarise
 from mpfjax.moves.resampling.allocation import allocate_slots, place_slots
@@ -55,12 +55,17 @@ class GaussianRegeneration(AbstractResampling):
         check_whole(**given(particles_per_component=self.particles_per_component))
         check_callable("a function that chooses from the state", **given(where=self.where))
         check_positive(inflation=self.inflation)
-        check_one_of(NOISES, noise=self.noise)
+        check_one_of((*NOISES, "stratified"), noise=self.noise)
 
     @property
     def approximate(self) -> bool:
         """True: each component is replaced by a Gaussian."""
         return True
+
+    @property
+    def sorts(self) -> bool:
+        """Whether the draws are put in order."""
+        return self.noise == "rqmc"
 
     @property
     def keeps_parents(self) -> bool:
@@ -139,14 +144,12 @@ class GaussianRegeneration(AbstractResampling):
         moments = summarise(states, weights, mixture.component_indicators, mixture.num_components)
         factors = self.inflation * cholesky(moments.covariances)
         factors = spread(factors, vacated.component_indicators)
-        noise = draw_noise(
-            self.noise,
-            key,
-            (states.shape[0], states.shape[1]),
-            states.dtype,
-            vacated.component_indicators,
-            mixture.num_components,
-        )
+        shape = (states.shape[0], states.shape[1])
+        if self.noise == "stratified":
+            noise = stratified_normal(key, shape, states.dtype)
+        else:
+            labels, num_components = vacated.component_indicators, mixture.num_components
+            noise = draw_noise(self.noise, key, shape, states.dtype, labels, num_components)
         offsets = jnp.einsum("nij,nj->ni", factors, noise)
         means = spread(moments.means, vacated.component_indicators)
         unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], chosen))[1]

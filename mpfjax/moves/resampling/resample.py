@@ -102,6 +102,11 @@ class Resample(AbstractAdaptiveResampling):
                 f" {self.particles_per_component}"
             )
 
+    @property
+    def sorts(self) -> bool:
+        """Whether particles are sorted, those that are not resampled as well."""
+        return self.sort_by is not None
+
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
         if self.ess_threshold == 1.0:
