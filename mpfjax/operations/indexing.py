@@ -1,8 +1,8 @@
 """Gathers and scatters: values at given indices, and how often each index is named.
 
 In numpy: `values[indices]`, `np.bincount(places)` and `np.argsort(places)`. Here indices are known
-to be in range, so nothing is clipped. Under `vmap` all rows become one long row, since a CPU
-scatters with single indices in half the time of pairs of indices.
+to be in range, so nothing is clipped. Under `vmap` all rows of a scatter become one long row, since
+a CPU scatters with single indices in half the time of pairs of indices.
 """
 
 from collections.abc import Callable
@@ -17,43 +17,9 @@ from mpfjax.operations.gradients import without_gradient
 from mpfjax.operations.stored import stored
 
 
-@jax.custom_jvp
 def take(values: Array, indices: Int[Array, " n"]) -> Array:
     """values[indices] for indices that are known to lie in range."""
-    return _take(values, indices)
-
-
-@take.defjvp
-def _take_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    # The form of JAX itself, which can be transposed.
-    return take(*primals), _gathered(tangents[0], primals[1])
-
-
-def _gathered(values: Array, indices: Int[Array, " n"]) -> Array:
     return values.at[from_the_start(indices)].get(mode="promise_in_bounds")
-
-
-@jax.custom_batching.custom_vmap
-def _take(values: Array, indices: Int[Array, " n"]) -> Array:
-    return _gathered(values, indices)
-
-
-@_take.def_vmap
-def _take_of_each(
-    axis_size: int, in_batched: list[bool], values: Array, indices: Int[Array, "..."]
-) -> tuple[Array, bool]:
-    """From one long row; JAX would write out a pair of indices for every entry."""
-    has_values, has_indices = in_batched
-    if not has_indices:
-        return jax.vmap(_gathered, (0, None))(values, indices), True
-    shape, indices = indices.shape, indices.astype(jnp.int32)
-    if has_values:
-        n = values.shape[1]
-        check_numbered("slots up to", axis_size * n, num_particles=n, runs_at_once=axis_size)
-        firsts = values.shape[1] * jnp.arange(axis_size, dtype=jnp.int32)
-        indices = indices + firsts.reshape(-1, *[1] * (len(shape) - 1))
-        values = values.reshape(-1, *values.shape[2:])
-    return _take(values, indices.reshape(-1)).reshape(*shape, *values.shape[1:]), True
 
 
 def from_the_start(indices: Int[Array, "*shape"]) -> UInt32[Array, "*shape"]:
