@@ -155,12 +155,11 @@ def build(
         return mpfjax.gaussian_mixture_particle_filter(
             model, num_particles, regeneration=regeneration, **mixture
         )
-    options: dict[str, Any] = {"allocation": "equal", **mixture}
-    if name == "guided_mpf":
-        options |= {"proposal": mpfjax.GaussNewtonProposal(model), "noise": "rqmc"}
-    return mpfjax.with_selected_start(
-        mpfjax.mixture_particle_filter(model, num_particles, **options), 1
-    )
+    proposal = mpfjax.GaussNewtonProposal(model) if name == "guided_mpf" else None
+    filter = mpfjax.mixture_particle_filter(model, num_particles, proposal=proposal, **mixture)
+    filter = mpfjax.with_resampling(filter, mpfjax.Resample(allocation="equal"))
+    filter = mpfjax.with_selected_start(filter, 1)
+    return mpfjax.with_point_sets(filter) if name == "guided_mpf" else filter
 
 
 def collect(mixture: mpfjax.ParticleMixture) -> dict[str, Array]:
@@ -196,7 +195,7 @@ def study_of(
         "max_components": options.components,
         "regroup_every": options.regroup_every,
         # As the tables were made.
-        "kmeans": mpfjax.KMeans(),
+        "regroup": [mpfjax.Merge(), mpfjax.Split(), mpfjax.KMeans()],
     }
     return mpfjax.Study(
         filters={name: functools.partial(build, name, model, mixture) for name in options.filters},

@@ -5,9 +5,11 @@ from typing import Any
 
 from jaxtyping import Array, PyTree
 
-from mpfjax.checks import check_one_of, check_type, check_whole, given
+from mpfjax.chain import as_moves
+from mpfjax.checks import check_one_of, check_type, check_whole
 from mpfjax.filter import Filter
 from mpfjax.models.base import AbstractStateSpaceModel, mapped
+from mpfjax.models.conditionally_linear import is_marginalised
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import AbstractMove
@@ -15,8 +17,8 @@ from mpfjax.moves.every import Every
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.objects.partitioned import Partitioned, check_orders
-from mpfjax.moves.pilot import Lookahead, chosen_lookahead
-from mpfjax.moves.propagation.nested import propagation
+from mpfjax.moves.pilot import Lookahead
+from mpfjax.moves.propagation.marginalised import propagation
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
 from mpfjax.moves.regrouping.features import Scale
 from mpfjax.moves.regrouping.kmeans import KMeans
@@ -24,12 +26,17 @@ from mpfjax.moves.regrouping.merge import Merge
 from mpfjax.moves.regrouping.pool import Pool
 from mpfjax.moves.regrouping.random_partition import RandomPartition
 from mpfjax.moves.regrouping.split import Split
-from mpfjax.moves.resampling.auxiliary import AuxiliaryResample, propagating_proposal, resampling
+from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration
-from mpfjax.moves.resampling.ordering import HILBERT, SortBy
-from mpfjax.moves.resampling.resample import Resample
+from mpfjax.moves.resampling.ordering import SortBy
+from mpfjax.moves.resampling.resample import GRADIENTS, Resample
 from mpfjax.proposals import AbstractProposal
-from mpfjax.transforms import with_selected_start
+from mpfjax.transforms import (
+    with_lookahead,
+    with_point_sets,
+    with_score_gradient,
+    with_selected_start,
+)
 
 # K-means starts from the components of a few steps before, and needs few iterations.
 _WARM_ITERATIONS = 2
@@ -45,27 +52,16 @@ def particle_filter(
     ess_threshold: float = 1.0,
     sort_by: SortBy | None = None,
     noise: str = "independent",
-    num_draws: int = 1,
     gradient: str = "none",
 ) -> Filter:
     """The standard particle filter: resample, propagate.
 
     Vermaak et al. (2003), section 3, with one component; bootstrap unless a proposal is given. Use
     it for a filtering distribution with one mode. If there are several, it loses all but one.
-    `gradient` is that of `Resample`. "stop" is also that of `Propagate`: take it for tuning.
-    `num_draws` is that of `PropagateNested`: each particle draws this many x_t and keeps one.
-    `noise` is that of `Propagate`. With "rqmc", particles are ordered along a Hilbert curve of
-    their state unless `sort_by` is given, and the filter is sequential quasi-Monte Carlo (Gerber
-    and Chopin 2015).
+    `noise="rqmc"` is `with_point_sets`, and `gradient="stop"`, for tuning, `with_score_gradient`.
     """
-    sort_by = _standing(sort_by, noise)
-    resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
-    return Filter(
-        model,
-        moves=[resample, propagation(model, proposal, gradient, noise, num_draws)],
-        num_particles=num_particles,
-        initial_noise=noise,
-    )
+    moves = [Resample(scheme, ess_threshold, sort_by=sort_by), propagation(model, proposal)]
+    return _with(noise, gradient, Filter(model, moves, num_particles))
 
 
 def auxiliary_particle_filter(
@@ -77,9 +73,6 @@ def auxiliary_particle_filter(
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
     sort_by: SortBy | None = None,
-    noise: str = "independent",
-    num_draws: int = 1,
-    gradient: str = "none",
 ) -> Filter:
     """The auxiliary particle filter: resample by w times a look-ahead to y_t, propagate.
 
@@ -87,22 +80,13 @@ def auxiliary_particle_filter(
     a proposal with `log_normaliser`, which then also draws x_t unless another `proposal` is given.
     Ẑ is unbiased for any look-ahead; see `AuxiliaryResample`. With `GaussNewtonProposal(model, 1,
     inflation=1.0)` for a `LinearGaussianModel` the filter is fully adapted: ν is p(y_t | x_{t-1}),
-    x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are equal. `noise` and `num_draws` are
-    those of `particle_filter`. Use it where the likelihood is narrow and y_t shows early which
-    particles will survive.
+    x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are equal. Use it where the likelihood
+    is narrow and y_t shows early which particles will survive.
     """
-    sort_by = _standing(sort_by, noise)
-    resample = Resample(scheme, ess_threshold, sort_by=sort_by, gradient=gradient)
-    proposal = propagating_proposal(proposal, lookahead)
-    return Filter(
-        model,
-        moves=[
-            AuxiliaryResample(resample, lookahead),
-            propagation(model, proposal, gradient, noise, num_draws),
-        ],
-        num_particles=num_particles,
-        initial_noise=noise,
-    )
+    resample = AuxiliaryResample(Resample(scheme, ess_threshold, sort_by=sort_by), lookahead)
+    if proposal is None and isinstance(lookahead, AbstractProposal):
+        proposal = lookahead
+    return Filter(model, [resample, propagation(model, proposal)], num_particles)
 
 
 def mixture_particle_filter(
@@ -111,56 +95,48 @@ def mixture_particle_filter(
     max_components: int,
     *,
     proposal: AbstractProposal | None = None,
-    lookahead: Lookahead | str | None = "auto",
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
-    particles_per_component: int | None = None,
-    allocation: str = "variance",
-    sort_by: SortBy | None = None,
-    noise: str = "independent",
-    num_draws: int = 1,
-    gradient: str = "none",
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
-    merge: Merge | None = None,
-    split: Split | None = None,
-    kmeans: KMeans | None = None,
-    initial_kmeans: KMeans | None = None,
+    regroup: Sequence[AbstractMove] | None = None,
     regroup_every: int = 3,
+    noise: str = "independent",
+    gradient: str = "none",
 ) -> Filter:
     """The mixture particle filter: resample within components, propagate, regroup.
 
     Vermaak et al. (2003), sections 3 and 4. Each component is resampled on its own and competes
     with the others only through its mixture weight, so that no component takes particles from
     another. At every third step components that overlap merge, diffuse components split, and two
-    iterations of K-means refine the grouping. All of it is exact. `features` and `scale` are the
-    coordinates and units in which these three moves see the particles (see `Features`; features of
-    one particle, if the model is wrapped by `per_particle`). `merge`, `split` and `kmeans` replace
-    those moves, for example with other thresholds, and have their own features and scale.
-    `regroup_every` is k where they run at every k-th step (see `Every`): take 1 where modes move
-    fast, or where a `Merge` counts frames with its `patience`. `gradient`, `noise` and `num_draws`
-    are those of `particle_filter`, `lookahead` that of `auxiliary_particle_filter`, `allocation`
-    that of `Resample`. If M is more than one, x_0 is chosen by y_1 among four draws a particle;
-    `with_selected_start` changes their number. With `noise="rqmc"` each component has a point set
-    of its own, and the masses of modes are far more accurate. A `lookahead` "auto" is then a
-    `PilotLookahead`, unless there is a proposal or a conditionally linear model; otherwise it is
-    None. Use it where the filtering distribution has several modes and all of them must be kept.
+    iterations of K-means refine the grouping. All of it is exact. If M is more than one, x_0 is
+    chosen by y_1 among four draws a particle; `with_selected_start` changes their number.
+
+    - `features`, `scale`: the coordinates and units in which the grouping moves see the particles,
+      those of x_0 too (see `Features`; features of one particle, if the model is wrapped by
+      `per_particle`).
+    - `regroup`: moves in the place of `Merge`, `Split` and `KMeans`, with features and thresholds
+      of their own.
+    - `regroup_every`: k where they run at every k-th step (see `Every`): take 1 where modes move
+      fast, or where a `Merge` counts frames with its `patience`.
+    - `noise`: "rqmc" is `with_point_sets`: each component has a point set of its own, and the
+      masses of modes are far more accurate. `with_lookahead` comes with it, unless there is a
+      proposal or a conditionally linear model.
+    - `gradient`: "stop" is `with_score_gradient`.
+
+    Use it where the filtering distribution has several modes and all of them must be kept.
     """
-    sort_by = _standing(sort_by, noise)
-    lookahead = chosen_lookahead(lookahead, model, proposal, noise)
-    resample = Resample(
-        scheme, ess_threshold, particles_per_component, sort_by, gradient, allocation=allocation
-    )
-    proposal = propagating_proposal(proposal, lookahead)
-    propagate = propagation(model, proposal, gradient, noise, num_draws)
-    moves = [resampling(resample, lookahead), propagate]
+    moves = [Resample(scheme, ess_threshold), propagation(model, proposal)]
     seen: dict[str, Any] = {"features": mapped(model, features), "scale": scale}
-    kmeans = KMeans(_WARM_ITERATIONS, **seen) if kmeans is None else kmeans
-    filter = _mixture_filter(
-        model, num_particles, max_components, moves, features, scale,
-        merge, split, kmeans, initial_kmeans, regroup_every, noise,
-    )  # fmt: skip
-    return filter if max_components == 1 else with_selected_start(filter, _INITIAL_DRAWS)
+    if regroup is None:
+        regroup = [Merge(**seen), Split(**seen), KMeans(_WARM_ITERATIONS, **seen)]
+    sizes = (num_particles, max_components)
+    filter = _mixture_filter(model, sizes, moves, regroup, regroup_every, seen)
+    if max_components > 1:
+        filter = with_selected_start(filter, _INITIAL_DRAWS)
+    if noise == "rqmc" and proposal is None and not is_marginalised(model):
+        filter = with_lookahead(filter)
+    return _with(noise, gradient, filter)
 
 
 def gaussian_particle_filter(
@@ -170,20 +146,15 @@ def gaussian_particle_filter(
     proposal: AbstractProposal | None = None,
     regeneration: GaussianRegeneration | None = None,
     importance: str = "propagated",
-    noise: str = "independent",
 ) -> Filter:
     """The Gaussian particle filter: redraw from the Gaussian of the moments, propagate.
 
     Kotecha and Djuric (2003); Lin et al. (2012), section 3. It is an approximation for a filtering
-    distribution close to one Gaussian, and cannot keep two modes. `importance` and `noise` are
-    those of `gaussian_mixture_particle_filter`.
+    distribution close to one Gaussian, and cannot keep two modes. `importance` is that of
+    `gaussian_mixture_particle_filter`.
     """
-    return Filter(
-        model,
-        moves=_gaussian_moves(model, proposal, regeneration, importance, noise),
-        num_particles=num_particles,
-        initial_noise=noise,
-    )
+    moves = _gaussian_moves(model, proposal, regeneration, importance)
+    return Filter(model, moves, num_particles)
 
 
 def gaussian_mixture_particle_filter(
@@ -194,13 +165,9 @@ def gaussian_mixture_particle_filter(
     proposal: AbstractProposal | None = None,
     regeneration: GaussianRegeneration | None = None,
     importance: str = "propagated",
-    noise: str = "independent",
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
-    merge: Merge | None = None,
-    split: Split | None = None,
-    kmeans: KMeans | None = None,
-    initial_kmeans: KMeans | None = None,
+    regroup: Sequence[AbstractMove] | None = None,
     regroup_every: int = 1,
 ) -> Filter:
     """GM-MPF: redraw each component from the Gaussian of its moments, propagate, regroup.
@@ -212,16 +179,17 @@ def gaussian_mixture_particle_filter(
     weighted by L (or L D / q). "predictive_gaussian": these particles only give the moments of
     the prediction (eqs. 12 and 13). New particles are drawn from its Gaussian, N(μ̄, Σ̄), and
     weighted by L, since the Gaussian cancels in eq. 8. That is one more approximation and one
-    more draw. `noise` is that of `Propagate`, and of the regeneration unless one is given.
+    more draw. The other arguments are those of `mixture_particle_filter`.
 
     The filter is an approximation, good where each mode is close to a Gaussian. Raises
     `ValueError` for another `importance`, and for "predictive_gaussian" with a `proposal`.
     """
-    return _mixture_filter(
-        model, num_particles, max_components,
-        _gaussian_moves(model, proposal, regeneration, importance, noise), features, scale,
-        merge, split, kmeans, initial_kmeans, regroup_every, noise,
-    )  # fmt: skip
+    seen: dict[str, Any] = {"features": mapped(model, features), "scale": scale}
+    if regroup is None:
+        regroup = [Merge(**seen), Split(**seen), KMeans(**seen)]
+    moves = _gaussian_moves(model, proposal, regeneration, importance)
+    sizes = (num_particles, max_components)
+    return _mixture_filter(model, sizes, moves, regroup, regroup_every, seen)
 
 
 def partitioned_sampling(
@@ -231,7 +199,6 @@ def partitioned_sampling(
     *,
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
-    gradient: str = "none",
 ) -> Filter:
     """Partitioned sampling: resample, then move one object after the other.
 
@@ -240,7 +207,7 @@ def partitioned_sampling(
     every step. It needs far fewer particles than the joint particle filter, `particle_filter` on
     the same model. But the first objects of the order keep only a few distinct hypotheses, and
     hardly recover from an occlusion. It is unbiased in every order, also with an interaction.
-    `ess_threshold` and `gradient` are those of the resampling between steps and objects.
+    `scheme` and `ess_threshold` are those of the resampling between steps and objects.
     """
     require_multi_object(model, "partitioned_sampling")
     orders: Any = order
@@ -248,9 +215,9 @@ def partitioned_sampling(
         orders = check_orders(order, model.num_objects, "order")
         if orders.shape[0] != 1:
             raise ValueError(f"order: {orders.shape[0]} orders where there is one component")
-    settings: dict[str, Any] = {"ess_threshold": ess_threshold, "gradient": gradient}
-    partitioned = Partitioned(model, orders, scheme=scheme, **settings)
-    return Filter(model, [Resample(scheme, **settings), partitioned], num_particles)
+    between = Resample(scheme, ess_threshold, allocation="equal")
+    moves = [Resample(scheme, ess_threshold), Partitioned(model, orders, resample=between)]
+    return Filter(model, moves, num_particles)
 
 
 def distributed_partitioned_sampling(
@@ -261,7 +228,6 @@ def distributed_partitioned_sampling(
     *,
     scheme: str = "systematic",
     ess_threshold: float = 1.0,
-    gradient: str = "none",
 ) -> Filter:
     """DPS: the particles are dealt into C sets, and the objects move in another order in each.
 
@@ -270,9 +236,9 @@ def distributed_partitioned_sampling(
     hypotheses of its first objects; here all objects share this loss. `orders` are C permutations
     of the objects; None is the J circular shifts, and "random" J new permutations at every step.
     `reassembly` is "prior", the paper's, where every set returns to its mass (an approximation: the
-    marginal likelihood is biased), or "evidence", which is exact. See `Partitioned` for both, and
-    for `gradient`. Use it where it is unknown which object will be hard to track, and N/C particles
-    are enough to track all.
+    marginal likelihood is biased), or "evidence", which is exact. See `Partitioned` for both. Use
+    it where it is unknown which object will be hard to track, and N/C particles are enough to track
+    all.
     """
     require_multi_object(model, "distributed_partitioned_sampling")
     if orders is None:
@@ -281,11 +247,9 @@ def distributed_partitioned_sampling(
     if not isinstance(orders, str):
         orders = check_orders(orders, model.num_objects)
         num_sets = orders.shape[0]
-    resample = Resample(scheme, ess_threshold, gradient=gradient)
-    partitioned = Partitioned(
-        model, orders, scheme=scheme, ess_threshold=ess_threshold, reassembly=reassembly,
-        gradient=gradient,
-    )  # fmt: skip
+    between = Resample(scheme, ess_threshold, allocation="equal")
+    partitioned = Partitioned(model, orders, resample=between, reassembly=reassembly)
+    resample = Resample(scheme, ess_threshold)
     return Filter(
         model,
         moves=[Pool(), resample, RandomPartition(), partitioned],
@@ -340,54 +304,39 @@ def _gaussian_moves(
     proposal: AbstractProposal | None,
     regeneration: GaussianRegeneration | None,
     importance: str,
-    noise: str,
 ) -> list[AbstractMove]:
     """Redraw, propagate and weigh; for some, redraw again before weighing."""
-    redraw = GaussianRegeneration(noise=noise) if regeneration is None else regeneration
+    redraw = GaussianRegeneration() if regeneration is None else regeneration
     check_type(GaussianRegeneration, "a GaussianRegeneration", regeneration=redraw)
     check_one_of(("propagated", "predictive_gaussian"), importance=importance)
     if importance == "propagated":
-        return [redraw, Propagate(model, proposal, noise=noise)]
+        return [redraw, Propagate(model, proposal)]
     if proposal is not None:
         raise ValueError(f"importance: {importance!r} draws from no proposal, but one was given")
-    return [redraw, Predict(model, noise=noise), redraw, Reweight(model)]
-
-
-def _standing(sort_by: SortBy | None, noise: str) -> SortBy | None:
-    """The key by which particles are sorted: point sets need an order of the states."""
-    check_one_of(NOISES, noise=noise)
-    return HILBERT if sort_by is None and noise == "rqmc" else sort_by
+    return [redraw, Predict(model), redraw, Reweight(model)]
 
 
 def _mixture_filter(
     model: AbstractStateSpaceModel,
-    num_particles: int,
-    max_components: int,
-    moves: list[AbstractMove],
-    features: Callable[[PyTree], Array] | None,
-    scale: Scale,
-    merge: Merge | None,
-    split: Split | None,
-    kmeans: KMeans | None,
-    initial_kmeans: KMeans | None,
+    sizes: tuple[int, int],
+    moves: Sequence[AbstractMove],
+    regroup: Sequence[AbstractMove],
     regroup_every: int,
-    noise: str,
+    seen: dict[str, Any],
 ) -> Filter:
     """The given moves, then regrouping; x_0 grouped by K-means from seeds."""
+    num_particles, max_components = sizes
     check_whole(max_components=max_components, regroup_every=regroup_every)
-    check_type(Merge, "a Merge", **given(merge=merge))
-    check_type(Split, "a Split", **given(split=split))
-    check_type(KMeans, "a KMeans", **given(kmeans=kmeans, initial_kmeans=initial_kmeans))
-    seen: dict[str, Any] = {"features": mapped(model, features), "scale": scale}
-    kmeans = KMeans(**seen) if kmeans is None else kmeans
-    if initial_kmeans is None:
-        function, units = kmeans.features.function, kmeans.features.scale
-        initial_kmeans = KMeans(10, reseed=True, features=function, scale=units)
-    regroup: list[AbstractMove] = [
-        Merge(**seen) if merge is None else merge,
-        Split(**seen) if split is None else split,
-        kmeans,
-    ]
-    if regroup_every > 1:
-        regroup = [Every(regroup_every, regroup)]
-    return Filter(model, [*moves, *regroup], num_particles, max_components, [initial_kmeans], noise)
+    regroup = as_moves(regroup, "regroup")
+    if regroup and regroup_every > 1:
+        regroup = (Every(regroup_every, regroup),)
+    initial = [KMeans(10, reseed=True, **seen)]
+    return Filter(model, [*moves, *regroup], num_particles, max_components, initial)
+
+
+def _with(noise: str, gradient: str, filter: Filter) -> Filter:
+    """The filter with the two options of recipes that are transforms."""
+    check_one_of(NOISES, noise=noise)
+    check_one_of(GRADIENTS, gradient=gradient)
+    filter = with_point_sets(filter) if noise == "rqmc" else filter
+    return with_score_gradient(filter) if gradient == "stop" else filter

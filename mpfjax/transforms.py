@@ -1,11 +1,137 @@
-"""Filters made from filters, by changing their moves."""
+"""Filters made from filters, by changing their moves. They compose, also on chains of your own."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
 
 from mpfjax.checks import check_type, check_whole
 from mpfjax.filter import Filter
+from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.every import Every
 from mpfjax.moves.initial import SelectInitial
+from mpfjax.moves.pilot import Lookahead, PilotLookahead
 from mpfjax.moves.propagation.marginalised import PropagateMarginalised
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
+from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
+from mpfjax.moves.resampling.ordering import HILBERT
+from mpfjax.moves.resampling.resample import Resample
+from mpfjax.proposals import AbstractProposal
+
+_PROPAGATIONS = (Propagate, PropagateMarginalised)
+_LOOKS = (*_PROPAGATIONS, PropagateNested)
+
+
+def map_moves(change: Callable[[Any], Any], filter: Filter) -> Filter:
+    """The filter with `change(move)` in the place of each move.
+
+    It reaches the moves of an `Every` and the propagation of a `SelectInitial` too:
+
+        map_moves(lambda m: Resample("ssp") if isinstance(m, Resample) else m, filter)
+    """
+    check_type(Filter, "a Filter", filter=filter)
+
+    def changed(move: Any) -> Any:
+        if isinstance(move, Every):
+            return Every(move.num_steps, [changed(inner) for inner in move.moves])
+        if isinstance(move, SelectInitial):
+            return dataclasses.replace(move, propagation=change(move.propagation))
+        return change(move)
+
+    return filter.replace(
+        moves=[changed(move) for move in filter.moves],
+        initial_moves=[changed(move) for move in filter.initial_moves],
+    )
+
+
+def with_resampling(filter: Filter, resample: Resample) -> Filter:
+    """The filter with this `Resample` in the place of the chain's own, looking ahead as they did.
+
+    Raises `ValueError` for anything but a `Resample`. Use it for other slots of components:
+    `with_resampling(filter, Resample(allocation="equal"))`.
+    """
+    check_type(Resample, "a Resample", resample=resample)
+
+    def other(move: Any) -> Any:
+        if isinstance(move, AuxiliaryResample):
+            return AuxiliaryResample(resample, move.lookahead)
+        return resample if isinstance(move, Resample) else move
+
+    return map_moves(other, filter)
+
+
+def with_point_sets(filter: Filter) -> Filter:
+    """The filter whose draws are randomised quasi-Monte Carlo: sequential quasi-Monte Carlo.
+
+    Gerber and Chopin (2015). All noise is "rqmc", that of x_0 included (see `Propagate`), and the
+    chain's own resamplings put particles in order along a Hilbert curve of their state, unless they
+    have a `sort_by`. Raises `ValueError` for a model or proposal that is not made of noise. Use it
+    where masses of modes and likelihoods must be accurate.
+    """
+
+    def in_order(move: Any) -> Any:
+        if isinstance(move, AuxiliaryResample):
+            return dataclasses.replace(move, resample=in_order(move.resample))
+        if isinstance(move, Resample) and move.sort_by is None:
+            return dataclasses.replace(move, sort_by=HILBERT)
+        return move
+
+    return _everywhere(map_moves(in_order, filter), "noise", "rqmc").replace(initial_noise="rqmc")
+
+
+def with_score_gradient(filter: Filter) -> Filter:
+    """The filter whose derivatives estimate the score, for tuning: gradient "stop" everywhere.
+
+    Ścibior and Wood (2021); values are the same to the bit. It reaches the resampling inside of
+    propagations too. Raises `ValueError` for a model without `log_transition`.
+    """
+    return _everywhere(filter, "gradient", "stop")
+
+
+def with_proposals_per_particle(filter: Filter, num_draws: int) -> Filter:
+    """The filter in which each particle draws K of x_t and keeps one: `PropagateNested`.
+
+    `num_draws` is K; with one, each particle draws once again. Raises `ValueError` for K < 1, and
+    for a filter without `Propagate` or `PropagateMarginalised`. Use it where the likelihood is
+    narrow and cheap, with four to sixteen draws.
+    """
+    check_type(Filter, "a Filter", filter=filter)
+    check_whole(num_draws=num_draws)
+    _propagation_of(filter, "each particle draws")
+
+    def nested(move: Any) -> Any:
+        plain = move.propagate if isinstance(move, PropagateNested) else move
+        if num_draws == 1 or not isinstance(plain, _PROPAGATIONS):
+            return plain
+        return PropagateNested(plain, num_draws)
+
+    return map_moves(nested, filter)
+
+
+def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter:
+    """The filter that resamples by its weights times a look-ahead ν to y_t: `AuxiliaryResample`.
+
+    `lookahead` is that of the move; None is a `PilotLookahead`, which takes the model alone. One
+    that is a proposal also draws x_t, where the filter has no other. Raises `ValueError` for a
+    filter without `Resample`.
+    """
+    check_type(Filter, "a Filter", filter=filter)
+    look = PilotLookahead(filter.model) if lookahead is None else lookahead
+    if not any(isinstance(move, Resample | AuxiliaryResample) for move in filter.moves):
+        raise ValueError("filter: none of its moves is a Resample, which could look ahead")
+
+    def ahead(move: Any) -> Any:
+        if isinstance(move, Resample | AuxiliaryResample):
+            resample = move if isinstance(move, Resample) else move.resample
+            return AuxiliaryResample(resample, look)
+        guided = isinstance(look, AbstractProposal) and isinstance(move, _PROPAGATIONS)
+        if guided and move.proposal is None:
+            return dataclasses.replace(move, proposal=look)
+        return move
+
+    return map_moves(ahead, filter)
 
 
 def with_selected_start(filter: Filter, num_draws: int) -> Filter:
@@ -21,12 +147,40 @@ def with_selected_start(filter: Filter, num_draws: int) -> Filter:
     others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
     if num_draws == 1:
         return filter.replace(initial_moves=others)
-    kinds = (Propagate, PropagateMarginalised, PropagateNested)
-    looks = [move for move in filter.moves if isinstance(move, kinds)]
-    if not looks:
+    look = _propagation_of(filter, "x_0 is chosen")
+    select = SelectInitial(look, num_draws, filter.initial_noise)
+    return filter.replace(initial_moves=[select, *others])
+
+
+def _propagation_of(filter: Filter, what: str) -> Any:
+    """The move that draws x_t one particle at a time; a `ValueError` where there is none."""
+    found = [move for move in filter.moves if isinstance(move, _LOOKS)]
+    if not found:
         raise ValueError(
-            "filter: x_0 is chosen where Propagate, PropagateMarginalised or PropagateNested"
+            f"filter: {what} where Propagate, PropagateMarginalised or PropagateNested"
             " propagates, and none of its moves is one"
         )
-    select = SelectInitial(looks[0], num_draws, filter.initial_noise)
-    return filter.replace(initial_moves=[select, *others])
+    return found[0]
+
+
+def _everywhere(filter: Filter, field: str, value: str) -> Filter:
+    """The filter with another value of a field in all moves that have it, also within others."""
+    check_type(Filter, "a Filter", filter=filter)
+
+    def has_it(node: Any) -> bool:
+        return isinstance(node, AbstractMove) and field in node.__dataclass_fields__
+
+    def replaced(node: Any) -> Any:
+        if not has_it(node):
+            return node
+        own = {name: visit(getattr(node, name)) for name in node.__dataclass_fields__}
+        return type(node)(**own | {field: value})
+
+    def visit(tree: Any) -> Any:
+        # The model stays the very same object, by which a filter knows its own.
+        return jax.tree.map(replaced, tree, is_leaf=lambda n: n is filter.model or has_it(n))
+
+    return filter.replace(
+        moves=[visit(move) for move in filter.moves],
+        initial_moves=[visit(move) for move in filter.initial_moves],
+    )

@@ -113,6 +113,10 @@ def _mpf(m: int = NUM_COMPONENTS, **options) -> Callable[..., Filter]:
     return lambda model: mpfjax.mixture_particle_filter(model, NUM_PARTICLES, m, **options)
 
 
+def _resampling(resample: Resample, m: int = NUM_COMPONENTS) -> Callable[..., Filter]:
+    return lambda model: mpfjax.with_resampling(_mpf(m)(model), resample)
+
+
 def _chain(
     *before, m: int = NUM_COMPONENTS, then=(), proposal=lambda model: None
 ) -> Callable[..., Filter]:
@@ -181,14 +185,14 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
     return {
         "mpf": _mpf(m),
         "mpf rqmc": _mpf(m, noise="rqmc"),
-        "mpf rqmc, no look-ahead": _mpf(m, noise="rqmc", lookahead=None),
+        "mpf rqmc, no look-ahead": lambda model: mpfjax.with_point_sets(_mpf(m)(model)),
         "guided mpf rqmc, adaptive": lambda model: _mpf(
             m, proposal=GaussNewtonProposal(model), noise="rqmc", ess_threshold=0.5
         )(model),
-        "gaussian mixture rqmc": lambda model: mpfjax.gaussian_mixture_particle_filter(
-            model, NUM_PARTICLES, m, noise="rqmc"
+        "gaussian mixture rqmc": lambda model: mpfjax.with_point_sets(
+            mpfjax.gaussian_mixture_particle_filter(model, NUM_PARTICLES, m)
         ),
-        "mpf fixed number": _mpf(m, particles_per_component=36 // m),
+        "mpf fixed number": _resampling(Resample(particles_per_component=36 // m), m),
         "guided mpf": lambda model: _mpf(m, proposal=GaussNewtonProposal(model))(model),
         "guided, sorted": _chain(
             Resample(sort_by=lambda states: states.reshape(NUM_PARTICLES, -1)[:, 0]),
@@ -238,11 +242,13 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "pf ssp": _pf(scheme="ssp"),
     "pf rqmc": _pf(noise="rqmc"),
     "pf of many initial draws": _selecting(5),
-    "pf rqmc of many initial draws": _selecting(3, noise="rqmc", num_draws=2),
+    "pf rqmc of many initial draws": lambda model: mpfjax.with_proposals_per_particle(
+        _selecting(3, noise="rqmc")(model), 2
+    ),
     "auxiliary pf, adaptive": lambda model: mpfjax.auxiliary_particle_filter(
         model, NUM_PARTICLES, GaussNewtonProposal(model), ess_threshold=0.5
     ),
-    "auxiliary mpf": lambda model: _mpf(lookahead=Halfway(model))(model),
+    "auxiliary mpf": lambda model: mpfjax.with_lookahead(_mpf()(model), Halfway(model)),
     "guided pf": lambda model: _pf(proposal=GaussNewtonProposal(model))(model),
     **_of_components(NUM_COMPONENTS),
     **{
@@ -255,18 +261,20 @@ CHAINS: dict[str, Callable[..., Filter]] = {
     "every second step a random walk": lambda model: _chain(
         Resample(), then=[Every(2, [RandomWalkMetropolis(model)])]
     )(model),
-    "mpf of equal shares": _mpf(allocation="equal"),
+    "mpf of equal shares": _resampling(Resample(allocation="equal")),
     "regrouped every second step": _mpf(regroup_every=2),
     "resampled every second step": _chain(Every(2, [Resample("stratified"), KMeans(2)])),
     "in stages": _in_stages(1),
-    "pf of families": _pf(num_draws=3),
+    "pf of families": lambda model: mpfjax.with_proposals_per_particle(_pf()(model), 3),
     "point sets without an order": lambda model: Filter(
         model, [Resample(ess_threshold=0.5), Propagate(model, noise="rqmc")], NUM_PARTICLES
     ),
-    "guided mpf rqmc of families": lambda model: _mpf(
-        proposal=GaussNewtonProposal(model), noise="rqmc", num_draws=3
-    )(model),
-    "mpf rqmc of families": _mpf(noise="rqmc", num_draws=3),
+    "guided mpf rqmc of families": lambda model: mpfjax.with_proposals_per_particle(
+        _mpf(proposal=GaussNewtonProposal(model), noise="rqmc")(model), 3
+    ),
+    "mpf rqmc of families": lambda model: mpfjax.with_proposals_per_particle(
+        _mpf(noise="rqmc")(model), 3
+    ),
     "mixture in stages": _in_stages(NUM_COMPONENTS),
     "predict and weigh": lambda model: Filter(
         model, [Resample(), Predict(model), Reweight(model)], NUM_PARTICLES

@@ -41,8 +41,9 @@ def test_fewer_particles_than_components():
 
 
 def test_fewer_slots_than_a_fixed_number_each_needs():
+    filter = mpfjax.mixture_particle_filter(MODEL, 199, 10)
     with pytest.raises(ValueError, match="particles_per_component: 20 for each of 10"):
-        mpfjax.mixture_particle_filter(MODEL, 199, 10, particles_per_component=20)
+        mpfjax.with_resampling(filter, Resample(particles_per_component=20))
 
 
 def test_no_moves():
@@ -130,7 +131,7 @@ def test_an_option_of_a_move_that_is_out_of_range(move, options, name):
 
 
 def test_as_many_units_as_features():
-    filter = mpfjax.mixture_particle_filter(MODEL, 20, 2, kmeans=KMeans(scale=[1.0, 2.0]))
+    filter = mpfjax.mixture_particle_filter(MODEL, 20, 2, scale=[1.0, 2.0])
     with pytest.raises(ValueError, match="scale: 2 units for 1 features"):
         filter.init(KEY)
 

@@ -162,7 +162,7 @@ class TestOnline:
         # A run in which no particle lies within rounding of the edge between two offspring.
         for k, key in list(enumerate(jax.random.split(jax.random.key(3), NUM_RUNS)))[6:7]:
             initial, keys = step_keys(key, len(OBSERVATIONS))
-            mixture = filter.init(initial)
+            mixture = filter.init(initial, OBSERVATIONS[0])
             for t, observation in enumerate(OBSERVATIONS):
                 mixture, info = filter.step(keys[t], mixture, observation)
                 increment = run.log_likelihood_increments[k, t]

@@ -245,9 +245,11 @@ class TestExchange:
         log_weights = rng.normal(size=(g, n)) + np.asarray(log_masses)[:, None]
         states, labels = rng.normal(size=g * n), rng.integers(0, 3, g * n)
         whole = make_mixture(states, log_weights.ravel(), labels, 3)
-        islands = whole.replace(log_scale=jnp.zeros(g * n))
-        islands = jax.tree.map(lambda leaf: leaf.reshape(g, n, *leaf.shape[1:]), islands)
-        islands = islands.replace(log_scale=jnp.zeros(g))
+
+        def on_each(leaf):
+            return leaf.reshape(g, n, *leaf.shape[1:]) if leaf.ndim else jnp.repeat(leaf, g)
+
+        islands = jax.tree.map(on_each, whole)
         move = mpfjax.IslandInteraction(threshold)
         return islands, on_islands(lambda part: move(jax.random.key(0), part), islands)
 

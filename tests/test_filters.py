@@ -540,7 +540,7 @@ class TestWhatAUserHandsIt:
             assert move.features.function is first
             assert move.features.scale == (3.0,)
         own = mpfjax.KMeans(2, features=lambda states: states[:, 1])
-        filter = getattr(mpfjax, make)(Drift(), 20, 2, features=first, kmeans=own, regroup_every=1)
+        filter = getattr(mpfjax, make)(Drift(), 20, 2, regroup=[own], regroup_every=1)
         assert own in filter.moves
 
     @pytest.mark.thorough
@@ -551,9 +551,12 @@ class TestWhatAUserHandsIt:
         )
         many = mpfjax.mixture_particle_filter(
             mpfjax.per_particle(DriftOfOne()),
-            kmeans=mpfjax.KMeans(2, features=lambda states: states[:, 0], scale=0.5),
-            merge=mpfjax.Merge(features=lambda states: states[:, 0], scale=0.5),
-            split=mpfjax.Split(features=lambda states: states[:, 0], scale=0.5),
+            features=lambda state: state[0],
+            regroup=[
+                mpfjax.Merge(features=lambda states: states[:, 0], scale=0.5),
+                mpfjax.Split(features=lambda states: states[:, 0], scale=0.5),
+                mpfjax.KMeans(2, features=lambda states: states[:, 0], scale=0.5),
+            ],
             **options,
         )
         runs = [mpfjax.run_filter(jax.random.key(2), f, jnp.zeros(3)) for f in (one, many)]

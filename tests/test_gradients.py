@@ -24,9 +24,11 @@ ONE = TWO[:, 0]
 
 
 def joint(make, **options):
-    return lambda model, gradient: make(
-        mpfjax.MultiObjectModel(model, 2), NUM_PARTICLES, gradient=gradient, **options
-    )
+    def build(model, gradient):
+        filter = make(mpfjax.MultiObjectModel(model, 2), NUM_PARTICLES, **options)
+        return mpfjax.with_score_gradient(filter) if gradient == "stop" else filter
+
+    return build
 
 
 def single(make, *sizes, **options):
@@ -143,7 +145,9 @@ def test_propagation_with_stopped_gradients_is_the_same_to_the_bit(kind):
             MODEL, mpfjax.GaussNewtonProposal(MODEL), gradient
         ),
         "halves": lambda gradient: mpfjax.Predict(MODEL, gradient),
-        "partitioned": lambda gradient: mpfjax.Partitioned(joint, gradient=gradient),
+        "partitioned": lambda gradient: mpfjax.Partitioned(
+            joint, resample=mpfjax.Resample(gradient=gradient, allocation="equal")
+        ),
     }[kind]
     model, observation = (joint, TWO[0]) if kind == "partitioned" else (MODEL, ONE[0])
     moves = [make("none"), mpfjax.Reweight(model)]
@@ -226,11 +230,12 @@ def test_gradients_are_finite_where_weights_and_components_vanish():
         lambda model: mpfjax.mixture_particle_filter(model, 10, 2, gradient="stop"),
         lambda model: mpfjax.Propagate(model, gradient="stop"),
         lambda model: mpfjax.Predict(model, gradient="stop"),
-        lambda model: mpfjax.partitioned_sampling(
-            mpfjax.MultiObjectModel(model, 2), 10, gradient="stop"
-        ),
-        lambda model: mpfjax.distributed_partitioned_sampling(
-            mpfjax.MultiObjectModel(model, 2), 10, gradient="stop"
+        lambda model: mpfjax.run_filter(
+            jax.random.key(0),
+            mpfjax.with_score_gradient(
+                mpfjax.partitioned_sampling(mpfjax.MultiObjectModel(model, 2), 10)
+            ),
+            jnp.ones((2, 2)),
         ),
     ],
 )

@@ -131,9 +131,7 @@ BUILT = {
         {"model": SWITCHING, "proposal": None, "gradient": "none", "noise": "rqmc"},
     ),
     "RegimeProposal": (mpfjax.RegimeProposal, {"model": SWITCHING}),
-    "PropagateRegimes": (
-        mpfjax.PropagateRegimes, {"model": SWITCHING, "group": None, "scheme": "systematic"}
-    ),
+    "PropagateRegimes": (mpfjax.PropagateRegimes, {"model": SWITCHING, "group": None}),
     "SwitchingLinearGaussianModel": (
         mpfjax.SwitchingLinearGaussianModel,
         {"transition_matrix": EYE, "F": EYE, "Q": EYE, "H": EYE, "R": EYE, "m0": np.zeros(1),
@@ -158,8 +156,7 @@ BUILT = {
     ),
     "Partitioned": (
         mpfjax.Partitioned,
-        {"model": JOINT, "orders": None, "scheme": "systematic", "ess_threshold": 1.0,
-         "reassembly": "prior", "gradient": "none"},
+        {"model": JOINT, "orders": None, "resample": None, "reassembly": "prior"},
     ),
     "PropagateIndependently": (
         mpfjax.PropagateIndependently, {"model": JOINT, "scheme": "systematic"}
@@ -177,53 +174,52 @@ BUILT = {
         mpfjax.SelectInitial,
         {"propagation": mpfjax.Propagate(MODEL), "num_draws": 2, "noise": "rqmc"},
     ),
-    "with_selected_start": (
-        mpfjax.with_selected_start,
-        {"filter": mpfjax.particle_filter(MODEL, 4), "num_draws": 2},
+    "with_selected_start": (mpfjax.with_selected_start, {"filter": FILTER, "num_draws": 2}),
+    "with_proposals_per_particle": (
+        mpfjax.with_proposals_per_particle, {"filter": FILTER, "num_draws": 2}
+    ),
+    "with_lookahead": (mpfjax.with_lookahead, {"filter": FILTER, "lookahead": None}),
+    "with_point_sets": (mpfjax.with_point_sets, {"filter": FILTER}),
+    "with_score_gradient": (mpfjax.with_score_gradient, {"filter": FILTER}),
+    "with_resampling": (
+        mpfjax.with_resampling, {"filter": FILTER, "resample": mpfjax.Resample()}
     ),
     "particle_filter": (
         mpfjax.particle_filter,
         {"model": MODEL, "num_particles": 4, "proposal": None, "scheme": "systematic",
-         "ess_threshold": 1.0, "sort_by": None, "noise": "rqmc", "num_draws": 2,
-         "gradient": "none"},
+         "ess_threshold": 1.0, "sort_by": None, "noise": "rqmc", "gradient": "none"},
     ),
     "auxiliary_particle_filter": (
         mpfjax.auxiliary_particle_filter,
         {"model": MODEL, "num_particles": 4, "lookahead": mpfjax.GaussNewtonProposal(MODEL),
-         "proposal": None, "scheme": "ssp", "ess_threshold": 1.0, "sort_by": None,
-         "noise": "independent", "gradient": "none"},
+         "proposal": None, "scheme": "ssp", "ess_threshold": 1.0, "sort_by": None},
     ),
     "mixture_particle_filter": (
         mpfjax.mixture_particle_filter,
         {"model": MODEL, "num_particles": 4, "max_components": 2, "proposal": None,
-         "lookahead": None,
-         "scheme": "systematic", "ess_threshold": 1.0, "particles_per_component": None,
-         "allocation": "equal", "sort_by": "hilbert", "noise": "rqmc", "num_draws": 2,
-         "gradient": "none", "features": None,
-         "scale": 1.0, "merge": None, "split": None, "kmeans": None, "initial_kmeans": None,
-         "regroup_every": 1},
+         "scheme": "systematic", "ess_threshold": 1.0, "noise": "rqmc", "gradient": "none",
+         "features": None, "scale": 1.0, "regroup": None, "regroup_every": 1},
     ),
     "gaussian_particle_filter": (
         mpfjax.gaussian_particle_filter,
         {"model": MODEL, "num_particles": 4, "proposal": None, "regeneration": None,
-         "importance": "propagated", "noise": "rqmc"},
+         "importance": "propagated"},
     ),
     "gaussian_mixture_particle_filter": (
         mpfjax.gaussian_mixture_particle_filter,
         {"model": MODEL, "num_particles": 4, "max_components": 2, "proposal": None,
-         "regeneration": None, "importance": "propagated", "noise": "independent",
-         "features": None, "scale": 1.0, "merge": None, "split": None, "kmeans": None,
-         "initial_kmeans": None, "regroup_every": 1},
+         "regeneration": None, "importance": "propagated", "features": None, "scale": 1.0,
+         "regroup": None, "regroup_every": 1},
     ),
     "partitioned_sampling": (
         mpfjax.partitioned_sampling,
         {"model": JOINT, "num_particles": 4, "order": None, "scheme": "systematic",
-         "ess_threshold": 1.0, "gradient": "none"},
+         "ess_threshold": 1.0},
     ),
     "distributed_partitioned_sampling": (
         mpfjax.distributed_partitioned_sampling,
         {"model": JOINT, "num_particles": 4, "orders": None, "reassembly": "prior",
-         "scheme": "systematic", "ess_threshold": 1.0, "gradient": "none"},
+         "scheme": "systematic", "ess_threshold": 1.0},
     ),
     "independent_particle_filters": (
         mpfjax.independent_particle_filters,
@@ -406,7 +402,7 @@ def test_every_public_constructor_and_runner_is_tried():
     assert others == {
         "FilterRun", "StepInfo", "ParticleMixture", "MarginalisedState", "Pool",
         "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
-        "NetworkProposal", "keep_programs", "check_model",
+        "NetworkProposal", "keep_programs", "check_model", "map_moves",
     } - tried  # fmt: skip
 
 

@@ -99,7 +99,7 @@ def test_particles_descend_from_those_of_the_run():
     model = mpfjax.LinearGaussianModel(
         np.eye(2), 1e-12 * np.eye(2), np.eye(2), np.eye(2), np.zeros(2), np.eye(2)
     )
-    filter = mpfjax.mixture_particle_filter(model, 40, 3, noise="rqmc", lookahead=None)
+    filter = mpfjax.with_point_sets(mpfjax.mixture_particle_filter(model, 40, 3))
     run = mpfjax.run_filter(KEY, filter, np.ones((2, 2), np.float32))
     first = jax.tree.map(lambda leaf: leaf[0], run.collected)
     assert len(np.unique(first.ancestor_indices)) == 40  # no particle of x_0 is resampled

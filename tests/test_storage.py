@@ -55,9 +55,9 @@ class TestOnlineFilter:
         return state, infos, halfway if len(infos) == self.NUM_STEPS else None
 
     def test_resumed_equals_uninterrupted_to_the_bit(self, path):
-        merge = mpfjax.Merge(max_deviations=4.0, patience=3)
+        regroup = [mpfjax.Merge(max_deviations=4.0, patience=3), mpfjax.Split(), mpfjax.KMeans(2)]
         model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
-        filter = mpfjax.mixture_particle_filter(model, 30, 3, merge=merge)
+        filter = mpfjax.mixture_particle_filter(model, 30, 3, regroup=regroup)
         start = {"mixture": filter.init(jax.random.key(0)), "key": jax.random.key(1), "t": 0}
         end, infos, halfway = self.go_on(filter, start)
         # Patience counts, so that what is resumed depends on the memory.

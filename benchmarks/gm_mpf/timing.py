@@ -60,10 +60,11 @@ def time_quadratic(
     model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
     observations = (2 * jnp.sin(2 * jnp.pi * jnp.arange(1.0, num_steps + 1) / 100)) ** 2
     n = sizes.TIMED_PARTICLES
+    grouping = [mpfjax.Merge(), mpfjax.Split(), mpfjax.KMeans()]
     every = {
         "pf": mpfjax.particle_filter(model, n),
         "gpf": mpfjax.gaussian_particle_filter(model, n),
-        "mpf": mpfjax.mixture_particle_filter(model, n, 2, regroup_every=1, kmeans=mpfjax.KMeans()),
+        "mpf": mpfjax.mixture_particle_filter(model, n, 2, regroup=grouping, regroup_every=1),
         "gm_mpf": mpfjax.gaussian_mixture_particle_filter(model, n, 2),
     }
     filters = {name: every[name] for name in names}

@@ -131,14 +131,13 @@ def filters_of(size: np.ndarray) -> dict[str, Callable[[SoftColourModel], mpfjax
     where: dict[str, Any] = {"features": centre, "scale": tuple(size.tolist())}
 
     def mixture(model: SoftColourModel) -> mpfjax.Filter:
+        regroup = [
+            mpfjax.Merge(None, 0.5, **where),
+            mpfjax.Split(4.0, 0.5, min_share=0.15, **where),
+            mpfjax.KMeans(5, **where),
+        ]
         return mpfjax.mixture_particle_filter(
-            model,
-            NUM_PARTICLES,
-            MAX_COMPONENTS,
-            merge=mpfjax.Merge(None, 0.5, **where),
-            split=mpfjax.Split(4.0, 0.5, min_share=0.15, **where),
-            kmeans=mpfjax.KMeans(5, **where),
-            initial_kmeans=mpfjax.KMeans(5, reseed=True, **where),
+            model, NUM_PARTICLES, MAX_COMPONENTS, regroup=regroup, **where
         )
 
     return {"pf": lambda model: mpfjax.particle_filter(model, NUM_PARTICLES), "mpf": mixture}

@@ -18,26 +18,41 @@ def _plain(**options: Any) -> Make:
     )
 
 
-def _auxiliary(**options: Any) -> Make:
-    return lambda scene, num_particles: mpfjax.auxiliary_particle_filter(
-        scene.model, num_particles, scene.lookahead, **options
+def _auxiliary(scene: Scene, num_particles: int) -> mpfjax.Filter:
+    return mpfjax.auxiliary_particle_filter(scene.model, num_particles, scene.lookahead)
+
+
+def _mixture(**options: Any) -> Make:
+    return lambda scene, num_particles: mpfjax.mixture_particle_filter(
+        scene.model, num_particles, scene.max_components, **scene.grouping, **options
     )
 
 
-def _mixture(ahead: bool = False, **options: Any) -> Make:
-    def make(scene: Scene, num_particles: int) -> mpfjax.Filter:
-        lookahead = {"lookahead": scene.lookahead} if ahead else {}
-        return mpfjax.mixture_particle_filter(
-            scene.model, num_particles, scene.max_components,
-            **scene.grouping, **lookahead, **options,
-        )  # fmt: skip
+def _changed(make: Make, *changes: Callable[[mpfjax.Filter], mpfjax.Filter]) -> Make:
+    """The filters of another row after some changes, one after the other."""
 
-    return make
+    def changed(scene: Scene, num_particles: int) -> mpfjax.Filter:
+        filter = make(scene, num_particles)
+        for change in changes:
+            filter = change(filter)
+        return filter
+
+    return changed
 
 
-def _pilot(scene: Scene, num_particles: int) -> mpfjax.Filter:
-    """The mixture filter with independent noise and the look-ahead that point sets bring along."""
-    return _mixture(lookahead=mpfjax.PilotLookahead(scene.model))(scene, num_particles)
+def _with_equal_slots(filter: mpfjax.Filter) -> mpfjax.Filter:
+    return mpfjax.with_resampling(filter, mpfjax.Resample(allocation="equal"))
+
+
+def _with_four_draws(filter: mpfjax.Filter) -> mpfjax.Filter:
+    return mpfjax.with_proposals_per_particle(filter, 4)
+
+
+def _ahead(make: Make) -> Make:
+    """The filters of another row with the look-ahead of their scene."""
+    return lambda scene, num_particles: mpfjax.with_lookahead(
+        make(scene, num_particles), scene.lookahead
+    )
 
 
 def _tempered(scene: Scene, num_particles: int) -> mpfjax.Filter:
@@ -47,9 +62,7 @@ def _tempered(scene: Scene, num_particles: int) -> mpfjax.Filter:
         mpfjax.PropagateTempered(scene.model) if isinstance(move, mpfjax.Propagate) else move
         for move in plain.moves
     ]
-    return mpfjax.Filter(
-        scene.model, moves, num_particles, scene.max_components, initial_moves=plain.initial_moves
-    )
+    return plain.replace(moves=moves)
 
 
 def _learned(scene: Scene, num_particles: int) -> mpfjax.Filter:
@@ -61,17 +74,17 @@ def _learned(scene: Scene, num_particles: int) -> mpfjax.Filter:
 FILTERS: dict[str, Make] = {
     "PF": _plain(),
     "PF, rqmc": _plain(noise="rqmc"),
-    "APF": _auxiliary(),
-    "APF, rqmc": _auxiliary(noise="rqmc"),
+    "APF": _auxiliary,
+    "APF, rqmc": _changed(_auxiliary, mpfjax.with_point_sets),
     "MPF": _mixture(),
-    "MPF, equal slots": _mixture(allocation="equal"),
+    "MPF, equal slots": _changed(_mixture(), _with_equal_slots),
     "MPF, rqmc": _mixture(noise="rqmc"),
-    "MPF, rqmc, no look-ahead": _mixture(noise="rqmc", lookahead=None),
-    "MPF, 4 draws": _mixture(num_draws=4),
-    "MPF, rqmc, 4 draws": _mixture(noise="rqmc", num_draws=4),
-    "MPF, look-ahead": _mixture(ahead=True),
-    "MPF, rqmc, look-ahead": _mixture(ahead=True, noise="rqmc"),
-    "MPF, pilot look-ahead": _pilot,
+    "MPF, rqmc, no look-ahead": _changed(_mixture(), mpfjax.with_point_sets),
+    "MPF, 4 draws": _changed(_mixture(), _with_four_draws),
+    "MPF, rqmc, 4 draws": _changed(_mixture(noise="rqmc"), _with_four_draws),
+    "MPF, look-ahead": _ahead(_mixture()),
+    "MPF, rqmc, look-ahead": _ahead(_mixture(noise="rqmc")),
+    "MPF, pilot look-ahead": _changed(_mixture(), mpfjax.with_lookahead),
     "MPF, tempered": _tempered,
     "MPF, learned look-ahead": _learned,
 }

@@ -26,7 +26,8 @@ def observations_of(job: Job) -> np.ndarray:
 
 def _auxiliary(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:
     proposal = mpfjax.GaussNewtonProposal(model)
-    return mpfjax.mixture_particle_filter(model, num_particles, 2, lookahead=proposal, noise="rqmc")
+    plain = mpfjax.mixture_particle_filter(model, num_particles, 2)
+    return mpfjax.with_point_sets(mpfjax.with_lookahead(plain, proposal))
 
 
 def _guided(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:

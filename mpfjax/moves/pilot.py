@@ -8,10 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.checks import check_one_of
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, HasTransitionNoise, require_noise
-from mpfjax.models.conditionally_linear import is_marginalised, refuse_marginalised
+from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import noise_dtype
 from mpfjax.models.steps import likelihoods
 from mpfjax.moves.initial import trusted
@@ -61,20 +60,3 @@ class PilotLookahead(eqx.Module):
 
 
 Lookahead = AbstractProposal | PilotLookahead | Callable[[PyTree, PyTree], Array]
-
-
-def chosen_lookahead(
-    lookahead: Lookahead | str | None,
-    model: AbstractStateSpaceModel,
-    proposal: AbstractProposal | None,
-    noise: str,
-) -> Lookahead | None:
-    """The look-ahead itself, or what "auto" means: where point sets make x_t, that of the model.
-
-    None where a proposal knows y_t already, and where it could not be used.
-    """
-    if not isinstance(lookahead, str):
-        return lookahead
-    check_one_of(("auto",), lookahead=lookahead)
-    usable = proposal is None and not is_marginalised(model)
-    return PilotLookahead(model) if noise == "rqmc" and usable else None

@@ -37,8 +37,9 @@ def test_scores_are_those_of_the_filters_own_particles(study):
     model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
     truth, observations = benchmark.simulate(written["settings"]["data_seed"])
     keys = jax.random.split(jax.random.fold_in(jax.random.key(written["settings"]["seed"]), 1), 3)
-    as_in_the_paper = {"allocation": "equal", "kmeans": mpfjax.KMeans()}
-    filter = mpfjax.mixture_particle_filter(model, 20, 2, regroup_every=1, **as_in_the_paper)
+    regroup = [mpfjax.Merge(), mpfjax.Split(), mpfjax.KMeans()]
+    filter = mpfjax.mixture_particle_filter(model, 20, 2, regroup=regroup, regroup_every=1)
+    filter = mpfjax.with_resampling(filter, mpfjax.Resample(allocation="equal"))
     filter = mpfjax.with_selected_start(filter, 1)
     expected = []
     for key in keys:

@@ -6,8 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax import QuadraticModel, Resample, mixture_particle_filter, run_filter
+from mpfjax import (
+    QuadraticModel,
+    Resample,
+    mixture_particle_filter,
+    run_filter,
+    with_resampling,
+)
 from mpfjax.moves.resampling.allocation import EQUAL_PARTS, FEWEST, demands_by_variance
+from mpfjax.moves.resampling.line import in_line
 from tests.examples import make_mixture
 from tests.marking import thorough
 
@@ -17,7 +24,8 @@ MOVE = Resample()
 @eqx.filter_jit
 def _resampled(move, mixture):
     due = move.is_due(mixture)
-    targets = move.deal(mixture, due, mixture.component_counts)
+    line = in_line(mixture, ~due[mixture.component_indicators])
+    targets = move.deal(mixture, line, due)
     return targets, move(jax.random.key(0), mixture)
 
 
@@ -128,7 +136,7 @@ def test_groups_that_would_have_no_say_are_refused():
 
 def test_an_allocation_of_an_unknown_name_is_refused():
     with pytest.raises(ValueError, match="allocation"):
-        mixture_particle_filter(QuadraticModel(0.3, 0.5, -2.0, 2.0), 10, 2, allocation="mass")
+        Resample(allocation="mass")
 
 
 def test_where_particles_are_few_all_is_shared_equally():
@@ -138,9 +146,11 @@ def test_where_particles_are_few_all_is_shared_equally():
 
 def test_a_mixture_of_few_particles_draws_as_with_equal_shares():
     model = QuadraticModel(0.3, 0.5, -2.0, 2.0)
+    filter = mixture_particle_filter(model, 20, 2)
     runs = [
-        run_filter(jax.random.key(0), mixture_particle_filter(model, 20, 2, allocation=allocation),
-                   jnp.ones(5)).log_marginal_likelihood
+        run_filter(
+            jax.random.key(0), with_resampling(filter, Resample(allocation=allocation)), jnp.ones(5)
+        ).log_marginal_likelihood
         for allocation in ("variance", "equal")
-    ]  # fmt: skip
+    ]
     assert runs[0] == runs[1]

@@ -235,7 +235,7 @@ def test_resampling_on_either_side_of_every_block_size(n, num_components):
 def test_regrouping_treats_every_copy_of_a_particle_alike(name):
     """A mixture in which each particle stands twice is that of the particles with N doubled."""
     one = MIXTURES["ordinary"]
-    twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), one)
+    twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]) if leaf.ndim else leaf, one)
     twice = twice.replace(log_weights=twice.log_weights - np.log(2).astype(np.float32))
     labels = np.asarray(compiled(name)(jax.random.key(0), one).component_indicators)
     found = np.asarray(compiled(name)(jax.random.key(0), twice).component_indicators)

@@ -61,7 +61,9 @@ FILTERS = {
         2,
         initial_moves=[KMeans(2, reseed=True)],
     ),
-    "families": lambda: mpfjax.particle_filter(MODEL, NUM_PARTICLES, num_draws=3),
+    "families": lambda: mpfjax.with_proposals_per_particle(
+        mpfjax.particle_filter(MODEL, NUM_PARTICLES), 3
+    ),
     "a component for each regime": lambda: Filter(
         MODEL,
         [Resample(), PropagateMarginalised(MODEL), GroupBy(by_regime)],

@@ -60,7 +60,8 @@ def test_weights_are_means_and_draws_are_kept_by_theirs(noise):
 
 def test_each_particle_keeps_one_of_its_own_draws():
     still = mpfjax.QuadraticModel(1e-4, 0.5, -2.0, 2.0)
-    filter = mpfjax.mixture_particle_filter(still, 30, 3, num_draws=4)
+    filter = mpfjax.mixture_particle_filter(still, 30, 3)
+    filter = mpfjax.with_proposals_per_particle(filter, 4)
     before = filter.init(jax.random.key(0))
     after, _ = filter.step(jax.random.key(1), before, SEEN[0])
     parents = np.asarray(before.particles)[np.asarray(after.ancestor_indices)]
@@ -71,7 +72,8 @@ def test_the_evidence_varies_less_than_with_one_draw():
     exact = grid_filter(MODEL, SEEN, jnp.linspace(-5.0, 5.0, 2001)).log_marginal_likelihood
     errors = {}
     for num_draws in (1, 8):
-        filter = mpfjax.particle_filter(MODEL, 40, num_draws=num_draws)
+        filter = mpfjax.particle_filter(MODEL, 40)
+        filter = mpfjax.with_proposals_per_particle(filter, num_draws)
         keys = jax.random.split(jax.random.key(0), 300)
         run = mpfjax.monte_carlo(keys, filter, SEEN, lambda mixture: None)
         errors[num_draws] = np.asarray(run.log_marginal_likelihood, float) - float(exact)
@@ -114,7 +116,7 @@ def test_what_will_not_do_is_named(as_installed, arguments, message):
 
 
 def test_no_trajectory_can_be_kept_among_families():
-    filter = mpfjax.particle_filter(MODEL, 10, num_draws=2)
+    filter = mpfjax.with_proposals_per_particle(mpfjax.particle_filter(MODEL, 10), 2)
     trajectory = jnp.zeros(len(SEEN) + 1)
     with pytest.raises(ValueError, match="Propagate"):
         mpfjax.smoothing.conditional_filter(jax.random.key(0), filter, SEEN, trajectory)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax import MultiObjectModel, PairwiseRepulsion, Partitioned
+from mpfjax import MultiObjectModel, PairwiseRepulsion, Partitioned, Resample
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.objects.partitioned import circular_orders
 from tests.examples import make_mixture, stack, walker
@@ -148,7 +148,8 @@ class TestWeights:
         states = rng.normal(size=(40, 3, 1))
         labels = rng.integers(0, components, 40)
         mixture = make_mixture(states, log_weights, labels, components)
-        move = Partitioned(REPELLING, orders, ess_threshold=0.0)
+        between = Resample(ess_threshold=0.0, allocation="equal")
+        move = Partitioned(REPELLING, orders, resample=between)
         moved = apply(move, mixture, OBSERVATIONS[0])
         before = mixture.log_weights[moved.ancestor_indices]
         expected = before + REPELLING.log_likelihood(OBSERVATIONS[0], moved.particles)

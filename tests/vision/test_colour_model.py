@@ -256,7 +256,8 @@ def test_the_papers_variances_are_the_default(frame):
 
 def test_it_runs_through_a_filter_and_keeps_both_boxes(frame):
     model = model_of(frame, sigma=0.1)
-    filter = mpfjax.mixture_particle_filter(model, 40, 2, particles_per_component=20)
+    filter = mpfjax.mixture_particle_filter(model, 40, 2)
+    filter = mpfjax.with_resampling(filter, mpfjax.Resample(particles_per_component=20))
     run = mpfjax.run_filter(jax.random.key(0), filter, jnp.asarray(np.stack([frame] * 6)))
     assert np.isfinite(float(run.log_marginal_likelihood))
     means = np.asarray(run.final.component_averages(run.final.particles.box))

@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_one_of, shown
+from mpfjax.checks import check_one_of, check_type, given, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
@@ -41,21 +41,21 @@ class Partitioned(AbstractPropagation):
       order for each component; "circular", where component c starts with object c, then c + 1, and
       so on in a circle; or "random", a new order for each component at every step. None is 0, ...,
       J-1.
-    - `scheme`, `ess_threshold`: of the resampling after each object, as in `Resample`.
+    - `resample`: the resampling after each object; None is systematic, at every object, with equal
+      shares of the slots. With its gradient "stop" the objects' draws are constants too, and
+      derivatives pass through their densities, as in `Propagate`.
     - `reassembly`: the masses of the components afterwards (section 4 and eq. 5). "evidence"
       multiplies each mass by the component's evidence, eq. 4 of Vermaak et al. (2003). "prior" is
       the paper's: each component returns to the mass that it had before, and only the total grows
       by the evidence. The marginal likelihood is then biased (`approximate` is true), but one step
       of bad luck loses no component. With one component both are the same.
-    - `gradient`: of the resampling after each object, as in `Resample`. With "stop" the objects'
-      draws are constants too, and derivatives pass through their densities, as in `Propagate`.
 
     A component dies if an object leaves it without weight. The others share its slots and, with
     "prior", its mass. If all weight is lost, the particles move by their dynamics alone.
 
     Raises `ValueError` for an order that is no permutation of the objects, a number of orders other
-    than one or the number of components, an unknown scheme, reassembly or gradient, and "stop" with
-    an object model that has no `log_transition`.
+    than one or the number of components, an unknown reassembly, and gradient "stop" with an object
+    model that has no `log_transition`.
     """
 
     model: MultiObjectModel
@@ -69,10 +69,8 @@ class Partitioned(AbstractPropagation):
         model: MultiObjectModel,
         orders: str | Sequence[int] | Sequence[Sequence[int]] | Array | np.ndarray | None = None,
         *,
-        scheme: str = "systematic",
-        ess_threshold: float = 1.0,
+        resample: Resample | None = None,
         reassembly: str = "evidence",
-        gradient: str = "none",
     ) -> None:
         check_one_of(REASSEMBLIES, reassembly=reassembly)
         require_multi_object(model, "Partitioned")
@@ -83,9 +81,8 @@ class Partitioned(AbstractPropagation):
         else:
             self.rule, self.orders = None, check_orders(orders, model.num_objects)
         self.model = model
-        self.resample = Resample(scheme, ess_threshold, gradient=gradient, allocation="equal")
-        if self._stops_draws:
-            require(model.object_model, "log_transition", "gradient='stop'")
+        check_type(Resample, "a Resample", **given(resample=resample))
+        self.resample = Resample(allocation="equal") if resample is None else resample
         self.reassembly = reassembly
 
     @property
@@ -102,6 +99,8 @@ class Partitioned(AbstractPropagation):
     ) -> ParticleMixture:
         """Propagate and weigh the objects of every particle in its component's order."""
         num_objects = self.model.num_objects
+        if self._stops_draws:
+            require(self.model.object_model, "log_transition", "gradient='stop'")
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = split(key, 2 * num_objects + 1)
         orders = self._orders(keys[-1], mixture.num_components)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import check_type, saying
 from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.base import (
+    AbstractStateSpaceModel,
     HasTransitionNoise,
     check_moved,
     is_made_of_noise,
@@ -29,6 +30,7 @@ from mpfjax.models.noise import noise_dtype
 from mpfjax.models.steps import seen
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation.propagate import (
+    Propagate,
     check_noise,
     check_propagated_gradient,
     log_transition,
@@ -199,3 +201,12 @@ def _weighed(
     if log_ratio is not None:
         log_factors.append(log_ratio)
     return mixture.replace(particles=state).weighed(*log_factors)
+
+
+def propagation(
+    model: AbstractStateSpaceModel, proposal: AbstractProposal | None
+) -> Propagate | PropagateMarginalised:
+    """The propagation of x_t for this kind of model."""
+    if isinstance(model, AbstractConditionallyLinearModel):
+        return PropagateMarginalised(model, proposal)
+    return Propagate(model, proposal)

@@ -10,14 +10,12 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import check_numbered, check_type, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
-from mpfjax.models.conditionally_linear import AbstractConditionallyLinearModel
 from mpfjax.models.noise import draw_family_noise, noise_dtype
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation.marginalised import PropagateMarginalised
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.operations.generator import split, uniform
 from mpfjax.operations.indexing import take
-from mpfjax.proposals import AbstractProposal
 
 
 class PropagateNested(AbstractPropagation):
@@ -113,23 +111,3 @@ def _repeated(mixture: ParticleMixture, num_draws: int) -> ParticleMixture:
         component_indicators=repeat(mixture.component_indicators),
         ancestor_indices=repeat(mixture.ancestor_indices),
     )
-
-
-def propagation(
-    model: AbstractStateSpaceModel,
-    proposal: AbstractProposal | None,
-    gradient: str,
-    noise: str,
-    num_draws: int,
-) -> Propagate | PropagateMarginalised | PropagateNested:
-    """The propagation of x_t for this kind of model, with one or several draws of each particle.
-
-    Its gradient is the one that belongs to that of resampling.
-    """
-    check_whole(num_draws=num_draws)
-    own_gradient = "stop" if gradient == "stop" else "none"
-    if isinstance(model, AbstractConditionallyLinearModel):
-        propagate = PropagateMarginalised(model, proposal, own_gradient, noise)
-    else:
-        propagate = Propagate(model, proposal, own_gradient, noise)
-    return propagate if num_draws == 1 else PropagateNested(propagate, num_draws)

@@ -110,17 +110,3 @@ class AuxiliaryResample(AbstractMove):
         seen = mixture.weighed(log_factors).active
         is_seen = spread(seen, mixture.component_indicators) | ~(log_factors < jnp.inf)
         return jnp.where(is_seen, log_factors, 0.0)
-
-
-def propagating_proposal(
-    proposal: AbstractProposal | None, lookahead: Any
-) -> AbstractProposal | None:
-    """The proposal that draws x_t: that of the look-ahead, unless another is given."""
-    if proposal is None and isinstance(lookahead, AbstractProposal):
-        return lookahead
-    return proposal
-
-
-def resampling(resample: Resample, lookahead: Any) -> Resample | AuxiliaryResample:
-    """The resampling move, with a look-ahead if there is a `lookahead`."""
-    return resample if lookahead is None else AuxiliaryResample(resample, lookahead)

@@ -24,6 +24,7 @@ from mpfjax.moves.regrouping.kmeans import KMeans
 from mpfjax.moves.regrouping.merge import Merge
 from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.resample import Resample
+from mpfjax.transforms import with_resampling
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
 from mpfjax.vision.boxes.learned_colours import AdaptAppearance, LearnedBoxState, LearnedColourModel
 from mpfjax.vision.boxes.object_moves import (
@@ -45,16 +46,16 @@ def paper_filters(
     """The paper's model and parameters; thresholds of the MPF are in units of the mean box."""
     model = ColourModel.from_frame(frame, boxes, sigma=0.15, deviations=None, share_reference=True)
     where: dict[str, Any] = {"features": _centre, "scale": boxes[:, 2:].mean(axis=0)}
+    merge, split = Merge(None, 0.5, **where), Split(4.0, 0.5, min_share=0.15, **where)
     mixture = mixture_particle_filter(
         model,
         NUM_PARTICLES,
         MAX_COMPONENTS,
-        particles_per_component=PARTICLES_PER_COMPONENT,
-        merge=Merge(None, 0.5, **where),
-        split=Split(4.0, 0.5, min_share=0.15, **where),
-        kmeans=KMeans(5, **where),
+        regroup=[merge, split, KMeans(5, **where)],
         regroup_every=1,
+        **where,
     )
+    mixture = with_resampling(mixture, Resample(particles_per_component=PARTICLES_PER_COMPONENT))
     return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
 
 

@@ -1,0 +1,119 @@
+"""Filters from filters: they compose, reach every move that they are about, and keep the model."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpfjax
+from mpfjax import (
+    AuxiliaryResample,
+    Every,
+    Filter,
+    KMeans,
+    MultiObjectModel,
+    Propagate,
+    PropagateNested,
+    Resample,
+    SelectInitial,
+    with_lookahead,
+    with_point_sets,
+    with_proposals_per_particle,
+    with_resampling,
+    with_score_gradient,
+    with_selected_start,
+)
+from mpfjax.moves.pilot import PilotLookahead
+
+KEY = jax.random.key(0)
+MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
+OBSERVATIONS = np.array([1.5, 1.0, 0.4], np.float32)
+
+
+def own_chain(model=MODEL):
+    """A chain that no recipe makes, with a resampling from time to time."""
+    moves = [Every(2, [Resample("stratified"), KMeans(2)]), Propagate(model)]
+    return Filter(model, moves, 32, 2, initial_moves=[KMeans(3, reseed=True)])
+
+
+def final(filter):
+    return mpfjax.run_filter(KEY, filter, OBSERVATIONS).final
+
+
+def test_the_keywords_of_recipes_are_transforms():
+    plain = mpfjax.particle_filter(MODEL, 32)
+    for keywords, transform in (
+        ({"noise": "rqmc"}, with_point_sets),
+        ({"gradient": "stop"}, with_score_gradient),
+    ):
+        recipe = mpfjax.particle_filter(MODEL, 32, **keywords)
+        chex.assert_trees_all_equal(final(recipe), final(transform(plain)))
+
+
+def test_they_compose_on_a_chain_of_ones_own():
+    filter = own_chain()
+    for change in (
+        with_point_sets,
+        with_score_gradient,
+        lambda f: with_selected_start(f, 3),
+        lambda f: with_resampling(f, Resample("ssp")),
+    ):
+        filter = change(filter)
+    every, propagate = filter.moves
+    assert every.moves[0].scheme == "ssp"
+    assert (propagate.noise, propagate.gradient, filter.initial_noise) == ("rqmc", "stop", "rqmc")
+    select = filter.initial_moves[0]
+    assert isinstance(select, SelectInitial)
+    assert (select.noise, select.propagation.noise) == ("rqmc", "rqmc")
+    assert np.isfinite(mpfjax.run_filter(KEY, filter, OBSERVATIONS).log_marginal_likelihood)
+
+
+def test_the_model_stays_one():
+    model = mpfjax.QuadraticModel(jnp.array(0.3), jnp.array(0.5), -2.0, 2.0)
+    filter = with_point_sets(with_score_gradient(with_selected_start(own_chain(model), 2)))
+    assert len(jax.tree.leaves(filter)) == len(jax.tree.leaves(model))
+
+
+def test_the_score_gradient_reaches_the_resampling_inside_of_moves():
+    joint = MultiObjectModel(MODEL, 2, shared_observation=True)
+    filter = with_score_gradient(mpfjax.partitioned_sampling(joint, 16))
+    resample, partitioned = filter.moves
+    assert (resample.gradient, partitioned.resample.gradient) == ("stop", "stop")
+
+
+def test_point_sets_sort_the_chains_own_resampling_alone():
+    filter = with_point_sets(mpfjax.auxiliary_particle_filter(MODEL, 16, PilotLookahead(MODEL)))
+    assert filter.moves[0].resample.sort_by == "hilbert"
+    own = Resample(sort_by=lambda states: -states)
+    kept = with_point_sets(with_resampling(mpfjax.particle_filter(MODEL, 16), own))
+    assert kept.moves[0].sort_by is own.sort_by
+
+
+def test_a_look_ahead_and_proposals_are_put_on_and_taken_off():
+    plain = mpfjax.particle_filter(MODEL, 16)
+    guide = mpfjax.GaussNewtonProposal(MODEL)
+    ahead = with_lookahead(plain, guide)
+    assert isinstance(ahead.moves[0], AuxiliaryResample)
+    assert isinstance(ahead.moves[1].proposal, mpfjax.GaussNewtonProposal)
+    assert isinstance(with_lookahead(plain).moves[0].lookahead, PilotLookahead)
+    several = with_proposals_per_particle(plain, 4)
+    assert isinstance(several.moves[1], PropagateNested)
+    assert with_proposals_per_particle(several, 8).moves[1].num_draws == 8
+    assert isinstance(with_proposals_per_particle(several, 1).moves[1], Propagate)
+    chex.assert_trees_all_equal(final(with_selected_start(plain, 1)), final(plain))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: with_lookahead(f), "filter: none of its moves is a Resample"),
+        (lambda f: with_selected_start(f, 2), "filter: x_0 is chosen where"),
+        (lambda f: with_proposals_per_particle(f, 2), "filter: each particle draws where"),
+        (lambda f: with_proposals_per_particle(f, 0), "num_draws: 0"),
+    ],
+)
+def test_a_filter_without_the_move_is_refused(change, message):
+    joint = MultiObjectModel(MODEL, 2, shared_observation=True)
+    with pytest.raises(ValueError, match=message):
+        change(mpfjax.independent_particle_filters(joint, 8))
