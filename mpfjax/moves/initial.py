@@ -22,7 +22,6 @@ from mpfjax.moves.propagation.marginalised import PropagateMarginalised
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.resampling.ordering import HILBERT, sorted_order
-from mpfjax.operations.choices import any_run
 from mpfjax.operations.floats import default_float
 from mpfjax.operations.generator import split, uniform
 from mpfjax.operations.indexing import take
@@ -162,12 +161,11 @@ class Waiting(AbstractResampling):
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
     ) -> ParticleMixture:
-        """The resampled mixture, or the one given; all runs of a `vmap` decide together."""
-        return jax.lax.cond(
-            any_run(mixture.log_scale != 0),
-            lambda: mixture,
-            lambda: self.move(key, mixture, observation),
-        )
+        """The resampled mixture, or the one given."""
+        waits = mixture.log_scale != 0
+        # Not by a condition, which would copy all that goes through it at every step.
+        keep = lambda new, old: new if new is old else jnp.where(waits, old, new)  # noqa: E731
+        return jax.tree.map(keep, self.move(key, mixture, observation), mixture)
 
 
 def waiting_for_choice(moves: tuple[Any, ...], initial_moves: tuple[Any, ...]) -> tuple[Any, ...]:
