@@ -17,7 +17,6 @@ from mpfjax.vision.tracking.deaths import Deaths
 from mpfjax.vision.tracking.motion import PropagateObjects
 from mpfjax.vision.tracking.noise import LearnNoise
 from mpfjax.vision.tracking.observation import TrackedFrame
-from mpfjax.vision.tracking.occlusion import ShareDetections
 from mpfjax.vision.tracking.scores import RankScores
 from mpfjax.vision.tracking.tracker import object_model
 from tests.marking import thorough
@@ -34,14 +33,13 @@ def motion(states):
     return states.place, states.velocity
 
 
-def tracker_of(resampling, patience=3, sharing=False):
+def tracker_of(resampling, patience=3):
     """The default chain with few particles, and a patience that tests can wait for."""
     model = object_model()
     moves = [
         RankScores(),
         FollowCamera(Assign(model)),
         Assign(model),
-        *([ShareDetections(model, longest=12)] if sharing else []),
         resampling,
         PropagateObjects(model),
         Deaths(2, patience),
@@ -55,7 +53,6 @@ def tracker_of(resampling, patience=3, sharing=False):
 
 # Shared by the tests, since every tracker of other settings compiles anew.
 TRACKER = tracker_of(mpfjax.GaussianRegeneration(P, where=motion))
-SHARING = tracker_of(mpfjax.GaussianRegeneration(P, where=motion), 12, sharing=True)
 RESAMPLING = tracker_of(mpfjax.Resample(particles_per_component=P))
 
 
@@ -373,47 +370,6 @@ def test_who_is_in_contact_teaches_nobody():
     # They touch at t = 5, and overlap by a fifth at t = 6.
     assert not np.array_equal(references[5], references[4])
     np.testing.assert_array_equal(references[7], references[6])
-
-
-CROSSING = range(26)
-WIDE = np.array([14.0, 22.0])
-
-
-def crossing(pixels, alike, pace):
-    """Two who walk through each other, found as one box about both while they overlap by a third.
-
-    The tracks, and where the two are: the first goes to the right, and the second to the left.
-    """
-    state, tracks, places = SHARING.init(), [], []
-    for t in CROSSING:
-        x = np.array([23 + pace * (t - 13), 23 + pace * (13 - t)])
-        boxes = np.column_stack([x, [14, 15], [WIDE[0]] * 2, [WIDE[1]] * 2])
-        picture = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
-        for (left, top, w, h), shirt in reversed(list(zip(boxes, SHIRTS, strict=False))):
-            rows, columns = slice(int(top), int(top + h)), slice(round(left), round(left + w))
-            picture[rows, columns] = SHIRTS[0] if alike else shirt
-        merged = abs(x[1] - x[0]) < 10
-        low, high = boxes[:, :2].min(0), (boxes[:, :2] + boxes[:, 2:]).max(0)
-        found = np.r_[low, high - low][None] if merged else boxes
-        frame = jnp.asarray(picture) if pixels else None
-        state, track = SHARING.step(KEYS[t], state, frame, detections(found))
-        tracks.append(jax.tree.map(np.asarray, track))
-        places.append(boxes[:, :2] + WIDE / 2)
-    return tracks, places
-
-
-@pytest.mark.thorough
-def test_two_who_cross_and_are_found_as_one_keep_their_names():
-    """By their colours, and by `ShareDetections`; and both live all the time."""
-    tracks, places = crossing(True, False, 1.0)
-    assert [living(each) for each in tracks] == [[1, 2]] * len(tracks)
-    assert all(each.shown.sum() == 2 for each in tracks)
-    first = [box_of(tracks[0], 1)[0], box_of(tracks[0], 2)[0]]
-    names = [1, 2] if first[0] < first[1] else [2, 1]
-    for name, place in zip(names, places[-1], strict=True):
-        np.testing.assert_allclose(box_of(tracks[-1], name)[:2], place, atol=3)
-        # Nobody has become as wide as the two together were.
-        np.testing.assert_allclose(box_of(tracks[-1], name)[2:], WIDE, rtol=0.25)
 
 
 def test_a_weak_detection_sustains_a_component_and_founds_none():

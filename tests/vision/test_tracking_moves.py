@@ -22,7 +22,6 @@ from mpfjax.vision.tracking.model import AssignedFrame, DetectedObjectModel, Obj
 from mpfjax.vision.tracking.motion import PropagateObjects
 from mpfjax.vision.tracking.noise import LearnNoise
 from mpfjax.vision.tracking.observation import TrackedFrame, overlap
-from mpfjax.vision.tracking.occlusion import ShareDetections
 from mpfjax.vision.tracking.scores import RankScores
 from tests.marking import thorough
 
@@ -152,7 +151,7 @@ def test_colours_are_looked_at_where_a_place_is_drawn():
     some = jax.tree.map(lambda leaf: jnp.repeat(leaf[:1], 20_000, axis=0), mixture.particles)
     nobody = jnp.zeros(M, bool)
     assigned = AssignedFrame(
-        frame.detections, nobody, nobody, nobody, jnp.zeros(M), frame.pixels,
+        frame.detections, nobody, jnp.zeros(M), frame.pixels,
         mixture.memory["references"],
     )  # fmt: skip
     drawn, log_likelihood = eqx.filter_jit(model.seen)(KEY, assigned, some)
@@ -323,8 +322,6 @@ def tracked(seed=0):
             "lives": lives,
             "assigned": jnp.array([0, -1, 2, -1], jnp.int32),
             "doubts": jnp.zeros(M),
-            "shared": jnp.full(M, -1, jnp.int32),
-            "hidden": jnp.zeros(M, jnp.int32),
             "references": jnp.asarray(references, jnp.float32),
         },
     )
@@ -369,7 +366,6 @@ def test_what_only_remembers_leaves_the_distribution_as_it_is(name):
 def test_what_decides_is_approximate_and_what_follows_is_not():
     approximate = [
         Assign(MODEL),
-        ShareDetections(MODEL),
         Deaths(),
         Births(MODEL, P),
         LearnAppearance(COLOURS),
@@ -518,57 +514,6 @@ class Priced(Assign):
         costs = np.full((mixture.num_components, D), 1e4, np.float32)
         costs[:2, :2] = self.prices
         return jnp.asarray(np.where(costs < self.gate, costs, 1e4))
-
-
-# --- contact ------------------------------------------------------------------------------------
-
-
-def shared_by(source, boxes, confirmed=(True, True, True), unseen=(0, 0, 0)):
-    """Who shares which detection: objects at (20, 20), (24, 21), (60, 40), about 7 x 12 pixels."""
-    mixture, frame = tracked()
-    place = mixture.particles.place.at[P : 2 * P, :2].add(jnp.array([-4.0, 0.0]))
-    lives = mixture.memory["lives"]._replace(
-        confirmed=jnp.array([*confirmed, False]), unseen=jnp.array([*unseen, 0], jnp.int32)
-    )
-    move = ShareDetections(MODEL, 0.7, 2)
-    assigned = jnp.array([*source, -1], jnp.int32)
-    memory = mixture.memory | move.initial_memory(M) | {"lives": lives, "assigned": assigned}
-    states = mixture.particles
-    still = ObjectState(place, 0 * states.velocity, states.spread, states.label)
-    mixture = mixture.replace(particles=still, memory=memory)
-    padded = np.ones((D, 4), np.float32)
-    padded[: len(boxes)] = boxes
-    found = Detections(jnp.asarray(padded), jnp.arange(D) < len(boxes), jnp.ones(D))
-    rows = []
-    for _ in range(3):
-        mixture = moved_by(move, KEY, mixture, frame._replace(detections=found))
-        rows.append(np.asarray(mixture.memory["shared"]).tolist())
-    np.testing.assert_array_equal(mixture.particles.place, place)
-    return rows
-
-
-BOTH, FIRST, FAR = [22, 20, 14, 14], [20, 20, 7, 12], [60, 40, 8, 13]
-
-
-@pytest.mark.parametrize(
-    ("source", "boxes", "options", "expected"),
-    [
-        # The first's detection covers the second, and not a third that is far from it.
-        ((0, -1, -1), [BOTH], {}, [-1, 0, -1, -1]),
-        ((0, -1, 1), [BOTH, FAR], {}, [-1, 0, -1, -1]),
-        # One that covers half of it hides nobody, nor does a component that nobody believes in.
-        ((0, -1, -1), [FIRST], {}, [-1] * 4),
-        ((0, -1, -1), [BOTH], {"confirmed": (False, True, True)}, [-1] * 4),
-        # Nor is anybody hidden who has been lost for long, or whom nobody believes in.
-        ((0, -1, -1), [BOTH], {"unseen": (0, 9, 0)}, [-1] * 4),
-        ((0, -1, -1), [BOTH], {"confirmed": (True, False, True)}, [-1] * 4),
-        # One that is nobody's hides nobody.
-        ((-1, -1, -1), [BOTH], {}, [-1] * 4),
-    ],
-)  # fmt: skip
-def test_who_is_hidden_shares_the_detection_of_who_hides_it(source, boxes, options, expected):
-    """For two frames at the most, here."""
-    assert shared_by(source, boxes, **options) == [expected, expected, [-1] * 4]
 
 
 # --- scores, births, deaths, masses -------------------------------------------------------------

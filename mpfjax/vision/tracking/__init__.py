@@ -12,5 +12,4 @@ from mpfjax.vision.tracking.model import DetectedObjectModel as DetectedObjectMo
 from mpfjax.vision.tracking.model import ObjectState as ObjectState
 from mpfjax.vision.tracking.motion import PropagateObjects as PropagateObjects
 from mpfjax.vision.tracking.noise import LearnNoise as LearnNoise
-from mpfjax.vision.tracking.occlusion import ShareDetections as ShareDetections
 from mpfjax.vision.tracking.scores import RankScores as RankScores

@@ -11,7 +11,6 @@ from mpfjax.operations.indexing import take
 from mpfjax.vision.colour.bins import AbstractColours
 from mpfjax.vision.tracking.memory import ASSIGNED, LIVES, REFERENCES, mean_boxes, remember
 from mpfjax.vision.tracking.observation import TrackedFrame, overlap
-from mpfjax.vision.tracking.occlusion import in_front
 
 
 class LearnAppearance(AbstractMove):
@@ -73,7 +72,6 @@ class LearnAppearance(AbstractMove):
         alone = ~jnp.any((overlap(boxes, boxes) > self.contact) & others, axis=1)
         known = jnp.any(references > 0, axis=(1, 2, 3))
         # A detection that holds no pixel has no colours to learn.
-        alone &= ~in_front(mixture)
         teaches = (source >= 0) & jnp.any(seen > 0, axis=(1, 2, 3)) & (alone | ~known)
         rate = jnp.where(teaches, jnp.where(known, self.adaptation, 1.0), 0.0)
         rate = rate.astype(references.dtype)[:, None, None, None]

@@ -12,13 +12,11 @@ from mpfjax.operations.segments import spread
 from mpfjax.vision.tracking.memory import (
     ASSIGNED,
     GUESSES,
-    HIDDEN,
     LIVES,
     SCORES,
     Lives,
     mean_boxes,
     remember,
-    shared_detections,
 )
 from mpfjax.vision.tracking.observation import TrackedFrame, within
 
@@ -32,8 +30,7 @@ class Deaths(AbstractMove):
     confirmed after `confirmation` frames with strong detections. Components of the first frame are
     confirmed at once. Where there is no room for new components, an unconfirmed one ends in its
     first frame without a detection, and one that was confirmed at once and has had no strong
-    detections since ends as soon as it is no longer shown. Frames in which a component is hidden by
-    another (`ShareDetections`) do not count as frames without a detection.
+    detections since ends as soon as it is no longer shown.
 
     A component is shown while it is confirmed, for at most `longest_guess` frames without a
     detection, or as many as `LearnGuesses` has learned, and `longest_unsure` frames without a
@@ -95,9 +92,8 @@ class Deaths(AbstractMove):
         borne_out = source >= 0
         strong = borne_out & (take(scores, jnp.maximum(source, 0)) >= mixture.memory[SCORES].strong)
         seen = lives.seen + strong.astype(jnp.int32)
-        missed = ~borne_out & (shared_detections(mixture) < 0)
-        unseen = jnp.where(borne_out, 0, lives.unseen + missed.astype(jnp.int32))
-        unsure = jnp.where(strong, 0, lives.unsure + (missed | borne_out).astype(jnp.int32))
+        unseen = jnp.where(borne_out, 0, lives.unseen + 1)
+        unsure = jnp.where(strong, 0, lives.unsure + 1)
         confirmed = lives.alive & (lives.confirmed | (seen >= self.confirmation))
         # One that was confirmed at once and has had too few detections since makes room.
         in_the_way = lives.full & (seen < self.confirmation)
@@ -111,8 +107,7 @@ class Deaths(AbstractMove):
         stays &= within(jnp.concatenate([boxes[:, :2], sides], axis=1), observation.extent)
         dies = ~spread(stays, mixture.component_indicators)
         log_weights = jnp.where(dies, -jnp.inf, mixture.log_weights)
-        guesses = unseen + jnp.where(shared_detections(mixture) < 0, self._hidden(mixture), 0)
-        recent = (guesses <= self._longest_guess(mixture)) & (unsure <= self.longest_unsure)
+        recent = (unseen <= self._longest_guess(mixture)) & (unsure <= self.longest_unsure)
         lives = lives._replace(
             seen=seen,
             unseen=unseen,
@@ -125,6 +120,3 @@ class Deaths(AbstractMove):
     def _longest_guess(self, mixture: ParticleMixture) -> Int[Array, ""] | int:
         guesses = mixture.memory.get(GUESSES)
         return self.longest_guess if guesses is None else guesses.longest
-
-    def _hidden(self, mixture: ParticleMixture) -> Int[Array, " m"]:
-        return mixture.memory.get(HIDDEN, jnp.zeros(mixture.num_components, jnp.int32))

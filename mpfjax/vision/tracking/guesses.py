@@ -19,7 +19,6 @@ from mpfjax.vision.tracking.memory import (
     GUESSES,
     LIVES,
     Lives,
-    frames_unseen,
     noises_of,
     remember,
 )
@@ -107,7 +106,7 @@ class LearnGuesses(AbstractMove):
         resumed = (source >= 0) & lives.confirmed & (guesses.owners == lives.identities)
         right = KEPT * guesses.right + self._counted(guesses.frames, resumed & same)
         wrong = KEPT * guesses.wrong + self._counted(guesses.frames, ended | (resumed & ~same))
-        unseen = frames_unseen(mixture) + 1
+        unseen = mixture.memory[LIVES].unseen + 1
         return remember(
             mixture,
             guesses=Guesses(

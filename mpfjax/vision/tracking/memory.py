@@ -9,7 +9,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.vision.tracking.model import DetectedObjectModel, Noises, boxes_of
 
 SCORES, ASSIGNED, LIVES, REFERENCES = "scores", "assigned", "lives", "references"
-SHARED, HIDDEN, DOUBTS = "shared", "hidden", "doubts"
+DOUBTS = "doubts"
 CAMERA, NOISES, RIVALS, FATES = "camera", "noises", "rivals", "fates"
 GUESSES, DOUBLES = "guesses", "doubles"
 
@@ -90,19 +90,6 @@ class Doubles(NamedTuple):
 def mean_boxes(mixture: ParticleMixture) -> Float[Array, "m 4"]:
     """The box of each component, centre and size in pixels: the mean place of its particles."""
     return boxes_of(mixture.component_averages(mixture.particles.place))
-
-
-def frames_unseen(mixture: ParticleMixture) -> Int[Array, " m"]:
-    """For how many frames each component has had no detection and has not been hidden."""
-    lives: Lives = mixture.memory[LIVES]
-    hidden = mixture.memory.get(HIDDEN, jnp.zeros_like(lives.unseen))
-    return lives.unseen + jnp.where(shared_detections(mixture) < 0, hidden, 0)
-
-
-def shared_detections(mixture: ParticleMixture) -> Int[Array, " m"]:
-    """The row of the detection that each component shares; -1 for all where no move shares any."""
-    none = jnp.full(mixture.num_components, -1, jnp.int32)
-    return mixture.memory.get(SHARED, none)
 
 
 def assigned_detections(mixture: ParticleMixture) -> Int[Array, " m"]:

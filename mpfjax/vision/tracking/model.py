@@ -15,8 +15,6 @@ from mpfjax.vision.colour.histograms import IntegralHistogram, bhattacharyya, no
 from mpfjax.vision.colour.sampled_histograms import SampledBoxes, SampledHistogram
 from mpfjax.vision.tracking.detections import Detections
 
-# A size whose error is this many times larger is not observed.
-_NOTHING = 10.0
 # The share of a size's growth rate that is left after a frame.
 _GROWTH_KEPT = 0.9
 
@@ -161,8 +159,7 @@ class AssignedFrame(NamedTuple):
     """What is observed of each object in a frame: the observation of a `DetectedObjectModel`.
 
     - `detections`: a row for each object, its own detection, valid where it has one.
-    - `weak`: (m,), which of them are weak; `merged`: which stand for other objects as well, hidden
-      by this one; `borrowed`: which belong to another object, which hides this one.
+    - `weak`: (m,), which of them are weak.
     - `doubts`: (m,), the probability that an object's detection is not its own.
     - `pixels`: the colours of the frame; None where they are not used.
     - `references`: (m, parts, channels, bins), the reference histograms of each object, all zero
@@ -171,8 +168,6 @@ class AssignedFrame(NamedTuple):
 
     detections: Detections
     weak: Bool[Array, " m"]
-    merged: Bool[Array, " m"]
-    borrowed: Bool[Array, " m"]
     doubts: Float[Array, " m"]
     pixels: Pixels | None
     references: Float[Array, "m parts channels bins"] | None
@@ -193,9 +188,7 @@ class DetectedObjectModel(eqx.Module):
     The noises given here are priors: `LearnNoise` fits them to the recording.
 
     - `detection_deviations`, `place_noise`, `velocity_noise`: σ_d, σ_x and σ_v.
-    - `weak_error`: times σ_d for a weak detection; `merged_error`: for one that stands for two
-      objects; `borrowed_error`: for the place of one of another object, which has no information on
-      size.
+    - `weak_error`: times σ_d for a weak detection.
     - `start_velocity`: the standard deviation of an object's velocity when it is first detected.
     - `sigma`: σ, None where hypotheses are not weighed by colours.
 
@@ -215,8 +208,6 @@ class DetectedObjectModel(eqx.Module):
         converter=to_array("start_velocity"), default=(0.1, 0.05, 0.05, 0.03)
     )
     weak_error: float = eqx.field(static=True, default=1.35)
-    merged_error: float = eqx.field(static=True, default=2.0)
-    borrowed_error: float = eqx.field(static=True, default=3.0)
     sigma: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
@@ -225,12 +216,7 @@ class DetectedObjectModel(eqx.Module):
             if value.shape != (4,):
                 raise ValueError(f"{name}: {value} are not 4 numbers")
             check_positive_array(**{name: value})
-        check_positive(
-            weak_error=self.weak_error,
-            merged_error=self.merged_error,
-            borrowed_error=self.borrowed_error,
-            **given(sigma=self.sigma),
-        )
+        check_positive(weak_error=self.weak_error, **given(sigma=self.sigma))
 
     @property
     def noises(self) -> Noises:
@@ -250,15 +236,9 @@ class DetectedObjectModel(eqx.Module):
     ) -> tuple[Float[Array, "n 4"], Float[Array, "n 4"]]:
         """The place of each state's own detection, and the standard deviations of its error."""
         places = places_of(observation.detections.boxes)
-        deviations = units(places) * noises.errors[None] * self._errors(observation)
+        relative = jnp.where(observation.weak, self.weak_error, 1.0)[:, None]
+        deviations = units(places) * noises.errors[None] * relative
         return take(places, states.label), take(deviations, states.label)
-
-    def _errors(self, observation: AssignedFrame) -> Float[Array, "m 4"]:
-        """The standard deviations of each object's detection, relative to a strong detection's."""
-        borrowed = jnp.array([self.borrowed_error, self.borrowed_error, _NOTHING, _NOTHING])
-        errors = jnp.where(observation.weak, self.weak_error, 1.0)[:, None]
-        errors = errors * jnp.where(observation.merged[:, None], self.merged_error, 1.0)
-        return errors * jnp.where(observation.borrowed[:, None], borrowed[None], 1.0)
 
     def seen(
         self, key: Key[Array, ""], observation: AssignedFrame, states: ObjectState

@@ -16,7 +16,6 @@ from mpfjax.vision.tracking.memory import (
     REFERENCES,
     SCORES,
     noises_of,
-    shared_detections,
 )
 from mpfjax.vision.tracking.model import (
     AssignedFrame,
@@ -25,7 +24,6 @@ from mpfjax.vision.tracking.model import (
     log_normal,
 )
 from mpfjax.vision.tracking.observation import TrackedFrame
-from mpfjax.vision.tracking.occlusion import in_front
 
 # Weights within a component differ by at most the factor e^30.
 _FARTHEST = 30.0
@@ -43,10 +41,9 @@ class PropagateObjects(AbstractPropagation):
 
         w_i = (1 - doubt) Z_i / Z + doubt
 
-    where Z_i is its predictive density of the detection and Z the mean of Z_i in the component. A
-    hidden component follows the detection that it shares with a larger error. With σ, places are
-    drawn and weighed by their colours as well. Weights compare hypotheses within a component only,
-    since `ShareMass` replaces the mixture weights.
+    where Z_i is its predictive density of the detection and Z the mean of Z_i in the component.
+    With σ, places are drawn and weighed by their colours as well. Weights compare hypotheses within
+    a component only, since `ShareMass` replaces the mixture weights.
 
     Use `matched=False` where particles are rival hypotheses, `matched=True` where each component is
     one Gaussian.
@@ -68,15 +65,11 @@ class PropagateObjects(AbstractPropagation):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: TrackedFrame
     ) -> ParticleMixture:
         """Predict, update by the detections, and weigh."""
-        source, shared = mixture.memory[ASSIGNED], shared_detections(mixture)
-        borrowed = shared >= 0
-        own = own_detections(jnp.where(borrowed, shared, source), observation.detections)
+        own = own_detections(mixture.memory[ASSIGNED], observation.detections)
         seen = AssignedFrame(
             detections=own,
             weak=own.scores < mixture.memory[SCORES].strong,
-            merged=in_front(mixture),
-            borrowed=borrowed,
-            doubts=jnp.where(borrowed, 0.0, mixture.memory[DOUBTS]),
+            doubts=mixture.memory[DOUBTS],
             pixels=observation.pixels,
             references=mixture.memory.get(REFERENCES),
         )

@@ -30,7 +30,6 @@ from mpfjax.vision.tracking.model import (
     units,
 )
 from mpfjax.vision.tracking.observation import TrackedFrame
-from mpfjax.vision.tracking.occlusion import in_front
 
 # Candidate deviations of detections, places and velocities, in boxes, wider than real ones.
 _ERRORS = (0.01, 0.02, 0.04, 0.08, 0.16)
@@ -118,9 +117,9 @@ class LearnNoise(AbstractMove):
         places = places_of(take(found.boxes, rows))
         rivals: Rivals = mixture.memory[RIVALS]
         known = rivals.owners == lives.identities
-        alone = detected & known & ~in_front(mixture)
         strong = take(found.scores, rows) >= mixture.memory[SCORES].strong
-        teaches = alone & strong & lives.confirmed & (lives.seen >= self.first)
+        followed = detected & known
+        teaches = followed & strong & lives.confirmed & (lives.seen >= self.first)
 
         errors, place_noise, velocity_noise = self._rivals(places.dtype)
         moments = rivals.moments
@@ -140,12 +139,12 @@ class LearnNoise(AbstractMove):
         # Successive innovations of an object are correlated, unlike under the model.
         evidence = kept * rivals.evidence + 0.5 * evidence
 
-        moments = _where((detected & known)[:, None, None], posterior, moments)
+        moments = _where(followed[:, None, None], posterior, moments)
         start: Noises = mixture.memory[NOISES]
         started = self._started(places, start.start_velocity)
         moments = _where((detected & ~known)[:, None, None], started, moments)
         owners = jnp.where(detected | known, lives.identities, 0)
-        grown = alone & strong & (lives.seen == self.first)
+        grown = followed & strong & (lives.seen == self.first)
         squares, newborn = self._speeds(mixture, rivals, grown)
         speeds = jnp.sqrt(
             (_NEWBORN * self.model.start_velocity**2 + squares) / (_NEWBORN + newborn)

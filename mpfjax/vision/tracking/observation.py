@@ -92,12 +92,6 @@ def overlap(a: Float[Array, "m 4"], b: Float[Array, "d 4"]) -> Float[Array, "m d
     return jnp.where(union > 0, common / jnp.where(union > 0, union, 1.0), 0.0)
 
 
-def covered(a: Float[Array, "m 4"], b: Float[Array, "d 4"]) -> Float[Array, "m d"]:
-    """The share of each box of `a` that every box of `b` covers, 0 where the first has no area."""
-    area = jnp.prod(a[:, 2:], axis=1)[:, None]
-    return jnp.where(area > 0, _common(a, b) / jnp.where(area > 0, area, 1.0), 0.0)
-
-
 def _common(a: Float[Array, "m 4"], b: Float[Array, "d 4"]) -> Float[Array, "m d"]:
     low = jnp.maximum(a[:, None, :2] - a[:, None, 2:] / 2, b[None, :, :2] - b[None, :, 2:] / 2)
     high = jnp.minimum(a[:, None, :2] + a[:, None, 2:] / 2, b[None, :, :2] + b[None, :, 2:] / 2)

@@ -36,14 +36,12 @@ from mpfjax.vision.tracking.memory import (
     LIVES,
     Lives,
     assigned_detections,
-    frames_unseen,
     mean_boxes,
 )
 from mpfjax.vision.tracking.model import DetectedObjectModel, NoObjectYet, ObjectState, Pixels
 from mpfjax.vision.tracking.motion import PropagateObjects
 from mpfjax.vision.tracking.noise import LearnNoise
 from mpfjax.vision.tracking.observation import CameraMotion, TrackedFrame
-from mpfjax.vision.tracking.occlusion import ShareDetections
 from mpfjax.vision.tracking.scores import RankScores
 
 # A box of this many pixels cannot be counted in 16 bits.
@@ -58,9 +56,9 @@ class Tracks(NamedTuple):
     - `boxes`: (m, 4), the mean box of each, centre and size in pixels.
     - `identities`: (m,), a number that an object keeps for life, 0 for a dead component.
     - `confirmed`: (m,), whether it has had enough detections to be taken for an object.
-    - `unseen`: (m,), frames since its last detection; 0 while it is hidden by another one.
+    - `unseen`: (m,), frames since its last detection; 0 in a frame with one.
     - `full`: whether a detection that would have started a component found no room.
-    - `shown`: (m,), which are confirmed, were detected a moment ago or are hidden, and are not more
+    - `shown`: (m,), which are confirmed, were detected a moment ago, and are not more
       probably doubles of another one.
     - `detections`: (m,), the row of the detection assigned to each in this frame, in what the
       detector gave; -1 for none. Use it to look up class labels, masks and features.
@@ -82,7 +80,7 @@ class Tracks(NamedTuple):
             boxes=mean_boxes(mixture),
             identities=lives.identities,
             confirmed=lives.confirmed,
-            unseen=frames_unseen(mixture),
+            unseen=mixture.memory[LIVES].unseen,
             full=lives.full,
             shown=lives.shown,
             detections=detections.rows_of(assigned_detections(mixture)),
@@ -382,7 +380,6 @@ def _sees_detections(move: AbstractMove) -> bool:
     kinds = (
         RankScores,
         Assign,
-        ShareDetections,
         AbstractResampling,
         Deaths,
         Births,
