@@ -1,6 +1,7 @@
 """The documentation holds: its code runs, its commands exist, the API pages are complete."""
 
 import importlib.util
+import inspect
 import re
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser, SkipParser
 
+import mpfjax
 from tests.marking import quick_of
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -118,3 +120,10 @@ def test_a_new_reader_is_two_clicks_away(page, words):
         links = {link for text in texts for link in re.findall(r"\]\(([a-z_]+\.md)", text)}
         reached |= {link for link in links if (DOCS / link).exists()}
     assert page in reached
+
+
+def test_the_step_that_is_shown_is_the_one_that_runs():
+    shown = re.search(r"^def _step\(.*?^```", (DOCS / "inside.md").read_text("utf-8"), re.M | re.S)
+    lines = inspect.getsource(mpfjax.Filter._step).splitlines()
+    body = lines[next(k for k, line in enumerate(lines) if line.endswith('predicts."""')) + 1 :]
+    assert [line.strip() for line in shown[0].splitlines()[1:-1]] == [line.strip() for line in body]
