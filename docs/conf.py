@@ -26,7 +26,7 @@ nitpick_ignore_regex = [
     # What public classes hold or pass on, and users neither make nor read.
     ("py:class", r"mpfjax\..*\._\w+"),
     ("py:class", r"mpfjax\.tuning\.(smc2_run|problem|densities)\.\w+"),
-    ("py:class", r"mpfjax\.moves\.resampling\.layout\.\w+"),
+    ("py:class", r"mpfjax\.moves\.resampling\.(line|ancestors)\.\w+"),
     ("py:class", r"mpfjax\.vision\.tracking\.model\.Gaussian"),
 ]
 
