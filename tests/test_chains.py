@@ -122,13 +122,16 @@ class TestExactness:
         np.testing.assert_allclose(run.log_marginal_likelihood, total, rtol=1e-5, atol=1e-5)
 
     def test_final_mixture_is_normalised_and_finite(self, chain, model):
-        final = runs(chain, model).final
+        final, filter = runs(chain, model).final, chain_filter(chain, model)
         assert not np.isnan(final.log_weights).any()
         np.testing.assert_allclose(np.exp(final.log_weights).sum(axis=1), 1.0, rtol=1e-5)
         assert (final.component_indicators >= 0).all()
-        assert (final.component_indicators < chain_filter(chain, model).num_components).all()
-        assert (final.ancestor_indices >= 0).all()
-        assert (final.ancestor_indices < NUM_PARTICLES).all()
+        assert (final.component_indicators < filter.num_components).all()
+        ancestors = np.asarray(final.ancestor_indices)
+        if all(move.keeps_parents for move in filter.moves):
+            assert ((ancestors >= 0) & (ancestors < NUM_PARTICLES)).all()
+        else:
+            assert (ancestors == -1).all()
 
 
 def assert_unbiased(estimates, expected):
