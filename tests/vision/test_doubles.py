@@ -149,8 +149,9 @@ def recording(doubled):
     """People who cross the picture: in pairs, or single ones whom the detector splits now and then.
 
     The partner walks half a width beside the first, and from half the way on away from her. A split
-    person has two boxes for some seven frames out of twenty, at either side of the true one and
-    with scores of their own. The detector's errors are 3% of a box.
+    person has two boxes for some seven frames out of forty, at either side of the true one and
+    with scores of their own: often enough the double has ended before the next one, which is what
+    is learned from. The detector's errors are 3% of a box.
     """
     random = np.random.default_rng(3)
     truth, found = [], []
@@ -168,7 +169,7 @@ def recording(doubled):
             apart = 13 + 0.8 * max(t - 60, 0) if second else 0.0
             x, y = 20 + 4 * t + apart, 60 + 130 * row
             truth.append([start + t, person + 1, x, y, 30, 80])
-            split = max(split - 1, 0) if random.random() > 0.07 else 7
+            split = max(split - 1, 0) if random.random() > 0.03 else 7
             if doubled and split:
                 detect(start + t, x - 6, y + 4, random.uniform(0.6, 1))
                 detect(start + t, x + 6, y - 4, random.uniform(0.6, 1))
