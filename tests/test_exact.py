@@ -119,7 +119,10 @@ WALK = np.array([[1.0, 0.5], [0.0, 0.9]])
 )
 def test_what_is_known_for_sure_has_no_nan(rotation, Q, P0):
     """x_0 that is known, and a speed alone that is pushed, in any coordinates."""
-    turned = lambda matrix: rotation @ matrix @ rotation.T  # noqa: E731
+
+    def turned(matrix):
+        return rotation @ matrix @ rotation.T
+
     parts = {
         "A": turned(WALK), "Q": turned(Q), "H": np.array([[1.0, 0.0]]) @ rotation.T,
         "R": [[0.2]], "m0": rotation @ [0.1, 0.2], "P0": turned(P0),

@@ -172,6 +172,31 @@ def test_what_a_chain_weighs_before_it_propagates_counts():
     assert is_near(np.exp(np.asarray(found.log_marginal_likelihood, np.float64) - log_z))
 
 
+class CountingResample(mpfjax.AbstractResampling):
+    """A resampling of its own, which remembers how long each component has lived."""
+
+    def initial_memory(self, num_components):
+        return {"ages": jnp.zeros(num_components, jnp.int32)}
+
+    def forget(self, memory, dead):
+        return memory | {"ages": jnp.where(dead, 0, memory["ages"])}
+
+    def __call__(self, key, mixture, observation=None):
+        moved = mpfjax.Resample()(key, mixture)
+        return moved.replace(memory=mixture.memory | {"ages": mixture.memory["ages"] + 1})
+
+
+def test_a_resampling_that_waits_forgets_dead_components_all_the_same():
+    model = Wide()
+    propagate = mpfjax.Propagate(model)
+    filter = mpfjax.Filter(
+        model, [CountingResample(), propagate], 30, 3,
+        initial_moves=[mpfjax.SelectInitial(propagate, 4)],
+    )  # fmt: skip
+    ages = mpfjax.run_filter(KEY, filter, OBSERVATIONS).final.memory["ages"]
+    np.testing.assert_array_equal(ages, [2, 0, 0])  # two components have no particles, one waited
+
+
 def test_every_second_step_is_the_second_and_the_fourth():
     model = Wide()
     propagate = mpfjax.Propagate(model)
@@ -188,9 +213,11 @@ def test_on_islands_the_masses_of_their_choices_count():
     keys = jax.random.split(KEY, 300)
 
     def log_evidence(num_draws):
-        run = lambda key: mpfjax.run_islands(  # noqa: E731
-            key, make(num_draws, 50), OBSERVATIONS, nothing, num_islands=2
-        )
+        def run(key):
+            return mpfjax.run_islands(
+                key, make(num_draws, 50), OBSERVATIONS, nothing, num_islands=2
+            )
+
         return np.asarray(jax.jit(jax.vmap(run))(keys).log_marginal_likelihood, np.float64) - log_z
 
     chosen, plain = log_evidence(8), log_evidence(1)

@@ -207,7 +207,10 @@ class TestNoiseOfFamilies:
 @pytest.mark.parametrize("num_draws", [2, 3])
 def test_any_number_of_draws_fills_its_strata(num_draws):
     """Two strata are half of all numbers of 32 bits each, which int32 does not hold."""
-    draw = lambda key: draw_family_noise(key, (30, 1), num_draws, FLOAT, LABELS, 3)[0]  # noqa: E731
+
+    def draw(key):
+        return draw_family_noise(key, (30, 1), num_draws, FLOAT, LABELS, 3)[0]
+
     noise = np.asarray(jax.vmap(draw)(KEYS[:20])).reshape(-1, 30, num_draws)
     strata = np.floor(num_draws * scipy.stats.norm.cdf(noise)).astype(int)
     assert (strata == np.arange(num_draws)).all()
@@ -216,7 +219,10 @@ def test_any_number_of_draws_fills_its_strata(num_draws):
 def test_families_and_what_they_keep_are_one_net():
     """One of all draws in each cell of a coordinate; a draw kept by its share is even as well."""
     n, labels = 64, jnp.zeros(64, jnp.int32)
-    draw = lambda key: draw_family_noise(key, (n, 2), FAMILY, FLOAT, labels, 1)  # noqa: E731
+
+    def draw(key):
+        return draw_family_noise(key, (n, 2), FAMILY, FLOAT, labels, 1)
+
     noise, shares = map(np.asarray, jax.jit(jax.vmap(draw))(KEYS[:200]))
     points = np.floor(n * FAMILY * scipy.stats.norm.cdf(noise)).astype(int)
     assert (np.sort(points, axis=1) == np.arange(n * FAMILY)[None, :, None]).all()

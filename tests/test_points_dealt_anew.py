@@ -81,7 +81,10 @@ def test_masses_of_a_mixture_after_a_missing_observation(size):
     """The modes ±1 are equally probable; independent noise has an error of 0.7 / √N."""
     model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
     filter = mpfjax.mixture_particle_filter(model, size, 4, noise="rqmc")
-    below = lambda mixture: mixture.average(mixture.particles < 0)  # noqa: E731
+
+    def below(mixture):
+        return mixture.average(mixture.particles < 0)
+
     found = runs_of(filter, [1.0, 0.9, NAN, 1.1, 1.0], below).collected[:, -1]
     assert rms(found - 0.5) < 0.5 / np.sqrt(size)
 
@@ -109,7 +112,10 @@ def test_regeneration_of_a_part_of_the_state_is_dealt_anew_as_well(size):
     redraw = mpfjax.GaussianRegeneration(where=lambda s: s["velocity"], noise="stratified")
     model = Drift()
     filter = mpfjax.Filter(model, [redraw, Propagate(model)], size)
-    place = lambda mixture: mixture.average(mixture.particles["place"] ** 2)  # noqa: E731
+
+    def place(mixture):
+        return mixture.average(mixture.particles["place"] ** 2)
+
     found = runs_of(filter, np.zeros(3), place).collected[:, -1]
     assert rms(found - 3) < 1.6 * np.sqrt(30 / size)
 
@@ -129,8 +135,13 @@ def test_shuffled_indices_are_a_permutation_that_keeps_blocks_together():
 def test_noise_dealt_twice_is_independent_of_itself(d):
     """The mean product of the two draws of each slot has an error of 1 / √N, over rows and keys."""
     n, keys = 1000, jax.random.split(jax.random.key(3), 400)
-    rqmc = lambda key: draw_noise("rqmc", key, (n, d), jnp.dtype("float32"), shuffle=True)  # noqa: E731
-    stratified = lambda key: stratified_normal(key, (n, d), jnp.dtype("float32"))  # noqa: E731
+
+    def rqmc(key):
+        return draw_noise("rqmc", key, (n, d), jnp.dtype("float32"), shuffle=True)
+
+    def stratified(key):
+        return stratified_normal(key, (n, d), jnp.dtype("float32"))
+
     for draw in (rqmc, stratified):
         draws = np.asarray(jax.jit(jax.vmap(draw))(keys))
         products = np.mean(draws[0::2] * draws[1::2], axis=1)

@@ -152,6 +152,15 @@ class Waiting(AbstractResampling):
         """Whether the move does; while it waits, particles stand as `SelectInitial` left them."""
         return self.move.sorts
 
+    @property
+    def needs_parents(self) -> bool:
+        """Whether the move does."""
+        return self.move.needs_parents
+
+    def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
+        """The memory without the move's memory of dead components."""
+        return self.move.forget(memory, dead)
+
     def would_resample(
         self, mixture: ParticleMixture, observation: PyTree = None
     ) -> Bool[Array, " m"]:
