@@ -64,6 +64,7 @@ from mpfjax.moves import Resample as Resample
 from mpfjax.moves import Reweight as Reweight
 from mpfjax.moves import SelectInitial as SelectInitial
 from mpfjax.moves import Split as Split
+from mpfjax.observations import Series as Series
 from mpfjax.operations.compiling import keep_programs as keep_programs
 from mpfjax.operations.generator import normal as normal
 from mpfjax.proposals import AbstractProposal as AbstractProposal

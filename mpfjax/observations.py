@@ -9,20 +9,36 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree
 
-from mpfjax.checks import as_numbers, check_one_of
+from mpfjax.checks import as_numbers, check_one_of, check_shape
 from mpfjax.models.base import model_name
 from mpfjax.models.inputs import takes_inputs
 
 
 class Series(eqx.Module):
-    """What a filter is given at the steps 1, ..., t; every leaf has a leading axis t."""
+    """All that a filter is given at the steps 1, ..., t; every leaf has a leading axis t.
+
+    Whatever takes observations takes either the arrays of y_1, ..., y_t, all of them finite
+    numbers, or a `Series`, which also says what is known beside them and which are missing.
+    """
 
     observations: PyTree
     """y_1, ..., y_t."""
-    present: Bool[Array, " t"] | None = None
-    """which observations are there; None is all of them."""
     inputs: PyTree = None
-    """u_1, ..., u_t; None where the model knows none."""
+    """u_1, ..., u_t, finite numbers, which the model finds in its field `inputs` at each step, also
+    at one without an observation; None where the model knows none."""
+    present: Bool[Array | np.ndarray, " t"] | None = None
+    """which observations are there; at the others the filter only predicts. None is all of them."""
+    skips_missing: bool = eqx.field(static=True, default=False)
+    """whether steps with a NaN or an infinity are missing, as `skipping` has it."""
+
+    @classmethod
+    def skipping(cls, observations: PyTree, inputs: PyTree = None) -> "Series":
+        """Observations of which those that hold a NaN or an infinity are missing.
+
+        A model with `handles_missing = True` gets the NaN; for it, only a step of nothing but NaN
+        is missing.
+        """
+        return cls(observations, inputs, skips_missing=True)
 
     @property
     def length(self) -> int:
@@ -30,14 +46,35 @@ class Series(eqx.Module):
         return jax.tree.leaves(self.observations)[0].shape[0]
 
 
-def as_series(observations: PyTree, inputs: PyTree, missing: str, model: Any) -> Series:
-    """The observations and inputs as arrays; a `ValueError` for data that cannot be run.
+def as_series(data: PyTree, model: Any, inputs: PyTree = None, missing: str = "error") -> Series:
+    """Observations, or a `Series`, as arrays; a `ValueError` for data that cannot be run.
 
-    A step with a missing y_t still has its u_t: inputs are always finite numbers.
+    In the result `present` is known, and None if no observation is missing. `inputs` and `missing`
+    are those of `run_filter`, for observations that are no `Series`.
     """
-    present = present_steps(observations, missing, model)
-    series = Series(as_arrays(observations), present)
-    return Series(series.observations, present, steps_of_inputs(inputs, series.length, model))
+    series = gathered(data, inputs, missing)
+    observations = as_arrays(series.observations)
+    length = _length(observations, series.observations, "observations")
+    present = _present_steps(observations, series, length, model)
+    return Series(observations, steps_of_inputs(series.inputs, length, model), present)
+
+
+def gathered(data: PyTree, inputs: PyTree = None, missing: str = "error") -> Series:
+    """The data as a `Series`, unchecked."""
+    check_one_of(("error", "skip"), missing=missing)
+    if not isinstance(data, Series):
+        return Series(data, inputs, skips_missing=missing == "skip")
+    if inputs is not None or missing != "error":
+        raise ValueError(
+            "observations: a Series says itself what its inputs are and which steps are missing"
+        )
+    return data
+
+
+def check_series(data: PyTree) -> None:
+    """A `ValueError` for observations that no model can be run on."""
+    observations = gathered(data).observations
+    _length(as_arrays(observations), observations, "observations")
 
 
 def steps_of_inputs(
@@ -48,20 +85,25 @@ def steps_of_inputs(
         return None
     _require_place_for(inputs, model)
     arrays = as_arrays(inputs, "inputs")
-    leaves = jax.tree.leaves(arrays)
-    own_length = _length(leaves, inputs, "inputs")
+    own_length = _length(arrays, inputs, "inputs")
     if own_length != length:
         raise ValueError(
             f"inputs: the leading axis t is {own_length}, and that of the {of_what} is {length}"
         )
-    known = [leaf for leaf in leaves if not isinstance(leaf, Tracer) and _is_inexact(leaf)]
-    for usable in _each_step(np, _usable(np, known, False), "all"):
+
+    def check(leaf: Any) -> Any:
+        if not _is_inexact(leaf):
+            return leaf
+        if isinstance(leaf, Tracer):
+            # No value can be named: the check runs with the caller's program.
+            return eqx.error_if(leaf, ~jnp.all(jnp.isfinite(leaf)), "inputs: NaN or infinite")
+        usable = _each_step(np.isfinite(leaf)).all(axis=1)
         if not usable.all():
             raise ValueError(
                 f"inputs: NaN or infinite at index {int(np.argmin(usable))} of the leading axis"
             )
-    # Under the caller's jit no value can be named: the check runs with the program.
-    check = lambda leaf: checked_inputs(leaf) if isinstance(leaf, Tracer) else leaf  # noqa: E731
+        return leaf
+
     return jax.tree.map(check, arrays)
 
 
@@ -73,17 +115,6 @@ def one_input(inputs: PyTree, model: Any) -> PyTree:
     if not jax.tree.leaves(inputs):
         raise ValueError("inputs: there are none")
     return as_arrays(inputs, "inputs")
-
-
-def checked_inputs(inputs: PyTree) -> PyTree:
-    """The inputs; an error at run time for a NaN or an infinity."""
-
-    def check(leaf: Any) -> Any:
-        if not _is_inexact(leaf):
-            return leaf
-        return eqx.error_if(leaf, ~jnp.all(jnp.isfinite(leaf)), "inputs: NaN or infinite")
-
-    return jax.tree.map(check, inputs)
 
 
 def _require_place_for(inputs: PyTree, model: Any) -> None:
@@ -124,7 +155,7 @@ def faults_of(model: Any, observation: PyTree, inputs: PyTree) -> tuple[Fault, .
     ):
         inexact = [leaf for leaf in jax.tree.leaves(tree) if _is_inexact(leaf)]
         if inexact:
-            usable = [jnp.all(part) for part in _usable(jnp, inexact, may_be_nan)]
+            usable = [jnp.all(_usable(jnp, leaf, may_be_nan)) for leaf in inexact]
             faults.append(Fault(~jnp.all(jnp.stack(usable)), message))
     return tuple(faults)
 
@@ -144,44 +175,43 @@ def raise_faults(value: PyTree, faults: tuple[Fault, ...]) -> PyTree:
     return value
 
 
-def check_series(observations: PyTree, missing: str) -> list[Any]:
-    """The arrays of y_1..y_t; a `ValueError` for data that no model can be run on."""
-    check_one_of(("error", "skip"), missing=missing)
-    leaves = jax.tree.leaves(as_arrays(observations))
-    _length(leaves, observations, "observations")
-    return leaves
-
-
-def present_steps(observations: PyTree, missing: str, model: Any) -> Bool[Array, " t"] | None:
-    """Which observations are there, or None where all are; raises for data that cannot be run.
-
-    For a `model` with `handles_missing`, a NaN is a missing number, and a step is missing only if
-    all its numbers are.
-    """
-    leaves = check_series(observations, missing)
+def _present_steps(
+    observations: PyTree, series: Series, length: int, model: Any
+) -> Bool[Array, " t"] | None:
+    """Which observations are there, or None where all are; raises for data that cannot be run."""
+    leaves = jax.tree.leaves(observations)
     inexact = [leaf for leaf in leaves if _is_inexact(leaf)]
-    if not inexact:
-        return None
+    mask = series.present
+    if mask is not None:
+        check_shape(f"{length}", present=mask)
+    is_traced = any(isinstance(leaf, Tracer) for leaf in [*inexact, mask])
+    numpy: Any = jnp if is_traced else np
     takes_nan = getattr(model, "handles_missing", False)
-    if any(isinstance(leaf, Tracer) for leaf in inexact):
-        return _present_traced(inexact, missing, takes_nan)
-    usable = np.logical_and.reduce(_each_step(np, _usable(np, inexact, takes_nan), "all"))
-    if not usable.all() and (missing == "error" or takes_nan):
-        what = "infinite" if takes_nan else "NaN or infinite"
-        hint = "" if takes_nan else "; missing='skip' takes such steps as missing"
+    whole = numpy.ones(length, bool)
+    present = whole if mask is None else numpy.asarray(mask, bool)
+    usable = whole
+    for leaf in inexact:
+        usable = usable & _each_step(_usable(numpy, leaf, takes_nan)).all(axis=1)
+    if series.skips_missing and not takes_nan:
+        present = present & usable
+    elif series.skips_missing and len(inexact) == len(leaves):  # whole numbers are always there
+        seen = [_each_step(~numpy.isnan(leaf)).any(axis=1) for leaf in inexact]
+        present = present & numpy.stack(seen).any(axis=0)
+    broken = present & ~usable
+    what = "infinite" if takes_nan else "NaN or infinite"
+    if is_traced:  # No value can be named: the check runs with the caller's program.
+        return eqx.error_if(present, broken, f"observations: {what}")
+    if broken.any():
+        hint = "" if takes_nan else "; missing='skip', or Series.skipping, takes them as missing"
         raise ValueError(
-            f"observations: {what} at index {int(np.argmin(usable))} of the leading axis{hint}"
+            f"observations: {what} at index {int(np.argmax(broken))} of the leading axis{hint}"
         )
-    present = usable
-    if takes_nan and missing == "skip":
-        whole = len(inexact) < len(leaves)  # a leaf of whole numbers is always there
-        seen = [~np.isnan(leaf) for leaf in inexact]
-        present = np.logical_or.reduce(_each_step(np, seen, "any")) | whole
     return None if present.all() else jnp.asarray(present)
 
 
-def _length(leaves: list[Any], tree: PyTree, name: str) -> int:
+def _length(arrays: PyTree, tree: PyTree, name: str) -> int:
     """t, the length of the leading axis that all leaves share; a `ValueError` without one."""
+    leaves = jax.tree.leaves(arrays)
     if not leaves:
         raise ValueError(f"{name}: there are none")
     lengths = {leaf.shape[0] for leaf in leaves if leaf.ndim}
@@ -199,22 +229,11 @@ def _is_inexact(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jnp.inexact)
 
 
-def _usable(numpy: Any, leaves: list[Any], takes_nan: bool) -> list[Any]:
+def _usable(numpy: Any, leaf: Any, takes_nan: bool) -> Any:
     """Which numbers may be handed to the model."""
-    return [~numpy.isinf(leaf) if takes_nan else numpy.isfinite(leaf) for leaf in leaves]
+    return ~numpy.isinf(leaf) if takes_nan else numpy.isfinite(leaf)
 
 
-def _each_step(numpy: Any, masks: list[Any], how: str) -> list[Any]:
-    """For every leaf, whether all or any of a step's numbers are in the mask."""
-    return [getattr(numpy, how)(mask.reshape(mask.shape[0], -1), axis=1) for mask in masks]
-
-
-def _present_traced(leaves: list[Array], missing: str, takes_nan: bool) -> Bool[Array, " t"] | None:
-    """Under the caller's jit no value can be named: the check runs with the program."""
-    usable = jnp.stack(_each_step(jnp, _usable(jnp, leaves, takes_nan), "all")).all(axis=0)
-    if takes_nan and missing == "skip":
-        seen = jnp.stack(_each_step(jnp, [~jnp.isnan(leaf) for leaf in leaves], "any"))
-        return eqx.error_if(seen.any(axis=0), ~usable, "observations: infinite")
-    if missing == "skip":
-        return usable
-    return eqx.error_if(usable, ~usable, "observations: NaN or infinite")
+def _each_step(mask: Any) -> Any:
+    """The mask with all numbers of a step in one row."""
+    return mask.reshape(mask.shape[0], -1)

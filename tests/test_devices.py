@@ -196,7 +196,11 @@ class TestIslands:
         with pytest.raises(ValueError, match="index 1"):
             mpfjax.run_islands(jax.random.key(7), filter, holed, num_islands=2)
         run = mpfjax.run_islands(
-            jax.random.key(7), filter, holed.at[2].set(1e30), mean, num_islands=2, missing="skip"
+            jax.random.key(7),
+            filter,
+            mpfjax.Series.skipping(holed.at[2].set(1e30)),
+            mean,
+            num_islands=2,
         )
         assert run.log_likelihood_increments[1] == 0
         np.testing.assert_array_equal(run.degenerate, [False, False, True, False])

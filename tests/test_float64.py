@@ -47,7 +47,7 @@ def test_every_chain_is_traced(chain):
     filter, seen = CHAINS[chain](quadratic()), jnp.asarray(SQUARES)
     present = jnp.isfinite(seen)
     run = eqx.filter_eval_shape(
-        lambda key: scan(Start(key), filter, Series(seen, present), None), KEY
+        lambda key: scan(Start(key), filter, Series(seen, present=present), None), KEY
     )
     assert_double(run)
 

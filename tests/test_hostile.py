@@ -233,8 +233,7 @@ BUILT = {
     "Study": (
         mpfjax.Study,
         {"filters": {"pf": lambda num_particles: FILTER}, "num_particles": [4],
-         "keys": KEY[None], "observations": np.zeros(2), "settings": {}, "collect": nothing,
-         "missing": "error"},
+         "keys": KEY[None], "observations": np.zeros(2), "settings": {}, "collect": nothing},
     ),
 }  # fmt: skip
 RUN = {
@@ -252,7 +251,7 @@ RUN = {
     "run_islands": (
         mpfjax.run_islands,
         {"key": KEY, "filter": FILTER, "observations": np.ones(2, np.float32),
-         "collect": nothing, "num_islands": 2, "missing": "error", "devices": None},
+         "collect": nothing, "num_islands": 2, "devices": None},
     ),
     "step": (
         lambda key, mixture, observation: FILTER.step(key, mixture, observation),
@@ -400,7 +399,7 @@ def test_every_public_constructor_and_runner_is_tried():
     others = {name for name in public - tried if not name.startswith(("Abstract", "_"))}
     # Records of results, what takes no argument to check, and what other tests are about.
     assert others == {
-        "FilterRun", "StepInfo", "ParticleMixture", "MarginalisedState", "Pool",
+        "FilterRun", "StepInfo", "Series", "ParticleMixture", "MarginalisedState", "Pool",
         "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
         "NetworkProposal", "keep_programs", "check_model", "map_moves",
     } - tried  # fmt: skip

@@ -366,17 +366,20 @@ class TestRunners:
         np.testing.assert_allclose(runs.log_marginal_likelihood[0], expected, rtol=1e-5)
         study = mpfjax.Study(
             {"pf": lambda num_particles: mpfjax.particle_filter(Driven(), num_particles)},
-            [32], self.KEY[None], OBSERVATIONS, inputs=INPUTS,
+            [32], self.KEY[None], mpfjax.Series(OBSERVATIONS, INPUTS),
         )  # fmt: skip
         (cell,) = mpfjax.run_study(study, tmp_path)
         np.testing.assert_allclose(cell["log_marginal_likelihood"][0], expected, rtol=1e-5)
         other = mpfjax.Study(
-            study.filters, [32], self.KEY[None], OBSERVATIONS, inputs=repeated(built_in())
+            study.filters,
+            [32],
+            self.KEY[None],
+            mpfjax.Series(OBSERVATIONS, repeated(built_in())),
         )
-        with pytest.raises(ValueError, match=r"holds another study \(inputs"):
+        with pytest.raises(ValueError, match=r"holds another study \(observations"):
             mpfjax.run_study(other, tmp_path, resume=True)
         island = mpfjax.run_islands(
-            self.KEY, self.FILTER, OBSERVATIONS, nothing, num_islands=1, inputs=INPUTS
+            self.KEY, self.FILTER, mpfjax.Series(OBSERVATIONS, INPUTS), nothing, num_islands=1
         )
         alone = mpfjax.run_filter(
             jax.random.fold_in(self.KEY, 0), self.FILTER, OBSERVATIONS, nothing, inputs=INPUTS

@@ -53,7 +53,7 @@ def test_a_whole_filter_is_lowered_for_a_gpu():
     filter = CHAINS["mpf"](MODEL)
 
     def run(key):
-        return scan(Start(key), filter, Series(OBSERVATIONS, None), None).log_marginal_likelihood
+        return scan(Start(key), filter, Series(OBSERVATIONS), None).log_marginal_likelihood
 
     lowered = export.export(jax.jit(run), platforms=["cuda"])(jax.random.key(0))
     assert lowered.platforms == ("cuda",)

@@ -234,7 +234,6 @@ class TestOtherFiles:
             ({"keys": jax.random.split(jax.random.key(1), 4)}, "keys is "),
             ({"observations": OBSERVATIONS + np.float32(1)}, "observations is "),
             ({"measure": lambda run: measure(run)}, "measure is <function measure> there"),
-            ({"missing": "skip"}, "missing is error there and skip here"),
         ],
     )
     def test_a_folder_of_another_study_is_refused_by_what_differs(self, alone, changes, named):
@@ -389,7 +388,6 @@ class TestBadInput:
             ({"settings": {"study": [1]}}, "settings: 'study'"),
             ({"keys": jax.random.key(0)}, "keys: "),
             ({"observations": np.array([])}, "observations: "),
-            ({"missing": "no"}, "missing: "),
             ({"filters": None}, "filters: None"),
             ({"filters": 3}, "filters: 3"),
             ({"filters": "pf"}, "filters: 'pf'"),
@@ -422,7 +420,6 @@ class TestBadInput:
             ({"collect": 3}, "collect: 3"),
             ({"observations": None}, "observations: "),
             ({"observations": "1.5"}, "observations: "),
-            ({"missing": None}, "missing: "),
         ],
     )
     def test_to_the_study_is_an_error_at_once(self, changes, named):

@@ -77,7 +77,7 @@ def grid_filter(
         require(model, "log_initial", "grid_filter without log_initial")
     else:
         log_initial = real_arrays(str(len(points)), log_initial=log_initial)
-    series = as_series(observations, inputs, missing, model)
+    series = as_series(observations, model, inputs, missing)
     with saying_that_none_were_given(model):
         return _grid_filter(model, series, points, width, log_initial, state_shape)
 

@@ -24,8 +24,6 @@ def run_islands(
     collect: Callable[[ParticleMixture], PyTree] | None = None,
     *,
     num_islands: int,
-    inputs: PyTree = None,
-    missing: str = "error",
     devices: int | Sequence[Any] | None = None,
 ) -> FilterRun:
     """Run one filter of G islands, each a copy of `filter`, over many devices.
@@ -37,6 +35,7 @@ def run_islands(
     the mixture weights"; Vergé et al. 2015 for islands). If the filter's marginal likelihood is
     unbiased, so is this one.
 
+    - `observations`: arrays, or a `Series`.
     - `filter`: that of one island; N and M are those of one island. A plain particle filter makes
       islands of particles. With an `IslandInteraction` among the moves, their masses stay even.
     - `num_islands`: G. The result depends on the key and on G, not on the devices. With another
@@ -50,7 +49,7 @@ def run_islands(
 
     The result is that of `run_filter` on the whole mixture. Slots and component labels of island g
     come after those of island g - 1, ancestors may be on other islands, and only `memory` keeps a
-    leading axis of islands. `observations`, `inputs`, `missing` and errors are those of
+    leading axis of islands. Errors are those of
     `run_filter`. Also raises `ValueError` for G < 1, and for devices that do not exist or do not
     divide G. Use it if one filter is too large or too slow for one device. For many runs of a
     filter that fits on one device, use `monte_carlo`.
@@ -58,7 +57,7 @@ def run_islands(
     check_key(key)
     check_run(filter, collect)
     check_whole(num_islands=num_islands)
-    series = as_series(observations, inputs, missing, filter.model)
+    series = as_series(observations, filter.model)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_islands, dtype=jnp.uint32))
 
     def run(filter: Filter) -> FilterRun:

@@ -38,7 +38,8 @@ def run_filter(
 ) -> FilterRun:
     """Run a filter over observations y_1..y_t in one scan.
 
-    - `observations`: a pytree whose leaves have a leading axis t.
+    - `observations`: a pytree whose leaves have a leading axis t; or a `Series`, which says itself
+      what `inputs` and `missing` say otherwise.
     - `collect`: a function of the mixture after each step; its results are stacked over t. None
       keeps the whole mixture. The same function object compiles once; a new lambda in every call
       compiles again. Methods of a mixture are for one mixture: `jax.vmap(lambda m: m.mean())`
@@ -62,7 +63,7 @@ def run_filter(
     check_key(key)
     check_run(filter, collect)
     check_flag(progress=progress)
-    series = as_series(observations, inputs, missing, filter.model)
+    series = as_series(observations, filter.model, inputs, missing)
     with shown_progress(progress, series.length, (key, filter, series)) as bar:
         bars = () if bar is None else (bar,)
         run = lambda filter: _run(key, filter, series, collect, *bars)  # noqa: E731
@@ -106,7 +107,7 @@ def monte_carlo(
     check_run(filter, collect)
     check_flag(progress=progress)
     check_whole(**given(slots=slots))
-    series = as_series(observations, inputs, missing, filter.model)
+    series = as_series(observations, filter.model, inputs, missing)
 
     def run(filter: Filter) -> FilterRun:
         starts = Start(keys)

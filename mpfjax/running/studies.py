@@ -77,17 +77,13 @@ class Study:
     keys: Key[Array, " seeds"]
     """one for each run of a cell; the same in all cells."""
     observations: PyTree
-    """y_1..y_t, one data set for all; every leaf has a leading axis t."""
+    """y_1..y_t, one data set for all, or a `Series`."""
     settings: Mapping[str, Values] = field(default_factory=dict)
     """by name: the values of each setting, numbers or strings. All combinations are run."""
     measure: Callable[[FilterRun], Mapping[str, Any]] = log_evidence
     """arrays by name from a cell's runs, each with the leading axis of seeds."""
     collect: Callable[[ParticleMixture], PyTree] | None = nothing
     """as for `run_filter`, for `measure` to use; None keeps all of every mixture."""
-    missing: str = "error"
-    """as for `run_filter`."""
-    inputs: PyTree = None
-    """u_1..u_t, as for `run_filter`; the same in all cells."""
 
     def __post_init__(self) -> None:
         check_type(Mapping, "functions by name, {name: function}", filters=self.filters)
@@ -110,7 +106,7 @@ class Study:
                 raise ValueError(f"{_argument(name)}: {values} is empty or has the same twice")
         for number in _axes(self)["num_particles"]:
             check_whole(num_particles=number)
-        check_series(self.observations, self.missing)
+        check_series(self.observations)
 
 
 def run_study(
@@ -218,7 +214,7 @@ def _cells(study: Study) -> list[_Cell]:
         filter = study.filters[name](num_particles, **settings)
         if not isinstance(filter, Filter):
             raise ValueError(f"filters: {name} made {filter!r}, no Filter")
-        as_series(study.observations, study.inputs, study.missing, filter.model)
+        as_series(study.observations, filter.model)
         words = [name, f"N{num_particles}", *(f"{k}_{v}" for k, v in settings.items())]
         stem = re.sub(r"[^\w.+-]+", "_", "-".join([f"{index:04d}", *words]))[:100]
         cells.append(_Cell(f"{stem}.npz", description, json.dumps(description), filter))
@@ -268,8 +264,6 @@ def _manifest(study: Study) -> dict[str, Any]:
         "observations": _summary(study.observations),
         "measure": named(study.measure),
         "collect": named(study.collect),
-        "missing": study.missing,
-        "inputs": None if study.inputs is None else _summary(study.inputs),
         "versions": [*versions, str(default_float())],
     }
     return json.loads(json.dumps(manifest))
@@ -372,8 +366,6 @@ def _measure(
             cell.filter,
             study.observations,
             study.collect,
-            inputs=study.inputs,
-            missing=study.missing,
             slots=slots,
         )
         measured = {name: np.asarray(array) for name, array in study.measure(run).items()}

@@ -105,7 +105,7 @@ def conditional_filter(
     check_type(Filter, "a Filter", filter=filter)
     check_flag(backward=backward)
     check_conditional(filter, backward, "conditional_filter")
-    series = as_series(observations, inputs, missing, filter.model)
+    series = as_series(observations, filter.model, inputs, missing)
     trajectory = _as_states(trajectory, filter.model, series.length + 1)
     # Checked before the run: backward sampling could not recover an impossible trajectory.
     _require(_steps_are_possible(filter.model, trajectory, series.inputs))

@@ -104,7 +104,7 @@ def smoothed_sums(
     if method == "mcmc":
         check_keep_parents("filter", filter.moves, "smoothed_sums with method 'mcmc'")
     check_whole(num_draws=num_draws)
-    series = as_series(observations, inputs, missing, filter.model)
+    series = as_series(observations, filter.model, inputs, missing)
     if lag is not None:
         lag = min(lag, series.length - 1)
     options = (mapped(filter.model, function), lag, method, num_draws)

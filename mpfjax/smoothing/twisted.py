@@ -101,7 +101,7 @@ def learn_lookahead(
     model: Any = filter.model
     if not is_mixed(model):
         require_noise(model, "learn_lookahead")
-    series = as_series(observations, inputs, missing, model)
+    series = as_series(observations, model, inputs, missing)
     twist = _knowing_nothing(key, filter, series.length, mapped(model, features))
     learners = num_particles or _LEARNERS * filter.num_particles
     for pass_key in jax.random.split(key, num_passes):

@@ -167,7 +167,7 @@ def particle_gibbs(
             "observations: a list is several sequences, and this takes one;"
             " jnp.asarray(observations) is one of numbers"
         )
-    joint = LogJoint(as_series(observations, inputs, missing, filter.model))
+    joint = LogJoint(as_series(observations, filter.model, inputs, missing))
     problem = pose_filter(filter, joint, parameters, transforms)
     deviations = checked_deviations(proposal_deviations, problem.start())
     key_start, key_steps = jax.random.split(key)

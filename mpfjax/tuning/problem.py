@@ -91,8 +91,8 @@ class LogEvidence(eqx.Module):
         for g, (observations, present, inputs) in enumerate(self.groups):
             num_sequences = jax.tree.leaves(observations)[0].shape[0]
             keys = jax.random.split(jax.random.fold_in(key, g), num_sequences)
-            run = lambda key, *of: scan(Start(key), filter, Series(*of), _nothing)  # noqa: E731
-            runs = jax.vmap(run)(keys, observations, present, inputs)
+            run = lambda key, series: scan(Start(key), filter, series, _nothing)  # noqa: E731
+            runs = jax.vmap(run)(keys, Series(observations, inputs, present))
             total += jnp.sum(runs.log_marginal_likelihood)
         return jnp.asarray(total)
 

@@ -47,7 +47,7 @@ class Observed:
                 "observations: a list is several sequences, and this takes one;"
                 " jnp.asarray(observations) is one of numbers"
             )
-        series = as_series(observations, inputs, missing, model)
+        series = as_series(observations, model, inputs, missing)
         return cls(jax.tree.map(np.asarray, series), missing, model)
 
     @property
@@ -90,7 +90,7 @@ class Observed:
 def _with_all_present(series: Series) -> Series:
     if series.present is not None:
         return series
-    return Series(series.observations, jnp.ones(series.length, bool), series.inputs)
+    return Series(series.observations, series.inputs, jnp.ones(series.length, bool))
 
 
 def _kind(series: Series) -> str:
