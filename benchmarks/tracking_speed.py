@@ -28,7 +28,8 @@ import mpfjax
 from mpfjax.console import Clock, exit_status, format_table, peak_memory, whole, write_json
 from mpfjax.vision.tracking.adapters import LEAST_ROOM
 from mpfjax.vision.tracking.background import BackgroundSubtraction
-from mpfjax.vision.tracking.track import make_tracker, track
+from mpfjax.vision.tracking.track import track
+from mpfjax.vision.tracking.tracker import ObjectTracker
 
 FEW, MORE, CROWD = (3, 8), (6, 10), (10, 15)  # rows and columns of objects
 BOX = 100 / 240, 250 / 360  # as shares of an object's field
@@ -121,7 +122,7 @@ class Timed:
             detections: Any = self._detecting(BackgroundSubtraction())
         else:
             detections = self.clock.over("read", map(street.detected, _count()))
-        tracker = make_tracker("gm_mpf", way.room)
+        tracker = ObjectTracker(way.room)
         tracked = track(frames, detections, tracker, camera_motion=way.motion)
         self.tracked = self.clock.over("track", tracked)
 

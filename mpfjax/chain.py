@@ -188,10 +188,9 @@ def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> Pa
 
 
 def normalised(
-    mixture: ParticleMixture, previous: ParticleMixture, may_be_empty: bool
+    mixture: ParticleMixture, previous: ParticleMixture
 ) -> tuple[ParticleMixture, Float[Array, ""]]:
-    """Remove the growth of the mass. If no mass is left, keep the previous weights or, where a
-    mixture may be empty, none.
+    """Remove the growth of the mass. If no mass is left, keep the previous weights.
 
     The scale is removed first, which is exact. If it were added to it, the sum of the weights would
     be lost to rounding.
@@ -203,11 +202,8 @@ def normalised(
     shares = (mixture.log_weights - log_largest) + log_share
     # A comparison with NaN is false, but NaN is not a step of zero likelihood.
     keep = has_mass | jnp.isnan(log_total)
-    without_mass = mixture.log_weights if may_be_empty else previous.log_weights
-    log_weights = jnp.where(keep, shares, without_mass)
+    log_weights = jnp.where(keep, shares, previous.log_weights)
     log_growth = log_scale + log_total
-    if may_be_empty:
-        log_growth = jnp.where(keep, log_growth, 0.0)
     moved = mixture.replace(log_weights=log_weights, log_scale=jnp.zeros_like(log_total))
     return moved, log_growth
 

@@ -18,7 +18,7 @@ from mpfjax.chain import (
     tie,
     untie,
 )
-from mpfjax.checks import check_flag, check_key, check_one_of, check_type
+from mpfjax.checks import check_key, check_one_of, check_type
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, require_model
 from mpfjax.models.inputs import saying_that_none_were_given
@@ -61,9 +61,6 @@ class Filter(eqx.Module):
       `KMeans(reseed=True)`, and `SelectInitial`. What they weigh is part of the first increment.
     - `initial_noise`: the noise of x_0 where the model has `initial_from_noise`: "independent", as
       the model's own `sample_initial` draws it, or "rqmc"; see `Propagate`.
-    - `starts_empty`: at time 0 no slot holds a particle, and later all may become empty again.
-      Moves start components, as the births of a tracker. A step without any mass has an increment
-      of zero.
 
     Raises `ValueError` for N < 1, M < 1, N < M, no moves, moves that never use an observation, or
     fewer slots than `particles_per_component` asks for.
@@ -75,7 +72,6 @@ class Filter(eqx.Module):
     num_particles: int = eqx.field(static=True)
     num_components: int = eqx.field(static=True)
     initial_noise: str = eqx.field(static=True)
-    starts_empty: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -85,7 +81,6 @@ class Filter(eqx.Module):
         num_components: int = 1,
         initial_moves: Iterable[AbstractMove] = (),
         initial_noise: str = "independent",
-        starts_empty: bool = False,
     ) -> None:
         require_model(model, "Filter")
         moves = as_moves(moves, "moves")
@@ -97,9 +92,7 @@ class Filter(eqx.Module):
         self.num_particles = int(num_particles)
         self.num_components = int(num_components)
         check_one_of(NOISES, initial_noise=initial_noise)
-        check_flag(starts_empty=starts_empty)
         self.initial_noise = initial_noise
-        self.starts_empty = bool(starts_empty)
 
     @property
     def moves(self) -> tuple[Any, ...]:
@@ -126,7 +119,6 @@ class Filter(eqx.Module):
             "num_components": self.num_components,
             "initial_moves": untie(self._initial_moves, model),
             "initial_noise": self.initial_noise,
-            "starts_empty": self.starts_empty,
         }
         return Filter(**own | changes)
 
@@ -170,10 +162,8 @@ class Filter(eqx.Module):
             with saying_that_none_were_given(self.model):
                 mixture = move(move_key, mixture, observation)
         if self.looks_at_first:
-            mixture, log_mass = normalised(mixture, mixture, self.starts_empty)
+            mixture, log_mass = normalised(mixture, mixture)
             mixture = mixture.replace(log_scale=log_mass)
-        if self.starts_empty:
-            mixture = mixture.replace(log_weights=jnp.full_like(mixture.log_weights, -jnp.inf))
         return mixture
 
     @property
@@ -245,7 +235,7 @@ class Filter(eqx.Module):
                     resampled |= move.would_resample(mixture, observation)
                 moved = moved_by(move, move_key, mixture, observation, moves)
             if observation is not None and not move.keeps_mass:
-                moved, log_growth = normalised(moved, mixture, self.starts_empty)
+                moved, log_growth = normalised(moved, mixture)
                 increment += log_growth
             in_order = move.sorts or (moved.in_order and not move.propagates)
             mixture = forgetting(moves, moved)

@@ -5,7 +5,8 @@ import pytest
 
 from mpfjax.vision.files.boxes import read_tracks, write_tracks
 from mpfjax.vision.tracking.adapters import Rows
-from mpfjax.vision.tracking.track import make_tracker, online_rows, track
+from mpfjax.vision.tracking.track import online_rows, track
+from mpfjax.vision.tracking.tracker import ObjectTracker
 from tests.examples import two_walkers
 from tests.marking import thorough
 from tests.track_command import SMALL, run, summary_in
@@ -133,7 +134,7 @@ def test_equal_scores_and_a_single_frame_are_tracked(tmp_path, num_frames, score
     assert run(path, "--out", tmp_path, *SMALL) == 0
     expected = two_walkers(num_frames)
     by_command = read_tracks(tmp_path / "tracks.txt")
-    tracked = track(None, rows, make_tracker("gm_mpf", 3))
+    tracked = track(None, rows, ObjectTracker(3))
     direct = np.concatenate([online_rows(t, tracks) for t, tracks in enumerate(tracked, 1)])
     for found in (by_command, direct):
         assert len(found) == len(expected)

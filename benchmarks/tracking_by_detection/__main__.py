@@ -1,4 +1,4 @@
-"""Our trackers beside those that people use, on the same detections and scored alike.
+"""Our tracker beside those that people use, on the same detections and scored alike.
 
     python -m benchmarks.tracking_by_detection DIR [DIR ...]
     python -m benchmarks.tracking_by_detection --scene football
@@ -6,9 +6,9 @@
 Each DIR is a sequence: img/ (or img1/), gt.txt (or gt/gt.txt) and one or more files of detections,
 det*.txt (or det/det.txt). Without images ours see the detections alone, as the others always do. An
 ignore.txt is taken as `read_truth` does, and of several sequences the means are printed. On each
-file run the two filters of `mpfjax.vision.track`, means over
-seeds, and the peers that are installed: the SORT-like trackers of the packages `trackers` and
-`norfair`, with their defaults, with what their documentation advises, and then all of them, ours
+file run `mpfjax.vision.track`, which draws nothing at random, and the peers that are installed:
+the SORT-like trackers of the packages `trackers` and `norfair`, with their defaults, with what
+their documentation advises, and then all of them, ours
 as well, with the same minimal score, that below which weaker detections are left out. It is the
 threshold that parts the file's scores best in two (Otsu's), unless --min-score gives one. With
 --scene football the sequences are rendered, and the detections simulated.
@@ -21,7 +21,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from tqdm import tqdm
 
@@ -43,9 +42,10 @@ from mpfjax.vision.files import frames
 from mpfjax.vision.files.sequences import detection_files, last_frame, read_sequence_info
 from mpfjax.vision.files.truth import Truth, read_truth
 from mpfjax.vision.tracking.adapters import Rows
-from mpfjax.vision.tracking.track import make_tracker, online_rows, track
+from mpfjax.vision.tracking.track import online_rows, track
+from mpfjax.vision.tracking.tracker import ObjectTracker
 
-OURS = {"gm_mpf": "GM-MPF", "mpf": "MPF"}
+OURS = "mpfjax"
 SCORES = ("HOTA", "MOTA", "IDF1", "id_switches")
 COLUMNS = ("tracker", "sequence", "detections", *SCORES, "frames_per_second")
 
@@ -83,19 +83,19 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """The arguments, each checked as far as it can be without the sequences."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.tracking_by_detection",
-        description="Our trackers beside those that people use, on the same detections.",
+        description="Our tracker beside those that people use, on the same detections.",
     )
     parser.add_argument("sequences", type=Path, nargs="*", metavar="DIR", help="img/, gt.txt, det*")
     parser.add_argument("--scene", choices=("football",), help="rendered, in place of any DIR")
     parser.add_argument("--out", type=Path, default=Path("results/tracking_by_detection"))
-    parser.add_argument("--seed", type=seed, default=0)
-    parser.add_argument("--seeds", type=whole(), default=3, help="runs of ours; scores are means")
+    parser.add_argument("--seed", type=seed, default=0, help="of the rendered scene")
+    parser.add_argument("--seeds", type=whole(), default=1, help="nothing is drawn: one will do")
     parser.add_argument("--frames", metavar="A:B", help="frames A to B, counted from 1, both in")
     parser.add_argument("--fps", type=positive, help="frames a second, where nothing says it")
     parser.add_argument(
         "--min-score", type=finite, metavar="S", help="the same minimal score for all"
     )
-    parser.add_argument("--no-peers", action="store_true", help="our own trackers alone")
+    parser.add_argument("--no-peers", action="store_true", help="our own tracker alone")
     parser.add_argument("--no-colour", action="store_true", help="ours on the detections alone")
     parser.add_argument(
         "--camera-motion", choices=("pixels", "detections"), help="where ours has it from"
@@ -155,8 +155,8 @@ def run(options: argparse.Namespace) -> None:
     results: list[dict[str, Any]] = []
     options.out.mkdir(parents=True, exist_ok=True)
     for sequence in sequences:
-        for name, runs in _runs(options, sequence, others):
-            results.append(_result(name, sequence, list(runs)))
+        for name, run in _runs(options, sequence, others):
+            results.append(_result(name, sequence, run))
             write_json(options.out / "tracking_by_detection.json", {"rows": results})
     print(table(results))
     if len(sequences) > 1:
@@ -166,46 +166,40 @@ def run(options: argparse.Namespace) -> None:
 
 def _runs(
     options: argparse.Namespace, sequence: Sequence, others: list[Peer]
-) -> Iterator[tuple[str, Iterator[Run]]]:
-    """The name of each tracker with its setting, and its runs, made as they are asked for."""
+) -> Iterator[tuple[str, Run]]:
+    """The name of each tracker with its setting, and its run, made as it is asked for."""
     least = options.min_score
     if least is None and _scores(sequence.rows) is not None:
         least = otsu(sequence.rows[:, 6])
-    for filter, name in OURS.items():
-        yield name, _ours(options, sequence, filter, None)
+    yield OURS, _ours(options, sequence, None)
     for peer in others:
-        yield f"{peer.name}, {peer.setting}", iter([_theirs(sequence, peer, None)])
+        yield f"{peer.name}, {peer.setting}", _theirs(sequence, peer, None)
     if least is not None:
-        for filter, name in OURS.items():
-            yield f"{name}, score >= {least:.3g}", _ours(options, sequence, filter, least)
+        yield f"{OURS}, score >= {least:.3g}", _ours(options, sequence, least)
         for peer in others:
             if peer.setting == "defaults":
-                run = _theirs(sequence, peer, least)
-                yield f"{peer.name}, defaults, score >= {least:.3g}", iter([run])
+                name = f"{peer.name}, defaults, score >= {least:.3g}"
+                yield name, _theirs(sequence, peer, least)
 
 
-def _ours(
-    options: argparse.Namespace, sequence: Sequence, filter: str, least: float | None
-) -> Iterator[Run]:
-    """A run for each seed; compiling, in the first frame, is not timed."""
+def _ours(options: argparse.Namespace, sequence: Sequence, least: float | None) -> Run:
+    """One run, which has no random numbers; compiling, in the first frame, is not timed."""
     rows = Rows(sequence.rows, sequence.first, sequence.last)
-    tracker = make_tracker(filter, rows.most_objects(), sequence.frames_per_second)
-    for number in range(options.seed, options.seed + options.seeds):
-        clock, stills = Clock("read", "track"), sequence.stills()
-        tracked = track(
-            None if stills is None else clock.over("read", stills), rows, tracker,
-            key=jax.random.key(number),
-            first=sequence.first, min_score=least, use_colours=not options.no_colour,
-            frame_size=sequence.frame_size, camera_motion=_camera_motion(options, sequence),
-        )  # fmt: skip
-        kept, compiling = [], 0.0
-        bar = tqdm(total=sequence.last - sequence.first + 1, desc=OURS[filter], disable=None)
-        for frame, tracks in enumerate(clock.over("track", tracked), sequence.first):
-            kept.append(online_rows(frame, tracks))
-            compiling = compiling or clock.seconds["track"]
-            bar.update()
-        bar.close()
-        yield Run(np.concatenate(kept), _rate(len(kept) - 1, clock.seconds["track"] - compiling))
+    tracker = ObjectTracker(rows.most_objects(), frames_per_second=sequence.frames_per_second)
+    clock, stills = Clock("read", "track"), sequence.stills()
+    tracked = track(
+        None if stills is None else clock.over("read", stills), rows, tracker,
+        first=sequence.first, min_score=least, use_colours=not options.no_colour,
+        frame_size=sequence.frame_size, camera_motion=_camera_motion(options, sequence),
+    )  # fmt: skip
+    kept, compiling = [], 0.0
+    bar = tqdm(total=sequence.last - sequence.first + 1, desc=OURS, disable=None)
+    for frame, tracks in enumerate(clock.over("track", tracked), sequence.first):
+        kept.append(online_rows(frame, tracks))
+        compiling = compiling or clock.seconds["track"]
+        bar.update()
+    bar.close()
+    return Run(np.concatenate(kept), _rate(len(kept) - 1, clock.seconds["track"] - compiling))
 
 
 def _camera_motion(options: argparse.Namespace, sequence: Sequence) -> str | None:
@@ -248,19 +242,18 @@ def otsu(scores: np.ndarray) -> float:
     return float(ordered[1:][np.argmax(between)]) if n > 1 else float(ordered[0])
 
 
-def _result(name: str, sequence: Sequence, runs: list[Run]) -> dict[str, Any]:
+def _result(name: str, sequence: Sequence, run: Run) -> dict[str, Any]:
     span = (sequence.first, sequence.last)
     truth = sequence.truth
     away = {"ignored": truth.ignored, "min_height": truth.min_height}
-    scores = [multi_object_scores(run.rows, truth.objects, span, **away) for run in runs]
+    scores = multi_object_scores(run.rows, truth.objects, span, **away)
     result: dict[str, Any] = {
         "tracker": name,
         "sequence": sequence.name,
         "detections": sequence.detections,
     }
-    result |= {score: round(float(np.mean([s[score] for s in scores])), 4) for score in SCORES}
-    rate = float(np.median([run.frames_per_second for run in runs]))
-    return result | {"frames_per_second": round(rate, 1)}
+    result |= {score: round(float(scores[score]), 4) for score in SCORES}
+    return result | {"frames_per_second": round(run.frames_per_second, 1)}
 
 
 def table(results: list[dict[str, Any]]) -> str:

@@ -28,7 +28,7 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
-from benchmarks.visual_tracking.detected import detect_all, make_trackers, track_detected
+from benchmarks.visual_tracking.detected import detect_all, make_mixtures, track_detected
 from benchmarks.visual_tracking.pictures import NAMES, write_contact_sheet, write_video
 from benchmarks.visual_tracking.scores import score, table, tracking_scores
 from benchmarks.visual_tracking.source import Source, open_source
@@ -137,7 +137,7 @@ def _by_object(
 
 
 def _detected_runs(options, source: Source, keys: Array) -> tuple[dict[str, Any], Source]:
-    """The PF of the preset, started at the first detections, and the two trackers."""
+    """The PF of the preset, started at the first detections, and the two mixtures."""
     detected = detect_all(source)
     first = next((t for t, boxes in enumerate(detected.boxes) if len(boxes)), None)
     if first is None:
@@ -147,8 +147,8 @@ def _detected_runs(options, source: Source, keys: Array) -> tuple[dict[str, Any]
     still = next(frame for t, frame in enumerate(source.read()) if t == first)
     filter = PRESETS[options.preset](still, boxes)["pf"]
     runs: dict[str, Any] = {"pf": _plain_run(filter, source, keys)}
-    for name, tracker in make_trackers().items():
-        runs[name] = track_detected(tracker, keys, source, detected)
+    for name, component in make_mixtures().items():
+        runs[name] = track_detected(component, keys, source, detected)
     return runs, source
 
 

@@ -81,9 +81,6 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     track.add_argument("--frames", metavar="A:B", help="frames A to B, counted from 1, both in")
     track.add_argument("--seed", type=seed, default=0, help="of the random numbers")
-    track.add_argument(
-        "--filter", choices=("gm_mpf", "mpf"), help="Gaussian mixture (default) or resampling"
-    )
     track.add_argument("--min-score", type=finite, metavar="S", help="leave out weaker detections")
     track.add_argument(
         "--max-objects", type=whole(1, 1024), metavar="M", help="room for objects at a time"
@@ -118,7 +115,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
             )
         track.error("one of the arguments --detections --detect --box is required")
     if options.box is not None:
-        for name in ("filter", "max_objects", "min_score", "no_colour", "camera_motion", "offline"):
+        for name in ("max_objects", "min_score", "no_colour", "camera_motion", "offline"):
             if getattr(options, name):
                 track.error(f"argument --{name.replace('_', '-')}: not allowed with --box")
     if options.detect and options.min_score is not None:

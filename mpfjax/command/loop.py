@@ -28,8 +28,9 @@ from mpfjax.vision.files.threads import read_ahead, write_behind
 from mpfjax.vision.tracking.adapters import LEAST_ROOM, Rows
 from mpfjax.vision.tracking.background import BackgroundSubtraction
 from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv, opencv_on_one_thread
-from mpfjax.vision.tracking.track import make_tracker, offline_rows, online_rows, track
-from mpfjax.vision.tracking.tracker import Tracks
+from mpfjax.vision.tracking.state import Tracks
+from mpfjax.vision.tracking.track import offline_rows, online_rows, track
+from mpfjax.vision.tracking.tracker import ObjectTracker
 
 
 class Results:
@@ -121,9 +122,8 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
         return lambda stills: follow_boxes(stills or (), boxes, key=key)
     rows = None if source.rows is None else Rows(source.rows, source.first, source.last)
     room = LEAST_ROOM if rows is None else rows.most_objects()
-    tracker = make_tracker(
-        options.filter or "gm_mpf", options.max_objects or room, source.frames_per_second
-    )
+    rate = source.frames_per_second
+    tracker = ObjectTracker(options.max_objects or room, frames_per_second=rate)
     detector = BackgroundSubtraction() if options.detect else None
     if options.camera_motion == "pixels":
         OpticalFlow()  # an error before anything is written, where OpenCV is missing

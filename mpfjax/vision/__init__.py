@@ -27,7 +27,6 @@ from mpfjax.vision.colour.histograms import IntegralHistogram as IntegralHistogr
 from mpfjax.vision.colour.histograms import bhattacharyya as bhattacharyya
 from mpfjax.vision.colour.histograms import integral_histogram as integral_histogram
 from mpfjax.vision.colour.sampled_histograms import SampledBoxes as SampledBoxes
-from mpfjax.vision.colour.sampled_histograms import SampledHistogram as SampledHistogram
 from mpfjax.vision.files.boxes import check_boxes as check_boxes
 from mpfjax.vision.files.boxes import parse_box as parse_box
 from mpfjax.vision.files.boxes import read_detections as read_detections
@@ -44,11 +43,10 @@ from mpfjax.vision.scenes.football import Scene as Scene
 from mpfjax.vision.scenes.football import football_scene as football_scene
 from mpfjax.vision.tracking.background import BackgroundSubtraction as BackgroundSubtraction
 from mpfjax.vision.tracking.detections import Detections as Detections
-from mpfjax.vision.tracking.observation import CameraMotion as CameraMotion
+from mpfjax.vision.tracking.gaussian import CameraMotion as CameraMotion
 from mpfjax.vision.tracking.optical_flow import OpticalFlow as OpticalFlow
-from mpfjax.vision.tracking.track import make_tracker as make_tracker
+from mpfjax.vision.tracking.state import Tracks as Tracks
 from mpfjax.vision.tracking.track import offline_rows as offline_rows
 from mpfjax.vision.tracking.track import online_rows as online_rows
 from mpfjax.vision.tracking.track import track as track
 from mpfjax.vision.tracking.tracker import ObjectTracker as ObjectTracker
-from mpfjax.vision.tracking.tracker import Tracks as Tracks

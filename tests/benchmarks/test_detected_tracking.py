@@ -12,7 +12,7 @@ from benchmarks.visual_tracking import __main__ as visual_tracking
 from benchmarks.visual_tracking.detected import (
     Detected,
     detect_all,
-    make_trackers,
+    make_mixtures,
     track_detected,
 )
 from benchmarks.visual_tracking.source import Source
@@ -140,8 +140,8 @@ def tracked(sequence, boxes_of_frames, truth=None):
     source = Source("street", lambda: frames, 1, NUM, np.zeros((0, 4)), truth, False)
     detected = Detected(boxes_of_frames, [0.0] * NUM)
     keys = jax.random.split(jax.random.key(0), 1)
-    tracker = make_trackers()["gm_mpf"]
-    frames_of_run, rows_of_run = track_detected(tracker, keys, source, detected)
+    mixture = make_mixtures()["gm_mpf"]
+    frames_of_run, rows_of_run = track_detected(mixture, keys, source, detected)
     with tqdm(disable=True) as bar:
         (rows,) = rows_of_run([snapshot for snapshot, _ in frames_of_run(bar)])
     return rows, source

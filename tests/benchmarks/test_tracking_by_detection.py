@@ -62,15 +62,15 @@ def test_one_row_for_each_tracker_and_setting(sequence, tmp_path, monkeypatch, c
     assert all(list(row) == COLUMNS for row in content["rows"])
     names = [row["tracker"] for row in content["rows"]]
     assert names == [
-        "GM-MPF", "MPF", "Other, defaults", "Other, advised",
-        "GM-MPF, score >= 0.81", "MPF, score >= 0.81", "Other, defaults, score >= 0.81",
+        "mpfjax", "Other, defaults", "Other, advised",
+        "mpfjax, score >= 0.81", "Other, defaults, score >= 0.81",
     ]  # fmt: skip
     by_name = {row["tracker"]: row for row in content["rows"]}
     assert {row["sequence"] for row in content["rows"]} == {"walks"}
     assert by_name["Other, defaults, score >= 0.81"]["HOTA"] == 1
     assert by_name["Other, defaults, score >= 0.81"]["id_switches"] == 0
     assert by_name["Other, defaults"]["MOTA"] < 1, "weak detections were left out unasked"
-    assert by_name["GM-MPF, score >= 0.81"]["HOTA"] > 0.5
+    assert by_name["mpfjax, score >= 0.81"]["HOTA"] > 0.5
     assert all(row["frames_per_second"] > 0 for row in content["rows"])
     printed = capsys.readouterr().out.splitlines()
     assert printed[2].startswith("Other, defaults, score")

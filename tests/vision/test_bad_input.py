@@ -81,11 +81,6 @@ TABLE = {
         {"boxes": BOXES, "max_detections": 3},
         {"boxes": "rows", "max_detections": "count"},
     ),
-    "SampledHistogram": (
-        vision.SampledHistogram,
-        {"frame": FRAME, "colours": vision.RGBColours(4)},
-        {"colours": "kind", "rows": "count", "columns": "count"},
-    ),
     "distracter_scene": (
         vision.distracter_scene,
         {"key": KEY},
@@ -130,11 +125,6 @@ TABLE = {
         vision.follow_boxes,
         {"frames": [FRAME], "boxes": BOXES},
         {"boxes": "rows", "key": "key?"},
-    ),
-    "make_tracker": (
-        vision.make_tracker,
-        {},
-        {"filter": "kind", "max_objects": "count", "frames_per_second": "positive?"},
     ),
     "read_detections": (vision.read_detections, {}, {"path": "path"}),
     "frame_rate": (vision.frame_rate, {}, {"path": "path"}),
@@ -194,9 +184,8 @@ TABLE = {
     "ObjectTracker": (
         vision.ObjectTracker,
         {},
-        {"max_objects": "count", "particles_per_object": "count?", "resampling": "kind?",
-         "colours": "kind?", "sigma": "positive?", "frames_per_second": "positive?",
-         "exact_colours": "flag", "moves": "kind?"},
+        {"max_objects": "count", "frames_per_second": "positive?", "scores": "kind",
+         "class_matters": "kind"},
     ),
 }  # fmt: skip
 
@@ -221,7 +210,7 @@ def test_what_will_not_do_is_named(function, good, name, value):
         (vision.joint_colour_model, OF_FRAME, "templates", {0: FRAME}),
         (vision.joint_colour_model, OF_FRAME, "templates", {0: (FRAME, None)}),
         (vision.joint_colour_model, OF_FRAME, "templates", {0: (None, BOXES[0])}),
-        (vision.ObjectTracker, {"weak_score": 2.0}, "strong_score", NAN),
+        (vision.ObjectTracker, {}, "scores", (0.5, NAN)),
         (vision.distracter_scene, {"key": KEY}, "num_frames", 2),
         (vision.write_tracks, {"path": "/nowhere"}, "rows", [[0.5, 1, 2, 3, 4, 5]]),
         (vision.write_tracks, {"path": "/nowhere"}, "rows", [[1, 1, NAN, 3, 4, 5]]),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mpfjax.vision import CameraMotion, Detections, ObjectTracker, football_scene, track
-from mpfjax.vision.tracking.model import Gaussian
+from mpfjax.vision.tracking.gaussian import Gaussian
 from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV comes with the extra 'video', which 'test' brings")
@@ -280,9 +280,8 @@ def test_wrong_motions_from_pixels_are_overruled_by_the_detections():
         state, tracks = TRACKER.step(jax.random.key(number), state, None, rows, wrong)
     assert sorted(np.asarray(tracks.identities)[np.asarray(tracks.confirmed)]) == [1, 2, 3, 4]
     assert distances(tracks, boxes).max() < 1.0
-    camera = state.memory["camera"]
-    assert float(camera.left[0]) > 0.03  # of boxes 30 pixels wide
-    assert float(camera.left[1]) < 0.02
+    assert float(state.camera.left[0]) > 0.03  # of boxes 30 pixels wide
+    assert float(state.camera.left[1]) < 0.02
 
 
 # --- without OpenCV, and what does not fit -------------------------------------------------------

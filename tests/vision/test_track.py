@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import mpfjax
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import Detections, ObjectTracker, Tracks, football_scene, track
 from mpfjax.vision.boxes.follow_boxes import follow_boxes
@@ -17,11 +16,11 @@ from mpfjax.vision.boxes.object_moves import best_components
 from mpfjax.vision.boxes.recipes import objects_filters
 from mpfjax.vision.files.frames import write_image
 from mpfjax.vision.tracking.adapters import LEAST_ROOM, MOST_ROOM, Rows
-from mpfjax.vision.tracking.track import make_tracker, offline_rows, online_rows
+from mpfjax.vision.tracking.track import offline_rows, online_rows
 
 SHAPE = (48, 64, 3)
 NUM_FRAMES = 8
-TRACKER = ObjectTracker(3, 10)
+TRACKER = ObjectTracker(3)
 
 
 def walks(num_frames=NUM_FRAMES):
@@ -136,10 +135,9 @@ def test_grey_frames_are_frames():
     assert_same(tracked(grey[..., None], walks()), tracked(coloured, walks()))
 
 
-def test_the_key_decides_and_nothing_else(without_pixels):
-    assert_same(tracked(None, walks(), key=jax.random.key(0)), without_pixels)
-    other = tracked(None, walks(), key=jax.random.key(1))
-    assert not np.array_equal(other[-1].boxes, without_pixels[-1].boxes)
+def test_nothing_is_drawn(without_pixels):
+    other = tracked(None, walks(), key=jax.random.key(7))
+    assert_same(other, without_pixels)
 
 
 def test_tracks_are_the_same_where_frames_are_looked_at_ahead(with_pixels):
@@ -247,7 +245,7 @@ def test_two_thousand_detections_leave_the_strongest():
 def test_more_objects_than_room_are_flagged_and_the_strongest_kept():
     places = np.stack([np.arange(6) * 10, np.full(6, 10), np.full(6, 6), np.full(6, 12)], axis=1)
     scores = np.arange(6.0)
-    tracker = ObjectTracker(3, 10, strong_score=0.0, weak_score=0.0)
+    tracker = ObjectTracker(3, scores=(0.0, 0.0))
     with pytest.warns(RuntimeWarning, match="frame 1 has more objects than the 3 .* max_objects"):
         run = list(track(None, [(places, scores)] * 3, tracker))
     assert run[0].full
@@ -426,35 +424,6 @@ def test_the_second_frame_is_tracked_by_the_program_of_the_first():
     ]
     assert jax.tree.leaves(kinds[0]) == jax.tree.leaves(kinds[1])
     assert jax.tree.structure(before) == jax.tree.structure(after)
-
-
-def test_trackers_are_made_by_the_name_of_their_filter():
-    gaussian, resampling = make_tracker("gm_mpf", 5), make_tracker("mpf", 5, 30.0)
-    several = make_tracker("gm_mpf", 5, particles_per_object=2)
-    names = [[type(move).__name__ for move in one.moves] for one in (gaussian, resampling, several)]
-    assert not {"GaussianRegeneration", "Resample"} & set(names[0])
-    assert "Resample" in names[1]
-    assert "GaussianRegeneration" in names[2]
-    assert gaussian.max_objects == resampling.max_objects == 5
-    with pytest.raises(ValueError, match="filter: 'pf' is not one of"):
-        make_tracker("pf")
-
-
-def test_the_gaussian_of_one_particle_is_that_particle():
-    """The default chain leaves the regeneration out, where each object has one particle."""
-    redraw = mpfjax.GaussianRegeneration(
-        1, where=lambda states: (states.place, states.velocity), noise="stratified"
-    )
-    found = [
-        list(track(None, walks(20), tracker))
-        for tracker in (ObjectTracker(3), ObjectTracker(3, resampling=redraw))
-    ]
-    assert len(found[0]) == 20
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_array_equal(one.identities, other.identities)
-        np.testing.assert_array_equal(one.shown, other.shown)
-        np.testing.assert_allclose(one.boxes, other.boxes, atol=1e-3)
-    assert found[0][-1].confirmed.sum() == 2
 
 
 @pytest.mark.thorough

@@ -20,7 +20,7 @@ from mpfjax.vision.boxes.object_moves import best_components
 from mpfjax.vision.boxes.recipes import objects_filters
 from mpfjax.vision.colour.histograms import IntegralHistogram
 from mpfjax.vision.files.frames import of_one_kind
-from mpfjax.vision.tracking.tracker import Tracks
+from mpfjax.vision.tracking.state import Tracks
 
 
 def follow_boxes(

@@ -26,6 +26,7 @@ class Detections(eqx.Module):
     - `scores`: (d,), how sure the detector was of each, on any scale, higher for surer.
     - `rows`: (d,), the row of each in what the detector gave; None counts them as they stand here.
     - `extent`: left, top, right, bottom of the frame; as far as can be where not known.
+    - `labels`: (d,), the class of each, whole numbers from 1 on; 0 for none.
     """
 
     boxes: Float[Array, "d 4"] = eqx.field(converter=to_array("boxes"))
@@ -33,6 +34,7 @@ class Detections(eqx.Module):
     scores: Float[Array, " d"] = eqx.field(converter=to_array("scores"))
     rows: Int[Array, " d"] | None = None
     extent: Float[Array, "4"] = eqx.field(converter=to_array("extent"), default=_UNBOUNDED)
+    labels: Int[Array, " d"] = eqx.field(converter=to_array("labels", floating=False), default=0)
 
     @classmethod
     def from_boxes(
@@ -43,6 +45,7 @@ class Detections(eqx.Module):
         *,
         frame_size: tuple[int, int] | None = None,
         origin: Float[np.ndarray, "2"] | None = None,
+        labels: Int[np.ndarray, " k"] | None = None,
     ) -> "Detections":
         """Boxes (x, y, w, h), top-left corner first, and a score for each; all 1 where None.
 
@@ -62,6 +65,7 @@ class Detections(eqx.Module):
         if len(rows) > 0 and np.ndim(boxes) != 2:
             raise ValueError(f"boxes: shape {np.shape(boxes)} is not (k, 4), of boxes x,y,w,h")
         strengths = _checked_scores(scores, len(rows))
+        classes = _checked_labels(labels, len(rows))
         present = np.flatnonzero(~np.any(np.ma.getmaskarray(rows), axis=1))
         rows, strengths = centred(rows.data[present]), strengths[present]
         corner = np.zeros(2) if origin is None else np.asarray(origin, float)
@@ -75,12 +79,16 @@ class Detections(eqx.Module):
         padded_scores[: len(kept)] = strengths[kept]
         padded_rows = np.full(max_detections, -1, np.int32)
         padded_rows[: len(kept)] = present[kept]
+        padded_labels = np.zeros(max_detections, np.int32)
+        padded_labels[: len(kept)] = classes[present[kept]]
         valid = np.arange(max_detections) < len(kept)
         extent = _UNBOUNDED
         if frame_size is not None:
             height, width = frame_size
             extent = np.array([*-corner, *([width, height] - corner)], np.float32)
-        return cls(*map(jnp.asarray, (padded, valid, padded_scores, padded_rows, extent)))
+        return cls(
+            *map(jnp.asarray, (padded, valid, padded_scores, padded_rows, extent, padded_labels))
+        )
 
     def rows_of(self, indices: Int[Array, " m"]) -> Int[Array, " m"]:
         """The rows, in what the detector gave, of detections by their indices; -1 stays -1."""
@@ -124,3 +132,15 @@ def _checked_scores(scores: Any, number: int) -> np.ndarray:
     if not np.isfinite(values).all():
         raise ValueError(f"scores: {shown(values)} are not all finite")
     return values
+
+
+def _checked_labels(labels: Any, number: int) -> np.ndarray:
+    """A whole number from 0 on for each box, all 0 where none are given."""
+    if labels is None:
+        return np.zeros(number, np.int32)
+    values = np.asarray(as_numbers("labels", labels))
+    if values.shape != (number,):
+        raise ValueError(f"labels: shape {values.shape} is not that of one a box, ({number},)")
+    if not np.all((values >= 0) & (values == values.astype(np.int32))):
+        raise ValueError(f"labels: {shown(values)} are not all whole numbers from 0 on")
+    return values.astype(np.int32)

@@ -9,7 +9,7 @@ import numpy as np
 
 from mpfjax.checks import to_rows
 from mpfjax.vision.files.frames import check_frame
-from mpfjax.vision.tracking.observation import CameraMotion
+from mpfjax.vision.tracking.gaussian import CameraMotion
 
 _WIDTH = 320  # of the reduced picture, about
 _CORNERS = 200  # the most that are followed

@@ -7,30 +7,28 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Key, PyTree, UInt8
+from jaxtyping import Array, Float, Key, UInt8
 
 from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole, given
-from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.compiling import in_little_memory, jit_with
 from mpfjax.vision.files.boxes import centred, top_left
 from mpfjax.vision.files.frames import of_one_kind, read_frames
 from mpfjax.vision.files.threads import read_ahead
 from mpfjax.vision.tracking.adapters import (
-    LEAST_ROOM,
     AbstractDetector,
     DetectedBoxes,
     Once,
     Sieve,
     as_detector,
 )
-from mpfjax.vision.tracking.camera import FollowCamera
 from mpfjax.vision.tracking.detections import Detections
-from mpfjax.vision.tracking.observation import CameraMotion
+from mpfjax.vision.tracking.gaussian import CameraMotion
 from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
-from mpfjax.vision.tracking.tracker import RIVALS_PER_OBJECT, ObjectTracker, Tracks
+from mpfjax.vision.tracking.state import Tracks
+from mpfjax.vision.tracking.tracker import ObjectTracker, advanced
 
-# Compiling in three quarters of the time, or less, is worth a frame's 7 to 13% up to here.
-_FEW_PARTICLES = 32
+# Compiling in four fifths of the time is worth a tenth of a frame's up to here.
+_FEW_OBJECTS = 48
 
 
 def track(
@@ -106,27 +104,24 @@ def track(
     check_key(key)
     room = 2 * tracker.max_objects if max_detections is None else max_detections
     stills = None if frames is None else of_one_kind(frames, first)
-    flow = _optical_flow(camera_motion, tracker, frames is not None, use_colours)
+    flow = _optical_flow(camera_motion, frames is not None, use_colours)
     observed = _observed(stills, detector, first)
     seen = _seen(observed, sieve, tracker, room, use_colours, flow)
-    return _tracked(seen, tracker, key, ahead)
+    return _tracked(seen, tracker, ahead)
 
 
 def _optical_flow(
-    camera_motion: str | None, tracker: ObjectTracker, has_frames: bool, use_colours: bool
+    camera_motion: str | None, has_frames: bool, use_colours: bool
 ) -> OpticalFlow | None:
     """What finds the camera's motion from pixels, None where it is left to the detections."""
-    follows = any(isinstance(move, FollowCamera) for move in tracker.moves)
     if camera_motion is None:
-        wanted = has_frames and use_colours and follows and has_opencv()
+        wanted = has_frames and use_colours and has_opencv()
         return OpticalFlow() if wanted else None
     check_one_of(("pixels", "detections"), camera_motion=camera_motion)
     if camera_motion == "detections":
         return None
     if not has_frames:
         raise ValueError("camera_motion: 'pixels' needs frames, and frames is None")
-    if not follows:
-        raise ValueError("camera_motion: 'pixels' needs a tracker with the move FollowCamera")
     return OpticalFlow()
 
 
@@ -174,16 +169,13 @@ def _seen(
 
 
 def _tracked(
-    seen: Iterator[_Seen], tracker: ObjectTracker, key: Key[Array, ""], ahead: bool
+    seen: Iterator[_Seen], tracker: ObjectTracker, ahead: bool
 ) -> Generator[Tracks, None, None]:
     state, once = tracker.init(), Once()
-    options = in_little_memory(soon=tracker.filter.num_particles <= _FEW_PARTICLES)
-    advance = jit_with(options, _advance)
+    advance = jit_with(in_little_memory(soon=tracker.max_objects <= _FEW_OBJECTS), advanced)
     with read_ahead(seen) if ahead else contextlib.nullcontext(seen) as coming:
         for number, pixels, observation, motion, kept, origin in coming:
-            # An array: each new Python number would compile anew.
-            arguments = (np.asarray(number), state, pixels, observation, motion)
-            state, tracks = advance(tracker, key, *arguments)
+            state, tracks = advance(tracker, state, observation, pixels, motion)
             tracks = jax.device_get(tracks)
             if tracks.full:
                 once.warn(
@@ -196,19 +188,6 @@ def _tracked(
                 boxes=tracks.boxes + np.append(origin, [0, 0]),
                 detections=np.where(taken >= 0, np.append(kept, -1)[taken], -1),
             )
-
-
-def _advance(
-    tracker: ObjectTracker,
-    key: Key[Array, ""],
-    number: Any,
-    state: PyTree,
-    pixels: Any,
-    observation: Detections,
-    motion: CameraMotion | None,
-) -> tuple[PyTree, Tracks]:
-    """A step and the key of its frame, in one program: each call costs half a millisecond."""
-    return tracker.step(jax.random.fold_in(key, number), state, pixels, observation, motion)
 
 
 def _observed(
@@ -229,29 +208,6 @@ def _observed(
             detector.warn_of_the_rest(number - 1)
             return
         yield number, None, found
-
-
-def make_tracker(
-    filter: str = "gm_mpf",
-    max_objects: int = LEAST_ROOM,
-    frames_per_second: float | None = None,
-    **settings: Any,
-) -> ObjectTracker:
-    """The tracker with the filter "gm_mpf" or "mpf", with room for `max_objects` objects.
-
-    With "gm_mpf" a component is one Gaussian; with "mpf" it is particles that are resampled, which
-    are rival hypotheses of the association. `settings` are those of `ObjectTracker`. Raises
-    `ValueError` for another name, and for `moves`, which only `ObjectTracker` takes.
-    """
-    check_one_of(("gm_mpf", "mpf"), filter=filter)
-    if "moves" in settings:
-        raise ValueError("moves: they are in place of a filter's; give them to ObjectTracker")
-    if frames_per_second is not None:
-        settings["frames_per_second"] = frames_per_second
-    if filter == "mpf":
-        particles = settings.get("particles_per_object", RIVALS_PER_OBJECT)
-        settings["resampling"] = Resample(particles_per_component=particles)
-    return ObjectTracker(max_objects, **settings)
 
 
 # --- tracks as files have them -------------------------------------------------------------

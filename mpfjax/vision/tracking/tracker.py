@@ -1,393 +1,347 @@
-"""A tracker that starts and ends its components by itself, from detections: a chain of moves."""
+"""A tracker of an unknown number of objects, from detections: a Kalman filter for each."""
 
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from mpfjax.checks import (
-    check_flag,
+    check_finite,
+    check_one_of,
     check_positive,
     check_type,
     check_whole,
     given,
-    is_series,
     shown,
 )
-from mpfjax.filter import Filter, step_and_faults
-from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractMove, AbstractResampling
-from mpfjax.moves.resampling.gaussian import GaussianRegeneration
-from mpfjax.vision.colour.bins import AbstractColours, HSVColours
-from mpfjax.vision.colour.histograms import integral_histogram
-from mpfjax.vision.colour.sampled_histograms import SampledBoxes, SampledHistogram
-from mpfjax.vision.tracking.appearance import LearnAppearance
-from mpfjax.vision.tracking.assignment import Assign
-from mpfjax.vision.tracking.births import Births, ShareMass
-from mpfjax.vision.tracking.camera import FollowCamera
-from mpfjax.vision.tracking.deaths import Deaths
-from mpfjax.vision.tracking.detections import Detections
-from mpfjax.vision.tracking.doubles import LearnDoubles
-from mpfjax.vision.tracking.guesses import LearnGuesses
-from mpfjax.vision.tracking.memory import (
-    LIVES,
-    Lives,
-    assigned_detections,
-    mean_boxes,
+from mpfjax.vision.colour.bins import HSVColours
+from mpfjax.vision.colour.histograms import normalise
+from mpfjax.vision.colour.sampled_histograms import SampledBoxes
+from mpfjax.vision.tracking.associate import (
+    compatible,
+    learned_colours,
+    mahalanobis,
+    one_to_one,
+    probabilities,
+    seated,
+    stronger,
+    unlikeness,
 )
-from mpfjax.vision.tracking.model import DetectedObjectModel, NoObjectYet, ObjectState, Pixels
-from mpfjax.vision.tracking.motion import PropagateObjects
-from mpfjax.vision.tracking.noise import LearnNoise
-from mpfjax.vision.tracking.observation import CameraMotion, TrackedFrame
-from mpfjax.vision.tracking.scores import RankScores
+from mpfjax.vision.tracking.camera import CameraState
+from mpfjax.vision.tracking.detections import Detections
+from mpfjax.vision.tracking.gaussian import (
+    CameraMotion,
+    Gaussian,
+    boxes_of,
+    overlap,
+    places_of,
+    shared,
+    units,
+    within,
+    zeros,
+)
+from mpfjax.vision.tracking.lives import Doubles, Guesses, Lives, Spans
+from mpfjax.vision.tracking.noise import NoiseState
+from mpfjax.vision.tracking.scores import ScoreState
+from mpfjax.vision.tracking.state import TrackerState, Tracks
 
-# A box of this many pixels cannot be counted in 16 bits.
-_LARGEST_NARROW = 2**16
-# The default number of particles of an object, where they differ.
-RIVALS_PER_OBJECT = 16
-
-
-class Tracks(NamedTuple):
-    """The tracks in one frame, a row for each of the M components.
-
-    - `boxes`: (m, 4), the mean box of each, centre and size in pixels.
-    - `identities`: (m,), a number that an object keeps for life, 0 for a dead component.
-    - `confirmed`: (m,), whether it has had enough detections to be taken for an object.
-    - `unseen`: (m,), frames since its last detection; 0 in a frame with one.
-    - `full`: whether a detection that would have started a component found no room.
-    - `shown`: (m,), which are confirmed, were detected a moment ago, and are not more
-      probably doubles of another one.
-    - `detections`: (m,), the row of the detection assigned to each in this frame, in what the
-      detector gave; -1 for none. Use it to look up class labels, masks and features.
-    """
-
-    boxes: Float[Array, "m 4"]
-    identities: Int[Array, " m"]
-    confirmed: Bool[Array, " m"]
-    unseen: Int[Array, " m"]
-    full: Bool[Array, ""]
-    shown: Bool[Array, " m"]
-    detections: Int[Array, " m"]
-
-    @classmethod
-    def of(cls, mixture: ParticleMixture, detections: Detections) -> "Tracks":
-        """The tracks in a mixture, after a step with these detections."""
-        lives: Lives = mixture.memory[LIVES]
-        return cls(
-            boxes=mean_boxes(mixture),
-            identities=lives.identities,
-            confirmed=lives.confirmed,
-            unseen=mixture.memory[LIVES].unseen,
-            full=lives.full,
-            shown=lives.shown,
-            detections=detections.rows_of(assigned_detections(mixture)),
-        )
-
-    @property
-    def corner_boxes(self) -> Float[Array | np.ndarray, "m 4"]:
-        """The boxes (x, y, w, h) with (x, y) the top-left corner, as files have them."""
-        sides = self.boxes[:, np.array([2, 3, 2, 3])]
-        return self.boxes - sides * np.array([[0.5, 0.5, 0, 0]], self.boxes.dtype)
+_COLOURS, _BANDS = HSVColours(8, 4, 6), 3
+# Of a weak detection, of an object that is not confirmed, and of one with another label.
+_WEAK_COST, _DOUBT_COST, _LABEL_COST = 8.0, 2.0, 8.0
+_WEAK_ERROR = 1.35  # times the error of a strong detection
+_YIELDING = 0.01  # of the claim of an object that takes only what others leave
+_BIRTH_OVERLAP = 0.5  # with an object or a stronger detection: it is one more box of the same
+_SAME = 0.5  # least overlap of a prediction that was right with the detection
+_CONTACT = 0.12  # an overlap from which on objects would learn each other's colours
+_FIRST = 3  # strong detections of an object after which it teaches the noises
 
 
 class ObjectTracker(eqx.Module):
-    """A mixture particle filter with a component for each object, born and ended by detections.
+    """Tracks an unknown and changing number of objects, with any detector.
 
-    `filter` is a `Filter` that starts empty; `run_filter` takes it, with `TrackedFrame`s for
-    observations. A step is a chain of moves on a `ParticleMixture`, each with a memory of its own:
+    Every object has a Kalman filter for its box. `step` is a function of the state and of what is
+    found in a frame; nothing is drawn at random. In a step
 
-    - `RankScores`: which detections are strong, by the scores seen so far;
-    - `FollowCamera`: the motion that all objects have in common;
-    - `Assign`: at most one detection for each component, at the least total cost;
-    - `LearnGuesses`: for how long an object without a detection is shown;
-    - a resampling, of the GM-MPF (Lin et al. 2012) or of the MPF (Vermaak et al. 2003), unless P is
-      1: the Gaussian of one particle is that particle;
-    - `PropagateObjects`: a Kalman prediction and update of each hypothesis, and its weight;
-    - `Deaths`: end components without detections, or outside the frame;
-    - `Births`: a component for each strong detection that no component explains;
-    - `LearnDoubles`: whether what appears beside an object is another one;
-    - `LearnNoise`: the detector's errors, and the noises of motion and growth;
-    - `LearnAppearance`: the colours of objects that stand alone;
-    - `ShareMass`: the same mixture weight for every object.
+    - objects move by their velocities, and by the motion that all have in common, the camera's;
+    - the detections' scores tell which are strong, by what became of earlier ones;
+    - each pair of object and detection has a probability in the joint distribution of all
+      one-to-one assignments; the most probable assignment is chosen, and an object follows its
+      detection by the probability of the pair, as in probabilistic data association;
+    - objects without detections, or outside the frame, end; strong detections that nobody explains
+      begin new ones;
+    - the detector's errors and the noises of the motion are learned from the innovations.
 
     Lengths are in boxes, so that nothing depends on the size of the frame or of the objects.
-    Particles carry Gaussian moments. With Gaussian regeneration a component is one Gaussian: P = 1
-    is enough and, unless particles are weighed by colours, nothing is drawn at random. With a
-    resampling, particles are rival hypotheses of the association. All moves except
-    `PropagateObjects` and the resampling depart from the exact recursion (`approximate`). Use it to
-    track an unknown and changing number of objects, with any detector.
 
-    - `max_objects`: M; `particles_per_object`: P. None takes P from the resampling, or else 1, or
-      16 where particles are weighed by colours.
+    - `max_objects`: M, how many objects there is room for.
     - `frames_per_second`: of the video. An object ends after a second without a detection. None
       takes 25.
-    - `resampling`: `Resample(particles_per_component=P)` for an MPF, or `GaussianRegeneration(P,
-      where=lambda states: (states.place, states.velocity))`, by default with stratified noise.
-    - `colours`: the bins of the histograms.
-    - `exact_colours`: count every pixel of a box by an integral histogram, whose cost grows with
-      the frame, in place of the grid of points of a `SampledHistogram`.
-    - `sigma`: weigh particles by their colours as well, as a `DetectedObjectModel` does; None, the
-      default, uses colours only to assign detections, which costs less.
-    - `strong_score`, `weak_score`: the score from which a detection starts a component, and the
-      least score that counts at all; None takes them from the scores seen so far.
-    - `moves`: a chain of your own in place of all of these, with settings of its own; colours are
-      learned where it holds a `LearnAppearance`, by whose bins.
+    - `scores`: "learned" finds from which score on a detection is strong, and starts an object.
+      "ignore" takes all for strong. A pair (weak, strong) has thresholds of your own: below weak a
+      detection counts for nothing.
+    - `class_matters`: "always" pairs objects with detections of their own label only, and does not
+      take those of another one for doubles. "prefers" is for detectors that mix up classes: another
+      label costs as much as a weak score does. False does not look at labels. The label 0 is none,
+      and goes with all.
 
-    Raises `ValueError` for a count that is not a whole number from 1 on, a rate or σ that is not
-    positive and finite, a weak score above the strong one, and a resampling that does not give
-    every component P particles or would redraw their labels. Raises `ValueError` for a setting
-    given beside `moves` that the moves have themselves, for moves that share one memory, and for a
-    move that needs the memory of a move that is missing.
+    Raises `ValueError` for a number of objects that is not whole, or below 1, a rate that is not
+    positive, and scores or classes that are none of these.
     """
 
-    filter: Filter
-    colours: AbstractColours
-    exact_colours: bool = eqx.field(static=True)
-    # The bands of a box whose colours are learned, where those of detections suffice for a step.
-    _bands: int | None = eqx.field(static=True)
+    max_objects: int = eqx.field(static=True)
+    rate: Float[Array | np.ndarray, ""]
+    scores: str | tuple[float, float] = eqx.field(static=True)
+    class_matters: str | bool = eqx.field(static=True)
 
     def __init__(
         self,
         max_objects: int = 24,
-        particles_per_object: int | None = None,
         *,
         frames_per_second: float | None = None,
-        resampling: AbstractResampling | None = None,
-        colours: AbstractColours | None = None,
-        exact_colours: bool = False,
-        sigma: float | None = None,
-        strong_score: float | None = None,
-        weak_score: float | None = None,
-        moves: Iterable[AbstractMove] | None = None,
+        scores: str | tuple[float, float] = "learned",
+        class_matters: str | bool = "always",
     ) -> None:
-        moves = tuple(moves) if is_series(moves) else moves
-        if particles_per_object is None:
-            particles_per_object = _enough_particles(resampling, moves, sigma)
-        check_whole(max_objects=max_objects, particles_per_object=particles_per_object)
-        check_positive(**given(frames_per_second=frames_per_second, sigma=sigma))
-        check_flag(exact_colours=exact_colours)
-        if moves is not None:
-            moves = _own_chain(
-                moves,
-                particles_per_object,
-                frames_per_second=frames_per_second,
-                resampling=resampling,
-                sigma=sigma,
-                strong_score=strong_score,
-                weak_score=weak_score,
-            )
-            colours = _learned_colours(moves, colours)
-        colours = HSVColours(8, 4, 6) if colours is None else colours
-        check_type(AbstractColours, "AbstractColours such as HSVColours()", colours=colours)
-        if moves is None:
-            is_alone = resampling is None and particles_per_object == 1
-            if resampling is None:
-                resampling = GaussianRegeneration(
-                    particles_per_object, where=_motion, noise="stratified"
-                )
-            _check_resampling(resampling, particles_per_object)
-            rate = 25.0 if frames_per_second is None else frames_per_second
-            model = object_model(rate, sigma)
-            assign = Assign(model)
-            deaths = Deaths(
-                patience=max(round(rate), 8),
-                longest_guess=max(round(0.1 * rate), 1),
-                longest_unsure=max(round(0.3 * rate), 1),
-            )
-            moves = (
-                RankScores(
-                    lasting=max(round(2 * rate), 10),
-                    strong_score=strong_score,
-                    weak_score=weak_score,
-                ),
-                FollowCamera(assign),
-                assign,
-                LearnGuesses(model, deaths),
-                *(() if is_alone else (resampling,)),
-                PropagateObjects(model, matched=isinstance(resampling, GaussianRegeneration)),
-                deaths,
-                Births(model, particles_per_object),
-                LearnDoubles(),
-                LearnNoise(model),
-                LearnAppearance(colours),
-                ShareMass(),
-            )
-        size = max_objects * particles_per_object
-        self.filter = Filter(NoObjectYet(), moves, size, max_objects, starts_empty=True)
-        self.colours = colours
-        self.exact_colours = bool(exact_colours)
-        learned = [move.num_parts for move in moves if isinstance(move, LearnAppearance)]
-        suffice = not exact_colours and len(learned) == 1 and all(map(_sees_detections, moves))
-        self._bands = learned[0] if suffice else None
+        check_whole(max_objects=max_objects)
+        check_positive(**given(frames_per_second=frames_per_second))
+        self.max_objects = max_objects
+        # An array, so that one program serves all rates.
+        self.rate = np.asarray(frames_per_second or 25, np.float32)
+        self.scores = _checked_scores(scores)
+        if class_matters is not False:
+            check_one_of(("always", "prefers"), class_matters=class_matters)
+        self.class_matters = class_matters
 
-    @property
-    def moves(self) -> tuple[AbstractMove, ...]:
-        """The moves of one step."""
-        return self.filter.moves
+    def init(self) -> TrackerState:
+        """The state before the first frame: no objects."""
+        m = self.max_objects
+        state = TrackerState(
+            objects=Gaussian.nowhere(m),
+            lives=Lives.initial(m),
+            guesses=Guesses.initial(),
+            doubles=Doubles.initial(m),
+            scores=ScoreState.initial(m),
+            camera=CameraState.initial(),
+            noise=NoiseState.initial(m, float(self.rate)),
+            colours=zeros(m, _BANDS * _COLOURS.num_bins),
+        )
+        return jax.tree.map(jnp.asarray, state)
 
-    @property
-    def max_objects(self) -> int:
-        """M, how many objects there is room for."""
-        return self.filter.num_components
-
-    @property
-    def particles_per_object(self) -> int:
-        """P."""
-        return self.filter.num_particles // self.filter.num_components
-
-    @property
-    def approximate(self) -> bool:
-        """Whether any move departs from the exact recursion."""
-        return self.filter.approximate
-
-    def init(self) -> ParticleMixture:
-        """The state before the first frame: every component dead, every slot empty."""
-        return _begin(self.filter)
-
-    @eqx.filter_jit
     def step(
         self,
-        key: Key[Array, ""],
-        state: ParticleMixture,
-        frame: UInt8[Array, "h w 3"] | SampledBoxes | None,
+        key: Key[Array, ""] | None,
+        state: TrackerState,
+        frame: UInt8[np.ndarray, "h w 3"] | SampledBoxes | None,
         detections: Detections,
         motion: CameraMotion | None = None,
-    ) -> tuple[ParticleMixture, Tracks]:
+    ) -> tuple[TrackerState, Tracks]:
         """The state after a frame and its detections, and the tracks in it.
 
         The result of `look` may be given in place of the frame. Where `frame` is None detections
         are tracked alone, without colours. `motion` is what `OpticalFlow` makes of the frames; None
-        leaves the camera's motion to the detections. Frames may have any size, but each new size
-        compiles anew, and boxes keep their places in pixels. Raises `ValueError` for a frame that
-        is not (h, w, 3) of type uint8, and for anything but `Detections`.
+        leaves the camera's motion to the detections. Nothing is drawn: the key may be None. Raises
+        `ValueError` for a frame that is not (h, w, 3) of type uint8, and for anything but
+        `Detections` and a state of `init`.
         """
+        del key
         check_type(Detections, "Detections, as from_boxes makes them", detections=detections)
-        seen = TrackedFrame(detections, self._pixels(frame), motion)
-        state, _, _ = step_and_faults(self.filter, key, state, seen)
-        return state, Tracks.of(state, detections)
+        check_type(TrackerState, "a state, as init and step return it", state=state)
+        if frame is not None and not isinstance(frame, SampledBoxes):
+            frame = self.look(frame, detections)
+        return _advanced(self, state, detections, frame, motion)
 
-    def look(
-        self, frame: UInt8[np.ndarray, "h w 3"], detections: Detections
-    ) -> SampledBoxes | UInt8[np.ndarray, "h w 3"]:
-        """The part of a frame that `step` needs: the detections' colours, where these suffice.
+    def look(self, frame: UInt8[np.ndarray, "h w 3"], detections: Detections) -> SampledBoxes:
+        """The part of a frame that `step` needs: the detections' colours.
 
-        The time of a step then does not depend on the size of the frame, and a new size does not
-        compile anew. The result is the whole frame where particles are weighed by their colours,
-        where colours are exact, and for a chain that holds moves of other kinds than the default
-        chain. Raises `ValueError` for a frame as `step` does.
+        Raises `ValueError` for a frame as `step` does.
         """
-        if self._bands is None:
-            return frame
-        return SampledBoxes.of(frame, np.asarray(detections.boxes), self.colours, self._bands)
-
-    def _pixels(self, frame: Any) -> Pixels | None:
-        if frame is None or isinstance(frame, SampledBoxes):
-            return frame
-        if self.exact_colours:
-            wide = frame.shape[0] * frame.shape[1] >= _LARGEST_NARROW
-            return integral_histogram(frame, self.colours, wide)
-        return SampledHistogram(frame, self.colours)
+        return SampledBoxes.of(np.asarray(frame), np.asarray(detections.boxes), _COLOURS, _BANDS)
 
 
-@eqx.filter_jit
-def _begin(filter: Filter) -> ParticleMixture:
-    """All of the initial state in one program; operation by operation it would be some forty."""
-    return filter.init(jax.random.key(0))
+def _checked_scores(scores: Any) -> str | tuple[float, float]:
+    if isinstance(scores, str) and scores in ("learned", "ignore"):
+        return scores
+    if not isinstance(scores, tuple) or len(scores) != 2:
+        raise ValueError(
+            f'scores: {shown(scores)} is neither "learned" nor "ignore", nor a pair (weak, strong)'
+        )
+    weak, strong = scores
+    check_finite(**{"scores: weak": weak, "scores: strong": strong})
+    if weak > strong:
+        raise ValueError(f"scores: the weak one, {weak}, is above the strong one, {strong}")
+    return float(weak), float(strong)
 
 
-def object_model(
-    frames_per_second: float = 25.0, sigma: float | None = None
-) -> DetectedObjectModel:
-    """The model of objects before anything is learned, at a frame rate.
+class _Found(NamedTuple):
+    """The detections of a frame, and what they are to each other.
 
-    At a lower frame rate new objects may move further in a frame. Raises `ValueError` for a rate or
-    σ that is not positive.
+    - `places`: (d, 4); `colours`: (d, bins), None without pixels; `extent`: of the frame.
+    - `stronger`: (d, d), whether the first of a pair is; `overlaps`: (d, d).
     """
-    check_positive(frames_per_second=frames_per_second)
-    model = DetectedObjectModel(sigma=sigma)
-    speeds = model.start_velocity * min(25 / frames_per_second, 2.5)
-    return eqx.tree_at(lambda model: model.start_velocity, model, speeds)
+
+    detections: Detections
+    places: Float[Array, "d 4"]
+    colours: Float[Array, "d bins"] | None
+    extent: Float[Array, "4"]
+    stronger: Bool[Array, "d d"]
+    overlaps: Float[Array, "d d"]
+
+    @classmethod
+    def of(cls, detections: Detections, seen: SampledBoxes | None) -> "_Found":
+        """Compare all with all."""
+        colours, extent, boxes = None, detections.extent, detections.boxes
+        if seen is not None:
+            extent = jnp.array([0, 0, 1, 1]) * jnp.tile(jnp.stack([seen.width, seen.height]), 2)
+            extent = extent.astype(boxes.dtype)
+            colours = normalise(seen.counts(_BANDS)).reshape(len(boxes), -1)
+        ranked = stronger(detections.scores, jnp.prod(boxes[:, 2:], axis=1))
+        return cls(detections, places_of(boxes), colours, extent, ranked, overlap(boxes, boxes))
 
 
-def _enough_particles(resampling: Any, moves: Any, sigma: float | None) -> int:
-    """P of the resampling, or else the least number that represents what is drawn."""
-    for move in [resampling] if moves is None or not is_series(moves) else moves:
-        number = getattr(move, "particles_per_component", None)
-        if number is not None:
-            return number
-    nothing_drawn = resampling is None and moves is None and sigma is None
-    return 1 if nothing_drawn else RIVALS_PER_OBJECT
+class _Taken(NamedTuple):
+    """The detection of each object: its row, whether there is any, and a strong one; its place."""
+
+    rows: Int[Array, " m"]
+    there: Bool[Array, " m"]
+    strong: Bool[Array, " m"]
+    place: Float[Array, "m 4"]
+
+    @classmethod
+    def of(cls, source: Int[Array, " m"], strong: Bool[Array, " d"], found: _Found) -> "_Taken":
+        """By the rows, -1 for none."""
+        rows, there = jnp.maximum(source, 0), source >= 0
+        return cls(rows, there, there & strong[rows], found.places[rows])
 
 
-def _own_chain(
-    moves: Iterable[AbstractMove], particles_per_object: int, **settings: Any
-) -> tuple[AbstractMove, ...]:
-    """The user's moves, or a `ValueError` for settings beside them and moves that do not fit."""
-    if not is_series(moves):
-        raise ValueError(f"moves: {shown(moves)} is not a sequence of moves")
-    for name, value in given(**settings).items():
-        raise ValueError(
-            f"{name}: {shown(value)} is given beside moves, which have settings of their own"
-        )
-    chain = tuple(moves)
-    for move in chain:
-        check_type(AbstractMove, "a sequence of moves", moves=move)
-        if isinstance(move, AbstractResampling):
-            _check_resampling(move, particles_per_object, "moves")
-    if not any(isinstance(move, Deaths) for move in chain):
-        raise ValueError(f"moves: {shown(chain)} lacks Deaths, which keeps the list of objects")
-    return chain
+def advanced(
+    tracker: ObjectTracker,
+    state: TrackerState,
+    detections: Detections,
+    seen: SampledBoxes | None = None,
+    motion: CameraMotion | None = None,
+) -> tuple[TrackerState, Tracks]:
+    """A step as a pure function, for `jax.lax.scan` and for programs of your own."""
+    if tracker.scores == "ignore":
+        same = jnp.ones_like(detections.scores)
+        detections = eqx.tree_at(lambda found: found.scores, detections, same)
+    found, lives = _Found.of(detections, seen), state.lives
+    spans = Spans.at(jnp.asarray(tracker.rate))
+    labels = jnp.broadcast_to(detections.labels, detections.valid.shape).astype(jnp.int32)
+    alike = compatible(lives.labels, labels)
+    strictly = tracker.class_matters == "always"
+    if strictly:
+        together = compatible(labels, labels)
+        found = found._replace(overlaps=jnp.where(together, found.overlaps, 0.0))
+    unlike = unlikeness(found.colours, state.colours)
+    if tracker.class_matters == "prefers":
+        unlike += jnp.where(alike, 0.0, _LABEL_COST)
+    unlike = jnp.where(alike | (not strictly), unlike, jnp.inf)
 
+    objects, noise, camera, shift = _moved(state, found, unlike, motion)
+    errors, speed = noise.noises.errors, noise.noises.speed
+    scores = state.scores.after(detections, found.stronger, found.overlaps, shift, spans.lasting)
+    if isinstance(tracker.scores, tuple):
+        weak, strong = (jnp.full_like(scores.weak, score) for score in tracker.scores)
+        scores = scores._replace(weak=weak, strong=strong)
+    strong = detections.valid & (detections.scores >= scores.strong)
 
-def _learned_colours(
-    moves: Iterable[AbstractMove], colours: AbstractColours | None
-) -> AbstractColours | None:
-    """The bins of the chain's `LearnAppearance`; `colours`, if given, have to be the same."""
-    for move in moves:
-        if isinstance(move, LearnAppearance):
-            if colours is not None and not eqx.tree_equal(colours, move.colours):
-                raise ValueError(
-                    f"colours: {shown(colours)} are not those of LearnAppearance, {move.colours}"
-                )
-            return move.colours
-    return colours
+    cost = mahalanobis(objects, errors, found.places) + unlike
+    cost += jnp.where(strong, 0.0, _WEAK_COST)[None]
+    cost += jnp.where(lives.confirmed, 0.0, _DOUBT_COST)[:, None]
+    counts = detections.valid & (detections.scores >= scores.weak)
+    possible = lives.alive[:, None] & counts[None] & (cost < 0)
+    cost = jnp.where(state.doubles.doubtful[:, None], _YIELDING * cost, cost)
+    cost = jnp.where(possible, cost, jnp.inf)
+    probability, source = probabilities(cost), one_to_one(cost)
+    taken = _Taken.of(source, strong, found)
+    predicted = boxes_of(objects.place)
+    right = shared(predicted, detections.boxes[taken.rows]) >= _SAME
+    error = units(taken.place) * errors[None] * jnp.where(taken.strong, 1.0, _WEAK_ERROR)[:, None]
+    updated, _, _ = objects.updated(taken.place, error)
+    trust = jnp.take_along_axis(probability, taken.rows[:, None], axis=1)
+    objects = updated.mixed_with(objects, jnp.where(taken.there[:, None], trust, 0.0))
 
+    boxes = boxes_of(objects.place)
+    inside = within(boxes, found.extent, centred=~taken.there)
+    guess = state.guesses.longest(spans)
+    stayed = lives.counted(taken.there, taken.strong, inside, spans, guess)
+    guesses = state.guesses.after(lives, stayed, taken.there, right, spans)
 
-def _check_resampling(
-    resampling: AbstractResampling, particles_per_object: int, argument: str = "resampling"
-) -> None:
-    check_type(AbstractResampling, "a resampling move", **{argument: resampling})
-    number = getattr(resampling, "particles_per_component", None)
-    # Another number would leave no empty slots for new components.
-    if number != particles_per_object:
-        raise ValueError(
-            f"{argument}: its particles_per_component, {number}, is not particles_per_object,"
-            f" {particles_per_object}"
-        )
-    if isinstance(resampling, GaussianRegeneration) and resampling.where is None:
-        raise ValueError(
-            f"{argument}: where is None, but the label of a particle's object is not Gaussian"
-        )
+    stays = stayed.alive
+    covered = stays[:, None] & (overlap(boxes, detections.boxes) > _BIRTH_OVERLAP)
+    covered &= alike | (not strictly)
+    free = jnp.ones_like(strong).at[_or_past(source, strong)].set(False, mode="drop")
+    wanted = strong & free & within(detections.boxes, found.extent) & ~jnp.any(covered, axis=0)
+    doubles = (found.overlaps > _BIRTH_OVERLAP) & wanted[:, None] & found.stronger
+    wanted &= ~jnp.any(doubles, axis=0)
+    begun = seated(wanted, found.stronger, ~stays)
+    taken = _Taken.of(jnp.where(stays, source, begun), strong, found)
+    born, unit = begun >= 0, units(taken.place)
+    start = Gaussian.begun(taken.place, unit * errors[None], unit * speed[None])
+    objects = start.where(born, objects)
+    told = jnp.where(taken.there, labels[taken.rows], 0)
+    lives = stayed.begins(born, told, jnp.sum(wanted, dtype=jnp.int32))
 
-
-def _sees_detections(move: AbstractMove) -> bool:
-    """Whether the move uses the colours of detections alone, or none."""
-    if isinstance(move, PropagateObjects):
-        return move.model.sigma is None
-    kinds = (
-        RankScores,
-        Assign,
-        AbstractResampling,
-        Deaths,
-        Births,
-        LearnAppearance,
+    boxes = boxes_of(objects.place)
+    overlaps = overlap(boxes, boxes)
+    if strictly:
+        overlaps = jnp.where(compatible(lives.labels, lives.labels), overlaps, 0.0)
+    second = state.doubles.after(lives.identities, stays, taken.there, overlaps)
+    lives = lives._replace(shown=lives.shown & ~second.doubtful)
+    teaches = taken.strong & stays
+    noise = noise.after(
+        taken.place,
+        taken.there & stays,
+        teaches & lives.confirmed & (lives.seen >= _FIRST),
+        born,
+        teaches & (lives.seen == _FIRST),
+        objects,
     )
-    learning = (LearnDoubles, LearnGuesses, LearnNoise)
-    return isinstance(move, (*kinds, *learning, FollowCamera, ShareMass))
+    colours = state.colours
+    if found.colours is not None:
+        others = lives.alive[None] & ~jnp.eye(len(boxes), dtype=bool)
+        alone = ~jnp.any((overlaps > _CONTACT) & others, axis=1)
+        seen_now = jnp.where(taken.there[:, None], found.colours[taken.rows], 0.0)
+        colours = learned_colours(jnp.where(born[:, None], 0.0, colours), seen_now, alone)
+    state = TrackerState(objects, lives, guesses, second, scores, camera, noise, colours)
+    rows = detections.rows_of(jnp.where(taken.there, taken.rows, -1))
+    shown = lives.identities, lives.confirmed, lives.unseen, lives.full, lives.shown
+    return state, Tracks(boxes, *shown, rows)
 
 
-def _motion(states: ObjectState) -> tuple[PyTree, PyTree]:
-    return states.place, states.velocity
+_advanced = eqx.filter_jit(advanced)
+
+
+def _moved(
+    state: TrackerState,
+    found: _Found,
+    unlike: Float[Array, "m d"],
+    motion: CameraMotion | None,
+) -> tuple[Gaussian, NoiseState, CameraState, Float[Array, "2"]]:
+    """Objects a frame later, moved with the camera, and by how far that was."""
+    before, noise, gone = state.objects, state.noise, None
+    deviations = state.camera.deviations
+    if motion is not None:
+        carried = motion.carried(before)
+        gone = (carried.place - before.place)[:, :2]
+        before, noise = carried, noise._replace(moments=motion.carried(noise.moments))
+        deviations = jnp.where(motion.known, state.camera.left, deviations)
+    errors, place, velocity, _ = noise.noises
+    objects = before.predicted(place[None], velocity[None])
+    confirmed = state.lives.confirmed
+    number = jnp.maximum(jnp.sum(confirmed, dtype=objects.place.dtype), 1.0)
+    box = jnp.exp(jnp.sum(jnp.where(confirmed[:, None], objects.place[:, 2:], 0.0), 0) / number)
+    cost = mahalanobis(objects, errors, found.places, 2 * deviations * box) + unlike
+    strong = found.detections.valid & (found.detections.scores >= state.scores.strong)
+    cost = jnp.where(confirmed[:, None] & strong[None], cost, jnp.inf)
+    known = jnp.asarray(False) if motion is None else jnp.asarray(motion.known)
+    camera, shift = state.camera.after(objects, gone, known, cost, errors, found.places, box)
+    noise = noise._replace(moments=noise.moments.shifted(shift))
+    return objects.shifted(shift), noise, camera, shift
+
+
+def _or_past(source: Int[Array, " m"], rows: Array) -> Int[Array, " m"]:
+    """The rows, with one past the last for none, which a scatter drops."""
+    return jnp.where(source >= 0, source, len(rows))
