@@ -2,18 +2,19 @@
 
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Key
 from tqdm import tqdm
 
 import mpfjax
 from benchmarks.visual_tracking.source import Source
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractMove, AbstractPropagation
 from mpfjax.vision import (
     BackgroundSubtraction,
     Detections,
@@ -22,12 +23,14 @@ from mpfjax.vision import (
     offline_rows,
 )
 from mpfjax.vision.boxes.snapshots import Snapshot
+from mpfjax.vision.tracking.gaussian import Gaussian, boxes_of, places_of, units
 from mpfjax.vision.tracking.state import TrackerState
+from mpfjax.vision.tracking.tracker import WEAK_ERROR
 
-MAX_DETECTIONS, MAX_OBJECTS, PARTICLES = 32, 24, 200
-# Standard deviations along (x, y, log w, log h), in boxes.
-ERRORS, START_VELOCITY = (0.1, 0.06, 0.12, 0.08), (0.1, 0.05, 0.02, 0.02)
-PLACE_NOISE, VELOCITY_NOISE = (0.03, 0.02, 0.03, 0.02), (0.01, 0.006, 0.0005, 0.0005)
+MAX_DETECTIONS, MAX_OBJECTS, PARTICLES = 32, 24, 16
+DECIDED = "decided"
+# Weights within a component differ by at most the factor e^30.
+FARTHEST = 30.0
 
 
 class Detected(NamedTuple):
@@ -49,40 +52,169 @@ def detect_all(source: Source) -> Detected:
     return Detected(boxes, seconds)
 
 
+class Seen(NamedTuple):
+    """A frame: its detections, and their colours."""
+
+    detections: Detections
+    colours: Any
+
+
+class Decided(NamedTuple):
+    """What the detections say of the components: the tracker's state and tracks, and births."""
+
+    tracker: TrackerState
+    tracks: Tracks
+    born: Array
+
+
+class NobodyYet(mpfjax.AbstractStateSpaceModel):
+    """x_0 of a mixture whose components detections start: `FollowDetections` moves them."""
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Gaussian:
+        """Boxes of one pixel."""
+        del key
+        return Gaussian(*(jnp.zeros((num_particles, 4)) for _ in Gaussian._fields))
+
+    def sample_transition(self, key: Key[Array, ""], states: Gaussian) -> Gaussian:
+        """The same."""
+        del key
+        return states
+
+    def log_likelihood(self, observation: Seen, states: Gaussian) -> Float[Array, " n"]:
+        """None."""
+        del observation
+        return jnp.zeros(len(states.place))
+
+
+class Seats(AbstractMove):
+    """The initial components, P particles each. They stand for nobody as yet."""
+
+    weighs = False
+    keeps_mass = True
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: Any
+    ) -> ParticleMixture:
+        """Deal the particles out."""
+        del key, observation
+        seats = jnp.arange(mixture.num_particles, dtype=jnp.int32) // PARTICLES
+        return mixture.replace(component_indicators=seats)
+
+
+class Decide(AbstractMove):
+    """Which detection each component has, which components end and which begin.
+
+    As an `ObjectTracker` decides it, with the moments of the particles in the place of its own.
+    """
+
+    tracker: ObjectTracker
+    start: TrackerState
+    approximate = True
+    weighs = False
+    keeps_mass = True
+
+    def initial_memory(self, num_components: int) -> dict[str, Any]:
+        """Nobody, and no detection."""
+        m, none = num_components, jnp.zeros(num_components, jnp.int32)
+        never = jnp.zeros(m, bool)
+        tracks = Tracks(
+            jnp.zeros((m, 4)), none, never, none, jnp.zeros((), bool), never, none - 1, jnp.zeros(m)
+        )
+        return {DECIDED: Decided(self.start, tracks, never)}
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: Seen
+    ) -> ParticleMixture:
+        """Remember what is decided."""
+        before = mixture.memory[DECIDED].tracker
+        state = before._replace(objects=moments(mixture))
+        state, tracks = self.tracker.step(None, state, observation.colours, observation.detections)
+        born = (tracks.identities > 0) & (tracks.identities != before.lives.identities)
+        decided = {DECIDED: Decided(state, tracks, born)}
+        return mixture.replace(memory=mixture.memory | decided)
+
+
+class FollowDetections(AbstractPropagation):
+    """Predict every hypothesis, update it by its component's detection, and weigh it.
+
+    A particle carries the Gaussian moments of place and velocity given its detections
+    (Rao-Blackwellisation). The detection is the object's own with the probability p of the pair. A
+    particle follows it, or only the prediction, as is drawn by the posterior probability of the
+    two: particles of a component are rival hypotheses. Where a component is one Gaussian
+    (`matched`), a particle has the moments of both. Particle i has the weight
+
+        w_i = p Z_i / Z + 1 - p
+
+    where Z_i is its predictive density of the detection, and Z the mean of Z_i in the component.
+    All components have the same mixture weight: they stand for objects that all exist, and not for
+    rival hypotheses. Particles of a component that begins are about its detection.
+    """
+
+    matched: bool = eqx.field(static=True)
+    approximate = True
+    keeps_parents = False
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: Seen
+    ) -> ParticleMixture:
+        """Follow the detections, and begin components."""
+        decided, found = mixture.memory[DECIDED], observation.detections
+        noises, owner = decided.tracker.noise.noises, mixture.component_indicators
+        mine = found.rows[None] == decided.tracks.detections[:, None]
+        rows = jnp.argmax(mine, axis=1)
+        place, there = places_of(found.boxes[rows]), jnp.any(mine, axis=1)[owner]
+        weak = found.scores[rows] < decided.tracker.scores.strong
+        unit = units(place)
+        error = unit * noises.errors[None]
+        wide = error * jnp.where(weak, WEAK_ERROR, 1.0)[:, None]
+        moved = mixture.particles.predicted(noises.place[None], noises.velocity[None])
+        updated, gap, variance = moved.updated(place[owner], wide[owner])
+        log_z = -0.5 * jnp.sum(gap**2 / variance + jnp.log(variance), axis=1)
+        offset = log_z - mixture.component_averages(log_z)[owner]
+        ratio = jnp.exp(jnp.clip(offset, -FARTHEST, FARTHEST))
+        p = decided.tracks.probabilities[owner]
+        own = p * ratio / mixture.component_averages(ratio)[owner]
+        factor = jnp.where(there, own + 1 - p, 1.0)
+        share = jnp.where(there, own / factor, 0.0)
+        if not self.matched:
+            share = jnp.where(jax.random.uniform(key, share.shape) < share, 1.0, 0.0)
+        particles = updated.mixed_with(moved, share[:, None])
+        begun = Gaussian.begun(place, error, unit * noises.speed[None])
+        begun = Gaussian(*(moment[owner] for moment in begun))
+        born = decided.born[owner]
+        weights = jnp.where(born, 1.0, mixture.component_weights * factor)
+        total = mixture.replace(log_weights=jnp.log(weights))
+        log_weights = total.log_component_weights - jnp.log(1.0 * MAX_OBJECTS)
+        return mixture.replace(particles=begun.where(born, particles), log_weights=log_weights)
+
+
+def moments(mixture: ParticleMixture) -> Gaussian:
+    """Those of each component: of the mixture of its particles' Gaussians."""
+    particles, owner = mixture.particles, mixture.component_indicators
+    place, velocity, *spread = (mixture.component_averages(row) for row in particles)
+    away, away_velocity = particles.place - place[owner], particles.velocity - velocity[owner]
+    products = away**2, away * away_velocity, away_velocity**2
+    between = (mixture.component_averages(row) for row in products)
+    return Gaussian(place, velocity, *(a + b for a, b in zip(spread, between, strict=True)))
+
+
 def make_mixtures() -> dict[str, mpfjax.Filter]:
-    """Each component's filter: with resampling, and with Gaussian regeneration.
+    """The same chain with resampling and with Gaussian regeneration."""
+    tracker = ObjectTracker(MAX_OBJECTS)
 
-    A component is an object, so that the components of a mixture have the same weight and are
-    filters side by side. Place (x, y, log w, log h) and velocity are in boxes.
-    """
-    place, velocity = np.array(PLACE_NOISE), np.array(VELOCITY_NOISE)
-    model = mpfjax.LinearGaussianModel(
-        A=np.kron([[1.0, 1.0], [0.0, 1.0]], np.eye(4)),
-        Q=np.diag(np.concatenate([place, velocity]) ** 2),
-        H=np.eye(4, 8),
-        R=np.diag(np.array(ERRORS) ** 2),
-        m0=np.zeros(8),
-        P0=np.diag(np.concatenate([ERRORS, START_VELOCITY]) ** 2),
-    )
-    # Of the model's own transition most particles would miss a detection's sharp likelihood.
-    guided = mpfjax.GaussNewtonProposal(model, num_iterations=1, inflation=1.0)
+    def chain(resampling: AbstractMove, matched: bool) -> mpfjax.Filter:
+        moves = Decide(tracker, tracker.init()), resampling, FollowDetections(matched)
+        size = MAX_OBJECTS * PARTICLES
+        return mpfjax.Filter(NobodyYet(), moves, size, MAX_OBJECTS, initial_moves=[Seats()])
+
+    def motion(states: Gaussian) -> tuple[Array, Array]:
+        return states.place, states.velocity
+
+    regenerated = mpfjax.GaussianRegeneration(PARTICLES, where=motion, noise="stratified")
     return {
-        "mpf": mpfjax.particle_filter(model, PARTICLES, proposal=guided),
-        "gm_mpf": mpfjax.gaussian_particle_filter(model, PARTICLES, proposal=guided),
+        "mpf": chain(mpfjax.Resample(particles_per_component=PARTICLES), matched=False),
+        "gm_mpf": chain(regenerated, matched=True),
     }
-
-
-class Born(NamedTuple):
-    """A mixture whose components are born and ended by the detections of a tracker.
-
-    `identities` and `units` are of the object of each component; `clouds` are its particles, with
-    axes for runs and components.
-    """
-
-    tracked: TrackerState
-    identities: Int[Array, " m"]
-    units: Float[Array, "m 4"]
-    clouds: mpfjax.ParticleMixture
 
 
 def track_detected(
@@ -96,77 +228,41 @@ def track_detected(
     tracker = ObjectTracker(MAX_OBJECTS)
 
     def frames_of_run(bar: tqdm) -> Iterator[tuple[Snapshot, float]]:
-        none, runs = jnp.zeros(MAX_OBJECTS, jnp.int32), (len(keys), MAX_OBJECTS)
-        clouds = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (*runs, *leaf.shape)), filter.init(keys[0])
-        )
-        born = Born(tracker.init(), none, jnp.ones((MAX_OBJECTS, 4)), clouds)
+        mixtures = jax.vmap(filter.init)(keys)
         for t, (still, boxes) in enumerate(zip(source.read(), detected.boxes, strict=True)):
             start = time.perf_counter()
             found = Detections.from_boxes(boxes, MAX_DETECTIONS)
-            seen = tracker.look(still, found)
-            born, tracks, snapshot = _advance(
-                tracker, filter, keys, jnp.asarray(t), born, seen, found
-            )
+            seen = Seen(found, tracker.look(still, found))
+            mixtures, tracks, snapshot = _advance(filter, keys, jnp.asarray(t), mixtures, seen)
             kept.append(jax.tree.map(np.asarray, tracks))
             snapshot = jax.tree.map(np.asarray, snapshot)
             bar.update()
             yield snapshot, time.perf_counter() - start + detected.seconds[t]
 
     def rows_of_run(snapshots: list[Snapshot]) -> list[np.ndarray]:
-        tracked = list(zip(kept, snapshots, strict=False))
+        tracked = kept[: len(snapshots)]
         return [
-            offline_rows((now._replace(boxes=of.means[run]) for now, of in tracked), source.first)
+            offline_rows((_of_run(tracks, run) for tracks in tracked), source.first)
             for run in range(len(keys))
         ]
 
     return frames_of_run, rows_of_run
 
 
+def _of_run(tracks: Tracks, run: int) -> Tracks:
+    return jax.tree.map(lambda leaf: leaf[run], tracks)
+
+
 @eqx.filter_jit
-def _advance(tracker, filter, keys, t, born: Born, seen, found):
-    tracked, tracks = tracker.step(None, born.tracked, seen, found)
-    mine = found.rows[None] == tracks.detections[:, None]
-    boxes = found.boxes[jnp.argmax(mine, axis=1)]
-    there = tracks.detections >= 0
-    new = tracks.identities != born.identities
-    sizes = jnp.concatenate([boxes[:, 2:], jnp.ones_like(boxes[:, 2:])], axis=1)
-    units = jnp.where(there[:, None], sizes, born.units)
-    ratios = jnp.tile(born.units / units, 2)
-    places = boxes.at[:, 2:].set(jnp.log(boxes[:, 2:])) / units
+def _advance(filter, keys, t, mixtures, seen):
+    def step(key, mixture):
+        mixture, _ = filter.step(jax.random.fold_in(key, t), mixture, seen)
+        tracks = mixture.memory[DECIDED].tracks
+        means = boxes_of(mixture.component_averages(mixture.particles.place))
+        owner = mixture.component_indicators
+        labels = jnp.where(tracks.identities[owner] > 0, owner, -1)
+        points = mixture.particles.place[:, :2]
+        snapshot = Snapshot(means, tracks.shown, points, labels)
+        return mixture, tracks._replace(boxes=means), snapshot
 
-    def component(key, cloud, ratio, place, there, new):
-        cloud = cloud.replace(particles=cloud.particles * ratio[None])
-        begun = filter.init(key)
-        begun = begun.replace(particles=begun.particles.at[:, :4].add(place[None]))
-        updated, predicted = filter.step(key, cloud, place)[0], filter.predict(key, cloud)[0]
-        moved = jax.tree.map(partial(jnp.where, there), updated, predicted)
-        return jax.tree.map(partial(jnp.where, new), begun, moved)
-
-    def run(key, clouds):
-        split = jax.random.split(jax.random.fold_in(key, t), len(units))
-        return jax.vmap(component)(split, clouds, ratios, places, there, new)
-
-    clouds = jax.vmap(run)(keys, born.clouds)
-    if any(isinstance(move, mpfjax.GaussianRegeneration) for move in filter.moves):
-        clouds = _redrawn(jax.random.fold_in(keys[0], t), clouds, tracked.objects, units)
-    weights = jax.nn.softmax(clouds.log_weights, axis=-1)
-    means = jnp.sum(weights[..., None] * clouds.particles[..., :4], axis=2) * units[None]
-    means = means.at[..., 2:].set(jnp.exp(means[..., 2:]))
-    runs, m, n = weights.shape
-    points = clouds.particles[..., :2] * units[None, :, None, :2]
-    owners = jnp.where(tracks.identities > 0, jnp.arange(m, dtype=jnp.int32), -1)
-    labels = jnp.broadcast_to(owners[None, :, None], (runs, m, n)).reshape(runs, -1)
-    shown = jnp.broadcast_to(tracks.shown[None], (runs, m))
-    snapshot = Snapshot(means, shown, points.reshape(runs, -1, 2), labels)
-    return Born(tracked, tracks.identities, units, clouds), tracks, snapshot
-
-
-def _redrawn(key, clouds, gaussian, units):
-    """Particles drawn anew from the Gaussian of each component, about its mean."""
-    noise = jax.random.normal(key, (*clouds.particles.shape[:-1], 4))
-    noise -= jnp.mean(noise, axis=2, keepdims=True)
-    places = gaussian.place[None, :, None] + jnp.sqrt(gaussian.var_place)[None, :, None] * noise
-    particles = clouds.particles.at[..., :4].set(places / units[None, :, None])
-    drawn = particles, jnp.zeros_like(clouds.log_weights)
-    return eqx.tree_at(lambda mixture: (mixture.particles, mixture.log_weights), clouds, drawn)
+    return jax.vmap(step)(keys, mixtures)

@@ -383,7 +383,7 @@ def said(identities, confirmed, shown):
     unseen = np.zeros(len(identities), int)
     return Tracks(
         boxes, np.array(identities), np.array(confirmed), unseen, np.array(False), np.array(shown),
-        np.full(len(identities), -1),
+        np.full(len(identities), -1), np.zeros(len(identities)),
     )  # fmt: skip
 
 

@@ -96,6 +96,7 @@ def _advance(
     means = mixture.component_averages(model.boxes(mixture.particles))
     identities = jnp.where(held, jnp.arange(1, num_objects + 1, dtype=jnp.int32), 0)
     unseen = jnp.zeros(num_objects, jnp.int32)
-    none = jnp.full(num_objects, -1, jnp.int32)
-    tracks = Tracks(means[best], identities, held, unseen, jnp.zeros((), bool), held, none)
+    none, never = jnp.full(num_objects, -1, jnp.int32), jnp.zeros(num_objects)
+    full = jnp.zeros((), bool)
+    tracks = Tracks(means[best], identities, held, unseen, full, held, none, never)
     return mixture, tracks, faults

@@ -44,6 +44,7 @@ class Tracks(NamedTuple):
       doubles of another one.
     - `detections`: (m,), the row of the detection assigned to each in this frame, in what the
       detector gave; -1 for none. Use it to look up masks and features.
+    - `probabilities`: (m,), that this detection is the object's own; 0 where there is none.
     """
 
     boxes: Float[Array, "m 4"]
@@ -53,6 +54,7 @@ class Tracks(NamedTuple):
     full: Bool[Array, ""]
     shown: Bool[Array, " m"]
     detections: Int[Array, " m"]
+    probabilities: Float[Array, " m"]
 
     @property
     def corner_boxes(self) -> Float[Array | np.ndarray, "m 4"]:

@@ -51,7 +51,7 @@ from mpfjax.vision.tracking.state import TrackerState, Tracks
 _COLOURS, _BANDS = HSVColours(8, 4, 6), 3
 # Of a weak detection, of an object that is not confirmed, and of one with another label.
 _WEAK_COST, _DOUBT_COST, _LABEL_COST = 8.0, 2.0, 8.0
-_WEAK_ERROR = 1.35  # times the error of a strong detection
+WEAK_ERROR = 1.35  # times the error of a strong detection
 _YIELDING = 0.01  # of the claim of an object that takes only what others leave
 _BIRTH_OVERLAP = 0.5  # with an object or a stronger detection: it is one more box of the same
 _SAME = 0.5  # least overlap of a prediction that was right with the detection
@@ -177,27 +177,41 @@ def _checked_scores(scores: Any) -> str | tuple[float, float]:
 class _Found(NamedTuple):
     """The detections of a frame, and what they are to each other.
 
-    - `places`: (d, 4); `colours`: (d, bins), None without pixels; `extent`: of the frame.
-    - `stronger`: (d, d), whether the first of a pair is; `overlaps`: (d, d).
+    - `places`: (d, 4); `labels`: (d,), 0 where they do not matter; `extent`: of the frame.
+    - `colours`: (d, bins), None without pixels.
+    - `stronger`: (d, d), whether the first of a pair is; `overlaps`: (d, d), of what may be one.
     """
 
     detections: Detections
     places: Float[Array, "d 4"]
-    colours: Float[Array, "d bins"] | None
+    labels: Int[Array, " d"]
     extent: Float[Array, "4"]
+    colours: Float[Array, "d bins"] | None
     stronger: Bool[Array, "d d"]
     overlaps: Float[Array, "d d"]
 
     @classmethod
-    def of(cls, detections: Detections, seen: SampledBoxes | None) -> "_Found":
+    def of(
+        cls, tracker: ObjectTracker, detections: Detections, seen: SampledBoxes | None
+    ) -> "_Found":
         """Compare all with all."""
+        if tracker.scores == "ignore":
+            same = jnp.ones_like(detections.scores)
+            detections = eqx.tree_at(lambda found: found.scores, detections, same)
         colours, extent, boxes = None, detections.extent, detections.boxes
         if seen is not None:
             extent = jnp.array([0, 0, 1, 1]) * jnp.tile(jnp.stack([seen.width, seen.height]), 2)
             extent = extent.astype(boxes.dtype)
             colours = normalise(seen.counts(_BANDS)).reshape(len(boxes), -1)
+        labels = detections.labels if tracker.class_matters else 0
+        labels = jnp.broadcast_to(labels, detections.valid.shape).astype(jnp.int32)
         ranked = stronger(detections.scores, jnp.prod(boxes[:, 2:], axis=1))
-        return cls(detections, places_of(boxes), colours, extent, ranked, overlap(boxes, boxes))
+        overlaps = jnp.where(_may_be_one(tracker, labels, labels), overlap(boxes, boxes), 0.0)
+        return cls(detections, places_of(boxes), labels, extent, colours, ranked, overlaps)
+
+    def strong(self, least: Float[Array, ""]) -> Bool[Array, " d"]:
+        """Which detections have at least this score."""
+        return self.detections.valid & (self.detections.scores >= least)
 
 
 class _Taken(NamedTuple):
@@ -214,6 +228,10 @@ class _Taken(NamedTuple):
         rows, there = jnp.maximum(source, 0), source >= 0
         return cls(rows, there, there & strong[rows], found.places[rows])
 
+    def values(self, values: Array, none: Any) -> Array:
+        """The value of each object's detection, or another where there is none."""
+        return jnp.where(self.there.reshape(-1, *[1] * (values.ndim - 1)), values[self.rows], none)
+
 
 def advanced(
     tracker: ObjectTracker,
@@ -223,95 +241,77 @@ def advanced(
     motion: CameraMotion | None = None,
 ) -> tuple[TrackerState, Tracks]:
     """A step as a pure function, for `jax.lax.scan` and for programs of your own."""
-    if tracker.scores == "ignore":
-        same = jnp.ones_like(detections.scores)
-        detections = eqx.tree_at(lambda found: found.scores, detections, same)
-    found, lives = _Found.of(detections, seen), state.lives
-    spans = Spans.at(jnp.asarray(tracker.rate))
-    labels = jnp.broadcast_to(detections.labels, detections.valid.shape).astype(jnp.int32)
-    alike = compatible(lives.labels, labels)
-    strictly = tracker.class_matters == "always"
-    if strictly:
-        together = compatible(labels, labels)
-        found = found._replace(overlaps=jnp.where(together, found.overlaps, 0.0))
-    unlike = unlikeness(found.colours, state.colours)
-    if tracker.class_matters == "prefers":
-        unlike += jnp.where(alike, 0.0, _LABEL_COST)
-    unlike = jnp.where(alike | (not strictly), unlike, jnp.inf)
-
-    objects, noise, camera, shift = _moved(state, found, unlike, motion)
-    errors, speed = noise.noises.errors, noise.noises.speed
-    scores = state.scores.after(detections, found.stronger, found.overlaps, shift, spans.lasting)
+    found, spans = _Found.of(tracker, detections, seen), Spans.at(jnp.asarray(tracker.rate))
+    unlike = _unlikeness(tracker, state, found)
+    predicted, noise, camera, shift = _moved(state, found, unlike, motion)
+    scores = state.scores.after(
+        found.detections, found.stronger, found.overlaps, shift, spans.lasting
+    )
     if isinstance(tracker.scores, tuple):
         weak, strong = (jnp.full_like(scores.weak, score) for score in tracker.scores)
         scores = scores._replace(weak=weak, strong=strong)
-    strong = detections.valid & (detections.scores >= scores.strong)
+    strong = found.strong(scores.strong)
 
-    cost = mahalanobis(objects, errors, found.places) + unlike
-    cost += jnp.where(strong, 0.0, _WEAK_COST)[None]
-    cost += jnp.where(lives.confirmed, 0.0, _DOUBT_COST)[:, None]
-    counts = detections.valid & (detections.scores >= scores.weak)
-    possible = lives.alive[:, None] & counts[None] & (cost < 0)
-    cost = jnp.where(state.doubles.doubtful[:, None], _YIELDING * cost, cost)
-    cost = jnp.where(possible, cost, jnp.inf)
-    probability, source = probabilities(cost), one_to_one(cost)
+    errors, speed = noise.noises.errors, noise.noises.speed
+    cost = mahalanobis(predicted, errors, found.places) + unlike
+    source, probability = _associated(state, cost, strong, found.strong(scores.weak))
     taken = _Taken.of(source, strong, found)
-    predicted = boxes_of(objects.place)
-    right = shared(predicted, detections.boxes[taken.rows]) >= _SAME
-    error = units(taken.place) * errors[None] * jnp.where(taken.strong, 1.0, _WEAK_ERROR)[:, None]
-    updated, _, _ = objects.updated(taken.place, error)
-    trust = jnp.take_along_axis(probability, taken.rows[:, None], axis=1)
-    objects = updated.mixed_with(objects, jnp.where(taken.there[:, None], trust, 0.0))
+    error = units(taken.place) * errors[None] * jnp.where(taken.strong, 1.0, WEAK_ERROR)[:, None]
+    updated, _, _ = predicted.updated(taken.place, error)
+    objects = updated.mixed_with(predicted, probability[:, None])
 
-    boxes = boxes_of(objects.place)
-    inside = within(boxes, found.extent, centred=~taken.there)
+    inside = within(boxes_of(objects.place), found.extent, centred=~taken.there)
     guess = state.guesses.longest(spans)
-    stayed = lives.counted(taken.there, taken.strong, inside, spans, guess)
-    guesses = state.guesses.after(lives, stayed, taken.there, right, spans)
+    lives = state.lives.counted(taken.there, taken.strong, inside, spans, guess)
+    right = shared(boxes_of(predicted.place), found.detections.boxes[taken.rows]) >= _SAME
+    guesses = state.guesses.after(state.lives, lives, taken.there, right, spans)
 
-    stays = stayed.alive
-    covered = stays[:, None] & (overlap(boxes, detections.boxes) > _BIRTH_OVERLAP)
-    covered &= alike | (not strictly)
-    free = jnp.ones_like(strong).at[_or_past(source, strong)].set(False, mode="drop")
-    wanted = strong & free & within(detections.boxes, found.extent) & ~jnp.any(covered, axis=0)
-    doubles = (found.overlaps > _BIRTH_OVERLAP) & wanted[:, None] & found.stronger
-    wanted &= ~jnp.any(doubles, axis=0)
+    stays, wanted = lives.alive, _unexplained(tracker, state, lives, objects, found, source, strong)
     begun = seated(wanted, found.stronger, ~stays)
-    taken = _Taken.of(jnp.where(stays, source, begun), strong, found)
-    born, unit = begun >= 0, units(taken.place)
+    taken, born = _Taken.of(jnp.where(stays, source, begun), strong, found), begun >= 0
+    unit = units(taken.place)
     start = Gaussian.begun(taken.place, unit * errors[None], unit * speed[None])
     objects = start.where(born, objects)
-    told = jnp.where(taken.there, labels[taken.rows], 0)
-    lives = stayed.begins(born, told, jnp.sum(wanted, dtype=jnp.int32))
+    lives = lives.begins(born, taken.values(found.labels, 0), jnp.sum(wanted, dtype=jnp.int32))
 
     boxes = boxes_of(objects.place)
-    overlaps = overlap(boxes, boxes)
-    if strictly:
-        overlaps = jnp.where(compatible(lives.labels, lives.labels), overlaps, 0.0)
-    second = state.doubles.after(lives.identities, stays, taken.there, overlaps)
-    lives = lives._replace(shown=lives.shown & ~second.doubtful)
+    alike = _may_be_one(tracker, lives.labels, lives.labels)
+    overlaps = jnp.where(alike, overlap(boxes, boxes), 0.0)
+    doubles = state.doubles.after(lives.identities, stays, taken.there, overlaps)
+    lives = lives._replace(shown=lives.shown & ~doubles.doubtful)
     teaches = taken.strong & stays
-    noise = noise.after(
-        taken.place,
-        taken.there & stays,
-        teaches & lives.confirmed & (lives.seen >= _FIRST),
-        born,
-        teaches & (lives.seen == _FIRST),
-        objects,
-    )
+    known, grown = teaches & lives.confirmed & (lives.seen >= _FIRST), lives.seen == _FIRST
+    there = taken.there & stays
+    noise = noise.after(taken.place, there, known, born, teaches & grown, objects)
     colours = state.colours
     if found.colours is not None:
         others = lives.alive[None] & ~jnp.eye(len(boxes), dtype=bool)
         alone = ~jnp.any((overlaps > _CONTACT) & others, axis=1)
-        seen_now = jnp.where(taken.there[:, None], found.colours[taken.rows], 0.0)
-        colours = learned_colours(jnp.where(born[:, None], 0.0, colours), seen_now, alone)
-    state = TrackerState(objects, lives, guesses, second, scores, camera, noise, colours)
+        kept = jnp.where(born[:, None], 0.0, colours)
+        colours = learned_colours(kept, taken.values(found.colours, 0.0), alone)
+    state = TrackerState(objects, lives, guesses, doubles, scores, camera, noise, colours)
     rows = detections.rows_of(jnp.where(taken.there, taken.rows, -1))
-    shown = lives.identities, lives.confirmed, lives.unseen, lives.full, lives.shown
-    return state, Tracks(boxes, *shown, rows)
+    probability = jnp.where(born, 1.0, jnp.where(stays, probability, 0.0))
+    told = lives.identities, lives.confirmed, lives.unseen, lives.full, lives.shown
+    return state, Tracks(boxes, *told, rows, probability)
 
 
 _advanced = eqx.filter_jit(advanced)
+
+
+def _may_be_one(
+    tracker: ObjectTracker, a: Int[Array, " m"], b: Int[Array, " d"]
+) -> Bool[Array, "m d"]:
+    """Whether boxes with these labels may be of one object."""
+    return compatible(a, b) | (tracker.class_matters == "prefers")
+
+
+def _unlikeness(tracker: ObjectTracker, state: TrackerState, found: _Found) -> Float[Array, "m d"]:
+    """What pairs cost beside distance: for their colours and labels, and infinitely if need be."""
+    cost = unlikeness(found.colours, state.colours)
+    if tracker.class_matters == "prefers":
+        cost += jnp.where(compatible(state.lives.labels, found.labels), 0.0, _LABEL_COST)
+    return jnp.where(_may_be_one(tracker, state.lives.labels, found.labels), cost, jnp.inf)
 
 
 def _moved(
@@ -334,14 +334,47 @@ def _moved(
     number = jnp.maximum(jnp.sum(confirmed, dtype=objects.place.dtype), 1.0)
     box = jnp.exp(jnp.sum(jnp.where(confirmed[:, None], objects.place[:, 2:], 0.0), 0) / number)
     cost = mahalanobis(objects, errors, found.places, 2 * deviations * box) + unlike
-    strong = found.detections.valid & (found.detections.scores >= state.scores.strong)
-    cost = jnp.where(confirmed[:, None] & strong[None], cost, jnp.inf)
+    pairs = confirmed[:, None] & found.strong(state.scores.strong)[None]
+    cost = jnp.where(pairs, cost, jnp.inf)
     known = jnp.asarray(False) if motion is None else jnp.asarray(motion.known)
     camera, shift = state.camera.after(objects, gone, known, cost, errors, found.places, box)
     noise = noise._replace(moments=noise.moments.shifted(shift))
     return objects.shifted(shift), noise, camera, shift
 
 
-def _or_past(source: Int[Array, " m"], rows: Array) -> Int[Array, " m"]:
-    """The rows, with one past the last for none, which a scatter drops."""
-    return jnp.where(source >= 0, source, len(rows))
+def _associated(
+    state: TrackerState,
+    cost: Float[Array, "m d"],
+    strong: Bool[Array, " d"],
+    counts: Bool[Array, " d"],
+) -> tuple[Int[Array, " m"], Float[Array, " m"]]:
+    """The detection of each object, -1 for none, and the probability that it is its own."""
+    cost += jnp.where(strong, 0.0, _WEAK_COST)[None]
+    cost += jnp.where(state.lives.confirmed, 0.0, _DOUBT_COST)[:, None]
+    possible = state.lives.alive[:, None] & counts[None] & (cost < 0)
+    cost = jnp.where(state.doubles.doubtful[:, None], _YIELDING * cost, cost)
+    cost = jnp.where(possible, cost, jnp.inf)
+    source = one_to_one(cost)
+    chosen = jnp.maximum(source, 0)[:, None]
+    probability = jnp.take_along_axis(probabilities(cost), chosen, axis=1)[:, 0]
+    return source, jnp.where(source >= 0, probability, 0.0)
+
+
+def _unexplained(
+    tracker: ObjectTracker,
+    state: TrackerState,
+    lives: Lives,
+    objects: Gaussian,
+    found: _Found,
+    source: Int[Array, " m"],
+    strong: Bool[Array, " d"],
+) -> Bool[Array, " d"]:
+    """Which strong detections begin an object: no object has them, or is there already."""
+    boxes = found.detections.boxes
+    covered = lives.alive[:, None] & (overlap(boxes_of(objects.place), boxes) > _BIRTH_OVERLAP)
+    covered &= _may_be_one(tracker, state.lives.labels, found.labels)
+    past = jnp.where(source >= 0, source, len(strong))  # a scatter drops it
+    free = jnp.ones_like(strong).at[past].set(False, mode="drop")
+    wanted = strong & free & within(boxes, found.extent) & ~jnp.any(covered, axis=0)
+    doubles = (found.overlaps > _BIRTH_OVERLAP) & wanted[:, None] & found.stronger
+    return wanted & ~jnp.any(doubles, axis=0)
