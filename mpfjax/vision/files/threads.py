@@ -1,27 +1,18 @@
 """Reading ahead of the tracker and writing behind it, in threads, at the pace of the slowest.
 
-Queues between threads are bounded, so that memory does not grow with the video.
+No more than a few frames wait between threads, so that memory does not grow with the video.
 """
 
 import contextlib
 import contextvars
-import queue
-import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple, TypeVar
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
 
 T = TypeVar("T")
 # Enough to even out frames of different cost; a frame of 4K has 25 MB.
 _WAITING = 4
-# How often a thread that waits looks whether the run has ended, in seconds.
-_LOOK = 0.1
-
-
-class _Made(NamedTuple):
-    """An item, or what ended them: an error, or nothing where there are no more."""
-
-    items: tuple[Any, ...] = ()
-    error: BaseException | None = None
 
 
 @contextlib.contextmanager
@@ -31,42 +22,21 @@ def read_ahead(items: Iterable[T]) -> Iterator[Iterator[T]]:
     An exception in making an item is raised in the place of the item. Leaving the block ends the
     thread, which closes the items if they can be closed.
     """
-    made: queue.Queue[_Made] = queue.Queue(_WAITING)
-    left = threading.Event()
+    coming, end = iter(items), object()
 
-    def hand_over(one: _Made) -> None:
-        while not left.is_set():
-            with contextlib.suppress(queue.Full):
-                return made.put(one, timeout=_LOOK)
+    def taken() -> Iterator[Any]:
+        while (item := waiting.popleft().result()) is not end:
+            waiting.append(start(next, coming, end))
+            yield item
 
-    def make() -> None:
+    with _one_thread() as start:
+        waiting = deque(start(next, coming, end) for _ in range(_WAITING))
         try:
-            for item in items:
-                hand_over(_Made((item,)))
-                if left.is_set():
-                    break
-            hand_over(_Made())
-        except BaseException as error:
-            hand_over(_Made(error=error))
+            yield taken()
         finally:
-            close: Callable[[], None] = getattr(items, "close", lambda: None)
-            close()
-
-    def taken() -> Iterator[T]:
-        while True:
-            found = made.get()
-            if found.error is not None:
-                raise found.error
-            if not found.items:
-                return
-            yield found.items[0]
-
-    thread = _started(make)
-    try:
-        yield taken()
-    finally:
-        left.set()
-        thread.join()
+            for future in waiting:
+                future.cancel()
+            start(getattr(items, "close", lambda: None)).result()
 
 
 @contextlib.contextmanager
@@ -76,34 +46,32 @@ def write_behind(write: Callable[..., Any]) -> Iterator[Callable[..., None]]:
     An exception of `write` is raised by the next call or at the end of the block, and nothing more
     is written. However the block is left, all earlier calls are completed first.
     """
-    waiting: queue.Queue[tuple[Any, ...] | None] = queue.Queue(_WAITING)
+    waiting: deque[Future[None]] = deque()
     errors: list[BaseException] = []
 
-    def work() -> None:
-        while (arguments := waiting.get()) is not None:
-            try:
-                if not errors:
-                    write(*arguments)
-            except BaseException as error:
-                errors.append(error)
+    def unless_failed(*arguments: Any) -> None:
+        try:
+            if not errors:
+                write(*arguments)
+        except BaseException as error:
+            errors.append(error)
 
     def hand_over(*arguments: Any) -> None:
+        if len(waiting) > _WAITING:
+            waiting.popleft().result()
         if errors:
             raise errors[0]
-        waiting.put(arguments)
+        waiting.append(start(unless_failed, *arguments))
 
-    thread = _started(work)
-    try:
+    with _one_thread() as start:
         yield hand_over
-    finally:
-        waiting.put(None)
-        thread.join()
     if errors:
         raise errors[0]
 
 
-def _started(work: Callable[[], None]) -> threading.Thread:
-    """A daemon thread with the settings of this one."""
-    thread = threading.Thread(target=contextvars.copy_context().run, args=(work,), daemon=True)
-    thread.start()
-    return thread
+@contextlib.contextmanager
+def _one_thread() -> Iterator[Callable[..., Future[Any]]]:
+    """A function that has calls made by one other thread, in turn and with this one's settings."""
+    context = contextvars.copy_context()
+    with ThreadPoolExecutor(1) as thread:
+        yield lambda call, *arguments: thread.submit(context.run, call, *arguments)
