@@ -32,6 +32,7 @@ import numpy as np
 
 from mpfjax.console import exit_status, format_table, whole, write_json
 from mpfjax.vision import football_scene, write_tracks
+from mpfjax.vision.files.frames import write_image
 
 HERE = Path(__file__).resolve().parents[1]
 NUM_FRAMES = 60
@@ -69,7 +70,7 @@ import contextlib, importlib, pkgutil, mpfjax
 names = [found.name for found in pkgutil.walk_packages(mpfjax.__path__, "mpfjax.")
          if not found.name.endswith("__main__")]
 names += ["benchmarks.score_vs_particles", "matplotlib.pyplot", "matplotlib.backends.backend_pdf",
-          "scipy.optimize", "trackeval", "imageio.v2", "imageio.v3", "imageio_ffmpeg", "PIL.Image"]
+          "scipy.optimize", "trackeval", "av", "PIL.Image"]
 for name in names:
     with contextlib.suppress(ImportError):
         importlib.import_module(name)
@@ -249,12 +250,10 @@ sys.exit(code)
 
 def render(folder: Path) -> Path:
     """A football scene as images, with its truth for detections."""
-    import imageio.v3 as imageio
-
     scene = football_scene(jax.random.key(0), NUM_FRAMES, num_players=8, num_opponents=0)
     (folder / "img").mkdir(parents=True)
     for number, frame in enumerate(np.asarray(scene.frames), 1):
-        imageio.imwrite(folder / "img" / f"{number:06d}.jpg", frame)
+        write_image(folder / "img" / f"{number:06d}.jpg", frame)
     # Without a truth beside it, which would be scored with.
     (folder / "first" / "img").mkdir(parents=True)
     shutil.copy(folder / "img" / "000001.jpg", folder / "first" / "img")

@@ -17,7 +17,6 @@ dies when its object is gone (Lin et al. 2012, section 5).
 import argparse
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -190,8 +189,6 @@ def _write_scores(options, source: Source, num_frames: int, results) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the benchmark; bad input is one line on the error stream and exit status 2."""
-    # Writing a video starts an encoder, whose fork and exec JAX's threads do not touch.
-    warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
     return exit_status(lambda: run(parse_arguments(arguments)), arguments)
 
 

@@ -12,6 +12,4 @@ def main(arguments: list[str] | None = None) -> int:
     options = parse_arguments(arguments)
     with warnings.catch_warnings():
         say_warnings(RuntimeWarning)
-        # Python warns of forks beside JAX's threads; the encoder's fork execs at once and is safe.
-        warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
         return exit_status(lambda: run(options), arguments)

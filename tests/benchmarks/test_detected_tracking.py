@@ -2,7 +2,6 @@
 
 import json
 
-import imageio.v3 as imageio
 import jax
 import numpy as np
 import pytest
@@ -18,8 +17,6 @@ from benchmarks.visual_tracking.detected import (
 from benchmarks.visual_tracking.source import Source
 from mpfjax.vision.files.boxes import read_tracks, write_tracks
 from mpfjax.vision.files.frames import read_frames, write_image, write_video
-
-pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
 
 # Of one size in every test, so that nothing compiles twice.
 HEIGHT, WIDTH, NUM = 72, 96, 30
@@ -178,7 +175,7 @@ def test_a_grey_video_is_tracked_by_its_values(tmp_path):
     """Images of one channel in a folder: the colour models see three equal ones."""
     folder = sequence_of(tmp_path, ())
     for i, frame in enumerate(street(walkers), 1):
-        imageio.imwrite(folder / "img" / f"{i:06d}.png", frame[:, :, 0])
+        write_image(folder / "img" / f"{i:06d}.png", frame[:, :, 0])
     source = Source("grey", lambda: read_frames(folder), 1, NUM, np.zeros((0, 4)), None, False)
     rows, _ = tracked(folder, detect_all(source).boxes)
     assert np.isfinite(rows).all()

@@ -13,7 +13,7 @@ from mpfjax.vision.files.boxes import write_tracks
 from mpfjax.vision.files.frames import write_image
 from tests.examples import two_walkers
 
-pytest.importorskip("imageio", reason="reading frames needs the extra 'video', which 'test' brings")
+pytest.importorskip("av", reason="reading frames needs the extra 'video', which 'test' brings")
 pytest.importorskip("trackeval", reason="scoring needs the extra 'trackeval', which 'test' brings")
 
 COLUMNS = [

@@ -13,8 +13,7 @@ from mpfjax.vision.files.frames import read_frames, write_image, write_video
 from mpfjax.vision.scenes.football import football_scene
 from tests.marking import thorough
 
-pytest.importorskip("imageio", reason="reading and writing frames needs the extra 'video'")
-pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
+pytest.importorskip("av", reason="reading and writing frames needs the extra 'video'")
 
 FIELDS = [
     "filter", "all_covered", "per_object", "on_object", "on_other", "id_swaps", "object_swaps",

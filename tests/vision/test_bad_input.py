@@ -244,6 +244,6 @@ class TestFramesToDetectIn:
 @pytest.mark.usefixtures("as_installed")
 @pytest.mark.parametrize("frames", [None, 3, [None], [FRAME[0]], [FRAME.astype(float)]])
 def test_a_video_of_no_frames_is_named(tmp_path, frames):
-    pytest.importorskip("imageio", reason=VIDEO)
+    pytest.importorskip("av", reason=VIDEO)
     with pytest.raises(ValueError, match=r"^frames: "):
         vision.write_video(tmp_path / "video.gif", frames)

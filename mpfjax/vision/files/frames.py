@@ -1,13 +1,11 @@
-"""Frames in and out: folders of images and GIFs through imageio, video files through PyAV too."""
+"""Frames in and out: folders of images through Pillow, video files through PyAV."""
 
 import contextlib
-import functools
 import math
 import re
-import signal
-import threading
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -23,7 +21,7 @@ _IMAGES = (".jpg", ".jpeg", ".png", ".bmp")
 _INNER = ("img", "img1")
 # In half to .7 of the time of the preset "fast" at rate 20, with the same quality to .1 dB, in
 # files a tenth larger.
-_X264 = ["-crf", "19", "-preset", "veryfast", "-x264-params", "rc-lookahead=30:subme=4"]
+_X264 = {"crf": "19", "preset": "veryfast", "x264-params": "rc-lookahead=30:subme=4"}
 
 
 def read_frames(
@@ -34,7 +32,7 @@ def read_frames(
     `path` is a video file, a folder of images in the natural order of their names (2.png before
     10.png), or a folder with such a folder `img` or `img1`. All frames of a video are read,
     whatever the time between them, rotated as the file says. A `RuntimeWarning` names those that
-    are too damaged to be decoded. Raises `ImportError` if imageio or PyAV is missing,
+    are too damaged to be decoded. Raises `ImportError` if PyAV is missing for a video,
     `FileNotFoundError` if `path` is, and `ValueError` with `path` if it cannot be read, has no
     frames, or has frames of different sizes, and for `first` and `last` that are no range.
     """
@@ -46,7 +44,7 @@ def read_frames(
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such video or folder of images")
     frames = _read_images(path, first, last) if path.is_dir() else _read_video(path, first, last)
-    return _of_one_size(path, frames)
+    return of_one_kind(frames, first, str(path))
 
 
 def parse_range(text: str | None, argument: str = "frames") -> tuple[int, int | None]:
@@ -81,12 +79,8 @@ def frame_rate(path: str | Path) -> float | None:
     path = Path(path)
     if path.is_dir():
         return read_sequence_info(path, path.parent).frame_rate
-    if path.suffix.lower() == ".gif":
-        with _naming(path, "a video"):
-            rate = _imageio().immeta(path, plugin="pillow").get("fps")
-    else:
-        with _opened(path) as (_, stream):
-            rate = stream.average_rate or stream.guessed_rate
+    with _opened(path) as (_, stream):
+        rate = stream.average_rate or stream.guessed_rate
     return float(rate) if rate and 0 < rate < math.inf else None
 
 
@@ -95,63 +89,52 @@ def write_video(
 ) -> None:
     """Write RGB frames to an MP4 or, by the ending of `path`, a GIF that loops.
 
-    Raises `ValueError` for another ending, a frame that is no RGB image and a rate that is not
-    positive, `ImportError` where imageio is missing.
+    Raises `ValueError` for another ending, frames that are no images of one size and a rate that is
+    not positive, `ImportError` where PyAV is missing for an MP4.
     """
+    check_type((str, Path), "a path", path=path)
     check_type(Iterable, "frames one after the other", frames=frames)
+    check_positive(frames_per_second=frames_per_second)
+    stills = of_one_kind(frames)
+    if Path(path).suffix.lower() == ".gif":
+        from PIL import Image
+
+        images = map(Image.fromarray, stills)
+        duration = 1000 / frames_per_second
+        next(images).save(path, save_all=True, append_images=images, duration=duration, loop=0)
+        return
     with open_video(path, frames_per_second) as append:
-        for frame in frames:
-            append(frame)
+        for still in stills:
+            append(still)
 
 
 @contextlib.contextmanager
 def open_video(
     path: str | Path, frames_per_second: float = 10.0
 ) -> Iterator[Callable[[UInt8[np.ndarray, "h w 3"]], None]]:
-    """A context that appends RGB frames to a new MP4 or GIF, complete however the block ends.
+    """A context that appends RGB frames to a new MP4, complete however the block ends.
 
-    Raises as `write_video` does. Use it where frames are made one at a time.
+    There is no file before the first frame. Use it where frames are made one at a time.
     """
-    check_type((str, Path), "a path", path=path)
-    check_positive(frames_per_second=frames_per_second)
-    suffix = Path(path).suffix.lower()
-    if suffix not in (".gif", ".mp4"):
+    if Path(path).suffix.lower() != ".mp4":
         raise ValueError(f"path: {path} ends in neither .mp4 nor .gif")
-    _imageio()
-    # Only the older interface takes one frame after the other, without keeping all of them.
-    from imageio.v2 import get_writer
+    library, rate = _av(), Fraction(frames_per_second).limit_denominator(1001)
+    with contextlib.ExitStack() as opened:
+        file: Any = None
+        stream: Any = None
 
-    if suffix == ".gif":
-        writer = get_writer(path, mode="I", duration=1000 / frames_per_second, loop=0)
-    else:
-        writer = get_writer(
-            path, fps=frames_per_second, quality=None, macro_block_size=1, output_params=_X264
-        )
+        def append(frame: np.ndarray) -> None:
+            nonlocal file, stream
+            frame = _even(frame)
+            if stream is None:
+                file = opened.enter_context(library.open(str(path), "w"))
+                stream = file.add_stream("libx264", rate=rate, options=_X264)
+                stream.height, stream.width, stream.pix_fmt = *frame.shape[:2], "yuv420p"
+                stream.codec_context.thread_count = 0  # one for each processor
+                opened.callback(lambda: file.mux(stream.encode()))
+            file.mux(stream.encode(library.VideoFrame.from_ndarray(frame, format="rgb24")))
 
-    def append(frame: np.ndarray) -> None:
-        check_frame(frame, "frames")
-        # Interrupted while it is fed, imageio kills the encoder, and the video is lost.
-        with _uninterrupted():
-            writer.append_data(_even(frame) if suffix == ".mp4" else frame)
-
-    with writer:
         yield append
-
-
-@contextlib.contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Put off a Ctrl-C that comes within the block until its end."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # Python sends signals to the main thread alone
-        return
-    pending: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: pending.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
-        if pending and before is not signal.SIG_IGN:
-            signal.raise_signal(signal.SIGINT)
 
 
 def check_frame(frame: Any, argument: str = "frame", *, eight_bits: bool = True) -> None:
@@ -164,7 +147,7 @@ def check_frame(frame: Any, argument: str = "frame", *, eight_bits: bool = True)
 
 
 def of_one_kind(
-    frames: Iterable[UInt8[np.ndarray, "..."]], first: int = 1
+    frames: Iterable[UInt8[np.ndarray, "..."]], first: int = 1, argument: str = "frames"
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """The frames in RGB, also from grey ones; errors name frames by their number from `first` on.
 
@@ -176,19 +159,21 @@ def of_one_kind(
         frame = np.asarray(frame)
         if frame.ndim == 2 or frame.shape[2:] == (1,):
             frame = np.repeat(frame.reshape(*frame.shape[:2], 1), 3, axis=2)
-        check_frame(frame, "frames")
+        check_frame(frame, argument)
         shape = shape or frame.shape
         if frame.shape != shape:
             raise ValueError(
-                f"frames: frame {number} is {frame.shape[1]} x {frame.shape[0]}, and those before"
-                f" it {shape[1]} x {shape[0]}"
+                f"{argument}: frame {number} is {frame.shape[1]} x {frame.shape[0]},"
+                f" and those before it {shape[1]} x {shape[0]}"
             )
         yield frame
 
 
 def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
     """Write one RGB image, its format chosen by the ending of `path`."""
-    _imageio().imwrite(path, image)
+    from PIL import Image
+
+    Image.fromarray(image).save(path)
 
 
 def _even(frame: np.ndarray) -> np.ndarray:
@@ -211,43 +196,34 @@ def _natural(path: Path) -> tuple[list[Any], str]:
 
 
 def _read_images(folder: Path, first: int, last: int | None) -> Iterator[np.ndarray]:
-    imageio, paths = _imageio(), _image_paths(folder)
+    from PIL import Image
+
+    paths = _image_paths(folder)
     if first > len(paths):
         raise ValueError(f"{folder}: holds {len(paths)} images, frame {first} is not among them")
     for path in paths[first - 1 : last]:
-        with _naming(path, "an image"):
-            image = _rgb(imageio.imread(path))
-        yield image
+        with _naming(path, "an image"), Image.open(path) as image:
+            if image.mode.startswith("I"):  # 16 bits of grey
+                image = Image.fromarray((np.asarray(image) // 257).astype(np.uint8))
+            frame = np.array(image.convert("RGB"))
+        yield frame
 
 
 def _read_video(path: Path, first: int, last: int | None) -> Iterator[np.ndarray]:
     number = 0
-    decoded = _decode_gif(path) if path.suffix.lower() == ".gif" else _decode_video(path)
-    for number, image in enumerate(decoded, 1):
+    for number, frame in enumerate(_decoded(path), 1):
         if number >= first:
             with _naming(path, "a video"):
-                frame = image()
-            yield frame
+                image = _upright(frame)
+            yield image
         if number == last:
-            decoded.close()
             return
     if number < first:
         raise ValueError(f"{path}: holds {number} frames, frame {first} is not among them")
 
 
-def _decode_gif(path: Path) -> Generator[Callable[[], np.ndarray]]:
-    """Functions that decode the frames of a GIF, one for each frame."""
-    images = iter(_imageio().imiter(path, plugin="pillow"))
-    while True:
-        with _naming(path, "a video"):
-            image = next(images, None)
-        if image is None:
-            return
-        yield functools.partial(_rgb, image)
-
-
-def _decode_video(path: Path) -> Generator[Callable[[], np.ndarray]]:
-    """A function for each frame of a video that decodes it; unneeded ones are not called."""
+def _decoded(path: Path) -> Iterator[Any]:
+    """The frames of a video, their pixels not yet converted."""
     with _opened(path) as (container, stream):
         stream.thread_type = "AUTO"
         packets, any_frame, damaged = container.demux(stream), False, None
@@ -261,9 +237,8 @@ def _decode_video(path: Path) -> Generator[Callable[[], np.ndarray]]:
             except (OSError, ValueError) as error:  # the library's error for a damaged packet
                 damaged = damaged or error
                 continue
-            for frame in frames:
-                any_frame = True
-                yield functools.partial(_upright, frame)
+            any_frame = any_frame or bool(frames)
+            yield from frames
         if damaged and not any_frame:
             raise ValueError(f"{path}: cannot be read as a video ({damaged})")
     if damaged:
@@ -308,45 +283,9 @@ def _naming(path: Path, what: str) -> Iterator[None]:
         raise ValueError(f"{path}: cannot be read as {what} ({said.splitlines()[0]})") from error
 
 
-def _of_one_size(path: Path, frames: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
-    shape = None
-    for frame in frames:
-        shape = shape or frame.shape
-        if frame.shape != shape:
-            raise ValueError(
-                f"{path}: frames of different sizes, {shape[:2]} and {frame.shape[:2]}"
-            )
-        yield frame
-
-
-def _rgb(image: np.ndarray) -> np.ndarray:
-    """Three channels of eight bits, also from grey, a palette, or with transparency."""
-    image = np.asarray(image)
-    if image.ndim == 2:
-        image = image[:, :, None]
-    if image.shape[2] < 3:
-        # Grey, perhaps with transparency behind it.
-        image = np.repeat(image[:, :, :1], 3, axis=2)
-    if image.dtype == np.uint16:
-        image = image // 257
-    elif image.dtype == bool:
-        image = 255 * image.astype(np.uint8)
-    return np.ascontiguousarray(image[:, :, :3]).astype(np.uint8)
-
-
-def _imageio() -> ModuleType:
-    try:
-        import imageio.v3 as imageio
-    except ImportError as error:
-        raise ImportError(
-            'imageio is needed to read and write video: pip install "imageio[ffmpeg]"'
-        ) from error
-    return imageio
-
-
 def _av() -> ModuleType:
     try:
         import av
     except ImportError as error:
-        raise ImportError("av is needed to read video: pip install av") from error
+        raise ImportError("av is needed to read and write video: pip install av") from error
     return av
