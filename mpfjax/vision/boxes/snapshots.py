@@ -113,19 +113,18 @@ def annotate(
     frame: UInt8[np.ndarray, "h w 3"],
     snapshot: Snapshot,
     zoom: int = 1,
-    crop: slice | tuple[slice, slice] = (slice(None), slice(None)),
+    crop: tuple[slice, slice] = (slice(None), slice(None)),
 ) -> UInt8[np.ndarray, "zh zw 3"]:
     """A frame, cropped and enlarged, with the particles and mean boxes of the first run.
 
-    Both are drawn in the colour of their component. `crop` is a slice of rows and one of columns,
-    or of rows alone; negative numbers count from the end. `zoom` is the side in pixels to which
-    each pixel is enlarged. Raises `ValueError` for a zoom that is not a whole number from 1 on, and
-    for a crop that is no slices of step one or leaves no pixel.
+    Both are drawn in the colour of their component. `crop` is a slice of rows and one of columns;
+    negative numbers count from the end. `zoom` is the side in pixels to which each pixel is
+    enlarged. Raises `ValueError` for a zoom that is not a whole number from 1 on.
     """
     check_whole(zoom=zoom)
-    rows, columns = _within(frame, crop)
-    canvas = frame[rows, columns].repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
-    corner = np.array([columns.start, rows.start], float)
+    canvas = frame[crop].repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
+    top, left = (part.indices(n)[0] for part, n in zip(crop, frame.shape[:2], strict=True))
+    corner = np.array([left, top], float)
     labels, palette = snapshot.labels[0], drawing.PALETTE
     for m in np.flatnonzero(snapshot.active[0]):
         box = box_files.top_left(snapshot.means[0][m][None])[0] - [*corner, 0, 0]
@@ -134,21 +133,3 @@ def annotate(
     points = zoom * (snapshot.points[0][filled] - corner)
     drawing.draw_points(canvas, points, palette[labels[filled] % len(palette)], 0.9 * zoom)
     return np.clip(canvas, 0, 255).astype(np.uint8)
-
-
-def _within(frame: np.ndarray, crop: Any) -> tuple[slice, slice]:
-    """The rows and columns of a crop, counted from the frame's top-left corner."""
-    check_type((slice, tuple), "a slice of rows, or one of rows and one of columns", crop=crop)
-    parts = (crop, slice(None)) if isinstance(crop, slice) else crop
-    if len(parts) != 2 or not all(isinstance(part, slice) for part in parts):
-        raise ValueError(f"crop: {crop} is not one slice of rows and one of columns")
-    found = []
-    for part, length in zip(parts, frame.shape[:2], strict=True):
-        try:
-            start, stop, step = part.indices(length)
-        except TypeError as error:
-            raise ValueError(f"crop: {part} does not count pixels ({error})") from error
-        if step != 1 or stop <= start:
-            raise ValueError(f"crop: {part} of {length} is no stretch of pixels")
-        found.append(slice(start, stop))
-    return found[0], found[1]
