@@ -66,7 +66,7 @@ from mpfjax.moves import SelectInitial as SelectInitial
 from mpfjax.moves import Split as Split
 from mpfjax.observations import Series as Series
 from mpfjax.operations.compiling import keep_programs as keep_programs
-from mpfjax.operations.generator import normal as normal
+from mpfjax.operations.random import normal as normal
 from mpfjax.proposals import AbstractProposal as AbstractProposal
 from mpfjax.proposals import GaussNewtonProposal as GaussNewtonProposal
 from mpfjax.proposals import NetworkProposal as NetworkProposal

@@ -14,9 +14,9 @@ from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.inputs import with_inputs
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.every import Every, with_inner
-from mpfjax.operations.across_islands import excess_over_islands, island_index, num_islands
-from mpfjax.operations.indexing import take
+from mpfjax.operations.islands import excess_over_islands, island_index, num_islands
 from mpfjax.operations.logarithms import scaled_log_sum_exp
+from mpfjax.operations.stored import take
 
 Moves = tuple[AbstractMove, ...]
 

@@ -27,9 +27,9 @@ from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.initial import sample_initial, waiting_for_choice
 from mpfjax.moves.report import StepInfo, step_info
 from mpfjax.observations import Fault, faults_of, one_input, one_observation, raise_faults
-from mpfjax.operations.choices import drawn_once
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
-from mpfjax.operations.generator import split_keys
+from mpfjax.operations.islands import drawn_once
+from mpfjax.operations.random import split_keys
 
 BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 

@@ -8,8 +8,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree, Shaped
 
 from mpfjax.checks import as_numbers
-from mpfjax.operations.floats import as_inexact, default_float
-from mpfjax.operations.logarithms import exp, finite_max, log_sum_exp, scaled_exp, softmax
+from mpfjax.operations.logarithms import (
+    as_inexact,
+    default_float,
+    exp,
+    finite_max,
+    log_sum_exp,
+    scaled_exp,
+    softmax,
+)
 from mpfjax.operations.segments import (
     segment_any,
     segment_counts,

@@ -21,8 +21,8 @@ from mpfjax.checks import (
 )
 from mpfjax.models.base import model_name, require
 from mpfjax.models.inputs import has_attribute
-from mpfjax.operations.generator import normal
 from mpfjax.operations.matrices import cholesky, solve_lower
+from mpfjax.operations.random import normal
 
 
 class AbstractProposal(eqx.Module):

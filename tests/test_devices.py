@@ -17,7 +17,8 @@ import pytest
 import mpfjax
 from mpfjax.exact import grid_filter
 from mpfjax.operations import compiling
-from mpfjax.operations.across_islands import (
+from mpfjax.operations.compiling import cpu_options, in_little_memory
+from mpfjax.operations.islands import (
     DEVICE_AXIS,
     ISLAND_AXIS,
     deal_to_islands,
@@ -25,7 +26,6 @@ from mpfjax.operations.across_islands import (
     num_islands,
     over_islands,
 )
-from mpfjax.operations.compiling import cpu_options, in_little_memory
 from mpfjax.operations.segments import segment_sum
 from mpfjax.running.devices import choose_devices
 from mpfjax.running.threads import over_threads

@@ -9,7 +9,7 @@ import pytest
 from scipy.special import erfinv, log_ndtr
 
 import mpfjax
-from mpfjax.operations.generator import (
+from mpfjax.operations.random import (
     bits,
     fast_key,
     normal,

@@ -36,10 +36,8 @@ ORDER = (
 # Inside the folders that hold several floors: files, and folders.
 FLOORS = {
     "operations": (
-        "floats", "gradients", "platforms", "stored", "indexing", "prefix_sums", "maxima",
-        "logarithms", "segments", "runs", "choices", "matrices", "coordinates", "stacks",
-        "gaussians", "across_islands", "generator", "positions", "sobol", "hilbert", "sorting",
-        "compiling",
+        "logarithms", "stored", "matrices", "gaussians", "islands", "compiling", "random",
+        "prefix_sums", "segments", "sorting",
     ),
     "moves": (
         "base", "local_quadratics", "eve_indices", "island_interaction", "every",

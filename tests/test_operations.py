@@ -6,14 +6,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.operations import positions
-from mpfjax.operations.choices import cond_if_any, drawn_once
-from mpfjax.operations.coordinates import coordinates, inner, log_total, transformed
-from mpfjax.operations.floats import default_float
-from mpfjax.operations.indexing import count_places, take
-from mpfjax.operations.logarithms import exp, log_sum_exp, softmax
-from mpfjax.operations.matrices import cholesky, draw_columns, row_sums, solve_lower
-from mpfjax.operations.maxima import largest
+from mpfjax.operations import prefix_sums
+from mpfjax.operations.islands import cond_if_any, drawn_once
+from mpfjax.operations.logarithms import default_float, exp, largest, log_sum_exp, softmax
+from mpfjax.operations.matrices import (
+    cholesky,
+    coordinates,
+    draw_columns,
+    inner,
+    log_total,
+    row_sums,
+    solve_lower,
+    transformed,
+)
 from mpfjax.operations.prefix_sums import (
     _blocked_sum_before,
     _scanned_sum_before,
@@ -22,9 +27,8 @@ from mpfjax.operations.prefix_sums import (
     few_upto,
     sum_before,
 )
-from mpfjax.operations.runs import runs_of, whole
 from mpfjax.operations.segments import (
-    order_by_segment,
+    runs_of,
     segment_any,
     segment_argmax,
     segment_counts,
@@ -34,8 +38,10 @@ from mpfjax.operations.segments import (
     segment_sum,
     segments_in_order,
     spread,
+    whole,
 )
-from mpfjax.operations.stored import to_int, whole_blocks
+from mpfjax.operations.sorting import order_by_segment
+from mpfjax.operations.stored import count_places, take, to_int, whole_blocks
 from tests.marking import quick_of, thorough
 from tests.precision import float64
 
@@ -100,7 +106,7 @@ def test_sums_never_fall_and_zeros_add_nothing(n, how):
     np.testing.assert_allclose(total, np.asarray(values).sum(axis=1, dtype=float), rtol=1e-5)
 
 
-@pytest.mark.parametrize("form", [positions._blocked, positions._scanned])
+@pytest.mark.parametrize("form", [prefix_sums._blocked, prefix_sums._scanned])
 def test_sums_in_two_parts_are_exact(form):
     """Of multiples of 2^-24 far from each other in size, whose sums float32 could not hold."""
     rng = np.random.default_rng(7)
@@ -124,26 +130,20 @@ def test_the_last_position_before_each_point():
     rng = np.random.default_rng(7)
     places = np.sort(np.round(rng.random(300) ** 2 * 64 * 2**12) / 2**12)
     points = np.append(rng.random(500) * 64, places)
-    parts = lambda values: positions.as_positions(jnp.asarray(values, jnp.float32))  # noqa: E731
-    found = eqx.filter_jit(positions.last_before)(parts(places), parts(points), 64)
+    parts = lambda values: prefix_sums.as_positions(jnp.asarray(values, jnp.float32))  # noqa: E731
+    found = eqx.filter_jit(prefix_sums.last_before)(parts(places), parts(points), 64)
     points = points.astype(np.float32)
     np.testing.assert_array_equal(found, np.searchsorted(places, points, "right") - 1)
 
 
 def test_random_positions_fill_lines_of_any_length_evenly():
     lengths = jnp.asarray(np.repeat([1, 3, 10**6, 2**30 + 1], 10_000), jnp.int32)
-    drawn = jax.jit(positions.random_positions)(jax.random.key(0), lengths)
+    drawn = jax.jit(prefix_sums.random_positions)(jax.random.key(0), lengths)
     shares = (np.asarray(drawn.whole) + np.asarray(drawn.fraction, float)) / np.asarray(lengths)
     for values in (shares, np.asarray(drawn.fraction)):
         found = np.sort(values.reshape(4, -1), axis=1)
         gaps = np.abs(found - np.linspace(0, 1, 10_000)[None]).max(axis=1)
         assert (gaps < 0.02).all()  # Kolmogorov and Smirnov's statistic, of one in a thousand
-
-
-def test_too_many_slots_to_number_are_refused_by_name():
-    indices = jax.ShapeDtypeStruct((600, 2**22), jnp.int32)
-    with pytest.raises(ValueError, match="num_particles: 4194304, runs_at_once: 600"):
-        jax.eval_shape(jax.vmap(lambda row: count_places(row, 2**22)), indices)
 
 
 def test_exponentials_are_never_subnormal():

@@ -9,10 +9,8 @@ from jax import export
 import mpfjax
 from mpfjax.filter import Start
 from mpfjax.observations import Series
-from mpfjax.operations.platforms import default_forms
-from mpfjax.operations.positions import exact_sum_before
-from mpfjax.operations.prefix_sums import count_upto, sum_before
-from mpfjax.operations.stored import stored
+from mpfjax.operations.prefix_sums import count_upto, exact_sum_before, sum_before
+from mpfjax.operations.stored import default_forms, stored
 from mpfjax.running.scan import scan
 from tests.marking import quick_of
 from tests.registry import CHAINS

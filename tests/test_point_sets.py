@@ -11,14 +11,18 @@ import scipy.stats
 from scipy.stats import qmc
 
 from mpfjax.models.noise import draw_family_noise, draw_noise, rqmc_normal
-from mpfjax.operations.hilbert import bits_per_dimension, hilbert_index
-from mpfjax.operations.sobol import (
+from mpfjax.operations.random import (
     MOST_DIMENSIONS,
     direction_numbers,
     scrambled_directions,
     sobol_points,
 )
-from mpfjax.operations.sorting import order_by_key, sortable_bits
+from mpfjax.operations.sorting import (
+    bits_per_dimension,
+    hilbert_index,
+    order_by_key,
+    sortable_bits,
+)
 from tests.marking import thorough
 
 # As one program each: to compile operations one by one takes longer.

@@ -15,7 +15,7 @@ import mpfjax
 from mpfjax import Propagate, Resample
 from mpfjax.exact import kalman_filter
 from mpfjax.models.noise import draw_noise, stratified_normal
-from mpfjax.operations.sobol import shuffled
+from mpfjax.operations.random import shuffled
 from tests.marking import thorough
 
 KEYS = jax.random.split(jax.random.key(5), 16)

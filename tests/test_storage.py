@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.operations.generator import fast_key
+from mpfjax.operations.random import fast_key
 from mpfjax.running.storage.descriptions import describe
 from mpfjax.running.storage.files import load_arrays, write_arrays
 from tests.examples import make_mixture

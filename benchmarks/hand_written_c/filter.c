@@ -1,7 +1,7 @@
 /* The bootstrap filter of the quadratic model, written by hand for one processor's vectors.
 
    Its random numbers cost what JAX's do: Threefry-2x32 with 20 rounds, and normals from its bits by
-   the polynomials of mpfjax/operations/generator.py. */
+   the polynomials of mpfjax/operations/random.py. */
 #include <math.h>
 #include <stdint.h>
 #include <string.h>

@@ -15,8 +15,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import check_whole, shown
 from mpfjax.models.inputs import replaced, takes_inputs, with_inputs
 from mpfjax.models.noise import noise_dtype
-from mpfjax.operations.generator import normal, split
-from mpfjax.operations.sobol import direction_numbers
+from mpfjax.operations.random import direction_numbers, normal, split
 
 
 class AbstractStateSpaceModel(eqx.Module):

@@ -14,9 +14,9 @@ from mpfjax.checks import shown
 from mpfjax.mixture import MarginalisedState
 from mpfjax.models.base import AbstractStateSpaceModel, check_moved, model_name
 from mpfjax.operations import gaussians
-from mpfjax.operations.floats import default_float
-from mpfjax.operations.gaussians import Gaussian, Linear
-from mpfjax.operations.stacks import (
+from mpfjax.operations.gaussians import (
+    Gaussian,
+    Linear,
     applied,
     cholesky,
     particles_first,
@@ -26,6 +26,7 @@ from mpfjax.operations.stacks import (
     solve_upper,
     transposed,
 )
+from mpfjax.operations.logarithms import default_float
 
 
 class AbstractConditionallyLinearModel(AbstractStateSpaceModel):

@@ -14,8 +14,8 @@ from mpfjax.checks import (
     check_shape,
     to_array,
 )
-from mpfjax.operations.generator import normal
 from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
+from mpfjax.operations.random import normal
 
 
 class AbstractDynamics(eqx.Module):

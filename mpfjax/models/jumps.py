@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from mpfjax.checks import check_inner_share, check_positive_array, check_rows, check_shape, to_array
 from mpfjax.models.dynamics import AbstractRandomWalk, RandomWalk
-from mpfjax.operations.generator import fast_key, normal, split_once
+from mpfjax.operations.random import fast_key, normal, split_once
 
 
 class RandomWalkWithJumps(AbstractRandomWalk):

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_finite_array, check_shape, to_array
 from mpfjax.models.base import AbstractStateSpaceModel
-from mpfjax.operations.generator import normal
 from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
+from mpfjax.operations.random import normal
 
 _IN_TIME = ("A", "Q", "H", "R", "B", "inputs")
 

@@ -19,7 +19,7 @@ from mpfjax.models.base import (
 )
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.inputs import replaced, takes_inputs, with_inputs
-from mpfjax.operations.generator import split
+from mpfjax.operations.random import split
 
 # A number of particles that is hardly ever the length of a parameter's axis.
 _TRIAL = 1_000_003

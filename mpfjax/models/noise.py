@@ -7,15 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
-from mpfjax.operations.floats import default_float
-from mpfjax.operations.generator import bits, normal, normal_quantile, split, uniform
-from mpfjax.operations.segments import first_places, spread
-from mpfjax.operations.sobol import (
+from mpfjax.operations.logarithms import default_float
+from mpfjax.operations.random import (
     MOST_DIMENSIONS,
+    bits,
+    normal,
+    normal_quantile,
     scrambled_directions,
     shuffled,
     sobol_points,
+    split,
+    uniform,
 )
+from mpfjax.operations.segments import first_places, spread
 from mpfjax.operations.stored import stored
 
 NOISES = ("independent", "rqmc")

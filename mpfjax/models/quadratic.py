@@ -15,7 +15,7 @@ from mpfjax.checks import (
 )
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.noise import stratified_uniform
-from mpfjax.operations.generator import normal, uniform
+from mpfjax.operations.random import normal, uniform
 
 
 class QuadraticModel(AbstractStateSpaceModel):

@@ -26,7 +26,7 @@ from mpfjax.models.conditionally_linear import (
 )
 from mpfjax.models.noise import noise_dtype
 from mpfjax.operations import gaussians
-from mpfjax.operations.generator import normal
+from mpfjax.operations.random import normal
 
 
 def moved(key: Key[Array, ""], model: Any, states: PyTree) -> PyTree:

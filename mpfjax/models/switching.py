@@ -18,8 +18,8 @@ from mpfjax.checks import (
     to_array,
 )
 from mpfjax.models.conditionally_linear import AbstractConditionallyLinearModel
-from mpfjax.operations.generator import uniform
 from mpfjax.operations.logarithms import log_or_nothing
+from mpfjax.operations.random import uniform
 from mpfjax.operations.segments import spread
 
 # Sums of probabilities may differ from one by this much, for rounding.

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float, Key
 
 from mpfjax.checks import check_not_negative_array, check_type, shown, to_array
 from mpfjax.models.dynamics import AbstractDynamics, AbstractRandomWalk
-from mpfjax.operations.generator import normal
+from mpfjax.operations.random import normal
 
 
 def _as_shares(gain: Any) -> tuple[float, ...]:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.operations.gradients import without_gradient
+from mpfjax.operations.logarithms import without_gradient
 
 
 class AbstractMove(eqx.Module):

@@ -16,7 +16,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractAdaptiveResampling, AbstractPropagation
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight, log_transition
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.indexing import take
+from mpfjax.operations.stored import take
 
 REFERENCE = "reference"  # the name of its slot and time in a mixture's memory
 

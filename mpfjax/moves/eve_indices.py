@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.checks import check_numbered
 from mpfjax.mixture import ParticleMixture
-from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import segment_sum
+from mpfjax.operations.stored import take
 
 EVE_INDICES = "eve_indices"
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 from mpfjax.checks import check_whole, is_series, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
-from mpfjax.operations.generator import split
+from mpfjax.operations.random import split
 
 _MOST_STEPS = 2**31 - 1  # that int32 counts
 

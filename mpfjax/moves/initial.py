@@ -22,13 +22,10 @@ from mpfjax.moves.propagation.marginalised import PropagateMarginalised
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.resampling.ordering import HILBERT, sorted_order
-from mpfjax.operations.floats import default_float
-from mpfjax.operations.generator import split, uniform
-from mpfjax.operations.indexing import take
-from mpfjax.operations.logarithms import exp, finite_or_zero
-from mpfjax.operations.maxima import largest
+from mpfjax.operations.logarithms import default_float, exp, finite_or_zero, largest
 from mpfjax.operations.prefix_sums import count_starts, sum_before
-from mpfjax.operations.stored import stored
+from mpfjax.operations.random import split, uniform
+from mpfjax.operations.stored import stored, take
 
 # A particle that the first observation tells nothing of keeps a quarter of its chance, so that no
 # weight is more than four times the mean.

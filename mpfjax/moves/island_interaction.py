@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Key, PyTree
 from mpfjax.checks import check_share
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
-from mpfjax.operations.across_islands import deal_to_islands, num_islands, over_islands
+from mpfjax.operations.islands import deal_to_islands, num_islands, over_islands
 from mpfjax.operations.logarithms import softmax
 
 

@@ -9,7 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
-from mpfjax.operations.coordinates import Coordinates, coordinates, inner, log_total, transformed
+from mpfjax.operations.matrices import (
+    Coordinates,
+    coordinates,
+    inner,
+    log_total,
+    transformed,
+)
 
 Index = Int[Array, ""]
 

@@ -15,8 +15,8 @@ from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.steps import likelihoods
 from mpfjax.moves.base import AbstractMarkovMove
 from mpfjax.moves.propagation.propagate import log_transition
-from mpfjax.operations.generator import normal, split, uniform
-from mpfjax.operations.gradients import add_gradient, without_gradient
+from mpfjax.operations.logarithms import add_gradient, without_gradient
+from mpfjax.operations.random import normal, split, uniform
 
 
 class _Target(NamedTuple):

@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.eve_indices import EVE_INDICES, evidence_variance, mass_variances
-from mpfjax.operations.across_islands import num_islands
+from mpfjax.operations.islands import num_islands
 
 
 class StepInfo(eqx.Module):

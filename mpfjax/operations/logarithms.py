@@ -2,15 +2,80 @@
 
 In numpy: `np.log(np.sum(np.exp(x)))` and `np.exp(x) / np.sum(np.exp(x))`. Here the largest value is
 subtracted first, and -inf everywhere is a case of its own. A weight that is too small to count
-becomes zero, since a CPU takes a hundred times as long for subnormal numbers.
+becomes zero, since a CPU takes a hundred times as long for subnormal numbers. What these and others
+need of floating point types, maxima and gradients stands here too.
 """
 
 import math
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Inexact, Int, PyTree, Shaped
 
-from mpfjax.operations.maxima import largest
+_INTEGERS = {2: jnp.int16, 4: jnp.int32, 8: jnp.int64}
+
+
+def as_inexact(values: Shaped[Array, "*shape"]) -> Inexact[Array, "*shape"]:
+    """The same numbers in floating point, in which whole numbers and booleans can be averaged."""
+    is_inexact = jnp.issubdtype(values.dtype, jnp.inexact)
+    return values if is_inexact else values.astype(default_float())
+
+
+def default_float() -> jnp.dtype:
+    """The floating point type of new arrays: float32, or float64 where JAX is set to it."""
+    return jnp.result_type(float)
+
+
+@jax.custom_jvp
+def add_gradient(
+    values: Float[Array, " *shape"], source: Float[Array, " *shape"]
+) -> Float[Array, " *shape"]:
+    """`values`, to the bit, with the derivatives of `values + source`, of every order.
+
+    Without differentiation, the source is not even computed.
+    """
+    del source
+    return values
+
+
+@add_gradient.defjvp
+def _add_gradient_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    return add_gradient(*primals), tangents[0] + tangents[1]
+
+
+def without_gradient(tree: PyTree) -> PyTree:
+    """The same values, all of them constants to a derivative."""
+    return jax.tree.map(
+        lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, tree
+    )
+
+
+def largest(values: Shaped[Array, "..."], axis: int | None = None) -> Shaped[Array, "..."]:
+    """The largest value, over all or along an axis: -inf of none, NaN where there is one.
+
+    Whole numbers have the largest one, too; there must be one. A derivative treats the largest as
+    a constant.
+    """
+    if not jnp.issubdtype(values.dtype, jnp.floating):
+        return jnp.max(values, axis=axis)
+    kind = _INTEGERS[values.dtype.itemsize]
+    least = _in_order(jnp.array(-jnp.inf, values.dtype), kind)
+    # Of all integers, the last one is NaN.
+    keys = jnp.where(jnp.isnan(values), jnp.iinfo(kind).max, _in_order(values, kind))
+    found = jnp.max(keys, axis=axis, initial=least)
+    return jax.lax.bitcast_convert_type(_mirrored(found, kind), values.dtype)
+
+
+def _in_order(values: Shaped[Array, "..."], kind: type) -> Int[Array, "..."]:
+    """The bits as integers in the order of the values."""
+    return _mirrored(jax.lax.bitcast_convert_type(values, kind), kind)
+
+
+def _mirrored(bits: Int[Array, "..."], kind: type) -> Int[Array, "..."]:
+    """The other bits of those with a sign, inverted: their order, and back."""
+    info = jnp.iinfo(kind)
+    return bits ^ ((bits >> (info.bits - 1)) & info.max)
 
 
 def exp(log_values: Float[Array, " *shape"]) -> Float[Array, " *shape"]:

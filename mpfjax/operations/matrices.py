@@ -1,22 +1,23 @@
-"""Many small rows and matrices at once: sums, draws, factors.
+"""Many small rows and matrices at once, the particles first: sums, factors, products.
 
-In numpy: `values.sum(axis=1)`, `rng.choice(n, p=weights[i])` for each row i, `np.linalg.cholesky`
-and `np.linalg.solve`. Calls of LAPACK for thousands of tiny matrices cost far more than their
-arithmetic. Here one operation does the same column of all matrices.
+In numpy: `values.sum(axis=1)`, `rng.choice(n, p=weights[i])`, `np.linalg.cholesky`,
+`np.linalg.solve` and `points @ matrix.T`. Calls of LAPACK for thousands of tiny matrices cost far
+more than their arithmetic, and rows of a few numbers do not run on vectors. Here one operation does
+the same column of all.
 """
 
 import math
-from typing import Any
+from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from mpfjax.operations.logarithms import finite_or_zero
+
 _FEW_COLUMNS = 16
-# Larger matrices than these, up to so many of them, are factored in a loop over their columns: most
-# of the time until a tracker's first frame is compiling.
-_SMALL = 4
-_FEW_MATRICES = 64
+Coordinates = Sequence[Float[Array, " n"]]
+# Sums over more terms than this are a matrix product: written out they would compile too long.
+_FEW = 10
 
 
 def row_sums(values: Float[Array, "n d"]) -> Float[Array, " n"]:
@@ -95,22 +96,13 @@ def cholesky(matrices: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
     d = matrices.shape[-1]
     tiny = 8 * d * jnp.finfo(matrices.dtype).eps * jnp.diagonal(matrices, axis1=1, axis2=2)
 
-    def column(j: Any, factors: Float[Array, "n d d"]) -> Float[Array, "n d"]:
-        rest = matrices[:, :, j] - jnp.einsum("nik,nk->ni", factors, factors[:, j])
-        positive = rest[:, j] > tiny[:, j]
-        pivot = jnp.sqrt(jnp.where(positive, rest[:, j], 1.0))
-        return jnp.where(positive[:, None], rest / pivot[:, None], 0.0)
-
     factors = jnp.zeros_like(matrices)
-    if d > _SMALL and len(matrices) <= _FEW_MATRICES:
-
-        def with_column(j: Any, factors: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
-            below = jnp.arange(d) >= j
-            return factors.at[:, :, j].set(jnp.where(below, column(j, factors), 0.0))
-
-        return jax.lax.fori_loop(0, d, with_column, factors)
     for j in range(d):
-        factors = factors.at[:, j:, j].set(column(j, factors)[:, j:])
+        rest = matrices[:, j:, j] - jnp.einsum("nik,nk->ni", factors[:, j:], factors[:, j])
+        positive = rest[:, 0] > tiny[:, j]
+        pivot = jnp.sqrt(jnp.where(positive, rest[:, 0], 1.0))
+        column = jnp.where(positive[:, None], rest / pivot[:, None], 0.0)
+        factors = factors.at[:, j:, j].set(column)
     return factors
 
 
@@ -127,3 +119,44 @@ def solve_lower(
         rest = vectors[:, i] - jnp.sum(factors[:, i] * solved, axis=1)
         solved = solved.at[:, i].set(rest / factors[:, i, i])
     return solved
+
+
+def coordinates(points: Float[Array, "n d"]) -> Coordinates:
+    """The columns of an array with a row for each point."""
+    return [points[:, i] for i in range(points.shape[1])]
+
+
+def transformed(
+    matrix: Float[Array, "e d"], points: Coordinates, is_lower: bool = False
+) -> Coordinates:
+    """A x of each point x; `is_lower` says that A has zeros above its diagonal."""
+    rows, columns = matrix.shape
+    if columns > _FEW:
+        found = matrix @ jnp.stack(points)
+        return [found[i] for i in range(rows)]
+    return [
+        total([matrix[i, j] * points[j] for j in range(i + 1 if is_lower else columns)])
+        for i in range(rows)
+    ]
+
+
+def total(terms: Coordinates) -> Float[Array, " n"]:
+    """The sum of the terms, one after the other; zero where there is none."""
+    found = terms[0] if terms else jnp.zeros(())
+    for term in terms[1:]:
+        found = found + term
+    return found
+
+
+def inner(points: Coordinates, others: Coordinates) -> Float[Array, " n"]:
+    """xᵀy of each pair of points."""
+    return total([x * y for x, y in zip(points, others, strict=True)])
+
+
+def log_total(logs: Coordinates) -> Float[Array, " n"]:
+    """log Σ exp of the terms, -inf where all are."""
+    most = logs[0]
+    for term in logs[1:]:
+        most = jnp.maximum(most, term)
+    most = finite_or_zero(most)
+    return jnp.log(total([jnp.exp(term - most) for term in logs])) + most

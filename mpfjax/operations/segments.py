@@ -1,31 +1,39 @@
-"""Sums, maxima and orders by component.
+"""Sums, maxima and other reductions by component.
 
-In numpy: `[values[labels == m].sum() for m in range(M)]`, `per_component[labels]` and
-`np.argsort(labels, kind="stable")`. For few components or particles there are M masks, which XLA
-fuses into its loops. For many there is one scatter, shared by lanes, so that neighbours need not
-wait for each other and rounding errors of long sums stay small.
+In numpy: `[values[labels == m].sum() for m in range(M)]` and `per_component[labels]`. For few
+components or particles there are M masks, which XLA fuses into its loops. For many there is one
+scatter, shared by lanes, so that neighbours need not wait for each other and rounding errors of
+long sums stay small. Where segments stand side by side (`Runs`), values are taken in blocks, whose
+sums run on vectors.
 """
 
+import functools
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from mpfjax.operations.floats import default_float
-from mpfjax.operations.indexing import (
-    count_places,
-    from_the_start,
-    in_rows,
-    inverse_permutation,
-    take,
+from mpfjax.operations.logarithms import (
+    default_float,
+    exp,
+    finite_or_zero,
+    largest,
+    log_or_nothing,
+    masked_shares,
 )
-from mpfjax.operations.logarithms import exp, finite_or_zero, log_or_nothing, masked_shares
-from mpfjax.operations.maxima import largest
-from mpfjax.operations.prefix_sums import count_starts, count_upto
-from mpfjax.operations.stored import EXACT_IN_FLOAT32, stored, whole_blocks
+from mpfjax.operations.prefix_sums import count_starts
+from mpfjax.operations.stored import (
+    EXACT_IN_FLOAT32,
+    block_size,
+    from_the_start,
+    stored,
+    take,
+    whole_blocks,
+)
 
 # Up to this many segments, a sum has a mask for each; with more, up to this many masked entries.
 # Masks run on vectors, and compile in half the time of a scatter. Runs of a `vmap` multiply them.
@@ -43,11 +51,10 @@ _FEW_COLUMNS = 9
 _HANDFUL = 2**12
 # In float32, a million equal numbers, added one after the other, give a thousandth too much.
 _LONGEST_SUM = 2**10
-_COUNTED_BLOCK = 32
 # The segments that occur are kept in the bits of at most this many words.
 _WORD, _MOST_WORDS = 32, 8
 _WORD_BITS = 5  # a word has 2^5 bits
-_MOST_COUNTED_SEGMENTS = 8 * _COUNTED_BLOCK  # eight counts for each particle
+_COMBINED = {"add": jnp.add, "max": jnp.maximum, "min": jnp.minimum}
 
 
 @jax.jit
@@ -215,27 +222,18 @@ def _scattered(
     """
     n = values.shape[0]
     num_lanes = _num_lanes(n, num_segments)
-    padding = ((0, 0), (0, -n % num_lanes))
-
-    def scatter(
-        rows: Shaped[Array, "k n"], labels: Int[Array, "k n"]
-    ) -> Shaped[Array, "k num_segments"]:
-        num_rows = rows.shape[0]
-        # One more, for values that are in no segment.
-        labels = jnp.where((labels >= 0) & (labels < num_segments), labels, num_segments)
-        labels = jnp.pad(labels, padding, constant_values=num_segments)
-        labels = labels.reshape(num_rows, -1, num_lanes)
-        # Row and lane are added without other arithmetic. XLA would move such arithmetic out of a
-        # filter's loop, and not see any more that two sums by the same labels use the same places.
-        row, lane = (jax.lax.broadcasted_iota(jnp.int32, labels.shape, axis) for axis in (0, 2))
-        places = (labels * num_lanes + lane) * num_rows + row
-        line = jnp.full((num_segments + 1) * num_lanes * num_rows, initial, rows.dtype)
-        combine = getattr(line.at[from_the_start(places.reshape(-1))], how)
-        lines = combine(jnp.pad(rows, padding).reshape(-1), mode="promise_in_bounds")
-        lines = lines.reshape(-1, num_lanes, num_rows)[:num_segments]
-        return REDUCTIONS[how](lines, axis=1).T.astype(rows.dtype)
-
-    return in_rows(scatter)(values, segments)
+    padding = (0, -n % num_lanes)
+    # One more, for values that are in no segment.
+    labels = jnp.where((segments >= 0) & (segments < num_segments), segments, num_segments)
+    labels = jnp.pad(labels, padding, constant_values=num_segments).reshape(-1, num_lanes)
+    # The lane is added without other arithmetic. XLA would move such arithmetic out of a filter's
+    # loop, and not see any more that two sums by the same labels use the same places.
+    places = labels * num_lanes + jax.lax.broadcasted_iota(jnp.int32, labels.shape, 1)
+    line = jnp.full((num_segments + 1) * num_lanes, initial, values.dtype)
+    combine = getattr(line.at[from_the_start(places.reshape(-1))], how)
+    lines = combine(jnp.pad(jax.lax.stop_gradient(values), padding), mode="promise_in_bounds")
+    lines = lines.reshape(-1, num_lanes)[:num_segments]
+    return REDUCTIONS[how](lines, axis=1).astype(values.dtype)
 
 
 def _num_lanes(n: int, num_segments: int) -> int:
@@ -318,54 +316,6 @@ def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, "
     return segments
 
 
-def order_by_segment(
-    segments: Int[Array, " n"], num_segments: int
-) -> tuple[Int[Array, " n"], Int[Array, " num_segments"]]:
-    """The indices that make segments contiguous and ascending, and how many each segment has.
-
-    Within a segment the original order stays; a label equal to `num_segments` comes last. For up to
-    a few hundred segments the place of each entry is counted, in O(n). For more, label and index
-    are packed into one integer if they fit: sorting one array is several times faster than
-    sorting pairs.
-    """
-    n = segments.shape[0]
-    if num_segments <= _MOST_COUNTED_SEGMENTS and n < EXACT_IN_FLOAT32:
-        places, counts = _places_by_segment(segments, num_segments)
-        return inverse_permutation(places), counts
-    counts = segment_counts(jnp.ones(n, bool), segments, num_segments)
-    if (num_segments + 1) * n >= 2**31:
-        return jnp.argsort(segments, stable=True).astype(jnp.int32), counts
-    index = jnp.arange(n, dtype=jnp.int32)
-    return jax.lax.sort(segments.astype(jnp.int32) * n + index) % n, counts
-
-
-def _places_by_segment(
-    segments: Int[Array, " n"], num_segments: int
-) -> tuple[Int[Array, " n"], Int[Array, " num_segments"]]:
-    """Each entry's place in the order, which is how many come before it, and segments' counts.
-
-    A table has a row for each segment and a column for each block of entries; a cell counts the
-    block's entries of that segment. The prefix sum over the whole table, row after row, is the
-    first place of each cell. The rank of an entry in its cell is the number of entries before it
-    in the block that are of its segment.
-    """
-    n = segments.shape[0]
-    # Odd: rows whose distance is a power of two would share few places of a cache.
-    num_blocks = -(-n // _COUNTED_BLOCK) | 1
-    cells = segments * num_blocks + jnp.arange(n, dtype=jnp.int32) // _COUNTED_BLOCK
-    num_cells = whole_blocks((num_segments + 1) * num_blocks + 1)
-    # One place further, so that the sum up to a cell is the sum of all cells before it.
-    before = count_upto(count_places(cells + 1, num_cells, jnp.float32), n)
-    # The start of the first block is filled up with a label of no cell.
-    line = jnp.pad(cells, (_COUNTED_BLOCK, 0), constant_values=-1)
-    ranks = jnp.zeros(n, jnp.int32)
-    for back in range(1, _COUNTED_BLOCK):
-        earlier = jax.lax.slice_in_dim(line, _COUNTED_BLOCK - back, _COUNTED_BLOCK - back + n)
-        ranks = ranks + (earlier == cells).astype(jnp.int32)
-    firsts = before[: (num_segments + 1) * num_blocks : num_blocks]
-    return take(before, cells) + ranks, jnp.diff(firsts)
-
-
 def _members(
     segments: Int[Array, " n"], num_segments: int, trailing: int = 0
 ) -> Bool[Array, "num_segments n ..."]:
@@ -373,3 +323,67 @@ def _members(
     labels = jnp.arange(num_segments, dtype=segments.dtype)
     member = segments[None] == labels[:, None]
     return member.reshape(member.shape + (1,) * trailing)
+
+
+class Runs(NamedTuple):
+    """The places of segments, in blocks; the segments together fill whole blocks."""
+
+    labels: Int[Array, "blocks size"]
+    first_blocks: Int[Array, " m"]
+    last_blocks: Int[Array, " m"]
+
+    def sums(self, values: Float[Array, " p"]) -> Float[Array, " m"]:
+        """The sum of each segment's values."""
+        return self._reduced("add", values, 0.0)
+
+    def maxima(self, values: Float[Array, " p"]) -> Float[Array, " m"]:
+        """The largest value of each segment, -inf for an empty one."""
+        return self._reduced("max", values, -jnp.inf)
+
+    def extents(self, mask: Bool[Array, " p"]) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
+        """The first and the last masked place of each segment; any place where there is none."""
+        places = jnp.arange(mask.shape[0], dtype=jnp.int32)
+        last = mask.shape[0] - 1
+        # The last place is the least of the negative ones: one minimum finds both.
+        signed = jnp.where(mask[None], jnp.stack([places, -places]), last)
+        firsts, lasts = jax.vmap(lambda row: self._reduced("min", row, last))(signed)
+        return firsts, jnp.maximum(-lasts, 0)
+
+    def _reduced(
+        self, how: str, values: Shaped[Array, " p"], nothing: float
+    ) -> Shaped[Array, " m"]:
+        m, blocks = self.first_blocks.shape[0], values.reshape(self.labels.shape)
+        is_whole = self.labels[:, 0] == self.labels[:, -1]
+        reduce = REDUCTIONS[how]
+        found = segment_reduce(
+            how, reduce(blocks, axis=1), jnp.where(is_whole, self.labels[:, 0], m), m, nothing
+        )
+
+        # Of the first and the last block of each segment, unless it is whole, its own entries.
+        ends = jnp.concatenate([self.first_blocks, self.last_blocks])
+        labels = take(self.labels, ends)
+        is_last = np.arange(2 * m) >= m
+        counts = (labels[:, 0] != labels[:, -1]) & (
+            ~is_last | jnp.tile(self.last_blocks > self.first_blocks, 2)
+        )
+        is_own = labels == np.tile(np.arange(m, dtype=labels.dtype), 2)[:, None]
+        own = jnp.where(is_own & counts[:, None], take(blocks, ends), nothing)
+        of_ends = reduce(own.astype(values.dtype), axis=1)
+        return functools.reduce(_COMBINED[how], (found, of_ends[:m], of_ends[m:]))
+
+
+def runs_of(labels: Int[Array, " p"], num_segments: int) -> Runs:
+    """The runs of labels in ascending order, whole blocks of them."""
+    blocks = labels.reshape(-1, block_size(labels.shape[0]))
+    label = jnp.arange(num_segments, dtype=labels.dtype)[None]
+    last = blocks.shape[0] - 1
+    before = jnp.sum((blocks[:, -1:] < label).astype(jnp.int32), axis=0)
+    after = jnp.sum((blocks[:, :1] > label).astype(jnp.int32), axis=0)
+    ends = jnp.stack([jnp.minimum(before, last), jnp.maximum(last - after, 0)])
+    return Runs(blocks, *stored(ends))
+
+
+def whole(values: Array, fill: float) -> Array:
+    """The values, filled up to whole blocks."""
+    n = values.shape[0]
+    return jnp.pad(values, (0, whole_blocks(n) - n), constant_values=fill)

@@ -1,22 +1,51 @@
-"""Values that are computed once and kept.
+"""What XLA computes once and keeps, and gathers and scatters of it.
 
-In numpy all of this is `values.copy()` and `values.astype(int)`. XLA fuses a computation into
-everything that uses its result, and then repeats it for every use. It does not fuse across the
-call of a function that it must not inline, and a call that does nothing takes no time.
+In numpy: `values.copy()`, `values.astype(int)`, `values[indices]` and `np.bincount(places)`. XLA
+fuses a computation into everything that uses its result, and then repeats it for every use. It does
+not fuse across the call of a function that it must not inline, and a call that does nothing takes
+no time. An operation has one form for CPUs and another for all other platforms.
 """
+
+import contextlib
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
-from jaxtyping import Array, Float, Int, Shaped
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float, Int, PyTree, Shaped, UInt32
 
-from mpfjax.operations.platforms import on_platform
-
+_only_the_default_forms = False
 VECTOR = 32
 # Powers of two fill the vectors; sizes far from 32 make more rows or longer products.
 _BLOCKS = (VECTOR, 16, 40, 48, 24, 56, 28, 36, 20, 44, 52)
 EXACT_IN_FLOAT32 = 2**23  # as exact as up to 2^24, and readable from the lowest bits
+
+
+def on_platform(
+    *operands: PyTree, cpu: Callable[..., PyTree], default: Callable[..., PyTree]
+) -> PyTree:
+    """The result of `cpu` on a CPU, and of `default` elsewhere.
+
+    Both give the same numbers, up to rounding.
+    """
+    if _only_the_default_forms:
+        return default(*operands)
+    return jax.lax.platform_dependent(*operands, cpu=cpu, default=default)
+
+
+@contextlib.contextmanager
+def default_forms() -> Iterator[None]:
+    """Within it the default forms run on a CPU as well, so that they can be tried without a GPU."""
+    global _only_the_default_forms
+    _only_the_default_forms = True
+    jax.clear_caches()
+    try:
+        yield
+    finally:
+        _only_the_default_forms = False
+        jax.clear_caches()
 
 
 def whole_blocks(n: int) -> int:
@@ -72,3 +101,28 @@ def to_int(
         return values.astype(jnp.int32)
     shift = np.float32(2**23)
     return jax.lax.bitcast_convert_type(values + shift, jnp.int32) - shift.view(np.int32)
+
+
+def take(values: Array, indices: Int[Array, " n"]) -> Array:
+    """values[indices] for indices that are known to lie in range."""
+    return values.at[from_the_start(indices)].get(mode="promise_in_bounds")
+
+
+def from_the_start(indices: Int[Array, "*shape"]) -> UInt32[Array, "*shape"]:
+    """Indices without a sign, so that JAX does not check whether they count from the end."""
+    return indices.astype(jnp.uint32)
+
+
+def count_places(
+    places: Int[Array, " n"], num_places: int, dtype: DTypeLike = jnp.int32
+) -> Shaped[Array, " num_places"]:
+    """How many of the entries name each place, all of which must be in [0, num_places)."""
+    counts = jnp.zeros(num_places, dtype).at[from_the_start(places)]
+    return counts.add(1, mode="promise_in_bounds")
+
+
+def inverse_permutation(places: Int[Array, " n"]) -> Int[Array, " n"]:
+    """The index at each place, given every index's place."""
+    index = jnp.arange(places.shape[0], dtype=jnp.int32)
+    found = jnp.zeros_like(index).at[from_the_start(stored(places))]
+    return found.set(index, mode="promise_in_bounds", unique_indices=True)

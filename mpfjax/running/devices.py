@@ -14,8 +14,8 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, PyTree
 
 from mpfjax.checks import is_series
-from mpfjax.operations.across_islands import DEVICE_AXIS
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors
+from mpfjax.operations.islands import DEVICE_AXIS
 
 
 def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:

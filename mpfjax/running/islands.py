@@ -11,8 +11,8 @@ from mpfjax.checks import check_key, check_whole
 from mpfjax.filter import Filter, Start
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import as_series
-from mpfjax.operations.across_islands import DEVICE_AXIS, ISLAND_AXIS
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
+from mpfjax.operations.islands import DEVICE_AXIS, ISLAND_AXIS
 from mpfjax.running.devices import choose_devices, over_devices
 from mpfjax.running.scan import FilterRun, check_run, checked, scan
 

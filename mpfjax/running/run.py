@@ -14,7 +14,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import Series, as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
-from mpfjax.operations.generator import split, split_keys
+from mpfjax.operations.random import split, split_keys
 from mpfjax.running.devices import choose_devices, over_devices
 from mpfjax.running.progress import shown_progress
 from mpfjax.running.scan import FilterRun, check_run, checked, first_mixture, scan

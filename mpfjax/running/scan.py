@@ -16,8 +16,8 @@ from mpfjax.checks import check_callable, check_type, given, saying
 from mpfjax.filter import BROKEN_DENSITY, Filter, Start, StepInfo
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Series
-from mpfjax.operations.across_islands import num_islands
-from mpfjax.operations.generator import split_for_run
+from mpfjax.operations.islands import num_islands
+from mpfjax.operations.random import split_for_run
 from mpfjax.running.progress import Bar, advance_bar
 
 

@@ -31,7 +31,7 @@ from mpfjax.checks import (
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import as_series, check_series
-from mpfjax.operations.floats import default_float
+from mpfjax.operations.logarithms import default_float
 from mpfjax.running.run import monte_carlo
 from mpfjax.running.scan import FilterRun
 from mpfjax.running.storage.descriptions import describe, differences, fingerprint, named

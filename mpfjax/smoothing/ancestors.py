@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from mpfjax.checks import check_numbered
 from mpfjax.mixture import ParticleMixture
-from mpfjax.operations.indexing import count_places, take
+from mpfjax.operations.stored import count_places, take
 from mpfjax.running.scan import FilterRun
 from mpfjax.smoothing.history import mixtures_of, with_parents
 

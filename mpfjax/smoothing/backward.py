@@ -15,11 +15,9 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import check_log_density
 from mpfjax.models.inputs import with_inputs
-from mpfjax.operations.generator import split, uniform
-from mpfjax.operations.indexing import take
 from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.matrices import draw_columns
-from mpfjax.operations.positions import (
+from mpfjax.operations.prefix_sums import (
     exact_sum_before,
     growths,
     in_slots,
@@ -27,8 +25,10 @@ from mpfjax.operations.positions import (
     needs_two_parts,
     random_positions,
     scales,
+    sum_before,
 )
-from mpfjax.operations.prefix_sums import sum_before
+from mpfjax.operations.random import split, uniform
+from mpfjax.operations.stored import take
 
 # How many densities are held at once: rows of states are taken together up to this.
 MOST_DENSITIES = 2**22

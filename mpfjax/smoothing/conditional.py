@@ -29,7 +29,7 @@ from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.observations import Series, as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
-from mpfjax.operations.generator import split, uniform
+from mpfjax.operations.random import split, uniform
 from mpfjax.running.scan import FilterRun, checked, scan
 from mpfjax.smoothing.backward import draw, log_transitions
 from mpfjax.smoothing.history import mixtures_of

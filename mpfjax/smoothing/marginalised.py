@@ -38,11 +38,9 @@ from mpfjax.models.inputs import with_inputs
 from mpfjax.moves.propagation.marginalised import log_latent_transition
 from mpfjax.operations import gaussians
 from mpfjax.operations.compiling import jit_on_wide_vectors
-from mpfjax.operations.gaussians import Gaussian, Linear, without_missing
-from mpfjax.operations.generator import split, uniform
-from mpfjax.operations.indexing import take
-from mpfjax.operations.matrices import draw_columns
-from mpfjax.operations.stacks import (
+from mpfjax.operations.gaussians import (
+    Gaussian,
+    Linear,
     applied,
     cholesky,
     particles_first,
@@ -51,7 +49,11 @@ from mpfjax.operations.stacks import (
     solve_lower,
     symmetric,
     transposed,
+    without_missing,
 )
+from mpfjax.operations.matrices import draw_columns
+from mpfjax.operations.random import split, uniform
+from mpfjax.operations.stored import take
 from mpfjax.smoothing.backward import MOST_DENSITIES, draw
 
 _NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the step before"

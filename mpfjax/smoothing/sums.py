@@ -26,9 +26,9 @@ from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.inputs import with_inputs
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
-from mpfjax.operations.floats import as_inexact
-from mpfjax.operations.generator import split, split_keys
-from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import as_inexact
+from mpfjax.operations.random import split, split_keys
+from mpfjax.operations.stored import take
 from mpfjax.running.scan import (
     FilterRun,
     checked,

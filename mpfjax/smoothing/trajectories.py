@@ -15,8 +15,8 @@ from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
 from mpfjax.models.inputs import saying_that_none_were_given, with_inputs
 from mpfjax.observations import as_arrays, steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors
-from mpfjax.operations.generator import split_keys
-from mpfjax.operations.indexing import take
+from mpfjax.operations.random import split_keys
+from mpfjax.operations.stored import take
 from mpfjax.running.scan import FilterRun
 from mpfjax.smoothing.backward import draw, draw_exactly, propose, walk
 from mpfjax.smoothing.distinct import warn_of_few

@@ -16,7 +16,6 @@ from mpfjax.moves.resampling.allocation import place_slots
 from mpfjax.moves.resampling.ancestors import SCHEMES as SCHEMES_BY_NAME
 from mpfjax.moves.resampling.ancestors import Dealt
 from mpfjax.moves.resampling.line import in_line
-from mpfjax.operations import positions
 from mpfjax.smoothing.backward import draw
 from tests.examples import make_mixture
 from tests.marking import quick_of, thorough
@@ -139,7 +138,7 @@ class TestTwoParts:
 
     @pytest.fixture(autouse=True)
     def always(self, monkeypatch):
-        monkeypatch.setattr(positions, "MOST_IN_ONE_FLOAT", 0)
+        monkeypatch.setattr(prefix_sums, "MOST_IN_ONE_FLOAT", 0)
 
     @pytest.mark.thorough
     @pytest.mark.parametrize("scheme", quick_of(SCHEMES, ["residual"]))
@@ -157,7 +156,7 @@ class TestTwoParts:
         for move in (Resample(), Resample(ess_threshold=0.9), Resample(particles_per_component=9)):
             two, one = [], []
             for found, limit in ((two, 0), (one, 100_000)):
-                monkeypatch.setattr(positions, "MOST_IN_ONE_FLOAT", limit)
+                monkeypatch.setattr(prefix_sums, "MOST_IN_ONE_FLOAT", limit)
                 # A new function each time, since jit remembers the last form.
                 redraw = jax.jit(jax.vmap(lambda key: move(key, mixture).ancestor_indices))  # noqa: B023
                 found.extend(np.asarray(redraw(jax.random.split(jax.random.key(0), 20))).ravel())

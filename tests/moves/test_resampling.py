@@ -11,7 +11,6 @@ import pytest
 from mpfjax import Resample
 from mpfjax.moves.resampling.allocation import place_slots
 from mpfjax.moves.resampling.ancestors import random_points
-from mpfjax.operations import positions
 from tests.examples import make_mixture
 from tests.marking import quick_of, thorough
 
@@ -318,9 +317,11 @@ def test_points_stay_within_their_components_stretch_of_slots(word):
     slots = place_slots(targets, 2**20 + 100_000)
     ends = np.asarray(slots.firsts) + np.asarray(targets)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(positions, "bits", lambda key, shape: jnp.full(shape, word, jnp.uint32))
+        patch.setattr(prefix_sums, "bits", lambda key, shape: jnp.full(shape, word, jnp.uint32))
         ends_of_unit = {0: 0.0, 2**32 - 1: NEARLY_ONE}
-        patch.setattr(positions, "uniform", lambda key, shape: jnp.full(shape, ends_of_unit[word]))
+        patch.setattr(
+            prefix_sums, "uniform", lambda key, shape: jnp.full(shape, ends_of_unit[word])
+        )
         points = jax.jit(lambda key: random_points(key, slots, targets))(jax.random.key(0))
     own = np.asarray(slots.components)
     assert (points.whole >= np.asarray(slots.firsts)[own]).all()

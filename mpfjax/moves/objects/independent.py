@@ -12,7 +12,7 @@ from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling.allocation import require_equal_rows
 from mpfjax.moves.resampling.ancestors import SCHEMES
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.generator import split
+from mpfjax.operations.random import split
 
 
 class PropagateIndependently(AbstractPropagation):

@@ -36,8 +36,8 @@ from mpfjax.moves.propagation.propagate import (
     log_transition,
     noise_of_slots,
 )
-from mpfjax.operations.generator import normal
-from mpfjax.operations.gradients import add_gradient, without_gradient
+from mpfjax.operations.logarithms import add_gradient, without_gradient
+from mpfjax.operations.random import normal
 from mpfjax.proposals import AbstractProposal
 
 

@@ -14,8 +14,8 @@ from mpfjax.models.noise import draw_family_noise, noise_dtype
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation.marginalised import PropagateMarginalised
 from mpfjax.moves.propagation.propagate import Propagate
-from mpfjax.operations.generator import split, uniform
-from mpfjax.operations.indexing import take
+from mpfjax.operations.random import split, uniform
+from mpfjax.operations.stored import take
 
 
 class PropagateNested(AbstractPropagation):

@@ -25,8 +25,7 @@ from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
 from mpfjax.models.steps import likelihoods
 from mpfjax.moves.base import AbstractPropagation
-from mpfjax.operations.gradients import add_gradient
-from mpfjax.operations.logarithms import finite_max
+from mpfjax.operations.logarithms import add_gradient, finite_max
 from mpfjax.proposals import AbstractProposal
 
 

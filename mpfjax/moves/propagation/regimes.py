@@ -22,10 +22,10 @@ from mpfjax.moves.regrouping.group_by import GroupBy
 from mpfjax.moves.resampling.ancestors import draw_ancestors
 from mpfjax.moves.resampling.line import Line, in_line
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.generator import uniform
-from mpfjax.operations.indexing import take
 from mpfjax.operations.logarithms import log_or_nothing
+from mpfjax.operations.random import uniform
 from mpfjax.operations.segments import spread
+from mpfjax.operations.stored import take
 from mpfjax.proposals import AbstractProposal
 
 

@@ -16,8 +16,8 @@ from mpfjax.models.steps import likelihoods
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.generator import normal, split, uniform
 from mpfjax.operations.logarithms import finite_max
+from mpfjax.operations.random import normal, split, uniform
 
 EXPONENTS = (1 / 64, 1 / 16, 1 / 4, 1.0)
 

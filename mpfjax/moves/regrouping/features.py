@@ -10,8 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from mpfjax.checks import check_callable, check_positive_array, given, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
-from mpfjax.operations.floats import as_inexact
-from mpfjax.operations.logarithms import exp, finite_or_zero
+from mpfjax.operations.logarithms import as_inexact, exp, finite_or_zero
 from mpfjax.operations.segments import are_masked, column_sums, segment_max, spread_stored
 from mpfjax.operations.stored import stored
 

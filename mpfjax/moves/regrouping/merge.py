@@ -17,8 +17,8 @@ from mpfjax.moves.regrouping.features import (
     separation,
     summarise,
 )
-from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import spread_stored
+from mpfjax.operations.stored import take
 
 
 class Merge(AbstractRegrouping):

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mpfjax.operations.choices import most_of_runs
+from mpfjax.operations.islands import most_of_runs
 from mpfjax.operations.matrices import row_sums
 
 # Centroids in one pass over the particles. A program of all 64 takes seconds to compile.

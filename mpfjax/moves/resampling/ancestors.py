@@ -19,12 +19,16 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from mpfjax.moves.resampling.allocation import Slots, place_slots
 from mpfjax.moves.resampling.line import Line
-from mpfjax.operations.generator import split, uniform
-from mpfjax.operations.indexing import count_places, take
-from mpfjax.operations.positions import Positions, last_before, random_positions
-from mpfjax.operations.prefix_sums import count_starts, count_upto
+from mpfjax.operations.prefix_sums import (
+    Positions,
+    count_starts,
+    count_upto,
+    last_before,
+    random_positions,
+)
+from mpfjax.operations.random import split, uniform
 from mpfjax.operations.segments import spread
-from mpfjax.operations.stored import stored, whole_blocks
+from mpfjax.operations.stored import count_places, stored, take, whole_blocks
 
 _MOST_LEVELS = 31  # of the pairs of a component, whose particles are counted in 31 bits
 

@@ -12,8 +12,8 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import spread
+from mpfjax.operations.stored import take
 from mpfjax.proposals import AbstractProposal
 
 

@@ -16,10 +16,10 @@ from mpfjax.moves.regrouping.features import origin, summarise
 from mpfjax.moves.resampling.allocation import allocate_slots, place_slots
 from mpfjax.moves.resampling.ordering import sorted_order
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.generator import split
-from mpfjax.operations.indexing import take
 from mpfjax.operations.matrices import cholesky
+from mpfjax.operations.random import split
 from mpfjax.operations.segments import segment_argmax, spread
+from mpfjax.operations.stored import take
 
 
 class GaussianRegeneration(AbstractResampling):

@@ -13,10 +13,9 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.resampling.ordering import SortBy, sorted_order
-from mpfjax.operations.choices import cond_if_any
-from mpfjax.operations.indexing import take
+from mpfjax.operations.islands import cond_if_any
 from mpfjax.operations.logarithms import exp, finite_or_zero, log_or_nothing
-from mpfjax.operations.positions import (
+from mpfjax.operations.prefix_sums import (
     Positions,
     as_positions,
     exact_sum_before,
@@ -24,12 +23,12 @@ from mpfjax.operations.positions import (
     in_slots,
     needs_two_parts,
     scales,
+    sum_before,
     unit_shift,
 )
-from mpfjax.operations.prefix_sums import sum_before
-from mpfjax.operations.runs import Runs, runs_of, whole
-from mpfjax.operations.segments import order_by_segment, segment_counts, spread
-from mpfjax.operations.stored import stored
+from mpfjax.operations.segments import Runs, runs_of, segment_counts, spread, whole
+from mpfjax.operations.sorting import order_by_segment
+from mpfjax.operations.stored import stored, take
 
 
 class Line(NamedTuple):

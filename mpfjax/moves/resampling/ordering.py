@@ -10,10 +10,14 @@ from jaxtyping import Array, Float, Int, PyTree, UInt32
 
 from mpfjax.checks import check_callable, saying, shown
 from mpfjax.mixture import ParticleMixture, points
-from mpfjax.operations.floats import as_inexact
-from mpfjax.operations.hilbert import bits_per_dimension, hilbert_index
+from mpfjax.operations.logarithms import as_inexact
 from mpfjax.operations.segments import column_sums, spread
-from mpfjax.operations.sorting import order_by_key, sortable_bits
+from mpfjax.operations.sorting import (
+    bits_per_dimension,
+    hilbert_index,
+    order_by_key,
+    sortable_bits,
+)
 from mpfjax.operations.stored import stored
 
 HILBERT = "hilbert"

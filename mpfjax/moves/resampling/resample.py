@@ -19,10 +19,9 @@ from mpfjax.moves.resampling.allocation import (
 from mpfjax.moves.resampling.ancestors import SCHEMES, Ancestors, draw_ancestors
 from mpfjax.moves.resampling.line import Line, in_line
 from mpfjax.moves.resampling.ordering import SortBy, check_sort_by
-from mpfjax.operations.gradients import add_gradient
-from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import add_gradient
 from mpfjax.operations.segments import spread
-from mpfjax.operations.stored import stored
+from mpfjax.operations.stored import stored, take
 
 ALLOCATIONS = ("variance", "equal")
 GRADIENTS = ("none", "stop")

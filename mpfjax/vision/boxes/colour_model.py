@@ -22,7 +22,7 @@ from mpfjax.checks import (
 )
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
-from mpfjax.operations.generator import fast_key
+from mpfjax.operations.random import fast_key
 from mpfjax.vision.colour.bins import AbstractColours, RGBColours
 from mpfjax.vision.colour.histograms import (
     IntegralHistogram,

@@ -14,7 +14,7 @@ from mpfjax.filter import Filter, step_and_faults
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Fault, raise_faults
 from mpfjax.operations.compiling import cpu_options, in_little_memory, jit_with
-from mpfjax.operations.generator import split_once
+from mpfjax.operations.random import split_once
 from mpfjax.vision.boxes.learned_colours import LearnedColourModel
 from mpfjax.vision.boxes.object_moves import best_components
 from mpfjax.vision.boxes.recipes import objects_filters

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from mpfjax.operations.floats import default_float
+from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.segments import segment_counts
 from mpfjax.vision.colour.bins import AbstractColours
 from mpfjax.vision.files.frames import check_frame

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.checks import as_numbers, check_whole, shown, to_array, to_rows
-from mpfjax.operations.indexing import take
+from mpfjax.operations.stored import take
 from mpfjax.vision.files.boxes import centred, top_left
 
 # Finite, as observations have to be.
