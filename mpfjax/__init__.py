@@ -71,6 +71,7 @@ from mpfjax.proposals import AbstractProposal as AbstractProposal
 from mpfjax.proposals import GaussNewtonProposal as GaussNewtonProposal
 from mpfjax.proposals import NetworkProposal as NetworkProposal
 from mpfjax.running.islands import run_islands as run_islands
+from mpfjax.running.long_runs import Checkpoint as Checkpoint
 from mpfjax.running.run import monte_carlo as monte_carlo
 from mpfjax.running.run import run_filter as run_filter
 from mpfjax.running.scan import FilterRun as FilterRun

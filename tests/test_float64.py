@@ -112,7 +112,7 @@ def test_every_smoother_is_traced(name, chain, model):
 @pytest.mark.thorough
 def test_particle_gibbs_runs():
     chain = particle_gibbs(
-        KEY, mpfjax.particle_filter(quadratic(), 8), SQUARES, 3, missing="skip",
+        KEY, mpfjax.particle_filter(quadratic(), 8), mpfjax.Series.skipping(SQUARES), 3,
         parameters={"sigma_y": lambda filter: filter.model.sigma_y},
         transforms={"sigma_y": Positive()}, proposal_deviations=0.1,
         log_prior=lambda parameters: -(parameters["sigma_y"] ** 2), progress=False,

@@ -399,7 +399,8 @@ def test_every_public_constructor_and_runner_is_tried():
     others = {name for name in public - tried if not name.startswith(("Abstract", "_"))}
     # Records of results, what takes no argument to check, and what other tests are about.
     assert others == {
-        "FilterRun", "StepInfo", "Series", "ParticleMixture", "MarginalisedState", "Pool",
+        "FilterRun", "StepInfo", "Series", "Checkpoint", "ParticleMixture", "MarginalisedState",
+        "Pool",
         "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
         "NetworkProposal", "keep_programs", "check_model", "map_moves",
     } - tried  # fmt: skip

@@ -46,7 +46,8 @@ FLOORS = {
     ),
     "vision": ("files", "colour", "scenes", "tracking", "boxes"),
     "running": (
-        "storage", "devices", "threads", "progress", "scan", "run", "islands", "studies",
+        "storage", "long_runs", "devices", "threads", "progress", "scan", "run", "islands",
+        "studies",
     ),
 }  # fmt: skip
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")

@@ -21,8 +21,8 @@ from mpfjax.metrics.coverage import covers
 from mpfjax.metrics.tracking_quality import intersection_area
 from mpfjax.tuning import (
     LabelLikelihood,
-    Maximisation,
     Positive,
+    TuningRun,
     maximise,
     transition_candidates,
 )
@@ -97,7 +97,7 @@ def untuned_model(labelled: Labelled, template: int) -> SoftColourModel:
     return eqx.tree_at(lambda m: m.reference_logits, model, looks)
 
 
-def tune(key: Array, model: SoftColourModel, labelled: Labelled, num_steps: int) -> Maximisation:
+def tune(key: Array, model: SoftColourModel, labelled: Labelled, num_steps: int) -> TuningRun:
     """λ, the bandwidth and the references, by the conditional likelihood of the labels."""
     key_drawn, key_around, key_near, key_refined = jax.random.split(key, 4)
     states = labelled_states(model, labelled.boxes)

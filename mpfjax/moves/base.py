@@ -41,6 +41,9 @@ class AbstractMove(eqx.Module):
     keeps_parents = True
     """whether each particle comes from one particle of the mixture that the move was given. Where
     it does not, the move sets its ancestor index to -1, and what follows ancestors refuses it."""
+    biases_score = False
+    """whether it redraws particles in a way that derivatives in the model's parameters do not see,
+    so that the score is biased."""
     looks_ahead = False
     """whether its weights, as an initial move, wait for the likelihood that it has looked at. The
     particles of x_0 are then not resampled before they have been weighed by it."""

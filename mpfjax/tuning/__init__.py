@@ -1,17 +1,14 @@
 """Tuning of a filter's parameters by gradients, and their posterior."""
 
 from mpfjax.tuning.curvature import standard_errors as standard_errors
-from mpfjax.tuning.densities import LogDensity as LogDensity
 from mpfjax.tuning.densities import log_density as log_density
 from mpfjax.tuning.gibbs import GibbsPosterior as GibbsPosterior
 from mpfjax.tuning.gibbs import particle_gibbs as particle_gibbs
 from mpfjax.tuning.inference_data import to_inference_data as to_inference_data
 from mpfjax.tuning.labels import LabelLikelihood as LabelLikelihood
-from mpfjax.tuning.labels import label_log_posteriors as label_log_posteriors
 from mpfjax.tuning.labels import transition_candidates as transition_candidates
 from mpfjax.tuning.metropolis import Posterior as Posterior
 from mpfjax.tuning.metropolis import metropolis_hastings as metropolis_hastings
-from mpfjax.tuning.optimisation import Maximisation as Maximisation
 from mpfjax.tuning.optimisation import TuningRun as TuningRun
 from mpfjax.tuning.optimisation import fit as fit
 from mpfjax.tuning.optimisation import maximise as maximise
@@ -21,4 +18,3 @@ from mpfjax.tuning.transforms import AbstractTransform as AbstractTransform
 from mpfjax.tuning.transforms import Interval as Interval
 from mpfjax.tuning.transforms import Positive as Positive
 from mpfjax.tuning.transforms import Simplex as Simplex
-from mpfjax.tuning.transforms import Unconstrained as Unconstrained

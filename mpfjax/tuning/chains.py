@@ -1,14 +1,12 @@
-"""The loop over the steps of Markov chains, which the samplers of parameters share."""
+"""Markov chains of parameters: what their kernels are, and the loop over their steps."""
 
 import abc
 import math
-import os
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import equinox as eqx
 import jax
@@ -16,13 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
-from tqdm import tqdm
 
-from mpfjax.checks import check_flag, check_whole
+from mpfjax.checks import check_type, check_whole, given
 from mpfjax.operations.compiling import jit_on_wide_vectors
-from mpfjax.running.storage.checkpoints import Checkpoint, Notes, identity_of
-from mpfjax.tuning.problem import Reals
-from mpfjax.tuning.starts import Starts, drawn, repeated
+from mpfjax.running.long_runs import Checkpoint, LongRun, State, identity_of
+from mpfjax.tuning.densities import LogPrior, Prior, SamplePrior, checked_prior, chosen, drawn
+from mpfjax.tuning.problem import Problem, Reals
 from mpfjax.tuning.walks import RandomWalk, random_walk
 
 _MOST_DRAWS_OF_A_START = 100
@@ -62,19 +59,33 @@ class AbstractKernel(eqx.Module):
         """One step of one chain."""
 
 
-@dataclass(frozen=True)
-class Plan:
-    """The length of chains, and which of their steps are kept."""
+class ChainOptions(TypedDict, total=False):
+    """What `metropolis_hastings` and `particle_gibbs` both take, beside their own arguments."""
 
-    num_steps: int
+    num_chains: int
+    sample_prior: SamplePrior | None
     burn_in: int
     thinning: int
-    adapt: bool
+    checkpoint: Checkpoint | None
+    progress: bool
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How many chains there are, where they start, and which of their steps are kept."""
+
+    num_steps: int
+    num_chains: int = 1
+    sample_prior: SamplePrior | None = None
+    burn_in: int = 0
+    thinning: int = 1
+    checkpoint: Checkpoint | None = None
+    progress: bool = True
 
     def __post_init__(self) -> None:
-        check_whole(num_steps=self.num_steps, thinning=self.thinning)
+        check_whole(num_chains=self.num_chains, num_steps=self.num_steps, thinning=self.thinning)
         check_whole(0, burn_in=self.burn_in)
-        check_flag(adapt=self.adapt)
+        check_type(Checkpoint, "a Checkpoint", **given(checkpoint=self.checkpoint))
         if self.thinning > self.num_steps:
             raise ValueError(
                 f"thinning: {self.thinning} is more than num_steps, {self.num_steps}: no step"
@@ -82,14 +93,7 @@ class Plan:
             )
 
     @property
-    def settings(self) -> dict[str, int]:
-        """All that has to be the same for a checkpoint to fit, by name."""
-        return {
-            "burn_in": int(self.burn_in), "thinning": int(self.thinning), "adapt": bool(self.adapt)
-        }  # fmt: skip
-
-    @property
-    def total(self) -> int:
+    def last(self) -> int:
         """The number of steps, of burn-in and after, up to the last one that is kept."""
         return self.burn_in + self.num_steps // self.thinning * self.thinning
 
@@ -106,146 +110,130 @@ class Chains(eqx.Module):
     num_invalid: dict[str, Int[Array, " chains"]]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """The draws of chains, leaves (chains, draws, ...), and their state at the end."""
+class Outcome(NamedTuple):
+    """What chains give: their draws, leaves (chains, draws, ...), and the fields of a posterior."""
 
     draws: PyTree
-    chains: Chains
-    stopped: str | None
-
-    @property
-    def proposal_covariance(self) -> np.ndarray:
-        """Of the random walk at the end."""
-        factor = np.asarray(self.chains.walk.factor)
-        return factor @ factor.T
-
-    @property
-    def num_invalid(self) -> dict[str, np.ndarray]:
-        """How often each density was no number, by chain."""
-        return {name: np.asarray(counts) for name, counts in self.chains.num_invalid.items()}
+    fields: dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Run:
-    """Chains of a kernel, for the public function `caller`."""
+class Sampling:
+    """Chains on the parameters of a problem, for the public function `caller`."""
 
     caller: str
-    kernel: AbstractKernel
-    starts: Starts
     key: Key[Array, ""]
+    problem: Problem
+    deviations: Reals
+    """of the random walk at first."""
     plan: Plan
-    file: Checkpoint | None
 
-    def sample(self, every: int, progress: bool) -> Outcome:
-        """All steps, from the start or from the step of the checkpoint, which is written `every` so
-        many.
+    def prior(self, log_prior: LogPrior) -> Prior:
+        """The prior; a `ValueError` for one that is no number where chains start."""
+        sample_prior = self.plan.sample_prior
+        if sample_prior is None:
+            return checked_prior(log_prior, self.problem, self.problem.start(), "at the start")
+        draws = drawn(self._keys[0], self.problem, sample_prior, 1)
+        first = jax.tree.map(lambda u: u[0], draws)
+        return checked_prior(log_prior, self.problem, first, "at a draw of sample_prior")
 
-        Ctrl-C ends the chains with a warning and the draws so far, if there are any.
-        """
-        chains, draws, step = self._loaded() or self._started()
-        pieces, capacity = [draws], _capacity(draws)
-        length, saved, stopped = 1, step, None
-        bar = tqdm(total=self.plan.total, initial=step, disable=not progress, unit="step")
-        try:
-            while step < self.plan.total:
-                length = min(length, (capacity - 1) * self.plan.thinning)
-                last = min(step + length, self.plan.total, (step // every + 1) * every)
-                began = time.monotonic()
-                chains, piece = self._advanced(chains, step, last, capacity)
-                length = _next_length(length, time.monotonic() - began)
-                pieces.append(piece)
-                bar.update(last - step)
-                step = last
-                if self.file is not None and step % every == 0:
-                    pieces, saved = [self._saved(step, chains, pieces)], step
-        except KeyboardInterrupt:
-            if not self.plan.num_draws(step):
-                raise
-            stopped = f"interrupted at step {step} of {self.plan.total}"
-        finally:
-            bar.close()
-            if self.file is not None and step > saved:
-                pieces = [self._saved(step, chains, pieces)]
-        if stopped is not None:
-            warnings.warn(f"{self.caller}: {stopped}", stacklevel=3)
-        most = self.plan.num_draws(self.plan.total)
-        draws = jax.tree.map(lambda leaf: leaf[:, :most], _joined(pieces))
-        outcome = Outcome(draws, chains, stopped)
-        warn_of_invalid(self.caller, outcome.num_invalid, stacklevel=4)
-        return outcome
+    def run(
+        self, kernel: AbstractKernel, settings: Mapping[str, Any], functions: Mapping[str, Any]
+    ) -> Outcome:
+        """All steps; the last two arguments are those of `identity_of`."""
+        plan, caller = self.plan, self.caller
+        settings = self.problem.settings | settings | {
+            "proposal_deviations": self.deviations, "key": self.key, "burn_in": plan.burn_in,
+            "num_chains": plan.num_chains, "thinning": plan.thinning,
+        }  # fmt: skip
+        identity = identity_of(plan.checkpoint, settings, functions)
+        run = LongRun(caller, plan.last, plan.checkpoint, plan.progress, lambda step: identity)
+        at = eqx.filter_eval_shape(self._chains_at, kernel, self.key, self._own_start())
+        report = eqx.filter_eval_shape(_all_steps, kernel, self.key, at[0], 0).report
+        none = jax.tree.map(lambda leaf: np.empty((0, *leaf.shape), leaf.dtype), report)
+        start = lambda: State(0, self._started(kernel), none)  # noqa: E731
+        state, stopped = run.go(State(0, at[0], none), start, self._advance(kernel, report))
+        num_draws = plan.num_draws(plan.last)
+        draws = jax.tree.map(lambda rows: np.moveaxis(rows[:num_draws], 0, 1), state.rows)
+        num_invalid = jax.tree.map(np.asarray, state.carry.num_invalid)
+        warn_of_invalid(caller, num_invalid, stacklevel=4)
+        factor = np.asarray(state.carry.walk.factor)
+        return Outcome(
+            draws,
+            {
+                "num_invalid": num_invalid, "stopped": stopped,
+                "proposal_covariance": factor @ factor.T,
+            },
+        )  # fmt: skip
 
-    def _advanced(self, chains: Chains, step: int, last: int, capacity: int) -> tuple[Chains, Any]:
-        plan = self.plan
-        numbers = jnp.array([step, last, plan.burn_in, plan.thinning, plan.adapt], jnp.int32)
-        chains, buffers = _steps(self.kernel, self.key, chains, numbers, capacity)
-        new = plan.num_draws(last) - plan.num_draws(step)
-        # Waits for the program, so that an interruption comes before anything is taken over.
-        pieces = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf)[:new], 0, 1), buffers)
-        return chains, pieces
+    @property
+    def _keys(self) -> Key[Array, " 2"]:
+        """For the starts and for the steps."""
+        return jax.random.split(self.key)
 
-    def _loaded(self) -> tuple[Chains, PyTree, int] | None:
-        """The chains, the draws and the step of the checkpoint; None where there is none."""
-        if self.file is None or not self.file.path.exists():
-            return None
-        starts = self.starts
-        reals = repeated(starts.problem.start(), starts.num_chains)
-        keys = jax.random.split(starts.key, starts.num_chains)
-        walk = random_walk(starts.deviations, reals)
-        chains, empty, _ = eqx.filter_eval_shape(_start_all, self.kernel, keys, reals, walk)
+    def _own_start(self) -> Reals:
+        """The filter's own parameters, for each chain."""
+        num = self.plan.num_chains
+        return jax.tree.map(lambda u: jnp.broadcast_to(u, (num, *u.shape)), self.problem.start())
 
-        def like(notes: Notes) -> PyTree:
-            def rows(leaf: jax.ShapeDtypeStruct) -> np.ndarray:
-                num_draws = self.plan.num_draws(notes["step"])
-                return np.empty((leaf.shape[0], num_draws, *leaf.shape[2:]), leaf.dtype)
+    def _chains_at(
+        self, kernel: AbstractKernel, key: Key[Array, ""], reals: Reals
+    ) -> tuple[Chains, Array]:
+        """All chains at some parameters, and which can start there."""
+        keys = jax.random.split(key, self.plan.num_chains)
+        return _start_all(kernel, keys, reals, random_walk(self.deviations, reals))
 
-            return {"chains": chains, "draws": jax.tree.map(rows, empty)}
-
-        notes, state = self.file.load(like)
-        return state["chains"], state["draws"], notes["step"]
-
-    def _started(self) -> tuple[Chains, PyTree, int]:
-        """All chains at their starts, without draws.
+    def _started(self, kernel: AbstractKernel) -> Chains:
+        """All chains at their starts.
 
         A draw of the prior at which a chain cannot start is drawn again.
         """
-        key, problem, sample_prior = self.starts.key, self.starts.problem, self.starts.sample_prior
-        num = self.starts.num_chains
-
-        def at(key: Key[Array, ""], reals: Reals) -> tuple[Chains, PyTree, Array]:
-            walk = random_walk(self.starts.deviations, reals)
-            return _start_all(self.kernel, jax.random.split(key, num), reals, walk)
-
-        reals = repeated(problem.start(), num)
-        if sample_prior is not None:
-            reals = drawn(jax.random.fold_in(key, 0), problem, sample_prior, num)
-        chains, empty, fine = at(key, reals)
-        for attempt in range(1, _MOST_DRAWS_OF_A_START):
-            if np.all(fine) or sample_prior is None:
-                break
-            again = jax.random.fold_in(key, attempt)
-            new, _, now_fine = at(again, drawn(again, problem, sample_prior, num))
-            states = jax.vmap(chosen)(fine, chains.states, new.states)
-            walk = random_walk(self.starts.deviations, states.reals)
-            chains = Chains(states, walk, chains.num_invalid)
-            fine |= now_fine
+        key, sample_prior, num = self._keys[0], self.plan.sample_prior, self.plan.num_chains
+        if sample_prior is None:
+            chains, fine = self._chains_at(kernel, key, self._own_start())
+        else:
+            again = jax.random.fold_in(key, 0)
+            reals = drawn(again, self.problem, sample_prior, num)
+            chains, fine = self._chains_at(kernel, key, reals)
+            for attempt in range(1, _MOST_DRAWS_OF_A_START):
+                if np.all(fine):
+                    break
+                again = jax.random.fold_in(key, attempt)
+                reals = drawn(again, self.problem, sample_prior, num)
+                new, now_fine = self._chains_at(kernel, again, reals)
+                states = jax.vmap(chosen)(fine, chains.states, new.states)
+                walk = random_walk(self.deviations, states.reals)
+                chains, fine = Chains(states, walk, chains.num_invalid), fine | now_fine
         if not np.all(fine):
             where = "the start" if sample_prior is None else "any draw of sample_prior"
             raise RuntimeError(
                 f"{self.caller}: the log prior or log marginal likelihood was NaN or inf at {where}"
             )
-        return chains, jax.tree.map(np.asarray, empty), 0
+        return chains
 
-    def _saved(self, step: int, chains: Chains, pieces: list[PyTree]) -> PyTree:
-        draws = _joined(pieces)
-        if self.file is not None:
-            self.file.save(step, {"chains": chains, "draws": draws})
-        return draws
+    def _advance(self, kernel: AbstractKernel, report: PyTree) -> Callable[..., Any]:
+        """Some steps of all chains, about as many as take half a second."""
+        plan, key, length = self.plan, self._keys[1], 1
+        size = 8 * sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(report))
+        capacity = max(2, min(_MOST_DRAWS_AT_ONCE, _MOST_BYTES_AT_ONCE // max(size, 1)))
 
+        def advance(step: int, last: int, chains: Chains) -> tuple[int, Chains, PyTree]:
+            nonlocal length
+            last = min(step + length, last)
+            began = time.monotonic()
+            numbers = jnp.array([step, last, plan.burn_in, plan.thinning], jnp.int32)
+            chains, buffers = _steps(kernel, key, chains, numbers, capacity)
+            new = plan.num_draws(last) - plan.num_draws(step)
+            # Waits for the program, so that an interruption comes before anything is taken over.
+            rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:new], buffers)
+            seconds = time.monotonic() - began
+            if seconds < _SECONDS_BETWEEN / 2:
+                length = min(2 * length, (capacity - 1) * plan.thinning)
+            elif seconds > 2 * _SECONDS_BETWEEN:
+                length = max(1, length // 2)
+            return last, chains, rows
 
-def chosen(accepted: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
-    """One of two states."""
-    return jax.tree.map(lambda after, before: jnp.where(accepted, after, before), new, old)
+        return advance
 
 
 def warn_of_invalid(caller: str, num_invalid: Mapping[str, Any], stacklevel: int) -> None:
@@ -259,73 +247,37 @@ def warn_of_invalid(caller: str, num_invalid: Mapping[str, Any], stacklevel: int
         )
 
 
-def as_checkpoint(
-    path: str | os.PathLike[str] | None,
-    caller: str,
-    name: str | None,
-    settings: Mapping[str, Any],
-    code: Mapping[str, Any],
-) -> Checkpoint | None:
-    """The file of chains, if they have one; its arguments are those of `identity_of`."""
-    if path is None:
-        return None
-    identity = identity_of(name, settings, code)
-    return Checkpoint(Path(path), caller, lambda step: identity)
-
-
-def _next_length(length: int, seconds: float) -> int:
-    """How many steps to take in the next call, given the time of the last one."""
-    if seconds < _SECONDS_BETWEEN / 2:
-        return 2 * length
-    return max(1, length // 2) if seconds > 2 * _SECONDS_BETWEEN else length
-
-
-def _joined(pieces: list[PyTree]) -> PyTree:
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *pieces)
-
-
 @jit_on_wide_vectors
 def _start_all(kernel, keys, reals, walk):
-    """All chains at their starts, draws of length none, and which could start."""
+    """All chains at their starts, and which could start."""
     states, fine = jax.vmap(kernel.start)(keys, reals)
-    step, report = eqx.filter_eval_shape(_all_chains, kernel, keys[0], Chains(states, walk, {}), 0)
-    counts = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, jnp.int32), step.invalid)
-    empty = jax.tree.map(
-        lambda leaf: jnp.zeros((leaf.shape[0], 0, *leaf.shape[1:]), leaf.dtype), report
-    )
-    return Chains(states, walk, counts), empty, fine
+    steps = eqx.filter_eval_shape(_all_steps, kernel, keys[0], Chains(states, walk, {}), 0)
+    counts = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, jnp.int32), steps.invalid)
+    return Chains(states, walk, counts), fine
 
 
-def _capacity(draws: PyTree) -> int:
-    """How many draws a program holds; the same for all lengths of chains, so that they share it."""
-    rows = [math.prod((leaf.shape[0], *leaf.shape[2:])) for leaf in jax.tree.leaves(draws)]
-    size = 8 * sum(rows)
-    return max(2, min(_MOST_DRAWS_AT_ONCE, _MOST_BYTES_AT_ONCE // max(size, 1)))
-
-
-def _all_chains(kernel: Any, key: Key[Array, ""], chains: Chains, step: Any) -> tuple[Step, PyTree]:
-    """One step of every chain, and what is kept of it."""
+def _all_steps(kernel: Any, key: Key[Array, ""], chains: Chains, step: Any) -> Step:
+    """One step of every chain."""
     num_chains = jax.tree.leaves(chains.states)[0].shape[0]
     keys = jax.random.split(jax.random.fold_in(key, step), num_chains)
-    steps = jax.vmap(kernel.step, in_axes=(0, 0, None))(keys, chains.states, chains.walk)
-    return steps, steps.report
+    return jax.vmap(kernel.step, in_axes=(0, 0, None))(keys, chains.states, chains.walk)
 
 
 @jit_on_wide_vectors
 def _steps(kernel, key, chains, numbers, capacity):
     """Some steps of all chains, and their draws: one program for any number of steps."""
-    first, last, burn_in, thinning, adapt = numbers
-    _, report = eqx.filter_eval_shape(_all_chains, kernel, key, chains, 0)
+    first, last, burn_in, thinning = numbers
+    report = eqx.filter_eval_shape(_all_steps, kernel, key, chains, 0).report
     buffers = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), report)
     before = jnp.maximum(first - burn_in, 0) // thinning
 
     def advance(step: Array, carry: tuple[Chains, PyTree]) -> tuple[Chains, PyTree]:
         chains, buffers = carry
-        steps, report = _all_chains(kernel, key, chains, step)
+        steps = _all_steps(kernel, key, chains, step)
         points = jax.vmap(lambda reals: ravel_pytree(reals)[0])(steps.state.reals)
         acceptance = jnp.mean(steps.acceptance) if kernel.learns_scale else None
         walk = jax.lax.cond(
-            (step < burn_in) & (adapt > 0),
+            step < burn_in,
             lambda: chains.walk.adapted(points, step, acceptance),
             lambda: chains.walk,
         )
@@ -334,7 +286,7 @@ def _steps(kernel, key, chains, numbers, capacity):
         )
         # A draw is the last of the steps that are written to its row.
         row = jnp.clip((step - burn_in) // thinning - before, 0, capacity - 1)
-        buffers = jax.tree.map(lambda rows, leaf: rows.at[row].set(leaf), buffers, report)
+        buffers = jax.tree.map(lambda rows, leaf: rows.at[row].set(leaf), buffers, steps.report)
         return Chains(steps.state, walk, counts), buffers
 
     return jax.lax.fori_loop(first, last, advance, (chains, buffers))

@@ -11,14 +11,8 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_key, check_whole
 from mpfjax.filter import Filter
-from mpfjax.tuning.problem import (
-    Parameters,
-    Problem,
-    Reals,
-    pose_evidence,
-    score_of_each,
-    warn_of_bias,
-)
+from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
+from mpfjax.tuning.problem import Parameters, Problem, Reals, score_of_each
 from mpfjax.tuning.transforms import AbstractTransform, Interval, Positive, Simplex
 
 _MOST_NUMBERS = 50
@@ -43,8 +37,6 @@ def standard_errors(
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
     num_seeds: int = 100,
-    inputs: PyTree = None,
-    missing: str = "error",
 ) -> dict[str, np.ndarray] | None:
     """Standard errors of a filter's parameters where they maximise the likelihood.
 
@@ -67,7 +59,7 @@ def standard_errors(
     """
     check_key(key)
     check_whole(1, num_seeds=num_seeds)
-    problem = pose_evidence(filter, observations, parameters, transforms, missing, inputs)
+    problem = pose_evidence(filter, observations, parameters, transforms)
     warn_of_bias("standard_errors", problem)
     batches = [jax.random.split(key, num_seeds)]
     return errors_at(problem, problem.start(), batches, "num_seeds")

@@ -4,16 +4,19 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import check_callable, check_type, shown
+from mpfjax.checks import check_callable, shown
 from mpfjax.filter import Filter
-from mpfjax.tuning.problem import Parameters, Problem, Reals, pose_evidence
+from mpfjax.tuning.evidence import check_exact, pose_evidence
+from mpfjax.tuning.problem import Parameters, Problem, Reals
 from mpfjax.tuning.transforms import AbstractTransform
 
 LogPrior = Callable[[dict[str, Array]], Float[Array, ""]]
+SamplePrior = Callable[[Key[Array, ""]], Mapping[str, Array]]
 
 
 class Prior(eqx.Module):
@@ -37,7 +40,7 @@ class Evaluated(NamedTuple):
 
     log_prior: Float[Array, "*chains"]
     """with the Jacobian; -inf where it is zero or no number."""
-    log_marginal_likelihood: Float[Array, "*chains"]
+    log_likelihood: Float[Array, "*chains"]
     """-inf where it is zero, no number, or where the prior is zero."""
     invalid: dict[str, Bool[Array, "*chains"]]
     """which of the two was NaN or +inf."""
@@ -45,19 +48,20 @@ class Evaluated(NamedTuple):
     @property
     def log_density(self) -> Float[Array, "*chains"]:
         """Their sum."""
-        return self.log_prior + self.log_marginal_likelihood
+        return self.log_prior + self.log_likelihood
 
 
-def evaluated(log_prior: Float[Array, ""], log_evidence: Float[Array, ""]) -> Evaluated:
-    """The two parts as numbers or -inf, and which of them was not a number."""
+def evaluated(
+    log_prior: Float[Array, ""],
+    log_likelihood: Float[Array, ""],
+    name: str = "log_marginal_likelihood",
+) -> Evaluated:
+    """The two parts as numbers or -inf, and which of them was not a number, by name."""
     has_prior = (log_prior > -jnp.inf) & (log_prior < jnp.inf)
-    invalid = {
-        "log_prior": is_invalid(log_prior),
-        # Where the prior is zero, the likelihood may not even be defined.
-        "log_marginal_likelihood": has_prior & is_invalid(log_evidence),
-    }
-    log_evidence = jnp.where(has_prior, number_or_zero(log_evidence), -jnp.inf)
-    return Evaluated(number_or_zero(log_prior), log_evidence, invalid)
+    # Where the prior is zero, the likelihood may not even be defined.
+    invalid = {"log_prior": is_invalid(log_prior), name: has_prior & is_invalid(log_likelihood)}
+    log_likelihood = jnp.where(has_prior, number_or_zero(log_likelihood), -jnp.inf)
+    return Evaluated(number_or_zero(log_prior), log_likelihood, invalid)
 
 
 class LogDensity(eqx.Module):
@@ -85,14 +89,11 @@ class LogDensity(eqx.Module):
 
     def constrain(self, reals: Reals) -> dict[str, Array]:
         """The parameters by name, on their own scale."""
-        return {name: self.problem.transforms[name].constrain(u) for name, u in reals.items()}
+        return self.problem.constrain(reals)
 
     def unconstrain(self, parameters: Mapping[str, Any]) -> Reals:
         """u of parameters by name."""
-        return {
-            name: transform.unconstrain(jnp.asarray(parameters[name]))
-            for name, transform in self.problem.transforms.items()
-        }
+        return self.problem.unconstrain(parameters, "parameters")
 
     def filter_at(self, reals: Reals) -> Filter:
         """The filter with these parameters."""
@@ -106,8 +107,6 @@ def log_density(
     log_prior: LogPrior,
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
-    inputs: PyTree = None,
-    missing: str = "error",
 ) -> LogDensity:
     """The posterior's log density in unconstrained numbers, for samplers of other libraries.
 
@@ -126,25 +125,15 @@ def log_density(
     blackjax as `partial(density, key=key)`, with numpyro as
     `potential_fn=lambda u: -density(u, key)`.
     """
-    check_type(Filter, "a filter", filter=filter)
-    check_callable("a function of the parameters by name", log_prior=log_prior)
-    problem = pose_evidence(filter, observations, parameters, transforms, missing, inputs)
     check_exact(filter, "likelihood")
+    problem = pose_evidence(filter, observations, parameters, transforms)
     return LogDensity(problem, checked_prior(log_prior, problem, problem.start(), "at the start"))
-
-
-def check_exact(filter: Filter, what: str) -> None:
-    """Raise a `ValueError` for a filter whose estimates of the likelihood are biased."""
-    if filter.approximate:
-        raise ValueError(
-            f"filter: an approximate one has no unbiased likelihood, and so no exact {what}"
-        )
 
 
 def checked_prior(log_prior: Any, problem: Problem, at: Reals, where: str) -> Prior:
     """The prior; a `ValueError` for one that is no finite number at some point."""
     check_callable("a function of the parameters by name", log_prior=log_prior)
-    density = log_prior({name: problem.transforms[name].constrain(u) for name, u in at.items()})
+    density = log_prior(problem.constrain(at))
     is_number = eqx.is_array_like(density) and jnp.ndim(density) == 0
     if not is_number or not jnp.issubdtype(jnp.result_type(density), jnp.floating):
         raise ValueError(f"log_prior: {shown(density)} {where} is no floating point number")
@@ -155,6 +144,23 @@ def checked_prior(log_prior: Any, problem: Problem, at: Reals, where: str) -> Pr
     return prior
 
 
+def drawn(key: Key[Array, ""], problem: Problem, sample_prior: SamplePrior, num: int) -> Reals:
+    """Draws of the prior in unconstrained numbers, leaves (num, ...)."""
+    check_callable("a function of a key", sample_prior=sample_prior)
+    keys = jax.random.split(key, num)
+    # By the way, the names and shapes are checked.
+    problem.unconstrain(sample_prior(keys[0]), "sample_prior")
+    draws, reals = jax.vmap(sample_prior)(keys), {}
+    for name, index in problem.tuned:
+        values, transform = jnp.asarray(draws[name]), problem.transforms[name]
+        if not transform.contains(np.asarray(values)):
+            kind = type(transform).__name__
+            raise ValueError(f"sample_prior: a draw of {name} is outside {kind}'s domain")
+        values = values.astype(problem.leaves[index].dtype)
+        reals[name] = jax.vmap(transform.unconstrain)(values)
+    return reals
+
+
 def is_invalid(log_density: Float[Array, "*n"]) -> Bool[Array, "*n"]:
     """Whether a log density is no number: NaN or +inf."""
     return ~(log_density < jnp.inf)
@@ -163,3 +169,8 @@ def is_invalid(log_density: Float[Array, "*n"]) -> Bool[Array, "*n"]:
 def number_or_zero(log_density: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """A log density, -inf where it is no number."""
     return jnp.where(is_invalid(log_density), -jnp.inf, log_density)
+
+
+def chosen(accepted: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
+    """One of two states."""
+    return jax.tree.map(lambda after, before: jnp.where(accepted, after, before), new, old)

@@ -1,9 +1,8 @@
 """The posterior of parameters and states together, by particle Gibbs."""
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, Unpack, cast
 
 import equinox as eqx
 import jax
@@ -11,40 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import (
-    check_callable,
-    check_flag,
-    check_key,
-    check_type,
-    check_whole,
-    given,
-    saying,
-    shown,
-)
+from mpfjax.checks import check_callable, check_key, check_type, given, saying, shown
 from mpfjax.filter import Filter, Start
 from mpfjax.models.base import require
 from mpfjax.models.inputs import with_inputs
 from mpfjax.models.steps import likelihoods
 from mpfjax.moves.initial import sample_initial
-from mpfjax.observations import Series, as_series
+from mpfjax.observations import Series
 from mpfjax.running.scan import scan
-from mpfjax.running.storage.checkpoints import check_checkpoint
-from mpfjax.running.storage.descriptions import fingerprint
 from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.conditional import check_conditional, draw_trajectory, is_possible, renew
-from mpfjax.tuning.chains import (
-    AbstractKernel,
-    Plan,
-    Run,
-    Step,
-    as_checkpoint,
-    chosen,
-)
-from mpfjax.tuning.densities import LogPrior, Prior, is_invalid, number_or_zero
-from mpfjax.tuning.problem import Parameters, Problem, Reals, pose_filter
-from mpfjax.tuning.starts import SamplePrior, Starts, constrained
+from mpfjax.tuning.chains import AbstractKernel, ChainOptions, Plan, Sampling, Step
+from mpfjax.tuning.densities import LogPrior, Prior, chosen, evaluated, is_invalid
+from mpfjax.tuning.evidence import one_sequence, pose_filter
+from mpfjax.tuning.problem import Parameters, Problem, Reals
 from mpfjax.tuning.transforms import AbstractTransform
 from mpfjax.tuning.walks import RandomWalk, accepts, checked_deviations
+
+_NUM_METROPOLIS_STEPS = 5  # for one new trajectory; they cost little
 
 Draw = Callable[[Key[Array, ""], PyTree, PyTree, Any], Mapping[str, Any]]
 
@@ -88,23 +71,11 @@ def particle_gibbs(
     *,
     draw: Draw | None = None,
     log_prior: LogPrior | None = None,
-    sample_prior: SamplePrior | None = None,
     proposal_deviations: float | Mapping[str, Any] = 0.1,
-    num_metropolis_steps: int = 5,
-    burn_in: int = 0,
-    adapt: bool = True,
-    thinning: int = 1,
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
-    num_chains: int = 1,
-    backward: bool = True,
     collect: Callable[[PyTree], PyTree] | None = None,
-    inputs: PyTree = None,
-    missing: str = "error",
-    checkpoint: str | os.PathLike[str] | None = None,
-    checkpoint_every: int = 1000,
-    checkpoint_name: str | None = None,
-    progress: bool = True,
+    **options: Unpack[ChainOptions],
 ) -> GibbsPosterior:
     """Sample p(θ, x_0, ..., x_t | y_1..y_t), parameters and trajectory in turn.
 
@@ -121,19 +92,20 @@ def particle_gibbs(
       one chain. `model` has the present parameters. Missing observations are there, as NaN.
     - `log_prior`: in place of `draw`: a function of the parameters by name, as for
       `metropolis_hastings`. The model then needs `log_transition` and `log_initial`.
-    - `proposal_deviations`: of the Metropolis steps' random walk, as for `metropolis_hastings`.
-      `num_metropolis_steps`: how many of them there are for one new trajectory; they cost little.
-    - `num_chains`, `sample_prior`, `burn_in`, `adapt`, `thinning`: as for `metropolis_hastings`.
-      Each chain starts at a trajectory of its own. The random walk learns its scale too, since
-      the density given a trajectory has no noise: it aims at accepting 44% of the Metropolis
-      steps for one number, 23% for several. With `draw` nothing is learned.
-    - `backward`: as for `conditional_filter`.
+    - `proposal_deviations`: of the Metropolis steps' random walk, as for `metropolis_hastings`;
+      there are five of them for one new trajectory.
     - `collect`: a function of one trajectory that returns what to keep of it, such as
       `lambda trajectory: trajectory[-1]`, or `lambda trajectory: None`. None keeps all.
-    - `checkpoint`, `checkpoint_every`, `checkpoint_name`: as for `metropolis_hastings`. The file
-      holds what is kept of the trajectories too.
-    - `observations`: one sequence. `parameters`, `transforms`, `inputs`, `missing`: as for `fit`.
+    - `observations`: one sequence, arrays or a `Series`. `parameters`, `transforms`: as for `fit`.
       Parameters are usually the model's; those of a proposal have no posterior.
+    - `num_chains`, `sample_prior`, `burn_in`, `thinning`, `checkpoint`, `progress`: the further
+      options of `metropolis_hastings`. Each chain starts at a trajectory of its own. In the burn-in
+      the random walk learns its scale too, since the density given a trajectory has no noise: it
+      aims at accepting 44% of the Metropolis steps for one number, 23% for several. With `draw`
+      nothing is learned.
+
+    The new trajectory is drawn by backward sampling, or of a model without `log_transition` by the
+    genealogy, see `conditional_filter`.
 
     A proposal whose density is NaN or +inf is rejected. If the conditional filter meets such a
     density, the whole step is rejected. `num_invalid` counts both, with a warning. Ctrl-C returns
@@ -148,59 +120,39 @@ def particle_gibbs(
     """
     check_key(key)
     check_type(Filter, "a filter", filter=filter)
-    check_whole(num_chains=num_chains, num_metropolis_steps=num_metropolis_steps)
-    plan = Plan(num_steps, burn_in, thinning, adapt)
-    check_flag(backward=backward, progress=progress)
+    plan = Plan(num_steps, **options)
     check_callable("a function of a trajectory", **given(collect=collect))
     what = "a function of a key, a trajectory, observations and a model"
     check_callable(what, **given(draw=draw))
     check_callable("a function of the parameters by name", **given(log_prior=log_prior))
-    check_callable("a function of a key", **given(sample_prior=sample_prior))
-    check_checkpoint(checkpoint, checkpoint_every, checkpoint_name)
     if (draw is None) == (log_prior is None):
         raise ValueError(
             f"draw, log_prior: {shown(draw)} and {shown(log_prior)}; exactly one must be given"
         )
+    backward = callable(getattr(filter.model, "log_transition", None))
     check_conditional(filter, backward, "particle_gibbs")
-    if isinstance(observations, list):
-        raise ValueError(
-            "observations: a list is several sequences, and this takes one;"
-            " jnp.asarray(observations) is one of numbers"
-        )
-    joint = LogJoint(as_series(observations, filter.model, inputs, missing))
+    joint = LogJoint(one_sequence(observations, filter.model))
     problem = pose_filter(filter, joint, parameters, transforms)
     deviations = checked_deviations(proposal_deviations, problem.start())
-    key_start, key_steps = jax.random.split(key)
-    starts = Starts(key_start, problem, num_chains, sample_prior, deviations)
+    sampling = Sampling("particle_gibbs", key, problem, deviations, plan)
     prior = None
     if log_prior is not None:
         for density in ("log_transition", "log_initial"):
             require(filter.model, density, "particle_gibbs with log_prior")
-        prior = starts.checked(log_prior)
-    kernel = _Kernel(problem, joint, prior, draw, collect, int(num_metropolis_steps), backward)
-    if draw is not None:
-        _check_draw(kernel, problem.start())
-    settings = {
-        "observations": fingerprint(joint), "missing": missing, "backward": bool(backward),
-        "num_metropolis_steps": int(num_metropolis_steps),
+        prior = sampling.prior(log_prior)
+    kernel = _Kernel(problem, joint, prior, draw, collect, backward)
+    start, trajectory = problem.start(), _shape_of_trajectory(joint, filter.model)
+    if draw is not None:  # Names and shapes are checked before anything compiles.
+        jax.eval_shape(kernel.drawn, key, start, trajectory)
+    functions = {
+        "draw": (None if draw is None else kernel.drawn, key, start, trajectory),
+        "log_prior": (prior, start), "collect": (collect, trajectory),
     }  # fmt: skip
-    settings |= starts.settings | plan.settings | {"key": key}
-    code = {
-        "draw": draw, "log_prior": log_prior, "sample_prior": sample_prior, "collect": collect
-    }  # fmt: skip
-    file = as_checkpoint(checkpoint, "particle_gibbs", checkpoint_name, settings, code)
-    run = Run("particle_gibbs", kernel, starts, key_steps, plan, file)
-    outcome = run.sample(checkpoint_every, progress)
-    reals, kept, accepted, renewed = outcome.draws
-    return GibbsPosterior(
-        parameters=constrained(problem, reals),
-        trajectories=kept,
-        accepted=accepted,
-        renewed=renewed,
-        num_invalid=outcome.num_invalid,
-        proposal_covariance=outcome.proposal_covariance,
-        stopped=outcome.stopped,
+    (reals, kept, accepted, renewed), fields = sampling.run(
+        kernel, {"observations": joint.series}, functions
     )
+    parameters = problem.constrained_rows(reals)
+    return GibbsPosterior(parameters, kept, accepted, renewed, **fields)
 
 
 class LogJoint(eqx.Module):
@@ -242,7 +194,6 @@ class _Kernel(AbstractKernel):
     prior: Prior | None
     draw: Draw | None
     collect: Callable[[PyTree], PyTree] | None
-    num_metropolis_steps: int = eqx.field(static=True)
     backward: bool = eqx.field(static=True)
 
     @property
@@ -306,18 +257,7 @@ class _Kernel(AbstractKernel):
         with saying("in draw, which is called with a key, trajectory, observations and model"):
             observations = self.joint.series.observations
             drawn = cast(Draw, self.draw)(key, trajectory, observations, filter.model)
-        if not isinstance(drawn, Mapping) or set(drawn) != set(reals):
-            names = sorted(drawn) if isinstance(drawn, Mapping) else shown(drawn)
-            raise ValueError(f"draw: it gave {names}, no values by the names {sorted(reals)}")
-        moved = {}
-        for name, transform in self.problem.transforms.items():
-            value, present = jnp.asarray(drawn[name]), transform.constrain(reals[name])
-            if value.shape != present.shape:
-                raise ValueError(
-                    f"draw: {name} of shape {value.shape}, where the parameter's is {present.shape}"
-                )
-            moved[name] = transform.unconstrain(value.astype(present.dtype))
-        return moved
+        return self.problem.unconstrain(drawn, "draw")
 
     def _metropolis(
         self, key: Key[Array, ""], reals: Reals, trajectory: PyTree, walk: RandomWalk
@@ -326,15 +266,9 @@ class _Kernel(AbstractKernel):
         prior = cast(Prior, self.prior)
 
         def log_density(reals: Reals) -> tuple[Array, dict[str, Array]]:
-            log_prior, log_joint = prior(reals), self.joint(trajectory, self.problem.at(reals))
-            has_prior = (log_prior > -jnp.inf) & (log_prior < jnp.inf)
-            # Where the prior is zero, the likelihood may not even be defined.
-            density = jnp.where(has_prior, log_prior + number_or_zero(log_joint), -jnp.inf)
-            invalid = {
-                "log_prior": is_invalid(log_prior),
-                "log_joint": has_prior & is_invalid(log_joint),
-            }
-            return density, invalid
+            log_joint = self.joint(trajectory, self.problem.at(reals))
+            found = evaluated(prior(reals), log_joint, "log_joint")
+            return found.log_density, found.invalid
 
         def move(place: tuple[Reals, Array], key: Key[Array, ""]) -> tuple[tuple, tuple]:
             reals, current = place
@@ -344,19 +278,18 @@ class _Kernel(AbstractKernel):
             accepted = accepts(key_accept, new - current)
             return chosen(accepted, (proposed, new), place), (accepted, invalid)
 
-        keys = jax.random.split(key, self.num_metropolis_steps)
+        keys = jax.random.split(key, _NUM_METROPOLIS_STEPS)
         place = (reals, log_density(reals)[0])
         (reals, _), (accepted, invalid) = jax.lax.scan(move, place, keys)
         counts = jax.tree.map(lambda some: jnp.sum(some, dtype=jnp.int32), invalid)
         return reals, jnp.mean(accepted.astype(jnp.result_type(float))), counts
 
 
-def _check_draw(kernel: _Kernel, start: Reals) -> None:
-    """Raise a `ValueError` for a draw of other names or shapes, before anything compiles."""
-    length = kernel.joint.series.length + 1
-    key, model = jax.random.key(0), kernel.problem.at(start).model
-    states = jax.eval_shape(lambda key: sample_initial(key, model, 1), key)
-    trajectory = jax.tree.map(
-        lambda state: jax.ShapeDtypeStruct((length, *state.shape[1:]), state.dtype), states
+def _shape_of_trajectory(joint: LogJoint, model: Any) -> PyTree:
+    states = jax.eval_shape(lambda key: sample_initial(key, model, 1), jax.random.key(0))
+    return jax.tree.map(
+        lambda state: jax.ShapeDtypeStruct(
+            (joint.series.length + 1, *state.shape[1:]), state.dtype
+        ),
+        states,
     )
-    jax.eval_shape(lambda *arguments: kernel.drawn(*arguments), key, start, trajectory)

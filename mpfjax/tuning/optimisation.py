@@ -1,6 +1,6 @@
 """`fit` and `maximise`: gradient ascent on the log marginal likelihood, or another objective."""
 
-import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -12,37 +12,43 @@ import numpy as np
 import optax
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.checks import (
-    check_callable,
-    check_key,
-    check_whole,
-    shown,
-)
+from mpfjax.checks import check_callable, check_key, check_type, check_whole, given, shown
 from mpfjax.filter import Filter
-from mpfjax.running.storage.descriptions import fingerprint
+from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.curvature import errors_at
-from mpfjax.tuning.gradient_ascent import Optimisation, Plan
-from mpfjax.tuning.problem import Objective, Parameters, Problem, pose, pose_evidence, warn_of_bias
+from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
+from mpfjax.tuning.problem import Objective, Parameters, Problem, Reals, pose, scores
 from mpfjax.tuning.transforms import AbstractTransform
 
 
 @dataclass(frozen=True)
 class TuningRun:
-    """The result of `fit`, and its history."""
+    """The result of `fit` or `maximise`, and its history."""
 
-    filter: Filter
-    """with the parameters at the end; if it was stopped, the last good ones."""
+    model: Any
+    """the model, or of `fit` the filter, with the parameters at the end; if it was stopped, the
+    last good ones."""
     parameters: dict[str, np.ndarray]
     """the same, by name, on their own scale."""
-    standard_errors: dict[str, np.ndarray] | None
-    """of every number in them; None if not asked for, or if there is no maximum."""
-    log_marginal_likelihood: float
-    """with these parameters: the mean over seeds, summed over sequences."""
+    value: float
+    """the objective with these parameters: the mean over seeds."""
     history: dict[str, np.ndarray]
-    """by step: `log_marginal_likelihood`, the mean over seeds, and `deviation`, its standard
-    deviation, with each parameter, by name, as it was then."""
+    """by step: `value`, or of `fit` `log_marginal_likelihood`, the mean over seeds, and
+    `deviation`, its standard deviation, with each parameter, by name, as it was then."""
     stopped: str | None
     """why it ended before `num_steps`, or None."""
+    standard_errors: dict[str, np.ndarray] | None = None
+    """of every number in the parameters; None if not asked for, or if there is no maximum."""
+
+    @property
+    def filter(self) -> Filter:
+        """Of `fit`: the filter with the parameters at the end."""
+        return self.model
+
+    @property
+    def log_marginal_likelihood(self) -> float:
+        """Of `fit`: the mean over seeds with these parameters, summed over sequences."""
+        return self.value
 
 
 def fit(
@@ -55,15 +61,8 @@ def fit(
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
     num_seeds: int = 8,
-    common_random_numbers: bool = False,
-    inputs: PyTree = None,
-    missing: str = "error",
-    patience: int | None = None,
-    tolerance: float = 0.0,
     curvature_seeds: int = 0,
-    checkpoint: str | os.PathLike[str] | None = None,
-    checkpoint_every: int = 50,
-    checkpoint_name: str | None = None,
+    checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> TuningRun:
     """Maximise the log marginal likelihood over some of a filter's parameters.
@@ -74,7 +73,7 @@ def fit(
     are, and a warning says so. For the parameters of a proposal, such as a `NetworkProposal`,
     "none" is right, and there is no warning.
 
-    - `observations`: as for `run_filter`; a list is several sequences, each run on its own.
+    - `observations`: arrays or a `Series`; a list is several sequences, each run on its own.
     - `optimizer`: an optimiser of optax. It steps in the unconstrained numbers of the transforms.
     - `parameters`: what is tuned, by name: `{"sigma_y": lambda f: f.model.sigma_y}`. A node, such
       as a network, stands for all its arrays. Or a filter spec, a pytree of booleans like the
@@ -82,79 +81,33 @@ def fit(
       array.
     - `transforms`: by name, such as `Positive()` for a scale. A parameter without one has no
       constraint.
-    - `num_seeds`: the number of runs in each step, under one vmap. `common_random_numbers` takes
-      the same seeds in every step: there is no noise between steps, but the error of those seeds
-      stays.
-    - `inputs`, `missing`: as for `run_filter`; of several sequences, a list of inputs.
-    - `patience`: a number of steps k. The optimisation ends when the mean of the last k steps is at
-      most `tolerance` nats above the mean of the k steps before.
+    - `num_seeds`: the number of runs in each step, under one vmap.
     - `curvature_seeds`: the seeds for `standard_errors` at the end, in whole batches of
       `num_seeds`; 0 for none.
-    - `checkpoint`: a .npz file, without pickles. It is written every `checkpoint_every` steps, and
-      when the optimisation ends or is interrupted. If the file exists, the optimisation goes on
-      from it, the same to the bit as without the interruption. An optimisation that has ended is
-      returned as it ended. To go on, take a larger `num_steps`, or another `patience` or
-      `tolerance`. An optimisation that ended at a number that is not finite stays there. All else
-      must be the same: the filter and the observations to the bit, the parameters, transforms, key
-      and seeds, and the optimiser with the numbers in its closures and schedules. Functions and
-      classes are compared by their names and by what they hold: take a new file after you change
-      what they do. With another version of optax, the file may be refused.
-    - `checkpoint_name`: what the optimisation is called, such as "adam, cosine". Its file is then
-      recognised by this name, and functions and the optimiser are not compared; numbers and arrays
-      are. Use it for functions that change what they hold, and across versions.
+    - `checkpoint`: a `Checkpoint`, from whose file the same call goes on, also to a larger
+      `num_steps`. All else must be the same: the filter and the observations to the bit, the
+      parameters, transforms, key and seeds, and the steps that the optimiser takes.
 
     If the log marginal likelihood or the gradient is not finite, the optimisation ends with the
-    last good parameters, a warning, and the step in `stopped`. Raises `ValueError` for a parameter
-    that is no floating point number, is static, starts outside its domain or has no effect. Raises
-    it for a checkpoint of another fit, naming what differs, for one that is cut off or lacks an
-    array, and where `run_filter` does. Raises `RuntimeError` if the start itself is not finite.
+    last good parameters, a warning, and the step in `stopped`. Ctrl-C ends it with a warning as
+    well. Raises `ValueError` for a parameter that is no floating point number, is static, starts
+    outside its domain or has no effect. Raises it for a checkpoint of another fit, naming what
+    differs, for one that is cut off or lacks an array, and where `run_filter` does. Raises
+    `RuntimeError` if the start itself is not finite.
     """
-    _check_optimisation(key, optimizer, num_seeds)
-    plan = Plan(
-        num_steps, common_random_numbers, patience, tolerance,
-        checkpoint, checkpoint_every, checkpoint_name, progress,
-    )  # fmt: skip
     check_whole(0, curvature_seeds=curvature_seeds)
-    problem = pose_evidence(filter, observations, parameters, transforms, missing, inputs)
+    problem = pose_evidence(filter, observations, parameters, transforms)
     warn_of_bias("fit", problem)
-
-    observed = fingerprint(problem.objective)
-    settings = {"filter": problem.tree, "observations": observed, "missing": missing}
-    objective = "log_marginal_likelihood"
-    optimisation = Optimisation(
-        "fit", objective, key, problem, optimizer, num_seeds, settings, {}, plan
-    )
-    end = optimisation.run()
+    ascent = _Ascent("fit", "log_marginal_likelihood", key, problem, optimizer, num_seeds)
+    data = {"observations": problem.objective}
+    reals, run = ascent.climb(num_steps, checkpoint, progress, data, {})
     errors = None
     if curvature_seeds:
         key_curvature = jax.random.fold_in(key, num_steps + 1)
-        batches = optimisation.batches(key_curvature, curvature_seeds)
-        errors = errors_at(problem, end.state.reals, batches, "curvature_seeds")
-    return TuningRun(
-        filter=problem.at(end.state.reals),
-        parameters=problem.constrained(end.state.reals),
-        standard_errors=errors,
-        log_marginal_likelihood=end.value,
-        history=optimisation.history(end.state),
-        stopped=end.stopped,
-    )
-
-
-@dataclass(frozen=True)
-class Maximisation:
-    """The result of `maximise`, and its history."""
-
-    model: Any
-    """with the parameters at the end; if it was stopped, the last good ones."""
-    parameters: dict[str, np.ndarray]
-    """the same, by name, on their own scale."""
-    value: float
-    """the objective with these parameters: the mean over seeds."""
-    history: dict[str, np.ndarray]
-    """by step: `value`, the mean over seeds, and `deviation`, its standard deviation, with each
-    parameter, by name, as it was then."""
-    stopped: str | None
-    """why it ended before `num_steps`, or None."""
+        shape = (-(-curvature_seeds // num_seeds), num_seeds)  # which is compiled already
+        batches = list(jax.random.split(key_curvature, shape))
+        errors = errors_at(problem, reals, batches, "curvature_seeds")
+    return TuningRun(*run, standard_errors=errors)
 
 
 def maximise(
@@ -167,14 +120,9 @@ def maximise(
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
     num_seeds: int = 1,
-    common_random_numbers: bool = False,
-    patience: int | None = None,
-    tolerance: float = 0.0,
-    checkpoint: str | os.PathLike[str] | None = None,
-    checkpoint_every: int = 50,
-    checkpoint_name: str | None = None,
+    checkpoint: Checkpoint | None = None,
     progress: bool = True,
-) -> Maximisation:
+) -> TuningRun:
     """Maximise any objective in some of a model's, or a filter's, parameters.
 
     Maximises the mean over seeds of `objective(key, model)`, a scalar that JAX can differentiate,
@@ -188,46 +136,115 @@ def maximise(
     - `parameters`: as for `fit`, picked from `model`; None is every floating point array of it.
 
     Raises what `fit` does for the same arguments, and `ValueError` for an objective that is not a
-    floating point scalar. For a `checkpoint` the objective must also be the same: the code and
-    closure of a function, the fields of an `equinox.Module`.
+    floating point scalar. For a `checkpoint` the objective must also be the same.
     """
-    _check_optimisation(key, optimizer, num_seeds)
-    plan = Plan(
-        num_steps, common_random_numbers, patience, tolerance,
-        checkpoint, checkpoint_every, checkpoint_name, progress,
-    )  # fmt: skip
     check_callable("a function of a key and a model", objective=objective)
     problem = pose(model, objective, parameters, transforms)
-    _check_scalar(problem, key)
-
-    settings, code = {"model": problem.tree}, {"objective": objective}
-    optimisation = Optimisation(
-        "maximise", "value", key, problem, optimizer, num_seeds, settings, code, plan
-    )
-    end = optimisation.run()
-    return Maximisation(
-        model=problem.at(end.state.reals),
-        parameters=problem.constrained(end.state.reals),
-        value=end.value,
-        history=optimisation.history(end.state),
-        stopped=end.stopped,
-    )
-
-
-def _check_optimisation(key: Any, optimizer: Any, num_seeds: Any) -> None:
-    """The other arguments that `fit` and `maximise` share, before anything compiles."""
-    check_key(key)
-    for method in ("init", "update"):
-        if isinstance(optimizer, type) or not callable(getattr(optimizer, method, None)):
-            raise ValueError(
-                f"optimizer: {shown(optimizer)} has no {method}; take one of optax, such as"
-                " optax.adam(0.05)"
-            )
-    check_whole(1, num_seeds=num_seeds)
-
-
-def _check_scalar(problem: Problem, key: Key[Array, ""]) -> None:
+    ascent = _Ascent("maximise", "value", key, problem, optimizer, num_seeds)
     found = eqx.filter_eval_shape(problem.value, problem.start(), key)
     shape, dtype = getattr(found, "shape", None), getattr(found, "dtype", None)
     if shape != () or dtype is None or not jnp.issubdtype(dtype, jnp.floating):
         raise ValueError(f"objective: it returns {shown(found)}, no floating point scalar")
+    functions = {"objective": (problem.value, problem.start(), key)}
+    data = {"objective": objective}
+    _, run = ascent.climb(num_steps, checkpoint, progress, data, functions)
+    return TuningRun(*run)
+
+
+@dataclass(frozen=True)
+class _Ascent:
+    """The steps up the gradient, for the public function `caller`."""
+
+    caller: str
+    objective: str
+    key: Key[Array, ""]
+    problem: Problem
+    optimizer: optax.GradientTransformation
+    num_seeds: int
+
+    def __post_init__(self) -> None:
+        check_key(self.key)
+        check_whole(num_seeds=self.num_seeds)
+        for method in ("init", "update"):
+            is_class = isinstance(self.optimizer, type)
+            if is_class or not callable(getattr(self.optimizer, method, None)):
+                raise ValueError(
+                    f"optimizer: {shown(self.optimizer)} has no {method}; take one of optax, such"
+                    " as optax.adam(0.05)"
+                )
+
+    def climb(
+        self,
+        num_steps: int,
+        checkpoint: Checkpoint | None,
+        progress: bool,
+        data: dict[str, Any],
+        functions: dict[str, Any],
+    ) -> tuple[Reals, tuple]:
+        """The parameters at the end, and the first fields of a `TuningRun`."""
+        check_whole(num_steps=num_steps)
+        check_type(Checkpoint, "a Checkpoint", **given(checkpoint=checkpoint))
+        reals = self.problem.start()
+        optimizer = self.optimizer.init(reals)
+        no_path = jax.tree.map(lambda u: np.empty((0, *u.shape), u.dtype), reals)
+        start = State(0, (reals, optimizer), (np.empty(0), np.empty(0), no_path))
+        settings = {"key": self.key, "num_seeds": int(self.num_seeds)}
+        settings |= self.problem.settings | data
+        first = lambda reals: self._updated(reals, self.optimizer.init(reals), reals)  # noqa: E731
+        functions |= {"optimizer": (first, reals)}
+        identity = identity_of(checkpoint, settings, functions)
+        run = LongRun(self.caller, num_steps, checkpoint, progress, lambda step: identity)
+        state, stopped = run.go(start, lambda: start, self._advance)
+        (reals, _), (values, deviations, path) = state.carry, state.rows
+        seeds, _, fault = self._evaluated(state.step, reals)
+        value = float(seeds.mean())
+        if fault is not None:
+            # The parameters are those of the step before, and so is their value.
+            if stopped is None:
+                stopped = f"{fault} at step {state.step}"
+                warnings.warn(
+                    f"{self.caller}: {stopped}; its result is of the step before", stacklevel=3
+                )
+            reals, value = jax.tree.map(lambda rows: jnp.asarray(rows[-1]), path), float(values[-1])
+        history = {self.objective: values, "deviation": deviations}
+        history |= self.problem.constrained_rows(path)
+        parameters = jax.tree.map(np.asarray, self.problem.constrain(reals))
+        return reals, (self.problem.at(reals), parameters, value, history, stopped)
+
+    def _evaluated(self, step: int, reals: Reals) -> tuple[np.ndarray, Reals, str | None]:
+        """The objective of each seed, the gradient of their mean, and what is not finite, if so."""
+        keys = jax.random.split(jax.random.fold_in(self.key, step), self.num_seeds)
+        values, gradient = scores(self.problem, reals, keys)
+        values, named = np.asarray(values), self.objective.replace("_", " ")
+        broken = [name for name, leaf in gradient.items() if not np.isfinite(leaf).all()]
+        if not np.isfinite(values).all():
+            return values, gradient, f"the {named} was {values.mean()}"
+        if broken:
+            return values, gradient, f"the gradient of {', '.join(broken)} was not finite"
+        return values, gradient, None
+
+    def _advance(self, step: int, last: int, carry: PyTree) -> tuple[int, PyTree, PyTree]:
+        """One step up."""
+        reals, optimizer = carry
+        values, gradient, fault = self._evaluated(step, reals)
+        if fault is not None:
+            raise Broken(fault)
+        idle = [name for name, leaf in gradient.items() if not np.asarray(leaf).any()]
+        if step == 0 and idle:
+            raise ValueError(
+                f"parameters: the {self.objective.replace('_', ' ')} does not depend on"
+                f" {', '.join(idle)}; with gradient='stop' no filter's ever does on a proposal's"
+            )
+        updated, optimizer = self._updated(gradient, optimizer, reals)
+        row = values.mean(), values.std(), jax.tree.map(np.asarray, reals)
+        row = jax.tree.map(lambda leaf: np.asarray(leaf)[None], row)
+        return step + 1, (updated, optimizer), row
+
+    def _updated(self, gradient: Reals, optimizer: PyTree, reals: Reals) -> tuple[Reals, PyTree]:
+        """One step of the optimiser."""
+        descent = jax.tree.map(jnp.negative, gradient)
+        # Optimisers need JAX's default promotion, whatever the caller has set.
+        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+            updates, optimizer = self.optimizer.update(descent, optimizer, reals)
+            moved: Any = optax.apply_updates(reals, updates)
+        return moved, optimizer

@@ -1,5 +1,6 @@
 """Particles of parameters, each with a filter of its own: the step of `smc2`."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,8 +16,14 @@ from mpfjax.observations import Series
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.logarithms import log_sum_exp
 from mpfjax.running.scan import first_mixture, step_or_predict
-from mpfjax.tuning.chains import chosen
-from mpfjax.tuning.densities import Evaluated, Prior, evaluated, is_invalid, number_or_zero
+from mpfjax.tuning.densities import (
+    Evaluated,
+    Prior,
+    chosen,
+    evaluated,
+    is_invalid,
+    number_or_zero,
+)
 from mpfjax.tuning.problem import Problem, Reals
 from mpfjax.tuning.walks import accepts, factor_of
 
@@ -70,7 +77,6 @@ class Sampler(eqx.Module):
     run: FilterOf
     prior: Prior
     num_moves: int = eqx.field(static=True)
-    waste_free: bool = eqx.field(static=True)
     num_samples: int = eqx.field(static=True)
 
     @property
@@ -80,13 +86,15 @@ class Sampler(eqx.Module):
 
     def with_observations(self, run: FilterOf) -> "Sampler":
         """The same over other observations."""
-        return eqx.tree_at(lambda sampler: sampler.run, self, run, is_leaf=_is_none)
+        return dataclasses.replace(self, run=run)
 
     def with_particles(self, num_particles: int) -> "Sampler":
         """The same with filters of another number of particles."""
+        if num_particles == self.num_particles:
+            return self
         resized = self.problem.tree.replace(num_particles=num_particles)
         problem = self.problem.with_structure(jax.tree.structure(resized))
-        return eqx.tree_at(lambda sampler: sampler.problem, self, problem)
+        return dataclasses.replace(self, problem=problem)
 
     def start(self, key: Key[Array, ""], reals: Reals) -> Sample:
         """A θ with the mixture of x_0."""
@@ -108,7 +116,7 @@ class Sampler(eqx.Module):
         """A θ with a new filter over all observations so far."""
         mixture, log_evidence = self.run(key, self.problem.at(reals), num_steps)
         found = evaluated(self.prior(reals), log_evidence)
-        return Sample(reals, mixture, found.log_marginal_likelihood), found
+        return Sample(reals, mixture, found.log_likelihood), found
 
     def move(
         self,
@@ -179,9 +187,8 @@ def rejuvenated(sampler, key, samples, num_steps):
     points = jax.vmap(lambda reals: ravel_pytree(reals)[0])(samples.particles.reals)
     centred = points - samples.average(points)[None]
     factor = factor_of(samples.average(centred[:, :, None] * centred[:, None, :]))
-    num_chains, num_moves = sampler.num_samples, sampler.num_moves
-    if sampler.waste_free:
-        num_chains //= num_moves + 1
+    num_moves = sampler.num_moves
+    num_chains = sampler.num_samples // (num_moves + 1)
     resampled = Resample(particles_per_component=num_chains)(key_resample, samples)
     starts = jax.tree.map(lambda leaf: leaf[:num_chains], resampled.particles)
 
@@ -192,18 +199,15 @@ def rejuvenated(sampler, key, samples, num_steps):
 
         return jax.lax.scan(advance, sample, jax.random.split(key, num_moves))
 
-    ends, (paths, accepted, invalid) = jax.vmap(chain)(
-        jax.random.split(key_moves, num_chains), starts
+    _, (paths, accepted, invalid) = jax.vmap(chain)(jax.random.split(key_moves, num_chains), starts)
+    everywhere = jax.tree.map(
+        lambda start, path: jnp.concatenate([start, path.reshape(-1, *path.shape[2:])]),
+        starts,
+        paths,
     )
-    if sampler.waste_free:
-        ends = jax.tree.map(
-            lambda start, path: jnp.concatenate([start, path.reshape(-1, *path.shape[2:])]),
-            starts,
-            paths,
-        )
     rate = jnp.mean(accepted.astype(samples.log_weights.dtype))
     counts = jax.tree.map(lambda some: jnp.sum(some, dtype=jnp.int32), invalid)
-    return Rejuvenated(single_component(ends), rate, counts)
+    return Rejuvenated(single_component(everywhere), rate, counts)
 
 
 @jit_on_wide_vectors
@@ -218,13 +222,9 @@ def exchanged(sampler, key, samples, num_steps):
     particles, found = jax.vmap(sampler.run_again, in_axes=(0, 0, None))(
         keys, samples.particles.reals, num_steps
     )
-    ratios = found.log_marginal_likelihood - samples.particles.log_evidence
+    ratios = found.log_likelihood - samples.particles.log_evidence
     log_weights = jnp.where(samples.log_weights > -jnp.inf, samples.log_weights + ratios, -jnp.inf)
     total = log_sum_exp(log_weights)
     samples = samples.replace(particles=particles, log_weights=log_weights - total)
     invalid = jnp.sum(found.invalid["log_marginal_likelihood"], dtype=jnp.int32)
     return Extended(samples, total, samples.effective_sample_size, invalid)
-
-
-def _is_none(node: Any) -> bool:
-    return node is None

@@ -1,31 +1,37 @@
 """The posterior of parameters as observations come in, by SMC²."""
 
-import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field, replace
+from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import (
-    check_callable,
-    check_flag,
-    check_key,
-    check_share,
-    check_type,
-    check_whole,
-    given,
-)
+from mpfjax.checks import check_key, check_type, check_whole, given
 from mpfjax.filter import Filter
-from mpfjax.running.storage.checkpoints import check_checkpoint, identity_of
-from mpfjax.tuning.densities import LogPrior, check_exact, checked_prior
-from mpfjax.tuning.parameter_particles import Sampler
-from mpfjax.tuning.problem import Parameters, pose_filter
-from mpfjax.tuning.smc2_run import Doubling, Observed, SamplesFile, Smc2Run, State
-from mpfjax.tuning.starts import SamplePrior, constrained, drawn
+from mpfjax.observations import Series
+from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
+from mpfjax.tuning.chains import warn_of_invalid
+from mpfjax.tuning.densities import LogPrior, SamplePrior, checked_prior, drawn
+from mpfjax.tuning.evidence import check_exact, one_sequence, pose_filter
+from mpfjax.tuning.parameter_particles import (
+    FilterOf,
+    Sampler,
+    exchanged,
+    extended,
+    rejuvenated,
+    started,
+)
+from mpfjax.tuning.problem import Parameters
 from mpfjax.tuning.transforms import AbstractTransform
+
+# The share of their number below which the effective sample size of the θs leads to moves.
+_ESS_THRESHOLD = 0.5
+# N is doubled after moves that accept less.
+_ACCEPTANCE_THRESHOLD = 0.2
 
 
 @dataclass(frozen=True)
@@ -49,7 +55,7 @@ class SequentialPosterior:
     and of proposals that were rejected."""
     stopped: str | None = None
     """why it ended before the last observation, or None."""
-    _goes_on: tuple[Smc2Run, State] | None = field(default=None, repr=False, compare=False)
+    _goes_on: "tuple[_Run, State] | None" = field(default=None, repr=False, compare=False)
     """what `extend` starts from."""
 
     @property
@@ -66,23 +72,19 @@ class SequentialPosterior:
         """E[θ | y_1..y_t] of one parameter, estimated."""
         return np.asarray(np.einsum("n,n...->...", self.weights, self.parameters[name]))
 
-    def extend(
-        self, observations: PyTree, *, inputs: PyTree = None, progress: bool = True
-    ) -> "SequentialPosterior":
+    def extend(self, observations: PyTree, *, progress: bool = True) -> "SequentialPosterior":
         """The posterior after further observations: the one of all observations at once.
 
-        - `observations`: those that come next, with a leading axis t. Of a posterior that was
-          stopped, those after its last increment.
-        - `inputs`: theirs.
+        - `observations`: those that come next, arrays or a `Series`, with a leading axis t. Of a
+          posterior that was stopped, those after its last increment.
 
         This posterior stays as it is. Raises `ValueError` for observations of other shapes or
         types, and what `smc2` does. Use it as observations come in.
         """
-        check_flag(progress=progress)
         if self._goes_on is None:
             raise ValueError("extend: this posterior has no filters to go on with; smc2 gives them")
         run, state = self._goes_on
-        return _posterior(run.with_observations(state.step, observations, inputs), state, progress)
+        return run.followed_by(state.step, observations, progress).posterior(state)
 
 
 def smc2(
@@ -93,25 +95,18 @@ def smc2(
     *,
     sample_prior: SamplePrior,
     log_prior: LogPrior,
-    ess_threshold: float = 0.5,
     num_moves: int = 5,
-    waste_free: bool = True,
     max_particles: int | None = None,
-    acceptance_threshold: float = 0.2,
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
-    inputs: PyTree = None,
-    missing: str = "error",
-    checkpoint: str | os.PathLike[str] | None = None,
-    checkpoint_every: int = 10,
-    checkpoint_name: str | None = None,
+    checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> SequentialPosterior:
     """Sample p(θ | y_1..y_s) for s = 1, ..., t: particles of θ, each with a filter of its own.
 
     SMC² (Chopin, Jacob and Papaspiliopoulos 2013). All filters take one observation at a time,
     under one vmap, and every θ is weighted by its filter's increment of Ẑ. If the effective sample
-    size of the θs falls below a share of their number, they are resampled together with their
+    size of the θs falls below half of their number, they are resampled together with their
     filters. Then each makes steps of particle marginal Metropolis-Hastings: a Gaussian step in
     unconstrained numbers u, a new filter over all observations so far, accepted by the ratio of
     prior times Ẑ. The covariance of these steps is that of the weighted θs times 2.38² / d. Since Ẑ
@@ -121,87 +116,174 @@ def smc2(
     - `num_samples`: how many θs there are. Memory is that of as many filters.
     - `sample_prior`: a function of a key that draws one θ, the parameters by name on their own
       scale. `log_prior`: its density, up to a constant, as for `metropolis_hastings`.
-    - `ess_threshold`: the share below which the θs are resampled and moved.
-    - `num_moves`: Metropolis steps in each rejuvenation.
-    - `waste_free`: resample num_samples / (num_moves + 1) of the θs, and keep all states of their
-      chains (Dau and Chopin 2022), which costs less for the same number of samples and is usually
-      better. Otherwise all θs are resampled and only the ends of their chains kept.
-    - `max_particles`: where given, N is doubled after moves that accept less than
-      `acceptance_threshold`, as long as it stays below this: each θ gets a filter of 2N particles,
-      and the weight Ẑ_2N / Ẑ_N (section 3.6 there, the exchange step by importance sampling).
-      Longer sequences need larger N. Each N compiles its own programs.
-    - `checkpoint`: a .npz file, without pickles. It is written every `checkpoint_every`
-      observations, and at the end or an interruption. If the file exists, the samples go on from
-      it, the same to the bit; also to more observations than those that it has seen.
-      `checkpoint_name`: as for `metropolis_hastings`.
-    - `observations`: one sequence; `SequentialPosterior.extend` takes those that come later.
-      `parameters`, `transforms`, `inputs`, `missing`: as for `fit`.
+    - `num_moves`: Metropolis steps in each rejuvenation. Of the θs, num_samples / (num_moves + 1)
+      are resampled, and all states of their chains are kept (waste-free, Dau and Chopin 2022),
+      which costs less for the same number of samples than to keep the ends of chains alone.
+    - `max_particles`: where given, N is doubled after moves that accept less than a fifth, as long
+      as it stays below this: each θ gets a filter of 2N particles, and the weight Ẑ_2N / Ẑ_N
+      (section 3.6 there, the exchange step by importance sampling). Longer sequences need larger
+      N. Each N compiles its own programs.
+    - `checkpoint`: a `Checkpoint`, from whose file the samples go on, also to more observations
+      than those that it has seen. All else must be the same.
+    - `observations`: one sequence, arrays or a `Series`; `SequentialPosterior.extend` takes those
+      that come later. `parameters`, `transforms`: as for `fit`.
 
     A θ whose likelihood is NaN or +inf gets the weight zero, a proposal with such a prior or
     likelihood is rejected, and `num_invalid` counts them, with a warning. Ctrl-C, and an
     observation for which no θ has any likelihood, end it with a warning and the posterior before
     that.
 
-    Raises `ValueError` for a filter that is `approximate`, numbers below one, a threshold outside
-    [0, 1], `num_samples` that `num_moves` + 1 does not divide where `waste_free`, draws of the
-    prior of other names, shapes or domains than the parameters or where its density is not
-    finite, a list of sequences, a checkpoint of other samples, and what `fit` does; `RuntimeError`
+    Raises `ValueError` for a filter that is `approximate`, numbers below one, `num_samples` that
+    `num_moves` + 1 does not divide, draws of the prior of other names, shapes or domains than the
+    parameters or where its density is not finite, a list of sequences, a checkpoint of other
+    samples, and what `fit` does; `RuntimeError`
     where no θ has any likelihood at the first observation. Use it to follow a posterior in time,
     for posteriors with several modes, and to compare models; `metropolis_hastings` is simpler where
     only the last posterior is wanted.
     """
     check_key(key)
-    check_type(Filter, "a filter", filter=filter)
-    check_whole(num_samples=num_samples, num_moves=num_moves)
-    check_whole(1, **given(max_particles=max_particles))
-    check_share(ess_threshold=ess_threshold, acceptance_threshold=acceptance_threshold)
-    check_flag(waste_free=waste_free, progress=progress)
-    check_callable("a function of a key", sample_prior=sample_prior)
-    check_checkpoint(checkpoint, checkpoint_every, checkpoint_name)
     check_exact(filter, "SMC²")
-    if waste_free and num_samples % (num_moves + 1):
+    check_whole(num_samples=num_samples, num_moves=num_moves, **given(max_particles=max_particles))
+    check_type(Checkpoint, "a Checkpoint", **given(checkpoint=checkpoint))
+    if num_samples % (num_moves + 1):
         raise ValueError(
-            f"num_samples: {num_samples} is no multiple of num_moves + 1, {num_moves + 1}, as"
-            " waste_free needs"
+            f"num_samples: {num_samples} is no multiple of num_moves + 1, {num_moves + 1}"
         )
-    observed = Observed.checked(observations, inputs, missing, filter.model)
-    run = observed.filter_of(observed.length)
-    problem = pose_filter(filter, run, parameters, transforms)
+    series = jax.tree.map(np.asarray, one_sequence(observations, filter.model))
+    runs = _padded(series, series.length)
+    problem = pose_filter(filter, runs, parameters, transforms)
     key_prior, key_filters, key_steps = jax.random.split(key, 3)
     reals = drawn(key_prior, problem, sample_prior, num_samples)
     first = jax.tree.map(lambda u: u[0], reals)
     prior = checked_prior(log_prior, problem, first, "at a draw of sample_prior")
-    sampler = Sampler(problem, run, prior, int(num_moves), bool(waste_free), int(num_samples))
-    settings = {
-        "filter": problem.tree, "parameters": str(problem.tuned), "transforms": problem.transforms,
-        "key": key, "missing": missing, "num_samples": int(num_samples),
-        "ess_threshold": float(ess_threshold), "num_moves": int(num_moves),
-        "waste_free": bool(waste_free), "max_particles": str(max_particles),
-        "acceptance_threshold": float(acceptance_threshold),
+    sampler = Sampler(problem, runs, prior, int(num_moves), int(num_samples))
+    settings = problem.settings | {
+        "key": key, "num_samples": int(num_samples), "num_moves": int(num_moves),
+        "max_particles": max_particles,
     }  # fmt: skip
-    code = {"log_prior": log_prior, "sample_prior": sample_prior}
-    file = None
-    if checkpoint is not None:
-        identity = identity_of(checkpoint_name, settings, code)
-        file = SamplesFile(Path(checkpoint), int(checkpoint_every), identity)
-    doubling = Doubling(max_particles, float(acceptance_threshold))
-    run = Smc2Run(sampler, observed, key_steps, float(ess_threshold), doubling, file)
-    keys = jax.random.split(key_filters, num_samples)
-    return _posterior(run, run.loaded(keys, reals) or run.started(keys, reals), progress)
+    identity = identity_of(checkpoint, settings, {"log_prior": (prior, first)})
+    run = _Run(sampler, series, key_steps, max_particles, checkpoint, progress, identity)
+    return run.posterior(None, jax.random.split(key_filters, num_samples), reals)
 
 
-def _posterior(run: Smc2Run, state: State, progress: bool) -> SequentialPosterior:
-    """The posterior after all observations, from where the state is."""
-    state, stopped = run.go(state, progress)
-    reals = jax.tree.map(np.asarray, state.samples.particles.reals)
-    return SequentialPosterior(
-        parameters=constrained(run.sampler.problem, reals),
-        log_weights=np.asarray(state.samples.log_weights),
-        log_likelihood_increments=state.rows.increments,
-        effective_sample_sizes=state.rows.sizes,
-        acceptance_rates=state.rows.rates,
-        num_particles=state.rows.num_particles,
-        num_invalid=state.num_invalid,
-        stopped=stopped,
-        _goes_on=(run, state),
+@dataclass(frozen=True)
+class _Run:
+    """SMC² over some observations. It carries the samples, N and the counts of invalid densities;
+    its rows are the increment, the effective sample size, the acceptance rate and N of each step.
+    """
+
+    sampler: Sampler
+    """with the number of particles at the start."""
+    series: Series
+    """the data of the filters, in arrays of numpy."""
+    key: Key[Array, ""]
+    max_particles: int | None
+    checkpoint: Checkpoint | None
+    progress: bool
+    identity: dict[str, str]
+
+    def followed_by(self, step: int, observations: PyTree, progress: bool) -> "_Run":
+        """The same with the observations that come after a step, and no others."""
+        before = jax.tree.map(lambda leaf: leaf[:step], self.series)
+        after = jax.tree.map(
+            np.asarray, one_sequence(observations, self.sampler.problem.tree.model)
+        )
+        if (before.present is None) != (after.present is None):
+            before, after = _with_present(before), _with_present(after)
+        if _kind(before) != _kind(after):
+            raise ValueError(
+                f"observations: {_kind(after)} are not like those before, {_kind(before)}"
+            )
+        series = jax.tree.map(lambda *leaves: np.concatenate(leaves), before, after)
+        held = self.sampler.run.series.length
+        # With room for as many more, so that observations that come one by one share a program.
+        capacity = held if series.length <= held else max(series.length, 2 * held)
+        sampler = self.sampler.with_observations(_padded(series, capacity))
+        return replace(self, sampler=sampler, series=series, progress=progress)
+
+    def posterior(
+        self, state: State | None, keys: Key[Array, " n"] | None = None, reals: Any = None
+    ) -> SequentialPosterior:
+        """The posterior after all observations, from a state on, or from draws of the prior."""
+
+        def identity(step: int) -> dict[str, str]:
+            seen = jax.tree.map(lambda leaf: leaf[:step], self.series)
+            seen = _with_present(seen)
+            return self.identity | identity_of(self.checkpoint, {"observations": seen}, {})
+
+        def start() -> State:
+            return like._replace(carry=(started(self.sampler, keys, reals), *like.carry[1:]))
+
+        run = LongRun("smc2", self.series.length, self.checkpoint, self.progress, identity)
+        before = {"log_prior": 0, "log_marginal_likelihood": 0}
+        if state is None:
+            samples = eqx.filter_eval_shape(started, self.sampler, keys, reals)
+            rows = (np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))
+            like = State(0, (samples, self.sampler.num_particles, before), rows)
+            state, stopped = run.go(like, start, self._advance)
+        else:
+            before = state.carry[2]
+            state, stopped = run.go_on(state, self._advance)
+        samples, _, num_invalid = state.carry
+        new = {name: count - before[name] for name, count in num_invalid.items()}
+        warn_of_invalid("smc2", new, stacklevel=4)
+        return SequentialPosterior(
+            self.sampler.problem.constrained_rows(samples.particles.reals),
+            np.asarray(samples.log_weights),
+            *state.rows,
+            num_invalid=num_invalid,
+            stopped=stopped,
+            _goes_on=(self, state),
+        )
+
+    def _advance(self, step: int, last: int, carry: PyTree) -> tuple[int, PyTree, PyTree]:
+        """The samples after one more observation."""
+        samples, num_particles, invalid = carry
+        counts, sampler = dict(invalid), self.sampler.with_particles(num_particles)
+        keys = jax.random.split(jax.random.fold_in(self.key, step), 3)
+        found = extended(sampler, keys[0], samples, jnp.asarray(step, jnp.int32))
+        counts["log_marginal_likelihood"] += int(found.invalid)
+        increment, size, rate = float(found.increment), float(found.effective_sample_size), np.nan
+        if increment == -np.inf:
+            broken = f", NaN or +inf in {int(found.invalid)}," if int(found.invalid) else ""
+            raise Broken(f"no sample has any likelihood{broken}")
+        samples = found.samples
+        if size < _ESS_THRESHOLD * sampler.num_samples:
+            so_far = jnp.asarray(step + 1, jnp.int32)
+            moved = rejuvenated(sampler, keys[1], samples, so_far)
+            samples, rate = moved.samples, float(moved.acceptance_rate)
+            for name, count in moved.invalid.items():
+                counts[name] += int(count)
+            may_double = self.max_particles is not None and 2 * num_particles <= self.max_particles
+            if may_double and rate < _ACCEPTANCE_THRESHOLD:
+                larger = self.sampler.with_particles(2 * num_particles)
+                more = exchanged(larger, keys[2], samples, so_far)
+                counts["log_marginal_likelihood"] += int(more.invalid)
+                # Where no filter of 2N particles has any likelihood, those of N are kept.
+                if float(more.increment) > -np.inf:
+                    samples, num_particles = more.samples, 2 * num_particles
+                    increment += float(more.increment)
+        row = (np.array([number]) for number in (increment, size, rate, num_particles))
+        return step + 1, (samples, num_particles, counts), tuple(row)
+
+
+def _padded(series: Series, capacity: int) -> FilterOf:
+    """Runs over the data, in arrays with room for this many steps."""
+    pad = lambda leaf: jnp.asarray(np.resize(leaf, (capacity, *leaf.shape[1:])))  # noqa: E731
+    return FilterOf(jax.tree.map(pad, series))
+
+
+def _with_present(series: Series) -> Series:
+    if series.present is not None:
+        return series
+    return Series(series.observations, series.inputs, np.ones(series.length, bool))
+
+
+def _kind(series: Series) -> str:
+    """The structure, shapes and types of one step of a series."""
+    return str(
+        [
+            f"{jax.tree_util.keystr(place)} {leaf.dtype}{list(leaf.shape[1:])}"
+            for place, leaf in jax.tree_util.tree_leaves_with_path(series)
+        ]
     )

@@ -22,6 +22,8 @@ from tests.tuning.exact_posteriors import (
 )
 from tests.user_models import ScalarLinear
 
+SERIES = mpfjax.Series.skipping(OBSERVATIONS)
+
 
 def draw_a(key, trajectory, observations, model):
     """a is normal given the trajectory: a regression of each state on the one before."""
@@ -31,10 +33,10 @@ def draw_a(key, trajectory, observations, model):
     return {"a": mean + jax.random.normal(key) / jnp.sqrt(precision)}
 
 
-def sample(num_steps=3, *, filter=None, observations=OBSERVATIONS, **options):
+def sample(num_steps=3, *, filter=None, observations=SERIES, **options):
     if not {"draw", "log_prior"} & set(options):
         options["draw"] = draw_a
-    options = {"parameters": A, "progress": False, "num_chains": 2, "missing": "skip"} | options
+    options = {"parameters": A, "progress": False, "num_chains": 2} | options
     filter = mpfjax.particle_filter(ScalarLinear(), 10) if filter is None else filter
     arguments = {"key": jax.random.key(0), "filter": filter, "observations": observations}
     return particle_gibbs(**arguments | {"num_steps": num_steps} | options)
@@ -110,6 +112,13 @@ class NoTransition(ScalarLinear):
     log_transition = None
 
 
+@pytest.mark.thorough
+def test_without_log_transition_the_trajectory_follows_its_ancestors():
+    run = sample(filter=mpfjax.particle_filter(NoTransition(), 10))
+    assert np.isfinite(run.parameters["a"]).all()
+    assert run.renewal_rates[-1] > 0
+
+
 @pytest.mark.usefixtures("as_installed")
 @pytest.mark.parametrize(
     ("options", "named"),
@@ -118,9 +127,6 @@ class NoTransition(ScalarLinear):
         ({"filter": 3}, "filter: 3 is not a filter"),
         ({"num_steps": 0}, "num_steps: 0"),
         ({"num_chains": 1.5}, "num_chains: 1.5"),
-        ({"num_metropolis_steps": 0}, "num_metropolis_steps: 0"),
-        ({"progress": "no"}, "progress: 'no'"),
-        ({"backward": None}, "backward: None"),
         ({"collect": 3}, "collect: 3"),
         ({"draw": 3}, "draw: 3"),
         ({"draw": None}, "draw, log_prior: None and None; exactly one"),
@@ -128,20 +134,15 @@ class NoTransition(ScalarLinear):
         ({"log_prior": 3}, "log_prior: 3"),
         ({"log_prior": log_prior_of_a}, "ScalarLinear defines no log_initial"),
         (
-            {"filter": mpfjax.particle_filter(NoTransition(), 10)},
-            "NoTransition defines no log_transition, which backward sampling",
-        ),
-        (
             {
                 "filter": mpfjax.particle_filter(NoTransition(), 10),
-                "log_prior": log_prior_of_a, "backward": False,
+                "log_prior": log_prior_of_a,
             },
             "NoTransition defines no log_transition, which particle_gibbs with log_prior",
         ),
         ({"filter": mpfjax.gaussian_particle_filter(ScalarLinear(), 10)}, "filter: Gaussian"),
         ({"observations": [1.0, 2.0]}, "observations: a list"),
-        ({"observations": np.full(3, np.nan), "missing": "error"}, "observations: NaN"),
-        ({"missing": 0}, "missing: 0"),
+        ({"observations": np.full(3, np.nan)}, "observations: NaN"),
         ({"parameters": "a"}, "parameters: 'a'"),
         ({"transforms": {"b": Positive()}}, r"transforms: \['b'\]"),
     ],
@@ -154,6 +155,6 @@ def test_bad_arguments_are_refused_by_name(options, named):
 @pytest.mark.thorough
 def test_one_step_of_time_and_no_observation_at_all():
     """Without observations the posterior is the prior."""
-    run = sample(observations=jnp.full(1, jnp.nan), missing="skip")
+    run = sample(observations=mpfjax.Series.skipping(jnp.full(1, jnp.nan)))
     assert run.trajectories.shape == (2, 3, 2)
     assert np.isfinite(run.parameters["a"]).all()

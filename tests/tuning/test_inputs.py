@@ -22,6 +22,7 @@ from tests.marking import thorough
 from tests.test_inputs import INPUTS, OBSERVATIONS, TRACED, Driven, in_matrices
 
 FILTER = mpfjax.particle_filter(Driven(), 100)
+SERIES = mpfjax.Series(OBSERVATIONS, INPUTS)
 PARAMETERS = {"gain": lambda filter: filter.model.gain}
 
 
@@ -57,24 +58,24 @@ def truth():
 
 def by_metropolis(key):
     run = metropolis_hastings(
-        key, FILTER, OBSERVATIONS, 400, log_prior=log_prior, proposal_deviations=0.8,
-        num_chains=4, burn_in=50, parameters=PARAMETERS, inputs=INPUTS, progress=False,
+        key, FILTER, SERIES, 400, log_prior=log_prior, proposal_deviations=0.8,
+        num_chains=4, burn_in=50, parameters=PARAMETERS, progress=False,
     )  # fmt: skip
     return np.ravel(run.parameters["gain"]), None
 
 
 def by_gibbs(key):
     run = particle_gibbs(
-        key, FILTER, OBSERVATIONS, 300, log_prior=log_prior, proposal_deviations=0.8,
-        num_chains=4, burn_in=50, parameters=PARAMETERS, inputs=INPUTS, progress=False,
+        key, FILTER, SERIES, 300, log_prior=log_prior, proposal_deviations=0.8,
+        num_chains=4, burn_in=50, parameters=PARAMETERS, progress=False,
     )  # fmt: skip
     return np.ravel(run.parameters["gain"]), None
 
 
 def by_smc2(key):
     run = smc2(
-        key, FILTER, OBSERVATIONS, 120, log_prior=log_prior, sample_prior=sample_prior,
-        parameters=PARAMETERS, inputs=INPUTS, progress=False,
+        key, FILTER, SERIES, 120, log_prior=log_prior, sample_prior=sample_prior,
+        parameters=PARAMETERS, progress=False,
     )  # fmt: skip
     return np.ravel(run.parameters["gain"]), np.asarray(run.weights)
 
@@ -94,11 +95,11 @@ def test_fit_ends_where_the_likelihood_is_highest():
     """log Z is a parabola in the coefficient, so that two derivatives tell where and how wide."""
     slope, curvature = jax.grad(log_evidence)(0.0), jax.hessian(log_evidence)(0.0)
     filter = mpfjax.particle_filter(Driven(), 200, gradient="stop")
-    key, given = jax.random.key(0), {"parameters": PARAMETERS, "inputs": INPUTS}
-    run = fit(key, filter, OBSERVATIONS, optax.adam(0.1), 60, num_seeds=32, progress=False, **given)
+    key, given = jax.random.key(0), {"parameters": PARAMETERS}
+    run = fit(key, filter, SERIES, optax.adam(0.1), 60, num_seeds=32, progress=False, **given)
     late = run.history["gain"][-20:]
     assert late.mean() == pytest.approx(float(-slope / curvature), abs=0.1)
-    found = standard_errors(key, run.filter, OBSERVATIONS, num_seeds=256, **given)
+    found = standard_errors(key, run.filter, SERIES, num_seeds=256, **given)
     assert found["gain"] == pytest.approx(float(-curvature) ** -0.5, rel=0.15)
 
 
@@ -106,8 +107,8 @@ def test_fit_ends_where_the_likelihood_is_highest():
 def test_the_score_of_the_posterior():
     """The gradient that other libraries' samplers take, over seeds, beside the exact one."""
     filter = mpfjax.particle_filter(Driven(), 200, gradient="stop")
-    given = {"log_prior": log_prior, "parameters": PARAMETERS, "inputs": INPUTS}
-    density = log_density(filter, OBSERVATIONS, **given)
+    given = {"log_prior": log_prior, "parameters": PARAMETERS}
+    density = log_density(filter, SERIES, **given)
     keys = jax.random.split(jax.random.key(2), 200)
     score = jax.jit(jax.vmap(jax.grad(density), (None, 0)))
     for gain in (0.0, 1.2):
@@ -123,21 +124,21 @@ def test_other_inputs_compile_nothing_again(name):
     filter = mpfjax.particle_filter(Driven(), 10, gradient="stop" if name == "fit" else "none")
     key, given = jax.random.key(0), {"parameters": PARAMETERS, "progress": False}
     by_name = {
-        "fit": lambda inputs: fit(
-            key, filter, OBSERVATIONS, optax.sgd(0.1), 2, inputs=inputs, **given
+        "fit": lambda series: fit(
+            key, filter, series, optax.sgd(0.1), 2, **given
         ),
-        "metropolis_hastings": lambda inputs: metropolis_hastings(
-            key, filter, OBSERVATIONS, 2, log_prior=log_prior, inputs=inputs, **given
+        "metropolis_hastings": lambda series: metropolis_hastings(
+            key, filter, series, 2, log_prior=log_prior, **given
         ),
-        "particle_gibbs": lambda inputs: particle_gibbs(
-            key, filter, OBSERVATIONS, 2, log_prior=log_prior, inputs=inputs, **given
+        "particle_gibbs": lambda series: particle_gibbs(
+            key, filter, series, 2, log_prior=log_prior, **given
         ),
-        "smc2": lambda inputs: smc2(
-            key, filter, OBSERVATIONS, 12, log_prior=log_prior, sample_prior=sample_prior,
-            inputs=inputs, **given,
+        "smc2": lambda series: smc2(
+            key, filter, series, 12, log_prior=log_prior, sample_prior=sample_prior, **given,
         ),
     }  # fmt: skip
-    by_name[name](INPUTS)
+    by_name[name](SERIES)
     before = len(TRACED)
-    by_name[name](jax.tree.map(lambda leaf: 0.5 * leaf, INPUTS))
+    other = jax.tree.map(lambda leaf: 0.5 * leaf, INPUTS)
+    by_name[name](mpfjax.Series(OBSERVATIONS, other))
     assert len(TRACED) == before > 0

@@ -17,8 +17,9 @@ import pytest
 from scipy.optimize import minimize
 
 import mpfjax
+from mpfjax import Checkpoint
 from mpfjax.exact import kalman_filter
-from mpfjax.running.storage.descriptions import contents_of
+from mpfjax.running.storage.descriptions import program_of
 from mpfjax.running.storage.files import load_arrays, write_arrays
 from mpfjax.tuning import Interval, Positive, fit, standard_errors
 from tests.full_disk import no_room_beyond
@@ -122,15 +123,11 @@ class TestMaximum:
 class TestResuming:
     def test_an_interrupted_fit_ends_as_if_it_had_not_been(self, tmp_path):
         whole = short_fit()
-        short_fit(3, checkpoint=tmp_path / "fit.npz")
-        resumed = short_fit(checkpoint=tmp_path / "fit.npz")
-        assert resumed.parameters["r"] == whole.parameters["r"]
-        for name, values in whole.history.items():
-            np.testing.assert_array_equal(resumed.history[name], values)
-        assert resumed.log_marginal_likelihood == whole.log_marginal_likelihood
+        short_fit(3, checkpoint=Checkpoint(tmp_path / "fit.npz"))
+        assert_same(short_fit(checkpoint=Checkpoint(tmp_path / "fit.npz")), whole)
 
     def test_what_is_done_is_kept_where_it_is_interrupted(self, tmp_path, monkeypatch):
-        real, path = mpfjax.tuning.gradient_ascent.scores, tmp_path / "fit.npz"
+        real, path = mpfjax.tuning.optimisation.scores, tmp_path / "fit.npz"
         calls = []
 
         def interrupted(*arguments):
@@ -139,95 +136,87 @@ class TestResuming:
                 raise KeyboardInterrupt
             return real(*arguments)
 
-        monkeypatch.setattr(mpfjax.tuning.gradient_ascent, "scores", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            short_fit(checkpoint=path)
+        monkeypatch.setattr(mpfjax.tuning.optimisation, "scores", interrupted)
+        with pytest.warns(UserWarning, match="fit: interrupted at step 3 of 6"):
+            part = short_fit(checkpoint=Checkpoint(path))
         assert notes_of(path)["step"] == 3
         monkeypatch.undo()
-        assert short_fit(checkpoint=path).parameters["r"] == short_fit().parameters["r"]
+        whole = short_fit()
+        np.testing.assert_array_equal(part.history["r"], whole.history["r"][:3])
+        assert part.parameters["r"] == whole.history["r"][3]
+        assert_same(short_fit(checkpoint=Checkpoint(path)), whole)
+
+    def test_before_the_first_step_an_interruption_is_one(self, tmp_path, monkeypatch):
+        def interrupted(*arguments):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(mpfjax.tuning.optimisation, "scores", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            short_fit(checkpoint=Checkpoint(tmp_path / "fit.npz"))
+        assert not (tmp_path / "fit.npz").exists()
 
     @pytest.mark.parametrize(
         ("other", "named"),
         [
             ({"num_seeds": 2}, "num_seeds is 4 there and 2 here"),
-            ({"common_random_numbers": True}, "common_random_numbers is False there"),
             ({"start": {"r": 0.7}}, r"filter\.model\.r is .* 0\.5 there and .* 0\.7 here"),
             ({"start": {"q": 0.7}}, r"filter\.model\.q is"),
             ({"start": {"num_particles": 8}}, r"filter\.num_particles is 16 there and 8 here"),
             ({"start": {"gradient": "none"}}, r"filter\._moves\[0\]\.gradient is"),
-            ({"observations": OBSERVATIONS.at[3].add(1e-6)}, "observations is"),
-            ({"missing": "skip"}, "missing is error there and skip here"),
+            ({"observations": OBSERVATIONS.at[3].add(1e-6)}, r"observations.* is"),
             ({"key": jax.random.key(1)}, "key is"),
             ({"transforms": {"r": Interval(0.0, 9.0)}}, r"transforms\['r'\]"),
-            ({"parameters": {"r": lambda filter: filter.model.q}}, "parameters r is"),
-            ({"optimizer": optax.sgd(0.05)}, "optimizer"),
-            ({"optimizer": optax.adam(0.06)}, r"optimizer\..*step_size is -0\.05 there and -0\.06"),
-            ({"optimizer": optax.adam(0.05, b1=0.8)}, r"optimizer\..*b1 is 0\.9 there and 0\.8"),
+            ({"parameters": {"r": lambda filter: filter.model.q}}, r"parameters\['r'\] is"),
+            ({"optimizer": optax.sgd(0.05)}, "optimizer is"),
+            ({"optimizer": optax.adam(0.06)}, "optimizer is"),
         ],
     )  # fmt: skip
     def test_a_checkpoint_of_another_fit_is_refused_with_what_differs(self, tmp_path, other, named):
-        short_fit(1, checkpoint=tmp_path / "fit.npz")
+        short_fit(1, checkpoint=Checkpoint(tmp_path / "fit.npz"))
         with pytest.raises(
             ValueError, match=r"checkpoint: .*fit\.npz is of another fit: .*" + named
         ):
-            short_fit(checkpoint=tmp_path / "fit.npz", **other)
+            short_fit(checkpoint=Checkpoint(tmp_path / "fit.npz"), **other)
 
     def test_what_may_differ_is_how_long_it_goes_on(self, tmp_path):
-        short_fit(2, checkpoint=tmp_path / "fit.npz", patience=9)
-        options = {"patience": 2, "tolerance": -1e9, "checkpoint_every": 1}
-        resumed = short_fit(checkpoint=tmp_path / "fit.npz", **options)
-        np.testing.assert_array_equal(resumed.history["r"], short_fit().history["r"])
-
-    def test_a_fit_that_converged_does_not_go_on(self, tmp_path):
-        options = {"optimizer": optax.sgd(1e-4), "patience": 3, "common_random_numbers": True}
-        options |= {"tolerance": 1.0, "checkpoint": tmp_path / "fit.npz"}
-        first = short_fit(40, **options)
-        assert "3 steps gained" in first.stopped
-        assert notes_of(options["checkpoint"])["stopped"] == first.stopped
-        assert_same(short_fit(40, **options), first)
-        assert_same(short_fit(80, **options), first)
-        further = short_fit(10, **options | {"patience": None})
-        assert further.stopped is None
-        assert len(further.history["r"]) == 10
-        np.testing.assert_array_equal(further.history["r"][:6], first.history["r"])
+        short_fit(2, checkpoint=Checkpoint(tmp_path / "fit.npz"))
+        resumed = short_fit(checkpoint=Checkpoint(tmp_path / "fit.npz", every=1))
+        assert_same(resumed, short_fit())
 
     @pytest.mark.parametrize(("num_steps", "step"), [(6, 0.2), (1, 1.0)])
     def test_a_fit_that_broke_does_not_go_on(self, tmp_path, num_steps, step):
         """In the middle, or where its end was evaluated."""
-        options = {"optimizer": falling(step), "checkpoint": tmp_path / "fit.npz"}
+        options = {"optimizer": falling(step), "checkpoint": Checkpoint(tmp_path / "fit.npz")}
         with pytest.warns(UserWarning, match="was nan at step"):
             first = short_fit(num_steps, **options)
-        before = options["checkpoint"].read_bytes()
+        before = (tmp_path / "fit.npz").read_bytes()
         for more in (0, 5):
             with pytest.warns(UserWarning, match="was nan at step"):
                 assert_same(short_fit(num_steps + more, **options), first)
-        assert options["checkpoint"].read_bytes() == before
+        assert (tmp_path / "fit.npz").read_bytes() == before
 
     @pytest.mark.parametrize(
         ("name", "array"),
         [
-            ("['reals']['r']", np.zeros(2, np.float32)),
-            ("['reals']['r']", np.zeros((), np.float64)),
-            ("['optimizer'][0].count", None),
-            ("['optimizer'][0].mu['r']", np.zeros((), np.int32)),
-            ("['path']['r']", np.zeros(1, np.float32)),
-            ("['values']", None),
+            ("['carry'][0]['r']", np.zeros((), np.float64)),
+            ("['carry'][1][0].count", None),
+            ("['rows'][0]", None),
         ],
     )
     def test_a_file_with_other_arrays_is_damaged(self, tmp_path, name, array):
         path = tmp_path / "fit.npz"
-        short_fit(2, checkpoint=path)
+        short_fit(2, checkpoint=Checkpoint(path))
         arrays = load_arrays(path)
         del arrays[name]
         write_arrays(path, arrays | ({} if array is None else {name: array}))
         with pytest.raises(ValueError, match=r"checkpoint: .*fit\.npz: damaged"):
-            short_fit(checkpoint=path)
+            short_fit(checkpoint=Checkpoint(path))
 
     def test_a_file_of_something_else_is_refused(self, tmp_path):
         path = tmp_path / "fit.npz"
         write_arrays(path, {"step": np.array(3)})
         with pytest.raises(ValueError, match=r"fit\.npz is no checkpoint of fit"):
-            short_fit(checkpoint=path)
+            short_fit(checkpoint=Checkpoint(path))
 
     def test_an_optimiser_with_a_key_and_short_floats_goes_on(self, tmp_path):
         def disturb(updates, key, params=None):
@@ -238,50 +227,60 @@ class TestResuming:
         with_key = optax.GradientTransformation(lambda params: jax.random.key(3), disturb)
         noisy = optax.chain(with_key, optax.adam(0.05, mu_dtype=jnp.bfloat16))
         whole = short_fit(4, optimizer=noisy)
-        short_fit(2, optimizer=noisy, checkpoint=tmp_path / "fit.npz")
-        resumed = short_fit(4, optimizer=noisy, checkpoint=tmp_path / "fit.npz")
-        np.testing.assert_array_equal(resumed.history["r"], whole.history["r"])
+        options = {"optimizer": noisy, "checkpoint": Checkpoint(tmp_path / "fit.npz")}
+        short_fit(2, **options)
+        assert_same(short_fit(4, **options), whole)
 
     def test_a_checkpoint_that_is_cut_off_is_named_and_left_alone(self, tmp_path):
         path = tmp_path / "fit.npz"
-        short_fit(1, checkpoint=path)
+        short_fit(1, checkpoint=Checkpoint(path))
         path.write_bytes(path.read_bytes()[:500])
         with pytest.raises(ValueError, match=r"fit\.npz: cut off"):
-            short_fit(checkpoint=path)
+            short_fit(checkpoint=Checkpoint(path))
         assert path.stat().st_size == 500
 
     def test_a_full_disk_leaves_the_last_checkpoint(self, tmp_path):
         path = tmp_path / "fit.npz"
-        short_fit(2, checkpoint=path)
+        short_fit(2, checkpoint=Checkpoint(path))
         before = path.read_bytes()
         with pytest.raises(OSError, match=r"fit\.npz"), no_room_beyond(500):
-            short_fit(checkpoint=path)
+            short_fit(checkpoint=Checkpoint(path))
         assert path.read_bytes() == before
 
     @pytest.mark.parametrize("name", [None, "cosine"])
     def test_a_schedule_that_writes_into_its_closure_goes_on(self, tmp_path, name):
         """As optax's cosine does when it is first called, in this process and in a new one."""
         make = lambda: optax.adam(optax.cosine_decay_schedule(0.05, 10))  # noqa: E731
-        options = {"checkpoint": tmp_path / "fit.npz", "checkpoint_name": name}
+        options = {"checkpoint": Checkpoint(tmp_path / "fit.npz", name=name)}
         optimizer = make()
         short_fit(2, optimizer=optimizer, **options)
         short_fit(3, optimizer=optimizer, **options)
-        resumed = short_fit(4, optimizer=make(), **options)
-        np.testing.assert_array_equal(
-            resumed.history["r"], short_fit(4, optimizer=make()).history["r"]
-        )
+        assert_same(short_fit(4, optimizer=make(), **options), short_fit(4, optimizer=make()))
 
     def test_of_a_name_the_name_and_the_data_are_compared_alone(self, tmp_path):
-        options = {"checkpoint": tmp_path / "fit.npz", "checkpoint_name": "mine"}
+        options = {"checkpoint": Checkpoint(tmp_path / "fit.npz", name="mine")}
         short_fit(1, **options)
         assert len(short_fit(2, optimizer=optax.adam(0.07), **options).history["r"]) == 2
         for other, named in (
-            ({"checkpoint_name": "yours"}, "checkpoint_name is mine there and yours here"),
-            ({"start": {"r": 0.7}}, "filter is"),
-            ({"observations": OBSERVATIONS.at[3].add(1e-6)}, "observations is"),
+            ({"checkpoint": Checkpoint(tmp_path / "fit.npz", name="yours")}, "name is mine there"),
+            ({"start": {"r": 0.7}}, r"filter\.model\.r is"),
+            ({"observations": OBSERVATIONS.at[3].add(1e-6)}, "observations.* is"),
         ):
             with pytest.raises(ValueError, match=named):
                 short_fit(3, **options | other)
+
+
+@pytest.mark.usefixtures("as_installed")
+def test_bad_checkpoints_are_refused_by_name():
+    for arguments, named in (
+        ({"path": 3}, "path: 3"),
+        ({"path": os.curdir}, "path: . is a directory"),
+        ({"path": ""}, "path: ''"),
+        ({"path": "a.npz", "every": 0}, "every: 0"),
+        ({"path": "a.npz", "name": 3}, "name: 3"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            Checkpoint(**arguments)
 
 
 def notes_of(path):
@@ -299,10 +298,16 @@ def assert_same(run, other):
 
 
 class TestOptimisers:
-    """Which are closures: two are the same where all that these hold is."""
+    """Which are closures: two are the same where they take the same steps."""
+
+    def program(self, optimizer):
+        reals = {"r": jnp.ones(())}
+        first = lambda reals: optimizer.update(reals, optimizer.init(reals), reals)  # noqa: E731
+        return program_of(first, reals)
 
     def same(self, one, other):
-        return contents_of("optimizer", one) == contents_of("optimizer", other)
+        with jax.numpy_dtype_promotion("standard"):
+            return self.program(one) == self.program(other)
 
     @pytest.mark.parametrize(
         "make",
@@ -311,10 +316,10 @@ class TestOptimisers:
             lambda: optax.adam(optax.cosine_decay_schedule(0.05, 100)),
             lambda: optax.chain(optax.clip(1.0), optax.inject_hyperparams(optax.sgd)(0.1)),
             lambda: optax.MultiSteps(optax.sgd(0.1), 3),
-            lambda: optax.lbfgs(),
             lambda: falling(0.2),
             lambda: optax.sgd(lambda step: 0.1 / (1 + step)),
             lambda: optax.multi_transform({"a": optax.sgd(0.1), "b": optax.adam(0.2)}, {"r": "a"}),
+            lambda: optax.chain(optax.add_noise(0.1, 0.5, 3), optax.scale_by_adam()),
         ],
     )
     def test_made_twice_they_are_the_same(self, make):
@@ -353,13 +358,14 @@ class TestOptimisers:
     def test_they_are_the_same_in_another_process(self):
         """Where addresses and the order of sets are others."""
         code = """
-import hashlib, jax, mpfjax, optax
-from mpfjax.running.storage.descriptions import contents_of
+import jax, jax.numpy as jnp, mpfjax, optax
+from mpfjax.running.storage.descriptions import describe, program_of
 filter = mpfjax.mixture_particle_filter(mpfjax.QuadraticModel(0.3, 0.3, -2.5, 2.5), 20, 2)
-rate = optax.cosine_decay_schedule(0.05, 100)
-optimizer = optax.chain(optax.clip(1.0), optax.adam(lambda t: rate(t) if t in {1, 2} else 0.1))
-found = contents_of("", [optimizer, optax.lbfgs(), filter, {"a", "b", "c"}, jax.nn.tanh])
-print(hashlib.sha256(repr(found).encode()).hexdigest())
+optimizer = optax.chain(optax.clip(1.0), optax.adam(optax.cosine_decay_schedule(0.05, 100)))
+reals = {"b": jnp.ones(()), "a": jnp.ones(3)}
+run = lambda key: mpfjax.run_filter(key, filter, jnp.ones(3)).log_marginal_likelihood
+print(program_of(optimizer.update, reals, optimizer.init(reals), reals))
+print(describe((filter, {"a", "b"}.pop), values=True) and program_of(run, jax.random.key(0)))
 """
         digests = {
             subprocess.run(
@@ -390,23 +396,10 @@ class TestStopping:
         with pytest.raises(RuntimeError, match="was nan at the start"):
             short_fit(start={"r": 0.2})
 
-    def test_patience_ends_what_no_longer_climbs(self):
-        run = short_fit(40, optimizer=optax.sgd(0.0), patience=3, common_random_numbers=True)
-        assert len(run.history["r"]) == 6
-        assert "3 steps gained" in run.stopped
-
 
 def falling(step):
     """An optimiser that takes the same step down whatever the gradient is."""
     return optax.stateless(lambda updates, _: jax.tree.map(lambda u: 0 * u - step, updates))
-
-
-def test_common_random_numbers_are_the_same_at_every_step():
-    still = optax.sgd(0.0)
-    same = short_fit(3, optimizer=still, common_random_numbers=True)
-    assert len(set(same.history["log_marginal_likelihood"])) == 1
-    fresh = short_fit(3, optimizer=still)
-    assert len(set(fresh.history["log_marginal_likelihood"])) == 3
 
 
 @pytest.mark.thorough
@@ -534,21 +527,9 @@ class TestBias:
         ({"optimizer": 0.1}, "optimizer: 0.1 has no init"),
         ({"optimizer": optax.adam}, "optimizer: "),
         ({"num_steps": 2.0}, "num_steps: 2.0 is not a whole number of at least 1"),
-        ({"num_steps": None}, "num_steps: None"),
-        ({"num_steps": True}, "num_steps: True"),
         ({"num_seeds": "8"}, "num_seeds: '8'"),
-        ({"patience": 1.5}, "patience: 1.5"),
-        ({"tolerance": float("nan")}, "tolerance: nan"),
-        ({"tolerance": float("inf")}, "tolerance: inf"),
-        ({"tolerance": None}, "tolerance: None"),
         ({"curvature_seeds": 2.5}, "curvature_seeds: 2.5"),
-        ({"checkpoint": 3}, "checkpoint: 3"),
-        ({"checkpoint": os.curdir}, "checkpoint: . is a directory"),
-        ({"checkpoint_every": 0}, "checkpoint_every: 0"),
-        ({"checkpoint_every": 2.0}, "checkpoint_every: 2.0"),
-        ({"progress": None}, "progress: None"),
-        ({"common_random_numbers": 1}, "common_random_numbers: 1"),
-        ({"missing": None}, "missing: None"),
+        ({"checkpoint": "fit.npz"}, "checkpoint: 'fit.npz' is not a Checkpoint"),
         ({"parameters": "r"}, "parameters: 'r' is neither"),
         ({"parameters": lambda f: f.model.r}, "parameters: .* is neither"),
         ({"parameters": {0: lambda f: f.model.r}}, "parameters: 0 is not a name"),
@@ -587,7 +568,6 @@ def test_standard_errors_refuse_the_same(options, named):
     [
         ({"num_steps": 0}, "num_steps: 0"),
         ({"num_seeds": 0}, "num_seeds: 0"),
-        ({"patience": 0}, "patience: 0"),
         ({"curvature_seeds": -1}, "curvature_seeds: -1"),
         ({"start": {"r": -0.5}}, r"parameters: r starts at -0.5, outside Positive"),
         ({"parameters": {"idle": lambda f: f.model.idle}, "transforms": {}}, "depend on idle"),

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.tuning import Interval, Positive, Simplex, Unconstrained
+from mpfjax.tuning import Interval, Positive, Simplex
+from mpfjax.tuning.transforms import Unconstrained
 
 INSIDE = {
     "positive": (Positive(), [0.01, 1.0, 300.0]),

@@ -100,6 +100,7 @@ class PropagateInClusters(AbstractPropagation):
         """Whether clusters are split again."""
         return self.split_after is not None
 
+    biases_score = True
     keeps_parents = False
     """each cluster of a particle has a parent of its own."""
 

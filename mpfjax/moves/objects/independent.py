@@ -42,6 +42,7 @@ class PropagateIndependently(AbstractPropagation):
         """Whether the model has an interaction, which this move ignores."""
         return self.model.interaction is not None
 
+    biases_score = True
     keeps_parents = False
     """each object of a particle has a parent of its own."""
 

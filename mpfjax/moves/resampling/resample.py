@@ -106,6 +106,11 @@ class Resample(AbstractAdaptiveResampling):
         """Whether particles are sorted, those that are not resampled as well."""
         return self.sort_by is not None
 
+    @property
+    def biases_score(self) -> bool:
+        """Whether it may resample, and without a gradient."""
+        return self.gradient == "none" and self.ess_threshold > 0
+
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
         if self.ess_threshold == 1.0:

@@ -1,13 +1,11 @@
-"""Descriptions of a pytree, a function or a setting, as text by which two runs are compared."""
+"""Descriptions of a pytree or a function, as text by which two runs are compared."""
 
 import dataclasses
-import functools
 import hashlib
 import json
 import re
-import types
-from collections.abc import Mapping
-from typing import Any, cast
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,10 +15,14 @@ from jaxtyping import PyTree
 _MOST_SHOWN = 4
 
 
-def describe(tree: PyTree) -> dict[str, str]:
-    """Every leaf's shape and dtype, every static field, and what else there is, by its place."""
+def describe(tree: PyTree, *, values: bool = False) -> dict[str, str]:
+    """Every leaf's shape and dtype, every static field, and what else there is, by its place.
+
+    With `values`, numbers are described by their values and arrays by a fingerprint as well.
+    """
+    of_leaf = _value if values else kind
     return _static_fields(tree, ()) | {
-        jax.tree_util.keystr(place): kind(leaf) if is_data(leaf) else named(leaf)
+        jax.tree_util.keystr(place): of_leaf(leaf) if is_data(leaf) else named(leaf)
         for place, leaf in jax.tree_util.tree_leaves_with_path(tree)
     }
 
@@ -31,6 +33,25 @@ def fingerprint(tree: PyTree) -> str:
     for leaf in filter(is_data, jax.tree.leaves(tree)):
         digest.update(as_numpy(leaf).tobytes())
     return digest.hexdigest()
+
+
+def program_of(function: Callable[..., Any], *arguments: Any) -> str:
+    """A fingerprint of what JAX traces of a function: that of all that do the same.
+
+    It tells apart functions of other code, and those that hold other numbers.
+    """
+    program, *_ = eqx.filter_make_jaxpr(function)(*arguments)
+    return fingerprint((named(program.jaxpr), list(_constants(program))))[:12]
+
+
+def _constants(program: Any) -> Iterator[Any]:
+    """All arrays that a program of JAX holds, those of programs within it as well."""
+    yield from getattr(program, "consts", ())
+    inner = getattr(program, "jaxpr", program)
+    for equation in inner.eqns:
+        for value in jax.tree.leaves(list(equation.params.values())):
+            if hasattr(value, "eqns") or hasattr(value, "jaxpr"):
+                yield from _constants(value)
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
@@ -49,7 +70,7 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
 
 def named(value: Any) -> str:
     """A name for a function, or for another thing without a value; the same in every process."""
-    return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+    return value if isinstance(value, str) else re.sub(r" at 0x[0-9a-f]+", "", repr(value))
 
 
 def is_data(leaf: Any) -> bool:
@@ -76,6 +97,15 @@ def as_numpy(leaf: Any) -> np.ndarray:
     return np.asarray(jax.random.key_data(leaf) if is_key(leaf) else leaf)
 
 
+def _value(leaf: Any) -> str:
+    """A number as it is printed, which is exact; an array by its fingerprint."""
+    if is_number(leaf):
+        return str(leaf)
+    if is_key(leaf) or leaf.size != 1:
+        return f"{kind(leaf)} of fingerprint {fingerprint(leaf)[:12]}"
+    return f"{kind(leaf)} of {np.asarray(leaf).reshape(())[()]!s}"
+
+
 def _static_fields(tree: PyTree, place: tuple[Any, ...]) -> dict[str, str]:
     """The class and static fields of every module in a pytree, by their places."""
     found = {}
@@ -90,93 +120,3 @@ def _static_fields(tree: PyTree, place: tuple[Any, ...]) -> dict[str, str]:
         if is_inner(node):
             found |= _static_fields(node, place + inner)
     return found
-
-
-def contents_of(name: str, value: Any) -> dict[str, str]:
-    """All that a filter, an objective or an optimiser is made from, by `name` and its place.
-
-    Numbers are described by their values, arrays by their `fingerprint`, classes by their names.
-    Functions are described by their names and by what they hold: closures, bound arguments, and
-    the object of a method. What their code does cannot be compared.
-    """
-    found: dict[str, str] = {}
-    _collect(name, value, found, {})
-    return found
-
-
-def _collect(name: str, value: Any, found: dict[str, str], seen: dict[int, Any]) -> None:
-    """Write down a value, and what it holds."""
-    if value is None or isinstance(value, str | bytes | np.dtype):
-        found[name] = repr(value)
-    elif is_data(value):
-        found[name] = _value(value)
-    elif isinstance(value, type | types.BuiltinFunctionType | types.ModuleType):
-        found[name] = named(value)
-    elif isinstance(value, set | frozenset):
-        found[name] = repr(sorted(map(named, value)))
-    elif id(value) in seen:
-        found[name] = "as above"
-    else:
-        # Kept alive, since another object could get the id of one that is gone.
-        seen[id(value)] = value
-        found[name] = _title(value)
-        for part, held in _parts(value).items():
-            _collect(f"{name}{part}", held, found, seen)
-
-
-def _title(value: Any) -> str:
-    """What kind of thing it is."""
-    if isinstance(value, types.FunctionType):
-        return f"{value.__module__}.{value.__qualname__}"
-    return type(value).__name__
-
-
-def _parts(value: Any) -> dict[str, Any]:
-    """What a thing holds, by what to write after its own name."""
-    if isinstance(value, types.FunctionType):
-        return _parts_of_function(value)
-    if isinstance(value, types.MethodType):
-        return {".__func__": value.__func__, ".__self__": value.__self__}
-    if isinstance(value, functools.partial):
-        return {".func": value.func, ".args": value.args, ".keywords": value.keywords}
-    if isinstance(value, Mapping):
-        return {f"[{key!r}]": value[key] for key in value}
-    if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        return {f".{field}": held for field, held in cast(Any, value)._asdict().items()}
-    if isinstance(value, list | tuple):
-        return {f"[{i}]": held for i, held in enumerate(value)}
-    if hasattr(value, "__wrapped__"):
-        return {".__wrapped__": value.__wrapped__}
-    return {f".{field}": held for field, held in getattr(value, "__dict__", {}).items()}
-
-
-def _parts_of_function(function: types.FunctionType) -> dict[str, Any]:
-    parts: dict[str, Any] = {}
-    cells = function.__closure__ or ()
-    for variable, cell in zip(function.__code__.co_freevars, cells, strict=True):
-        try:
-            held = cell.cell_contents
-        except ValueError:
-            # Not assigned yet.
-            continue
-        # optax's cosine schedule writes its whole numbers as floats into its closure when it is
-        # first called.
-        parts[f".{variable}"] = float(held) if _is_count(held) else held
-    parts |= {f".default {i}": value for i, value in enumerate(function.__defaults__ or ())}
-    parts |= {f".{name}": value for name, value in (function.__kwdefaults__ or {}).items()}
-    return parts
-
-
-def _is_count(value: Any) -> bool:
-    """A whole number that is the same as a float."""
-    return type(value) is int and abs(value) < 2**53
-
-
-def _value(value: Any) -> str:
-    """A number as it is printed, which is exact; an array by its fingerprint."""
-    if not isinstance(value, jax.Array | np.ndarray | np.generic):
-        return str(value)
-    kind = f"{value.dtype}{list(value.shape)}"
-    if is_key(value) or value.size != 1:
-        return f"{kind} of fingerprint {fingerprint(value)[:12]}"
-    return f"{kind} of {np.asarray(value).reshape(())[()]!s}"

@@ -77,39 +77,23 @@ def arrays_of(state: PyTree) -> dict[str, np.ndarray]:
 
 
 def filled(path: Path, arrays: Mapping[str, np.ndarray], like: PyTree) -> PyTree:
-    """A pytree like this one with the `arrays_of` another; `ValueError` where they do not fit."""
+    """A pytree like this one with the `arrays_of` another, of these dtypes but of any shapes.
+
+    Raises `ValueError` where they do not fit.
+    """
     places, structure = jax.tree_util.tree_flatten_with_path(like)
-    return structure.unflatten(
-        _as_leaf(_found(path, arrays, jax.tree_util.keystr(place), leaf), leaf)
-        if is_data(leaf)
-        else leaf
-        for place, leaf in places
-    )
-
-
-def _found(path: Path, arrays: Mapping[str, np.ndarray], name: str, leaf: Any) -> np.ndarray:
-    """The array of a leaf, in the shape and dtype in which such a leaf is written."""
-    if name not in arrays:
-        raise ValueError(f"{path}: damaged, it describes {name} and does not hold it")
-    array = arrays[name]
-    if is_number(leaf):
-        shape, fits = (), array.dtype.kind in _KINDS[type(np.asarray(leaf).item())]
-    else:
-        written = jax.eval_shape(jax.random.key_data, _shape_of(leaf)) if is_key(leaf) else leaf
-        shape, fits = written.shape, array.dtype == _stored_dtype(np.dtype(written.dtype))
-    if array.shape != shape or not fits:
-        raise ValueError(
-            f"{path}: damaged, {name} is {kind(array)} and not {kind(leaf)}, as it is described"
-        )
-    return array
-
-
-# The types that numpy gives Python's numbers; whole numbers from 2⁶³ on are unsigned.
-_KINDS = {bool: "b", int: "iu", float: "f", complex: "c"}
-
-
-def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
+    leaves = []
+    for place, leaf in places:
+        name = jax.tree_util.keystr(place)
+        if is_data(leaf):
+            if name not in arrays:
+                raise ValueError(f"{path}: damaged, it does not hold {name}")
+            try:
+                leaf = _as_leaf(arrays[name], leaf)
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{path}: damaged, {name} is not {kind(leaf)}") from error
+        leaves.append(leaf)
+    return structure.unflatten(leaves)
 
 
 def _stored_dtype(dtype: np.dtype) -> np.dtype:
@@ -124,6 +108,8 @@ def _as_leaf(array: np.ndarray, like: Any) -> Any:
     if is_key(like):
         implementation = jax.random.key_impl(jnp.empty((), like.dtype))
         return jax.random.wrap_key_data(jnp.asarray(array), impl=implementation)
+    if array.dtype != _stored_dtype(np.dtype(like.dtype)):
+        raise ValueError(f"it is {array.dtype}")
     array = array.view(like.dtype)
     if isinstance(like, np.generic):
         return array[()]

@@ -1,0 +1,175 @@
+"""Long runs: one loop with a file to go on from, a bar, and an end at Ctrl-C or what is broken."""
+
+import json
+import os
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+from tqdm import tqdm
+
+from mpfjax.checks import check_type, check_whole, given
+from mpfjax.running.storage.descriptions import describe, differences, program_of
+from mpfjax.running.storage.files import as_path, load_arrays, read_description, write_arrays
+from mpfjax.running.storage.states import arrays_of, filled
+
+_NOTES = "notes"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The file from which a long run goes on: `fit`, `maximise`, and the samplers of parameters.
+
+    - `path`: a .npz file, without pickles. If it exists, the same call goes on from it, the same to
+      the bit as without the interruption; also to more steps, or more observations.
+    - `every`: after how many steps it is written. It is also written when the run ends, fails or is
+      interrupted. After an interruption of the writing it is the old file or the new one.
+    - `name`: what the run is called, such as "adam, cosine". Its file is then recognised by this
+      name and by the data and numbers of the call, and no longer by the program that JAX makes of
+      the functions, such as a prior or an optimiser, which another version of JAX may change.
+
+    Raises `ValueError` for something that is no path of a file, and an `every` below one.
+    """
+
+    path: str | os.PathLike[str]
+    every: int = 50
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        if as_path(self.path).is_dir():
+            raise ValueError(f"path: {self.path} is a directory, not a file")
+        check_whole(every=self.every)
+        check_type(str, "a name", **given(name=self.name))
+
+
+class State(NamedTuple):
+    """All that a long run goes on from, and that its file holds."""
+
+    step: int
+    carry: PyTree
+    """what the next step needs."""
+    rows: PyTree
+    """what is kept of the steps so far: arrays of numpy with a leading axis."""
+
+
+Advance = Callable[[int, int, PyTree], tuple[int, PyTree, PyTree]]
+"""From a step and what was carried, by some steps, at most to a last one; with their new rows."""
+
+
+class Broken(Exception):
+    """A run cannot go on: what it met in words, as "the likelihood was nan"."""
+
+
+@dataclass(frozen=True)
+class LongRun:
+    """A run of the public function `caller`, up to a last step.
+
+    `identity` describes all that has to be the same for a file to be of this run, up to a step.
+    """
+
+    caller: str
+    last: int
+    checkpoint: Checkpoint | None
+    progress: bool
+    identity: Callable[[int], Mapping[str, str]]
+
+    def go(
+        self, like: State, start: Callable[[], State], advance: Advance
+    ) -> tuple[State, str | None]:
+        """The state after all steps, and why there are fewer, if there are.
+
+        The run goes on from its file, or starts. `like` is a state as it could start, or the shapes
+        of one. Ctrl-C, and what is `Broken`, end it with a warning and the steps before; without
+        any row, Ctrl-C is raised, and what is broken at the start is a RuntimeError.
+        """
+        return self.go_on(self._loaded(like) or start(), advance)
+
+    def go_on(self, state: State, advance: Advance) -> tuple[State, str | None]:
+        """The same from a state on."""
+        every = self.last if self.checkpoint is None else self.checkpoint.every
+        pieces, saved, stopped = [state.rows], state.step, None
+        bar = tqdm(total=self.last, initial=state.step, disable=not self.progress, unit="step")
+        try:
+            while state.step < self.last:
+                last = min(self.last, (state.step // every + 1) * every)
+                step, carry, rows = advance(state.step, last, state.carry)
+                bar.update(step - state.step)
+                state, pieces = State(step, carry, None), [*pieces, rows]
+                if step % every == 0:
+                    pieces, saved = [self._saved(state, pieces)], step
+        except Broken as error:
+            if not state.step:
+                raise RuntimeError(f"{self.caller}: {error} at the start") from error
+            stopped = f"{error} at step {state.step}"
+        except KeyboardInterrupt:
+            if not any(map(len, jax.tree.leaves(pieces))):
+                raise
+            stopped = f"interrupted at step {state.step} of {self.last}"
+        finally:
+            bar.close()
+            if state.step > saved:
+                pieces = [self._saved(state, pieces)]
+        if stopped is not None:
+            warnings.warn(
+                f"{self.caller}: {stopped}; its result is of the steps before", stacklevel=3
+            )
+        return state._replace(rows=_joined(pieces)), stopped
+
+    def _saved(self, state: State, pieces: list[PyTree]) -> PyTree:
+        """All rows in one piece, written to the file with the state."""
+        rows = _joined(pieces)
+        if self.checkpoint is not None:
+            notes = {"caller": self.caller, "step": state.step}
+            notes |= {"identity": dict(self.identity(state.step))}
+            arrays = arrays_of({"carry": state.carry, "rows": rows})
+            write_arrays(self.checkpoint.path, arrays | {_NOTES: np.array(json.dumps(notes))})
+        return rows
+
+    def _loaded(self, like: State) -> State | None:
+        """The state that the file holds, None without a file; a `ValueError` for another run's."""
+        if self.checkpoint is None or not as_path(self.checkpoint.path).exists():
+            return None
+        path = as_path(self.checkpoint.path)
+        arrays = load_arrays(path)
+        notes: dict[str, Any] = read_description(path, arrays, _NOTES) if _NOTES in arrays else {}
+        if notes.get("caller") != self.caller:
+            raise ValueError(f"checkpoint: {path} is no checkpoint of {self.caller}")
+        found, own = notes["identity"], dict(self.identity(notes["step"]))
+        if found != own:
+            raise ValueError(
+                f"checkpoint: {path} is of another {self.caller}: {differences(found, own)}"
+            )
+        try:
+            held = filled(path, arrays, {"carry": like.carry, "rows": like.rows})
+        except ValueError as error:
+            raise ValueError(f"checkpoint: {error}") from error
+        return State(notes["step"], held["carry"], held["rows"])
+
+
+def identity_of(
+    checkpoint: Checkpoint | None, settings: Mapping[str, Any], functions: Mapping[str, Any]
+) -> dict[str, str]:
+    """All that has to be the same for a file to belong to this run, as text.
+
+    `settings` are numbers, arrays, modules and names, and always compared. `functions` are each a
+    function with arguments to trace it by; in their place stands a name that the user gave.
+    """
+    if checkpoint is None:
+        return {}
+    told = {
+        f"{part}{place}": text
+        for part, value in settings.items()
+        for place, text in describe(value, values=True).items()
+    }
+    if checkpoint.name is not None:
+        return told | {"name": checkpoint.name}
+    programs = {part: program_of(*call) for part, call in functions.items() if call[0] is not None}
+    return told | programs
+
+
+def _joined(pieces: list[PyTree]) -> PyTree:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)

@@ -1,0 +1,138 @@
+"""The log marginal likelihood of a filter as an objective of its parameters."""
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key, PyTree
+
+from mpfjax.checks import check_type
+from mpfjax.filter import Filter, Start
+from mpfjax.moves.base import AbstractMove
+from mpfjax.observations import Series, as_series, gathered
+from mpfjax.proposals import AbstractProposal
+from mpfjax.running.scan import scan
+from mpfjax.tuning.problem import Objective, Parameters, Place, Problem, placed, pose
+from mpfjax.tuning.transforms import AbstractTransform
+
+
+class LogEvidence(eqx.Module):
+    """log Ẑ of a filter with one seed, summed over sequences of observations."""
+
+    groups: list[Series]
+    """sequences of one shape, stacked."""
+
+    def __call__(self, key: Key[Array, ""], filter: Filter) -> Float[Array, ""]:
+        """One run for each sequence."""
+        total = 0.0
+        for g, group in enumerate(self.groups):
+            keys = jax.random.split(jax.random.fold_in(key, g), group.length)
+            run = lambda key, series: scan(Start(key), filter, series, _nothing)  # noqa: E731
+            total += jnp.sum(jax.vmap(run)(keys, group).log_marginal_likelihood)
+        return jnp.asarray(total)
+
+
+def pose_evidence(
+    filter: Filter,
+    observations: PyTree,
+    parameters: Parameters,
+    transforms: Mapping[str, AbstractTransform] | None,
+) -> Problem:
+    """The problem of the log marginal likelihood; without `parameters`, in those of the model."""
+    check_type(Filter, "a filter", filter=filter)
+    sequences = observations if isinstance(observations, list) else [observations]
+    if not sequences:
+        raise ValueError("observations: there are no sequences")
+    groups: dict[str, list[Series]] = {}
+    for sequence in sequences:
+        series = as_series(sequence, filter.model)
+        kind = lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf).name)  # noqa: E731
+        shapes = jax.tree.map(kind, (series.observations, series.inputs))
+        groups.setdefault(str(shapes), []).append(series)
+    objective = LogEvidence([_stacked(group) for group in groups.values()])
+    return pose_filter(filter, objective, parameters, transforms)
+
+
+def pose_filter(
+    filter: Filter,
+    objective: Objective,
+    parameters: Parameters,
+    transforms: Mapping[str, AbstractTransform] | None,
+) -> Problem:
+    """The problem of any objective of a filter; without `parameters`, in those of its model."""
+    if parameters is None:
+        fixed = jax.tree.map(lambda _: False, filter)
+        of_model = jax.tree.map(eqx.is_inexact_array, filter.model)
+        parameters = eqx.tree_at(lambda f: f.model, fixed, of_model)
+    return pose(filter, objective, parameters, transforms)
+
+
+def one_sequence(observations: PyTree, model: Any) -> Series:
+    """The data of one sequence; a `ValueError` for a list of several."""
+    if isinstance(gathered(observations).observations, list):
+        raise ValueError(
+            "observations: a list is several sequences, and this takes one;"
+            " jnp.asarray(observations) is one of numbers"
+        )
+    return as_series(observations, model)
+
+
+def check_exact(filter: Filter, what: str) -> None:
+    """Raise a `ValueError` for a filter whose estimates of the likelihood are biased."""
+    check_type(Filter, "a filter", filter=filter)
+    if filter.approximate:
+        raise ValueError(
+            f"filter: an approximate one has no unbiased likelihood, and so no exact {what}"
+        )
+
+
+def warn_of_bias(caller: str, problem: Problem) -> None:
+    """Warn where the derivatives of a filter are not the score of what is tuned.
+
+    It does not warn for parameters of proposals, whose bound is maximised without the derivative of
+    the resampling, nor for filters that never resample.
+    """
+    of_proposals = {
+        place.index
+        for node in _nodes(placed(problem.tree), AbstractProposal)
+        for place in jax.tree.leaves(node)
+        if isinstance(place, Place)
+    }
+    names = [name for name, index in problem.tuned if index not in of_proposals]
+    moves = [move for move in _nodes(problem.tree, AbstractMove) if move.biases_score]
+    if names and moves:
+        warnings.warn(
+            f"{caller}: the resampling of {type(moves[0]).__name__} has no gradient, so that the"
+            f" score of {', '.join(names)} is biased, however many particles there are; build the"
+            ' filter with gradient="stop", if need be of other moves',
+            stacklevel=3,
+        )
+
+
+def _nodes(tree: PyTree, kind: type) -> list[Any]:
+    """The nodes of a kind, anywhere in a pytree, also within one another."""
+    found = []
+    is_inner = lambda node: node is not tree and isinstance(node, kind)  # noqa: E731
+    for node in jax.tree.leaves(tree, is_leaf=is_inner):
+        if is_inner(node):
+            found += [node, *_nodes(node, kind)]
+    return found
+
+
+def _stacked(group: list[Series]) -> Series:
+    """Sequences of one shape in one `Series`, whose leaves have a leading axis of them."""
+    if any(series.present is not None for series in group):
+        full = jnp.ones(group[0].length, bool)
+        present = [full if series.present is None else series.present for series in group]
+        group = [
+            Series(series.observations, series.inputs, there)
+            for series, there in zip(group, present, strict=True)
+        ]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *group)
+
+
+def _nothing(mixture: Any) -> None:
+    del mixture
