@@ -15,6 +15,7 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
+from benchmarks.likelihood_tuning.soft_colours import SoftColourModel
 from mpfjax import plotting
 from mpfjax.console import format_table, write_figure, write_json
 from mpfjax.metrics.coverage import covers
@@ -28,7 +29,6 @@ from mpfjax.tuning import (
 )
 from mpfjax.vision import (
     BoxState,
-    SoftColourModel,
     boxes_around,
     football_scene,
     labelled_states,

@@ -20,7 +20,7 @@ from benchmarks.partitioned_sampling.posterior import (
 )
 from mpfjax import vision
 from mpfjax.metrics import effective_dynamics, uniqueness
-from mpfjax.vision.boxes.joint_colour import PAPER_DEVIATIONS
+from mpfjax.vision.boxes.joint_colour import PAPER_DEVIATIONS, with_lambda
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.scenes.distracter import NoPath
 
@@ -214,7 +214,7 @@ def real_scene(folder: Path, event: Event) -> Scene:
         truth,
         0,
         jnp.asarray(stills),
-        lambda lambda_: vision.with_lambda(model, lambda_),
+        lambda lambda_: with_lambda(model, lambda_),
         lambda everything: collect if everything else collect_boxes,
         deviations[:2],
     )

@@ -21,8 +21,7 @@ COLOUR = {"frame": "array", "boxes": "rows", "sigma": "positive", "num_parts": "
 def built(name):
     if name == "joint":
         return vision.joint_colour_model(FRAME, BOXES)
-    model = vision.ColourModel.from_frame(FRAME, BOXES, colours=vision.RGBColours(4))
-    return vision.LearnedColourModel(model) if name == "learned" else model
+    return vision.ColourModel.from_frame(FRAME, BOXES, colours=vision.RGBColours(4))
 
 
 def late(function, **builds):
@@ -33,11 +32,6 @@ def late(function, **builds):
         return function(**made | arguments)
 
     return call
-
-
-def counts(**arguments):
-    table = vision.integral_histogram(jnp.asarray(FRAME), vision.RGBColours(4))
-    return table.counts(**{"boxes": jnp.ones((2, 4))} | arguments)
 
 
 TABLE = {
@@ -54,27 +48,16 @@ TABLE = {
         COLOUR | {"colours": "kind?", "weigh_colours": "flag", "share_reference": "flag",
                   "contrast": "not negative"},
     ),
-    "SoftColourModel": (
-        vision.SoftColourModel.from_frame,
-        OF_FRAME,
-        COLOUR | {"num_bins": "count", "bandwidth": "positive", "num_points": "count",
-                  "floor": "inner share"},
-    ),
     "joint_colour_model": (
         vision.joint_colour_model,
         OF_FRAME,
         {"frame": "array", "boxes": "rows", "lambda_": "positive", "num_parts": "count",
          "colours": "kind?", "deviations": "four", "templates": "kind?"},
     ),
-    "with_lambda": (
-        late(vision.with_lambda, model="joint"),
-        {"lambda_": 3.0},
-        {"model": "kind", "lambda_": "positive"},
-    ),
     "object_boxes": (
         late(vision.object_boxes, model="joint"),
         {"states": STATES},
-        {"model": "kind", "states": "kind"},
+        {"states": "kind"},
     ),
     "Detections": (
         vision.Detections.from_boxes,
@@ -92,12 +75,6 @@ TABLE = {
         {"key": "key", "num_frames": "count", "num_players": "count", "num_opponents": "number",
          "height": "count", "width": "count", "still_camera": "flag"},
     ),
-    "check_boxes": (
-        vision.check_boxes,
-        {"boxes": BOXES, "height": 40, "width": 50},
-        {"boxes": "rows", "height": "count", "width": "count"},
-    ),
-    "parse_box": (lambda box: vision.parse_box(box), {}, {"box": "path"}),
     "read_tracks": (vision.read_tracks, {}, {"path": "path"}),
     "read_truth": (vision.read_truth, {}, {"path": "path"}),
     "write_tracks": (
@@ -127,25 +104,6 @@ TABLE = {
         {"boxes": "rows", "key": "key?"},
     ),
     "read_detections": (vision.read_detections, {}, {"path": "path"}),
-    "frame_rate": (vision.frame_rate, {}, {"path": "path"}),
-    "integral_histogram": (
-        vision.integral_histogram,
-        {"frame": FRAME, "colours": vision.RGBColours(4)},
-        {"frame": "array", "colours": "kind", "wide_counts": "flag"},
-    ),
-    "counts": (counts, {}, {"boxes": "array", "num_parts": "count"}),
-    "bhattacharyya": (
-        vision.bhattacharyya,
-        {"histograms": jnp.ones(4), "references": jnp.ones(4)},
-        {"histograms": "array", "references": "array"},
-    ),
-    "soft_histograms": (
-        vision.soft_histograms,
-        {"frame": jnp.asarray(FRAME), "boxes": jnp.ones((2, 4)), "num_bins": 4,
-         "bandwidth": jnp.array(0.5)},
-        {"frame": "array", "boxes": "array", "num_bins": "count", "bandwidth": "array",
-         "num_points": "count", "num_parts": "count"},
-    ),
     "boxes_around": (
         late(vision.boxes_around, model="colour"),
         {"key": KEY, "states": STATES, "num_boxes": 3},
@@ -157,30 +115,14 @@ TABLE = {
         {"boxes": BOXES[None]},
         {"model": "kind", "boxes": "rows"},
     ),
-    "ObjectExclusion": (
-        vision.ObjectExclusion,
-        {},
-        {"strength": "positive", "radius": "positive", "scale": "range"},
-    ),
     "BackgroundSubtraction": (
         vision.BackgroundSubtraction,
         {},
         {"history": "count", "warm_up": "count", "threshold": "positive",
          "most_pixels": "count", "background_share": "inner share",
-         "shadow_brightness": "inner share?", "cut_depth": "inner share", "largest_gap": "share",
-         "area": "range", "aspect": "range?"},
+         "shadow_brightness": "inner share?", "cut_depth": "inner share",
+         "largest_gap": "not negative"},
     ),
-    "LearnedColourModel": (
-        late(vision.LearnedColourModel, colour_model="colour"),
-        {},
-        {"colour_model": "kind", "anchor": "share", "hidden_distance": "positive"},
-    ),
-    "AdaptAppearance": (
-        late(vision.AdaptAppearance, model="learned"),
-        {},
-        {"model": "kind", "rate": "share"},
-    ),
-    "PruneHypotheses": (vision.PruneHypotheses, {}, {"least_share": "inner share"}),
     "ObjectTracker": (
         vision.ObjectTracker,
         {},
@@ -214,9 +156,6 @@ def test_what_will_not_do_is_named(function, good, name, value):
         (vision.distracter_scene, {"key": KEY}, "num_frames", 2),
         (vision.write_tracks, {"path": "/nowhere"}, "rows", [[0.5, 1, 2, 3, 4, 5]]),
         (vision.write_tracks, {"path": "/nowhere"}, "rows", [[1, 1, NAN, 3, 4, 5]]),
-        (vision.bhattacharyya, {"histograms": jnp.ones(4)}, "references", jnp.ones(3)),
-        (vision.soft_histograms, TABLE["soft_histograms"][1], "boxes", jnp.ones((2, 3))),
-        (vision.soft_histograms, TABLE["soft_histograms"][1], "bandwidth", jnp.ones(2)),
         (late(vision.object_boxes, model="joint"), {}, "states", STATES),
         (late(vision.boxes_around, model="colour"), {"key": KEY, "states": STATES, "num_boxes": 3},
          "stretch", 0.5),

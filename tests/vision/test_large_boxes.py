@@ -10,10 +10,9 @@ from mpfjax.vision import (
     Detections,
     ObjectTracker,
     RGBColours,
-    integral_histogram,
     joint_colour_model,
 )
-from mpfjax.vision.colour.histograms import normalise
+from mpfjax.vision.colour.histograms import integral_histogram, normalise
 
 HEIGHT, WIDTH, BINS = 600, 620, 4
 COLOURS = RGBColours(BINS)

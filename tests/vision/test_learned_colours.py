@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from mpfjax.mixture import single_component
-from mpfjax.vision import (
+from mpfjax.vision import BoxState, ColourModel, RGBColours
+from mpfjax.vision.boxes.learned_colours import (
     AdaptAppearance,
-    BoxState,
-    ColourModel,
     LearnedBoxState,
     LearnedColourModel,
-    RGBColours,
 )
 
 RNG = np.random.default_rng(0)

@@ -5,13 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.vision import (
-    HSVColours,
-    RGBColours,
-    bhattacharyya,
-    integral_histogram,
-)
-from mpfjax.vision.colour.histograms import normalise
+from mpfjax.vision import HSVColours, RGBColours
+from mpfjax.vision.colour.histograms import bhattacharyya, integral_histogram, normalise
 from mpfjax.vision.colour.sampled_histograms import SampledBoxes
 
 RNG = np.random.default_rng(0)

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt8
 
-from mpfjax.checks import check_positive, check_type, check_whole, shown, to_rows
+from mpfjax.checks import check_positive, check_shape, check_type, check_whole, to_rows
 from mpfjax.models.dynamics import Autoregression
-from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
+from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel, positive_deviations
 from mpfjax.vision.colour.bins import AbstractColours, HSVColours
 
@@ -79,13 +79,11 @@ def joint_colour_model(
     for j, template in templates.items():
         if j not in range(len(boxes)):
             raise ValueError(f"templates: {j} is none of the {len(boxes)} objects, from 0 on")
-        if not isinstance(template, Sequence) or len(template) != 2:
-            raise ValueError(f"templates: {shown(template)}, of object {j}, is no (frame, box)")
-        other_frame, box = template
         try:
+            other_frame, box = template
             looks = learn(other_frame, to_rows(4, "box", box)[:1]).references[0]
-        except ValueError as error:
-            raise ValueError(f"templates: of object {j}, {error}") from error
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"templates: of object {j}, (frame, box): {error}") from error
         model = eqx.tree_at(lambda m: m.references, model, model.references.at[j].set(looks))
     return MultiObjectModel(
         _one_each(model),
@@ -97,12 +95,7 @@ def joint_colour_model(
 
 
 def with_lambda(model: MultiObjectModel, lambda_: float) -> MultiObjectModel:
-    """A `joint_colour_model` with another λ, whose filters compile to the same programs.
-
-    Raises `ValueError` for a λ that is not positive, and for another model. Use it to compare
-    values of λ.
-    """
-    _check_model(model, "with_lambda")
+    """A `joint_colour_model` with another λ, whose filters compile to the same programs."""
     colour_model: Any = model.object_model
     sigma = _sigma(lambda_, colour_model.references.shape[-3])
     sigma = jnp.full_like(colour_model.sigma, sigma)
@@ -113,25 +106,16 @@ def object_boxes(model: MultiObjectModel, states: BoxState) -> Float[Array, "n o
     """(x, y, w, h) of every object of every particle, (x, y) the top-left corner, in pixels.
 
     For particles of a `joint_colour_model`, whose leaves are (n, J, ...). Raises `ValueError` for
-    another model, and states of another kind or shape.
+    states of another kind or shape.
     """
-    _check_model(model, "object_boxes")
     check_type(BoxState, "a BoxState", states=states)
-    if jnp.shape(states.box)[1:] != (model.num_objects, 4):
-        shape = jnp.shape(states.box)
-        raise ValueError(f"states: shape {shape} of box is not (n, {model.num_objects}, 4)")
+    check_shape(f"n {model.num_objects} 4", states=states.box)
 
     def place(colour_model: ColourModel, states: BoxState) -> Float[Array, "n 4"]:
         boxes = colour_model.boxes(states)
         return jnp.concatenate([boxes[:, :2] - 0.5 * boxes[:, 2:], boxes[:, 2:]], axis=1)
 
     return eqx.filter_vmap(place, in_axes=(0, 1), out_axes=1)(model.object_model, states)
-
-
-def _check_model(model: MultiObjectModel, needed_by: str) -> None:
-    require_multi_object(model, needed_by)
-    if not isinstance(model.object_model, ColourModel):
-        raise ValueError(f"model: {type(model.object_model).__name__} is no ColourModel of objects")
 
 
 def _sigma(lambda_: float, num_parts: int) -> float:

@@ -2,8 +2,6 @@
 
 from collections import deque
 from collections.abc import Iterable
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -12,13 +10,12 @@ from mpfjax.checks import (
     check_inner_share,
     check_not_negative,
     check_positive,
-    check_share,
     check_type,
     check_whole,
     given,
-    shown,
 )
 from mpfjax.vision.files.frames import check_frame
+from mpfjax.vision.tracking.optical_flow import opencv
 
 # What OpenCV's mask holds where a pixel is foreground; a shadow has another value.
 _FOREGROUND = 255
@@ -86,28 +83,19 @@ class BackgroundSubtraction:
     ) -> None:
         check_whole(history=history, warm_up=warm_up, most_pixels=most_pixels)
         check_positive(threshold=threshold)
-        check_not_negative(**given(cut_aspect=cut_aspect))
+        check_not_negative(largest_gap=largest_gap, **given(cut_aspect=cut_aspect))
         check_inner_share(background_share=background_share, cut_depth=cut_depth)
         check_inner_share(**given(shadow_brightness=shadow_brightness))
-        check_share(largest_gap=largest_gap)
-        if largest_gap == 1:
-            raise ValueError(f"largest_gap: {largest_gap} is not in [0, 1)")
-        if not 0 <= _range(area)[0] < _range(area)[1] <= 1:
-            raise ValueError(f"area: {shown(area)} is not a range within [0, 1]")
-        if aspect is not None and not 0 < _range(aspect)[0] < _range(aspect)[1] < np.inf:
-            raise ValueError(f"aspect: {shown(aspect)} is not a range of positive numbers")
-        self._cv2 = _cv2()
-        self.history = int(history)
-        self.threshold = threshold
-        self.background_share = background_share
-        self.shadow_brightness = shadow_brightness
-        self.warm_up = int(warm_up)
-        self.area = area
-        self.aspect = (0.0, np.inf) if aspect is None else aspect
-        self.largest_gap = largest_gap
-        self.cut_aspect = cut_aspect
-        self.cut_depth = cut_depth
-        self.most_pixels = int(most_pixels)
+        aspect = (0.0, np.inf) if aspect is None else aspect
+        for name, (least, most), limit in (("area", area, 1), ("aspect", aspect, np.inf)):
+            if not 0 <= least < most <= limit:
+                raise ValueError(f"{name}: {(least, most)} is not a range within [0, {limit}]")
+        self._cv2 = opencv()
+        self.history, self.threshold = history, threshold
+        self.background_share, self.shadow_brightness = background_share, shadow_brightness
+        self.warm_up, self.most_pixels = warm_up, most_pixels
+        self.area, self.aspect = area, aspect
+        self.largest_gap, self.cut_aspect, self.cut_depth = largest_gap, cut_aspect, cut_depth
         self._forget()
 
     def learn(self, frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
@@ -167,8 +155,7 @@ class BackgroundSubtraction:
         # OpenCV would silently start a new background.
         if self._shape is not None and frame.shape != self._shape:
             raise ValueError(
-                f"frame: {_size(frame.shape)} differs from the size of the frames before it, "
-                f"{_size(self._shape)}"
+                f"frame: {frame.shape} differs from the shape of those before it, {self._shape}"
             )
         self._shape = frame.shape
         mask = self._background.apply(self._reduced(frame), learningRate=rate)
@@ -181,12 +168,13 @@ class BackgroundSubtraction:
         if factor == 1:
             return np.ascontiguousarray(frame)
         size = (max(width // factor, 1), max(height // factor, 1))
-        return self._cv2.resize(
-            np.ascontiguousarray(frame), size, interpolation=self._cv2.INTER_AREA
-        )
+        area = self._cv2.INTER_AREA
+        return self._cv2.resize(np.ascontiguousarray(frame), size, interpolation=area)
 
     def _blobs(self, foreground: np.ndarray) -> list[tuple[int, int, int, int]]:
-        gap = round(self.largest_gap * self._usual_height(len(foreground)))
+        known = len(self._heights) >= _ENOUGH
+        usual = np.median(self._heights) if known else _UNKNOWN_HEIGHT * len(foreground)
+        gap = round(self.largest_gap * float(usual))
         if gap > 0:
             # Vertically only: people who walk side by side must not be joined.
             line = np.ones((gap + 1, 1), np.uint8)
@@ -208,22 +196,14 @@ class BackgroundSubtraction:
         ]
         self._aspects.extend(h / w for w, h in whole)
         self._heights.extend(h for _, h in whole)
-        widest = self._cut_aspect()
+        # A blob lower than this many widths may be several objects; 0 where this is unknown.
+        known = len(self._aspects) >= _ENOUGH
+        usual = float(np.median(self._aspects)) if known else 0.0
+        widest = usual if self.cut_aspect is None else self.cut_aspect
         for label, x, y, w, h in large:
             blob = labels[y : y + h, x : x + w] == label
             boxes += [(x + i, y + j, *size) for i, j, *size in self._cut(blob, widest)]
         return boxes
-
-    def _cut_aspect(self) -> float:
-        """A blob lower than this many widths may be several objects; 0 where this is unknown."""
-        if self.cut_aspect is not None:
-            return self.cut_aspect
-        return float(np.median(self._aspects)) if len(self._aspects) >= _ENOUGH else 0.0
-
-    def _usual_height(self, rows: int) -> float:
-        """The median height of a blob, in pixels of the reduced frame."""
-        known = len(self._heights) >= _ENOUGH
-        return float(np.median(self._heights)) if known else _UNKNOWN_HEIGHT * rows
 
     def _cut(self, blob: Bool[np.ndarray, "h w"], widest: float) -> list[tuple[int, int, int, int]]:
         """The boxes of the objects that stand side by side in a blob that fills its array."""
@@ -260,26 +240,3 @@ class BackgroundSubtraction:
         shares = width * height / pixels
         sized = (shares >= self.area[0]) & (shares <= self.area[1])
         return sized & (height >= self.aspect[0] * width) & (height <= self.aspect[1] * width)
-
-
-def _range(values: Any) -> np.ndarray:
-    """Two numbers, or twice NaN, which is in no range, where `value` is something else."""
-    try:
-        numbers = np.asarray(values, float)
-    except (TypeError, ValueError):
-        numbers = np.zeros(0)
-    return numbers if numbers.shape == (2,) else np.full(2, np.nan)
-
-
-def _size(shape: tuple[int, ...]) -> str:
-    return f"{shape[1]} x {shape[0]}"
-
-
-def _cv2() -> ModuleType:
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError(
-            "OpenCV is needed for background subtraction: pip install opencv-python-headless"
-        ) from error
-    return cv2

@@ -38,7 +38,7 @@ class OpticalFlow:
     """
 
     def __init__(self) -> None:
-        self._cv2: Any = _cv2()
+        self._cv2: Any = opencv()
         self._before: np.ndarray | None = None
         self._boxes = np.zeros((0, 4))
 
@@ -115,7 +115,7 @@ class OpticalFlow:
 def has_opencv() -> bool:
     """Whether OpenCV is installed."""
     try:
-        _cv2()
+        opencv()
     except ImportError:
         return False
     return True
@@ -129,7 +129,7 @@ def opencv_on_one_thread() -> Iterator[None]:
     `OpticalFlow`, two threads take nearly twice the processor's time, and none less by the clock.
     Use it around a loop over frames, where nothing else needs OpenCV's threads.
     """
-    cv2: Any = _cv2()
+    cv2: Any = opencv()
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -145,12 +145,13 @@ def _inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return np.any(within[..., 0] & within[..., 1], axis=1)
 
 
-def _cv2() -> ModuleType:
+def opencv() -> ModuleType:
+    """OpenCV, or an `ImportError` that says how to install it."""
     try:
         import cv2
     except ImportError as error:
         raise ImportError(
-            "OpenCV is needed for the camera's motion from pixels: pip install"
-            " opencv-python-headless"
+            "OpenCV is needed for background subtraction and the camera's motion from pixels:"
+            " pip install opencv-python-headless"
         ) from error
     return cv2

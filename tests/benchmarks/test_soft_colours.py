@@ -8,8 +8,8 @@ import pytest
 from jax.test_util import check_grads
 
 import mpfjax
+from benchmarks.likelihood_tuning.soft_colours import SoftColourModel, soft_histograms
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
-from mpfjax.vision.boxes.soft_histograms import SoftColourModel, soft_histograms
 from mpfjax.vision.colour.bins import RGBColours
 from mpfjax.vision.colour.histograms import integral_histogram
 from tests.precision import float64
