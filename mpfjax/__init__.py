@@ -16,20 +16,22 @@ from mpfjax.filters import particle_filter as particle_filter
 from mpfjax.filters import partitioned_sampling as partitioned_sampling
 from mpfjax.mixture import MarginalisedState as MarginalisedState
 from mpfjax.mixture import ParticleMixture as ParticleMixture
-from mpfjax.models import AbstractConditionallyLinearModel as AbstractConditionallyLinearModel
-from mpfjax.models import AbstractDynamics as AbstractDynamics
-from mpfjax.models import AbstractStateSpaceModel as AbstractStateSpaceModel
-from mpfjax.models import Autoregression as Autoregression
-from mpfjax.models import LinearGaussianModel as LinearGaussianModel
-from mpfjax.models import MultiObjectModel as MultiObjectModel
-from mpfjax.models import PairwiseRepulsion as PairwiseRepulsion
-from mpfjax.models import QuadraticModel as QuadraticModel
-from mpfjax.models import RandomWalk as RandomWalk
-from mpfjax.models import RandomWalkWithJumps as RandomWalkWithJumps
-from mpfjax.models import SwitchingLinearGaussianModel as SwitchingLinearGaussianModel
-from mpfjax.models import WalkWithVelocity as WalkWithVelocity
-from mpfjax.models import check_model as check_model
-from mpfjax.models import per_particle as per_particle
+from mpfjax.models.base import AbstractStateSpaceModel as AbstractStateSpaceModel
+from mpfjax.models.base import per_particle as per_particle
+from mpfjax.models.conditionally_linear import (
+    AbstractConditionallyLinearModel as AbstractConditionallyLinearModel,
+)
+from mpfjax.models.dynamics import AbstractDynamics as AbstractDynamics
+from mpfjax.models.dynamics import Autoregression as Autoregression
+from mpfjax.models.dynamics import RandomWalk as RandomWalk
+from mpfjax.models.dynamics import RandomWalkWithJumps as RandomWalkWithJumps
+from mpfjax.models.dynamics import WalkWithVelocity as WalkWithVelocity
+from mpfjax.models.interaction import PairwiseRepulsion as PairwiseRepulsion
+from mpfjax.models.linear_gaussian import LinearGaussianModel as LinearGaussianModel
+from mpfjax.models.multi_object import MultiObjectModel as MultiObjectModel
+from mpfjax.models.quadratic import QuadraticModel as QuadraticModel
+from mpfjax.models.switching import SwitchingLinearGaussianModel as SwitchingLinearGaussianModel
+from mpfjax.models.trial import check_model as check_model
 from mpfjax.moves import AbstractMarkovMove as AbstractMarkovMove
 from mpfjax.moves import AbstractMetropolis as AbstractMetropolis
 from mpfjax.moves import AbstractMove as AbstractMove

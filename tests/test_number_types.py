@@ -18,7 +18,7 @@ import pytest
 import mpfjax
 from mpfjax import metrics
 from mpfjax.exact import grid_filter, kalman_filter, kalman_smoother
-from mpfjax.metrics.coverage import coverage
+from mpfjax.metrics.tracking_scores import coverage
 from mpfjax.smoothing import conditional_filter, smoothed_sums
 from mpfjax.vision import Detections
 from tests.marking import quick_of

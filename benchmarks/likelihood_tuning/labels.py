@@ -18,8 +18,8 @@ import mpfjax
 from benchmarks.likelihood_tuning.soft_colours import SoftColourModel
 from mpfjax import plotting
 from mpfjax.console import format_table, write_figure, write_json
-from mpfjax.metrics.coverage import covers
 from mpfjax.metrics.tracking_quality import intersection_area
+from mpfjax.metrics.tracking_scores import covers
 from mpfjax.tuning import (
     LabelLikelihood,
     Positive,

@@ -19,7 +19,7 @@ from benchmarks.partitioned_sampling.posterior import (
     posterior_means,
 )
 from mpfjax import vision
-from mpfjax.metrics import effective_dynamics, uniqueness
+from mpfjax.metrics.particle_scores import effective_dynamics, uniqueness
 from mpfjax.vision.boxes.joint_colour import PAPER_DEVIATIONS, with_lambda
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.scenes.distracter import NoPath

@@ -9,7 +9,7 @@ from benchmarks.visual_tracking.pictures import NAMES
 from benchmarks.visual_tracking.source import Source
 from mpfjax.console import format_table
 from mpfjax.metrics import multi_object_scores
-from mpfjax.metrics.coverage import coverage
+from mpfjax.metrics.tracking_scores import coverage
 
 
 def score(

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from mpfjax.console import refuse_overwriting
-from mpfjax.metrics.coverage import covers
+from mpfjax.metrics.tracking_scores import covers
 from mpfjax.vision import football_scene, read_truth
 from mpfjax.vision.boxes.recipes import MAX_COMPONENTS
 from mpfjax.vision.files import boxes as box_files

@@ -2,11 +2,7 @@
 and all sequences of regimes for switching ones.
 """
 
-from mpfjax.exact.grid import GridFilterRun as GridFilterRun
 from mpfjax.exact.grid import grid_filter as grid_filter
-from mpfjax.exact.kalman import KalmanFilterRun as KalmanFilterRun
-from mpfjax.exact.kalman import KalmanSmootherRun as KalmanSmootherRun
 from mpfjax.exact.kalman import kalman_filter as kalman_filter
 from mpfjax.exact.kalman import kalman_smoother as kalman_smoother
-from mpfjax.exact.switching import SwitchingFilterRun as SwitchingFilterRun
 from mpfjax.exact.switching import switching_filter as switching_filter

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.checks import check_callable, check_finite, check_positive, check_shape, real_arrays
+from mpfjax.checks import check_callable, check_positive, check_shape, real_arrays
 
 
 @jax.jit  # without it, every call outside of `jax.jit` would compile the search again
@@ -93,10 +93,7 @@ def ospa(
     positive and finite, and an order below 1 or infinite. Use it for an error per object;
     `gospa` says how many objects were missed.
     """
-    estimates, truths = _checked_sets(estimates, truths, estimate_mask, truth_mask)
-    _check_numbers(cutoff, order, base_distance)
-    distances = base_distance(estimates, truths) / cutoff
-    pairing = _cheapest_pairing(distances, estimate_mask, truth_mask, order)
+    pairing = _paired(estimates, truths, cutoff, order, estimate_mask, truth_mask, base_distance)
     size = jnp.maximum(jnp.sum(pairing.is_estimate), jnp.sum(pairing.is_truth))
     size = jnp.maximum(size, 1).astype(pairing.distances.dtype)
     return cutoff * pairing.distance(order, 1.0) / size ** (1.0 / order)
@@ -125,13 +122,10 @@ def gospa(
     Raises `ValueError` as `ospa` does, and for an alpha outside (0, 2]. Use it to score trackers
     that may lose objects or invent them, with alpha at 2.
     """
-    estimates, truths = _checked_sets(estimates, truths, estimate_mask, truth_mask)
-    _check_numbers(cutoff, order, base_distance)
     check_positive(alpha=alpha)
     if alpha > 2:
         raise ValueError(f"alpha: {alpha} is not in (0, 2]")
-    distances = base_distance(estimates, truths) / cutoff
-    pairing = _cheapest_pairing(distances, estimate_mask, truth_mask, order)
+    pairing = _paired(estimates, truths, cutoff, order, estimate_mask, truth_mask, base_distance)
     near = pairing.is_pair & ~(pairing.distances >= 1.0)
     localisation = jnp.sum(jnp.where(near, (cutoff * pairing.distances) ** order, 0.0))
     dtype = localisation.dtype
@@ -151,14 +145,31 @@ def gospa(
     )
 
 
+def _paired(
+    estimates: Any, truths: Any, cutoff: float, order: float, estimate_mask: Any, truth_mask: Any,
+    base_distance: Callable[[Array, Array], Array],
+) -> _Pairing:  # fmt: skip
+    """The cheapest pairing of the two sets; a `ValueError` for arguments that will not do."""
+    estimates = real_arrays("number d", estimates=estimates)
+    truths = real_arrays("number d", truths=truths)
+    check_positive(cutoff=cutoff, order=order)
+    if order < 1:
+        raise ValueError(f"order: {order} is less than 1")
+    check_callable("a function of two sets", base_distance=base_distance)
+    is_estimate = _mask("estimate_mask", estimate_mask, estimates.shape[0])
+    is_truth = _mask("truth_mask", truth_mask, truths.shape[0])
+    distances = base_distance(estimates, truths) / cutoff
+    return _cheapest_pairing(distances, is_estimate, is_truth, order)
+
+
 # Costs below this share of the largest are lost in the sums of the search.
 _FINE = 1e-3
 
 
 def _cheapest_pairing(
     distances: Float[Array, "k l"],
-    estimate_mask: Bool[Array, " k"] | None,
-    truth_mask: Bool[Array, " l"] | None,
+    is_estimate: Bool[Array, " k"],
+    is_truth: Bool[Array, " l"],
     order: float,
 ) -> _Pairing:
     """Pair as many entries as possible, in a square matrix whose other entries are not there.
@@ -170,8 +181,8 @@ def _cheapest_pairing(
     num_estimates, num_truths = distances.shape
     size = max(num_estimates, num_truths)
     rows, columns = (0, size - num_estimates), (0, size - num_truths)
-    is_estimate = jnp.pad(_all_unless_given(estimate_mask, num_estimates), rows)
-    is_truth = jnp.pad(_all_unless_given(truth_mask, num_truths), columns)
+    is_estimate = jnp.pad(is_estimate, rows)
+    is_truth = jnp.pad(is_truth, columns)
     is_pair, is_alone = is_estimate[:, None] & is_truth[None], is_estimate[:, None] ^ is_truth[None]
     capped = jnp.where(is_pair, jnp.pad(jnp.minimum(distances, 1.0), (rows, columns)), 0.0)
     # The search for the pairing would not end on a NaN, so it never sees one.
@@ -195,32 +206,10 @@ def _cheapest_pairing(
     return _Pairing(capped[i, j], is_estimate[i], is_truth[j])
 
 
-def _all_unless_given(mask: Bool[Array, " k"] | None, size: int) -> Bool[Array, " k"]:
-    return jnp.ones(size, bool) if mask is None else mask
-
-
-def _checked_sets(
-    estimates: Any, truths: Any, estimate_mask: Any, truth_mask: Any
-) -> tuple[Float[Array, "k d"], Float[Array, "l d"]]:
-    """The two sets in floating point; a `ValueError` for what is none, and for other masks."""
-    sets = {"estimate": ("estimates", estimates), "truth": ("truths", truths)}
-    masks = {"estimate": estimate_mask, "truth": truth_mask}
-    for kind, (name, entries) in sets.items():
-        check_shape("number d", **{name: entries})
-        mask = masks[kind]
-        if mask is not None:
-            check_shape("number", **{f"{kind}_mask": mask})
-            if mask.shape != entries.shape[:1] or mask.dtype != bool:
-                raise ValueError(
-                    f"{kind}_mask: {mask.dtype}{mask.shape} is no mask of {entries.shape[0]} {name}"
-                )
-    estimates = real_arrays("number d", estimates=estimates)
-    return estimates, real_arrays("number d", truths=truths)
-
-
-def _check_numbers(cutoff: float, order: float, base_distance: Any) -> None:
-    check_positive(cutoff=cutoff)
-    check_finite(order=order)
-    if order < 1:
-        raise ValueError(f"order: {order} is less than 1")
-    check_callable("a function of two sets", base_distance=base_distance)
+def _mask(name: str, mask: Any, size: int) -> Bool[Array, " k"]:
+    if mask is None:
+        return jnp.ones(size, bool)
+    check_shape(f"{size}", **{name: mask})
+    if mask.dtype != bool:
+        raise ValueError(f"{name}: {mask.dtype} is no mask")
+    return jnp.asarray(mask)

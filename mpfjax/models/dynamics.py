@@ -1,115 +1,111 @@
-"""The dynamics of a vector from frame to frame: random walk, second-order autoregression."""
+"""The dynamics of a vector from frame to frame: random walks, with long steps or with a velocity,
+and second-order autoregression.
+"""
 
 import abc
+from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key
 
 from mpfjax.checks import (
     check_finite_array,
+    check_inner_share,
+    check_not_negative_array,
     check_positive_array,
     check_rows,
     check_scalars,
     check_shape,
+    shown,
     to_array,
 )
 from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
-from mpfjax.operations.random import normal
+from mpfjax.operations.random import fast_key, normal, split_once
+
+Rows = Float[Array, "n d"]
 
 
 class AbstractDynamics(eqx.Module):
     """D(x_t | x_{t-1}, x_{t-2}) of a vector: a part of a model, not a model itself.
 
-    There is one set of parameters for all particles, or one for each, along a leading axis. If
-    `order` is 2, a model keeps the past of x_t in its state too: x_{t-1}, or the value of
-    `remembered`, which is then `previous` in the next step.
+    A class defines the `expected` x_t and the law of the step that x_t takes from there. There is
+    one set of parameters for all particles, or one for each, along a leading axis. If `order`, how
+    many past values x_t depends on, is 2, a model keeps the past of x_t in its state too: x_{t-1},
+    or the value of `remembered`, which is then `previous` in the next step.
     """
 
-    @property
-    @abc.abstractmethod
-    def order(self) -> int:
-        """How many past values x_t depends on, 1 or 2."""
+    order = 1
 
     @property
-    @abc.abstractmethod
     def is_shared(self) -> bool:
         """Whether there is one set of parameters for all particles."""
+        return self.step_deviations.ndim == 1
+
+    @property
+    def noise_dimension(self) -> int:
+        """k, how many standard normal numbers x_t is made of."""
+        return self.step_deviations.shape[-1]
 
     @property
     @abc.abstractmethod
-    def noise_dimension(self) -> int:
-        """k, how many standard normal numbers x_t is made of."""
+    def step_deviations(self) -> Float[Array, "*n d"]:
+        """The standard deviation of every coordinate of a step."""
 
     @abc.abstractmethod
+    def expected(self, current: Rows, previous: Rows | None = None) -> Rows:
+        """The place that x_t steps from, given x_{t-1}, and x_{t-2} where the order is 2."""
+
+    @abc.abstractmethod
+    def step(self, noise: Float[Array, "n k"]) -> Rows:
+        """The step of each row, made of standard normal noise."""
+
+    @abc.abstractmethod
+    def log_step(self, steps: Rows) -> Float[Array, " n"]:
+        """The log-density of a step."""
+
+    def sample_step(self, key: Key[Array, ""], num_rows: int, dtype: jnp.dtype) -> Rows:
+        """Steps of fresh noise."""
+        return self.step(normal(key, (num_rows, self.noise_dimension), dtype))
+
     def from_noise(
-        self,
-        noise: Float[Array, "n k"],
-        current: Float[Array, "n d"],
-        previous: Float[Array, "n d"] | None = None,
-    ) -> Float[Array, "n d"]:
+        self, noise: Float[Array, "n k"], current: Rows, previous: Rows | None = None
+    ) -> Rows:
         """x_t given x_{t-1}, and x_{t-2} where the order is 2, made of standard normal noise."""
+        check_shape(f"n {self.noise_dimension}", noise=noise)
+        return self.expected(current, previous) + self.step(noise)
 
-    def sample(
-        self,
-        key: Key[Array, ""],
-        current: Float[Array, "n d"],
-        previous: Float[Array, "n d"] | None = None,
-    ) -> Float[Array, "n d"]:
-        """x_t given x_{t-1}, and x_{t-2} where the order is 2: `from_noise` of fresh noise."""
-        shape = (current.shape[0], self.noise_dimension)
-        return self.from_noise(normal(key, shape, current.dtype), current, previous)
+    def sample(self, key: Key[Array, ""], current: Rows, previous: Rows | None = None) -> Rows:
+        """x_t given x_{t-1}, and x_{t-2} where the order is 2."""
+        steps = self.sample_step(key, current.shape[0], current.dtype)
+        return self.expected(current, previous) + steps
 
-    @abc.abstractmethod
     def log_density(
-        self,
-        following: Float[Array, "n d"],
-        current: Float[Array, "n d"],
-        previous: Float[Array, "n d"] | None = None,
+        self, following: Rows, current: Rows, previous: Rows | None = None
     ) -> Float[Array, " n"]:
         """log D(x_t | x_{t-1}, x_{t-2}), with x_t in `following`."""
+        return self.log_step(following - self.expected(current, previous))
 
-    @abc.abstractmethod
-    def moments(
-        self, current: Float[Array, "n d"], previous: Float[Array, "n d"] | None = None
-    ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
+    def moments(self, current: Rows, previous: Rows | None = None) -> tuple[Rows, Rows]:
         """Mean and standard deviation of every coordinate of x_t."""
+        deviations = jnp.broadcast_to(self.step_deviations, current.shape)
+        return self.expected(current, previous), deviations
 
-    def remembered(
-        self,
-        following: Float[Array, "n d"],
-        current: Float[Array, "n d"],
-        previous: Float[Array, "n d"] | None,
-    ) -> Float[Array, "n d"] | None:
+    def remembered(self, following: Rows, current: Rows, previous: Rows | None) -> Rows | None:
         """The past of x_t, in `following`: x_{t-1} where the order is 2, and None where it is 1."""
         del following, previous
         return current if self.order == 2 else None
 
-    def initial_past(
-        self, key: Key[Array, ""], current: Float[Array, "n d"]
-    ) -> Float[Array, "n d"] | None:
+    def initial_past(self, key: Key[Array, ""], current: Rows) -> Rows | None:
         """The past of x_0: x_0 itself where the order is 2, which then stands still."""
         del key
         return current if self.order == 2 else None
 
 
-class AbstractRandomWalk(AbstractDynamics):
-    """Dynamics whose expected x_t is x_{t-1}, with steps of given `deviations`."""
-
-    deviations: eqx.AbstractVar[Float[Array, "*n d"]]
-
-    @property
-    def order(self) -> int:
-        """1."""
-        return 1
-
-    @property
-    def is_shared(self) -> bool:
-        """Whether `deviations` is one row for all."""
-        return self.deviations.ndim == 1
-
-
-class RandomWalk(AbstractRandomWalk):
+class RandomWalk(AbstractDynamics):
     """x_t = x_{t-1} + diag(deviations) ω_t, ω_t ~ N(0, I).
 
     Vermaak et al. (2003), section 5.2. `deviations`: (d,), or (n, d) with a row for each
@@ -124,39 +120,168 @@ class RandomWalk(AbstractRandomWalk):
         check_rows(deviations=self.deviations)
 
     @property
+    def step_deviations(self) -> Float[Array, "*n d"]:
+        """`deviations`."""
+        return self.deviations
+
+    def expected(self, current: Rows, previous: Rows | None = None) -> Rows:
+        """x_{t-1}."""
+        del previous
+        return current
+
+    def step(self, noise: Float[Array, "n k"]) -> Rows:
+        """The noise in units of `deviations`."""
+        return jnp.broadcast_to(self.deviations, noise.shape) * noise
+
+    def log_step(self, steps: Rows) -> Float[Array, " n"]:
+        """log N(step; 0, diag(deviations²))."""
+        return _log_normal(steps, self.deviations)
+
+
+class RandomWalkWithJumps(RandomWalk):
+    """x_t = x_{t-1} + diag(s) ω_t, ω_t ~ N(0, I); s is long with a small probability.
+
+    The contaminated normal of Tukey (1960) as dynamics: (1 - p) N(x_{t-1}, diag(deviations²))
+    + p N(x_{t-1}, diag(jump_deviations²)). A few particles jump. They find an object again that
+    was hidden for some frames, or that the filter lost to a look-alike. The recursion stays exact.
+
+    - `deviations`, `jump_deviations`: standard deviations of an ordinary and of a long step, (d,),
+      or (n, d) with a row for each particle, in units of the state per frame.
+    - `jump_probability`: p.
+
+    Raises `ValueError` for a deviation that is not positive, for deviations of different shapes,
+    and for a probability outside (0, 1). Use it where objects vanish and come back elsewhere.
+    """
+
+    jump_deviations: Float[Array, "*n d"] = eqx.field(converter=to_array("jump_deviations"))
+    jump_probability: float = eqx.field(static=True, default=0.03)
+
+    def __check_init__(self) -> None:
+        check_positive_array(jump_deviations=self.jump_deviations)
+        _check_shape_of_deviations(self.deviations, jump_deviations=self.jump_deviations)
+        check_inner_share(jump_probability=self.jump_probability)
+
+    @property
     def noise_dimension(self) -> int:
-        """d."""
-        return self.deviations.shape[-1]
+        """d, and one number that decides which particles jump."""
+        return self.deviations.shape[-1] + 1
 
-    def from_noise(
-        self,
-        noise: Float[Array, "n d"],
-        current: Float[Array, "n d"],
-        previous: Float[Array, "n d"] | None = None,
-    ) -> Float[Array, "n d"]:
-        """x_{t-1} plus noise."""
-        del previous
-        check_shape(f"n {current.shape[1]}", noise=noise)
-        return current + jnp.broadcast_to(self.deviations, current.shape) * noise
+    @property
+    def step_deviations(self) -> Float[Array, "*n d"]:
+        """The deviation of short and long steps together."""
+        p = self.jump_probability
+        return jnp.sqrt((1 - p) * self.deviations**2 + p * self.jump_deviations**2)
 
-    def log_density(
-        self,
-        following: Float[Array, "n d"],
-        current: Float[Array, "n d"],
-        previous: Float[Array, "n d"] | None = None,
-    ) -> Float[Array, " n"]:
-        """log N(x_t; x_{t-1}, diag(deviations²))."""
-        del previous
-        deviations = jnp.broadcast_to(self.deviations, current.shape)
-        noise = (following - current) / deviations
-        return _log_standard_normal(noise) - row_sums(jnp.log(deviations))
+    def step(self, noise: Float[Array, "n k"]) -> Rows:
+        """A step, long for the particles that jump."""
+        jumps = jax.scipy.special.ndtr(noise[:, -1:]) < self.jump_probability
+        return self._step(jumps, noise[:, :-1])
 
-    def moments(
-        self, current: Float[Array, "n d"], previous: Float[Array, "n d"] | None = None
-    ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
-        """x_{t-1}, and `deviations`."""
-        del previous
-        return current, jnp.broadcast_to(self.deviations, current.shape)
+    def sample_step(self, key: Key[Array, ""], num_rows: int, dtype: jnp.dtype) -> Rows:
+        """The same, from keys of their own for the jumps and the steps."""
+        key_noise, key_jump = split_once(key, 2)
+        # In one row, which is drawn fast; the numbers are those of n rows.
+        jumps = jax.random.bernoulli(fast_key(key_jump), self.jump_probability, (num_rows,))
+        noise = normal(key_noise, (num_rows, self.deviations.shape[-1]), dtype)
+        return self._step(jumps[:, None], noise)
+
+    def _step(self, jumps: Bool[Array, "n 1"], noise: Rows) -> Rows:
+        short, long = self.deviations, self.jump_deviations
+        both = jnp.broadcast_to(long, noise.shape), jnp.broadcast_to(short, noise.shape)
+        return jnp.where(jumps, *both) * noise
+
+    def log_step(self, steps: Rows) -> Float[Array, " n"]:
+        """log of the mixture of the two normal densities."""
+        short, long = _log_normal(steps, self.deviations), _log_normal(steps, self.jump_deviations)
+        log_odds = jnp.log(jnp.array([1 - self.jump_probability, self.jump_probability]))
+        log_odds = log_odds.astype(short.dtype)
+        return jnp.logaddexp(log_odds[0] + short, log_odds[1] + long)
+
+
+def _as_shares(gain: Any) -> tuple[float, ...]:
+    try:
+        return tuple(map(float, np.ravel(gain)))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"gain: {shown(gain)} is no number, nor one a coordinate") from error
+
+
+class WalkWithVelocity(AbstractDynamics):
+    """x_t = x_{t-1} + v_{t-1} + e_t and v_t = v_{t-1} + gain · e_t, with e_t a step of `walk`.
+
+    The local linear trend in innovations form: Holt's smoothing as a model (Hyndman, Koehler, Ord
+    and Snyder 2008, chapter 3, with α = 1). v is the mean that a Kalman filter in its steady state
+    has of a velocity that is itself a random walk, so that a particle carries its velocity without
+    drawing it. With a gain of 0, v never changes; with 1, it is the last displacement.
+
+    The past that a model keeps is x_t - v_t, the place from which x_t would come at its velocity
+    (`remembered`).
+
+    - `walk`: the noise of x_t, a `RandomWalk` or `RandomWalkWithJumps`.
+    - `gain`: in [0, 1], a number or one a coordinate. v averages over about 1 / gain steps.
+    - `initial_velocity`: deviations of v_0 about 0, of the shape of the walk's deviations, in units
+      of the state a frame; None takes 0.
+
+    Raises `ValueError` for a gain outside [0, 1], a negative deviation and shapes that do not fit.
+    Use it where objects keep their velocity: look-alikes that cross keep their identities, and a
+    hidden object moves on.
+    """
+
+    order = 2
+
+    walk: RandomWalk
+    gain: float | Sequence[float] = eqx.field(static=True, converter=_as_shares, default=0.1)
+    initial_velocity: Float[Array, "*n d"] | None = eqx.field(
+        converter=lambda value: None if value is None else to_array("initial_velocity")(value),
+        default=None,
+    )
+
+    def __check_init__(self) -> None:
+        d, gain = self.walk.deviations.shape[-1], np.asarray(self.gain)
+        if len(gain) not in (1, d) or not ((gain >= 0) & (gain <= 1)).all():
+            raise ValueError(f"gain: {self.gain} is not one or {d} numbers in [0, 1]")
+        if self.initial_velocity is not None:
+            deviations = self.walk.deviations
+            _check_shape_of_deviations(deviations, initial_velocity=self.initial_velocity)
+            check_not_negative_array(initial_velocity=self.initial_velocity)
+
+    @property
+    def noise_dimension(self) -> int:
+        """That of the walk."""
+        return self.walk.noise_dimension
+
+    @property
+    def step_deviations(self) -> Float[Array, "*n d"]:
+        """Those of the walk."""
+        return self.walk.step_deviations
+
+    def expected(self, current: Rows, previous: Rows | None = None) -> Rows:
+        """x_{t-1} + v_{t-1}."""
+        return 2 * current - _given(previous, self)
+
+    def step(self, noise: Float[Array, "n k"]) -> Rows:
+        """A step of the walk."""
+        return self.walk.step(noise)
+
+    def log_step(self, steps: Rows) -> Float[Array, " n"]:
+        """That of the walk."""
+        return self.walk.log_step(steps)
+
+    def sample_step(self, key: Key[Array, ""], num_rows: int, dtype: jnp.dtype) -> Rows:
+        """A step, as the walk draws it."""
+        return self.walk.sample_step(key, num_rows, dtype)
+
+    def remembered(self, following: Rows, current: Rows, previous: Rows | None) -> Rows:
+        """x_t - v_t, with v_t = v_{t-1} + gain · (x_t - x_{t-1} - v_{t-1})."""
+        expected = self.expected(current, previous)
+        gain = jnp.asarray(self.gain, current.dtype)[None]
+        return following - (expected - current) - gain * (following - expected)
+
+    def initial_past(self, key: Key[Array, ""], current: Rows) -> Rows:
+        """x_0 - v_0, with v_0 ~ N(0, diag(initial_velocity²))."""
+        if self.initial_velocity is None:
+            return current
+        deviations = jnp.broadcast_to(self.initial_velocity, current.shape)
+        return current - deviations * normal(key, current.shape, current.dtype)
 
 
 class Autoregression(AbstractDynamics):
@@ -171,6 +296,8 @@ class Autoregression(AbstractDynamics):
     Raises `ValueError` for shapes that do not fit together. Use it for objects whose speed and
     direction last over several frames.
     """
+
+    order = 2
 
     A1: Float[Array, "*n d d"] = eqx.field(converter=to_array("A1"))
     A2: Float[Array, "*n d d"] = eqx.field(converter=to_array("A2"))
@@ -199,70 +326,59 @@ class Autoregression(AbstractDynamics):
         kept = to_array("momentum")(momentum)
         check_scalars(momentum=kept)
         check_finite_array(momentum=kept)
-        deviations = to_array("deviations")(deviations)
-        check_positive_array(deviations=deviations)
-        check_rows(deviations=deviations)
+        deviations = RandomWalk(deviations).deviations
         d = deviations.shape[-1]
         eye = jnp.broadcast_to(jnp.eye(d, dtype=deviations.dtype), (*deviations.shape, d))
         zero = jnp.zeros_like(deviations)
         return cls((1 + kept) * eye, -kept * eye, deviations[..., None] * eye, zero)
 
     @property
-    def order(self) -> int:
-        """2."""
-        return 2
+    def step_deviations(self) -> Float[Array, "*n d"]:
+        """The roots of the diagonal of B Bᵀ."""
+        return jnp.sqrt(jnp.sum(self.B**2, axis=-1))
 
-    @property
-    def is_shared(self) -> bool:
-        """Whether there is one set of matrices for all."""
-        return self.mean.ndim == 1
+    def expected(self, current: Rows, previous: Rows | None = None) -> Rows:
+        """x̄ + A1 (x_{t-1} - x̄) + A2 (x_{t-2} - x̄)."""
+        previous, mean = _given(previous, self), jnp.broadcast_to(self.mean, current.shape)
+        return mean + _times(self.A1, current - mean) + _times(self.A2, previous - mean)
 
-    @property
-    def noise_dimension(self) -> int:
-        """d."""
-        return self.mean.shape[-1]
+    def step(self, noise: Float[Array, "n k"]) -> Rows:
+        """B ω_t."""
+        return _times(self.B, noise)
 
-    def from_noise(
-        self,
-        noise: Float[Array, "n d"],
-        current: Float[Array, "n d"],
-        previous: Float[Array, "n d"] | None = None,
-    ) -> Float[Array, "n d"]:
-        """The expected x_t plus B ω_t."""
-        check_shape(f"n {current.shape[1]}", noise=noise)
-        return self.moments(current, previous)[0] + _times(self.B, noise)
-
-    def log_density(
-        self,
-        following: Float[Array, "n d"],
-        current: Float[Array, "n d"],
-        previous: Float[Array, "n d"] | None = None,
-    ) -> Float[Array, " n"]:
-        """log N(x_t; the expected x_t, B Bᵀ)."""
-        residuals = following - self.moments(current, previous)[0]
+    def log_step(self, steps: Rows) -> Float[Array, " n"]:
+        """log N(step; 0, B Bᵀ)."""
         B = self.B[None] if self.is_shared else self.B
         factors = cholesky(jnp.sum(B[:, :, None] * B[:, None], axis=3))
         log_volume = jnp.sum(jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)), axis=1)
-        return _log_standard_normal(solve_lower(factors, residuals)) - log_volume
-
-    def moments(
-        self, current: Float[Array, "n d"], previous: Float[Array, "n d"] | None = None
-    ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
-        """x̄ + A1 (x_{t-1} - x̄) + A2 (x_{t-2} - x̄), and the roots of the diagonal of B Bᵀ."""
-        if previous is None:
-            raise ValueError("previous: an Autoregression needs x_{t-2}")
-        mean = jnp.broadcast_to(self.mean, current.shape)
-        expected = mean + _times(self.A1, current - mean) + _times(self.A2, previous - mean)
-        deviations = jnp.sqrt(jnp.sum(self.B**2, axis=-1))
-        return expected, jnp.broadcast_to(deviations, current.shape)
+        return _log_standard_normal(solve_lower(factors, steps)) - log_volume
 
 
-def _times(matrices: Float[Array, "*n d d"], vectors: Float[Array, "n d"]) -> Float[Array, "n d"]:
+def _given(previous: Rows | None, dynamics: AbstractDynamics) -> Rows:
+    if previous is None:
+        raise ValueError(f"previous: {type(dynamics).__name__} needs what is `remembered`")
+    return previous
+
+
+def _check_shape_of_deviations(deviations: Array, **arguments: Array) -> None:
+    for name, array in arguments.items():
+        if array.shape != deviations.shape:
+            raise ValueError(
+                f"{name}: shape {array.shape} is not that of the deviations, {deviations.shape}"
+            )
+
+
+def _times(matrices: Float[Array, "*n d d"], vectors: Rows) -> Rows:
     """A x of every row, as sums, which XLA fuses; it does not fuse many tiny matrix products."""
     if matrices.ndim == 2:
         return vectors @ matrices.T
     return jnp.sum(matrices * vectors[:, None, :], axis=2)
 
 
-def _log_standard_normal(noise: Float[Array, "n d"]) -> Float[Array, " n"]:
+def _log_normal(steps: Rows, deviations: Float[Array, "*n d"]) -> Float[Array, " n"]:
+    deviations = jnp.broadcast_to(deviations, steps.shape)
+    return _log_standard_normal(steps / deviations) - row_sums(jnp.log(deviations))
+
+
+def _log_standard_normal(noise: Rows) -> Float[Array, " n"]:
     return row_sums(-0.5 * noise**2 - 0.5 * jnp.log(2 * jnp.pi))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.metrics import effective_dynamics, uniqueness
+from mpfjax.metrics.particle_scores import effective_dynamics, uniqueness
 from tests.examples import make_mixture
 
 NUM_OBJECTS, NUM_PARTICLES, VARIANCE = 7, 300, 4.0

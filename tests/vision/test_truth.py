@@ -6,7 +6,7 @@ import io
 import numpy as np
 import pytest
 
-from mpfjax.metrics import multi_object_scores, remove_ignored
+from mpfjax.metrics.tracking_scores import multi_object_scores, remove_ignored
 from mpfjax.vision import read_tracks, read_truth
 from mpfjax.vision.files.boxes import write_tracks
 

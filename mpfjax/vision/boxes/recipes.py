@@ -14,9 +14,7 @@ from jaxtyping import Array, Float, UInt8
 
 from mpfjax.filter import Filter
 from mpfjax.filters import mixture_particle_filter, particle_filter
-from mpfjax.models.dynamics import AbstractDynamics
-from mpfjax.models.jumps import RandomWalkWithJumps
-from mpfjax.models.velocity import WalkWithVelocity
+from mpfjax.models.dynamics import AbstractDynamics, RandomWalkWithJumps, WalkWithVelocity
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping
 from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.propagation.propagate import Propagate

@@ -42,7 +42,7 @@ class Truth(NamedTuple):
 
     - `objects`: (s, 6), rows (frame, id, x, y, w, h) of the objects to be tracked.
     - `ignored`: (r, 6), rows (frame, kind, x, y, w, h) of what is not scored, with the kinds of
-      `mpfjax.metrics.remove_ignored`.
+      `mpfjax.metrics.tracking_scores.remove_ignored`.
     - `min_height`: a tracked box of at most this height that matches nothing is not scored; 0 for
       none.
     """

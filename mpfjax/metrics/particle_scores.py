@@ -1,0 +1,178 @@
+"""Scores of weighted particles: of forecasts, of modes that are kept, of how many differ."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree, Shaped
+
+from mpfjax.checks import (
+    check_not_negative_array,
+    check_positive,
+    check_shape,
+    check_type,
+    real_arrays,
+)
+from mpfjax.mixture import ParticleMixture, flatten_states
+from mpfjax.models.base import AbstractStateSpaceModel, require_model
+from mpfjax.models.steps import likelihoods
+from mpfjax.observations import one_observation
+from mpfjax.operations.logarithms import log_sum_exp
+
+
+def crps(
+    values: Float[Array, "*batch n"],
+    weights: Float[Array, "*batch n"],
+    observations: Float[Array, " *batch"],
+) -> Float[Array, " *batch"]:
+    """The continuous ranked probability score of weighted draws, in the unit of the values.
+
+    CRPS = ∫ (F(z) - 1{z >= y})² dz = E|Y - y| - E|Y - Y'| / 2 of the distribution F of the draws
+    (Gneiting and Raftery 2007, section 4.2), by a sum over the draws in order, O(n log n). It is
+    the absolute error where all weight is in one draw. A weight of zero leaves a draw out, and
+    weights need not sum to one. A NaN in a row makes its score NaN.
+
+    Use it to score the draws of `mpfjax.forecast(..., simulate_observation=...)`, with the weights
+    of the forecast's mixtures. Raises `ValueError` for anything but arrays of real numbers, for
+    shapes that do not fit, and for a weight below zero.
+    """
+    values, weights = real_arrays("... n", values=values, weights=weights)
+    observations = real_arrays("...", observations=observations)
+    check_not_negative_array(weights=weights)
+    if weights.shape != values.shape:
+        raise ValueError(f"weights: shape {weights.shape} is not that of values, {values.shape}")
+    if observations.shape != values.shape[:-1]:
+        raise ValueError(
+            f"observations: shape {observations.shape} is not {values.shape[:-1]}, one for each row"
+            " of values"
+        )
+    errors = jnp.where(weights > 0, values - observations[..., None], 0.0)
+    order = jnp.argsort(errors, axis=-1)
+    errors = jnp.take_along_axis(errors, order, axis=-1)
+    shares = jnp.take_along_axis(weights, order, axis=-1)
+    shares = shares / jnp.sum(shares, axis=-1, keepdims=True)
+    middles = jnp.cumsum(shares, axis=-1) - 0.5 * shares
+    return 2 * jnp.sum(shares * errors * ((errors > 0).astype(errors.dtype) - middles), axis=-1)
+
+
+def log_score(
+    model: AbstractStateSpaceModel, mixture: ParticleMixture, observation: PyTree
+) -> Float[Array, ""]:
+    """-log p(y) under a forecast, -log Σ_i exp(ℓ_i) L(y | x_i), in nats.
+
+    The logarithmic score (Gneiting and Raftery 2007, section 4.1). `mixture` is one of a
+    `Forecast`; `jax.vmap` maps over several, beside their observations. One step ahead it is the
+    negative increment of log Ẑ that the bootstrap filter's next step would give. It is +inf where
+    no particle has any likelihood.
+
+    Use it to compare models that see the same observations, with likelihoods that are normalised.
+    Raises `ValueError` for anything but a model and a mixture, and for a likelihood of another
+    shape.
+    """
+    require_model(model, "log_score")
+    check_type(ParticleMixture, "a mixture, as in a Forecast", mixture=mixture)
+    observation = one_observation(observation)
+    values = likelihoods(model, observation, mixture.particles)
+    joint = jnp.where(mixture.occupied, mixture.log_weights + values, -jnp.inf)
+    return -log_sum_exp(joint)
+
+
+def modes_represented(
+    positions: Float[Array, "*batch n"],
+    occupied: Bool[Array, "*batch n"],
+    modes: Float[Array, "*batch k"],
+    radius: float,
+) -> Bool[Array, "*batch k"]:
+    """Whether some particle of positive weight lies within `radius` of each mode.
+
+    Vermaak et al. (2003), section 5.1, count the steps at which both modes are represented; their
+    share over a run is its score. Positions, modes and radius are in the state's unit. Use it on a
+    model whose modes are known. Raises `ValueError` for anything but arrays, masks of another shape
+    than the positions, and a radius that is not positive and finite.
+    """
+    check_shape("... n", occupied=occupied)
+    positions = real_arrays("... n", positions=positions)
+    modes = real_arrays("... k", modes=modes)
+    if occupied.shape != positions.shape:
+        raise ValueError(f"occupied: shape {occupied.shape} is no mask of the positions")
+    if modes.shape[:-1] != positions.shape[:-1]:
+        raise ValueError(f"modes: shape {modes.shape} does not go with that of {positions.shape}")
+    if not isinstance(radius, jax.Array):
+        check_positive(radius=radius)
+    distance = jnp.abs(positions[..., None, :] - modes[..., :, None])
+    return jnp.any((distance < radius) & occupied[..., None, :], axis=-1)
+
+
+def mass_above(mixture: ParticleMixture, threshold: float) -> Float[Array, ""]:
+    """P(x_t > threshold | y_1..y_t) of a scalar state; a particle at the threshold counts half.
+
+    The particles' estimate of `GridFilterRun.mass_above`. With a threshold between two modes it is
+    the mass of the upper one. Raises `ValueError` for anything but a mixture of scalar states.
+    """
+    check_type(ParticleMixture, "a ParticleMixture", mixture=mixture)
+    shapes = [leaf.shape for leaf in jax.tree.leaves(mixture.particles)]
+    if len(shapes) != 1 or math.prod(shapes[0]) != mixture.num_particles:
+        raise ValueError(f"mixture: particles of shapes {shapes} are no scalars")
+    positions = jax.tree.leaves(mixture.particles)[0].reshape(mixture.num_particles)
+    below = jnp.where(positions < threshold, 0.0, jnp.nan)
+    above = jnp.where(positions > threshold, 1.0, jnp.where(positions == threshold, 0.5, below))
+    return mixture.average(above.astype(mixture.log_weights.dtype))
+
+
+def uniqueness(mixture: ParticleMixture) -> Float[Array, " objects"]:
+    """U/N of each object: its distinct hypotheses as a share of all particles.
+
+    Smith and Gatica-Perez (2004), section 3.1. Two particles hold the same hypothesis of object j
+    if its whole state is equal in both. Particles have leaves (n, J, ...); empty slots hold no
+    hypothesis. Pass it as `collect` to get it after every step. A weighted resampling within the
+    step lowers it for the objects that have moved, as in the paper's figure 4. Raises `ValueError`
+    for particles of other shapes.
+    """
+    _check(mixture)
+    distinct = jax.vmap(lambda states: _distinct_rows(states, mixture), in_axes=1)
+    return distinct(mixture.particles) / jnp.asarray(
+        mixture.num_usable_slots, mixture.log_weights.dtype
+    )
+
+
+def effective_dynamics(mixture: ParticleMixture) -> PyTree:
+    """The variance of each object's parameters over the particles: every leaf (J, ...).
+
+    Smith and Gatica-Perez (2004), section 3.1, at the end of a step. Every filled slot counts
+    the same, whatever its weight: it measures how far the search reaches, and not the posterior.
+    Divided by the variance of the dynamics' noise, it is the percentage of figure 4. Resampling
+    lowers it for the first objects of an order; for the last it may exceed 100%. Raises
+    `ValueError` for particles of other shapes.
+    """
+    _check(mixture)
+    occupied = mixture.occupied
+
+    def variance(leaf: Shaped[Array, "n objects *rest"]) -> Float[Array, "objects *rest"]:
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            leaf = leaf.astype(mixture.log_weights.dtype)
+        filled = occupied.reshape(-1, *[1] * (leaf.ndim - 1))
+        count = jnp.maximum(jnp.sum(occupied.astype(leaf.dtype)), 1.0)
+        mean = jnp.sum(jnp.where(filled, leaf, 0.0), axis=0) / count
+        squares = jnp.where(filled, (leaf - mean[None]) ** 2, 0.0)
+        return jnp.sum(squares, axis=0) / count
+
+    return jax.tree.map(variance, mixture.particles)
+
+
+def _check(mixture: ParticleMixture) -> None:
+    check_type(ParticleMixture, "a ParticleMixture", mixture=mixture)
+    shapes = [leaf.shape for leaf in jax.tree.leaves(mixture.particles)]
+    if any(len(shape) < 2 for shape in shapes):
+        raise ValueError(f"mixture: particles of shapes {shapes} are not of objects, (n, J, ...)")
+
+
+def _distinct_rows(states: PyTree, mixture: ParticleMixture) -> Float[Array, ""]:
+    """How many different rows the filled slots hold."""
+    rows = flatten_states(states)
+    empty = ~mixture.occupied
+    # The last key of a lexicographic sort counts most: the empty slots come last.
+    order = jnp.lexsort((*rows.T, empty))
+    rows, filled = rows[order], ~empty[order]
+    is_new = jnp.any(rows[1:] != rows[:-1], axis=1)
+    is_first = jnp.concatenate([jnp.ones(1, bool), is_new])
+    return jnp.sum((is_first & filled).astype(mixture.log_weights.dtype))
