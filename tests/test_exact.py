@@ -7,6 +7,7 @@ import pytest
 import scipy.stats
 
 import mpfjax
+from mpfjax import Series
 from mpfjax.exact import grid_filter, kalman_filter, kalman_smoother
 from tests import switching
 from tests.marking import thorough
@@ -79,8 +80,8 @@ def test_kalman_smoother_conditions_the_joint_gaussian(parts, observations):
     """Whatever is missing: means, covariances, those of neighbours, and the evidence."""
     d, length = len(parts["m0"]), len(observations)
     model, seen = mpfjax.LinearGaussianModel(**parts), jnp.asarray(observations)
-    run = kalman_smoother(model, seen, missing="skip")
-    filtered = kalman_filter(model, seen, missing="skip")
+    run = kalman_smoother(model, Series.skipping(seen))
+    filtered = kalman_filter(model, Series.skipping(seen))
     mean, covariance = joint_gaussian(**parts, length=length, with_first=True)
     states, seen = d * (length + 1), np.flatnonzero(~np.isnan(observations.ravel()))
     y = states + seen
@@ -153,7 +154,7 @@ def test_kalman_smoother_of_several_series_at_once_and_its_derivative():
         np.testing.assert_allclose(together.means[one], alone, rtol=1e-5, atol=1e-6)
 
     def first(rows):
-        return kalman_smoother(model, rows, missing="skip").means[0, 0]
+        return kalman_smoother(model, Series.skipping(rows)).means[0, 0]
 
     slope = jax.jit(jax.grad(first))(jnp.asarray(GAPS))
     assert np.isfinite(slope).all()
@@ -213,8 +214,8 @@ def test_far_from_zero_the_moments_are_as_good(ends):
 
 def test_a_missing_observation_is_skipped_on_a_grid_too():
     seen, grid = jnp.asarray([[0.4], [NAN], [0.1], [1.0]]), jnp.linspace(-6.0, 6.0, 301)
-    run = on_a_grid(SCALAR, seen, grid, missing="skip")
-    exact = kalman_filter(mpfjax.LinearGaussianModel(**SCALAR), seen, missing="skip")
+    run = on_a_grid(SCALAR, Series.skipping(seen), grid)
+    exact = kalman_filter(mpfjax.LinearGaussianModel(**SCALAR), Series.skipping(seen))
     increments = exact.log_likelihood_increments
     np.testing.assert_allclose(run.log_likelihood_increments, increments, atol=1e-5)
     np.testing.assert_allclose(run.variances, exact.covariances[:, 0, 0], atol=1e-5)
@@ -288,7 +289,7 @@ def test_bad_input_is_named():
         with pytest.raises(ValueError, match="observations: NaN or infinite at index 1"):
             exact(model, GAPS[[2, 1]])
         with pytest.raises(ValueError, match="observations: infinite at index 0"):
-            exact(model, np.full((1, 2), np.inf), missing="skip")
+            exact(model, Series.skipping(np.full((1, 2), np.inf)))
         with pytest.raises(ValueError, match=r"model: QuadraticModel.* is not a LinearGaussian"):
             exact(mpfjax.QuadraticModel(), GAPS)
     with pytest.raises(ValueError, match="grid: shape"):

@@ -139,19 +139,19 @@ def nothing(mixture):
 class TestReferences:
     def test_kalman_filter_with_controls_and_matrices_by_time(self):
         model, inputs = in_matrices()
-        run = kalman_filter(model, OBSERVATIONS[:, None], inputs=inputs)
+        run = kalman_filter(model, mpfjax.Series(OBSERVATIONS[:, None], inputs))
         log_z, filtered, _ = truth()
         np.testing.assert_allclose(run.log_marginal_likelihood, log_z, atol=1e-5)
         np.testing.assert_allclose(run.means[:, 0], filtered, atol=1e-5)
 
     def test_kalman_smoother_with_controls_and_matrices_by_time(self):
         model, inputs = in_matrices()
-        run = kalman_smoother(model, OBSERVATIONS[:, None], inputs=inputs)
+        run = kalman_smoother(model, mpfjax.Series(OBSERVATIONS[:, None], inputs))
         np.testing.assert_allclose(run.means[:, 0], truth()[2], atol=1e-5)
 
     def test_grid_filter(self):
         grid = jnp.linspace(-4.0, 5.0, 700)
-        run = grid_filter(Driven(), OBSERVATIONS, grid, inputs=INPUTS)
+        run = grid_filter(Driven(), mpfjax.Series(OBSERVATIONS, INPUTS), grid)
         log_z, filtered, _ = truth()
         np.testing.assert_allclose(run.log_marginal_likelihood, log_z, atol=1e-4)
         np.testing.assert_allclose(run.means, filtered, atol=1e-4)
@@ -183,7 +183,7 @@ def test_evidence_and_means_are_unbiased(name):
 def test_smoothed_means_are_those_of_the_kalman_smoother(method):
     """Of every time, within 4 standard errors over the runs."""
     model, inputs = in_matrices()
-    expected = kalman_smoother(model, OBSERVATIONS[:, None], inputs=inputs).means[:, 0]
+    expected = kalman_smoother(model, mpfjax.Series(OBSERVATIONS[:, None], inputs)).means[:, 0]
     filter, name = mpfjax.particle_filter(Driven(), 300), "exact"
     given = jax.tree.map(jnp.asarray, INPUTS)
     if method.endswith("mcmc"):
@@ -461,7 +461,9 @@ def test_gradients_with_respect_to_inputs_and_parameters():
 
     def exact(gain, u):
         model, inputs = in_matrices(gain)
-        run = kalman_filter(model, OBSERVATIONS[:, None], inputs=inputs | {"inputs": u[:, None]})
+        run = kalman_filter(
+            model, mpfjax.Series(OBSERVATIONS[:, None], inputs | {"inputs": u[:, None]})
+        )
         return run.log_marginal_likelihood
 
     at = jnp.asarray(GAIN), jnp.asarray(INPUTS["u"])

@@ -10,10 +10,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.checks import as_numbers, check_one_of, check_type
+from mpfjax.checks import as_numbers, check_shape, check_type
 from mpfjax.models.inputs import with_inputs
 from mpfjax.models.linear_gaussian import LinearGaussianModel
-from mpfjax.observations import steps_of_inputs
+from mpfjax.observations import Series, gathered, steps_of_inputs
 from mpfjax.operations.matrices import cholesky
 
 
@@ -57,36 +57,30 @@ class KalmanSmootherRun(eqx.Module):
 
 def kalman_filter(
     model: LinearGaussianModel,
-    observations: Float[Array, "t p"],
-    *,
-    inputs: PyTree = None,
-    missing: str = "error",
+    observations: PyTree,
 ) -> KalmanFilterRun:
     """The Kalman filter (Kalman 1960), with the library's convention: y_1 follows x_1, not x_0.
 
     Covariances are updated in Joseph's form, which stays positive in float32. Differentiable, and
     `jax.vmap` maps it over several series.
 
-    - `inputs`: those of the model, with a leading axis t: controls, or matrices that change in
-      time.
-    - `missing`: "error" raises a `ValueError` for a NaN or an infinity, as far as the numbers are
-      known. "skip" leaves out each number that is NaN: of two sensors, the one that is there
-      counts. (A particle filter leaves out the whole step, unless its model has `handles_missing`.)
+    - `observations`: an array (t, p), or a `Series` of one. Its inputs are those of the model:
+      controls, or matrices that change in time. `Series.skipping` leaves out each number that is
+      NaN: of two sensors, the one that is there counts. (A particle filter leaves out the whole
+      step, unless its model has `handles_missing`.) Otherwise a NaN is a `ValueError`, as far as
+      the numbers are known.
 
     Raises `ValueError` for another model and observations that are not (t, p). Use it as the
     reference for a linear-Gaussian model.
     """
-    series = _checked(model, observations, inputs, missing)
+    series = _checked(model, observations)
     filtered, increments = _kalman_filter(model, *series)
     return KalmanFilterRun(*filtered, increments, jnp.sum(increments))
 
 
 def kalman_smoother(
     model: LinearGaussianModel,
-    observations: Float[Array, "t p"],
-    *,
-    inputs: PyTree = None,
-    missing: str = "error",
+    observations: PyTree,
 ) -> KalmanSmootherRun:
     """E and Cov of x_0, ..., x_t given y_1..y_t, by the recursion of Rauch, Tung and Striebel 1965.
 
@@ -100,30 +94,30 @@ def kalman_smoother(
     over several series. Arguments and errors are those of `kalman_filter`. Use it as the reference
     for particle smoothers of a linear-Gaussian model.
     """
-    return _smooth(model, *_checked(model, observations, inputs, missing))
+    return _smooth(model, *_checked(model, observations))
 
 
-def _checked(
-    model: Any, observations: Any, inputs: PyTree, missing: str
-) -> tuple[Float[Array, "t p"], PyTree]:
+def _checked(model: Any, observations: PyTree) -> tuple[Float[Array, "t p"], PyTree]:
     check_type(LinearGaussianModel, "a LinearGaussianModel", model=model)
-    rows = checked_rows(observations, model.H.shape[0], missing, model.m0.dtype)
-    return rows, steps_of_inputs(inputs, rows.shape[0], model)
+    series = gathered(observations)
+    rows = checked_rows(series, model.H.shape[0], model.m0.dtype)
+    return rows, steps_of_inputs(series.inputs, rows.shape[0], model)
 
 
-def checked_rows(
-    observations: Any, num_rows: int, missing: str, dtype: jnp.dtype
-) -> Float[Array, "t p"]:
-    """y_1..y_t as an array of this type; a `ValueError` for other numbers or shapes."""
-    check_one_of(("error", "skip"), missing=missing)
-    rows = jnp.asarray(as_numbers("observations", observations, floating=True))
+def checked_rows(series: Series, num_rows: int, dtype: jnp.dtype) -> Float[Array, "t p"]:
+    """y_1..y_t as an array of this type, NaN where missing; a `ValueError` for what is none."""
+    rows = jnp.asarray(as_numbers("observations", series.observations, floating=True))
     if rows.ndim != 2 or rows.shape[1] != num_rows:
         raise ValueError(f"observations: shape {rows.shape} is not (t, {num_rows})")
+    takes_nan = series.skips_missing
+    if series.present is not None:
+        check_shape(f"{len(rows)}", present=series.present)
+        rows, takes_nan = jnp.where(jnp.asarray(series.present)[:, None], rows, jnp.nan), True
     if not isinstance(rows, Tracer):
         values = np.asarray(rows)
-        usable = ~np.isinf(values) if missing == "skip" else np.isfinite(values)
+        usable = ~np.isinf(values) if takes_nan else np.isfinite(values)
         if not usable.all():
-            what = "infinite" if missing == "skip" else "NaN or infinite"
+            what = "infinite" if takes_nan else "NaN or infinite"
             first = int(np.argmin(usable.all(axis=1)))
             raise ValueError(f"observations: {what} at index {first} of the leading axis")
     return rows.astype(dtype)

@@ -17,6 +17,7 @@ from mpfjax.exact.kalman import (
     smoothed_moments,
 )
 from mpfjax.models.switching import SwitchingLinearGaussianModel
+from mpfjax.observations import Series
 from mpfjax.operations.logarithms import log_sum_exp
 
 
@@ -51,7 +52,8 @@ def switching_filter(model: Any, observations: Float[Array, "t ..."]) -> Switchi
     (t, p), and for more than a million sequences. Use it as the reference for a short series.
     """
     check_type(SwitchingLinearGaussianModel, "a SwitchingLinearGaussianModel", model=model)
-    rows = checked_rows(observations, model.H.shape[-2], "skip", model.m0.dtype)
+    series = Series.skipping(observations)
+    rows = checked_rows(series, model.H.shape[-2], model.m0.dtype)
     length, k = rows.shape[0], model.num_regimes
     if k ** (length + 1) > _MOST_SEQUENCES:
         raise ValueError(

@@ -75,7 +75,7 @@ def truth(case):
     """log Z, and E[x_s] and E[x_s²] at each step s."""
     model, _, observations = CASES[case]
     if model is LINE:
-        exact = kalman_filter(model, observations, missing="skip")
+        exact = kalman_filter(model, mpfjax.Series.skipping(observations))
         second = jnp.diagonal(exact.covariances, axis1=1, axis2=2) + exact.means**2
         return exact.log_likelihood_increments, exact.means, second
     exact = grid_filter(model, observations, GRID)
@@ -167,7 +167,7 @@ def test_a_conditionally_linear_model_learns_too(case):
     if model is REGIMES:
         exact = switching_filter(model, observations)
     else:
-        exact = kalman_filter(mixed.whole(True), observations, missing="skip")
+        exact = kalman_filter(mixed.whole(True), mpfjax.Series.skipping(observations))
 
     def logs(filter):
         collect = lambda mixture: mixture.mean().mean  # noqa: E731

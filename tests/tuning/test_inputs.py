@@ -37,7 +37,7 @@ def sample_prior(key):
 def log_evidence(gain):
     """log p(y_1..y_t), exactly."""
     model, inputs = in_matrices(gain)
-    run = kalman_filter(model, OBSERVATIONS[:, None], inputs=inputs)
+    run = kalman_filter(model, mpfjax.Series(OBSERVATIONS[:, None], inputs))
     return run.log_marginal_likelihood
 
 
