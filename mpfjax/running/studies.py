@@ -8,7 +8,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -88,24 +88,15 @@ class Study:
     def __post_init__(self) -> None:
         check_type(Mapping, "functions by name, {name: function}", filters=self.filters)
         check_type(Mapping, "values by name, {name: [value, ...]}", settings=self.settings)
-        for name, function in self.filters.items():
-            if not callable(function):
-                raise ValueError(
-                    f"filters: {shown(function)}, for {name!r}, is no function that builds a filter"
-                )
-        for name in self.settings:
-            check_type(str, "the name of a setting", settings=name)
+        what = "a function that builds a filter"
+        check_callable(what, **{f"filters: {name}": f for name, f in self.filters.items()})
         check_callable("a function of a cell's runs", measure=self.measure)
         check_callable("a function of a mixture", **given(collect=self.collect))
         check_key(self.keys, "keys", batch=True)
-        taken = [name for name in self.settings if name in _TAKEN]
-        if taken:
-            raise ValueError(f"settings: {taken[0]!r} is what a cell has a name for already")
-        for name, values in _axes(self).items():
-            if not values or len(set(values)) < len(values):
-                raise ValueError(f"{_argument(name)}: {values} is empty or has the same twice")
-        for number in _axes(self)["num_particles"]:
-            check_whole(num_particles=number)
+        for name in self.settings:
+            if not isinstance(name, str) or name in _TAKEN:
+                raise ValueError(f"settings: {name!r} is no name, or one that a cell has already")
+        check_whole(**{f"num_particles: {n!r}": n for n in _axes(self)["num_particles"]})
         check_series(self.observations)
 
 
@@ -222,33 +213,25 @@ def _cells(study: Study) -> list[_Cell]:
 
 
 def _axes(study: Study) -> dict[str, list[Any]]:
-    """The values along each axis of the grid, the filters' names first."""
-    axes: dict[str, Any] = {
-        "filter": list(study.filters),
-        "num_particles": study.num_particles,
-        **study.settings,
-    }
-    for name, values in axes.items():
-        # A string is a sequence as well, of its letters.
-        is_array = isinstance(values, np.ndarray | jax.Array) and values.ndim > 0
-        if isinstance(values, str | bytes) or not (is_array or isinstance(values, Sequence)):
-            raise ValueError(f"{_argument(name)}: {shown(values)} are no values, [value, ...]")
-    return {name: [_plain(name, value) for value in values] for name, values in axes.items()}
-
-
-def _argument(axis: str) -> str:
-    """The argument of `Study` that sets an axis."""
-    return {"filter": "filters", "num_particles": "num_particles"}.get(axis, f"settings: {axis}")
+    """The values along each axis of the grid, the filters' names first, as JSON can hold them."""
+    axes: dict[str, list[Any]] = {}
+    given_axes = {"filters": list(study.filters), "num_particles": study.num_particles}
+    for name, values in (given_axes | dict(study.settings)).items():
+        if isinstance(values, str | bytes | Mapping) or np.ndim(np.array(values, object)) == 0:
+            raise ValueError(f"{name}: {shown(values)} are no values, [value, ...]")
+        axes[name] = [_plain(name, value) for value in values]
+        if not axes[name] or len(set(axes[name])) < len(axes[name]):
+            raise ValueError(f"{name}: {shown(values)} is empty or has the same twice")
+    return {"filter": axes.pop("filters"), **axes}
 
 
 def _plain(name: str, value: Any) -> Any:
-    """A value of an axis in a form that JSON can hold."""
     is_array = isinstance(value, np.generic | np.ndarray | jax.Array)
     if is_array and value.ndim == 0 and not jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         value = value.item()
     if value is not None and not isinstance(value, str | int | float | bool):
         raise ValueError(
-            f"{name}: {value!r} is no number or string; name it, and let the filter's function"
+            f"{name}: {shown(value)} is no number or string; name it, and let the filter's function"
             " look it up"
         )
     return value
@@ -361,13 +344,7 @@ def _measure(
     for start in range(0, num_seeds, size):
         # The last batch is filled up, so that it does not compile again.
         batch = study.keys[np.clip(np.arange(start, start + size), 0, num_seeds - 1)]
-        run = monte_carlo(
-            batch,
-            cell.filter,
-            study.observations,
-            study.collect,
-            slots=slots,
-        )
+        run = monte_carlo(batch, cell.filter, study.observations, study.collect, slots=slots)
         measured = {name: np.asarray(array) for name, array in study.measure(run).items()}
         for name, array in measured.items():
             if name in cell.description or name in _TAKEN:
@@ -380,12 +357,12 @@ def _measure(
 
 def _in_turn(finish: Callable[[_Cell], None], cells: list[_Cell], at_once: int) -> Iterator[None]:
     """Finish the cells, several at once; an error ends it after the cells that are running."""
-    if at_once == 1:
+    if at_once == 1:  # in this thread, which has the caller's settings of JAX
         yield from map(finish, cells)
         return
-    pool = ThreadPoolExecutor(at_once)
-    try:
-        for future in as_completed([pool.submit(finish, cell) for cell in cells]):
-            yield future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
+    with ThreadPoolExecutor(at_once) as pool:
+        try:
+            yield from pool.map(finish, cells)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
