@@ -30,8 +30,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from benchmarks.scenes import football_scene
 from mpfjax.console import exit_status, format_table, whole, write_json
-from mpfjax.vision import football_scene, write_tracks
+from mpfjax.vision import write_tracks
 from mpfjax.vision.files.frames import write_image
 
 HERE = Path(__file__).resolve().parents[1]

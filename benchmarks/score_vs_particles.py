@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 import mpfjax
-from mpfjax import plotting
+from benchmarks import figures as plotting
 from mpfjax.console import exit_status, format_table, seed, whole, write_figure, write_json
 from mpfjax.exact import grid_filter
 from mpfjax.metrics import mass_above, modes_represented

@@ -30,12 +30,3 @@ def test_holds_its_outputs(path):
 
 def test_there_are_notebooks():
     assert NOTEBOOKS
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_imports_the_library_alone(path):
-    """What a notebook shows, a user who installed the wheel can do."""
-    cells = nbformat.read(path, as_version=4).cells
-    code = "\n".join(cell.source for cell in cells if cell.cell_type == "code")
-    assert "benchmarks" not in code
-    assert "mpfjax" in code

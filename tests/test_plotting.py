@@ -7,7 +7,8 @@ import scipy.stats
 from matplotlib.collections import LineCollection
 
 import mpfjax
-from mpfjax.plotting import draw_components, draw_errors_by_size, draw_overlaps, standard_error
+from benchmarks.figures import draw_errors_by_size, draw_overlaps, standard_error
+from mpfjax.plotting import draw_components
 from tests.switching import MODEL as SWITCHING
 from tests.switching import OBSERVATIONS as SEEN
 

@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import figures as plotting
 from benchmarks.gm_mpf import sizes
 from benchmarks.gm_mpf.filters import NAMES
 from benchmarks.gm_mpf.runs import Step, errors_by_size
 from benchmarks.gm_mpf.targets import Targets
-from mpfjax import plotting
 from mpfjax.vision.files import drawing
 
 

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from benchmarks.scenes.football import football_scene
 from mpfjax.vision import read_truth
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import frames
-from mpfjax.vision.scenes.football import football_scene
 
 DEFAULT_IDS, DEFAULT_FRAMES = [11, 13], "129:199"
 

@@ -15,8 +15,9 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
+from benchmarks import figures as plotting
 from benchmarks.likelihood_tuning.soft_colours import SoftColourModel
-from mpfjax import plotting
+from benchmarks.scenes import football_scene
 from mpfjax.console import format_table, write_figure, write_json
 from mpfjax.metrics.tracking_quality import intersection_area
 from mpfjax.metrics.tracking_scores import covers
@@ -30,7 +31,6 @@ from mpfjax.tuning import (
 from mpfjax.vision import (
     BoxState,
     boxes_around,
-    football_scene,
     labelled_states,
     read_frames,
     read_truth,

@@ -15,9 +15,9 @@ from scipy.optimize import minimize
 from tqdm import tqdm
 
 import mpfjax
+from benchmarks import figures as plotting
 from benchmarks.likelihood_tuning.quadratic import COARSE_GRID, GRID, OBSERVATIONS, exact_quadratic
 from benchmarks.score_vs_particles import HIGH, LOW
-from mpfjax import plotting
 from mpfjax.console import format_table, write_figure, write_json
 from mpfjax.tuning import Positive, TuningRun, fit
 

@@ -25,10 +25,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from benchmarks import figures as plotting
 from benchmarks.masses import measure
 from benchmarks.masses.filters import FILTERS
 from benchmarks.masses.scenes import SCENES, Scene
-from mpfjax import plotting
 from mpfjax.console import exit_status, format_table, seed, whole, write_figure, write_json
 from mpfjax.models.base import starts_from_noise
 

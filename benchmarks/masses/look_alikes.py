@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from benchmarks.scenes import football_scene
 from mpfjax import RandomWalk
-from mpfjax.vision import football_scene
 from mpfjax.vision.boxes.colour_model import ColourModel
 from mpfjax.vision.colour.bins import RGBColours
 from mpfjax.vision.files.boxes import boxes_of_frame

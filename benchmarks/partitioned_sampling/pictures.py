@@ -9,11 +9,11 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks import figures as plotting
 from benchmarks.partitioned_sampling.scenes import Kept, Scene
 from benchmarks.partitioned_sampling.study import Order, Row
 from benchmarks.partitioned_sampling.tables import label
 from benchmarks.partitioned_sampling.text import TITLES
-from mpfjax import plotting
 from mpfjax.console import write_figure
 from mpfjax.vision.files import drawing, frames
 

@@ -18,11 +18,11 @@ from benchmarks.partitioned_sampling.posterior import (
     particle_means,
     posterior_means,
 )
+from benchmarks.scenes import NoPath, distracter_scene
 from mpfjax import vision
 from mpfjax.metrics.particle_scores import effective_dynamics, uniqueness
 from mpfjax.vision.boxes.joint_colour import PAPER_DEVIATIONS, with_lambda
 from mpfjax.vision.files import boxes as box_files
-from mpfjax.vision.scenes.distracter import NoPath
 
 PAPER_WIDTH = 360  # the frames in which a step deviates by two pixels
 MOST_TRIED = 100  # keys, before there are too few scenes
@@ -103,7 +103,7 @@ def synthetic_scene(
     key: int, setting: Setting = DEFAULT, *, only_if_kept: bool = False
 ) -> Scene | None:
     """The seven objects of section 3.2 and their distracter; None where not to be kept."""
-    drawn = vision.distracter_scene(
+    drawn = distracter_scene(
         jax.random.key(key),
         size=setting.size,
         speed=setting.speed,

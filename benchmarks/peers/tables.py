@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import figures as plotting
 from benchmarks.peers.jobs import JOBS
-from mpfjax import plotting
 from mpfjax.console import format_table
 
 

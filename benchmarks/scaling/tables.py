@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
+from benchmarks import figures as plotting
 from benchmarks.scaling.cells import AXES, FILTERS
-from mpfjax import plotting
 from mpfjax.console import format_table
 
 

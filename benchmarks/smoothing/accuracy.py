@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
+from benchmarks import figures as plotting
 from benchmarks.smoothing.filters import make_model, observations_of
 from benchmarks.smoothing.jobs import Job
-from mpfjax import plotting
 from mpfjax.console import format_table
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.smoothing import sample_trajectories, smoothed_sums, trace_ancestors

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
+from benchmarks import figures as plotting
 from benchmarks.smoothing.filters import FILTERS, make_model, observations_of
 from benchmarks.smoothing.jobs import Quadratic
-from mpfjax import plotting
 from mpfjax.console import format_table
 from mpfjax.smoothing import sample_trajectories, trace_ancestors
 

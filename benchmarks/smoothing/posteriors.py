@@ -11,9 +11,10 @@ from jax.scipy.stats import norm
 from matplotlib.figure import Figure
 
 import mpfjax
+from benchmarks import figures as plotting
 from benchmarks.smoothing.filters import make_model, observations_of
 from benchmarks.smoothing.jobs import Quadratic
-from mpfjax import plotting, tuning
+from mpfjax import tuning
 from mpfjax.console import format_table
 from mpfjax.exact import grid_filter
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from mpfjax.vision.scenes.football import Scene, football_scene
+from benchmarks.scenes.football import Scene, football_scene
 
 FRAMES_PER_SECOND = 12.0
 NUM_FRAMES = 120

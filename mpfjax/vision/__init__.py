@@ -1,4 +1,4 @@
-"""Computer vision: frames, boxes, colour histograms, detections, the object tracker, scenes."""
+"""Computer vision: frames, boxes, colour histograms, detections, the object tracker."""
 
 from mpfjax.vision.boxes.colour_model import BoxState as BoxState
 from mpfjax.vision.boxes.colour_model import ColourModel as ColourModel
@@ -20,10 +20,6 @@ from mpfjax.vision.files.frames import read_frames as read_frames
 from mpfjax.vision.files.frames import write_video as write_video
 from mpfjax.vision.files.truth import Truth as Truth
 from mpfjax.vision.files.truth import read_truth as read_truth
-from mpfjax.vision.scenes.distracter import DistracterScene as DistracterScene
-from mpfjax.vision.scenes.distracter import distracter_scene as distracter_scene
-from mpfjax.vision.scenes.football import Scene as Scene
-from mpfjax.vision.scenes.football import football_scene as football_scene
 from mpfjax.vision.tracking.background import BackgroundSubtraction as BackgroundSubtraction
 from mpfjax.vision.tracking.detections import Detections as Detections
 from mpfjax.vision.tracking.gaussian import CameraMotion as CameraMotion

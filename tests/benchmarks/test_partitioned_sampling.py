@@ -23,11 +23,11 @@ from benchmarks.partitioned_sampling import (
     study,
     tables,
 )
+from benchmarks.scenes import distracter_scene
 from mpfjax.metrics import tracking_quality
 from mpfjax.vision import (
     BoxState,
     HSVColours,
-    distracter_scene,
     joint_colour_model,
     write_tracks,
 )

@@ -6,11 +6,11 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks.scenes.football import football_scene
 from benchmarks.visual_tracking import __main__ as visual_tracking
 from mpfjax.metrics.tracking_scores import coverage
 from mpfjax.vision.files.boxes import read_tracks, write_tracks
 from mpfjax.vision.files.frames import read_frames, write_image, write_video
-from mpfjax.vision.scenes.football import football_scene
 from tests.marking import thorough
 
 pytest.importorskip("av", reason="reading and writing frames needs the extra 'video'")

@@ -64,17 +64,6 @@ TABLE = {
         {"boxes": BOXES, "max_detections": 3},
         {"boxes": "rows", "max_detections": "count"},
     ),
-    "distracter_scene": (
-        vision.distracter_scene,
-        {"key": KEY},
-        {"key": "key", "num_frames": "count"},
-    ),
-    "football_scene": (
-        vision.football_scene,
-        {"key": KEY, "num_frames": 1},
-        {"key": "key", "num_frames": "count", "num_players": "count", "num_opponents": "number",
-         "height": "count", "width": "count", "still_camera": "flag"},
-    ),
     "read_tracks": (vision.read_tracks, {}, {"path": "path"}),
     "read_truth": (vision.read_truth, {}, {"path": "path"}),
     "write_tracks": (
@@ -153,7 +142,6 @@ def test_what_will_not_do_is_named(function, good, name, value):
         (vision.joint_colour_model, OF_FRAME, "templates", {0: (FRAME, None)}),
         (vision.joint_colour_model, OF_FRAME, "templates", {0: (None, BOXES[0])}),
         (vision.ObjectTracker, {}, "scores", (0.5, NAN)),
-        (vision.distracter_scene, {"key": KEY}, "num_frames", 2),
         (vision.write_tracks, {"path": "/nowhere"}, "rows", [[0.5, 1, 2, 3, 4, 5]]),
         (vision.write_tracks, {"path": "/nowhere"}, "rows", [[1, 1, NAN, 3, 4, 5]]),
         (late(vision.object_boxes, model="joint"), {}, "states", STATES),

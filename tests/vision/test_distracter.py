@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from mpfjax.vision import distracter_scene
+from benchmarks.scenes import distracter_scene
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +149,7 @@ def test_coloured_noise():
     ],
 )
 def test_what_leaves_no_scene_is_named(monkeypatch, name, value):
-    monkeypatch.setattr("mpfjax.vision.scenes.distracter._TRIES", 1000)
+    monkeypatch.setattr("benchmarks.scenes.distracter._TRIES", 1000)
     with pytest.raises(ValueError, match=f"^{name}"):
         distracter_scene(jax.random.key(0), **{name: value})
 

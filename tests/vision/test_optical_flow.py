@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.vision import CameraMotion, Detections, ObjectTracker, football_scene, track
+from benchmarks.scenes import football_scene
+from mpfjax.vision import CameraMotion, Detections, ObjectTracker, track
 from mpfjax.vision.tracking.gaussian import Gaussian
 from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
 

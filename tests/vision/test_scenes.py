@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from mpfjax.vision.scenes.football import football_scene
+from benchmarks.scenes.football import football_scene
 
 
 @pytest.fixture(scope="module")

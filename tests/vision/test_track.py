@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.scenes import football_scene
 from mpfjax.metrics import multi_object_scores
-from mpfjax.vision import Detections, ObjectTracker, Tracks, football_scene, track
+from mpfjax.vision import Detections, ObjectTracker, Tracks, track
 from mpfjax.vision.boxes.follow_boxes import follow_boxes
 from mpfjax.vision.boxes.object_moves import best_components
 from mpfjax.vision.boxes.recipes import objects_filters

@@ -1,4 +1,4 @@
-"""A run as the moments of its components over time."""
+"""Pictures of a run: its components over time. Only here matplotlib is used."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,13 @@ from matplotlib.figure import Figure
 
 from mpfjax.checks import check_whole, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
-from mpfjax.plotting.papers import COLOURS
+
+# Okabe and Ito's palette (2008), which people with colour blindness can tell apart.
+COLOURS = (
+    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00",
+    "#56B4E9", "#F0E442", "#8B4513", "#5E3C99", "#666666",
+)  # fmt: skip
+MARKERS = "osD^vP*X<>"
 
 
 def draw_components(

@@ -1,4 +1,4 @@
-"""Figures of the papers, and of what the benchmarks measure."""
+"""Figures of the papers, and of what the benchmarks measure; no command."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -10,12 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-# Okabe and Ito's palette (2008), which people with colour blindness can tell apart.
-COLOURS = (
-    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00",
-    "#56B4E9", "#F0E442", "#8B4513", "#5E3C99", "#666666",
-)  # fmt: skip
-MARKERS = "osD^vP*X<>"
+from mpfjax.plotting import COLOURS as COLOURS
+from mpfjax.plotting import MARKERS as MARKERS
+
 _MOST_TICKS = 6
 
 
