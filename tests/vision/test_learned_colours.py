@@ -1,5 +1,7 @@
 """Colours that are learned on the way: by hand, and in a scene where an object hides."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,6 @@ from mpfjax.mixture import single_component
 from mpfjax.vision import BoxState, ColourModel, RGBColours
 from mpfjax.vision.boxes.learned_colours import (
     AdaptAppearance,
-    LearnedBoxState,
     LearnedColourModel,
 )
 
@@ -19,16 +20,20 @@ BOXES = np.array([[5.0, 5, 10, 20], [20, 10, 10, 15]])
 BINS = 4
 
 
-def colour_model(contrast=0.0):
-    return ColourModel.from_frame(
+def colour_model(contrast=0.0, kind=ColourModel):
+    return kind.from_frame(
         FIRST, BOXES, colours=RGBColours(BINS), sigma=0.5, contrast=contrast
     )
+
+
+def learned_model(contrast=0.0, **options):
+    return dataclasses.replace(colour_model(contrast, LearnedColourModel), **options)
 
 
 def states_of(model, xs=(10.0, 12.0, 25.0), references=(0, 0, 1)):
     box = jnp.asarray([[x, 16.0, 1.0, 1.0] for x in xs], jnp.float32)
     reference = jnp.asarray(references, jnp.int32)
-    return LearnedBoxState(box, reference, None, model.references[reference])
+    return BoxState(box, reference, None, model.references[reference])
 
 
 def counted(frame, x, y, w, h):
@@ -57,10 +62,10 @@ def by_hand(anchor, hidden, rate):
 @pytest.mark.parametrize(("anchor", "hidden", "rate"), [(0.3, 0.4, 0.5), (0.0, 1.0, 1.0)])
 def test_the_likelihood_and_what_is_learned_by_hand(anchor, hidden, rate):
     inner = colour_model()
-    model = LearnedColourModel(inner, anchor=anchor, hidden_distance=hidden)
+    model = learned_model(anchor=anchor, hidden_distance=hidden)
     states = states_of(inner)
     appearance = states.appearance.at[0].set(inner.references[1])
-    states = LearnedBoxState(states.box, states.reference, None, appearance)
+    states = BoxState(states.box, states.reference, None, appearance)
     log_likelihood, learned = by_hand(anchor, hidden, rate)
     frame = jnp.asarray(NOW)
     np.testing.assert_allclose(model.log_likelihood(frame, states)[0], log_likelihood, atol=1e-4)
@@ -73,7 +78,7 @@ def test_the_likelihood_and_what_is_learned_by_hand(anchor, hidden, rate):
 
 def test_with_nothing_learned_and_nothing_hidden_it_is_the_colour_model():
     inner = colour_model(contrast=0.25)
-    model = LearnedColourModel(inner, anchor=0.5, hidden_distance=1e3)
+    model = learned_model(0.25, anchor=0.5, hidden_distance=1e3)
     states, frame = states_of(inner), jnp.asarray(NOW)
     bare = BoxState(states.box, states.reference)
     expected = inner.log_likelihood(frame, bare)
@@ -82,7 +87,7 @@ def test_with_nothing_learned_and_nothing_hidden_it_is_the_colour_model():
 
 def test_outside_the_frame_nothing_is_learned_and_the_object_is_hidden():
     inner = colour_model()
-    model = LearnedColourModel(inner, hidden_distance=0.1)
+    model = learned_model(hidden_distance=0.1)
     states, frame = states_of(inner, xs=(-500.0, np.nan, 10.0)), jnp.asarray(NOW)
     learned = model.learned(frame, states, 1.0)
     np.testing.assert_array_equal(learned.appearance[:2], states.appearance[:2])
@@ -92,4 +97,4 @@ def test_outside_the_frame_nothing_is_learned_and_the_object_is_hidden():
 
 
 def test_it_says_that_it_is_approximate():
-    assert AdaptAppearance(LearnedColourModel(colour_model())).approximate
+    assert AdaptAppearance(learned_model()).approximate

@@ -10,7 +10,6 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.vision.boxes.colour_model import BoxState
 from mpfjax.vision.boxes.object_moves import (
     ObjectExclusion,
-    OneComponentAnObject,
     PruneHypotheses,
 )
 
@@ -54,13 +53,6 @@ def test_pruning_compares_within_an_object_only():
     assert moved.active.tolist() == [True, False, True, True]
     kept = np.asarray(moved.log_weights)[[0, 2, 3]]
     np.testing.assert_allclose(kept, np.log([0.5, 4e-3, 1e-4]), rtol=1e-6)
-
-
-def test_at_the_start_an_object_is_one_component():
-    mixture = mixture_of(ROWS)
-    moved = OneComponentAnObject()(jax.random.key(0), mixture, None)
-    assert moved.component_indicators.tolist() == [0, 0, 0, 1, 1]
-    np.testing.assert_array_equal(np.asarray(moved.log_weights), np.asarray(mixture.log_weights))
 
 
 def test_both_say_that_they_are_approximate():

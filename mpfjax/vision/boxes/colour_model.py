@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt8
 
 from mpfjax.checks import (
-    check_flag,
     check_not_negative,
     check_positive,
     check_shape,
@@ -44,11 +43,14 @@ class BoxState(eqx.Module):
     - `reference`: r, the reference box it is compared with, in [0, number of references).
     - `previous`: the memory of second-order dynamics, as their `remembered` gives it: the box one
       frame before.
+    - `appearance`: the histograms that a `LearnedColourModel` has learned, (n, parts, channels,
+      bins); None for other models.
     """
 
     box: Float[Array, "*n 4"]
     reference: Int[Array, "*n"]
     previous: Float[Array, "*n 4"] | None = None
+    appearance: Float[Array, "*n parts channels bins"] | None = None
 
 
 class AbstractBoxModel(AbstractStateSpaceModel):
@@ -88,9 +90,8 @@ class AbstractBoxModel(AbstractStateSpaceModel):
             switches = jax.random.bernoulli(key_switch, self.switch_probability, reference.shape)
             drawn = jax.random.randint(key_reference, reference.shape, 0, k, reference.dtype)
             reference = jnp.where(switches, drawn, reference)
-        dynamics = self.dynamics_of(states)
-        box = dynamics.sample(key_noise, states.box, states.previous)
-        return BoxState(box, reference, dynamics.remembered(box, states.box, states.previous))
+        box = self.dynamics_of(states).sample(key_noise, states.box, states.previous)
+        return self.with_history(BoxState(box, reference, None, states.appearance), states)
 
     @property
     def noise_dimension(self) -> int:
@@ -107,10 +108,9 @@ class AbstractBoxModel(AbstractStateSpaceModel):
             k = self.reference_boxes.shape[0]
             drawn = jnp.clip(jnp.floor(k * shares), 0, k - 1).astype(reference.dtype)
             reference = jnp.where(shares < 1, drawn, reference)
-        dynamics = self.dynamics_of(states)
         noise = noise[:, : self.dynamics.noise_dimension]
-        box = dynamics.from_noise(noise, states.box, states.previous)
-        return BoxState(box, reference, dynamics.remembered(box, states.box, states.previous))
+        box = self.dynamics_of(states).from_noise(noise, states.box, states.previous)
+        return self.with_history(BoxState(box, reference, None, states.appearance), states)
 
     def log_transition(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
         """log D(x_t | x_{t-1}) + log P(r_t | r_{t-1}), -inf where r cannot have changed."""
@@ -118,21 +118,16 @@ class AbstractBoxModel(AbstractStateSpaceModel):
         log_density = dynamics.log_density(
             states.box, previous_states.box, previous_states.previous
         )
-        return log_density + self.log_switch(states, previous_states)
-
-    def log_switch(self, states: BoxState, previous_states: BoxState) -> Float[Array, " n"]:
-        """log P(r_t | r_{t-1}), the part of `log_transition` that concerns the reference."""
         drawn = self.switch_probability / self.reference_boxes.shape[0]
         stays = states.reference == previous_states.reference
-        return jnp.log(
-            jnp.where(stays, 1 - self.switch_probability + drawn, drawn).astype(states.box.dtype)
-        )
+        probability = jnp.where(stays, 1 - self.switch_probability + drawn, drawn)
+        return log_density + jnp.log(probability.astype(states.box.dtype))
 
     def with_history(self, states: BoxState, previous_states: BoxState) -> BoxState:
         """The states as offspring of the previous ones, whose boxes they remember."""
         dynamics = self.dynamics_of(previous_states)
         past = dynamics.remembered(states.box, previous_states.box, previous_states.previous)
-        return BoxState(states.box, states.reference, past)
+        return BoxState(states.box, states.reference, past, states.appearance)
 
     def dynamics_of(self, states: BoxState) -> AbstractDynamics:
         """The dynamics of each particle's own reference."""
@@ -238,7 +233,6 @@ class ColourModel(AbstractBoxModel):
             raise ValueError("boxes: there are none")
         check_boxes(boxes, *frame.shape[:2])
         colours = RGBColours() if colours is None else colours
-        check_type(AbstractColours, "AbstractColours such as RGBColours()", colours=colours)
         kind = "AbstractDynamics such as RandomWalk(deviations)"
         check_type(AbstractDynamics, kind, **given(dynamics=dynamics))
         deviations = positive_deviations(
@@ -246,7 +240,6 @@ class ColourModel(AbstractBoxModel):
         )
         check_positive(sigma=sigma)
         check_whole(num_parts=num_parts)
-        check_flag(weigh_colours=weigh_colours, share_reference=share_reference)
         check_share(switch_probability=switch_probability)
         check_not_negative(contrast=contrast)
         places = jnp.asarray(centred(boxes), float)
@@ -276,57 +269,37 @@ class ColourModel(AbstractBoxModel):
     ) -> Float[Array, " n"]:
         """-(Σ_c B² - contrast Σ_c B²_around) / 2σ², each B² averaged over the bands."""
         counts, sides = self.counts(observation, states)
-        weights, references = self._own(counts, states)
-        distances = self._contrasted(counts, sides, weights, references)
+        distances = self.distances(counts, sides, *self.own(states))
         return -0.5 * distances / self.sigma**2
+
+    def prepare_observation(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], soon: bool = False
+    ) -> IntegralHistogram:
+        """The frame's integral histogram; a model of several objects builds it only once."""
+        if isinstance(observation, IntegralHistogram):
+            return observation
+        return integral_histogram(observation, self.colours, self.wide_counts, soon)
 
     def counts(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
     ) -> tuple[Float[Array, "n parts channels bins"], Float[Array, "n parts channels bins"] | None]:
         """Pixels of each colour in each box, and at its sides where `contrast` is positive."""
         num_parts = self.references.shape[1]
-        observation, boxes = self._counted(observation), self.boxes(states)
+        observation, boxes = self.prepare_observation(observation), self.boxes(states)
         counts = observation.counts(boxes, num_parts)
         if self.contrast == 0:
             return counts, None
         wide = boxes * jnp.array([[1.0, 1.0, SURROUND, 1.0]], boxes.dtype)
         return counts, observation.counts(wide, num_parts) - counts
 
-    def contrasted(
+    def distances(
         self,
         counts: Float[Array, "n parts channels bins"],
         sides: Float[Array, "n parts channels bins"] | None,
-        states: BoxState,
-        references: Float[Array, "n parts channels bins"],
+        weights: Float[Array, "#n parts channels bins"],
+        references: Float[Array, "#n parts channels bins"],
     ) -> Float[Array, " n"]:
         """Σ_c B² - contrast Σ_c B²_around of boxes with these counts, from these references."""
-        return self._contrasted(counts, sides, self.colour_weights[states.reference], references)
-
-    def prepare_observation(
-        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], soon: bool = False
-    ) -> IntegralHistogram:
-        """The frame's integral histogram; a model of several objects builds it only once."""
-        return self._counted(observation, soon)
-
-    def squared_distances(
-        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
-    ) -> Float[Array, " n"]:
-        """Σ_c B² of each box from its reference, averaged over the bands: between 0 and the
-        number of channels.
-        """
-        counts = self._counted(observation).counts(self.boxes(states), self.references.shape[1])
-        return _distances(counts, *self._own(counts, states))
-
-    def _counted(
-        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], soon: bool = False
-    ) -> IntegralHistogram:
-        if isinstance(observation, IntegralHistogram):
-            return observation
-        return integral_histogram(observation, self.colours, self.wide_counts, soon)
-
-    def _contrasted(
-        self, counts: Array, sides: Array | None, weights: Array, references: Array
-    ) -> Float[Array, " n"]:
         distances = _distances(counts, weights, references)
         if sides is None:
             return distances
@@ -334,12 +307,14 @@ class ColourModel(AbstractBoxModel):
         around = jnp.where(uncounted, 0.0, _distances(sides, weights, references))
         return distances - self.contrast * around
 
-    def _own(self, counts: Array, states: BoxState) -> tuple[Array, Array]:
-        """The weights and the references of the particles."""
+    def own(
+        self, states: BoxState
+    ) -> tuple[Float[Array, "#n parts channels bins"], Float[Array, "#n parts channels bins"]]:
+        """The weights of colours and the references of the particles."""
         weights, references = self.colour_weights, self.references
         # With one reference, a gather costs more than the distance. Under vmap, where
         # each particle has a model of its own, the two gathers fuse.
-        if references.shape[0] > 1 or counts.shape[0] == 1:
+        if references.shape[0] > 1 or states.box.shape[0] == 1:
             weights, references = weights[states.reference], references[states.reference]
         return weights, references
 

@@ -1,118 +1,86 @@
 """Boxes recognised by colours that are learned during tracking, and that may be hidden."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key, UInt8
+from jaxtyping import Array, Float, Key, UInt8
 
 from mpfjax.checks import check_positive, check_share, check_type
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
 from mpfjax.vision.colour.histograms import IntegralHistogram, normalise
 
 
-class LearnedBoxState(eqx.Module):
-    """A `BoxState`, and the recent colours in the box of this hypothesis.
-
-    - `box`, `reference`, `previous`: as in `BoxState`.
-    - `appearance`: the learned histograms, (n, parts, channels, bins); at first those of the
-      reference.
-    """
-
-    box: Float[Array, "*n 4"]
-    reference: Int[Array, "*n"]
-    previous: Float[Array, "*n 4"] | None
-    appearance: Float[Array, "*n parts channels bins"]
-
-
-class LearnedColourModel(AbstractStateSpaceModel):
+class LearnedColourModel(ColourModel):
     """A `ColourModel` of objects that change their appearance and that are hidden at times.
 
         L(y | x) ∝ exp(-d / 2σ²) + exp(-d_hidden / 2σ²)
 
-    d is the squared distance of the `ColourModel`, including contrast: a share `anchor` of it is
+    d is the squared distance of a `ColourModel`, including contrast: a share `anchor` of it is
     the distance from the reference of the first frame, and the rest the distance from the
     particle's own `appearance`. The second term stands for a hidden object, and does not depend on
     the box. A hypothesis therefore stays near the place where its object vanished, and no
     look-alike at a distance of d_hidden or more attracts it. `appearance` is part of the state, and
-    only `AdaptAppearance` changes it; the motion is that of the `ColourModel`. Observations are
-    those of the `ColourModel`.
+    only `AdaptAppearance` changes it. All else is as in a `ColourModel`.
 
     - `hidden_distance`: d_hidden, squared, in units of Σ_c B². In a street scene, people were at a
       distance of .2 from themselves, .5 to .7 from others and 1 or more from the background.
 
-    Raises `TypeError` for another model, `ValueError` for a share outside [0, 1] and a distance
-    that is not positive. Use it where objects hide behind others or turn round.
+    Raises `ValueError` for a share outside [0, 1] and a distance that is not positive. Use it where
+    objects hide behind others or turn round.
     """
 
-    colour_model: ColourModel
     anchor: float = eqx.field(static=True, default=0.2)
     hidden_distance: float = eqx.field(static=True, default=0.6)
 
     def __check_init__(self) -> None:
-        check_type(ColourModel, "a ColourModel", colour_model=self.colour_model)
         check_share(anchor=self.anchor)
         check_positive(hidden_distance=self.hidden_distance)
 
-    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> LearnedBoxState:
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> BoxState:
         """x_0 of the `ColourModel`, with the appearance of the reference."""
-        states = self.colour_model.sample_initial(key, num_particles)
-        return _with_appearance(states, self.colour_model.references[states.reference])
-
-    def sample_transition(self, key: Key[Array, ""], states: LearnedBoxState) -> LearnedBoxState:
-        """x_t of the `ColourModel`, with the appearance of the previous state."""
-        return _with_appearance(
-            self.colour_model.sample_transition(key, _bare(states)), states.appearance
-        )
-
-    def boxes(self, states: LearnedBoxState) -> Float[Array, "n 4"]:
-        """The hypothesised boxes, centre and size in pixels."""
-        return self.colour_model.boxes(_bare(states))
+        states = super().sample_initial(key, num_particles)
+        return _with_appearance(states, self.references[states.reference])
 
     def log_likelihood(
-        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: LearnedBoxState
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
     ) -> Float[Array, " n"]:
         """log of the sum of the two terms, visible and hidden."""
         log_seen, log_hidden, _ = self._seen(observation, states)
         return jnp.logaddexp(log_seen, log_hidden)
 
-    def prepare_observation(
-        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], soon: bool = False
-    ) -> IntegralHistogram:
-        """The frame's integral histogram."""
-        return self.colour_model.prepare_observation(observation, soon)
-
     def learned(
         self,
         observation: IntegralHistogram | UInt8[Array, "h w 3"],
-        states: LearnedBoxState,
+        states: BoxState,
         rate: float,
-    ) -> LearnedBoxState:
+    ) -> BoxState:
         """The states, after rate · P(seen | x, y) (h(x) - appearance) is added to appearances."""
         log_seen, log_hidden, counts = self._seen(observation, states)
-        shown = normalise(counts, self.colour_model.colour_weights[states.reference])
+        shown = normalise(counts, self.own(states)[0])
         # A box that holds no pixel, or more than can be counted, has no colours to learn.
         some = jnp.any(shown > 0, axis=(1, 2, 3)) & jnp.all(jnp.isfinite(shown), axis=(1, 2, 3))
         share = jnp.where(some, rate * jax.nn.sigmoid(log_seen - log_hidden), 0.0)
         share = share.astype(shown.dtype)[:, None, None, None]
-        appearance = states.appearance + share * (
-            jnp.where(share > 0, shown, states.appearance) - states.appearance
-        )
-        return LearnedBoxState(states.box, states.reference, states.previous, appearance)
+        past: Any = states.appearance
+        change = jnp.where(share > 0, shown, past) - past
+        return _with_appearance(states, past + share * change)
 
     def _seen(
-        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: LearnedBoxState
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
     ) -> tuple[Float[Array, " n"], Float[Array, ""], Float[Array, "n parts channels bins"]]:
         """log of the two terms of the likelihood, and the colours in the boxes."""
-        model, bare = self.colour_model, _bare(states)
-        counts, sides = model.counts(observation, bare)
-        to_first = model.contrasted(counts, sides, bare, model.references[states.reference])
-        to_learned = model.contrasted(counts, sides, bare, states.appearance)
+        counts, sides = self.counts(observation, states)
+        weights, references = self.own(states)
+        to_first = self.distances(counts, sides, weights, references)
+        appearance: Any = states.appearance
+        to_learned = self.distances(counts, sides, weights, appearance)
         distances = self.anchor * to_first + (1 - self.anchor) * to_learned
-        log_hidden = -0.5 * self.hidden_distance / model.sigma**2
-        return -0.5 * distances / model.sigma**2, log_hidden.astype(distances.dtype), counts
+        log_hidden = -0.5 * self.hidden_distance / self.sigma**2
+        return -0.5 * distances / self.sigma**2, log_hidden.astype(distances.dtype), counts
 
 
 class AdaptAppearance(AbstractPropagation):
@@ -151,11 +119,7 @@ class AdaptAppearance(AbstractPropagation):
         )
 
 
-def _bare(states: LearnedBoxState) -> BoxState:
-    return BoxState(states.box, states.reference, states.previous)
-
-
 def _with_appearance(
     states: BoxState, appearance: Float[Array, "n parts channels bins"]
-) -> LearnedBoxState:
-    return LearnedBoxState(states.box, states.reference, states.previous, appearance)
+) -> BoxState:
+    return BoxState(states.box, states.reference, states.previous, appearance)

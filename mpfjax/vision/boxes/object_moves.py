@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import check_inner_share, check_positive, check_type
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractPropagation, AbstractRegrouping
+from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.objects.exclusion import AbstractExclusion
 
 
@@ -57,20 +57,6 @@ class ObjectExclusion(AbstractExclusion):
         total = jnp.sum(jnp.where(others, nearness, 0.0), axis=1)
         penalty = self.strength * total.astype(mixture.log_weights.dtype)
         return mixture.replace(log_weights=mixture.log_weights - penalty)
-
-
-class OneComponentAnObject(AbstractRegrouping):
-    """Put the particles of reference j into component j, as a start for hypotheses about it.
-
-    A filter needs as many components as there are references. Exact: a relabelling only.
-    """
-
-    def regroup(
-        self, key: Key[Array, ""], mixture: ParticleMixture
-    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
-        """The reference of every particle."""
-        del key
-        return mixture.particles.reference.astype(jnp.int32), mixture.memory
 
 
 class PruneHypotheses(AbstractPropagation):

@@ -18,16 +18,16 @@ from mpfjax.models.dynamics import AbstractDynamics, RandomWalkWithJumps, WalkWi
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping
 from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.propagation.propagate import Propagate
+from mpfjax.moves.regrouping.group_by import GroupBy
 from mpfjax.moves.regrouping.kmeans import KMeans
 from mpfjax.moves.regrouping.merge import Merge
 from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.transforms import with_resampling
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
-from mpfjax.vision.boxes.learned_colours import AdaptAppearance, LearnedBoxState, LearnedColourModel
+from mpfjax.vision.boxes.learned_colours import AdaptAppearance, LearnedColourModel
 from mpfjax.vision.boxes.object_moves import (
     ObjectExclusion,
-    OneComponentAnObject,
     PruneHypotheses,
 )
 from mpfjax.vision.colour.bins import RGBColours
@@ -99,7 +99,7 @@ def objects_filters(
     # Steps about a velocity are shorter than those of a random walk.
     steps = _steps(boxes) * np.array([0.3, 0.5, 1.0, 1.0])
     walk = _walking(_with_jumps(steps, probability=0.1, times=(8.0, 6.0)), boxes)
-    model = LearnedColourModel(_own_references(frame, boxes, steps, walk))
+    model: Any = _own_references(frame, boxes, steps, walk, kind=LearnedColourModel)
     apart = _apart(size)
     learn = AdaptAppearance(model, rate=0.03)
     num_components = most_components(len(boxes))
@@ -118,7 +118,8 @@ def objects_filters(
         ],
         num_particles=num_particles,
         num_components=num_components,
-        initial_moves=[OneComponentAnObject()],
+        # Each particle in the component of its object, as a start for hypotheses about it.
+        initial_moves=[GroupBy(_object)],
     )
     alone = Filter(model, moves=[Resample(), Propagate(model), learn], num_particles=num_particles)
     return {"pf": alone, "mpf": mixture}
@@ -135,10 +136,11 @@ def _own_references(
     deviations: np.ndarray,
     dynamics: AbstractDynamics,
     *,
+    kind: type[ColourModel] = ColourModel,
     switch_probability: float = 0.0,
 ) -> ColourModel:
     """Each box is a reference."""
-    return ColourModel.from_frame(
+    return kind.from_frame(
         frame,
         boxes,
         colours=RGBColours(16),
@@ -209,17 +211,17 @@ PRESETS = {
 }
 
 
-def _centre(states: BoxState | LearnedBoxState) -> Array:
+def _centre(states: BoxState) -> Array:
     return states.box[:, :2]
 
 
-def _object(states: BoxState | LearnedBoxState) -> Array:
+def _object(states: BoxState) -> Array:
     return states.reference
 
 
-def _reference(states: BoxState | LearnedBoxState) -> Array:
+def _reference(states: BoxState) -> Array:
     return states.reference[:, None].astype(states.box.dtype)
 
 
-def _centre_and_reference(states: BoxState | LearnedBoxState) -> Array:
+def _centre_and_reference(states: BoxState) -> Array:
     return jnp.concatenate([_centre(states), _reference(states)], axis=1)
