@@ -45,8 +45,7 @@ TABLE = {
     "ColourModel": (
         vision.ColourModel.from_frame,
         OF_FRAME,
-        COLOUR | {"colours": "kind?", "weigh_colours": "flag", "share_reference": "flag",
-                  "contrast": "not negative"},
+        COLOUR | {"colours": "kind?", "contrast": "not negative"},
     ),
     "joint_colour_model": (
         vision.joint_colour_model,
@@ -169,7 +168,7 @@ class TestFramesToDetectIn:
 
 
 @pytest.mark.usefixtures("as_installed")
-@pytest.mark.parametrize("frames", [None, 3, [None], [FRAME[0]], [FRAME.astype(float)]])
+@pytest.mark.parametrize("frames", [None, 3, [None], [FRAME[None]], [FRAME.astype(float)]])
 def test_a_video_of_no_frames_is_named(tmp_path, frames):
     pytest.importorskip("av", reason=VIDEO)
     with pytest.raises(ValueError, match=r"^frames: "):

@@ -28,7 +28,10 @@ def frame():
 
 # As one program: one operation after the other compiles longer.
 log_likelihood = eqx.filter_jit(ColourModel.log_likelihood)
-squared_distances = eqx.filter_jit(ColourModel.squared_distances)
+
+
+def squared_distances(model, observation, states):
+    return -2 * model.sigma**2 * log_likelihood(model, observation, states)
 
 
 def model_of(frame, **options):

@@ -120,8 +120,8 @@ def test_a_template_from_elsewhere(frame):
         learned.object_states(states_at(learned, *places), jnp.asarray(0, jnp.int32))
         for places in (centres(), centres()[[1, 1, 2]])
     )
-    assert own.squared_distances(jnp.asarray(frame), here)[0] > 0.3
-    assert own.squared_distances(jnp.asarray(frame), there)[0] < 0.05
+    assert -2 * own.sigma**2 * own.log_likelihood(jnp.asarray(frame), here)[0] > 0.3
+    assert -2 * own.sigma**2 * own.log_likelihood(jnp.asarray(frame), there)[0] < 0.05
     drawn = learned.sample_initial(KEY, 100).box[:, 0, :2].mean(axis=0)
     np.testing.assert_allclose(drawn, centres()[0], atol=1)
 

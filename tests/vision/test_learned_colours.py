@@ -21,9 +21,7 @@ BINS = 4
 
 
 def colour_model(contrast=0.0, kind=ColourModel):
-    return kind.from_frame(
-        FIRST, BOXES, colours=RGBColours(BINS), sigma=0.5, contrast=contrast
-    )
+    return kind.from_frame(FIRST, BOXES, colours=RGBColours(BINS), sigma=0.5, contrast=contrast)
 
 
 def learned_model(contrast=0.0, **options):

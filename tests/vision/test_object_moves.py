@@ -4,7 +4,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision.boxes.colour_model import BoxState
@@ -58,18 +57,3 @@ def test_pruning_compares_within_an_object_only():
 def test_both_say_that_they_are_approximate():
     assert ObjectExclusion().approximate
     assert PruneHypotheses().approximate
-
-
-@pytest.mark.parametrize(
-    ("name", "make"),
-    [
-        ("strength: 0", lambda: ObjectExclusion(strength=0)),
-        ("radius: -1", lambda: ObjectExclusion(radius=-1)),
-        ("scale", lambda: ObjectExclusion(scale=(1.0, 0.0))),
-        ("least_share: 0", lambda: PruneHypotheses(least_share=0)),
-        ("least_share: 1", lambda: PruneHypotheses(least_share=1)),
-    ],
-)
-def test_misuse_is_named(name, make):
-    with pytest.raises(ValueError, match=name):
-        make()

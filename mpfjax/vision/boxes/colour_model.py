@@ -233,6 +233,7 @@ class ColourModel(AbstractBoxModel):
             raise ValueError("boxes: there are none")
         check_boxes(boxes, *frame.shape[:2])
         colours = RGBColours() if colours is None else colours
+        check_type(AbstractColours, "AbstractColours such as RGBColours()", colours=colours)
         kind = "AbstractDynamics such as RandomWalk(deviations)"
         check_type(AbstractDynamics, kind, **given(dynamics=dynamics))
         deviations = positive_deviations(

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import check_positive, check_share, check_type
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
@@ -29,16 +28,11 @@ class LearnedColourModel(ColourModel):
     - `hidden_distance`: d_hidden, squared, in units of Σ_c B². In a street scene, people were at a
       distance of .2 from themselves, .5 to .7 from others and 1 or more from the background.
 
-    Raises `ValueError` for a share outside [0, 1] and a distance that is not positive. Use it where
-    objects hide behind others or turn round.
+    Use it where objects hide behind others or turn round.
     """
 
     anchor: float = eqx.field(static=True, default=0.2)
     hidden_distance: float = eqx.field(static=True, default=0.6)
-
-    def __check_init__(self) -> None:
-        check_share(anchor=self.anchor)
-        check_positive(hidden_distance=self.hidden_distance)
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> BoxState:
         """x_0 of the `ColourModel`, with the appearance of the reference."""
@@ -92,16 +86,11 @@ class AdaptAppearance(AbstractPropagation):
     Rival hypotheses learn different appearances. The `anchor` of the model keeps a share of the
     first frame's. The weights do not change.
 
-    The model changes with the data (`approximate` is true). Raises `TypeError` for another model
-    and `ValueError` for a rate outside [0, 1]. Use it after `Propagate`.
+    The model changes with the data (`approximate` is true). Use it after `Propagate`.
     """
 
     model: LearnedColourModel
     rate: float = eqx.field(static=True, default=0.1)
-
-    def __check_init__(self) -> None:
-        check_type(LearnedColourModel, "a LearnedColourModel", model=self.model)
-        check_share(rate=self.rate)
 
     approximate = True
     """appearances are learned from the same data that they explain."""

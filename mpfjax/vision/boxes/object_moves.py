@@ -4,7 +4,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_inner_share, check_positive, check_type
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.objects.exclusion import AbstractExclusion
@@ -24,21 +23,11 @@ class ObjectExclusion(AbstractExclusion):
     This is NOT part of the exact recursion. Objects interact as in a Markov random field, but
     through their means instead of their states. The marginal likelihood is biased (`approximate` is
     true). Use it after `Propagate`, where look-alikes cross.
-
-    Raises `ValueError` for a strength, radius or scale that is not positive.
     """
 
     strength: float = eqx.field(static=True, default=3.0)
     radius: float = eqx.field(static=True, default=0.5)
     scale: tuple[float, float] = eqx.field(static=True, default=(1.0, 1.0))
-
-    def __check_init__(self) -> None:
-        check_positive(strength=self.strength, radius=self.radius)
-        check_type(tuple, "a tuple (width, height)", scale=self.scale)
-        if len(self.scale) != 2:
-            raise ValueError(f"scale: {self.scale} is not (width, height)")
-        for unit in self.scale:
-            check_positive(scale=unit)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -66,14 +55,9 @@ class PruneHypotheses(AbstractPropagation):
     the same reference. Within one object the mixture weights are the posterior odds of its
     hypotheses (Vermaak et al. 2003, eq. 4). Each component that dies takes away at most this share
     of its object's mass. Use it with `Split`, to remove hypotheses that turned out wrong.
-
-    Raises `ValueError` for a share outside (0, 1).
     """
 
     least_share: float = eqx.field(static=True, default=1e-6)
-
-    def __check_init__(self) -> None:
-        check_inner_share(least_share=self.least_share)
 
     approximate = True
     """the mass of the pruned components is lost."""

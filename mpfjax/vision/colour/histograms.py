@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped, UInt8
 
-from mpfjax.checks import check_flag, check_shape, check_type, check_whole
 from mpfjax.operations.stored import stored
 from mpfjax.vision.colour.bins import AbstractColours
 from mpfjax.vision.files.frames import check_frame
@@ -52,11 +51,8 @@ class IntegralHistogram(eqx.Module):
         height]. A pixel belongs to a box that covers its centre. Boxes that leave the frame are
         clipped to it. A box that lies wholly outside, has no area or is not finite has zero counts.
         The counts of a box with more than `largest_box` pixels are NaN, since zeros would mean that
-        it has none of a colour. Raises `ValueError` for boxes that are no array of four numbers
-        each and a number of parts that is no whole number from 1 on.
+        it has none of a colour.
         """
-        check_shape("n 4", boxes=boxes)
-        check_whole(num_parts=num_parts)
         edges = jnp.concatenate(box_edges(boxes, num_parts, self.height, self.width), axis=1)
         # Otherwise XLA finds them again in each operation that uses the counts.
         edges = stored(edges)
@@ -88,8 +84,6 @@ def integral_histogram(
     `ValueError` for a frame of one channel or not of eight bits.
     """
     check_frame(frame)
-    check_type(AbstractColours, "AbstractColours such as RGBColours()", colours=colours)
-    check_flag(wide_counts=wide_counts, soon=soon)
     height, width, _ = frame.shape
     table = _table(frame, colours, wide_counts, soon)
     return IntegralHistogram(table, colours.num_channels, colours.num_bins, height, width)
@@ -115,12 +109,8 @@ def bhattacharyya(
     """B² = 1 - Σ_b sqrt(h_b r_b), the squared Bhattacharyya distance of normalised histograms.
 
     Vermaak et al. (2003), section 5.2. Between 0, for equal histograms, and 1, for histograms that
-    share no colour; an empty histogram shares none. The square is what the likelihood needs. Raises
-    `ValueError` for anything but arrays, and for different numbers of bins.
+    share no colour; an empty histogram shares none. The square is what the likelihood needs.
     """
-    check_shape("... bins", histograms=histograms, references=references)
-    if histograms.shape[-1] != references.shape[-1]:
-        raise ValueError(f"references: {references.shape} has not the bins of {histograms.shape}")
     return jnp.clip(1 - jnp.sum(jnp.sqrt(histograms * references), axis=-1), 0.0, 1.0)
 
 
