@@ -21,10 +21,10 @@ def _counted(looked, num_parts):
     return looked.counts(num_parts)
 
 
-def counted(boxes, colours, num_parts=1, frame=FRAME, **points):
+def counted(boxes, colours, num_parts=1, frame=FRAME):
     """As one program: one operation after the other compiles longer."""
     boxes = np.asarray(boxes, np.float32)
-    return _counted(SampledBoxes.of(frame, boxes, colours, num_parts, **points), num_parts)
+    return _counted(SampledBoxes.of(frame, boxes, colours), num_parts)
 
 
 def one_by_one(frame, box, colours, rows, columns, num_parts):
@@ -44,15 +44,9 @@ def one_by_one(frame, box, colours, rows, columns, num_parts):
 @pytest.mark.parametrize("colours", [HSVColours(4, 2, 2), RGBColours(5)], ids=["hsv", "rgb"])
 @pytest.mark.parametrize("num_parts", [1, 3])
 def test_every_point_counts_once(colours, num_parts):
-    counts = np.asarray(counted(BOXES, colours, num_parts, rows=6, columns=4))
-    expected = [one_by_one(FRAME, box, colours, 6, 4, num_parts) for box in BOXES]
+    counts = np.asarray(counted(BOXES, colours, num_parts))
+    expected = [one_by_one(FRAME, box, colours, 18, 8, num_parts) for box in BOXES]
     np.testing.assert_array_equal(counts, expected)
-
-
-@pytest.mark.thorough
-def test_rows_are_made_up_to_whole_bands():
-    counts = counted(BOXES[:1], HSVColours(4, 2, 2), 3, rows=7, columns=4)
-    np.testing.assert_array_equal(np.asarray(counts).sum(axis=(2, 3)), [[12, 12, 12]])
 
 
 @pytest.mark.parametrize(
@@ -60,10 +54,6 @@ def test_rows_are_made_up_to_whole_bands():
     [
         [-50, 10, 8, 8],
         [10, 200, 8, 8],
-        [10, 10, 0, 8],
-        [10, 10, 8, -3],
-        [np.nan, 10, 8, 8],
-        [10, 10, np.inf, 8],
         [3e9, 10, 8, 8],
     ],
 )
@@ -89,11 +79,7 @@ def test_distances_are_nearly_those_of_all_pixels():
     assert np.asarray(bhattacharyya(sampled, exact)).mean() < 0.02
 
 
-def test_a_bad_frame_and_bands_that_do_not_fit_are_named(as_installed):
+def test_a_bad_frame_is_named(as_installed):
     for frame in (np.zeros((3, 4), np.uint8), np.zeros((3, 4, 3), np.float32)):
         with pytest.raises(ValueError, match=r"^frame: "):
-            SampledBoxes.of(frame, BOXES, HSVColours(), 1)
-    looked = SampledBoxes.of(FRAME, BOXES, HSVColours(), 3, rows=6, columns=4)
-    assert (int(looked.height), int(looked.width)) == FRAME.shape[:2]
-    with pytest.raises(ValueError, match="num_parts: 4 does not divide the 6 rows"):
-        looked.counts(4)
+            SampledBoxes.of(frame, BOXES, HSVColours())

@@ -1,7 +1,5 @@
 """Colour histograms of boxes from a grid of points in each, at any size of frame and box."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +10,7 @@ from mpfjax.operations.segments import segment_counts
 from mpfjax.vision.colour.bins import AbstractColours
 from mpfjax.vision.files.frames import check_frame
 
-ROWS, COLUMNS = 18, 8
+_ROWS, _COLUMNS = 18, 8
 
 
 class SampledBoxes(eqx.Module):
@@ -38,29 +36,21 @@ class SampledBoxes(eqx.Module):
         frame: UInt8[np.ndarray, "h w 3"],
         boxes: Float[np.ndarray, "d 4"],
         colours: AbstractColours,
-        num_parts: int,
-        rows: int = ROWS,
-        columns: int = COLUMNS,
     ) -> "SampledBoxes":
-        """Sample boxes (x, y, w, h) about their centre, in `num_parts` bands.
+        """Sample boxes (x, y, w, h) about their centre.
 
         Raises `ValueError` for a frame that is not (h, w, 3) of type uint8.
         """
         check_frame(frame)
         height, width = frame.shape[:2]
-        rows = -(-rows // num_parts) * num_parts
-        row, column, inside = _points(boxes, rows, columns, height, width)
+        row, down = _points(boxes[:, 1], boxes[:, 3], _ROWS, height)
+        column, across = _points(boxes[:, 0], boxes[:, 2], _COLUMNS, width)
         pixels = frame[row[:, :, None], column[:, None, :]]
+        inside = down[:, :, None] & across[:, None, :]
         return cls(pixels, inside, np.asarray(height), np.asarray(width), colours)
 
     def counts(self, num_parts: int = 1) -> Float[Array, "d parts channels bins"]:
-        """Points of each colour in each box, cut into `num_parts` bands from top to bottom.
-
-        Raises `ValueError` for a number of bands into which the rows cannot be divided.
-        """
-        rows = self.pixels.shape[1]
-        if rows % num_parts:
-            raise ValueError(f"num_parts: {num_parts} does not divide the {rows} rows of points")
+        """Points of each colour in each box, cut into 1, 2 or 3 bands from top to bottom."""
         pixels, n = jnp.asarray(self.pixels), len(self.pixels)
         channels, bins = self.colours.num_channels, self.colours.num_bins
         drawn = self.colours.bins(pixels.reshape(n, -1, 3)).reshape(n, num_parts, -1, channels)
@@ -73,19 +63,10 @@ class SampledBoxes(eqx.Module):
 
 
 def _points(
-    boxes: np.ndarray, rows: int, columns: int, height: int, width: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows and columns of the boxes' points in the frame, and whether they are in it."""
-    y = boxes[:, 1, None] + boxes[:, 3, None] * _grid(rows, boxes.dtype)
-    x = boxes[:, 0, None] + boxes[:, 2, None] * _grid(columns, boxes.dtype)
-    sized = np.all(np.isfinite(boxes), axis=1) & np.all(boxes[:, 2:] > 0, axis=1)
-    down = np.expand_dims(sized, 1) & (y >= 0) & (y < height)
-    across = np.expand_dims(sized, 1) & (x >= 0) & (x < width)
-    row = np.where(down, y, 0.0).astype(np.int32)
-    column = np.where(across, x, 0.0).astype(np.int32)
-    return row, column, down[:, :, None] & across[:, None, :]
-
-
-def _grid(number: int, dtype: Any) -> np.ndarray:
-    """The centres of equal parts of [-1/2, 1/2]."""
-    return ((np.arange(number, dtype=dtype) + 0.5) / number - 0.5)[None].astype(dtype)
+    centres: np.ndarray, lengths: np.ndarray, number: int, size: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The pixels of points at the centres of equal parts, and whether they are in the frame."""
+    shares = (np.arange(number, dtype=centres.dtype) + 0.5) / number - 0.5
+    places = np.expand_dims(centres, 1) + np.expand_dims(lengths, 1) * np.expand_dims(shares, 0)
+    inside = (places >= 0) & (places < size)
+    return np.where(inside, places, 0.0).astype(np.int32), inside

@@ -185,22 +185,17 @@ class Sieve:
                     f"min_score: {self.min_score} is given, and detections have no scores"
                 )
             keep &= scores >= self.min_score
-        flat = keep & ~(boxes[:, 2:] > 0).all(axis=1)
-        if flat.any():
-            self.once.warn("flat", f"detections: frame {number} has boxes of no area; left out")
-        keep &= ~flat
         frame_size = self.frame_size if frame is None else frame.shape[:2]
-        if frame_size is not None:
-            height, width = frame_size
-            far = boxes[:, :2] + boxes[:, 2:]
-            inside = (far > 0).all(axis=1) & (boxes[:, 0] < width) & (boxes[:, 1] < height)
-            if np.any(keep & ~inside):
-                size = f"{width} x {height}"
-                self.once.warn(
-                    "outside",
-                    f"detections: frame {number} has boxes outside the frame, {size}; left out",
-                )
-            keep &= inside
+        height, width = (np.inf, np.inf) if frame_size is None else frame_size
+        low, far = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
+        inside = ((far > 0) & (low < [width, height])).all(axis=1) | (frame_size is None)
+        for what, good in (
+            ("of no area", (boxes[:, 2:] > 0).all(axis=1)),
+            (f"outside the frame, {width} x {height}", inside),
+        ):
+            if np.any(keep & ~good):
+                self.once.warn(what, f"detections: frame {number} has boxes {what}; left out")
+            keep &= good
         kept = DetectedBoxes(boxes[keep], None if scores is None else scores[keep])
         return kept, np.flatnonzero(keep).astype(np.int32)
 
@@ -221,38 +216,29 @@ class Once:
 def _as_found(value: Any, number: int) -> DetectedBoxes:
     """A pair of boxes and scores, whether the user gave both or boxes alone."""
     boxes, scores = value if isinstance(value, tuple) and len(value) == 2 else (value, None)
+    named = f"detections: frame {number}"
     if boxes is None:
-        raise ValueError(f"detections: frame {number}: None is no array; [] has no detections")
-    rows = to_masked_rows(4, f"detections: frame {number}", boxes)
-    return DetectedBoxes(rows, None if scores is None else _as_scores(scores, number))
-
-
-def _as_scores(scores: Any, number: int) -> np.ndarray:
-    try:
-        return np.asanyarray(scores, float).reshape(-1)
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"detections: frame {number}: scores {shown(scores)} are no numbers"
-        ) from error
+        raise ValueError(f"{named}: None is no array; [] has no detections")
+    if scores is not None:
+        try:
+            scores = np.asanyarray(scores, float).reshape(-1)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{named}: scores {shown(scores)} are no numbers") from error
+    return DetectedBoxes(to_masked_rows(4, named, boxes), scores)
 
 
 def _present(found: DetectedBoxes, number: int) -> tuple[DetectedBoxes, Bool[np.ndarray, " k"]]:
     """The boxes and scores without masks, and which of them are detections."""
-    boxes, scores = np.ma.getdata(found.boxes), found.scores
-    present = np.logical_not(np.any(np.ma.getmaskarray(found.boxes), axis=1))
-    if not np.isfinite(boxes[present]).all():
-        raise ValueError(f"detections: frame {number}: {shown(boxes)} is not finite")
-    if scores is not None:
-        if len(scores) != len(boxes):
-            raise ValueError(
-                f"detections: frame {number}: {len(scores)} scores for {len(boxes)} boxes"
-            )
-        if np.ma.is_masked(scores[present]):
-            raise ValueError(f"detections: frame {number}: scores {shown(scores)} are masked")
-        scores = np.ma.getdata(scores)
-        if not np.isfinite(scores[present]).all():
-            raise ValueError(f"detections: frame {number}: scores {shown(scores)} are not finite")
-    return DetectedBoxes(boxes, scores), present
+    boxes, scores = found
+    present = np.logical_not(np.any(np.ma.getmaskarray(boxes), axis=1))
+    named = f"detections: frame {number}"
+    if scores is not None and len(scores) != len(boxes):
+        raise ValueError(f"{named}: {len(scores)} scores for {len(boxes)} boxes")
+    for what, values in (("", boxes), ("scores ", scores)):
+        if values is not None and not np.isfinite(np.ma.filled(values[present], np.nan)).all():
+            raise ValueError(f"{named}: {what}{shown(values)} is not finite, or masked")
+    kept = None if scores is None else np.ma.getdata(scores)
+    return DetectedBoxes(np.ma.getdata(boxes), kept), present
 
 
 def _warn(message: str) -> None:

@@ -64,8 +64,10 @@ class Detections(eqx.Module):
         # A single box without its axis is more likely a slip than meant.
         if len(rows) > 0 and np.ndim(boxes) != 2:
             raise ValueError(f"boxes: shape {np.shape(boxes)} is not (k, 4), of boxes x,y,w,h")
-        strengths = _checked_scores(scores, len(rows))
-        classes = _checked_labels(labels, len(rows))
+        strengths = _one_each("scores", scores, len(rows), 1)
+        classes = _one_each("labels", labels, len(rows), 0)
+        if not np.array_equal(classes, np.abs(classes).astype(np.int32)):
+            raise ValueError(f"labels: {shown(classes)} are not all whole numbers from 0 on")
         present = np.flatnonzero(~np.any(np.ma.getmaskarray(rows), axis=1))
         rows, strengths = centred(rows.data[present]), strengths[present]
         corner = np.zeros(2) if origin is None else np.asarray(origin, float)
@@ -73,21 +75,23 @@ class Detections(eqx.Module):
         _check_float32(rows)
         strongest = np.lexsort((-rows[:, 2] * rows[:, 3], -strengths))[:max_detections]
         kept = np.sort(strongest)
-        padded = np.ones((max_detections, 4), np.float32)
-        padded[: len(kept)] = rows[kept]
-        padded_scores = np.zeros(max_detections, np.float32)
-        padded_scores[: len(kept)] = strengths[kept]
-        padded_rows = np.full(max_detections, -1, np.int32)
-        padded_rows[: len(kept)] = present[kept]
-        padded_labels = np.zeros(max_detections, np.int32)
-        padded_labels[: len(kept)] = classes[present[kept]]
-        valid = np.arange(max_detections) < len(kept)
-        extent = _UNBOUNDED
+        extent = np.array(_UNBOUNDED, np.float32)
         if frame_size is not None:
             height, width = frame_size
             extent = np.array([*-corner, *([width, height] - corner)], np.float32)
+
+        def padded(values: np.ndarray, none: float, dtype: Any) -> Array:
+            places = np.full((max_detections, *values.shape[1:]), none, dtype)
+            places[: len(kept)] = values
+            return jnp.asarray(places)
+
         return cls(
-            *map(jnp.asarray, (padded, valid, padded_scores, padded_rows, extent, padded_labels))
+            boxes=padded(rows[kept], 1, np.float32),
+            valid=padded(np.ones(len(kept)), 0, bool),
+            scores=padded(strengths[kept], 0, np.float32),
+            rows=padded(present[kept], -1, np.int32),
+            extent=jnp.asarray(extent),
+            labels=padded(classes[present[kept]], 0, np.int32),
         )
 
     def rows_of(self, indices: Int[Array, " m"]) -> Int[Array, " m"]:
@@ -122,25 +126,11 @@ def _check_float32(boxes: Float[np.ndarray, "k 4"]) -> None:
         )
 
 
-def _checked_scores(scores: Any, number: int) -> np.ndarray:
-    """A finite score for each box, all one where none are given."""
-    if scores is None:
-        return np.ones(number, np.float32)
-    values = np.asarray(as_numbers("scores", scores, floating=True), np.float32)
+def _one_each(name: str, values: Any, number: int, none: int) -> np.ndarray:
+    """A finite number for each box, the same one for all where none are given."""
+    values = np.asarray(as_numbers(name, np.full(number, none) if values is None else values))
     if values.shape != (number,):
-        raise ValueError(f"scores: shape {values.shape} is not that of one a box, ({number},)")
+        raise ValueError(f"{name}: shape {values.shape} is not that of one a box, ({number},)")
     if not np.isfinite(values).all():
-        raise ValueError(f"scores: {shown(values)} are not all finite")
+        raise ValueError(f"{name}: {shown(values)} are not all finite")
     return values
-
-
-def _checked_labels(labels: Any, number: int) -> np.ndarray:
-    """A whole number from 0 on for each box, all 0 where none are given."""
-    if labels is None:
-        return np.zeros(number, np.int32)
-    values = np.asarray(as_numbers("labels", labels))
-    if values.shape != (number,):
-        raise ValueError(f"labels: shape {values.shape} is not that of one a box, ({number},)")
-    if not np.all((values >= 0) & (values == values.astype(np.int32))):
-        raise ValueError(f"labels: {shown(values)} are not all whole numbers from 0 on")
-    return values.astype(np.int32)

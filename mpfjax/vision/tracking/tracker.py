@@ -15,7 +15,6 @@ from mpfjax.checks import (
     check_type,
     check_whole,
     given,
-    shown,
 )
 from mpfjax.vision.colour.bins import HSVColours
 from mpfjax.vision.colour.histograms import normalise
@@ -157,16 +156,13 @@ class ObjectTracker(eqx.Module):
 
         Raises `ValueError` for a frame as `step` does.
         """
-        return SampledBoxes.of(np.asarray(frame), np.asarray(detections.boxes), _COLOURS, _BANDS)
+        return SampledBoxes.of(np.asarray(frame), np.asarray(detections.boxes), _COLOURS)
 
 
 def _checked_scores(scores: Any) -> str | tuple[float, float]:
-    if isinstance(scores, str) and scores in ("learned", "ignore"):
-        return scores
     if not isinstance(scores, tuple) or len(scores) != 2:
-        raise ValueError(
-            f'scores: {shown(scores)} is neither "learned" nor "ignore", nor a pair (weak, strong)'
-        )
+        check_one_of(("learned", "ignore", "(weak, strong)"), scores=scores)
+        return scores
     weak, strong = scores
     check_finite(**{"scores: weak": weak, "scores: strong": strong})
     if weak > strong:
@@ -279,9 +275,8 @@ def advanced(
     overlaps = jnp.where(alike, overlap(boxes, boxes), 0.0)
     doubles = state.doubles.after(lives.identities, stays, taken.there, overlaps)
     lives = lives._replace(shown=lives.shown & ~doubles.doubtful)
-    teaches = taken.strong & stays
+    teaches, there = taken.strong & stays, taken.there & stays
     known, grown = teaches & lives.confirmed & (lives.seen >= _FIRST), lives.seen == _FIRST
-    there = taken.there & stays
     noise = noise.after(taken.place, there, known, born, teaches & grown, objects)
     colours = state.colours
     if found.colours is not None:
