@@ -23,8 +23,7 @@ from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
 from mpfjax.moves.regrouping.features import Scale
 from mpfjax.moves.regrouping.kmeans import KMeans
 from mpfjax.moves.regrouping.merge import Merge
-from mpfjax.moves.regrouping.pool import Pool
-from mpfjax.moves.regrouping.random_partition import RandomPartition
+from mpfjax.moves.regrouping.partitions import Pool, RandomPartition
 from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration
@@ -113,7 +112,7 @@ def mixture_particle_filter(
     chosen by y_1 among four draws a particle; `with_selected_start` changes their number.
 
     - `features`, `scale`: the coordinates and units in which the grouping moves see the particles,
-      those of x_0 too (see `Features`; features of one particle, if the model is wrapped by
+      those of x_0 too (see `KMeans`; features of one particle, if the model is wrapped by
       `per_particle`).
     - `regroup`: moves in the place of `Merge`, `Split` and `KMeans`, with features and thresholds
       of their own.

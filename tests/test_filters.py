@@ -537,8 +537,8 @@ class TestWhatAUserHandsIt:
         regrouping = [m for m in (*filter.moves, *filter._initial_moves) if hasattr(m, "features")]
         assert len(regrouping) == 4
         for move in regrouping:
-            assert move.features.function is first
-            assert move.features.scale == (3.0,)
+            assert move.features is first
+            assert move.scale == (3.0,)
         own = mpfjax.KMeans(2, features=lambda states: states[:, 1])
         filter = getattr(mpfjax, make)(Drift(), 20, 2, regroup=[own], regroup_every=1)
         assert own in filter.moves

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpfjax.mixture import flatten_states, single_component
-from mpfjax.moves.regrouping.features import Features
+from mpfjax.moves.regrouping.features import ByFeatures
 from tests.examples import example_mixtures, log_masses, make_mixture
 
 MIXTURES = example_mixtures()
@@ -149,7 +149,7 @@ class TestStatesThatAreNotFloats:
 
     def test_regrouping_measures_whole_numbers_in_any_unit(self):
         mixture, states = self.mixture()
-        features = Features(lambda state: state["mode"], 0.5)(mixture)
+        features = ByFeatures(features=lambda state: state["mode"], scale=0.5).features_of(mixture)
         filled = np.asarray(mixture.occupied)
         modes = 2.0 * states["mode"][filled]
         np.testing.assert_allclose(np.asarray(features)[filled, 0], modes - modes.mean(), atol=1e-5)

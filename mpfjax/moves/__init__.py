@@ -25,12 +25,11 @@ from mpfjax.moves.propagation.regimes import PropagateRegimes as PropagateRegime
 from mpfjax.moves.propagation.regimes import RegimeProposal as RegimeProposal
 from mpfjax.moves.propagation.tempered import PropagateTempered as PropagateTempered
 from mpfjax.moves.prune import Prune as Prune
-from mpfjax.moves.regrouping.features import Features as Features
-from mpfjax.moves.regrouping.group_by import GroupBy as GroupBy
 from mpfjax.moves.regrouping.kmeans import KMeans as KMeans
 from mpfjax.moves.regrouping.merge import Merge as Merge
-from mpfjax.moves.regrouping.pool import Pool as Pool
-from mpfjax.moves.regrouping.random_partition import RandomPartition as RandomPartition
+from mpfjax.moves.regrouping.partitions import GroupBy as GroupBy
+from mpfjax.moves.regrouping.partitions import Pool as Pool
+from mpfjax.moves.regrouping.partitions import RandomPartition as RandomPartition
 from mpfjax.moves.regrouping.split import Split as Split
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample as AuxiliaryResample
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration as GaussianRegeneration

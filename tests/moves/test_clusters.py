@@ -12,7 +12,6 @@ import pytest
 import mpfjax
 from mpfjax import MultiObjectModel, PairwiseRepulsion, PropagateInClusters
 from mpfjax.exact import kalman_filter
-from mpfjax.moves.objects.coupling import connected
 from tests.examples import stack, walker
 
 KEY = jax.random.key(0)
@@ -222,13 +221,6 @@ NOTHING = jnp.zeros((4, 1))
 
 
 class TestClusters:
-    def test_components_are_what_can_be_reached(self):
-        links = np.zeros((6, 6), bool)
-        for i, j in ((0, 3), (3, 5), (1, 4)):
-            links[i, j] = links[j, i] = True
-        assert connected(jnp.asarray(links)).tolist() == [0, 1, 2, 0, 1, 0]
-        assert connected(jnp.zeros((1, 1), bool)).tolist() == [0]
-
     def test_who_touches_merges_and_stays(self):
         """Object 2 touches 0 and 3, which do not touch each other."""
         filter = mpfjax.clustered_particle_filter(STILL, 30)

@@ -6,18 +6,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.checks import check_one_of, check_whole, given
-from mpfjax.mixture import ParticleMixture, no_ancestors, single_component
+from mpfjax.mixture import ParticleMixture, no_ancestors
 from mpfjax.models.base import require
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
-from mpfjax.moves.objects.coupling import connected, coupled, together
+from mpfjax.moves.objects.coupling import coupled, together
+from mpfjax.moves.objects.independent import drawn_rows, moved_objects, rows_of_each
 from mpfjax.moves.objects.recombination import recombined, rotated, scores
+from mpfjax.moves.regrouping.merge import lowest_connected
 from mpfjax.moves.resampling.allocation import require_equal_rows
 from mpfjax.moves.resampling.ancestors import SCHEMES
-from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.logarithms import default_float, finite_max
-from mpfjax.operations.random import split
-from mpfjax.operations.stored import take
+from mpfjax.operations.floats import default_float
+from mpfjax.operations.generator import split
+from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import finite_max
 
 STARTS = ("apart", "together")
 
@@ -130,17 +132,8 @@ class PropagateInClusters(AbstractPropagation):
         keys = split(key, 2 * num_objects + 2)
         keys_objects, keys_rows = keys[:num_objects], keys[num_objects : 2 * num_objects]
         key_inside, key_shift = keys[2 * num_objects :]
-        seen = self.model.prepare_observation(observation)
         particles, memory = mixture.particles, mixture.memory["clusters"]
-
-        def move(key: Key[Array, ""], states: PyTree, j: Int[Array, ""]) -> tuple:
-            points = self.model.sample_object_transition(key, states, j)
-            log_likelihood = self.model.object_log_likelihood(seen, points, j)
-            return points, log_likelihood.astype(default_float())
-
-        points, log_likelihoods = jax.vmap(move, in_axes=(0, 1, 0), out_axes=(1, 0))(
-            keys_objects, particles, jnp.arange(num_objects, dtype=jnp.int32)
-        )
+        points, log_likelihoods = moved_objects(self.model, keys_objects, particles, observation)
         common = jax.vmap(finite_max)(log_likelihoods)
         log_likelihoods = log_likelihoods - common[:, None]
         if self._may_be_joint:
@@ -150,7 +143,7 @@ class PropagateInClusters(AbstractPropagation):
             )
         else:
             rows, log_growth = self._resampled(keys_rows, memory["labels"], log_likelihoods)
-            particles = _rows_of_each(points, rows)
+            particles = rows_of_each(points, rows)
         particles = _shifted(key_shift, particles, memory["labels"])
         moved = mixture.replace(
             particles=particles,
@@ -202,10 +195,10 @@ class PropagateInClusters(AbstractPropagation):
             # Without this, rounding could redraw equal weights.
             unmoved = jnp.arange(last.shape[1], dtype=last.dtype)
             last = jnp.where(alone[:, None], unmoved[None], last)
-            return _rows_of_each(chosen, last), log_gain
+            return rows_of_each(chosen, last), log_gain
 
         def stay() -> tuple[PyTree, Float[Array, ""]]:
-            return _rows_of_each(points, rows), jnp.zeros((), default_float())
+            return rows_of_each(points, rows), jnp.zeros((), default_float())
 
         particles, log_gain = jax.lax.cond(jnp.all(alone), stay, cross)
         return particles, log_growth + log_gain
@@ -217,7 +210,7 @@ class PropagateInClusters(AbstractPropagation):
         if self.split_after is not None:
             steps_apart = jnp.where(meets, 0, steps_apart + 1)
             links = links & (steps_apart < self.split_after)
-        return {"labels": connected(links | meets), "steps_apart": steps_apart}
+        return {"labels": lowest_connected(links | meets), "steps_apart": steps_apart}
 
     def _resampled(
         self,
@@ -226,21 +219,9 @@ class PropagateInClusters(AbstractPropagation):
         log_weights: Float[Array, "objects n"],
     ) -> tuple[Int[Array, "objects n"], Float[Array, ""]]:
         """Each object's rows drawn anew, alike in a cluster, and log Π of the mean weights."""
-        resample = Resample(self.scheme)
-
-        def draw(key: Key[Array, ""], log_weights: Float[Array, " n"]) -> tuple:
-            cloud = single_component(log_weights).weighed(log_weights)
-            return resample(key, cloud).ancestor_indices, cloud.log_mass
-
-        rows, log_growths = jax.vmap(draw)(take(keys, labels), log_weights)
+        rows, log_growths = drawn_rows(self.scheme, take(keys, labels), log_weights)
         is_first = labels == jnp.arange(len(labels), dtype=labels.dtype)
         return rows, jnp.sum(jnp.where(is_first, log_growths, 0.0))
-
-
-def _rows_of_each(particles: PyTree, rows: Int[Array, "objects n"]) -> PyTree:
-    """Every object's states, from rows chosen for each object."""
-    gather = jax.vmap(take, in_axes=(1, 0), out_axes=1)
-    return jax.tree.map(lambda leaf: gather(leaf, rows), particles)
 
 
 def _shifted(key: Key[Array, ""], particles: PyTree, labels: Int[Array, " objects"]) -> PyTree:
@@ -251,4 +232,4 @@ def _shifted(key: Key[Array, ""], particles: PyTree, labels: Int[Array, " object
     """
     places = jnp.arange(jax.tree.leaves(particles)[0].shape[0], dtype=jnp.int32)
     keys = take(split(key, len(labels)), labels)
-    return _rows_of_each(particles, jax.vmap(rotated, in_axes=(0, None))(keys, places))
+    return rows_of_each(particles, jax.vmap(rotated, in_axes=(0, None))(keys, places))

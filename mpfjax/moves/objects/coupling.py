@@ -50,14 +50,6 @@ def together(labels: Int[Array, " objects"]) -> Bool[Array, "objects objects"]:
     return labels[:, None] == labels[None]
 
 
-def connected(linked: Bool[Array, "objects objects"]) -> Int[Array, " objects"]:
-    """The first object that each can be reached from; `linked` is symmetric."""
-    reach = linked | jnp.eye(len(linked), dtype=bool)
-    for _ in range(max(len(linked) - 1, 1).bit_length()):
-        reach = jnp.any(reach[:, :, None] & reach[None], axis=1)
-    return jnp.argmax(reach, axis=1).astype(jnp.int32)
-
-
 def alike(state: PyTree, others: PyTree) -> PyTree:
     """The same state repeated beside each of the other object's states."""
     return jax.tree.map(lambda a, b: jnp.broadcast_to(a[None], b.shape), state, others)

@@ -1,7 +1,5 @@
 """Exclusion: components repel each other, so that no two end on one object."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
@@ -9,7 +7,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import check_positive
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
-from mpfjax.moves.regrouping.features import Features, Scale, summarise
+from mpfjax.moves.regrouping.features import ByFeatures, summarise
 
 
 class AbstractExclusion(AbstractPropagation):
@@ -33,7 +31,7 @@ class AbstractExclusion(AbstractPropagation):
         return jnp.exp(-squared_distances / (2 * self.radius**2))
 
 
-class Exclusion(AbstractExclusion):
+class Exclusion(AbstractExclusion, ByFeatures):
     """Lower the weights of particles near the predicted means of the other components.
 
         log-weight_i -= strength · Σ_{m ≠ c_i} exp(-|x_i - μ_m|² / (2 radius²))
@@ -52,22 +50,11 @@ class Exclusion(AbstractExclusion):
     Raises `ValueError` for a strength or radius that is not positive.
     """
 
-    strength: float = eqx.field(static=True)
-    radius: float = eqx.field(static=True)
-    features: Features
+    strength: float = eqx.field(static=True, default=10.0)
+    radius: float = eqx.field(static=True, default=0.5)
 
-    def __init__(
-        self,
-        strength: float = 10.0,
-        radius: float = 0.5,
-        *,
-        features: Callable[[PyTree], Array] | None = None,
-        scale: Scale = 1.0,
-    ) -> None:
-        check_positive(strength=strength, radius=radius)
-        self.strength = strength
-        self.radius = radius
-        self.features = Features(features, scale)
+    def __check_init__(self) -> None:
+        check_positive(strength=self.strength, radius=self.radius)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -76,16 +63,11 @@ class Exclusion(AbstractExclusion):
         del key, observation
         if mixture.num_components == 1:
             return mixture
-        return mixture.weighed(-self.strength * self._nearness_to_others(mixture))
-
-    def _nearness_to_others(self, mixture: ParticleMixture) -> Float[Array, " n"]:
-        features = self.features(mixture)
-        own = mixture.component_indicators
-        groups = summarise(
-            features, mixture.occupied.astype(features.dtype), own, mixture.num_components
-        )
+        features, own = self.features_of(mixture), mixture.component_indicators
+        weights = mixture.occupied.astype(features.dtype)
+        groups = summarise(features, weights, own, mixture.num_components)
         total = jnp.zeros(mixture.num_particles, features.dtype)
         for m in range(mixture.num_components):
             square = jnp.sum((features - groups.means[m][None]) ** 2, axis=1)
             total += jnp.where((own != m) & groups.alive[m], self.nearness(square), 0.0)
-        return total
+        return mixture.weighed(-self.strength * total)

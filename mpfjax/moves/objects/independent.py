@@ -12,7 +12,9 @@ from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling.allocation import require_equal_rows
 from mpfjax.moves.resampling.ancestors import SCHEMES
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.random import split
+from mpfjax.operations.floats import default_float
+from mpfjax.operations.generator import split
+from mpfjax.operations.indexing import take
 
 
 class PropagateIndependently(AbstractPropagation):
@@ -54,29 +56,51 @@ class PropagateIndependently(AbstractPropagation):
         num_objects = self.model.num_objects
         # The objects' keys are those of the joint draw, so that one object is a plain filter.
         keys = split(key, 2 * num_objects)
-        seen = self.model.prepare_observation(observation)
-
-        def step(
-            key: Key[Array, ""], key_resample: Key[Array, ""], states: PyTree, j: Int[Array, ""]
-        ) -> tuple[PyTree, Float[Array, ""]]:
-            states = self.model.sample_object_transition(key, states, j)
-            log_likelihood = self.model.object_log_likelihood(seen, states, j)
-            cloud = single_component(states).weighed(log_likelihood)
-            drawn = Resample(self.scheme)(key_resample, cloud).particles
-            # An object whose particles all have zero likelihood moves by its dynamics alone.
-            has_mass = cloud.log_mass > -jnp.inf
-            pick = lambda new, old: jnp.where(has_mass, new, old)  # noqa: E731
-            return jax.tree.map(pick, drawn, states), cloud.log_mass
-
-        particles, log_growths = jax.vmap(step, in_axes=(0, 0, 1, 0), out_axes=(1, 0))(
-            keys[:num_objects],
-            keys[num_objects:],
-            mixture.particles,
-            jnp.arange(num_objects, dtype=jnp.int32),
+        points, log_likelihoods = moved_objects(
+            self.model, keys[:num_objects], mixture.particles, observation
         )
-        moved = mixture.replace(particles=particles, ancestor_indices=no_ancestors(mixture))
+        rows, log_growths = drawn_rows(self.scheme, keys[num_objects:], log_likelihoods)
+        # An object whose particles all have zero likelihood moves by its dynamics alone.
+        own = jnp.arange(rows.shape[1], dtype=rows.dtype)[None]
+        rows = jnp.where((log_growths > -jnp.inf)[:, None], rows, own)
+        moved = mixture.replace(
+            particles=rows_of_each(points, rows), ancestor_indices=no_ancestors(mixture)
+        )
         return moved.weighed(jnp.sum(log_growths)[None])
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) of all objects."""
         return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
+
+
+def moved_objects(
+    model: MultiObjectModel, keys: Key[Array, " objects"], states: PyTree, observation: PyTree
+) -> tuple[PyTree, Float[Array, "objects n"]]:
+    """x_t of every object of every row, and the logarithms of their likelihoods."""
+    seen = model.prepare_observation(observation)
+
+    def move(key: Key[Array, ""], states: PyTree, j: Int[Array, ""]) -> tuple:
+        points = model.sample_object_transition(key, states, j)
+        return points, model.object_log_likelihood(seen, points, j).astype(default_float())
+
+    objects = jnp.arange(model.num_objects, dtype=jnp.int32)
+    return jax.vmap(move, in_axes=(0, 1, 0), out_axes=(1, 0))(keys, states, objects)
+
+
+def drawn_rows(
+    scheme: str, keys: Key[Array, " objects"], log_weights: Float[Array, "objects n"]
+) -> tuple[Int[Array, "objects n"], Float[Array, " objects"]]:
+    """The rows that each object is resampled from, and log of its mean weight."""
+    resample = Resample(scheme)
+
+    def draw(key: Key[Array, ""], log_weights: Float[Array, " n"]) -> tuple:
+        cloud = single_component(log_weights).weighed(log_weights)
+        return resample(key, cloud).ancestor_indices, cloud.log_mass
+
+    return jax.vmap(draw)(keys, log_weights)
+
+
+def rows_of_each(states: PyTree, rows: Int[Array, "objects n"]) -> PyTree:
+    """Every object's states, from rows chosen for each object."""
+    gather = jax.vmap(take, in_axes=(1, 0), out_axes=1)
+    return jax.tree.map(lambda leaf: gather(leaf, rows), states)

@@ -17,8 +17,11 @@ from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.logarithms import add_gradient, log_sum_exp, without_gradient
-from mpfjax.operations.random import split
+from mpfjax.operations.choices import cond_if_any
+from mpfjax.operations.generator import split
+from mpfjax.operations.gradients import add_gradient
+from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import log_sum_exp
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
 
@@ -121,34 +124,18 @@ class Partitioned(AbstractPropagation):
         # Resampling may have lost a NaN, or left nothing of the particles but empty slots.
         moved = moved.replace(log_weights=jnp.where(broken, jnp.nan, moved.log_weights))
         lost = ~broken & ~jnp.any(moved.log_weights > -jnp.inf)
-        return self._unweighted_where(lost, key, mixture, moved)
+
+        def predicted() -> ParticleMixture:
+            # Without weights: the step is then one of zero likelihood.
+            nothing = jnp.full_like(mixture.log_weights, -jnp.inf)
+            unseen = self.predict(key, mixture).replace(log_weights=nothing)
+            return jax.tree.map(lambda new, old: jnp.where(lost, new, old), unseen, moved)
+
+        return cond_if_any(lost, predicted, lambda: moved)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) of all objects and leave the weights."""
         return predict(key, self.model, mixture, "stop" if self._stops_draws else "none")
-
-    def _unweighted_where(
-        self,
-        lost: Bool[Array, ""],
-        key: Key[Array, ""],
-        mixture: ParticleMixture,
-        moved: ParticleMixture,
-    ) -> ParticleMixture:
-        """The prediction without weights where every particle is lost, `moved` elsewhere.
-
-        It is a loop of at most one turn: under `vmap`, a `cond` would always draw the prediction.
-        """
-        move, before, after = without_gradient((self, mixture, moved))
-
-        def predict(carry: tuple[Array, ParticleMixture]) -> tuple[Array, ParticleMixture]:
-            nothing = jnp.full_like(before.log_weights, -jnp.inf)
-            predicted = move.predict(key, before).replace(log_weights=nothing)
-            return jnp.zeros_like(carry[0]), predicted
-
-        _, predicted = jax.lax.while_loop(lambda carry: carry[0], predict, (lost, after))
-        return jax.tree.map(
-            lambda otherwise, usually: jnp.where(lost, otherwise, usually), predicted, moved
-        )
 
     def _advance(
         self,
@@ -230,13 +217,11 @@ def check_orders(orders: Any, num_objects: int, name: str = "orders") -> Int[Arr
         return jnp.atleast_2d(orders).astype(jnp.int32)
     try:
         table = np.atleast_2d(np.asarray(orders))
-        permutations = table.ndim == 2 and np.issubdtype(table.dtype, np.integer) and table.size
-        permutations = permutations and bool(
-            (np.sort(table, axis=1) == np.arange(num_objects)[None]).all()
-        )
+        expected = np.broadcast_to(np.arange(num_objects), (len(table), num_objects))
+        is_order = np.array_equal(np.sort(table, axis=1), expected)
     except (TypeError, ValueError):  # rows of different lengths, or no numbers
-        permutations = False
-    if not permutations:
+        is_order = False
+    if not is_order:
         raise ValueError(
             f"{name}: {shown(orders)} is no permutation of the objects 0 to {num_objects - 1}"
         )

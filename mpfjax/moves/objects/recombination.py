@@ -15,7 +15,9 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.moves.objects.coupling import alike, over_pairs
-from mpfjax.operations.logarithms import default_float
+from mpfjax.operations.floats import default_float
+from mpfjax.operations.generator import split, uniform
+from mpfjax.operations.logarithms import finite_or_zero, log_or_nothing
 from mpfjax.operations.matrices import draw_columns
 from mpfjax.operations.random import split, uniform
 
@@ -97,10 +99,7 @@ def recombined(
 
     has_moved = jnp.zeros((num_particles, num_objects), bool)
     carry = (particles, jnp.zeros_like(log_sums), has_moved)
-    inputs = (
-        split(key_points, num_objects),
-        jnp.arange(num_objects, dtype=jnp.int32),
-    )
+    inputs = (split(key_points, num_objects), jnp.arange(num_objects, dtype=jnp.int32))
     (chosen, log_weights, _), _ = jax.lax.scan(choose, carry, inputs)
     return chosen, log_weights
 
@@ -161,14 +160,11 @@ def _draw_columns(
 def _log_sums(log_table: Float[Array, "k n"]) -> Float[Array, " k"]:
     """log Σ exp of every line, -inf where all of it is, with a finite gradient there."""
     shift = _finite_max(log_table)
-    total = jnp.sum(jnp.exp(log_table - shift[:, None]), axis=1)
-    empty = total == 0  # NaN is not: it must come out as NaN
-    return jnp.where(empty, -jnp.inf, jnp.log(jnp.where(empty, 1.0, total)) + shift)
+    return log_or_nothing(jnp.sum(jnp.exp(log_table - shift[:, None]), axis=1)) + shift
 
 
 def _finite_max(log_table: Float[Array, "k n"]) -> Float[Array, " k"]:
-    largest = jnp.max(jax.lax.stop_gradient(log_table), axis=1)
-    return jnp.where(jnp.isfinite(largest), largest, 0.0)
+    return finite_or_zero(jnp.max(jax.lax.stop_gradient(log_table), axis=1))
 
 
 def rotated(key: Key[Array, ""], indices: Int[Array, " k"]) -> Int[Array, " k"]:

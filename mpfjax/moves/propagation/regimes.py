@@ -18,7 +18,7 @@ from mpfjax.models.conditionally_linear import (
 )
 from mpfjax.models.steps import log_predictive
 from mpfjax.moves.base import AbstractPropagation
-from mpfjax.moves.regrouping.group_by import GroupBy
+from mpfjax.moves.regrouping.partitions import GroupBy
 from mpfjax.moves.resampling.ancestors import draw_ancestors
 from mpfjax.moves.resampling.line import Line, in_line
 from mpfjax.moves.resampling.resample import Resample

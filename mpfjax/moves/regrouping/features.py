@@ -14,10 +14,8 @@ from mpfjax.operations.logarithms import as_inexact, exp, finite_or_zero
 from mpfjax.operations.segments import are_masked, column_sums, segment_max, spread_stored
 from mpfjax.operations.stored import stored
 
-# Up to this many features are multiplied one by one, which runs on vectors, but compiles pair by
-# pair: it takes more particles than these before that is worth it.
+# Up to this many features are multiplied one by one, which runs on vectors.
 _FEW_FEATURES = 8
-_FEW_PARTICLES = 64
 Scale = ArrayLike | Sequence[float]
 
 
@@ -28,10 +26,10 @@ def _as_units(scale: Any) -> tuple[float, ...]:
         raise ValueError(f"scale: {shown(scale)} is no number, nor one a feature") from error
 
 
-class Features(eqx.Module):
-    """The coordinates in which particles are near or far, (n, k), measured in `scale`.
+class ByFeatures(eqx.Module):
+    """A move for which particles are near or far by their features, measured in `scale`.
 
-    - `function`: maps the particles to (n,) or (n, k) features; None takes the whole state,
+    - `features`: maps the particles to (n,) or (n, k) features; None takes the whole state,
       flattened.
     - `scale`: a number, or one a feature: the unit of each, such as the width and height of a box
       in pixels. All distances and thresholds of distance are in this unit.
@@ -39,20 +37,22 @@ class Features(eqx.Module):
     Raises `ValueError` for a scale that is not positive.
     """
 
-    function: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None)
-    scale: tuple[float, ...] = eqx.field(static=True, default=(1.0,), converter=_as_units)
+    features: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None, kw_only=True)
+    scale: tuple[float, ...] = eqx.field(
+        static=True, default=(1.0,), converter=_as_units, kw_only=True
+    )
 
     def __check_init__(self) -> None:
-        check_callable("a function of the particles", **given(features=self.function))
+        check_callable("a function of the particles", **given(features=self.features))
         check_positive_array(scale=np.asarray(self.scale))
 
-    def __call__(self, mixture: ParticleMixture) -> Float[Array, "n k"]:
+    def features_of(self, mixture: ParticleMixture) -> Float[Array, "n k"]:
         """The features of every particle, relative to their average, zero in an empty slot.
 
         Regrouping needs only differences, and values far from zero would lose them to rounding.
         """
         particles = mixture.particles
-        values = flatten_states(particles) if self.function is None else self.function(particles)
+        values = flatten_states(particles) if self.features is None else self.features(particles)
         values = as_inexact(values.reshape(mixture.num_particles, -1))
         if len(self.scale) not in (1, values.shape[1]):
             raise ValueError(f"scale: {len(self.scale)} units for {values.shape[1]} features")
@@ -149,8 +149,6 @@ def _first_moments(
 ) -> Float[Array, "c n"]:
     """The weights, and the weighted features, column by column."""
     weights = weights.astype(features.dtype)
-    if len(weights) <= _FEW_PARTICLES:
-        return jnp.concatenate([weights[None], weights[None] * features.T])
     return jnp.stack([weights, *(weights * column for column in features.T)])
 
 
@@ -160,35 +158,28 @@ def _products(
     """The weighted products of each pair of features, column by column, and the pairs."""
     num_features = gaps.shape[1]
     # A covariance is symmetric: one triangle of it.
-    pairs = [(i, j) for i in range(num_features) for j in range(i + 1)]
+    left, right = np.tril_indices(num_features)
     entries = np.zeros((num_features, num_features), int)
-    for entry, (i, j) in enumerate(pairs):
-        entries[i, j] = entries[j, i] = entry
+    entries[left, right] = entries[right, left] = np.arange(len(left))
     columns, weights = gaps.T, weights.astype(gaps.dtype)
-    if num_features > _FEW_FEATURES or len(weights) <= _FEW_PARTICLES:
-        left, right = np.array(pairs).T
+    if num_features > _FEW_FEATURES:
         return weights[None] * columns[left] * columns[right], entries
+    pairs = zip(left, right, strict=True)
     return jnp.stack([weights * columns[i] * columns[j] for i, j in pairs]), entries
 
 
 def separation(
-    means_a: Float[Array, "*#g k"],
-    covariances_a: Float[Array, "*#g k k"],
-    means_b: Float[Array, "*#g k"],
-    covariances_b: Float[Array, "*#g k k"],
-) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    gap: Float[Array, "*g k"], pooled: Float[Array, "*g k k"]
+) -> tuple[Float[Array, " *g"], Float[Array, " *g"]]:
     """The distance between the means of two groups, and the same in pooled standard deviations.
 
-    The second is |μ_a - μ_b| over the pooled standard deviation along the line through both means,
-    sqrt(uᵀ (Σ_a + Σ_b) u / 2). It is Ashman's D: below 2, two Gaussians of equal mass are usually
-    said to have no clear gap. Two groups of one point each are infinitely many deviations apart, or
-    zero if the points are the same.
+    `gap` is μ_a - μ_b, and `pooled` Σ, the mean of the two covariances. The second number is |gap|
+    over the standard deviation along the line through both means, sqrt(uᵀ Σ u). It is Ashman's D:
+    below 2, two Gaussians of equal mass are usually said to have no clear gap. Two groups of one
+    point each are infinitely many deviations apart, or zero if the points are the same.
     """
-    gap = means_a - means_b
     distance = jnp.sqrt(jnp.sum(gap**2, axis=-1))
-    pooled = (covariances_a + covariances_b) / 2
     spread = jnp.sqrt(jnp.maximum(jnp.einsum("...i,...ij,...j->...", gap, pooled, gap), 0.0))
+    at_points = jnp.where(distance > 0, jnp.inf, jnp.zeros_like(distance))
     deviations = distance**2 / jnp.where(spread > 0, spread, 1.0)
-    return distance, jnp.where(
-        spread > 0, deviations, jnp.where(distance > 0, jnp.inf, jnp.zeros_like(distance))
-    )
+    return distance, jnp.where(spread > 0, deviations, at_points)

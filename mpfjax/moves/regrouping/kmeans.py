@@ -1,7 +1,5 @@
 """K-means: every particle to the nearest centroid, each centroid to the mean of its particles."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,12 +8,16 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.checks import check_flag, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
-from mpfjax.moves.regrouping.features import Features, Scale
-from mpfjax.moves.regrouping.nearest import nearest
+from mpfjax.moves.regrouping.features import ByFeatures
+from mpfjax.operations.choices import most_of_runs
+from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.segments import segment_argmax, segment_counts, segment_sum
 
+# Centroids in one pass over the particles. A program of all 64 takes seconds to compile.
+_AT_ONCE = 16
 
-class KMeans(AbstractRegrouping):
+
+class KMeans(AbstractRegrouping, ByFeatures):
     """Assign particles to the nearest component, by K-means from the components as they are.
 
     Vermaak et al. (2003), section 4. Every particle counts the same, whatever its weight, so that
@@ -25,35 +27,26 @@ class KMeans(AbstractRegrouping):
     - `num_iterations`: how often all particles are assigned; the centroids move in between.
     - `reseed`: start from all M components instead, seeded by farthest-first traversal from the
       particle farthest from the mean. For the grouping of x_0.
-    - `features`, `scale`: see `Features`.
+    - `features`: maps the particles to the numbers by which they are near or far, (n,) or (n, k);
+      None takes the whole state, flattened.
+    - `scale`: the unit of each feature, or one for all. Distances are measured in it.
 
-    Raises `ValueError` for fewer than one iteration.
+    Raises `ValueError` for fewer than one iteration, and a scale that is not positive.
     """
 
-    num_iterations: int = eqx.field(static=True)
-    reseed: bool = eqx.field(static=True)
-    features: Features
+    num_iterations: int = eqx.field(static=True, default=5)
+    reseed: bool = eqx.field(static=True, default=False, kw_only=True)
 
-    def __init__(
-        self,
-        num_iterations: int = 5,
-        *,
-        reseed: bool = False,
-        features: Callable[[PyTree], Array] | None = None,
-        scale: Scale = 1.0,
-    ) -> None:
-        check_whole(num_iterations=num_iterations)
-        check_flag(reseed=reseed)
-        self.num_iterations = num_iterations
-        self.reseed = reseed
-        self.features = Features(features, scale)
+    def __check_init__(self) -> None:
+        check_whole(num_iterations=self.num_iterations)
+        check_flag(reseed=self.reseed)
 
     def regroup(
         self, key: Key[Array, ""], mixture: ParticleMixture
     ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
         """Each particle to the component whose centroid is nearest."""
         del key
-        features, occupied, m = self.features(mixture), mixture.occupied, mixture.num_components
+        features, occupied, m = self.features_of(mixture), mixture.occupied, mixture.num_components
         if self.reseed:
             alive = jnp.ones(m, bool)
             labels = nearest(features, farthest_first(features, occupied, m), alive)
@@ -105,3 +98,44 @@ def _centroids(
     counts = segment_counts(occupied, labels, num_components)
     sums = segment_sum(jnp.where(occupied[:, None], features, 0.0), labels, num_components)
     return sums / jnp.maximum(counts, 1).astype(features.dtype)[:, None], counts > 0
+
+
+def nearest(
+    features: Float[Array, "n k"], centroids: Float[Array, "m k"], alive: Bool[Array, " m"]
+) -> Int[Array, " n"]:
+    """The living centroid nearest to each particle; of equally near ones, the first.
+
+    A running minimum over the centroids: no (m, n) array is made. It ends with the last living one,
+    since the free labels are mostly the last.
+    """
+    n, m = features.shape[0], centroids.shape[0]
+    centroids = jnp.where(alive[:, None], centroids, jnp.inf)
+    found = jnp.full(n, jnp.inf, features.dtype), jnp.zeros(n, jnp.int32)
+    if m <= _AT_ONCE:
+        return _nearer(found, features, centroids, 0)[1]
+    padding = -m % _AT_ONCE
+    centroids = jnp.pad(centroids, ((0, padding), (0, 0)), constant_values=jnp.inf)
+    passes = centroids.reshape(-1, _AT_ONCE, centroids.shape[1])
+    last = jnp.max(jnp.where(alive, jnp.arange(m, dtype=jnp.int32), 0))
+    return jax.lax.fori_loop(
+        0,
+        most_of_runs(last // _AT_ONCE + 1),
+        lambda i, found: _nearer(found, features, passes[i], i * _AT_ONCE),
+        found,
+    )[1]
+
+
+def _nearer(
+    found: tuple[Float[Array, " n"], Int[Array, " n"]],
+    features: Float[Array, "n k"],
+    centroids: Float[Array, "m k"],
+    first: int | Int[Array, ""],
+) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
+    """The least squared distance so far and whose it is, after these centroids as well."""
+    best, labels = found
+    for m in range(centroids.shape[0]):
+        distance = row_sums((features - centroids[m][None]) ** 2)
+        closer = distance < best
+        labels = jnp.where(closer, first + m, labels)
+        best = jnp.where(closer, distance, best)
+    return best, labels

@@ -1,7 +1,5 @@
 """Merge: components that overlap become one."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,18 +8,13 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 from mpfjax.checks import check_positive, check_whole, given
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
-from mpfjax.moves.regrouping.features import (
-    Features,
-    Scale,
-    relative_weights,
-    separation,
-    summarise,
-)
+from mpfjax.moves.regrouping.features import ByFeatures, relative_weights, separation, summarise
+from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import spread_stored
 from mpfjax.operations.stored import take
 
 
-class Merge(AbstractRegrouping):
+class Merge(AbstractRegrouping, ByFeatures):
     """Merge components that overlap, after they have done so `patience` times in a row.
 
     Vermaak et al. (2003), section 4, leaves the criterion open. Here two components overlap when
@@ -40,28 +33,16 @@ class Merge(AbstractRegrouping):
     a patience below 1. Exact: a relabelling only.
     """
 
-    max_deviations: float | None = eqx.field(static=True)
-    max_distance: float | None = eqx.field(static=True)
-    patience: int = eqx.field(static=True)
-    features: Features
+    max_deviations: float | None = eqx.field(static=True, default=1.0)
+    max_distance: float | None = eqx.field(static=True, default=None)
+    patience: int = eqx.field(static=True, default=1, kw_only=True)
 
-    def __init__(
-        self,
-        max_deviations: float | None = 1.0,
-        max_distance: float | None = None,
-        *,
-        patience: int = 1,
-        features: Callable[[PyTree], Array] | None = None,
-        scale: Scale = 1.0,
-    ) -> None:
-        if max_deviations is None and max_distance is None:
+    def __check_init__(self) -> None:
+        conditions = given(max_deviations=self.max_deviations, max_distance=self.max_distance)
+        if not conditions:
             raise ValueError("max_deviations, max_distance: at least one must be given")
-        check_positive(**given(max_deviations=max_deviations, max_distance=max_distance))
-        check_whole(patience=patience)
-        self.max_deviations = max_deviations
-        self.max_distance = max_distance
-        self.patience = patience
-        self.features = Features(features, scale)
+        check_positive(**conditions)
+        check_whole(patience=self.patience)
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
         """How many times in a row each pair of components has overlapped, where patience counts."""
@@ -92,16 +73,12 @@ class Merge(AbstractRegrouping):
         return memory | {"overlap_durations": durations}
 
     def _overlap(self, mixture: ParticleMixture) -> Bool[Array, "m m"]:
-        groups = summarise(
-            self.features(mixture),
-            relative_weights(mixture),
-            mixture.component_indicators,
-            mixture.num_components,
-        )
+        weights, labels = relative_weights(mixture), mixture.component_indicators
+        groups = summarise(self.features_of(mixture), weights, labels, mixture.num_components)
+        means, covariances = groups.means, groups.covariances
         distance, deviations = separation(
-            groups.means[:, None], groups.covariances[:, None],
-            groups.means[None], groups.covariances[None],
-        )  # fmt: skip
+            means[:, None] - means[None], (covariances[:, None] + covariances[None]) / 2
+        )
         overlap = groups.alive[:, None] & groups.alive[None]
         if self.max_deviations is not None:
             overlap &= deviations < self.max_deviations

@@ -1,6 +1,5 @@
 """Split: a component that has become too diffuse is divided in two."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,8 +11,7 @@ from mpfjax.checks import check_not_negative, check_share, check_whole, given
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.regrouping.features import (
-    Features,
-    Scale,
+    ByFeatures,
     relative_weights,
     separation,
     summarise_about,
@@ -27,7 +25,7 @@ from mpfjax.operations.segments import segment_argmax, spread_stored
 from mpfjax.operations.stored import VECTOR, stored, take
 
 
-class Split(AbstractRegrouping):
+class Split(AbstractRegrouping, ByFeatures):
     """Split a component in two where it has become too diffuse.
 
     Vermaak et al. (2003), section 4, leaves the criterion open. Here weighted 2-means, started from
@@ -48,33 +46,16 @@ class Split(AbstractRegrouping):
     relabelling only.
     """
 
-    min_deviations: float = eqx.field(static=True)
-    min_distance: float = eqx.field(static=True)
-    min_share: float = eqx.field(static=True)
-    num_iterations: int = eqx.field(static=True)
-    sample_size: int | None = eqx.field(static=True)
-    features: Features
+    min_deviations: float = eqx.field(static=True, default=4.0)
+    min_distance: float = eqx.field(static=True, default=0.0)
+    min_share: float = eqx.field(static=True, default=0.05, kw_only=True)
+    num_iterations: int = eqx.field(static=True, default=3, kw_only=True)
+    sample_size: int | None = eqx.field(static=True, default=32, kw_only=True)
 
-    def __init__(
-        self,
-        min_deviations: float = 4.0,
-        min_distance: float = 0.0,
-        *,
-        min_share: float = 0.05,
-        num_iterations: int = 3,
-        sample_size: int | None = 32,
-        features: Callable[[PyTree], Array] | None = None,
-        scale: Scale = 1.0,
-    ) -> None:
-        check_not_negative(min_deviations=min_deviations, min_distance=min_distance)
-        check_share(0.5, min_share=min_share)
-        check_whole(num_iterations=num_iterations, **given(sample_size=sample_size))
-        self.min_deviations = min_deviations
-        self.min_distance = min_distance
-        self.min_share = min_share
-        self.num_iterations = num_iterations
-        self.sample_size = sample_size
-        self.features = Features(features, scale)
+    def __check_init__(self) -> None:
+        check_not_negative(min_deviations=self.min_deviations, min_distance=self.min_distance)
+        check_share(0.5, min_share=self.min_share)
+        check_whole(num_iterations=self.num_iterations, **given(sample_size=self.sample_size))
 
     def regroup(
         self, key: Key[Array, ""], mixture: ParticleMixture
@@ -82,13 +63,16 @@ class Split(AbstractRegrouping):
         """The lighter half of every component that is too diffuse, to a free label."""
         del key
         # Computed outside the condition, where XLA shares them with neighbouring moves.
-        features, active = self.features(mixture), mixture.active
-        labels = cond_if_any(
-            jnp.any(~active),
-            lambda: self._split_where_diffuse(mixture, features, active),
-            lambda: mixture.component_indicators,
-        )
-        return labels, mixture.memory
+        features, active = self.features_of(mixture), mixture.active
+        parent = mixture.component_indicators
+
+        def split() -> Int[Array, " n"]:
+            halves = self._halves(mixture, features)
+            labels = free_labels(halves.splits, halves.deviations, active)
+            moves = (halves.side == spread_stored(halves.lighter, parent)) & mixture.occupied
+            return jnp.where(moves, spread_stored(labels, parent), parent)
+
+        return cond_if_any(jnp.any(~active), split, lambda: parent), mixture.memory
 
     def is_diffuse(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
         """Which components would split if each had a free label.
@@ -96,40 +80,23 @@ class Split(AbstractRegrouping):
         Where `StepInfo.labels_ran_out`, these are the ones in which several modes share a label.
         """
         mixture = without_gradient(mixture)
-        return self._halves(mixture, self.features(mixture)).splits
-
-    def _split_where_diffuse(
-        self, mixture: ParticleMixture, features: Float[Array, "n k"], active: Bool[Array, " m"]
-    ) -> Int[Array, " n"]:
-        """The new labels, where at least one is free."""
-        parent = mixture.component_indicators
-        halves = self._halves(mixture, features)
-        labels = free_labels(halves.splits, halves.deviations, active)
-        lighter = spread_stored(halves.lighter, parent)
-        moves = (halves.side == lighter) & mixture.occupied
-        return jnp.where(moves, spread_stored(labels, parent), parent)
+        return self._halves(mixture, self.features_of(mixture)).splits
 
     def _halves(self, mixture: ParticleMixture, features: Float[Array, "n k"]) -> "_Halves":
         """Each component cut in two."""
         m, size = mixture.num_components, self.sample_size
-        particles = _Particles(
-            features,
-            relative_weights(mixture),
-            mixture.component_indicators,
-            mixture.occupied,
-        )
+        weights, parent = relative_weights(mixture), mixture.component_indicators
+        particles = _Particles(features, weights, parent, mixture.occupied)
         sample = particles
         if size is not None and mixture.num_particles > size * m:
             sample = _sampled(particles, size * m, mixture)
         centres = _two_means(sample, m, self.num_iterations)
-        _, weights, parent, _ = particles
         side, gaps = _nearer(features, centres, parent)
         halves = summarise_about(centres, gaps, weights, parent + m * side)
         masses = halves.masses.reshape(2, m)
         least_mass, total = jnp.min(masses, axis=0), jnp.sum(masses, axis=0)
-        distance, deviations = separation(
-            halves.means[:m], halves.covariances[:m], halves.means[m:], halves.covariances[m:]
-        )
+        pooled = (halves.covariances[:m] + halves.covariances[m:]) / 2
+        distance, deviations = separation(halves.means[:m] - halves.means[m:], pooled)
         splits = (
             (least_mass > 0)
             & (least_mass >= self.min_share * total)

@@ -1,0 +1,124 @@
+"""Groups of another kind than clouds: all particles in one, random sets, and the user's labels."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, Key, PyTree
+
+from mpfjax.checks import check_callable, check_whole, given, saying, shown
+from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.base import AbstractRegrouping
+from mpfjax.operations.generator import bits
+from mpfjax.operations.indexing import take
+from mpfjax.operations.prefix_sums import count_upto
+
+
+class Pool(AbstractRegrouping):
+    """Put all particles into component 0, so that the mixture is one particle set.
+
+    The left-hand side of eq. 3 of Smith and Gatica-Perez (2004), read from right to left. Use it
+    before a `Resample` in which the components should compete. Exact: a relabelling only.
+    """
+
+    def regroup(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+        """Component 0 for every particle."""
+        del key
+        return jnp.zeros_like(mixture.component_indicators), mixture.memory
+
+
+class RandomPartition(AbstractRegrouping):
+    """Deal the particles at random into sets of equal size, without replacement.
+
+    Smith and Gatica-Perez (2004), section 4: C sets of N/C particles each; sizes differ by one if C
+    does not divide N. Empty slots are dealt after the filled ones. The mass of a set is that of
+    its particles (eq. 5), so the distribution does not change.
+
+    - `num_sets`: C; None takes as many as the mixture has components.
+
+    Raises `ValueError` for C < 1, or more sets than components. Use it where all components
+    should stand for the same distribution, as when `Partitioned` gives each an order of its own.
+    """
+
+    num_sets: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        check_whole(**given(num_sets=self.num_sets))
+
+    def regroup(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+        """A random set for every particle."""
+        n = mixture.num_particles
+        num_sets = mixture.num_components if self.num_sets is None else self.num_sets
+        if num_sets > mixture.num_components:
+            raise ValueError(
+                f"num_sets: {num_sets} is more than num_components, {mixture.num_components}"
+            )
+        # Sets are dealt in turn and then sorted into a random order. Each is a word: the set in the
+        # lowest bits, random bits above it. Words of empty slots come after all others.
+        width = (num_sets - 1).bit_length()
+        occupied, index = mixture.occupied, jnp.arange(n, dtype=jnp.int32)
+        num_filled = jnp.sum(occupied, dtype=jnp.int32)
+        noise = bits(key, (n,)) >> (width + 1) << width
+        is_last = (index >= num_filled).astype(jnp.uint32) << 31
+        words = jax.lax.sort(is_last | noise | (index % num_sets).astype(jnp.uint32))
+        dealt = (words & jnp.uint32((1 << width) - 1)).astype(jnp.int32)
+        filled_before = count_upto(occupied, n) - occupied.astype(jnp.int32)
+        turn = jnp.where(occupied, filled_before, num_filled + index - filled_before)
+        return take(dealt, turn), mixture.memory
+
+
+class GroupBy(AbstractRegrouping):
+    """Group the particles by a label that they have: a regime, a room, a hypothesis.
+
+    A particle with label m is in component m. The labels do not change the weights, so the
+    distribution stays the same (Vermaak et al. 2003, section 4). With `Resample`, each label keeps
+    particles even while it is improbable. For regimes this is the IMM particle filter (Blom and
+    Bloem 2007).
+
+    - `function`: gives the label of each particle: whole numbers (n,), in [0, M), where M is the
+      filter's `num_components`. A function of the particles, as `lambda states: states["room"]`.
+
+    A label outside [0, M) of a filled slot is a RuntimeError that names the move. Raises
+    `ValueError` for anything but a function, and for a function that does not return whole numbers
+    (n,). Use it where you know what the modes are, and `KMeans`, `Merge` and `Split` where you do
+    not.
+    """
+
+    function: Callable[[PyTree], Int[Array, " n"]] = eqx.field(static=True)
+
+    def __check_init__(self) -> None:
+        check_callable("a function of the particles", function=self.function)
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+    ) -> ParticleMixture:
+        """Regroup the particles, also where there is one component: labels are then all zero."""
+        del observation
+        indicators, _ = self.regroup(key, mixture)
+        return mixture.replace(component_indicators=indicators)
+
+    def regroup(
+        self, key: Key[Array, ""], mixture: ParticleMixture
+    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+        """The label of every particle; that of an empty slot is moved into [0, M)."""
+        del key
+        with saying("in function, of GroupBy, which is called with the particles"):
+            labels: Any = self.function(mixture.particles)
+        n, dtype = mixture.num_particles, getattr(labels, "dtype", None)
+        if jnp.shape(labels) != (n,) or not jnp.issubdtype(dtype, jnp.integer):
+            raise ValueError(
+                f"function: it returned {shown(labels)}, not one whole number a particle, ({n},)"
+            )
+        num_labels = mixture.num_components
+        outside = mixture.occupied & ((labels < 0) | (labels >= num_labels))
+        inside = jnp.clip(labels, 0, num_labels - 1).astype(jnp.int32)
+        message = (
+            f"GroupBy: function gave a label outside [0, {num_labels}), the filter's num_components"
+        )
+        return eqx.error_if(inside, jnp.any(outside), message), mixture.memory
