@@ -14,6 +14,7 @@ from mpfjax.filters import independent_particle_filters as independent_particle_
 from mpfjax.filters import mixture_particle_filter as mixture_particle_filter
 from mpfjax.filters import particle_filter as particle_filter
 from mpfjax.filters import partitioned_sampling as partitioned_sampling
+from mpfjax.lookahead.pilot import PilotLookahead as PilotLookahead
 from mpfjax.mixture import MarginalisedState as MarginalisedState
 from mpfjax.mixture import ParticleMixture as ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel as AbstractStateSpaceModel
@@ -48,7 +49,6 @@ from mpfjax.moves import KMeans as KMeans
 from mpfjax.moves import Merge as Merge
 from mpfjax.moves import MetropolisAdjustedLangevin as MetropolisAdjustedLangevin
 from mpfjax.moves import Partitioned as Partitioned
-from mpfjax.moves import PilotLookahead as PilotLookahead
 from mpfjax.moves import Pool as Pool
 from mpfjax.moves import Predict as Predict
 from mpfjax.moves import Propagate as Propagate

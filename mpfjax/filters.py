@@ -8,6 +8,7 @@ from jaxtyping import Array, PyTree
 from mpfjax.chain import as_moves
 from mpfjax.checks import check_one_of, check_type, check_whole
 from mpfjax.filter import Filter
+from mpfjax.lookahead.pilot import Lookahead
 from mpfjax.models.base import AbstractStateSpaceModel, mapped
 from mpfjax.models.conditionally_linear import is_marginalised
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
@@ -17,7 +18,6 @@ from mpfjax.moves.every import Every
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.objects.partitioned import Partitioned, check_orders
-from mpfjax.moves.pilot import Lookahead
 from mpfjax.moves.propagation.marginalised import propagation
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
 from mpfjax.moves.regrouping.features import Scale

@@ -8,10 +8,10 @@ import jax
 
 from mpfjax.checks import check_type, check_whole
 from mpfjax.filter import Filter
+from mpfjax.lookahead.pilot import Lookahead, PilotLookahead
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.every import Every
 from mpfjax.moves.initial import SelectInitial
-from mpfjax.moves.pilot import Lookahead, PilotLookahead
 from mpfjax.moves.propagation.marginalised import PropagateMarginalised
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate

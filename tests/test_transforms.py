@@ -24,7 +24,7 @@ from mpfjax import (
     with_score_gradient,
     with_selected_start,
 )
-from mpfjax.moves.pilot import PilotLookahead
+from mpfjax.lookahead.pilot import PilotLookahead
 
 KEY = jax.random.key(0)
 MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)

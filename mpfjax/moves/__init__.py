@@ -15,7 +15,6 @@ from mpfjax.moves.objects.clusters import PropagateInClusters as PropagateInClus
 from mpfjax.moves.objects.exclusion import Exclusion as Exclusion
 from mpfjax.moves.objects.independent import PropagateIndependently as PropagateIndependently
 from mpfjax.moves.objects.partitioned import Partitioned as Partitioned
-from mpfjax.moves.pilot import PilotLookahead as PilotLookahead
 from mpfjax.moves.propagation.marginalised import PropagateMarginalised as PropagateMarginalised
 from mpfjax.moves.propagation.nested import PropagateNested as PropagateNested
 from mpfjax.moves.propagation.propagate import Predict as Predict

@@ -1,6 +1,7 @@
 """The kinds of moves of a filter, and their contracts."""
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -41,12 +42,14 @@ class AbstractMove(eqx.Module):
     keeps_parents = True
     """whether each particle comes from one particle of the mixture that the move was given. Where
     it does not, the move sets its ancestor index to -1, and what follows ancestors refuses it."""
-    biases_score = False
-    """whether it redraws particles in a way that derivatives in the model's parameters do not see,
-    so that the score is biased."""
+    keeps_families = True
+    """whether it draws independently, or tells the memory of first ancestors, so that the errors of
+    one run are known."""
     looks_ahead = False
     """whether its weights, as an initial move, wait for the likelihood that it has looked at. The
     particles of x_0 are then not resampled before they have been weighed by it."""
+    resampling = None
+    """the `Resample` by which it redraws the particles, whose weights a look-ahead may change."""
     particles_per_component = None
     """the slots that each component gets, where the move fixes their number."""
 
@@ -62,6 +65,14 @@ class AbstractMove(eqx.Module):
         """Which components the move would resample, for the report of a step; most moves none."""
         del observation
         return jnp.zeros(mixture.num_components, bool)
+
+    def around(self, reference: Any) -> "AbstractMove":
+        """The move in conditional SMC, which keeps one trajectory, a `Reference`; most cannot."""
+        del reference
+        raise ValueError(
+            f"filter: {type(self).__name__} cannot keep a trajectory, as conditional SMC does;"
+            " regrouping moves, Resample, Propagate, Predict and Reweight can"
+        )
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """The move when y_t is missing. Only a propagation does anything then."""
@@ -119,6 +130,11 @@ class AbstractRegrouping(AbstractMove):
         indicators, memory = self.regroup(key, without_gradient(mixture))
         return mixture.replace(component_indicators=indicators, memory=memory)
 
+    def around(self, reference: Any) -> "AbstractRegrouping":
+        """The move itself, for which the trajectory that is kept is like any other."""
+        del reference
+        return self
+
 
 class AbstractResampling(AbstractMove):
     """A move that redraws the particles of each component and keeps the component's mass.
@@ -130,6 +146,7 @@ class AbstractResampling(AbstractMove):
     weighs = False
     keeps_mass = True
     resamples = True
+    keeps_families = False
 
 
 class AbstractAdaptiveResampling(AbstractResampling):
@@ -156,6 +173,7 @@ class AbstractMarkovMove(AbstractMove):
 
     weighs = False
     keeps_mass = True
+    keeps_families = False
 
 
 class AbstractPropagation(AbstractMove):

@@ -6,60 +6,68 @@ puts x*_t into the slot, and the resampling gives the slot at least one offsprin
 `mpfjax.smoothing.conditional_filter` explains why this is exact.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
+from mpfjax.models.base import require
 from mpfjax.moves.base import AbstractAdaptiveResampling, AbstractPropagation
-from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight, log_transition
-from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.stored import take
+from mpfjax.operations.indexing import take
 
 REFERENCE = "reference"  # the name of its slot and time in a mixture's memory
+
+
+class Reference(NamedTuple):
+    """A trajectory that a filter keeps."""
+
+    trajectory: PyTree
+    """x*_0, ..., x*_t, leaves (t + 1, ...)."""
+    first_slot: Int[Array, ""]
+    """the slot of x*_0."""
 
 
 class ConditionalPropagation(AbstractPropagation):
     """Propagate every particle but the one in the reference slot, which moves to x*_t.
 
     The weight of the reference is that of any particle, L D / q, with q at x*_t, so that a proposal
-    needs `log_density`.
-
-    - `move`: a `Propagate` or `Predict`.
-    - `trajectory`: x*_0, ..., x*_t, leaves (t + 1, ...).
-    - `first_slot`: the slot of x*_0.
+    needs `log_density`. `move` is a `Propagate` or `Predict`.
     """
 
-    move: Propagate | Predict
-    trajectory: PyTree
-    first_slot: Int[Array, ""]
+    move: Any
+    reference: Reference
+
+    def __check_init__(self) -> None:
+        if self.move.noise != "independent":
+            raise ValueError(
+                "filter: conditional SMC needs draws that are independent of each other, and not"
+                f" noise={self.move.noise!r}; take noise='independent'"
+            )
+        if self.move.proposal is not None:
+            require(self.move.proposal, "log_density", "conditional SMC", "proposal")
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
         """The reference slot, and the time of the particles."""
         del num_components
-        return {REFERENCE: {"slot": self.first_slot, "time": jnp.zeros((), jnp.int32)}}
+        time = jnp.zeros((), jnp.int32)
+        return {REFERENCE: {"slot": self.reference.first_slot, "time": time}}
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
         """Propagate around x*_t, and weigh as the move does."""
-        move = self.move
-        if isinstance(move, Predict):
-            return self.predict(key, mixture)
-        if move.proposal is None:
-            return Reweight(move.model)(key, self.predict(key, mixture), observation)
-        proposal, previous = move.proposal, mixture.particles
+        proposal, previous = self.move.proposal, mixture.particles
+        if proposal is None:
+            return self.move.weighed(self.predict(key, mixture), observation)
         states, log_density = proposal.propose(key, observation, previous)
         moved = self._with_reference(mixture.replace(particles=states))
         slot = mixture.memory[REFERENCE]["slot"]
         own = lambda tree: jax.tree.map(lambda leaf: take(leaf, slot[None]), tree)  # noqa: E731
-        density: Any = proposal
-        log_own = density.log_density(observation, own(moved.particles), own(previous))
+        log_own = proposal.log_density(observation, own(moved.particles), own(previous))
         log_density = put(log_density, log_own[0], slot)
-        log_ratio = log_transition(move.model, moved.particles, previous) - log_density
-        return Reweight(move.model)(key, moved, observation).weighed(log_ratio)
+        return self.move.weighed(moved, observation, previous, log_density)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) around x*_t, and leave the weights."""
@@ -68,7 +76,7 @@ class ConditionalPropagation(AbstractPropagation):
     def _with_reference(self, mixture: ParticleMixture) -> ParticleMixture:
         """The particles at the next time, with x* of that time in its slot."""
         slot, time = (mixture.memory[REFERENCE][name] for name in ("slot", "time"))
-        now = jax.tree.map(lambda leaf: at(leaf, time + 1), self.trajectory)
+        now = jax.tree.map(lambda leaf: at(leaf, time + 1), self.reference.trajectory)
         particles = jax.tree.map(lambda leaf, own: put(leaf, own, slot), mixture.particles, now)
         memory = mixture.memory | {REFERENCE: {"slot": slot, "time": time + 1}}
         return mixture.replace(particles=particles, memory=memory)
@@ -82,7 +90,7 @@ class ConditionalResample(AbstractAdaptiveResampling):
     how. Other components are resampled as usual. `move` is the filter's own `Resample`.
     """
 
-    move: Resample
+    move: Any
 
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
@@ -92,8 +100,7 @@ class ConditionalResample(AbstractAdaptiveResampling):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
     ) -> ParticleMixture:
         """Resample every component that is due around the reference."""
-        reference = mixture.memory[REFERENCE]
-        due = self.is_due(mixture)
+        reference, due = mixture.memory[REFERENCE], self.is_due(mixture)
         resampled, ancestors = self.move.redraw(key, mixture, due, keep=reference["slot"])
         memory = resampled.memory | {REFERENCE: reference | {"slot": ancestors.kept}}
         return resampled.replace(memory=memory)

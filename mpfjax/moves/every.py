@@ -49,6 +49,15 @@ class Every(AbstractMove):
     keeps_mass = True
 
     @property
+    def keeps_families(self) -> bool:
+        """Whether all of the moves do."""
+        return all(move.keeps_families for move in self.moves)
+
+    def around(self, reference: Any) -> "Every":
+        """The moves around the trajectory, at the same steps."""
+        return Every(self.num_steps, [move.around(reference) for move in self.moves])
+
+    @property
     def needs_parents(self) -> bool:
         """Whether any of the moves does."""
         return any(move.needs_parents for move in self.moves)

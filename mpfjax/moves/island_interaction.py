@@ -1,5 +1,7 @@
 """Interaction of islands: particles are dealt anew where the islands' masses have become uneven."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -44,6 +46,11 @@ class IslandInteraction(AbstractMove):
 
     keeps_parents = False
     """those of a particle that was dealt to an island are on another one."""
+
+    def around(self, reference: Any) -> "IslandInteraction":
+        """The move itself: on the one island of conditional SMC it does nothing."""
+        del reference
+        return self
 
     def is_due(self, mixture: ParticleMixture) -> Bool[Array, ""]:
         """Whether the masses of the islands are uneven enough; the result is the same on each."""

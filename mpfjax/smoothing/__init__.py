@@ -1,16 +1,11 @@
 """Smoothing given all observations, and forecasts given those so far."""
 
-from mpfjax.smoothing.ancestors import Genealogy as Genealogy
-from mpfjax.smoothing.ancestors import trace_ancestors as trace_ancestors
-from mpfjax.smoothing.batches import BatchEstimate as BatchEstimate
-from mpfjax.smoothing.batches import batch_estimate as batch_estimate
-from mpfjax.smoothing.conditional import ConditionalRun as ConditionalRun
+from mpfjax.lookahead.learned import learn_lookahead as learn_lookahead
 from mpfjax.smoothing.conditional import conditional_filter as conditional_filter
-from mpfjax.smoothing.forecasts import Forecast as Forecast
-from mpfjax.smoothing.sums import SmoothedSums as SmoothedSums
+from mpfjax.smoothing.history import trace_ancestors as trace_ancestors
 from mpfjax.smoothing.sums import smoothed_sums as smoothed_sums
 from mpfjax.smoothing.trajectories import sample_trajectories as sample_trajectories
-from mpfjax.smoothing.twisted import learn_lookahead as learn_lookahead
+from mpfjax.smoothing.variance import batch_estimate as batch_estimate
 from mpfjax.smoothing.variance import (
     log_marginal_likelihood_variance as log_marginal_likelihood_variance,
 )

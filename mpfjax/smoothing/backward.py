@@ -5,6 +5,7 @@ joint weights of the mixture at s. Component indicators do not enter, since the 
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -57,56 +58,56 @@ def draw(
     return jnp.minimum(indices, jnp.max(jnp.where(weights > 0, place, 0)))
 
 
+def log_transition_from(model: Any, mixture: ParticleMixture) -> Callable[[PyTree], Array]:
+    """log D(state | x^i) of every particle, (n,), as a function of one state."""
+    n = mixture.num_particles
+
+    def log_density(state: PyTree) -> Float[Array, " n"]:
+        copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), state)
+        values = model.log_transition(copies, mixture.particles)
+        return check_log_density(values, model, "log_transition", n)
+
+    return log_density
+
+
 def draw_exactly(
     key: Key[Array, ""],
-    model: Any,
-    next_states: PyTree,
+    log_density: Callable[[PyTree], Array],
+    futures: PyTree,
     mixture: ParticleMixture,
     num_draws: int = 1,
     needed: Bool[Array, " k"] | None = None,
     checked: bool = True,
+    cost: int = 1,
 ) -> Int[Array, "k draws"]:
-    """Indices for each of the next states by W^i D(next | x^i), O(N) for a state.
+    """Indices for each of the futures by W^i times its density given x^i, O(N) for one.
 
-    An error at run time where a state that is `needed` cannot have come from any particle; any
-    index there where that is not `checked`.
+    `log_density` gives that of one future for all particles, (n,), at the `cost` of so many numbers
+    a particle. An error at run time where a future that is `needed` cannot have come from any
+    particle; any index there where that is not `checked`.
     """
     n = mixture.num_particles
 
-    def log_weights_of(state: PyTree) -> Float[Array, " n"]:
-        copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), state)
-        log_density = model.log_transition(copies, mixture.particles)
-        check_log_density(log_density, model, "log_transition", n)
-        return jnp.where(mixture.occupied, mixture.log_weights + log_density, -jnp.inf)
-
     def draw_some(inputs: tuple[Array, PyTree]) -> tuple[Array, Array]:
-        (quantiles, *within), state = inputs
-        log_weights = log_weights_of(state)
+        (quantiles, *within), future = inputs
+        log_weights = mixture.log_weights + log_density(future)
+        log_weights = jnp.where(mixture.occupied, log_weights, -jnp.inf)
         largest = jnp.max(log_weights)
         weights = exp(log_weights - finite_or_zero(largest))
         rows = jnp.broadcast_to(weights, (num_draws, n))
         return draw_columns(quantiles, rows, *within), largest
 
-    num_states = jax.tree.leaves(next_states)[0].shape[0]
+    number = jax.tree.leaves(futures)[0].shape[0]
     dtype = mixture.log_weights.dtype
     keys = split(key, 2) if needs_two_parts(n, dtype) else [key]
-    quantiles = [uniform(key, (num_states, num_draws), dtype) for key in keys]
-    together = max(1, min(num_states, MOST_DENSITIES // n))
-    inputs = (jnp.stack(quantiles, axis=1), next_states)
-    if together == num_states:
+    quantiles = [uniform(key, (number, num_draws), dtype) for key in keys]
+    together = max(1, min(number, MOST_DENSITIES // (cost * n)))
+    inputs = (jnp.stack(quantiles, axis=1), futures)
+    if together == number:
         indices, largest = jax.vmap(draw_some)(inputs)
     else:
         indices, largest = jax.lax.map(draw_some, inputs, batch_size=together)
-    if not checked:
-        return indices
-    return _with_a_past(indices, largest, needed)
-
-
-def propose(
-    key: Key[Array, ""], mixture: ParticleMixture, num_steps: int, num_states: int
-) -> Int[Array, "steps k"]:
-    """Proposals for `walk`: indices by the weights alone, so that all can be drawn beforehand."""
-    return draw(key, (num_steps, num_states), mixture.log_weights)
+    return _with_a_past(indices, largest, needed) if checked else indices
 
 
 def walk(
@@ -120,7 +121,8 @@ def walk(
 ) -> Int[Array, "steps k"]:
     """Steps of independent Metropolis-Hastings on the index, whose target is W^i D(next | x^i).
 
-    O(1) for a state and step; the index after each of the steps. `proposed` is that of `propose`.
+    O(1) for a state and step; the index after each of the steps. `proposed` are draws by
+    the weights alone, which can all be made beforehand.
     """
     num_states = start.shape[0]
 

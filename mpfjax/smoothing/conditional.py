@@ -11,28 +11,16 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import as_numbers, check_flag, check_key, check_type, shown
 from mpfjax.filter import Filter, Start
-from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, model_name, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
-from mpfjax.moves.base import AbstractRegrouping
-from mpfjax.moves.conditional import (
-    REFERENCE,
-    ConditionalPropagation,
-    ConditionalResample,
-    at,
-    put,
-)
-from mpfjax.moves.every import Every
+from mpfjax.moves.conditional import REFERENCE, ConditionalPropagation, Reference, at, put
 from mpfjax.moves.initial import sample_initial
-from mpfjax.moves.island_interaction import IslandInteraction
-from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
-from mpfjax.moves.resampling.resample import Resample
 from mpfjax.observations import Series, as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.random import split, uniform
 from mpfjax.running.scan import FilterRun, checked, scan
 from mpfjax.smoothing.backward import draw, log_transitions
-from mpfjax.smoothing.history import mixtures_of
+from mpfjax.smoothing.history import ancestors_of, mixtures_of, paths_through
 from mpfjax.smoothing.trajectories import draw_trajectories
 
 _IMPOSSIBLE = "trajectory: its density beside the observations is zero or NaN"
@@ -95,11 +83,11 @@ def conditional_filter(
     each other.
 
     Raises `ValueError` for a filter that is no chain of regrouping moves, `Resample`, `Propagate`,
-    `Predict` and `Reweight`; a conditionally linear model;
-    a proposal without `log_density`; noise that is not independent; a model without
-    `log_transition`, unless `backward` is false; a trajectory of other shapes or types than the
-    model's states, or of density zero (RuntimeError within jit). Use it in a Gibbs sampler of your
-    own; `mpfjax.tuning.particle_gibbs` is one for parameters.
+    `Predict`, `Reweight` and `Every` of these; a conditionally linear model; a proposal without
+    `log_density`; noise that is not independent; a model without `log_transition`, unless
+    `backward` is false; a trajectory of other shapes or types than the model's states, or of
+    density zero (RuntimeError within jit). Use it in a Gibbs sampler of your own;
+    `mpfjax.tuning.particle_gibbs` is one for parameters.
     """
     check_key(key)
     check_type(Filter, "a Filter", filter=filter)
@@ -108,7 +96,7 @@ def conditional_filter(
     series = as_series(observations, filter.model, inputs, missing)
     trajectory = _as_states(trajectory, filter.model, series.length + 1)
     # Checked before the run: backward sampling could not recover an impossible trajectory.
-    _require(_steps_are_possible(filter.model, trajectory, series.inputs))
+    _require(eqx.filter_jit(possible_times)(filter.model, trajectory, series.inputs))
     run = lambda filter: _run(key, filter, series, trajectory, backward)  # noqa: E731
     found = with_floats_traced(run, filter)
     found = eqx.tree_at(lambda found: found.run, found, checked(found.run))
@@ -123,15 +111,6 @@ def _require(possible: Bool[Array, " t"]) -> None:
     if not isinstance(possible, Tracer) and not np.all(possible):
         first = int(np.argmin(np.asarray(possible)))
         raise ValueError(f"{_IMPOSSIBLE}, first at index {first} of its times")
-
-
-@eqx.filter_jit
-def _steps_are_possible(
-    model: AbstractStateSpaceModel, trajectory: PyTree, inputs: PyTree
-) -> Bool[Array, " t"]:
-    """At which times the trajectory is possible, regardless of the observations."""
-    length = jax.tree.leaves(trajectory)[0].shape[0] - 1
-    return _possible(model, trajectory, inputs, jnp.ones(length, bool))
 
 
 @jit_on_wide_vectors
@@ -149,34 +128,31 @@ def renew(
 ) -> ConditionalRun:
     """`conditional_filter` under the caller's jit, its arguments unchecked.
 
-    Where the backward sampling is not `checked` either, look at `is_possible` of the trajectory.
+    Where the backward sampling is not `checked` either, look at `possible_times`.
     """
     key_slot, key_initial, key_run, key_back = split(key, 4)
     n = filter.num_particles
     first_slot = jnp.clip(jnp.floor(uniform(key_slot, ()) * n).astype(jnp.int32), 0, n - 1)
     particles = _independent_initial(key_initial, filter.model, n)
     start = jax.tree.map(lambda leaf, own: put(leaf, own[0], first_slot), particles, trajectory)
-    around = _around(filter, trajectory, first_slot)
+    around = _around(filter, Reference(trajectory, first_slot))
     run = scan(Start(key_run, start), around, series, None)
     reference = run.collected.memory[REFERENCE]["slot"]
     log_weights = jax.vmap(at)(run.collected.log_weights, reference)
-    later = (log_weights > -jnp.inf) & ~run.degenerate
-    slots = jnp.concatenate([first_slot[None], reference])
+    seen = (log_weights > -jnp.inf) & ~run.degenerate
     drawn = draw_trajectory(key_back, filter.model, run, series.inputs, backward, checked)
-    possible = _possible(filter.model, trajectory, series.inputs, later)
-    return ConditionalRun(drawn, run, slots, possible)
+    return ConditionalRun(
+        trajectory=drawn,
+        run=run,
+        slots=jnp.concatenate([first_slot[None], reference]),
+        possible=possible_times(filter.model, trajectory, series.inputs).at[1:].min(seen),
+    )
 
 
-def _around(filter: Filter, trajectory: PyTree, first_slot: Int[Array, ""]) -> Filter:
-    """The same chain of moves around the trajectory."""
-
-    def around(move: Any) -> Any:
-        if isinstance(move, Propagate | Predict):
-            return ConditionalPropagation(move, trajectory, first_slot)
-        return ConditionalResample(move) if isinstance(move, Resample) else move
-
+def _around(filter: Filter, reference: Any) -> Filter:
+    """The same chain of moves around the trajectory; a `ValueError` for one that cannot."""
     return filter.replace(
-        moves=[around(move) for move in filter.moves],
+        moves=[move.around(reference) for move in filter.moves],
         # x_0 is one of N draws of the model's.
         initial_moves=[move for move in filter.initial_moves if not move.weighs],
     )
@@ -201,40 +177,25 @@ def draw_trajectory(
 ) -> PyTree:
     """One trajectory of a run, by backward sampling or the genealogy: leaves (t + 1, ...)."""
     mixtures = mixtures_of(run)
-    if not backward:
-        return _of_the_genealogy(key, mixtures)
-    drawn = draw_trajectories(key, model, mixtures, inputs, 1, checked=checked)
+    if backward:
+        drawn = draw_trajectories(key, model, mixtures, inputs, 1, checked=checked)
+    else:
+        end = draw(key, (1,), mixtures.log_weights[-1])
+        drawn = paths_through(mixtures, ancestors_of(end, mixtures))
     return jax.tree.map(lambda leaf: leaf[0], drawn)
 
 
-def is_possible(model: Any, trajectory: PyTree, inputs: PyTree) -> Bool[Array, ""]:
-    """Whether a trajectory has a density above zero, as far as the model's densities tell."""
-    length = jax.tree.leaves(trajectory)[0].shape[0] - 1
-    return jnp.all(_possible(model, trajectory, inputs, jnp.ones(length, bool)))
+def possible_times(model: Any, trajectory: PyTree, inputs: PyTree) -> Bool[Array, " t"]:
+    """At which times a trajectory has a density above zero, as far as the densities tell.
 
-
-def _of_the_genealogy(key: Key[Array, ""], mixtures: ParticleMixture) -> PyTree:
-    """A particle of the last mixture by its weight, and its ancestors."""
-    last = jax.tree.map(lambda leaf: leaf[-1], mixtures)
-    end = draw(key, (1,), last.log_weights)[0]
-
-    def back(index: Array, ancestors: Array) -> tuple[Array, Array]:
-        return at(ancestors, index), index
-
-    first, later = jax.lax.scan(back, end, mixtures.ancestor_indices[1:], reverse=True)
-    indices = jnp.concatenate([first[None], later])
-    return jax.tree.map(lambda leaf: jax.vmap(at)(leaf, indices), mixtures.particles)
-
-
-def _possible(
-    model: Any, trajectory: PyTree, inputs: PyTree, later: Bool[Array, " t"]
-) -> Bool[Array, " all"]:
-    """At which times the trajectory has a density above zero, as far as the densities tell."""
-    start = jnp.ones((1,), bool)
+    The observations have no part in it.
+    """
+    length = jax.tree.leaves(trajectory)[0].shape[0]
+    start, later = jnp.ones(1, bool), jnp.ones(length - 1, bool)
     if callable(getattr(model, "log_initial", None)):
         start = model.log_initial(jax.tree.map(lambda leaf: leaf[:1], trajectory)) > -jnp.inf
     if callable(getattr(model, "log_transition", None)):
-        later &= log_transitions(model, trajectory, inputs) > -jnp.inf
+        later = log_transitions(model, trajectory, inputs) > -jnp.inf
     return jnp.concatenate([start, later])
 
 
@@ -243,31 +204,12 @@ def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
     refuse_marginalised(filter.model, needed_by, "metropolis_hastings and smc2 take it as it is")
     if backward:
         require(filter.model, "log_transition", f"backward sampling in {needed_by}")
-    advances = [move for move in filter.moves if isinstance(move, Propagate | Predict)]
-    if len(advances) != 1:
+    moves = [move.around(Reference(None, jnp.zeros((), jnp.int32))) for move in filter.moves]
+    number = sum(isinstance(move, ConditionalPropagation) for move in moves)
+    if number != 1:
         raise ValueError(
-            f"filter: {needed_by} needs one Propagate or Predict among its moves, not"
-            f" {len(advances)}; moves of other kinds that propagate cannot keep a trajectory, but"
-            " particle_filter and mixture_particle_filter can, on any model"
+            f"filter: {needed_by} needs one Propagate or Predict among its moves, not {number}"
         )
-    proposal = getattr(advances[0], "proposal", None)
-    if proposal is not None:
-        require(proposal, "log_density", needed_by, "proposal")
-    if advances[0].noise != "independent":
-        raise ValueError(
-            f"filter: {needed_by} needs draws that are independent of each other, and not"
-            f" noise={advances[0].noise!r}; take noise='independent'"
-        )
-    for move in filter.moves:
-        if isinstance(move, Every) and all(isinstance(m, AbstractRegrouping) for m in move.moves):
-            continue
-        elif not isinstance(
-            move, AbstractRegrouping | Resample | Propagate | Predict | Reweight | IslandInteraction
-        ):
-            raise ValueError(
-                f"filter: {type(move).__name__} cannot keep a trajectory, as {needed_by} does;"
-                " regrouping moves, Resample, Propagate, Predict and Reweight can"
-            )
 
 
 def _as_states(trajectory: Any, model: AbstractStateSpaceModel, length: int) -> PyTree:
@@ -281,16 +223,12 @@ def _as_states(trajectory: Any, model: AbstractStateSpaceModel, length: int) -> 
         )
 
     def convert(leaf: Any, state: jax.ShapeDtypeStruct) -> Array:
-        leaf = as_numbers("trajectory", leaf)
-        shape = (length, *state.shape[1:])
-        if jnp.shape(leaf) != shape:
+        leaf, shape = as_numbers("trajectory", leaf), (length, *state.shape[1:])
+        own, dtype = jnp.shape(leaf), jnp.result_type(leaf)
+        if own != shape or not np.can_cast(dtype, state.dtype, "same_kind"):
             raise ValueError(
-                f"trajectory: shape {jnp.shape(leaf)} is not {shape}, x_0 and one state"
-                f" for each of the observations, {of_states}"
-            )
-        if not np.can_cast(jnp.result_type(leaf), state.dtype, "same_kind"):
-            raise ValueError(
-                f"trajectory: {jnp.result_type(leaf)} is not {state.dtype}, that {of_states}"
+                f"trajectory: {dtype}{list(own)} is not {state.dtype}{list(shape)}, x_0 and one"
+                f" state for each of the observations, {of_states}"
             )
         return jnp.asarray(leaf, state.dtype)
 

@@ -1,4 +1,4 @@
-"""The mixtures of a run, from x_0 to x_t, in the form that all smoothers take."""
+"""What a run remembers: its mixtures from x_0 to x_t, and the ancestors of its particles."""
 
 from typing import Any
 
@@ -6,9 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
+from jaxtyping import Array, Float, Int, PyTree
 
-from mpfjax.checks import shown
+from mpfjax.checks import check_numbered, shown
 from mpfjax.mixture import ParticleMixture
+from mpfjax.operations.indexing import count_places, take
 from mpfjax.running.scan import FilterRun
 
 _NEEDED = "a FilterRun of run_filter(..., collect=None), or the mixtures that it collected"
@@ -55,3 +57,67 @@ def with_parents(mixtures: ParticleMixture, needed_by: str) -> ParticleMixture:
     if found:
         raise ValueError(message)
     return mixtures
+
+
+def ancestors_of(particles: Int[Array, " k"], mixtures: ParticleMixture) -> Int[Array, "t k"]:
+    """The slots of the ancestors of some particles of the last mixture, at every time."""
+
+    def back(indices: Array, ancestors: Array) -> tuple[Array, Array]:
+        return take(ancestors, indices), indices
+
+    parents = mixtures.ancestor_indices[1:]
+    first, later = jax.lax.scan(back, particles, parents, reverse=True)
+    return jnp.concatenate([first[None], later])
+
+
+def paths_through(mixtures: ParticleMixture, indices: Int[Array, "t k"]) -> PyTree:
+    """The states in these slots, leaves (k, t, ...)."""
+    states = lambda leaf: jnp.moveaxis(jax.vmap(take)(leaf, indices), 0, 1)  # noqa: E731
+    return jax.tree.map(states, mixtures.particles)
+
+
+class Genealogy(eqx.Module):
+    """The ancestors of the particles at the end, at every time of a run.
+
+    - `indices`: (t, n), the slot of each particle's ancestor; at the end its own.
+    - `trajectories`: leaves (n, t, ...), the states of the ancestors: a genealogical trajectory has
+      the weight of its particle in the final mixture.
+    - `share_apart`: (m, t), the number of distinct ancestors of each component's particles, divided
+      by the number of particles: 1 where all are distinct, 1/count where one is left, and zero for
+      a dead component.
+    """
+
+    indices: Int[Array, "t n"]
+    trajectories: PyTree
+    share_apart: Float[Array, "m t"]
+
+
+def trace_ancestors(mixtures: FilterRun | ParticleMixture) -> Genealogy:
+    """Follow the ancestor indices of a run back from its end.
+
+    `mixtures` is a run of `run_filter(..., collect=None)`, whose first time is then x_0, or the
+    mixtures that it collected, whose first time is x_1. Raises `ValueError` for anything else, and
+    where particles have no single ancestors (index -1; RuntimeError within jit). Use it to see how
+    far back the history of a mode goes. Resampling leaves few ancestors at early
+    times; `sample_trajectories` draws new ones.
+    """
+    return _trace(with_parents(mixtures_of(mixtures), "trace_ancestors"))
+
+
+@eqx.filter_jit
+def _trace(mixtures: ParticleMixture) -> Genealogy:
+    final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
+    n, m = final.num_particles, final.num_components
+    check_numbered("ancestors by component up to", (m + 1) * n, num_particles=n)
+    indices = ancestors_of(jnp.arange(n, dtype=jnp.int32), mixtures)
+
+    def num_ancestors(ancestors: Array) -> Array:
+        # Empty slots are counted as a component of their own.
+        labels = jnp.where(final.occupied, final.component_indicators, m)
+        named = count_places(labels * n + ancestors, (m + 1) * n).reshape(m + 1, n)
+        return jnp.sum(named[:m] > 0, axis=1, dtype=jnp.int32)
+
+    apart = jax.lax.map(num_ancestors, indices).T
+    share = apart / jnp.maximum(final.component_counts, 1)[:, None]
+    share = share.astype(final.log_weights.dtype)
+    return Genealogy(indices, paths_through(mixtures, indices), share)

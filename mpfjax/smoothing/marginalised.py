@@ -13,7 +13,6 @@ observation says of the x before it enters Ω, so that R may be singular.
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
@@ -38,9 +37,10 @@ from mpfjax.models.inputs import with_inputs
 from mpfjax.moves.propagation.marginalised import log_latent_transition
 from mpfjax.operations import gaussians
 from mpfjax.operations.compiling import jit_on_wide_vectors
-from mpfjax.operations.gaussians import (
-    Gaussian,
-    Linear,
+from mpfjax.operations.gaussians import Gaussian, Linear, without_missing
+from mpfjax.operations.generator import split
+from mpfjax.operations.indexing import take
+from mpfjax.operations.stacks import (
     applied,
     cholesky,
     particles_first,
@@ -51,12 +51,7 @@ from mpfjax.operations.gaussians import (
     transposed,
     without_missing,
 )
-from mpfjax.operations.matrices import draw_columns
-from mpfjax.operations.random import split, uniform
-from mpfjax.operations.stored import take
-from mpfjax.smoothing.backward import MOST_DENSITIES, draw
-
-_NO_PAST = "model: log_transition is -inf, or NaN, from every particle of the step before"
+from mpfjax.smoothing.backward import draw, draw_exactly
 
 
 class Information(NamedTuple):
@@ -78,11 +73,11 @@ def check_marginalised(
     if method != "exact":
         raise ValueError(f"method: {method!r} is not there for a conditionally linear model")
     lengths = {jnp.shape(leaf)[0] for leaf in jax.tree.leaves(observations)}
-    num_times = mixtures.log_weights.shape[0]
-    if lengths != {num_times - 1}:
+    num_steps = mixtures.log_weights.shape[0] - 1
+    if lengths != {num_steps}:
         raise ValueError(
-            f"observations: {sorted(lengths)} steps are not {num_times - 1}, those of mixtures from"
-            " x_0 on; take the whole run of run_filter(..., collect=None)"
+            f"observations: {sorted(lengths)} steps are not {num_steps}, those of mixtures from x_0"
+            " on; take the whole run of run_filter(..., collect=None)"
         )
 
 
@@ -232,8 +227,8 @@ def _indices(
     """The particle of s that each trajectory comes from."""
     n, state = earlier.log_weights.shape[0], earlier.particles
 
-    def of_one(inputs: Any) -> tuple[Array, Array]:
-        share, own, *of_future = inputs
+    def log_density(trajectory: tuple) -> Float[Array, " n"]:
+        own, *of_future = trajectory
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), own)
         law = predicted_gaussian(model, copies, state)
         log_density = log_latent_transition(model, copies, state)
@@ -243,18 +238,10 @@ def _indices(
             law, log_factor = gaussians.update(law, rows, seen)
             log_density = log_density + log_factor
         one = Information(*(part[..., None] for part in of_future))
-        log_density = log_density + _log_overlap(law, one)
-        log_weights = jnp.where(earlier.occupied, earlier.log_weights + log_density, -jnp.inf)
-        largest = jnp.max(log_weights)
-        weights = jnp.exp(log_weights - jnp.where(jnp.isfinite(largest), largest, 0.0))
-        return draw_columns(share[None], weights[None])[0], largest
+        return log_density + _log_overlap(law, one)
 
-    num_states = jax.tree.leaves(latent)[0].shape[0]
-    shares = uniform(key, (num_states,), earlier.log_weights.dtype)
-    together = max(1, min(num_states, MOST_DENSITIES // (16 * n)))
-    inputs = (shares, latent, *(jnp.moveaxis(part, -1, 0) for part in future))
-    indices, largest = jax.lax.map(of_one, inputs, batch_size=together)
-    return eqx.error_if(indices, jnp.any(~(largest > -jnp.inf)), _NO_PAST)
+    trajectories = (latent, *(jnp.moveaxis(part, -1, 0) for part in future))
+    return draw_exactly(key, log_density, trajectories, earlier, cost=16)[:, 0]
 
 
 def _smoothed(state: MarginalisedState, future: Information) -> MarginalisedState:

@@ -1,6 +1,7 @@
 """Online smoothing of sums over a trajectory: PaRIS, and fixed-lag smoothing."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -37,7 +38,7 @@ from mpfjax.running.scan import (
     run_of,
     step_or_predict,
 )
-from mpfjax.smoothing.backward import draw_exactly, propose, walk
+from mpfjax.smoothing.backward import draw, draw_exactly, log_transition_from, walk
 
 
 class SmoothedSums(eqx.Module):
@@ -121,7 +122,8 @@ def _smooth(key, filter, series, options):
     step_keys = jax.random.split(key_steps, length)
     initial = first_mixture(Start(key_initial), filter, series)
     num_kept = 1 if lag is None else lag + 1
-    shapes = _shapes(function, initial.particles)
+    states = initial.particles
+    shapes = jax.eval_shape(partial(_of_states, function), states, states)
     kept = jax.tree.map(lambda leaf: jnp.zeros((num_kept, *leaf.shape), leaf.dtype), shapes)
     settled = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:], leaf.dtype), shapes)
 
@@ -131,8 +133,13 @@ def _smooth(key, filter, series, options):
         moved, info = step_or_predict(filter, step_key, mixture, now)
         model = with_inputs(filter.model, now.inputs)
         indices = _draw_pasts(draw_key, model, mixture, moved, method, num_draws)
-        values = _values(function, mixture.particles, moved.particles, indices)
-        kept = jax.tree.map(lambda leaf: _mean_of_pasts(leaf, indices), kept)
+        places = indices.reshape(-1)
+        earlier = jax.tree.map(lambda leaf: take(leaf, places), mixture.particles)
+        repeat = lambda leaf: jnp.repeat(leaf, num_draws, axis=0)  # noqa: E731
+        values = _of_states(function, earlier, jax.tree.map(repeat, moved.particles))
+        values = jax.tree.map(lambda leaf: _mean_of_pasts(leaf, num_draws), values)
+        of_pasts = jax.vmap(lambda rows: _mean_of_pasts(take(rows, places), num_draws))
+        kept = jax.tree.map(of_pasts, kept)
         if lag is None:
             kept = jax.tree.map(lambda old, new: old + new[None], kept, values)
         else:
@@ -171,59 +178,31 @@ def _draw_pasts(
     """For each particle some of the step before, by the backward kernel."""
     needed = after.occupied
     if method == "exact":
-        return draw_exactly(key, model, after.particles, before, num_draws, needed)
+        log_density = log_transition_from(model, before)
+        return draw_exactly(key, log_density, after.particles, before, num_draws, needed)
     key_proposed, key_walk = split(key, 2)
     # The start counts as a draw, unless it would be the only one.
     num_steps, start = max(num_draws - 1, 1), after.ancestor_indices
-    proposed = propose(key_proposed, before, num_steps, start.shape[0])
+    proposed = draw(key_proposed, (num_steps, start.shape[0]), before.log_weights)
     later = walk(key_walk, model, after.particles, before, start, proposed, needed).T
     return later if num_draws == 1 else jnp.concatenate([start[:, None], later], axis=1)
 
 
-def _mean_of_pasts(values: Array, indices: Int[Array, "n draws"]) -> Array:
-    """For each kept term, (kept, n, ...), the mean over the drawn ancestors of each particle."""
-    n, num_draws = indices.shape
-    flat = indices.reshape(-1)
-
-    def mean(rows: Array) -> Array:
-        return jnp.mean(take(rows, flat).reshape(n, num_draws, *rows.shape[1:]), axis=1)
-
-    return jax.vmap(mean)(values)
+def _mean_of_pasts(values: Array, num_draws: int) -> Array:
+    """For each particle the mean of its draws, which stand side by side."""
+    return jnp.mean(values.reshape(-1, num_draws, *values.shape[1:]), axis=1)
 
 
-def _values(
-    function: Callable[[PyTree, PyTree], PyTree],
-    previous: PyTree,
-    states: PyTree,
-    indices: Int[Array, "n draws"],
+def _of_states(
+    function: Callable[[PyTree, PyTree], PyTree], previous: PyTree, states: PyTree
 ) -> PyTree:
-    """h, its mean over the drawn ancestors of each particle."""
-    n, num_draws = indices.shape
-    flat = indices.reshape(-1)
-    earlier = jax.tree.map(lambda leaf: take(leaf, flat), previous)
-    later = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_draws, axis=0), states)
+    """h of these states; a `ValueError` unless it is one value a particle."""
     with saying("in function, which is called with x_{t-1} and x_t of all particles"):
-        values = function(earlier, later)
-    return jax.tree.map(
-        lambda leaf: jnp.mean(as_inexact(leaf).reshape(n, num_draws, *leaf.shape[1:]), axis=1),
-        values,
-    )
-
-
-def _shapes(function: Callable[[PyTree, PyTree], PyTree], particles: PyTree) -> PyTree:
-    """Shapes and types of h of all particles; a `ValueError` unless it is one value a particle."""
-    n = jax.tree.leaves(particles)[0].shape[0]
-    with saying("in function, which is called with x_{t-1} and x_t of all particles"):
-        values = jax.eval_shape(function, particles, particles)
-    leaves = jax.tree.leaves(values)
-    if not leaves:
-        raise ValueError(f"function: it returned {shown(values)}, which holds no array")
-    for leaf in leaves:
-        if leaf.shape[:1] != (n,):
-            raise ValueError(
-                f"function: it returned an array of shape {leaf.shape}, whose leading axis is not"
-                f" that of the {n} particles"
-            )
-        if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
-            raise ValueError(f"function: it returned complex values ({leaf.dtype})")
-    return jax.tree.map(lambda leaf: jax.eval_shape(as_inexact, leaf), values)
+        values = function(previous, states)
+    n, leaves = jax.tree.leaves(states)[0].shape[0], jax.tree.leaves(values)
+    if not leaves or any(jnp.shape(leaf)[:1] != (n,) for leaf in leaves):
+        raise ValueError(
+            f"function: it returned {shown(jax.tree.map(jnp.shape, values))}, no arrays whose"
+            f" leading axis is that of the {n} particles"
+        )
+    return jax.tree.map(as_inexact, values)

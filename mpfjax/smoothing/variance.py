@@ -1,17 +1,18 @@
-"""The errors of log Ẑ and of mixture weights from one run, by its particles' first ancestors."""
+"""Standard errors of log Ẑ, masses and means: from one run by first ancestors, or from a batch."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.chain import check_keep_parents
-from mpfjax.checks import check_type, shown
+from mpfjax.checks import check_callable, check_type, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractMarkovMove, AbstractRegrouping, AbstractResampling
+from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.eve_indices import (
     EVE_INDICES,
     evidence_variance,
@@ -19,10 +20,11 @@ from mpfjax.moves.eve_indices import (
     with_new_eve_indices,
 )
 from mpfjax.moves.every import with_inner
-from mpfjax.moves.propagation.regimes import PropagateRegimes
-from mpfjax.moves.resampling.resample import Resample
+from mpfjax.operations.logarithms import log_sum_exp
 from mpfjax.running.scan import FilterRun
 
+# Standard errors from fewer runs are not reliable.
+FEWEST_RUNS = 4
 # What the estimates hold for. Draws that are more even vary less than they say, or more.
 _INDEPENDENT = {
     "scheme": "multinomial",
@@ -31,22 +33,18 @@ _INDEPENDENT = {
 }
 
 
-class _KeepFirstAncestors(AbstractRegrouping):
+class _KeepFirstAncestors(AbstractMove):
     """Puts an `EveIndices` into the mixture of x_0, which `Resample` then keeps up to date."""
 
-    def regroup(
-        self, key: Key[Array, ""], mixture: ParticleMixture
-    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
-        """The same indicators, and a memory with every particle its own first ancestor."""
-        del key
-        return mixture.component_indicators, with_new_eve_indices(mixture).memory
+    weighs = False
+    keeps_mass = True
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
     ) -> ParticleMixture:
-        """Also where there is one component, which other regrouping leaves alone."""
-        del observation
-        return mixture.replace(memory=self.regroup(key, mixture)[1])
+        """The mixture with a memory in which every particle is its own first ancestor."""
+        del key, observation
+        return with_new_eve_indices(mixture)
 
 
 def with_first_ancestors(filter: Filter) -> Filter:
@@ -63,9 +61,7 @@ def with_first_ancestors(filter: Filter) -> Filter:
     check_type(Filter, "a Filter", filter=filter)
     check_keep_parents("filter", filter.moves, "with_first_ancestors")
     for move in with_inner(filter.moves):
-        kinds = AbstractResampling | AbstractMarkovMove | PropagateRegimes
-        redraws = isinstance(move, kinds) and not isinstance(move, Resample)
-        if move.approximate or redraws:
+        if move.approximate or not move.keeps_families:
             raise ValueError(
                 f"filter: {type(move).__name__}, one of its moves, is approximate or draws in a way"
                 " of its own; the variance of log Ẑ is not known from one run"
@@ -185,3 +181,80 @@ def _with_lineage(run: Any) -> ParticleMixture:
     if mixture.memory[EVE_INDICES].indices.ndim != 1:
         raise ValueError("run: islands have no first ancestors in common")
     return mixture
+
+
+class BatchEstimate(NamedTuple):
+    """Estimates from a batch of runs, with their standard errors."""
+
+    value: Float[Array, " *shape"]
+    error: Float[Array, " *shape"]
+    """the standard error of `value`."""
+    log_marginal_likelihood: Float[Array, ""]
+    """log of the mean of Ẑ."""
+    log_marginal_likelihood_error: Float[Array, ""]
+    effective_runs: Float[Array, ""]
+    """(Σ Ẑ)² / Σ Ẑ²: below about a third of the runs, errors are too small themselves."""
+
+
+def batch_estimate(
+    runs: FilterRun, quantity: Callable[[ParticleMixture], Float[Array, " *shape"]]
+) -> BatchEstimate:
+    """An expectation and log Z from B independent runs, each with its standard error.
+
+    The runs are treated as one particle filter of B islands that do not interact: run b has the
+    weight Ẑ_b, so that
+
+        q = Σ_b Ẑ_b q_b / Σ_b Ẑ_b,   Ẑ = Σ_b Ẑ_b / B,
+
+    and Ẑ is unbiased (Vergé et al. 2015). The errors are those of the jackknife over runs (Efron
+    1982), (B - 1) / B Σ_b (q_(b) - mean of q_(.))², with q_(b) the estimate without run b. They
+    need only independent runs, and hold for every scheme, noise and move. (`with_first_ancestors`
+    needs multinomial draws.)
+
+    - `runs`: what `monte_carlo` returned for B keys, four or more. Twelve to thirty of N / B
+      particles each are a good choice. Take enough particles that log Ẑ of a single run has a
+      standard deviation of about one or less. Otherwise a few runs have most of the weight; see
+      `effective_runs`.
+    - `quantity`: a function of one mixture, such as `lambda m: m.average(m.particles > 0)`. For a
+      mass take the probability of a place or an event, since the labels of components differ
+      between runs.
+
+    Runs of zero likelihood have no weight. Raises `ValueError` for fewer runs, and for anything but
+    a stack of runs. Use it to see whether a mass can be trusted.
+    """
+    check_callable("a function of a mixture", quantity=quantity)
+    if not isinstance(runs, FilterRun) or runs.log_marginal_likelihood.ndim != 1:
+        what = "one run" if isinstance(runs, FilterRun) else shown(runs)
+        raise ValueError(f"runs: {what} is not what monte_carlo returns for several keys")
+    number = len(runs.log_marginal_likelihood)
+    if number < FEWEST_RUNS:
+        raise ValueError(f"runs: {number}; a standard error asks for {FEWEST_RUNS} at least")
+    logs = runs.log_marginal_likelihood
+    values = jax.vmap(quantity)(runs.final)
+    # Each run is left out in turn; a difference of sums would be lost to rounding.
+    stays = jnp.concatenate([jnp.ones((1, number), bool), ~jnp.eye(number, dtype=bool)])
+    log_z, estimates = jax.vmap(lambda kept: _combined(jnp.where(kept, logs, -jnp.inf), values))(
+        stays
+    )
+    log_z -= jnp.log(jnp.sum(stays, axis=1).astype(log_z.dtype))
+    shares = jax.nn.softmax(logs)
+    return BatchEstimate(
+        value=estimates[0],
+        error=_jackknife(estimates[1:]),
+        log_marginal_likelihood=log_z[0],
+        log_marginal_likelihood_error=_jackknife(log_z[1:]),
+        effective_runs=1 / jnp.sum(shares**2),
+    )
+
+
+def _combined(
+    logs: Float[Array, " b"], values: Float[Array, "b *shape"]
+) -> tuple[Float[Array, ""], Float[Array, " *shape"]]:
+    shares = jax.nn.softmax(logs).astype(values.dtype)
+    return log_sum_exp(logs), jnp.tensordot(shares, values, axes=1)
+
+
+def _jackknife(without: Float[Array, "b *shape"]) -> Float[Array, " *shape"]:
+    number = without.shape[0]
+    centred = without - jnp.mean(without, axis=0, keepdims=True)
+    return jnp.sqrt((number - 1) / number * jnp.sum(centred**2, axis=0))

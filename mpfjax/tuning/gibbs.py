@@ -19,11 +19,18 @@ from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import Series
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.backward import log_transitions
-from mpfjax.smoothing.conditional import check_conditional, draw_trajectory, is_possible, renew
-from mpfjax.tuning.chains import AbstractKernel, ChainOptions, Plan, Sampling, Step
-from mpfjax.tuning.densities import LogPrior, Prior, chosen, evaluated, is_invalid
-from mpfjax.tuning.evidence import one_sequence, pose_filter
-from mpfjax.tuning.problem import Parameters, Problem, Reals
+from mpfjax.smoothing.conditional import check_conditional, draw_trajectory, possible_times, renew
+from mpfjax.tuning.chains import (
+    AbstractKernel,
+    Plan,
+    Run,
+    Step,
+    as_checkpoint,
+    chosen,
+)
+from mpfjax.tuning.densities import LogPrior, Prior, is_invalid, number_or_zero
+from mpfjax.tuning.problem import Parameters, Problem, Reals, pose_filter
+from mpfjax.tuning.starts import SamplePrior, Starts, constrained
 from mpfjax.tuning.transforms import AbstractTransform
 from mpfjax.tuning.walks import RandomWalk, accepts, checked_deviations
 
@@ -213,7 +220,8 @@ class _Kernel(AbstractKernel):
         fine = jnp.all(jnp.isfinite(run.log_likelihood_increments))
         if self.prior is not None:
             fine &= jnp.isfinite(self.prior(reals))
-        return _Pair(reals, drawn), fine & is_possible(filter.model, drawn, series.inputs)
+        fine &= jnp.all(possible_times(filter.model, drawn, series.inputs))
+        return _Pair(reals, drawn), fine
 
     def step(self, key: Key[Array, ""], state: _Pair, walk: RandomWalk) -> Step:
         """The next pair."""
@@ -224,8 +232,8 @@ class _Kernel(AbstractKernel):
         series = self.joint.series
         found = renew(key_trajectory, filter, series, before, self.backward, checked=False)
         broken = jnp.any(is_invalid(found.run.log_likelihood_increments))
-        broken |= ~jnp.all(found.possible) | ~is_possible(
-            filter.model, found.trajectory, series.inputs
+        broken |= ~jnp.all(found.possible) | ~jnp.all(
+            possible_times(filter.model, found.trajectory, series.inputs)
         )
         pair = chosen(~broken, _Pair(reals, found.trajectory), state)
         invalid["conditional_filter"] = broken

@@ -222,7 +222,7 @@ class TestOrders:
     def test_bad_orders(self):
         with pytest.raises(ValueError, match=r"order: \(0, 0, 1\) is no permutation"):
             mpfjax.partitioned_sampling(APART, 10, (0, 0, 1))
-        for order in ((0, 1), (0, 1, 2, 3), (1, 2, 3), (0.0, 1.0, 2.0), (), "circular"):
+        for order in ((0, 1), (0, 1, 2, 3), (1, 2, 3), (0.5, 1.0, 2.0), (), "circular"):
             with pytest.raises(ValueError, match="order: "):
                 mpfjax.partitioned_sampling(APART, 10, order)
         with pytest.raises(ValueError, match="order: 2 orders where there is one component"):

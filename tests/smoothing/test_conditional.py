@@ -197,7 +197,7 @@ class TestBadInput:
         [
             ({"key": 0}, "key"),
             ({"filter": None}, "filter: None"),
-            ({"trajectory": np.zeros(3)}, r"trajectory: shape \(3,\) is not \(4,\)"),
+            ({"trajectory": np.zeros(3)}, r"trajectory: float32\[3\] is not float32\[4\]"),
             ({"trajectory": {"x": np.zeros(4)}}, "trajectory: .*structure"),
             ({"trajectory": None}, "trajectory: None"),
             ({"trajectory": "abcd"}, "trajectory: .*abcd"),
@@ -220,7 +220,7 @@ class TestBadInput:
         [
             (lambda: mpfjax.particle_filter(NoTransition(), 6), "defines no log_transition"),
             (
-                lambda: mpfjax.mixture_particle_filter(LINEAR, 6, 2, noise="rqmc"),
+                lambda: Filter(LINEAR, [Resample(), Propagate(LINEAR, noise="rqmc")], 6),
                 "filter: .*independent of each other, and not noise='rqmc'",
             ),
             (
@@ -233,7 +233,7 @@ class TestBadInput:
             ),
             (
                 lambda: mpfjax.partitioned_sampling(mpfjax.MultiObjectModel(Walled(), 2), 6),
-                "filter: .*one Propagate or Predict",
+                "filter: Partitioned cannot keep a trajectory",
             ),
             (
                 lambda: mpfjax.gaussian_particle_filter(Walled(), 6),

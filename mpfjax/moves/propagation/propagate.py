@@ -25,7 +25,9 @@ from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
 from mpfjax.models.steps import likelihoods
 from mpfjax.moves.base import AbstractPropagation
-from mpfjax.operations.logarithms import add_gradient, finite_max
+from mpfjax.moves.conditional import ConditionalPropagation, Reference
+from mpfjax.operations.gradients import add_gradient
+from mpfjax.operations.logarithms import finite_max
 from mpfjax.proposals import AbstractProposal
 
 
@@ -119,8 +121,24 @@ class Propagate(AbstractPropagation):
         check_moved(states, previous, self.proposal, "propose")
         if self.gradient == "stop":
             states, log_density = jax.lax.stop_gradient((states, log_density))
-        log_ratio = log_transition(self.model, states, previous) - log_density
-        return _weigh(self.model, mixture.replace(particles=states), observation, log_ratio)
+        return self.weighed(mixture.replace(particles=states), observation, previous, log_density)
+
+    def weighed(
+        self,
+        mixture: ParticleMixture,
+        observation: PyTree,
+        previous: PyTree = None,
+        log_density: Float[Array, " n"] | None = None,
+    ) -> ParticleMixture:
+        """The weights of x_t times L, and D / q where each has been drawn with a log q."""
+        if log_density is None:
+            return _weigh(self.model, mixture, observation)
+        log_ratio = log_transition(self.model, mixture.particles, previous) - log_density
+        return _weigh(self.model, mixture, observation, log_ratio)
+
+    def around(self, reference: Reference) -> ConditionalPropagation:
+        """The same around the trajectory, where noise and proposal allow it."""
+        return ConditionalPropagation(self, reference)
 
 
 class Predict(AbstractPropagation):
@@ -156,6 +174,18 @@ class Predict(AbstractPropagation):
         """The same without an observation."""
         return predict(key, self.model, mixture, self.gradient, self.noise)
 
+    proposal = None
+    """x_t is drawn by the dynamics."""
+
+    def weighed(self, mixture: ParticleMixture, observation: PyTree) -> ParticleMixture:
+        """The mixture as it is."""
+        del observation
+        return mixture
+
+    def around(self, reference: Reference) -> ConditionalPropagation:
+        """The same around the trajectory, where the noise allows it."""
+        return ConditionalPropagation(self, reference)
+
 
 class Reweight(AbstractPropagation):
     """Multiply the weights by L(y_t | x_t): the second half of a bootstrap `Propagate`.
@@ -188,6 +218,11 @@ class Reweight(AbstractPropagation):
         """The mixture unchanged: there is no observation."""
         del key
         return mixture
+
+    def around(self, reference: Reference) -> "Reweight":
+        """The move itself, which weighs the trajectory as any other."""
+        del reference
+        return self
 
 
 def _check_whole_states(model: Any, needed_by: str) -> None:

@@ -115,6 +115,9 @@ class PropagateRegimes(AbstractPropagation):
     model: AbstractConditionallyLinearModel
     group: GroupBy | None = None
 
+    keeps_families = False
+    """it resamples without a memory of first ancestors."""
+
     def __check_init__(self) -> None:
         require_finite(self.model, "PropagateRegimes")
         check_type(GroupBy, "a GroupBy", **given(group=self.group))

@@ -58,6 +58,11 @@ class AuxiliaryResample(AbstractMove):
         return self.resample.sorts
 
     @property
+    def resampling(self) -> Resample:
+        """The `Resample` that draws."""
+        return self.resample
+
+    @property
     def weighs(self) -> bool:
         """False: the weights are divided by the look-ahead again."""
         return False

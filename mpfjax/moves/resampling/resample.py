@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 from mpfjax.checks import check_callable, check_one_of, check_share, check_whole, given
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractAdaptiveResampling
+from mpfjax.moves.conditional import ConditionalResample, Reference
 from mpfjax.moves.eve_indices import with_offspring
 from mpfjax.moves.resampling.allocation import (
     allocate_slots,
@@ -171,6 +172,19 @@ class Resample(AbstractAdaptiveResampling):
             ancestor_indices=take(mixture.ancestor_indices, parents),
         )
         return with_offspring(redrawn, mixture, parents, targets, due), ancestors
+
+    @property
+    def resampling(self) -> "Resample":
+        """The move itself."""
+        return self
+
+    keeps_families = True
+    """it updates the memory of first ancestors."""
+
+    def around(self, reference: Reference) -> ConditionalResample:
+        """The same around the trajectory."""
+        del reference
+        return ConditionalResample(self)
 
     def deal(
         self, mixture: ParticleMixture, line: Line, due: Bool[Array, " m"]

@@ -1,19 +1,21 @@
 """Backward regression of a twisted filter's ψ_t on the particles of a run."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key, PyTree
+from jaxtyping import Array, Bool, Float, Key
 
 from mpfjax.filter import Filter
+from mpfjax.lookahead.quadratics import LocalQuadratics, neutral
+from mpfjax.lookahead.twisted import Twist, made_of, noise_dimension_of
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.steps import seen
-from mpfjax.moves.local_quadratics import LocalQuadratics, neutral
-from mpfjax.moves.twisted import Twist, made_of, noise_dimension_of
 from mpfjax.observations import Series
+from mpfjax.running.scan import FilterRun
 
 # The effective number of particles for each coefficient of a regression.
 _PARTICLES_A_COEFFICIENT = 4
@@ -27,11 +29,15 @@ _HALVINGS = 16
 
 @eqx.filter_jit
 def fit_lookahead(
-    key: Key[Array, ""], filter: Filter, twist: Twist, mixtures: ParticleMixture, series: Series
+    key: Key[Array, ""], filter: Filter, twist: Twist, run: FilterRun, series: Series
 ) -> Twist:
-    """ψ_T, ..., ψ_1 and that of x_0, from the mixtures of a run of `filter`, twisted by `twist`."""
+    """ψ_T, ..., ψ_1 and that of x_0, from a run of `filter`, twisted by `twist`."""
     key_steps, key_initial = jax.random.split(key)
-    before = lambda tree: jax.tree.map(lambda leaf: leaf[:-1], tree)  # noqa: E731
+    earlier = jax.tree.map(
+        lambda first, rest: jnp.concatenate([first[None].astype(rest.dtype), rest[:-1]]),
+        run.initial, run.collected,
+    )  # fmt: skip
+    used = jax.tree.map(lambda leaf: leaf[:-1], twist.steps)
     last = jax.tree.map(lambda leaf: leaf[-1], twist.steps)
 
     def back(after: LocalQuadratics, step: Any) -> tuple[LocalQuadratics, LocalQuadratics]:
@@ -44,8 +50,7 @@ def fit_lookahead(
         return fitted, fitted
 
     keys = jax.random.split(key_steps, series.length)
-    steps = (keys, before(twist.steps), before(mixtures), series)
-    first, fitted = jax.lax.scan(back, last, steps, reverse=True)
+    first, fitted = jax.lax.scan(back, last, (keys, used, earlier, series), reverse=True)
     whole = jax.tree.map(lambda some, end: jnp.concatenate([some, end[None]]), fitted, last)
     initial = twist.initial
     if initial is not None:
@@ -116,26 +121,21 @@ def _fit_step(points: _Points, used: LocalQuadratics) -> LocalQuadratics:
     alive = jnp.sum(weights, axis=0) > 0
     log_volumes = jnp.sum(jnp.log(jnp.diagonal(inverses, axis1=1, axis2=2)), axis=1)
     log_shares = jnp.where(alive, log_volumes, -jnp.inf)
-    located = _replaced(used, centres=means, whitening=inverses, log_shares=log_shares)
+    located = replace(used, centres=means, whitening=inverses, log_shares=log_shares)
     near = jnp.exp(located.log_near(points.features)).T
     weights = _tempered(points.log_importance, near, points.num_needed)
     weights = weights / jnp.maximum(jnp.sum(weights, axis=0), 1e-30)[None]
 
-    def fit(of_expert: tuple[Array, Array]) -> "_Expert":
+    def fit(of_expert: tuple[Array, Array]) -> tuple[dict[str, Array], Array]:
         return _integrated(*_regressed(*of_expert, points.noise, points.targets))
 
     whitened = jnp.swapaxes(located.whitened(points.features), 1, 2)
-    experts = jax.lax.map(fit, (weights.T, whitened))
-    missed = jnp.sum(jnp.where(alive, experts.missed, 0.0)) / _count(alive, points.targets.dtype)
-    return _replaced(
+    experts, missed = jax.lax.map(fit, (weights.T, whitened))
+    missed = jnp.sum(jnp.where(alive, missed, 0.0)) / _count(alive, points.targets.dtype)
+    return replace(
         located,
-        constants=experts.constant,
-        slopes=experts.slope,
-        curvatures=experts.curvature,
-        noise_means=experts.noise_mean,
-        noise_slopes=experts.noise_slope,
-        noise_factors=experts.noise_factor,
-        noise_whitening=_inverses(experts.noise_factor),
+        **experts,
+        noise_whitening=_inverses(experts["noise_factors"]),
         log_cap=jnp.max(points.targets),
         defence=jnp.clip(missed, _LEAST_DEFENCE, _MOST_DEFENCE),
     )
@@ -147,7 +147,7 @@ def _scaled(
     """ν with a mean of 1 over the filtering distribution, and its floor, δ of that mean."""
     log_factors = jnp.where(mixture.occupied, fitted.log_fitted(features), -jnp.inf)
     log_mean = jax.nn.logsumexp(mixture.log_weights + log_factors)
-    return _replaced(
+    return replace(
         fitted,
         constants=fitted.constants - log_mean,
         log_cap=fitted.log_cap - log_mean,
@@ -185,7 +185,7 @@ def _fit_initial(
     alive = (jnp.sum(weights, axis=0) > 0) & (first.log_shares > -jnp.inf)
     # Half of the draws are shared equally by all experts, so that no mode is lost.
     shares = jnp.where(alive, 0.5 * shares + 0.5 / _count(alive, shares.dtype), 0.0)
-    fitted = _replaced(
+    fitted = replace(
         used,
         log_shares=jnp.log(shares),
         noise_means=means,
@@ -196,7 +196,7 @@ def _fit_initial(
     log_weights = draw(key_fitted, fitted)[2]
     log_sum, log_squares = (jax.nn.logsumexp(power * log_weights) for power in (1, 2))
     missed = size * jnp.exp(log_squares - 2 * log_sum) - 1
-    return _replaced(fitted, defence=jnp.clip(missed, _LEAST_DEFENCE, _MOST_DEFENCE))
+    return replace(fitted, defence=jnp.clip(missed, _LEAST_DEFENCE, _MOST_DEFENCE))
 
 
 def _tempered(
@@ -240,18 +240,6 @@ def _moments(
         return mean, unit[:, None] * _factor(covariance)
 
     return jax.vmap(moments)(weights.T)
-
-
-class _Expert(NamedTuple):
-    """log ν_k and q_k of one expert, and the mean square error of its fit of log ψ."""
-
-    constant: Float[Array, "*k"]
-    slope: Float[Array, "*k d"]
-    curvature: Float[Array, "*k d d"]
-    noise_mean: Float[Array, "*k j"]
-    noise_slope: Float[Array, "*k j d"]
-    noise_factor: Float[Array, "*k j j"]
-    missed: Float[Array, "*k"]
 
 
 def _regressed(
@@ -303,8 +291,11 @@ def _integrated(
     hessian: Float[Array, "z z"],
     missed: Float[Array, ""],
     num_features: int,
-) -> _Expert:
-    """The quadratic in features and noise, with N(ε; 0, I) and integrated over ε."""
+) -> tuple[dict[str, Array], Float[Array, ""]]:
+    """The quadratic in features and noise, with N(ε; 0, I) and integrated over ε.
+
+    The fields of an expert, and the mean square error of its fit.
+    """
     d = num_features
     of_noise, mixed = hessian[d:, d:], hessian[:d, d:]
     precision = jnp.eye(len(of_noise), dtype=hessian.dtype) - of_noise
@@ -313,15 +304,15 @@ def _integrated(
     values = jnp.maximum(values, 1.0)
     covariance = (vectors / values[None]) @ vectors.T
     mean, gain = covariance @ slope[d:], covariance @ mixed.T
-    return _Expert(
-        constant=constant + 0.5 * slope[d:] @ mean - 0.5 * jnp.sum(jnp.log(values)),
-        slope=slope[:d] + mixed @ mean,
-        curvature=hessian[:d, :d] + mixed @ gain,
-        noise_mean=mean,
-        noise_slope=gain,
-        noise_factor=jnp.linalg.cholesky(covariance),
-        missed=missed,
-    )
+    expert = {
+        "constants": constant + 0.5 * slope[d:] @ mean - 0.5 * jnp.sum(jnp.log(values)),
+        "slopes": slope[:d] + mixed @ mean,
+        "curvatures": hessian[:d, :d] + mixed @ gain,
+        "noise_means": mean,
+        "noise_slopes": gain,
+        "noise_factors": jnp.linalg.cholesky(covariance),
+    }
+    return expert, missed
 
 
 def _numbers_or_neutral(psi: LocalQuadratics) -> LocalQuadratics:
@@ -349,8 +340,3 @@ def _factor(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
 def _inverses(factors: Float[Array, "k d d"]) -> Float[Array, "k d d"]:
     identity = jnp.broadcast_to(jnp.eye(factors.shape[1], dtype=factors.dtype), factors.shape)
     return jax.scipy.linalg.solve_triangular(factors, identity, lower=True)
-
-
-def _replaced(psi: LocalQuadratics, **fields: PyTree) -> LocalQuadratics:
-    own = {name: getattr(psi, name) for name in psi.__dataclass_fields__}
-    return LocalQuadratics(**own | fields)

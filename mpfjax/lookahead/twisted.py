@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.checks import check_one_of
+from mpfjax.lookahead.quadratics import LocalQuadratics
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -26,7 +27,6 @@ from mpfjax.models.conditionally_linear import (
 from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
 from mpfjax.models.steps import seen
 from mpfjax.moves.base import AbstractMove, AbstractPropagation, AbstractRegrouping
-from mpfjax.moves.local_quadratics import LocalQuadratics
 from mpfjax.moves.propagation.marginalised import (
     PropagateMarginalised,
     latent_made_of,

@@ -11,17 +11,9 @@ from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_callable, check_key, check_type, check_whole, given
 from mpfjax.filter import Filter
-from mpfjax.models.base import mapped, require_noise, starts_from_noise
-from mpfjax.models.conditionally_linear import is_mixed, with_moments
-from mpfjax.models.noise import noise_dtype
-from mpfjax.moves.base import AbstractRegrouping
-from mpfjax.moves.every import Every
-from mpfjax.moves.local_quadratics import neutral
-from mpfjax.moves.propagation.marginalised import PropagateMarginalised
-from mpfjax.moves.propagation.propagate import Propagate
-from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
-from mpfjax.moves.resampling.resample import Resample
-from mpfjax.moves.twisted import (
+from mpfjax.lookahead.quadratics import neutral
+from mpfjax.lookahead.regression import fit_lookahead
+from mpfjax.lookahead.twisted import (
     CountSteps,
     PropagateTwisted,
     RegroupTwisted,
@@ -31,10 +23,13 @@ from mpfjax.moves.twisted import (
     features_of,
     noise_dimension_of,
 )
+from mpfjax.models.base import mapped, require_noise, starts_from_noise
+from mpfjax.models.conditionally_linear import is_mixed, with_moments
+from mpfjax.models.noise import noise_dtype
+from mpfjax.moves.every import Every
+from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.observations import as_series
 from mpfjax.running.run import run_filter
-from mpfjax.smoothing.history import mixtures_of
-from mpfjax.smoothing.lookahead_regression import fit_lookahead
 
 # So many times the particles of a run in each pass.
 _LEARNERS = 16
@@ -108,7 +103,7 @@ def learn_lookahead(
         run_key, fit_key = jax.random.split(pass_key)
         twisted = _twisted(filter, twist, learners)
         run = run_filter(run_key, twisted, observations, inputs=inputs, missing=missing)
-        twist = fit_lookahead(fit_key, twisted, twist, mixtures_of(run), series)
+        twist = fit_lookahead(fit_key, twisted, twist, run, series)
     return _twisted(filter, twist, filter.num_particles)
 
 
@@ -121,8 +116,7 @@ def _knowing_nothing(
     states = jax.eval_shape(start, key)
     num_features = jax.eval_shape(partial(features_of, features), states).shape[1]
     size, dtype = filter.num_components, noise_dtype(states)
-    noise = jax.eval_shape(lambda states: jnp.zeros(noise_dimension_of(model, states)), states)
-    one = neutral(size, num_features, noise.shape[0], dtype)
+    one = neutral(size, num_features, noise_dimension_of(model, states), dtype)
     steps = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (length + 1, *leaf.shape)), one)
     initial = None
     if starts_from_noise(model):
@@ -133,32 +127,29 @@ def _knowing_nothing(
 
 def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
     """The filter whose moves look ahead by `twist`; a `ValueError` for one that cannot."""
-    moves = [_looking_ahead(move, filter, twist) for move in filter.moves]
+
+    def ahead(move: Any) -> Any:
+        if isinstance(move, Every):
+            return Every(move.num_steps, [ahead(inner) for inner in move.moves])
+        if move.regroups:
+            return RegroupTwisted(move, twist)
+        if move.resampling is not None:
+            # Masses of today tell little where ψ knows what is to come: each ψ_t errs by its fit.
+            equally = dataclasses.replace(move.resampling, allocation="equal")
+            return AuxiliaryResample(equally, TwistedLookahead(twist))
+        if hasattr(move, "from_noise") and move.gradient == "none":
+            return PropagateTwisted(filter.model, twist, move.noise)
+        raise ValueError(
+            f"filter: {type(move).__name__}, one of its moves, cannot look ahead; Resample,"
+            " Propagate or PropagateMarginalised of gradient 'none', and regrouping can"
+        )
+
+    moves = [ahead(move) for move in filter.moves]
     for kind, needed in ((AuxiliaryResample, "Resample"), (PropagateTwisted, "Propagate")):
         if sum(isinstance(move, kind) for move in moves) != 1:
             raise ValueError(f"filter: its moves need one {needed}, in the chain itself")
-    kept = [move for move in filter.initial_moves if not move.looks_ahead]
-    regroupings = [_looking_ahead(move, filter, twist) for move in kept]
-    initial: list[Any] = [TwistInitial(filter.model, twist, filter.initial_noise), *regroupings]
+    start = TwistInitial(filter.model, twist, filter.initial_noise)
+    kept = [ahead(move) for move in filter.initial_moves if not move.looks_ahead]
     return filter.replace(
-        moves=[CountSteps(), *moves], num_particles=num_particles, initial_moves=initial
-    )
-
-
-def _looking_ahead(move: Any, filter: Filter, twist: Twist) -> Any:
-    if isinstance(move, AuxiliaryResample):
-        move = move.resample
-    if isinstance(move, Resample):
-        # Masses of today tell little where ψ knows what is to come: each ψ_t errs by its own fit.
-        equally = dataclasses.replace(move, allocation="equal")
-        return AuxiliaryResample(equally, TwistedLookahead(twist))
-    if isinstance(move, Propagate | PropagateMarginalised) and move.gradient == "none":
-        return PropagateTwisted(filter.model, twist, move.noise)
-    if isinstance(move, Every):
-        return Every(move.num_steps, [_looking_ahead(inner, filter, twist) for inner in move.moves])
-    if isinstance(move, AbstractRegrouping):
-        return RegroupTwisted(move, twist)
-    raise ValueError(
-        f"filter: {type(move).__name__}, one of its moves, cannot look ahead; Resample, Propagate"
-        " or PropagateMarginalised of gradient 'none', and regrouping can"
+        moves=[CountSteps(), *moves], num_particles=num_particles, initial_moves=[start, *kept]
     )

@@ -1,0 +1,1 @@
+"""Look-aheads: what later observations say of a particle, before it is resampled or moved."""
