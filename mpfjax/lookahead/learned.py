@@ -138,7 +138,7 @@ def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
             equally = dataclasses.replace(move.resampling, allocation="equal")
             return AuxiliaryResample(equally, TwistedLookahead(twist))
         if hasattr(move, "from_noise") and move.gradient == "none":
-            return PropagateTwisted(filter.model, twist, move.noise)
+            return PropagateTwisted(dataclasses.replace(move, proposal=None), twist)
         raise ValueError(
             f"filter: {type(move).__name__}, one of its moves, cannot look ahead; Resample,"
             " Propagate or PropagateMarginalised of gradient 'none', and regrouping can"

@@ -8,31 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_one_of
 from mpfjax.lookahead.quadratics import LocalQuadratics
 from mpfjax.mixture import ParticleMixture, flatten_states
-from mpfjax.models.base import (
-    AbstractStateSpaceModel,
-    HasInitialNoise,
-    check_moved,
-    require_noise,
-)
-from mpfjax.models.conditionally_linear import (
-    AbstractConditionallyLinearModel,
-    is_marginalised,
-    is_mixed,
-    predicted,
-    with_moments,
-)
-from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
+from mpfjax.models.base import AbstractStateSpaceModel, HasInitialNoise, check_moved
+from mpfjax.models.conditionally_linear import is_marginalised, predicted, with_moments
+from mpfjax.models.noise import draw_noise, noise_dtype
 from mpfjax.models.steps import seen
 from mpfjax.moves.base import AbstractMove, AbstractPropagation, AbstractRegrouping
-from mpfjax.moves.propagation.marginalised import (
-    PropagateMarginalised,
-    latent_made_of,
-    latent_noise_dimension,
-)
-from mpfjax.moves.propagation.propagate import noise_of_slots, predict
+from mpfjax.moves.propagation.marginalised import latent_made_of, latent_noise_dimension
+from mpfjax.moves.propagation.propagate import noise_of_slots
 from mpfjax.operations.logarithms import log_sum_exp
 
 STEP = "twisted"
@@ -160,18 +144,11 @@ class PropagateTwisted(AbstractPropagation):
 
     No density of the dynamics is needed, which may be singular or mixed with discrete draws. For a
     conditionally linear model ε is the noise of z_t, and L is p(y_t | z_0, ..., z_t, y_1..y_{t-1}).
-    `noise` is that of `Propagate`. Raises `ValueError` for a model that makes x_t, or z_t,
-    otherwise, and for unknown noise.
+    `move` is the filter's own propagation, which makes x_t of noise.
     """
 
-    model: AbstractStateSpaceModel
+    move: Any
     twist: Twist
-    noise: str = eqx.field(static=True, default="independent")
-
-    def __check_init__(self) -> None:
-        if not is_mixed(self.model):
-            require_noise(self.model, "PropagateTwisted")
-        check_one_of(NOISES, noise=self.noise)
 
     @property
     def reads(self) -> frozenset[str]:
@@ -182,8 +159,9 @@ class PropagateTwisted(AbstractPropagation):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
-        model, previous = self.model, mixture.particles
-        noise = noise_of_slots(self.noise, key, noise_dimension_of(model, previous) + 1, mixture)
+        model, previous = self.move.model, mixture.particles
+        dimension = noise_dimension_of(model, previous) + 1
+        noise = noise_of_slots(self.move.noise, key, dimension, mixture)
         psi = self.twist.at(mixture.memory[STEP]["step"])
         drawn, log_ratio = psi.draw(noise, self.twist.features_of(previous))
         states, log_factors = seen(model, observation, made_of(model, drawn, previous))
@@ -191,10 +169,7 @@ class PropagateTwisted(AbstractPropagation):
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
-        model = self.model
-        if isinstance(model, AbstractConditionallyLinearModel):
-            return PropagateMarginalised(model, noise=self.noise).predict(key, mixture)
-        return predict(key, model, mixture, "none", self.noise)
+        return self.move.predict(key, mixture)
 
 
 class RegroupTwisted(AbstractRegrouping):

@@ -9,15 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.chain import give_inputs
-from mpfjax.checks import (
-    check_callable,
-    check_key,
-    check_type,
-    check_whole,
-    given,
-    saying,
-    shown,
-)
+from mpfjax.checks import check_callable, check_key, check_type, check_whole, given, saying, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped_draw
@@ -106,13 +98,8 @@ def _forecast(key, filter, mixture, inputs, options):
 def _check_simulated(observations: PyTree, num_particles: int) -> None:
     """Raise a `ValueError` unless there is one observation for each particle."""
     leaves = jax.tree.leaves(observations)
-    if not leaves:
+    if not leaves or any(jnp.shape(leaf)[:1] != (num_particles,) for leaf in leaves):
         raise ValueError(
-            f"simulate_observation: it returned {shown(observations)}, which holds no array"
+            f"simulate_observation: it returned {shown(jax.tree.map(jnp.shape, observations))}, no"
+            f" arrays whose leading axis is that of the {num_particles} particles"
         )
-    for leaf in leaves:
-        if jnp.shape(leaf)[:1] != (num_particles,):
-            raise ValueError(
-                f"simulate_observation: it returned an array of shape {jnp.shape(leaf)}, whose"
-                f" leading axis is not that of the {num_particles} particles"
-            )

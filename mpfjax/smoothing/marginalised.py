@@ -186,9 +186,8 @@ def _before(
     vector = vector - applied(precision, offset)
     root = cholesky(noise)
     half = solve_lower(_one_plus(precision, root), transposed(product(precision, root)))
-    white = solve_lower(_one_plus(precision, root), applied(transposed(root), vector)[:, None])[
-        :, 0
-    ]
+    white = solve_lower(_one_plus(precision, root), applied(transposed(root), vector)[:, None])
+    white = white[:, 0]
     precision = precision - product(transposed(half), half)
     vector = vector - applied(transposed(half), white)
     back = transposed(matrix)
