@@ -14,7 +14,6 @@ from mpfjax.filter import Filter
 from mpfjax.lookahead.quadratics import neutral
 from mpfjax.lookahead.regression import fit_lookahead
 from mpfjax.lookahead.twisted import (
-    CountSteps,
     PropagateTwisted,
     RegroupTwisted,
     Twist,
@@ -116,7 +115,8 @@ def _knowing_nothing(
     states = jax.eval_shape(start, key)
     num_features = jax.eval_shape(partial(features_of, features), states).shape[1]
     size, dtype = filter.num_components, noise_dtype(states)
-    one = neutral(size, num_features, noise_dimension_of(model, states), dtype)
+    noise = jax.eval_shape(lambda states: jnp.zeros(noise_dimension_of(model, states)), states)
+    one = neutral(size, num_features, noise.shape[0], dtype)
     steps = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (length + 1, *leaf.shape)), one)
     initial = None
     if starts_from_noise(model):
@@ -150,6 +150,4 @@ def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
             raise ValueError(f"filter: its moves need one {needed}, in the chain itself")
     start = TwistInitial(filter.model, twist, filter.initial_noise)
     kept = [ahead(move) for move in filter.initial_moves if not move.looks_ahead]
-    return filter.replace(
-        moves=[CountSteps(), *moves], num_particles=num_particles, initial_moves=[start, *kept]
-    )
+    return filter.replace(moves=moves, num_particles=num_particles, initial_moves=[start, *kept])

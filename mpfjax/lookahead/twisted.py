@@ -72,31 +72,6 @@ def made_of(model: Any, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
     return moved
 
 
-class CountSteps(AbstractMove):
-    """Keeps the number of the step, at the head of a chain whose look-ahead depends on it."""
-
-    weighs = False
-    keeps_mass = True
-
-    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
-        """The number of the step."""
-        del num_components
-        return {STEP: {"step": jnp.zeros((), jnp.int32)}}
-
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
-        """Count the step."""
-        del observation
-        return self.predict(key, mixture)
-
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """Count the step."""
-        del key
-        counted = {"step": mixture.memory[STEP]["step"] + 1}
-        return mixture.replace(memory=mixture.memory | {STEP: counted})
-
-
 class TwistInitial(AbstractMove):
     """Draws x_0 anew: its noise from q_0, with the weights N(ε; 0, I) / q_0(ε).
 
@@ -130,12 +105,12 @@ class TwistedLookahead(eqx.Module):
 
     @property
     def reads(self) -> frozenset[str]:
-        """The memory of `CountSteps`."""
+        """The number of the step."""
         return frozenset({STEP})
 
     def at_step_of(self, mixture: ParticleMixture) -> Callable[[PyTree, PyTree], Array]:
         """log ν_t of the states in this step; the observation is not used."""
-        step = mixture.memory[STEP]["step"]
+        step = next_step(mixture)
         return lambda observation, states: self.twist.log_normaliser(step, states)
 
 
@@ -150,10 +125,10 @@ class PropagateTwisted(AbstractPropagation):
     move: Any
     twist: Twist
 
-    @property
-    def reads(self) -> frozenset[str]:
-        """The memory of `CountSteps`."""
-        return frozenset({STEP})
+    def initial_memory(self, num_components: int) -> dict[str, PyTree]:
+        """The number of steps so far."""
+        del num_components
+        return {STEP: {"step": jnp.zeros((), jnp.int32)}}
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -162,14 +137,23 @@ class PropagateTwisted(AbstractPropagation):
         model, previous = self.move.model, mixture.particles
         dimension = noise_dimension_of(model, previous) + 1
         noise = noise_of_slots(self.move.noise, key, dimension, mixture)
-        psi = self.twist.at(mixture.memory[STEP]["step"])
+        psi = self.twist.at(next_step(mixture))
         drawn, log_ratio = psi.draw(noise, self.twist.features_of(previous))
         states, log_factors = seen(model, observation, made_of(model, drawn, previous))
-        return mixture.replace(particles=states).weighed(*log_factors, log_ratio)
+        return _counted(mixture.replace(particles=states).weighed(*log_factors, log_ratio))
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
-        return self.move.predict(key, mixture)
+        return _counted(self.move.predict(key, mixture))
+
+
+def next_step(mixture: ParticleMixture) -> Int[Array, ""]:
+    """The number of the step that takes the particles on from where they are."""
+    return mixture.memory[STEP]["step"] + 1
+
+
+def _counted(mixture: ParticleMixture) -> ParticleMixture:
+    return mixture.replace(memory=mixture.memory | {STEP: {"step": next_step(mixture)}})
 
 
 class RegroupTwisted(AbstractRegrouping):
@@ -184,7 +168,7 @@ class RegroupTwisted(AbstractRegrouping):
 
     @property
     def reads(self) -> frozenset[str]:
-        """The memory of `CountSteps`, and that which the move reads."""
+        """The number of the step, and that which the move reads."""
         return frozenset({STEP}) | self.move.reads
 
     @property
@@ -196,8 +180,7 @@ class RegroupTwisted(AbstractRegrouping):
         self, key: Key[Array, ""], mixture: ParticleMixture
     ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
         """The move's indicators under the weights times ν_{t+1}."""
-        step = mixture.memory[STEP]["step"] + 1
-        log_factors = self.twist.log_normaliser(step, mixture.particles)
+        log_factors = self.twist.log_normaliser(next_step(mixture), mixture.particles)
         log_weights = mixture.weighed(log_factors).log_weights
         log_weights = log_weights - log_sum_exp(log_weights)
         return self.move.regroup(key, mixture.replace(log_weights=log_weights))
