@@ -268,7 +268,9 @@ def independent_particle_filters(
     `PropagateIndependently`.
     """
     require_multi_object(model, "independent_particle_filters")
-    return Filter(model, moves=[PropagateIndependently(model, scheme)], num_particles=num_particles)
+    return Filter(
+        model, moves=[PropagateIndependently(model, scheme=scheme)], num_particles=num_particles
+    )
 
 
 def clustered_particle_filter(
@@ -294,7 +296,7 @@ def clustered_particle_filter(
     are after resampling. A cluster's distribution may have several modes, such as two look-alikes
     in either order. Their mean is then a place where no object is: take a median.
     """
-    move = PropagateInClusters(model, start, split_after, scheme)
+    move = PropagateInClusters(model, start, split_after, scheme=scheme)
     return Filter(model, moves=[move], num_particles=num_particles)
 
 

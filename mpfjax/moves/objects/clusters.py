@@ -8,14 +8,16 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 from mpfjax.checks import check_one_of, check_whole, given
 from mpfjax.mixture import ParticleMixture, no_ancestors
 from mpfjax.models.base import require
-from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
-from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.objects.coupling import coupled, together
-from mpfjax.moves.objects.independent import drawn_rows, moved_objects, rows_of_each
+from mpfjax.moves.objects.independent import (
+    AbstractPropagationByObject,
+    drawn_rows,
+    moved_objects,
+    rows_of_each,
+)
 from mpfjax.moves.objects.recombination import recombined, rotated, scores
 from mpfjax.moves.regrouping.merge import lowest_connected
 from mpfjax.moves.resampling.allocation import require_equal_rows
-from mpfjax.moves.resampling.ancestors import SCHEMES
 from mpfjax.operations.floats import default_float
 from mpfjax.operations.generator import split
 from mpfjax.operations.indexing import take
@@ -24,7 +26,7 @@ from mpfjax.operations.logarithms import finite_max
 STARTS = ("apart", "together")
 
 
-class PropagateInClusters(AbstractPropagation):
+class PropagateInClusters(AbstractPropagationByObject):
     """Propagate, weigh and resample clusters of objects, which merge where objects meet.
 
     Each object belongs to one cluster. A cluster has N rows, and a row holds a state of each of
@@ -84,14 +86,10 @@ class PropagateInClusters(AbstractPropagation):
     `split_after` below 1.
     """
 
-    model: MultiObjectModel
     start: str = eqx.field(static=True, default="apart")
     split_after: int | None = eqx.field(static=True, default=None)
-    scheme: str = eqx.field(static=True, default="systematic")
 
     def __check_init__(self) -> None:
-        require_multi_object(self.model, "PropagateInClusters")
-        check_one_of(SCHEMES, scheme=self.scheme)
         check_one_of(STARTS, start=self.start)
         check_whole(**given(split_after=self.split_after))
         if self._may_be_joint:
@@ -101,10 +99,6 @@ class PropagateInClusters(AbstractPropagation):
     def approximate(self) -> bool:
         """Whether clusters are split again."""
         return self.split_after is not None
-
-    biases_score = True
-    keeps_parents = False
-    """each cluster of a particle has a parent of its own."""
 
     @property
     def _may_be_joint(self) -> bool:
@@ -150,17 +144,12 @@ class PropagateInClusters(AbstractPropagation):
             ancestor_indices=no_ancestors(mixture),
             memory=mixture.memory | {"clusters": memory},
         ).weighed(log_growth[None], jnp.sum(common)[None])
-        return jax.lax.cond(
-            log_growth == -jnp.inf, lambda: self._unweighted(key, mixture), lambda: moved
-        )
 
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """Draw x_t ~ D(. | x_{t-1}) of all objects; the clusters stay."""
-        return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
+        def predicted() -> ParticleMixture:
+            nothing = jnp.full((1,), -jnp.inf, mixture.log_weights.dtype)
+            return self.predict(key, mixture).weighed(nothing)
 
-    def _unweighted(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        nothing = jnp.full((1,), -jnp.inf, mixture.log_weights.dtype)
-        return self.predict(key, mixture).weighed(nothing)
+        return jax.lax.cond(log_growth == -jnp.inf, predicted, lambda: moved)
 
     def _updated(
         self,
@@ -180,16 +169,9 @@ class PropagateInClusters(AbstractPropagation):
         rows, log_growth = self._resampled(keys_rows, labels, log_scores)
 
         def cross() -> tuple[PyTree, Float[Array, ""]]:
-            chosen, log_weights = recombined(
-                self.model,
-                key_cross,
-                particles,
-                points,
-                rows,
-                log_likelihoods - log_totals,
-                log_sums,
-                together_with,
-            )
+            log_point_weights = log_likelihoods - log_totals
+            tables = rows, log_point_weights, log_sums, together_with
+            chosen, log_weights = recombined(self.model, key_cross, particles, points, *tables)
             keys_last = split(key_last, len(labels))
             last, log_gain = self._resampled(keys_last, labels, log_weights)
             # Without this, rounding could redraw equal weights.

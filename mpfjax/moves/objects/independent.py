@@ -17,7 +17,24 @@ from mpfjax.operations.generator import split
 from mpfjax.operations.indexing import take
 
 
-class PropagateIndependently(AbstractPropagation):
+class AbstractPropagationByObject(AbstractPropagation):
+    """A propagation in which every object of a particle has a parent of its own."""
+
+    model: MultiObjectModel
+    scheme: str = eqx.field(static=True, default="systematic", kw_only=True)
+
+    keeps_parents = False
+
+    def __check_init__(self) -> None:
+        require_multi_object(self.model, type(self).__name__)
+        check_one_of(SCHEMES, scheme=self.scheme)
+
+    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """Draw x_t ~ D(. | x_{t-1}) of all objects, and leave all else."""
+        return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
+
+
+class PropagateIndependently(AbstractPropagationByObject):
     """Propagate, weigh and resample each object on its own, as if there were no other.
 
     For every object j: x_t^j ~ D, weights L(y_t | x_t^j), resampled by these weights alone.
@@ -32,21 +49,10 @@ class PropagateIndependently(AbstractPropagation):
     scheme.
     """
 
-    model: MultiObjectModel
-    scheme: str = eqx.field(static=True, default="systematic")
-
-    def __check_init__(self) -> None:
-        require_multi_object(self.model, "PropagateIndependently")
-        check_one_of(SCHEMES, scheme=self.scheme)
-
     @property
     def approximate(self) -> bool:
         """Whether the model has an interaction, which this move ignores."""
         return self.model.interaction is not None
-
-    biases_score = True
-    keeps_parents = False
-    """each object of a particle has a parent of its own."""
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -67,10 +73,6 @@ class PropagateIndependently(AbstractPropagation):
             particles=rows_of_each(points, rows), ancestor_indices=no_ancestors(mixture)
         )
         return moved.weighed(jnp.sum(log_growths)[None])
-
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """Draw x_t ~ D(. | x_{t-1}) of all objects."""
-        return mixture.replace(particles=self.model.sample_transition(key, mixture.particles))
 
 
 def moved_objects(
