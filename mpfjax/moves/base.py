@@ -42,6 +42,9 @@ class AbstractMove(eqx.Module):
     keeps_parents = True
     """whether each particle comes from one particle of the mixture that the move was given. Where
     it does not, the move sets its ancestor index to -1, and what follows ancestors refuses it."""
+    biases_score = False
+    """whether it redraws particles in a way that derivatives in the model's parameters do not see,
+    so that the score is biased."""
     keeps_families = True
     """whether it draws independently, or tells the memory of first ancestors, so that the errors of
     one run are known."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.moves.base import AbstractAdaptiveResampling, AbstractPropagation
-from mpfjax.operations.indexing import take
+from mpfjax.operations.stored import take
 
 REFERENCE = "reference"  # the name of its slot and time in a mixture's memory
 

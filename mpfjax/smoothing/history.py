@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from mpfjax.checks import check_numbered, shown
 from mpfjax.mixture import ParticleMixture
-from mpfjax.operations.indexing import count_places, take
+from mpfjax.operations.stored import count_places, take
 from mpfjax.running.scan import FilterRun
 
 _NEEDED = "a FilterRun of run_filter(..., collect=None), or the mixtures that it collected"

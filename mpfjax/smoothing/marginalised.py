@@ -37,20 +37,20 @@ from mpfjax.models.inputs import with_inputs
 from mpfjax.moves.propagation.marginalised import log_latent_transition
 from mpfjax.operations import gaussians
 from mpfjax.operations.compiling import jit_on_wide_vectors
-from mpfjax.operations.gaussians import Gaussian, Linear, without_missing
-from mpfjax.operations.generator import split
-from mpfjax.operations.indexing import take
-from mpfjax.operations.stacks import (
+from mpfjax.operations.gaussians import (
+    Gaussian,
+    Linear,
     applied,
-    cholesky,
     particles_first,
     product,
     sandwiched,
-    solve_lower,
     symmetric,
     transposed,
     without_missing,
 )
+from mpfjax.operations.matrices import cholesky, solve_lower
+from mpfjax.operations.random import split
+from mpfjax.operations.stored import take
 from mpfjax.smoothing.backward import draw, draw_exactly
 
 

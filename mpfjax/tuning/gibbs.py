@@ -20,17 +20,10 @@ from mpfjax.observations import Series
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.conditional import check_conditional, draw_trajectory, possible_times, renew
-from mpfjax.tuning.chains import (
-    AbstractKernel,
-    Plan,
-    Run,
-    Step,
-    as_checkpoint,
-    chosen,
-)
-from mpfjax.tuning.densities import LogPrior, Prior, is_invalid, number_or_zero
-from mpfjax.tuning.problem import Parameters, Problem, Reals, pose_filter
-from mpfjax.tuning.starts import SamplePrior, Starts, constrained
+from mpfjax.tuning.chains import AbstractKernel, ChainOptions, Plan, Sampling, Step
+from mpfjax.tuning.densities import LogPrior, Prior, chosen, evaluated, is_invalid
+from mpfjax.tuning.evidence import one_sequence, pose_filter
+from mpfjax.tuning.problem import Parameters, Problem, Reals
 from mpfjax.tuning.transforms import AbstractTransform
 from mpfjax.tuning.walks import RandomWalk, accepts, checked_deviations
 

@@ -18,10 +18,9 @@ from mpfjax.moves.objects.independent import (
 from mpfjax.moves.objects.recombination import recombined, rotated, scores
 from mpfjax.moves.regrouping.merge import lowest_connected
 from mpfjax.moves.resampling.allocation import require_equal_rows
-from mpfjax.operations.floats import default_float
-from mpfjax.operations.generator import split
-from mpfjax.operations.indexing import take
-from mpfjax.operations.logarithms import finite_max
+from mpfjax.operations.logarithms import default_float, finite_max
+from mpfjax.operations.random import split
+from mpfjax.operations.stored import take
 
 STARTS = ("apart", "together")
 

@@ -12,9 +12,9 @@ from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling.allocation import require_equal_rows
 from mpfjax.moves.resampling.ancestors import SCHEMES
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.floats import default_float
-from mpfjax.operations.generator import split
-from mpfjax.operations.indexing import take
+from mpfjax.operations.logarithms import default_float
+from mpfjax.operations.random import split
+from mpfjax.operations.stored import take
 
 
 class AbstractPropagationByObject(AbstractPropagation):
@@ -24,6 +24,7 @@ class AbstractPropagationByObject(AbstractPropagation):
     scheme: str = eqx.field(static=True, default="systematic", kw_only=True)
 
     keeps_parents = False
+    biases_score = True
 
     def __check_init__(self) -> None:
         require_multi_object(self.model, type(self).__name__)

@@ -17,11 +17,9 @@ from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.choices import cond_if_any
-from mpfjax.operations.generator import split
-from mpfjax.operations.gradients import add_gradient
-from mpfjax.operations.indexing import take
-from mpfjax.operations.logarithms import log_sum_exp
+from mpfjax.operations.islands import cond_if_any
+from mpfjax.operations.logarithms import add_gradient, log_sum_exp
+from mpfjax.operations.random import split
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
 

@@ -15,9 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.moves.objects.coupling import alike, over_pairs
-from mpfjax.operations.floats import default_float
-from mpfjax.operations.generator import split, uniform
-from mpfjax.operations.logarithms import finite_or_zero, log_or_nothing
+from mpfjax.operations.logarithms import default_float, finite_or_zero, log_or_nothing
 from mpfjax.operations.matrices import draw_columns
 from mpfjax.operations.random import split, uniform
 

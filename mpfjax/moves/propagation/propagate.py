@@ -26,8 +26,7 @@ from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
 from mpfjax.models.steps import likelihoods
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.conditional import ConditionalPropagation, Reference
-from mpfjax.operations.gradients import add_gradient
-from mpfjax.operations.logarithms import finite_max
+from mpfjax.operations.logarithms import add_gradient, finite_max
 from mpfjax.proposals import AbstractProposal
 
 

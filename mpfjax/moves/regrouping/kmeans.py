@@ -9,7 +9,7 @@ from mpfjax.checks import check_flag, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.regrouping.features import ByFeatures
-from mpfjax.operations.choices import most_of_runs
+from mpfjax.operations.islands import most_of_runs
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.segments import segment_argmax, segment_counts, segment_sum
 

@@ -9,7 +9,6 @@ from mpfjax.checks import check_positive, check_whole, given
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.regrouping.features import ByFeatures, relative_weights, separation, summarise
-from mpfjax.operations.indexing import take
 from mpfjax.operations.segments import spread_stored
 from mpfjax.operations.stored import take
 

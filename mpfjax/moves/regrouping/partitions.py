@@ -11,9 +11,9 @@ from jaxtyping import Array, Int, Key, PyTree
 from mpfjax.checks import check_callable, check_whole, given, saying, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
-from mpfjax.operations.generator import bits
-from mpfjax.operations.indexing import take
 from mpfjax.operations.prefix_sums import count_upto
+from mpfjax.operations.random import bits
+from mpfjax.operations.stored import take
 
 
 class Pool(AbstractRegrouping):
