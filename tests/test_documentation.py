@@ -96,7 +96,8 @@ def test_every_public_name_is_on_an_api_page():
     shown = re.findall(r"^\.\. auto(?:class|function|data):: (\S+)", text, re.MULTILINE)
     assert len(shown) == len(set(shown)), "a name stands on two pages"
     names = api.public_names()
-    assert set(names.values()) == {names.get(name, name) for name in shown}
+    # Pages also show what functions return, under the names of their files.
+    assert set(names.values()) <= {names.get(name, name) for name in shown}
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,7 @@ class PropagateInClusters(AbstractPropagationByObject):
     split_after: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
+        super().__check_init__()
         check_one_of(STARTS, start=self.start)
         check_whole(**given(split_after=self.split_after))
         if self._may_be_joint:
