@@ -18,9 +18,9 @@ from mpfjax.models.dynamics import AbstractDynamics, RandomWalkWithJumps, WalkWi
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping
 from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.propagation.propagate import Propagate
-from mpfjax.moves.regrouping.group_by import GroupBy
 from mpfjax.moves.regrouping.kmeans import KMeans
 from mpfjax.moves.regrouping.merge import Merge
+from mpfjax.moves.regrouping.partitions import GroupBy
 from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.transforms import with_resampling
