@@ -27,11 +27,11 @@ from mpfjax.models.dynamics import Autoregression as Autoregression
 from mpfjax.models.dynamics import RandomWalk as RandomWalk
 from mpfjax.models.dynamics import RandomWalkWithJumps as RandomWalkWithJumps
 from mpfjax.models.dynamics import WalkWithVelocity as WalkWithVelocity
-from mpfjax.models.interaction import PairwiseRepulsion as PairwiseRepulsion
-from mpfjax.models.linear_gaussian import LinearGaussianModel as LinearGaussianModel
+from mpfjax.models.linear import LinearGaussianModel as LinearGaussianModel
+from mpfjax.models.linear import SwitchingLinearGaussianModel as SwitchingLinearGaussianModel
 from mpfjax.models.multi_object import MultiObjectModel as MultiObjectModel
+from mpfjax.models.multi_object import PairwiseRepulsion as PairwiseRepulsion
 from mpfjax.models.quadratic import QuadraticModel as QuadraticModel
-from mpfjax.models.switching import SwitchingLinearGaussianModel as SwitchingLinearGaussianModel
 from mpfjax.models.trial import check_model as check_model
 from mpfjax.moves import AbstractMarkovMove as AbstractMarkovMove
 from mpfjax.moves import AbstractMetropolis as AbstractMetropolis

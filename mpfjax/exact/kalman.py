@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 
 from mpfjax.checks import as_numbers, check_shape, check_type
 from mpfjax.models.inputs import with_inputs
-from mpfjax.models.linear_gaussian import LinearGaussianModel
+from mpfjax.models.linear import LinearGaussianModel
 from mpfjax.observations import Series, gathered, steps_of_inputs
 from mpfjax.operations.matrices import cholesky
 

@@ -16,7 +16,7 @@ from mpfjax.exact.kalman import (
     filtered_moments,
     smoothed_moments,
 )
-from mpfjax.models.switching import SwitchingLinearGaussianModel
+from mpfjax.models.linear import SwitchingLinearGaussianModel
 from mpfjax.observations import Series
 from mpfjax.operations.logarithms import log_sum_exp
 

@@ -90,7 +90,7 @@ class AbstractStateSpaceModel(eqx.Module):
         `ValueError` otherwise. `inputs` are as for `run_filter`. Use it to test a filter on data
         whose states are known.
         """
-        from mpfjax.models.simulation import simulate
+        from mpfjax.models.trial import simulate
 
         return simulate(key, self, num_steps, inputs)
 
@@ -140,9 +140,8 @@ def is_made_of_noise(model: Any) -> bool:
 
 def starts_from_noise(model: Any) -> bool:
     """Whether the model makes x_0 of noise, and has no other law for it."""
-    return isinstance(model, HasInitialNoise) and not _draws_otherwise(
-        model, "sample_initial", "initial_from_noise"
-    )
+    has_noise = hasattr(model, "initial_from_noise") and hasattr(model, "initial_noise_dimension")
+    return has_noise and not _draws_otherwise(model, "sample_initial", "initial_from_noise")
 
 
 def _draws_otherwise(model: Any, drawing: str, making: str) -> bool:
@@ -158,12 +157,11 @@ def _draws_otherwise(model: Any, drawing: str, making: str) -> bool:
 
 def require_noise(model: Any, needed_by: str) -> None:
     """Raise a `ValueError` unless the model can make x_t of noise from the Sobol table."""
-    require(model, "transition_from_noise", needed_by)
-    if not hasattr(model, "noise_dimension"):
-        raise ValueError(
-            f"model: {model_name(model)} has no noise_dimension, which {needed_by} needs beside"
-            " transition_from_noise"
-        )
+    for name in ("transition_from_noise", "noise_dimension"):
+        if not hasattr(model, name):
+            raise ValueError(
+                f"model: {model_name(model)} defines no {name}, which {needed_by} needs"
+            )
     if not is_made_of_noise(model):
         raise ValueError(
             f"model: {model_name(model)} defines a sample_transition, but inherits its"
@@ -176,12 +174,11 @@ def require_noise(model: Any, needed_by: str) -> None:
 def require(model: Any, method: str, needed_by: str, argument: str = "model") -> None:
     """Raise a `ValueError` where `model` lacks `method`, before anything compiles."""
     if not callable(getattr(model, method, None)):
-        who = shown(model) if isinstance(model, _NO_MODELS) else model_name(model)
+        who = shown(model) if model is None else model_name(model)
         raise ValueError(f"{argument}: {who} defines no {method}, which {needed_by} needs")
 
 
 _FROM_NOISE = AbstractStateSpaceModel.sample_transition
-_NO_MODELS = (type(None), str, int, float, list, tuple, dict, jax.Array, np.ndarray)
 
 
 def model_name(model: Any) -> str:
@@ -207,28 +204,25 @@ def require_model(model: Any, needed_by: str, argument: str = "model") -> None:
         signature = inspect.signature(model.sample_initial)
     except (TypeError, ValueError):  # functions not written in Python cannot be inspected
         return
-    if not _takes(signature, 2):
-        wrap = "it is written for one particle: wrap it, mpfjax.per_particle(model)"
-        hint = wrap if _takes(signature, 1) else "it is sample_initial(key, num_particles)"
+    try:
+        signature.bind("key", "num_particles")
+    except TypeError as error:
         raise ValueError(
             f"{argument}: {model_name(model)}.sample_initial{signature} takes no (key,"
-            f" num_particles); {hint}"
-        )
+            " num_particles); if it is of one particle, wrap it, mpfjax.per_particle(model)"
+        ) from error
 
 
 def check_states(states: Any, model: Any, method: str, num_particles: int) -> None:
     """Raise a `ValueError` for states of another number of particles, or no states at all."""
-    leaves = jax.tree_util.tree_leaves_with_path(states)
     who = f"model: {model_name(model)}.{method} returned"
-    if not leaves:
+    if not jax.tree.leaves(states):
         raise ValueError(f"{who} {shown(states)}, which holds no array of particles")
-    for place, leaf in leaves:
-        if not isinstance(leaf, jax.Array | np.ndarray):
-            raise ValueError(f"{who} {shown(leaf)}{_at(place)}, no array of particles")
-        if leaf.shape[:1] != (num_particles,):
+    for place, leaf in jax.tree_util.tree_leaves_with_path(states):
+        if np.shape(leaf)[:1] != (num_particles,):
             raise ValueError(
-                f"{who} a leaf of shape {leaf.shape}{_at(place)}; its leading axis is not"
-                f" num_particles, {num_particles}"
+                f"{who} a leaf of shape {np.shape(leaf)}{_at(place)}; its leading axis is not the"
+                f" number of particles, {num_particles}"
             )
 
 
@@ -245,11 +239,10 @@ def check_moved(
         )
     before = jax.tree.leaves(previous_states)
     for (place, new), old in zip(jax.tree_util.tree_leaves_with_path(states), before, strict=True):
-        if not isinstance(new, jax.Array | np.ndarray):
-            raise ValueError(f"{who} {shown(new)}{_at(place)}, no array of particles")
-        if (new.shape, new.dtype) != (old.shape, old.dtype):
+        dtype = getattr(new, "dtype", type(new).__name__)
+        if (np.shape(new), dtype) != (old.shape, old.dtype):
             raise ValueError(
-                f"{who} {new.dtype}{list(new.shape)}{_at(place)} and was given"
+                f"{who} {dtype}{list(np.shape(new))}{_at(place)} and was given"
                 f" {old.dtype}{list(old.shape)}; sample_initial and {method} must agree"
             )
 
@@ -258,27 +251,14 @@ def _at(place: tuple[Any, ...]) -> str:
     return f" at states{jax.tree_util.keystr(place)}" if place else ""
 
 
-def _takes(signature: inspect.Signature, num_arguments: int) -> bool:
-    try:
-        signature.bind(*range(num_arguments))
-    except TypeError:
-        return False
-    return True
-
-
 def check_log_density(
     values: Any, model: Any, method: str, num_particles: int
 ) -> Float[Array, " n"]:
     """The result of a density of the model; a `ValueError` unless it is one real number each."""
     who = f"model: {model_name(model)}.{method} returned"
-    if not isinstance(values, jax.Array | np.ndarray):
-        raise ValueError(
-            f"{who} {shown(values)}, not one value a particle, an array of shape ({num_particles},)"
-        )
-    if values.shape != (num_particles,):
-        raise ValueError(
-            f"{who} shape {values.shape}, not one value a particle, ({num_particles},)"
-        )
+    if getattr(values, "shape", None) != (num_particles,):
+        found = f"shape {values.shape}" if hasattr(values, "shape") else shown(values)
+        raise ValueError(f"{who} {found}, not one value a particle, ({num_particles},)")
     if jnp.issubdtype(values.dtype, jnp.complexfloating):
         raise ValueError(f"{who} complex values ({values.dtype}); a log-density is real")
     return jnp.asarray(values)
@@ -331,7 +311,7 @@ class _PerParticleModel(AbstractStateSpaceModel):
         if name in _BATCHED and hasattr(model, name):
             return jax.vmap(getattr(model, name))
         if name == "sample_observation" and hasattr(model, name):
-            return _DrawnForEach(getattr(model, name))
+            return _OverParticles(getattr(model, name), draws=True)
         if name in _SHARED and hasattr(model, name):
             return getattr(model, name)
         raise AttributeError(f"{type(model).__name__} (per_particle) has no attribute {name!r}")
@@ -339,39 +319,29 @@ class _PerParticleModel(AbstractStateSpaceModel):
 
 @dataclass(frozen=True)
 class _OverParticles:
-    """A function of one particle, mapped over all of them; equal where the functions are."""
+    """A function of one particle, mapped over all of them; equal where the functions are.
+
+    A draw gets a key for each: with that of all, it would draw them one and the same.
+    """
 
     function: Callable[..., Any]
+    draws: bool = False
 
-    def __call__(self, *particles: PyTree) -> PyTree:
-        return jax.vmap(self.function)(*particles)
-
-
-def mapped(model: Any, function: Any) -> Any:
-    """A function of the particles from one in the terms of the model: of one, or of all."""
-    if not isinstance(model, _PerParticleModel) or not callable(function):
-        return function
-    return _OverParticles(function)
+    def __call__(self, *args: PyTree) -> PyTree:
+        if self.draws:
+            args = (split(args[0], len(jax.tree.leaves(args[1])[0])), *args[1:])
+        return jax.vmap(self.function)(*args)
 
 
-@dataclass(frozen=True)
-class _DrawnForEach:
-    """A draw of one particle, mapped over all of them with a key for each."""
+def mapped(model: Any, function: Any, draws: bool = False) -> Any:
+    """A function of the particles from one in the terms of the model: of one, or of all.
 
-    draw: Callable[..., Any]
-
-    def __call__(self, key: Key[Array, ""], states: PyTree) -> PyTree:
-        return jax.vmap(self.draw)(split(key, len(jax.tree.leaves(states)[0])), states)
-
-
-def mapped_draw(model: Any, draw: Any) -> Any:
-    """A draw `(key, states)` for all particles from one in the terms of the model: of one, or all.
-
-    A function of one particle that got the key of all of them would draw them one and the same.
+    With `draws` it is a draw, `(key, states)`.
     """
-    if not isinstance(model, _PerParticleModel) or isinstance(draw, _DrawnForEach):
-        return draw
-    return _DrawnForEach(draw)
+    is_mapped = isinstance(function, _OverParticles) or not callable(function)
+    if not isinstance(model, _PerParticleModel) or is_mapped:
+        return function
+    return _OverParticles(function, draws)
 
 
 def per_particle(model: Any) -> AbstractStateSpaceModel:

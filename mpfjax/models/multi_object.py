@@ -9,7 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_callable, check_flag, check_whole, given, shown
+from mpfjax.checks import (
+    check_callable,
+    check_flag,
+    check_positive_array,
+    check_scalars,
+    check_whole,
+    given,
+    shown,
+    to_array,
+)
+from mpfjax.mixture import flatten_states
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     check_log_density,
@@ -19,6 +29,7 @@ from mpfjax.models.base import (
 )
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.inputs import replaced, takes_inputs, with_inputs
+from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.random import split
 
 # A number of particles that is hardly ever the length of a parameter's axis.
@@ -73,24 +84,17 @@ class MultiObjectModel(AbstractStateSpaceModel):
     ) -> None:
         check_whole(num_objects=num_objects)
         require_model(object_model, "MultiObjectModel", "object_model")
-        instead = "give each object a filter of its own"
-        refuse_marginalised(object_model, "MultiObjectModel", instead, "object_model")
-        potential = "a function of the states of two objects, such as PairwiseRepulsion(...)"
-        check_callable(potential, **given(interaction=interaction))
-        check_flag(shared_observation=shared_observation, **given(per_object=per_object))
-        check_flag(shared_inputs=shared_inputs)
-        self.shared_inputs = shared_inputs
-        self.object_model = object_model
-        self.num_objects = int(num_objects)
-        self.interaction = interaction
+        refuse_marginalised(object_model, "MultiObjectModel", "give each a filter", "object_model")
+        check_callable("a function of the states of two objects", **given(interaction=interaction))
+        check_flag(shared_observation=shared_observation, shared_inputs=shared_inputs)
+        check_flag(**given(per_object=per_object))
+        self.object_model, self.num_objects = object_model, int(num_objects)
+        self.interaction, self.shared_inputs = interaction, shared_inputs
         self.shared_observation = shared_observation
         if per_object is None:
             per_object = _finds_object_axis(object_model, self.num_objects)
         elif per_object and not _has_axis(object_model, self.num_objects):
-            raise ValueError(
-                f"object_model: not every array of {type(object_model).__name__} has a leading"
-                f" axis of num_objects, {num_objects}, as per_object=True says"
-            )
+            raise ValueError(f"object_model: not every array has a leading axis of {num_objects}")
         self.per_object = per_object
 
     @property
@@ -133,9 +137,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
 
     def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """x_t of every object, independent of each other given x_{t-1}."""
-        keys = split(key, self.num_objects)
-        draw = lambda key, states, j: self.object_at(j).sample_transition(key, states)  # noqa: E731
-        return jax.vmap(draw, in_axes=(0, 1, 0), out_axes=1)(keys, states, self._indices)
+        return self._drawn("sample_transition", key, states)
 
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
         """Σ_j log L(y_t | x_t^j) + Σ_{i<j} log ψ(x_t^i, x_t^j)."""
@@ -144,24 +146,20 @@ class MultiObjectModel(AbstractStateSpaceModel):
         total = jnp.sum(jax.vmap(weigh, in_axes=(1, 0))(states, self._indices), axis=0)
         if self.interaction is None or self.num_objects == 1:
             return total
-        first, second = np.triu_indices(self.num_objects, 1)
-        potentials = jax.vmap(self.interaction, in_axes=1, out_axes=1)(
-            jax.tree.map(lambda leaf: leaf[:, first], states),
-            jax.tree.map(lambda leaf: leaf[:, second], states),
-        )
+        pairs = [
+            jax.tree.map(lambda leaf, of=of: leaf[:, of], states)
+            for of in np.triu_indices(self.num_objects, 1)
+        ]
+        potentials = jax.vmap(self.interaction, in_axes=1, out_axes=1)(*pairs)
         return total + jnp.sum(potentials, axis=1).astype(total.dtype)
 
     def __getattr__(self, name: str) -> Any:
-        # Only reached for names that the class lacks: the joint density is there exactly when
-        # the objects' is.
-        if name == "log_transition" and hasattr(self.object_model, name):
-            return self._log_transition
-        if name == "sample_observation" and hasattr(self.object_model, name):
-            return self._sample_observation
-        if name == "transition_from_noise" and is_made_of_noise(self.object_model):
-            return self._transition_from_noise
-        if name == "noise_dimension" and is_made_of_noise(self.object_model):
-            return self.num_objects * self._object_noise_dimension
+        # Only reached for names that the class lacks: the joint density is there if the objects'.
+        if name in ("log_transition", "sample_observation") and hasattr(self.object_model, name):
+            return getattr(self, f"_{name}")
+        is_of_noise = name in ("transition_from_noise", "noise_dimension")
+        if is_of_noise and is_made_of_noise(self.object_model):
+            return getattr(self, f"_{name}")
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
     def simulate(
@@ -176,14 +174,18 @@ class MultiObjectModel(AbstractStateSpaceModel):
         """The observation of every object, leaves (n, J, ...)."""
         if self.shared_observation:
             raise ValueError("shared_observation: how several objects make one is not known")
+        return self._drawn("sample_observation", key, states)
+
+    def _drawn(self, method: str, key: Key[Array, ""], states: PyTree) -> PyTree:
+        """The draws of every object, by a method of its model."""
         keys = split(key, self.num_objects)
-        draw = lambda key, states, j: self.object_at(j).sample_observation(key, states)  # pyright: ignore  # noqa: E731
+        draw = lambda key, states, j: getattr(self.object_at(j), method)(key, states)  # noqa: E731
         return jax.vmap(draw, in_axes=(0, 1, 0), out_axes=1)(keys, states, self._indices)
 
     @property
-    def _object_noise_dimension(self) -> int:
+    def _noise_dimension(self) -> int:
         model: Any = self.object_at(0)
-        return model.noise_dimension
+        return self.num_objects * model.noise_dimension
 
     def _transition_from_noise(self, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
         """x_t of every object, from its own columns of the noise."""
@@ -196,18 +198,14 @@ class MultiObjectModel(AbstractStateSpaceModel):
 
     def _log_transition(self, states: PyTree, previous_states: PyTree) -> Float[Array, " n"]:
         """Σ_j log D(x_t^j | x_{t-1}^j)."""
-
-        def weigh(states: PyTree, previous: PyTree, j: Int[Array, ""]) -> Float[Array, " n"]:
-            return self.object_at(j).log_transition(states, previous)  # pyright: ignore
-
-        per_object = jax.vmap(weigh, in_axes=(1, 1, 0))(states, previous_states, self._indices)
-        return jnp.sum(per_object, axis=0)
+        weigh = jax.vmap(self.object_log_transition, in_axes=(1, 1, 0))
+        return jnp.sum(weigh(states, previous_states, self._indices), axis=0)
 
     # One object at a time. `objects` is the same object for all particles, (), or one of its
     # own for each, (n,); `states` are those of that object, leaves (n, ...).
 
-    def object_at(self, index: int | Int[Array, ""]) -> AbstractStateSpaceModel:
-        """The model of one object."""
+    def object_at(self, index: int | Int[Array, "*n"]) -> AbstractStateSpaceModel:
+        """The model of one object, or of all where they share it."""
         if not self.per_object:
             return self.object_model
         return jax.tree.map(
@@ -243,9 +241,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
         self, key: Key[Array, ""], states: PyTree, objects: Int[Array, "*n"]
     ) -> PyTree:
         """x_t of one object of each particle."""
-        if not self.per_object:
-            return self.object_model.sample_transition(key, states)
-        if objects.ndim == 0:
+        if not self.per_object or objects.ndim == 0:
             return self.object_at(objects).sample_transition(key, states)
 
         def draw(key: Key[Array, ""], state: PyTree, j: Int[Array, ""]) -> PyTree:
@@ -265,65 +261,92 @@ class MultiObjectModel(AbstractStateSpaceModel):
         self, observation: PyTree, states: PyTree, objects: Int[Array, "*n"]
     ) -> Float[Array, " n"]:
         """log L(y_t | x_t^j) of one object of each particle; y_t as prepared."""
-        values = self._object_log_likelihood(observation, states, objects)
+
+        def weigh(states: PyTree, j: Int[Array, "*n"]) -> Any:
+            seen = observation
+            if not self.shared_observation:
+                seen = jax.tree.map(lambda leaf: leaf[j], observation)
+            return self.object_at(j).log_likelihood(seen, states)
+
+        if objects.ndim == 0 or (self.shared_observation and not self.per_object):
+            values = weigh(states, objects)
+        else:
+            values = jax.vmap(lambda state, j: weigh(_many(state), j)[0])(states, objects)
         num_particles = jax.tree.leaves(states)[0].shape[0]
         return check_log_density(values, self.object_model, "log_likelihood", num_particles)
-
-    def _object_log_likelihood(
-        self, observation: PyTree, states: PyTree, objects: Int[Array, "*n"]
-    ) -> Any:
-        if self.shared_observation and not self.per_object:
-            return self.object_model.log_likelihood(observation, states)
-        if objects.ndim == 0:
-            seen = self._seen_by(observation, objects)
-            return self.object_at(objects).log_likelihood(seen, states)
-
-        def weigh(state: PyTree, j: Int[Array, ""]) -> Float[Array, ""]:
-            seen = self._seen_by(observation, j)
-            return self.object_at(j).log_likelihood(seen, _many(state))[0]
-
-        return jax.vmap(weigh)(states, objects)
 
     def object_log_transition(
         self, states: PyTree, previous_states: PyTree, objects: Int[Array, "*n"]
     ) -> Float[Array, " n"]:
         """log D(x_t^j | x_{t-1}^j) of one object of each particle."""
-        if not self.per_object or objects.ndim == 0:
-            model: Any = self.object_at(objects) if self.per_object else self.object_model
-            return model.log_transition(states, previous_states)
 
-        def weigh(state: PyTree, previous: PyTree, j: Int[Array, ""]) -> Float[Array, ""]:
+        def weigh(states: PyTree, previous: PyTree, j: Int[Array, "*n"]) -> Float[Array, " n"]:
             model: Any = self.object_at(j)
-            return model.log_transition(_many(state), _many(previous))[0]
+            return model.log_transition(states, previous)
 
-        return jax.vmap(weigh)(states, previous_states, objects)
+        if not self.per_object or objects.ndim == 0:
+            return weigh(states, previous_states, objects)
+        one = lambda state, previous, j: weigh(_many(state), _many(previous), j)[0]  # noqa: E731
+        return jax.vmap(one)(states, previous_states, objects)
 
     def _require_object_axis(self, name: str, tree: PyTree) -> None:
         for leaf in jax.tree.leaves(tree):
             if jnp.shape(leaf)[:1] != (self.num_objects,):
                 raise ValueError(
-                    f"{name}: shape {jnp.shape(leaf)} has no leading axis of"
-                    f" num_objects, {self.num_objects}; is it shared by all objects?"
+                    f"{name}: shape {jnp.shape(leaf)} has no leading axis of num_objects,"
+                    f" {self.num_objects}; is it shared by all objects?"
                 )
-
-    def _seen_by(self, observation: PyTree, index: Int[Array, ""]) -> PyTree:
-        if self.shared_observation:
-            return observation
-        return jax.tree.map(lambda leaf: leaf[index], observation)
 
     @property
     def _indices(self) -> Int[Array, " objects"]:
         return jnp.arange(self.num_objects, dtype=jnp.int32)
 
 
+class PairwiseRepulsion(eqx.Module):
+    """log ψ(x_i, x_j) = -strength · k(|p_i - p_j| / radius), p the positions of two objects.
+
+    The pairwise Markov random field of Khan, Balch and Dellaert (2004), for objects that cannot
+    share a place. ψ is symmetric, 1 where the objects are far apart, and smooth: it has a gradient
+    everywhere, even where the objects are at the same point.
+
+    - `strength`: -log ψ of two objects at the same point, in nats; positive.
+    - `radius`: in the unit of the positions; positive. With `compact`, k(r) = (1 - r²)² inside the
+      radius and exactly 0 outside it. Without it, k(r) = exp(-r²/2), which is positive everywhere.
+    - `position`: maps the states of one object, leading axis n, to (n, k) or (n,); None takes
+      the whole state.
+
+    Called with the states of two objects, it gives (n,). Raises `ValueError` for a strength or
+    radius that is not positive. Use it where look-alikes cross and must not be tracked as one.
+    With the compact form a filter can tell that objects do not touch.
+    """
+
+    strength: Float[Array, ""] = eqx.field(converter=to_array("strength"))
+    radius: Float[Array, ""] = eqx.field(converter=to_array("radius"))
+    position: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None)
+    compact: bool = eqx.field(static=True, default=True)
+
+    def __check_init__(self) -> None:
+        check_positive_array(strength=self.strength, radius=self.radius)
+        check_scalars(strength=self.strength, radius=self.radius)
+        check_callable("a function of the states", **given(position=self.position))
+        check_flag(compact=self.compact)
+
+    def __call__(self, states: PyTree, other_states: PyTree) -> Float[Array, " n"]:
+        """log ψ of each row of the states with the same row of the other states."""
+        gaps = self._positions(states) - self._positions(other_states)
+        squares = row_sums((gaps / self.radius.astype(gaps.dtype)) ** 2)
+        nearness = jnp.maximum(1 - squares, 0.0) ** 2 if self.compact else jnp.exp(-squares / 2)
+        return -self.strength.astype(gaps.dtype) * nearness
+
+    def _positions(self, states: PyTree) -> Float[Array, "n k"]:
+        return flatten_states(states if self.position is None else self.position(states))
+
+
 def require_multi_object(model: Any, needed_by: str) -> None:
     """Raise a `ValueError` where `model` is not of several objects."""
     if not isinstance(model, MultiObjectModel):
         who = model_name(model) if hasattr(model, "sample_initial") else shown(model)
-        raise ValueError(
-            f"model: {who} is no MultiObjectModel, which {needed_by} needs;"
-            " MultiObjectModel(object_model, num_objects) makes one"
-        )
+        raise ValueError(f"model: {who} is no MultiObjectModel, which {needed_by} needs")
 
 
 def _is_array(leaf: Any) -> bool:
@@ -348,20 +371,14 @@ def _finds_object_axis(model: Any, num_objects: int) -> bool:
     """Whether the model's arrays carry an object axis, by trying to draw from it both ways."""
     if not _has_axis(model, num_objects):
         return False
-    one_for_all = _error_of_draws(model)
-    one_each = _error_of_draws(
-        jax.tree.map(lambda leaf: leaf[0] if _is_array(leaf) else leaf, model)
-    )
-    if one_for_all is not None and one_each is not None:
+    one = jax.tree.map(lambda leaf: leaf[0] if _is_array(leaf) else leaf, model)
+    one_for_all, one_each = _error_of_draws(model), _error_of_draws(one)
+    if (one_for_all is None) == (one_each is None) and (num_objects > 1 or one_each is not None):
+        ways = "both" if one_each is None else "neither"
         raise ValueError(
-            f"object_model: {type(model).__name__} cannot be drawn from, neither as one model for"
-            f" all objects nor as {num_objects} models side by side"
+            f"object_model: {type(model).__name__} can be drawn from {ways} as one model for all"
+            f" objects and as {num_objects} models side by side; say which with per_object"
         ) from one_for_all
-    if one_for_all is None and one_each is None and num_objects > 1:
-        raise ValueError(
-            f"object_model: {type(model).__name__} can be read as one model for all objects and"
-            f" as {num_objects} models side by side; say which with per_object"
-        )
     return one_for_all is not None
 
 

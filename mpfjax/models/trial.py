@@ -1,4 +1,6 @@
-"""A model tried out before it is run: what would go wrong without a word is said by name."""
+"""A model tried out before it is run, where what would go wrong without a word is said by name, and
+series drawn from a model.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import as_numbers, check_key, shown
+from mpfjax.checks import as_numbers, check_key, check_whole, shown
 from mpfjax.models.base import (
     check_log_density,
+    check_moved,
     check_states,
     is_made_of_noise,
     model_name,
+    require,
     require_model,
     require_noise,
 )
@@ -25,6 +29,7 @@ from mpfjax.models.conditionally_linear import (
 )
 from mpfjax.models.inputs import saying_that_none_were_given, takes_inputs, with_inputs
 from mpfjax.models.steps import likelihoods, moved
+from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 _KEYS, _PLACES, _DRAWS = 64, 4, 32  # of the draws that must differ
 _FAMILIES, _SIBLINGS = 8, 128  # of those that log_transition must know
@@ -53,8 +58,7 @@ def check_model(
     """
     check_key(key)
     require_model(model, "check_model")
-    if inputs is not None and not takes_inputs(model):
-        raise ValueError(f"inputs: {model_name(model)} has no place for them, a field inputs")
+    inputs = _as_inputs(inputs, model)
     if not jax.tree.leaves(observation):
         raise ValueError(f"observation: {shown(observation)} holds no array")
     observation = jax.tree.map(lambda leaf: as_numbers("observation", leaf), observation)
@@ -212,3 +216,52 @@ def _log_transition(model: Any, states: PyTree, previous: PyTree) -> Float[Array
     values = model.log_transition(states, previous)
     number = jax.tree.leaves(states)[0].shape[0]
     return check_log_density(values, model, "log_transition", number)
+
+
+def simulate(
+    key: Key[Array, ""], model: Any, num_steps: int, inputs: PyTree = None
+) -> tuple[PyTree, PyTree]:
+    """`AbstractStateSpaceModel.simulate`."""
+    check_key(key)
+    check_whole(num_steps=num_steps)
+    require(model, "sample_observation", "simulate")
+    inputs = _as_inputs(inputs, model)
+    for leaf in jax.tree.leaves(inputs):
+        if leaf.shape[:1] != (num_steps,):
+            raise ValueError(
+                f"inputs: the leading axis of a leaf of shape {leaf.shape} is not num_steps,"
+                f" {num_steps}"
+            )
+    with saying_that_none_were_given(model):
+        return with_floats_traced(lambda model: _simulate(key, model, num_steps, inputs), model)
+
+
+@jit_on_wide_vectors
+def _simulate(key, model, num_steps, inputs):
+    key_initial, key_steps = jax.random.split(key)
+    initial = model.sample_initial(key_initial, 1)
+    check_states(initial, model, "sample_initial", 1)
+
+    def advance(state: PyTree, step: tuple[Array, PyTree]) -> tuple[PyTree, tuple[PyTree, PyTree]]:
+        step_key, now = step
+        key_state, key_observation = jax.random.split(step_key)
+        at_step = with_inputs(model, now)
+        moved = at_step.sample_transition(key_state, state)
+        check_moved(moved, state, model)
+        seen = at_step.sample_observation(key_observation, moved)
+        check_states(seen, model, "sample_observation", 1)
+        return moved, (moved, seen)
+
+    steps = (jax.random.split(key_steps, num_steps), inputs)
+    _, (states, observations) = jax.lax.scan(advance, initial, steps)
+    first = lambda leaf: leaf[:, 0]  # noqa: E731
+    states = jax.tree.map(
+        lambda start, later: first(jnp.concatenate([start[None], later])), initial, states
+    )
+    return states, jax.tree.map(first, observations)
+
+
+def _as_inputs(inputs: PyTree, model: Any) -> PyTree:
+    if inputs is not None and not takes_inputs(model):
+        raise ValueError(f"inputs: {model_name(model)} has no place for them, a field inputs")
+    return jax.tree.map(lambda leaf: as_numbers("inputs", leaf), inputs)

@@ -12,7 +12,7 @@ from mpfjax.chain import give_inputs
 from mpfjax.checks import check_callable, check_key, check_type, check_whole, given, saying, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import mapped_draw
+from mpfjax.models.base import mapped
 from mpfjax.observations import steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
@@ -64,7 +64,7 @@ def forecast(
     check_callable(
         "a function of a key and states", **given(simulate_observation=simulate_observation)
     )
-    simulate = mapped_draw(filter.model, simulate_observation) if simulate_observation else None
+    simulate = mapped(filter.model, simulate_observation, draws=True)
     inputs = steps_of_inputs(inputs, num_steps, filter.model, "forecast")
     options = (num_steps, simulate)
     return with_floats_traced(

@@ -191,7 +191,7 @@ class TestWhetherParametersAreEachObjectsOwn:
         assert not MultiObjectModel(walk, 3).per_object
         ambiguous = Walk(jnp.array([[0.1], [0.2]]).reshape(2))
         with jax.numpy_rank_promotion("allow"):
-            with pytest.raises(ValueError, match="object_model: Walk can be read"):
+            with pytest.raises(ValueError, match="object_model: Walk can be drawn from both"):
                 MultiObjectModel(ambiguous, 2)
             for per_object in (True, False):
                 model = MultiObjectModel(ambiguous, 2, per_object=per_object)
@@ -200,7 +200,7 @@ class TestWhetherParametersAreEachObjectsOwn:
     @pytest.mark.usefixtures("as_installed")
     def test_bad_models(self):
         broken = eqx.tree_at(lambda m: m.Q, stack(OBJECTS), jnp.ones((3, 5, 5)))
-        with pytest.raises(ValueError, match="object_model: LinearGaussianModel cannot be drawn"):
+        with pytest.raises(ValueError, match=r"object_model: .* can be drawn from neither"):
             MultiObjectModel(broken, 3)
         with pytest.raises(ValueError, match="object_model: not every array"):
             MultiObjectModel(OBJECTS[0], 3, per_object=True)

@@ -80,5 +80,5 @@ def test_what_cannot_be_simulated_is_said():
         def sample_observation(self, key, states):
             return states[0, 0]
 
-    with pytest.raises(ValueError, match=r"model: Wrong.sample_observation returned an array"):
+    with pytest.raises(ValueError, match=r"model: Wrong.sample_observation returned a leaf"):
         Wrong().simulate(key, 3)

@@ -1,0 +1,358 @@
+"""Linear-Gaussian models: one system, and K of them with a Markov chain that chooses one."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int, Key, PyTree
+
+from mpfjax.checks import (
+    check_covariance_array,
+    check_finite_array,
+    check_not_negative_array,
+    check_shape,
+    shown,
+    to_array,
+)
+from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.conditionally_linear import AbstractConditionallyLinearModel
+from mpfjax.operations.logarithms import log_or_nothing
+from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
+from mpfjax.operations.random import normal, uniform
+from mpfjax.operations.segments import spread
+
+_IN_TIME = ("A", "Q", "H", "R", "B", "inputs")
+# Sums of probabilities may differ from one by this much, for rounding.
+_ROUNDING = 1e-4
+
+
+def _if_given(name: str) -> Callable[[Any], Array | None]:
+    """A converter of an argument that may be None."""
+    return lambda value: None if value is None else to_array(name)(value)
+
+
+class LinearGaussianModel(AbstractStateSpaceModel):
+    """x_t = A x_{t-1} + B u_t + N(0, Q), y_t = H x_t + N(0, R), x_0 ~ N(m0, P0).
+
+    - `A`, `Q`: (d, d); `H`: (p, d); `R`: (p, p); `m0`: (d,); `P0`: (d, d). R is positive definite;
+      P0 and Q may be singular, but x_0 or x_t then has no density. States have shape (n, d),
+      observations (p,).
+    - `B`: (d, k), the control matrix, for inputs u_t, (k,). None leaves B u_t out.
+
+    Inputs are u_t alone, or a dict of the fields that change in time by their names, such as
+    {"A": ..., "Q": ..., "inputs": ...}: each is that field at step t. So the matrices of a
+    continuous-time system at irregular times are inputs too.
+
+    Raises `ValueError` for shapes that do not fit together. Use it to compare a filter
+    with the Kalman filter, or where the system is linear.
+    """
+
+    A: Float[Array, "d d"] = eqx.field(converter=to_array("A"))
+    Q: Float[Array, "d d"] = eqx.field(converter=to_array("Q"))
+    H: Float[Array, "p d"] = eqx.field(converter=to_array("H"))
+    R: Float[Array, "p p"] = eqx.field(converter=to_array("R"))
+    m0: Float[Array, " d"] = eqx.field(converter=to_array("m0"))
+    P0: Float[Array, "d d"] = eqx.field(converter=to_array("P0"))
+    B: Float[Array, "d k"] | None = eqx.field(converter=_if_given("B"), default=None)
+    inputs: Float[Array, " k"] | None = eqx.field(converter=_if_given("inputs"), default=None)
+
+    def __check_init__(self) -> None:
+        d = self.m0.shape[-1] if self.m0.ndim else 0
+        p = self.H.shape[0] if self.H.ndim else 0
+        k = self.B.shape[-1] if self.B is not None and self.B.ndim else 0
+        shapes = {
+            "m0": (d,), "A": (d, d), "Q": (d, d), "P0": (d, d), "H": (p, d), "R": (p, p),
+            "B": (d, k), "inputs": (k,),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            array = getattr(self, name)
+            if array is not None and array.shape != shape:
+                raise ValueError(
+                    f"{name}: shape {array.shape} is not {shape}, for m0 of shape {self.m0.shape},"
+                    f" H of shape {self.H.shape} and B of shape {np.shape(self.B)}"
+                )
+            if array is not None and name != "inputs":
+                check_finite_array(**{name: array})
+
+    def with_inputs(self, inputs: PyTree) -> "LinearGaussianModel":
+        """The model at step t: u_t, (k,), or a dict of the fields that change in time."""
+        fields = inputs if isinstance(inputs, dict) else {"inputs": inputs}
+        unknown = sorted(set(fields) - set(_IN_TIME))
+        if unknown:
+            raise ValueError(f"inputs: {unknown} are not among {list(_IN_TIME)}")
+        return dataclasses.replace(self, **fields)
+
+    @property
+    def control(self) -> Float[Array, " d"] | None:
+        """B u_t; None where there is no B, or no u_t."""
+        return None if self.B is None or self.inputs is None else self.B @ self.inputs
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n d"]:
+        """x_0 ~ N(m0, P0)."""
+        return self.initial_from_noise(
+            normal(key, (num_particles, self.initial_noise_dimension), self.m0.dtype)
+        )
+
+    @property
+    def initial_noise_dimension(self) -> int:
+        """d."""
+        return self.m0.shape[0]
+
+    def initial_from_noise(self, noise: Float[Array, "n d"]) -> Float[Array, "n d"]:
+        """x_0 ~ N(m0, P0)."""
+        return self.m0[None] + noise @ _root(self.P0).T
+
+    @property
+    def noise_dimension(self) -> int:
+        """d."""
+        return self.m0.shape[0]
+
+    def transition_from_noise(
+        self, noise: Float[Array, "n d"], states: Float[Array, "n d"]
+    ) -> Float[Array, "n d"]:
+        """x_t ~ N(A x_{t-1} + B u_t, Q)."""
+        check_shape(f"n {self.noise_dimension}", noise=noise)
+        return self.transition_mean(states) + noise @ _root(self.Q).T
+
+    def log_likelihood(
+        self, observation: Float[Array, " p"], states: Float[Array, "n d"]
+    ) -> Float[Array, " n"]:
+        """log N(y_t; H x_t, R)."""
+        if jnp.shape(observation) != (self.H.shape[0],):
+            raise ValueError(
+                f"observation: shape {jnp.shape(observation)} is not ({self.H.shape[0]},),"
+                " the rows of H"
+            )
+        return _log_normal(observation[None] - self.observation_mean(states), self.R)
+
+    def sample_observation(
+        self, key: Key[Array, ""], states: Float[Array, "n d"]
+    ) -> Float[Array, "n p"]:
+        """y_t ~ N(H x_t, R) of every state."""
+        noise = normal(key, (len(states), self.R.shape[0]), self.R.dtype)
+        return self.observation_mean(states) + noise @ _root(self.R).T
+
+    def log_transition(
+        self, states: Float[Array, "n d"], previous_states: Float[Array, "n d"]
+    ) -> Float[Array, " n"]:
+        """log N(x_t; A x_{t-1} + B u_t, Q)."""
+        return _log_normal(states - self.transition_mean(previous_states), self.Q)
+
+    def log_initial(self, states: Float[Array, "n d"]) -> Float[Array, " n"]:
+        """log N(x_0; m0, P0)."""
+        return _log_normal(states - self.m0[None], self.P0)
+
+    def transition_mean(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
+        """A x_{t-1} + B u_t."""
+        mean = states @ self.A.T
+        return mean if self.control is None else mean + self.control[None]
+
+    def observation_mean(self, states: Float[Array, "n d"]) -> Float[Array, "n p"]:
+        """H x_t."""
+        return states @ self.H.T
+
+    @property
+    def transition_covariance(self) -> Float[Array, "d d"]:
+        """Q."""
+        return self.Q
+
+    @property
+    def observation_covariance(self) -> Float[Array, "p p"]:
+        """R."""
+        return self.R
+
+
+class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel):
+    """A Markov chain of K regimes z_t, and a linear-Gaussian system for each of them.
+
+        P(z_t = j | z_{t-1} = i) = Π_ij,    x_0 ~ N(m0, P0),
+        x_t = F[z_t] x_{t-1} + b[z_t] + N(0, Q[z_t]),    y_t = H[z_t] x_t + c[z_t] + N(0, R[z_t])
+
+    A jump Markov linear system, or switching state-space model. The latent is the regime, whole
+    numbers (n,). `exact.switching_filter` is exact for a short series.
+
+    - `transition_matrix`: Π, (K, K), each row sums to one.
+    - `F`, `Q`: (d, d), or (K, d, d) with one for each regime; `H`: (p, d) or (K, p, d); `R`: (p, p)
+      or (K, p, p). Q and R are positive semidefinite.
+    - `m0`: (d,) or (K, d), and `P0`: (d, d) or (K, d, d), by z_0.
+    - `b`, `c`: (d,) or (K, d), and (p,) or (K, p); None is zero.
+    - `initial_probabilities`: of z_0, (K,); None makes all equal.
+
+    Raises `ValueError` for shapes that do not fit together, for rows that are no probabilities, and
+    for Q, R or P0 that is no covariance.
+    Use it for manoeuvring targets, and for regimes of a time series.
+    """
+
+    transition_matrix: Float[Array, "k k"] = eqx.field(converter=to_array("transition_matrix"))
+    F: Float[Array, "*k d d"] = eqx.field(converter=to_array("F"))
+    Q: Float[Array, "*k d d"] = eqx.field(converter=to_array("Q"))
+    H: Float[Array, "*k p d"] = eqx.field(converter=to_array("H"))
+    R: Float[Array, "*k p p"] = eqx.field(converter=to_array("R"))
+    m0: Float[Array, "*k d"] = eqx.field(converter=to_array("m0"))
+    P0: Float[Array, "*k d d"] = eqx.field(converter=to_array("P0"))
+    b: Float[Array, "*k d"] | None = eqx.field(converter=_if_given("b"), default=None)
+    c: Float[Array, "*k p"] | None = eqx.field(converter=_if_given("c"), default=None)
+    initial_probabilities: Float[Array, " k"] | None = eqx.field(
+        converter=_if_given("initial_probabilities"), default=None
+    )
+
+    def __check_init__(self) -> None:
+        k = self.transition_matrix.shape[-1] if self.transition_matrix.ndim else 0
+        d = self.m0.shape[-1] if self.m0.ndim else 0
+        p = self.H.shape[-2] if self.H.ndim > 1 else 0
+        _check_probabilities((k, k), transition_matrix=self.transition_matrix)
+        shapes = {
+            "F": (d, d), "Q": (d, d), "H": (p, d), "R": (p, p), "m0": (d,), "P0": (d, d),
+            "b": (d,), "c": (p,),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            array = getattr(self, name)
+            if array is None:
+                continue
+            if array.shape not in (shape, (k, *shape)):
+                raise ValueError(
+                    f"{name}: shape {array.shape} is neither {shape} nor {(k, *shape)}, for"
+                    f" {k} regimes, m0 of shape {self.m0.shape} and H of shape {self.H.shape}"
+                )
+            check = check_covariance_array if name in ("Q", "R", "P0") else check_finite_array
+            check(**{name: array})
+        _check_probabilities((k,), initial_probabilities=self.probabilities_at_start)
+
+    @property
+    def num_regimes(self) -> int:
+        """K."""
+        return self.transition_matrix.shape[0]
+
+    @property
+    def probabilities_at_start(self) -> Float[Array, " k"]:
+        """P(z_0)."""
+        if self.initial_probabilities is not None:
+            return self.initial_probabilities
+        k = self.num_regimes
+        return jnp.full(k, 1 / k, self.transition_matrix.dtype)
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Int[Array, " n"]:
+        """z_0 by its probabilities."""
+        shares = uniform(key, (num_particles,), self.transition_matrix.dtype)
+        return self._initial(shares)
+
+    @property
+    def initial_noise_dimension(self) -> int:
+        """1."""
+        return 1
+
+    def initial_from_noise(self, noise: Float[Array, "n 1"]) -> Int[Array, " n"]:
+        """z_0 of standard normal numbers."""
+        return self._initial(jax.scipy.special.ndtr(noise[:, 0]))
+
+    def initial_moments(
+        self, latent: Int[Array, " n"]
+    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """m0 and P0."""
+        return self._of(latent, self.m0, 1), self._of(latent, self.P0, 2)
+
+    def sample_transition(self, key: Key[Array, ""], latent: Int[Array, " n"]) -> Int[Array, " n"]:
+        """z_t by the row of z_{t-1}."""
+        shares = uniform(key, latent.shape, self.transition_matrix.dtype)
+        return self._next(shares, latent)
+
+    @property
+    def noise_dimension(self) -> int:
+        """1."""
+        return 1
+
+    def transition_from_noise(
+        self, noise: Float[Array, "n 1"], latent: Int[Array, " n"]
+    ) -> Int[Array, " n"]:
+        """z_t of standard normal numbers."""
+        check_shape("n 1", noise=noise)
+        return self._next(jax.scipy.special.ndtr(noise[:, 0]), latent)
+
+    def log_transition(
+        self, latent: Int[Array, " n"], previous_latent: Int[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """log Π of the two regimes."""
+        k = self.num_regimes
+        return spread(log_or_nothing(self.transition_matrix).ravel(), previous_latent * k + latent)
+
+    def log_initial(self, latent: Int[Array, " n"]) -> Float[Array, " n"]:
+        """log P(z_0)."""
+        return spread(log_or_nothing(self.probabilities_at_start), latent)
+
+    def all_transitions(
+        self, latent: Int[Array, " n"]
+    ) -> list[tuple[Int[Array, " n"], Float[Array, " n"]]]:
+        """Every regime, with log of its probability after z_{t-1}."""
+        log_matrix = log_or_nothing(self.transition_matrix)
+        return [
+            (jnp.full_like(latent, j), spread(log_matrix[:, j], latent))
+            for j in range(self.num_regimes)
+        ]
+
+    def dynamics(
+        self, latent: Int[Array, " n"], previous_latent: Int[Array, " n"]
+    ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+        """F, b and Q of the regime z_t."""
+        del previous_latent
+        b = jnp.zeros(self.m0.shape[-1], self.m0.dtype) if self.b is None else self.b
+        return self._of(latent, self.F, 2), self._of(latent, b, 1), self._of(latent, self.Q, 2)
+
+    def emission(
+        self, latent: Int[Array, " n"]
+    ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+        """H, c and R of the regime z_t."""
+        c = jnp.zeros(self.H.shape[-2], self.H.dtype) if self.c is None else self.c
+        return self._of(latent, self.H, 2), self._of(latent, c, 1), self._of(latent, self.R, 2)
+
+    def _of(self, latent: Int[Array, " n"], values: Array, rank: int) -> Float[Array, "..."]:
+        """The parameter of each particle's regime; one that all regimes share, unchanged."""
+        return values if values.ndim == rank else spread(values, latent)
+
+    def _initial(self, shares: Float[Array, " n"]) -> Int[Array, " n"]:
+        bounds = jnp.cumsum(self.probabilities_at_start)[:-1]
+        return jnp.sum(shares[:, None] >= bounds[None], axis=1, dtype=jnp.int32)
+
+    def _next(self, shares: Float[Array, " n"], latent: Int[Array, " n"]) -> Int[Array, " n"]:
+        """The regime whose interval of the row's cumulative probabilities holds each number."""
+        bounds = jnp.cumsum(self.transition_matrix, axis=1)
+        drawn = jnp.zeros_like(latent)
+        for j in range(self.num_regimes - 1):
+            drawn = drawn + (shares >= spread(bounds[:, j], latent)).astype(latent.dtype)
+        return drawn
+
+
+def _check_probabilities(shape: tuple[int, ...], **arguments: Array) -> None:
+    """Each argument has this shape, and numbers from 0 on that sum to one along the last axis."""
+    for name, array in arguments.items():
+        check_shape(" ".join(map(str, shape)), **{name: array})
+        check_not_negative_array(**{name: array})
+        if isinstance(array, Tracer | jax.ShapeDtypeStruct):
+            continue
+        if np.abs(np.sum(np.asarray(array, float), axis=-1) - 1).max() > _ROUNDING:
+            raise ValueError(f"{name}: {shown(array)} has rows that do not sum to one")
+
+
+def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """A lower triangular L with L Lᵀ = covariance, which may be singular."""
+    is_definite = jnp.all(jnp.isfinite(jnp.linalg.cholesky(jax.lax.stop_gradient(covariance))))
+    semidefinite = lambda matrix: cholesky(matrix[None])[0]  # noqa: E731
+    return jax.lax.cond(is_definite, jnp.linalg.cholesky, semidefinite, covariance)
+
+
+def _log_normal(
+    residuals: Float[Array, "n d"], covariance: Float[Array, "d d"]
+) -> Float[Array, " n"]:
+    factor = jnp.linalg.cholesky(covariance)
+    # The columns of the factor's inverse: one small solve, whatever the number of particles.
+    whitening = solve_lower(factor[None], jnp.eye(len(factor), dtype=factor.dtype))
+    log_scale = jnp.sum(jnp.log(jnp.diagonal(factor)))
+    return (
+        -0.5 * row_sums((residuals @ whitening) ** 2)
+        - log_scale
+        - 0.5 * covariance.shape[0] * jnp.log(2 * jnp.pi)
+    )
