@@ -181,42 +181,25 @@ def _inverse(information: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"] 
 
 
 def _warn_of_noise(informations: Float[np.ndarray, "seeds d d"], of_seeds: str) -> None:
-    """Warn where halves of the seeds disagree on the errors."""
-    num_seeds = len(informations)
-    if num_seeds == 1:
-        warnings.warn(
-            f"standard_errors: {of_seeds} is 1, which leaves no halves that could differ: how"
-            " uncertain the standard errors are is not known",
-            stacklevel=4,
-        )
-        return
-    apart = _apart(informations)
-    if apart > _MOST_APART:
-        found = f"differ by {apart:.0%}" if np.isfinite(apart) else "may be no errors at all"
-        warnings.warn(
-            f"standard_errors: {num_seeds} seeds leave them uncertain, and rather too large: those"
-            f" of one half of the seeds and of the other half {found}; raise {of_seeds}",
-            stacklevel=4,
-        )
-
-
-def _apart(informations: Float[np.ndarray, "seeds d d"]) -> float:
-    """By how much errors from halves of the seeds differ, the worst of them; inf for no errors."""
+    """Warn where errors from halves of the seeds differ, the worst of them, over many halvings."""
     num_seeds = len(informations)
     # Halves of one split differ a lot or a little by chance.
-    generator = np.random.default_rng(0)
-    logs = []
-    for _ in range(_NUM_HALVINGS):
-        order = generator.permutation(num_seeds)
-        halves = order[: num_seeds // 2], order[num_seeds // 2 :]
-        variances = []
-        for half in halves:
-            covariance = _inverse(informations[half].mean(axis=0))
-            if covariance is None:
-                return np.inf
-            variances.append(np.diagonal(covariance))
-        logs.append(np.log(variances[0] / variances[1]) / 2)
-    return float(np.expm1(np.sqrt(np.mean(np.square(logs), axis=0)).max()))
+    generator, squares = np.random.default_rng(0), []
+    for _ in range(_NUM_HALVINGS if num_seeds > 1 else 0):
+        halves = np.array_split(generator.permutation(num_seeds), [num_seeds // 2])
+        inverses = [_inverse(informations[half].mean(axis=0)) for half in halves]
+        variances = [np.inf if inverse is None else np.diagonal(inverse) for inverse in inverses]
+        with np.errstate(invalid="ignore"):
+            squares.append((np.log(variances[0] / variances[1]) / 2) ** 2)
+    apart = np.expm1(np.sqrt(np.max(sum(squares) / _NUM_HALVINGS))) if squares else np.nan
+    if apart <= _MOST_APART:
+        return
+    found = f"differ by {apart:.0%}" if np.isfinite(apart) else "may be no errors at all"
+    warnings.warn(
+        f"standard_errors: {num_seeds} seeds leave them uncertain, and rather too large: those of"
+        f" one half of the seeds and of the other half {found}; raise {of_seeds}",
+        stacklevel=4,
+    )
 
 
 def _on_their_own_scale(

@@ -15,7 +15,7 @@ from mpfjax.moves.base import AbstractMove
 from mpfjax.observations import Series, as_series, gathered
 from mpfjax.proposals import AbstractProposal
 from mpfjax.running.scan import scan
-from mpfjax.tuning.problem import Objective, Parameters, Place, Problem, placed, pose
+from mpfjax.tuning.problem import Parameters, Place, Problem, placed, pose
 from mpfjax.tuning.transforms import AbstractTransform
 
 
@@ -53,20 +53,6 @@ def pose_evidence(
         shapes = jax.tree.map(kind, (series.observations, series.inputs))
         groups.setdefault(str(shapes), []).append(series)
     objective = LogEvidence([_stacked(group) for group in groups.values()])
-    return pose_filter(filter, objective, parameters, transforms)
-
-
-def pose_filter(
-    filter: Filter,
-    objective: Objective,
-    parameters: Parameters,
-    transforms: Mapping[str, AbstractTransform] | None,
-) -> Problem:
-    """The problem of any objective of a filter; without `parameters`, in those of its model."""
-    if parameters is None:
-        fixed = jax.tree.map(lambda _: False, filter)
-        of_model = jax.tree.map(eqx.is_inexact_array, filter.model)
-        parameters = eqx.tree_at(lambda f: f.model, fixed, of_model)
     return pose(filter, objective, parameters, transforms)
 
 

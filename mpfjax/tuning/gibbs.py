@@ -22,8 +22,8 @@ from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.conditional import check_conditional, draw_trajectory, possible_times, renew
 from mpfjax.tuning.chains import AbstractKernel, ChainOptions, Plan, Sampling, Step
 from mpfjax.tuning.densities import LogPrior, Prior, chosen, evaluated, is_invalid
-from mpfjax.tuning.evidence import one_sequence, pose_filter
-from mpfjax.tuning.problem import Parameters, Problem, Reals
+from mpfjax.tuning.evidence import one_sequence
+from mpfjax.tuning.problem import Parameters, Problem, Reals, pose
 from mpfjax.tuning.transforms import AbstractTransform
 from mpfjax.tuning.walks import RandomWalk, accepts, checked_deviations
 
@@ -132,7 +132,7 @@ def particle_gibbs(
     backward = callable(getattr(filter.model, "log_transition", None))
     check_conditional(filter, backward, "particle_gibbs")
     joint = LogJoint(one_sequence(observations, filter.model))
-    problem = pose_filter(filter, joint, parameters, transforms)
+    problem = pose(filter, joint, parameters, transforms)
     deviations = checked_deviations(proposal_deviations, problem.start())
     sampling = Sampling("particle_gibbs", key, problem, deviations, plan)
     prior = None

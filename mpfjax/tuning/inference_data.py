@@ -2,7 +2,7 @@
 
 import importlib
 import inspect
-from types import ModuleType
+import re
 from typing import Any
 
 import jax
@@ -14,10 +14,6 @@ from mpfjax.tuning.gibbs import GibbsPosterior
 from mpfjax.tuning.metropolis import Posterior
 from mpfjax.tuning.sequential import SequentialPosterior
 
-_NEEDED = (
-    "what metropolis_hastings, particle_gibbs or smc2 returns, nor trajectories, leaves"
-    " (trajectories, times, ...)"
-)
 Chains = Posterior | GibbsPosterior | SequentialPosterior
 
 
@@ -42,38 +38,43 @@ def to_inference_data(result: Chains | PyTree) -> Any:
     Raises `ImportError` where arviz is missing, `ValueError` for anything else. Use it for
     effective sample sizes and R-hat: `arviz.summary(to_inference_data(chains))`.
     """
-    arviz = _arviz()
+    try:
+        arviz = importlib.import_module("arviz")
+    except ImportError as error:
+        raise ImportError("to_inference_data needs arviz: pip install arviz") from error
+    stats: dict[str, np.ndarray] = {}
+    states: dict[str, np.ndarray] = {}
+    parameters = getattr(result, "parameters", {})
     if isinstance(result, Posterior):
-        stats = {
-            "log_marginal_likelihood": result.log_marginal_likelihoods,
-            "accepted": result.accepted,
-        }
-        return _convert(arviz, result.parameters, stats, {})
-    if isinstance(result, GibbsPosterior):
+        stats["log_marginal_likelihood"] = result.log_marginal_likelihoods
+        stats["accepted"] = result.accepted
+    elif isinstance(result, GibbsPosterior):
         states = _states(result.trajectories)
-        length = result.renewed.shape[2]
-        times = {
-            name: ["time"]
-            for name, leaf in states.items()
-            if leaf.ndim > 2 and leaf.shape[2] == length
-        }
-        for name in set(states) & set(result.parameters):
-            raise ValueError(f"result: a parameter is called {name}, as are the states")
         stats = {"acceptance_rate": result.accepted, "renewed": result.renewed}
-        dims = times | {"renewed": ["time"]}
-        return _convert(arviz, result.parameters | states, stats, dims)
-    if isinstance(result, SequentialPosterior):
+    elif isinstance(result, SequentialPosterior):
         draws = _of_equal_weight(result.weights)
-        posterior = {name: values[draws][None] for name, values in result.parameters.items()}
-        return _convert(arviz, posterior, {}, {})
-    leaves = jax.tree.leaves(result)
-    if not leaves or not all(map(_is_stack, leaves)):
-        raise ValueError(f"result: {shown(result)} is not {_NEEDED}")
-    if len({leaf.shape[:2] for leaf in leaves}) > 1:
-        shapes = [leaf.shape for leaf in leaves]
-        raise ValueError(f"result: leaves of shapes {shapes} are not {_NEEDED}")
-    states = {name: leaf[None] for name, leaf in _states(result).items()}
-    return _convert(arviz, states, {}, {name: ["time"] for name in states})
+        parameters = {name: values[draws][None] for name, values in parameters.items()}
+    else:
+        states = {name: leaf[None] for name, leaf in _states(result).items()}
+        leaves = list(states.values())
+        is_stack = all(leaf.ndim > 2 and np.issubdtype(leaf.dtype, np.number) for leaf in leaves)
+        if not is_stack or len({leaf.shape[:3] for leaf in leaves}) != 1:
+            raise ValueError(
+                f"result: {shown(result)} is not what metropolis_hastings, particle_gibbs or smc2"
+                " returns, nor trajectories, leaves (trajectories, times, ...)"
+            )
+    for name in set(states) & set(parameters):
+        raise ValueError(f"result: a parameter is called {name}, as are the states")
+    length = stats["renewed"].shape[2] if "renewed" in stats else None
+    dims, coords = {}, {}
+    for name, leaf in (states | stats).items():
+        if leaf.ndim > 2 and length in (None, leaf.shape[2]):
+            dims[name] = ["time", *(f"{name}_dim_{k}" for k in range(1, leaf.ndim - 2))]
+            coords = {"time": np.arange(leaf.shape[2])}
+    groups = {"posterior": parameters | states} | ({"sample_stats": stats} if stats else {})
+    if "posterior" in inspect.signature(arviz.from_dict).parameters:
+        return arviz.from_dict(**groups, dims=dims, coords=coords)
+    return arviz.from_dict(groups, dims=dims, coords=coords)
 
 
 def _of_equal_weight(weights: np.ndarray) -> np.ndarray:
@@ -88,44 +89,10 @@ def _of_equal_weight(weights: np.ndarray) -> np.ndarray:
     return np.random.default_rng(0).permutation(indices)
 
 
-def _is_stack(leaf: Any) -> bool:
-    is_array = isinstance(leaf, jax.Array | np.ndarray)
-    return is_array and leaf.ndim >= 2 and np.issubdtype(leaf.dtype, np.number)
-
-
 def _states(trajectories: PyTree) -> dict[str, np.ndarray]:
-    """The leaves by name."""
+    """The leaves by name: "state", and where they are several, what each is called."""
     named = jax.tree_util.tree_leaves_with_path(trajectories)
-    return {"_".join(["state", *map(_part, path)]): np.asarray(leaf) for path, leaf in named}
-
-
-def _part(key: Any) -> str:
-    """What a step of a path is called, without brackets and dots."""
-    return str(next(getattr(key, name) for name in ("key", "idx", "name") if hasattr(key, name)))
-
-
-def _convert(
-    arviz: ModuleType,
-    posterior: dict[str, np.ndarray],
-    stats: dict[str, np.ndarray],
-    names: dict[str, list[str]],
-) -> Any:
-    """Groups of arrays (chains, draws, ...), with the names of their first further dimension."""
-    groups = {"posterior": posterior} | ({"sample_stats": stats} if stats else {})
-    arrays = posterior | stats
-    dims = {
-        name: own + [f"{name}_dim_{k}" for k in range(len(own), arrays[name].ndim - 2)]
-        for name, own in names.items()
+    return {
+        "state" + re.sub(r"[^\w]+", "_", jax.tree_util.keystr(path)).rstrip("_"): np.asarray(leaf)
+        for path, leaf in named
     }
-    lengths = [arrays[name].shape[2] for name in names]
-    coords = {"time": np.arange(lengths[0])} if lengths else {}
-    if "posterior" in inspect.signature(arviz.from_dict).parameters:
-        return arviz.from_dict(**groups, dims=dims, coords=coords)
-    return arviz.from_dict(groups, dims=dims, coords=coords)
-
-
-def _arviz() -> ModuleType:
-    try:
-        return importlib.import_module("arviz")
-    except ImportError as error:
-        raise ImportError("to_inference_data needs arviz: pip install arviz") from error

@@ -1,7 +1,5 @@
 """A likelihood tuned on labels: the posterior of the label among candidate states."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -97,7 +95,7 @@ def transition_candidates(
     check_key(key)
     require(model, "sample_transition", "transition_candidates")
     check_whole(1, num_candidates=num_candidates)
-    t, k = _leading_axes("labels", labels, 2, "frames and labels")
+    t, k = _leading_axes("labels", labels, 2)
     if t < 2:
         raise ValueError(f"labels: {t} frames leave none with a label one frame before")
     lead = (t - 1, k, num_candidates)
@@ -111,33 +109,22 @@ def transition_candidates(
 
 def _check(observations: PyTree, labels: PyTree, candidates: PyTree) -> int:
     """The number of frames, or a `ValueError` for leading axes that do not agree."""
-    lead = _leading_axes("candidates", candidates, 3, "frames, labels and candidates")
-    for name, tree, axes in (
-        ("observations", observations, 1), ("labels", labels, 2), ("candidates", candidates, 3),
-    ):  # fmt: skip
-        for leaf in _arrays(name, tree):
-            if jnp.shape(leaf)[:axes] != lead[:axes]:
-                raise ValueError(
-                    f"{name}: leading axes {jnp.shape(leaf)[:axes]} are not {lead[:axes]},"
-                    " as of the candidates"
-                )
+    lead = _leading_axes("candidates", candidates, 3)
+    for name, tree, count in (("observations", observations, 1), ("labels", labels, 2)):
+        own = _leading_axes(name, tree, count)
+        if own != lead[:count]:
+            raise ValueError(
+                f"{name}: leading axes {own} are not {lead[:count]}, as of the candidates"
+            )
     return lead[0]
 
 
-def _leading_axes(name: str, tree: PyTree, count: int, what: str) -> tuple[int, ...]:
-    """The first axes of the first leaf, none of them empty."""
-    lead = jnp.shape(_arrays(name, tree)[0])[:count]
-    if len(lead) < count or 0 in lead:
-        raise ValueError(f"{name}: leading axes {lead} are not {what}")
-    return lead
-
-
-def _arrays(name: str, tree: PyTree) -> list[Any]:
-    """The leaves, of which there is one and each an array of numbers."""
+def _leading_axes(name: str, tree: PyTree, count: int) -> tuple[int, ...]:
+    """The first axes, which all leaves share, none of them empty."""
     leaves = jax.tree.leaves(tree)
-    for leaf in leaves:
-        if not eqx.is_array_like(leaf):
-            raise ValueError(f"{name}: {shown(leaf)} is no array of numbers")
-    if not leaves:
-        raise ValueError(f"{name}: {shown(tree)} holds no array")
-    return leaves
+    found = {jnp.shape(leaf)[:count] if eqx.is_array_like(leaf) else () for leaf in leaves}
+    lead = found.pop() if len(found) == 1 else ()
+    if len(lead) < count or 0 in lead:
+        what = ("frames", "labels", "candidates")[:count]
+        raise ValueError(f"{name}: {shown(tree)} has no leading axes of {', '.join(what)}")
+    return lead

@@ -76,9 +76,8 @@ def fit(
     - `observations`: arrays or a `Series`; a list is several sequences, each run on its own.
     - `optimizer`: an optimiser of optax. It steps in the unconstrained numbers of the transforms.
     - `parameters`: what is tuned, by name: `{"sigma_y": lambda f: f.model.sigma_y}`. A node, such
-      as a network, stands for all its arrays. Or a filter spec, a pytree of booleans like the
-      filter. None is every floating point array of the model. A named Python float becomes an
-      array.
+      as a network, stands for all its arrays. None is every floating point array of the model. A
+      named Python float becomes an array.
     - `transforms`: by name, such as `Positive()` for a scale. A parameter without one has no
       constraint.
     - `num_seeds`: the number of runs in each step, under one vmap.

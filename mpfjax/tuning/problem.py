@@ -16,7 +16,7 @@ from mpfjax.tuning.transforms import AbstractTransform, Unconstrained
 
 _DECLARED = "eqx.field(converter=jnp.asarray)"
 
-Parameters = Mapping[str, Callable[[Any], PyTree]] | PyTree
+Parameters = Mapping[str, Callable[[Any], PyTree]] | None
 Reals = dict[str, Array]
 Objective = Callable[[Key[Array, ""], Any], Float[Array, ""]]
 
@@ -191,10 +191,8 @@ def _as_array(name: str, value: Any) -> Array:
 
 def _what_there_is(tree: PyTree) -> str:
     """A hint at numbers that are not arrays, which can only be tuned by name."""
-    numbers = [
-        name for name, leaf in zip(_names(tree), jax.tree.leaves(tree), strict=True)
-        if isinstance(leaf, float) and not name.startswith("_")
-    ]  # fmt: skip
+    leaves = jax.tree_util.tree_leaves_with_path(_model_of(tree))
+    numbers = [_named("", path) for path, leaf in leaves if isinstance(leaf, float)]
     if not numbers:
         return ""
     return (
@@ -203,18 +201,24 @@ def _what_there_is(tree: PyTree) -> str:
     )
 
 
-def _names(tree: PyTree) -> list[str]:
-    """The name of each leaf where the user gave none."""
-    return [
-        jax.tree_util.keystr(path).removeprefix(".model.").removeprefix(".")
-        for path, _ in jax.tree_util.tree_leaves_with_path(tree)
-    ]
+def _model_of(tree: PyTree) -> PyTree:
+    return getattr(tree, "model", tree)
+
+
+def _named(name: str, path: Any) -> str:
+    """What a leaf of a parameter is called."""
+    return (name + jax.tree_util.keystr(path)).removeprefix(".")
 
 
 def _tuned(tree: PyTree, parameters: Parameters) -> dict[str, int]:
     """Each parameter's name, and its place among the tree's leaves."""
+    if parameters is None:
+        parameters = {"": _model_of}
     if not isinstance(parameters, Mapping):
-        return _of_spec(tree, parameters)
+        raise ValueError(
+            f"parameters: {shown(parameters)} is no mapping from names to functions, such as"
+            ' {"r": lambda filter: filter.model.r}'
+        )
     leaves, places = jax.tree.leaves(tree), placed(tree)
     tuned: dict[str, int] = {}
     for name, where in parameters.items():
@@ -225,23 +229,6 @@ def _tuned(tree: PyTree, parameters: Parameters) -> dict[str, int]:
                 raise ValueError(f"parameters: {twice} and {inner} pick the same number")
             tuned[inner] = index
     return tuned
-
-
-def _of_spec(tree: PyTree, parameters: PyTree) -> dict[str, int]:
-    """What a pytree of booleans selects; None is every floating point array."""
-    if parameters is None:
-        parameters = jax.tree.map(eqx.is_inexact_array, tree)
-    try:
-        spec = jax.tree.leaves(jax.tree.broadcast(parameters, tree))
-    except (ValueError, TypeError):
-        spec = [None]
-    if not all(isinstance(is_tuned, bool) for is_tuned in spec):
-        raise ValueError(
-            f"parameters: {shown(parameters)} is neither a mapping from names to functions, such"
-            ' as {"r": lambda filter: filter.model.r}, nor a filter spec, a pytree of booleans like'
-            " the filter"
-        )
-    return {name: i for i, name in enumerate(_names(tree)) if spec[i]}
 
 
 def _picked(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[str, int]:
@@ -260,10 +247,10 @@ def _picked(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[st
                 f" made from others; a field can be tuned where it is declared {_DECLARED}, without"
                 " static=True"
             )
-    if len(found) > 1:  # a network has functions among its leaves
+    if len(found) > 1 or not name:  # a network has functions among its leaves
         found = [
             (path, place) for path, place in found if eqx.is_inexact_array(leaves[place.index])
         ]
-    if not found:
+    if not found and name:
         raise ValueError(f"parameters: {name} picks no array")
-    return {name + jax.tree_util.keystr(path): place.index for path, place in found}
+    return {_named(name, path): place.index for path, place in found}

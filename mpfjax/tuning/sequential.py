@@ -16,7 +16,7 @@ from mpfjax.observations import Series
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.chains import warn_of_invalid
 from mpfjax.tuning.densities import LogPrior, SamplePrior, checked_prior, drawn
-from mpfjax.tuning.evidence import check_exact, one_sequence, pose_filter
+from mpfjax.tuning.evidence import check_exact, one_sequence
 from mpfjax.tuning.parameter_particles import (
     FilterOf,
     Sampler,
@@ -25,7 +25,7 @@ from mpfjax.tuning.parameter_particles import (
     rejuvenated,
     started,
 )
-from mpfjax.tuning.problem import Parameters
+from mpfjax.tuning.problem import Parameters, pose
 from mpfjax.tuning.transforms import AbstractTransform
 
 # The share of their number below which the effective sample size of the θs leads to moves.
@@ -151,7 +151,7 @@ def smc2(
         )
     series = jax.tree.map(np.asarray, one_sequence(observations, filter.model))
     runs = _padded(series, series.length)
-    problem = pose_filter(filter, runs, parameters, transforms)
+    problem = pose(filter, runs, parameters, transforms)
     key_prior, key_filters, key_steps = jax.random.split(key, 3)
     reals = drawn(key_prior, problem, sample_prior, num_samples)
     first = jax.tree.map(lambda u: u[0], reals)

@@ -7,11 +7,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mpfjax.checks import shown
+from mpfjax.checks import check_positive_array, shown
 from mpfjax.operations.matrices import cholesky
 from mpfjax.tuning.problem import Reals
 
@@ -97,19 +96,14 @@ def checked_deviations(given: float | Mapping[str, Any], start: Reals) -> Reals:
         raise ValueError(f"proposal_deviations: those of {sorted(by_name)}, not of {sorted(start)}")
     deviations = {}
     for name, u in start.items():
+        value = by_name[name]
         try:
-            value = np.asarray(by_name[name], float)
+            deviations[name] = jnp.broadcast_to(jnp.asarray(value, u.dtype), u.shape)
         except (TypeError, ValueError) as error:
             raise ValueError(
-                f"proposal_deviations: {shown(by_name[name])} of {name} is no number"
+                f"proposal_deviations: {shown(value)} of {name} is no number, nor {u.shape} numbers"
             ) from error
-        if not (np.isfinite(value).all() and (value > 0).all()):
-            raise ValueError(f"proposal_deviations: {value} of {name} is not positive")
-        if value.shape not in ((), u.shape):
-            raise ValueError(
-                f"proposal_deviations: shape {value.shape} of {name} is neither () nor {u.shape}"
-            )
-        deviations[name] = jnp.broadcast_to(jnp.asarray(value, u.dtype), u.shape)
+        check_positive_array(**{f"proposal_deviations: {name}": deviations[name]})
     return deviations
 
 

@@ -119,7 +119,7 @@ def test_too_few_seeds_are_said_to_be_too_few():
 
 
 def test_one_seed_cannot_be_halved():
-    with pytest.warns(UserWarning, match="num_seeds is 1"):
+    with pytest.warns(UserWarning, match="1 seeds leave them uncertain"):
         found = standard_errors(
             jax.random.key(0), filter_in(1.0, 1.0), jnp.asarray(OBSERVATIONS),
             parameters=picked("m"), num_seeds=1,
