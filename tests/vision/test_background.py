@@ -263,7 +263,6 @@ def test_learning_from_no_frames_is_named():
         ("aspect", (3.0, 2.0)),
         ("largest_gap", -0.5),
         ("cut_aspect", -0.5),
-        ("cut_depth", 1.0),
     ],
 )
 def test_a_bad_setting_is_named(name, value):

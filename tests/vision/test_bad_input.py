@@ -108,8 +108,7 @@ TABLE = {
         {},
         {"history": "count", "warm_up": "count", "threshold": "positive",
          "most_pixels": "count", "background_share": "inner share",
-         "shadow_brightness": "inner share?", "cut_depth": "inner share",
-         "largest_gap": "not negative"},
+         "shadow_brightness": "inner share?", "largest_gap": "not negative"},
     ),
     "ObjectTracker": (
         vision.ObjectTracker,

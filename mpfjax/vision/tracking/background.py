@@ -23,6 +23,8 @@ _FOREGROUND = 255
 _REMEMBERED, _ENOUGH = 500, 20
 # A part that is cut from a blob has at least this share of an object's usual width.
 _NARROWEST = 2.4
+# How high the outline may reach between two heads, as a share of the lower one's height.
+_CUT_DEPTH = 0.9
 # The height of an object before any was seen, as a share of the frame's.
 _UNKNOWN_HEIGHT = 0.125
 
@@ -54,8 +56,6 @@ class BackgroundSubtraction:
       blobs so far; of an eighth of the frame's height until there are a few.
     - `cut_aspect`: a blob lower than this many widths may be cut; None takes the median of the
       blobs so far, once there are a few, and 0 cuts none.
-    - `cut_depth`: how high the outline may reach between two heads, as a share of the lower one's
-      height above the foot of the blob, in (0, 1).
     - `most_pixels`: a frame with more pixels is reduced before detection, by a whole number along
       both sides; boxes are in pixels of the original frame.
 
@@ -78,14 +78,14 @@ class BackgroundSubtraction:
         aspect: tuple[float, float] | None = None,
         largest_gap: float = 0.1,
         cut_aspect: float | None = None,
-        cut_depth: float = 0.9,
         most_pixels: int = 640 * 480,
     ) -> None:
         check_whole(history=history, warm_up=warm_up, most_pixels=most_pixels)
         check_positive(threshold=threshold)
         check_not_negative(largest_gap=largest_gap, **given(cut_aspect=cut_aspect))
-        check_inner_share(background_share=background_share, cut_depth=cut_depth)
-        check_inner_share(**given(shadow_brightness=shadow_brightness))
+        check_inner_share(
+            background_share=background_share, **given(shadow_brightness=shadow_brightness)
+        )
         aspect = (0.0, np.inf) if aspect is None else aspect
         for name, (least, most), limit in (("area", area, 1), ("aspect", aspect, np.inf)):
             if not 0 <= least < most <= limit:
@@ -95,7 +95,7 @@ class BackgroundSubtraction:
         self.background_share, self.shadow_brightness = background_share, shadow_brightness
         self.warm_up, self.most_pixels = warm_up, most_pixels
         self.area, self.aspect = area, aspect
-        self.largest_gap, self.cut_aspect, self.cut_depth = largest_gap, cut_aspect, cut_depth
+        self.largest_gap, self.cut_aspect = largest_gap, cut_aspect
         self._forget()
 
     def learn(self, frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
@@ -220,7 +220,7 @@ class BackgroundSubtraction:
         right = np.maximum.accumulate(outline[::-1])[::-1]
         depths = outline / np.maximum(np.minimum(left, right), 1)
         cut = narrowest + int(np.argmin(depths[narrowest : width - narrowest]))
-        if depths[cut] > self.cut_depth:
+        if depths[cut] > _CUT_DEPTH:
             return [(0, 0, width, height)]
         left_part = self._cut_part(blob[:, :cut], 0, widest)
         return left_part + self._cut_part(blob[:, cut:], cut, widest)
