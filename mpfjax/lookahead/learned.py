@@ -17,7 +17,6 @@ from mpfjax.lookahead.twisted import (
     PropagateTwisted,
     RegroupTwisted,
     Twist,
-    TwistedLookahead,
     TwistInitial,
     features_of,
     noise_dimension_of,
@@ -136,7 +135,7 @@ def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
         if move.resampling is not None:
             # Masses of today tell little where ψ knows what is to come: each ψ_t errs by its fit.
             equally = dataclasses.replace(move.resampling, allocation="equal")
-            return AuxiliaryResample(equally, TwistedLookahead(twist))
+            return AuxiliaryResample(equally, twist)
         if hasattr(move, "from_noise") and move.gradient == "none":
             return PropagateTwisted(dataclasses.replace(move, proposal=None), twist)
         raise ValueError(

@@ -25,6 +25,8 @@ STEP = "twisted"
 class Twist(eqx.Module):
     """ψ_1, ..., ψ_T for the steps of a series, as `mpfjax.smoothing.learn_lookahead` fits them.
 
+    It is the look-ahead of an `AuxiliaryResample`, ν_t(x_{t-1}) of the step.
+
     - `steps`: ψ of each step, and one more, ψ = 1, for steps after the last.
     - `initial`: of x_0, which is made of noise alone; None where the model draws it otherwise.
     - `features`: φ, the features of a state that ψ depends on, (n, d); None is the flattened state.
@@ -34,18 +36,21 @@ class Twist(eqx.Module):
     initial: LocalQuadratics | None
     features: Callable[[PyTree], Array] | None = None
 
-    def at(self, step: Int[Array, ""]) -> LocalQuadratics:
-        """ψ_t, for t from 1 on."""
-        place = jnp.clip(step - 1, 0, self.steps.log_cap.shape[0] - 1)
+    reads = frozenset({STEP})
+
+    def next(self, mixture: ParticleMixture) -> LocalQuadratics:
+        """ψ of the step that takes the particles on from where they are."""
+        place = jnp.minimum(mixture.memory[STEP]["step"], self.steps.log_cap.shape[0] - 1)
         return jax.tree.map(lambda leaf: leaf[place], self.steps)
 
     def features_of(self, states: PyTree) -> Float[Array, "n d"]:
         """φ(x) of each particle."""
         return features_of(self.features, states)
 
-    def log_normaliser(self, step: Int[Array, ""], states: PyTree) -> Float[Array, " n"]:
-        """log ν_t of each particle, x_{t-1}."""
-        return self.at(step).log_normaliser(self.features_of(states))
+    def at_step_of(self, mixture: ParticleMixture) -> Callable[[PyTree, PyTree], Array]:
+        """log ν of the next step, as a function of y_t, which it does not use, and the states."""
+        psi = self.next(mixture)
+        return lambda observation, states: psi.log_normaliser(self.features_of(states))
 
 
 def features_of(features: Callable[[PyTree], Array] | None, states: PyTree) -> Float[Array, "n d"]:
@@ -98,22 +103,6 @@ class TwistInitial(AbstractMove):
         return mixture.replace(particles=states).weighed(log_ratio)
 
 
-class TwistedLookahead(eqx.Module):
-    """The look-ahead of an `AuxiliaryResample` that is ν_t(x_{t-1}) of the current step."""
-
-    twist: Twist
-
-    @property
-    def reads(self) -> frozenset[str]:
-        """The number of the step."""
-        return frozenset({STEP})
-
-    def at_step_of(self, mixture: ParticleMixture) -> Callable[[PyTree, PyTree], Array]:
-        """log ν_t of the states in this step; the observation is not used."""
-        step = next_step(mixture)
-        return lambda observation, states: self.twist.log_normaliser(step, states)
-
-
 class PropagateTwisted(AbstractPropagation):
     """Draw the noise ε of x_t from q_t(ε | x_{t-1}), and weigh by L(y_t | x_t) N(ε; 0, I) / q_t.
 
@@ -137,7 +126,7 @@ class PropagateTwisted(AbstractPropagation):
         model, previous = self.move.model, mixture.particles
         dimension = noise_dimension_of(model, previous) + 1
         noise = noise_of_slots(self.move.noise, key, dimension, mixture)
-        psi = self.twist.at(next_step(mixture))
+        psi = self.twist.next(mixture)
         drawn, log_ratio = psi.draw(noise, self.twist.features_of(previous))
         states, log_factors = seen(model, observation, made_of(model, drawn, previous))
         return _counted(mixture.replace(particles=states).weighed(*log_factors, log_ratio))
@@ -147,13 +136,9 @@ class PropagateTwisted(AbstractPropagation):
         return _counted(self.move.predict(key, mixture))
 
 
-def next_step(mixture: ParticleMixture) -> Int[Array, ""]:
-    """The number of the step that takes the particles on from where they are."""
-    return mixture.memory[STEP]["step"] + 1
-
-
 def _counted(mixture: ParticleMixture) -> ParticleMixture:
-    return mixture.replace(memory=mixture.memory | {STEP: {"step": next_step(mixture)}})
+    step = mixture.memory[STEP]["step"] + 1
+    return mixture.replace(memory=mixture.memory | {STEP: {"step": step}})
 
 
 class RegroupTwisted(AbstractRegrouping):
@@ -169,7 +154,7 @@ class RegroupTwisted(AbstractRegrouping):
     @property
     def reads(self) -> frozenset[str]:
         """The number of the step, and that which the move reads."""
-        return frozenset({STEP}) | self.move.reads
+        return self.twist.reads | self.move.reads
 
     @property
     def needs_parents(self) -> bool:
@@ -180,7 +165,7 @@ class RegroupTwisted(AbstractRegrouping):
         self, key: Key[Array, ""], mixture: ParticleMixture
     ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
         """The move's indicators under the weights times ν_{t+1}."""
-        log_factors = self.twist.log_normaliser(next_step(mixture), mixture.particles)
+        log_factors = self.twist.at_step_of(mixture)(None, mixture.particles)
         log_weights = mixture.weighed(log_factors).log_weights
         log_weights = log_weights - log_sum_exp(log_weights)
         return self.move.regroup(key, mixture.replace(log_weights=log_weights))

@@ -30,7 +30,7 @@ class AuxiliaryResample(AbstractMove):
     - `resample`: the `Resample` that draws; its `ess_threshold` applies to the weights times ν.
     - `lookahead`: a function (y_t, states) -> log ν of each particle, (n,), or a proposal that has
       `log_normaliser`, such as `GaussNewtonProposal`. Where ν depends on the step, its
-      `at_step_of(mixture)` gives that function, as of `TwistedLookahead`. The best ν is
+      `at_step_of(mixture)` gives that function, as of a learned one. The best ν is
       p(y_t | x_{t-1}). It must be positive for every particle that can explain y_t, and its tails
       no thinner than those of p(y_t | x_{t-1}): an overconfident ν leaves most of the weight to a
       few particles. Where ν is zero for all particles of a component, the component is resampled
