@@ -8,14 +8,13 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 from mpfjax.checks import check_one_of, check_whole, given
 from mpfjax.mixture import ParticleMixture, no_ancestors
 from mpfjax.models.base import require
-from mpfjax.moves.objects.coupling import coupled, together
+from mpfjax.moves.objects.coupling import coupled, recombined, rotated, scores, together
 from mpfjax.moves.objects.independent import (
     AbstractPropagationByObject,
     drawn_rows,
     moved_objects,
     rows_of_each,
 )
-from mpfjax.moves.objects.recombination import recombined, rotated, scores
 from mpfjax.moves.regrouping.merge import lowest_connected
 from mpfjax.moves.resampling.allocation import require_equal_rows
 from mpfjax.operations.logarithms import default_float, finite_max

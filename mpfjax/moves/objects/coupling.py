@@ -1,17 +1,27 @@
-"""Contact between objects: which objects meet, and the clusters that follow from it.
+"""Objects that meet: contact, the clusters that follow from it, and what their rows exchange.
 
 Two objects are in contact where log ψ ≠ 0 between any of their predicted points. A cluster is a set
-of objects linked by contact, directly or through others, and is named by its first object.
+of objects linked by contact, directly or through others, and is named by its first object. Its rows
+may take any point of each of its objects: the mathematics of step 4 of `PropagateInClusters`.
+Tables (J, n) have a line for each object. The lines of a cluster's objects agree in the cluster's
+own quantities, since they are drawn with the same key.
 """
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.models.multi_object import MultiObjectModel
+from mpfjax.operations.logarithms import default_float, finite_or_zero, log_or_nothing
+from mpfjax.operations.matrices import draw_columns
+from mpfjax.operations.random import split, uniform
+
+_GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 def coupled(
@@ -61,3 +71,151 @@ def over_pairs(
     """Turn a function of the states of equal rows into one of all pairs of rows."""
     of_one = lambda state, others: function(alike(state, others), others)  # noqa: E731
     return jax.vmap(of_one, in_axes=(0, None))
+
+
+def scores(
+    model: MultiObjectModel,
+    particles: PyTree,
+    points: PyTree,
+    log_likelihoods: Float[Array, "objects n"],
+    alone: Bool[Array, " objects"],
+) -> tuple[Float[Array, "objects n"], Float[Array, "objects n"]]:
+    """log Σ_r f_j(x^{jl} | row r) of each point, and log Σ_l b_rjl of each row.
+
+    An object alone needs neither: the score of its row is the likelihood of its own point.
+    """
+
+    def score(carry: None, j: Int[Array, ""]) -> tuple[None, tuple]:
+        def shared() -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+            object_model: Any = model.object_at(j)
+            log_f = over_pairs(lambda parent, point: object_model.log_transition(point, parent))
+            table = log_f(model.object_states(particles, j), model.object_states(points, j))
+            table = table.astype(default_float())
+            log_totals = _log_sums(table.T)
+            log_b = table + (log_likelihoods[j] - log_totals)[None]
+            return log_totals, _log_sums(log_b)
+
+        def own() -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+            return jnp.zeros_like(log_likelihoods[j]), log_likelihoods[j]
+
+        return carry, jax.lax.cond(alone[j], own, shared)
+
+    objects = jnp.arange(len(alone), dtype=jnp.int32)
+    return jax.lax.scan(score, None, objects)[1]
+
+
+def recombined(
+    model: MultiObjectModel,
+    key: Key[Array, ""],
+    particles: PyTree,
+    points: PyTree,
+    rows: Int[Array, "objects n"],
+    log_point_weights: Float[Array, "objects n"],
+    log_sums: Float[Array, "objects n"],
+    together: Bool[Array, "objects objects"],
+) -> tuple[PyTree, Float[Array, "objects n"]]:
+    """The points that each row takes, and the factor of its cluster's weight."""
+    num_objects, num_particles = log_sums.shape
+    key_start, key_points = split(key, 2)
+    ks = jnp.arange(num_particles, dtype=jnp.int32)
+    starts = rotated(key_start, jnp.arange(num_objects, dtype=jnp.int32))[ks % num_objects]
+    alone = jnp.sum(together, axis=1) == 1
+    by_object = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), points)
+
+    def choose(carry: tuple, inputs: tuple) -> tuple[tuple, None]:
+        chosen, log_weights, has_moved = carry
+        key, rank = inputs
+        objects = (starts + rank) % num_objects  # whose turn it is in each row
+        parent_rows = rows[objects, ks]
+        parents = jax.tree.map(lambda leaf: leaf[parent_rows, objects], particles)
+        own = jax.tree.map(lambda leaf: leaf[objects], by_object)
+        log_b = jax.vmap(partial(_log_kernels, model))(objects, parents, own)
+        log_b = log_b + log_point_weights[objects]
+        partners = has_moved & together[objects]
+        log_psi = _log_potentials(model, chosen, partners, own)
+        picked, log_gain = _draw_columns(key, log_b + log_psi)
+        before = log_sums[objects, parent_rows]
+        # A row without weight is drawn only if no row of the cluster has any.
+        counts = jnp.any(partners, axis=1) & (before != -jnp.inf)
+        log_gain = jnp.where(counts, log_gain - jnp.where(counts, before, 0.0), 0.0)
+        picked = jnp.where(alone[objects], parent_rows, picked)
+        states = jax.tree.map(lambda leaf: leaf[picked, objects], points)
+        states = jax.vmap(partial(_with_history, model))(objects, states, parents)
+        chosen = model.replace_object(chosen, objects, states)
+        log_weights += jnp.where(together[objects].T, log_gain[None], 0.0)
+        moves = objects[:, None] == jnp.arange(num_objects, dtype=jnp.int32)[None]
+        return (chosen, log_weights, has_moved | moves), None
+
+    has_moved = jnp.zeros((num_particles, num_objects), bool)
+    carry = (particles, jnp.zeros_like(log_sums), has_moved)
+    inputs = (split(key_points, num_objects), jnp.arange(num_objects, dtype=jnp.int32))
+    (chosen, log_weights, _), _ = jax.lax.scan(choose, carry, inputs)
+    return chosen, log_weights
+
+
+def _log_kernels(
+    model: MultiObjectModel, j: Int[Array, ""], parent: PyTree, points: PyTree
+) -> Float[Array, " n"]:
+    """log f_j of the points of one object given one parent."""
+    object_model: Any = model.object_at(j)
+    return object_model.log_transition(points, alike(parent, points)).astype(default_float())
+
+
+def _with_history(
+    model: MultiObjectModel, j: Int[Array, ""], state: PyTree, parent: PyTree
+) -> PyTree:
+    """The state with the past of a given parent, not that of the parent it was drawn from."""
+    replace_past = getattr(model.object_at(j), "with_history", None)
+    if replace_past is None:
+        return state
+    many = lambda state: jax.tree.map(lambda leaf: leaf[None], state)  # noqa: E731
+    return jax.tree.map(lambda leaf: leaf[0], replace_past(many(state), many(parent)))
+
+
+def _log_potentials(
+    model: MultiObjectModel, chosen: PyTree, partners: Bool[Array, "n objects"], points: PyTree
+) -> Float[Array, "n n"]:
+    """Σ log ψ of the partners in row k with its point l, in line k and column l."""
+    interaction, num = model.interaction, len(partners)
+    total = jnp.zeros((num, num), default_float())
+    if interaction is None:
+        return total
+    of_row = jax.vmap(lambda state, points: interaction(alike(state, points), points))
+
+    def add(total: Float[Array, "n n"], inputs: tuple) -> tuple[Float[Array, "n n"], None]:
+        i, meets = inputs
+        log_psi = of_row(model.object_states(chosen, i), points).astype(total.dtype)
+        return total + jnp.where(meets[:, None], log_psi, 0.0), None
+
+    objects = jnp.arange(partners.shape[1], dtype=jnp.int32)
+    return jax.lax.scan(add, total, (objects, partners.T))[0]
+
+
+def _draw_columns(
+    key: Key[Array, ""], log_table: Float[Array, "n n"]
+) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+    """A column of each line, drawn in proportion to its entries, and log of the line's sum.
+
+    One random shift serves all lines. The quantile of each next line is a golden-ratio step
+    further, modulo 1. So each quantile is uniform, and a run of equal lines draws evenly.
+    """
+    strides = _GOLDEN * np.arange(log_table.shape[0])
+    shift = uniform(key, (), log_table.dtype)
+    quantiles = (jnp.asarray(strides % 1, log_table.dtype) + shift) % 1
+    weights = jnp.exp(jax.lax.stop_gradient(log_table) - _finite_max(log_table)[:, None])
+    return draw_columns(quantiles, weights), _log_sums(log_table)
+
+
+def _log_sums(log_table: Float[Array, "k n"]) -> Float[Array, " k"]:
+    """log Σ exp of every line, -inf where all of it is, with a finite gradient there."""
+    shift = _finite_max(log_table)
+    return log_or_nothing(jnp.sum(jnp.exp(log_table - shift[:, None]), axis=1)) + shift
+
+
+def _finite_max(log_table: Float[Array, "k n"]) -> Float[Array, " k"]:
+    return finite_or_zero(jnp.max(jax.lax.stop_gradient(log_table), axis=1))
+
+
+def rotated(key: Key[Array, ""], indices: Int[Array, " k"]) -> Int[Array, " k"]:
+    """The numbers 0, ..., k-1 in a circle, starting from a random one."""
+    return (indices + jax.random.randint(key, (), 0, len(indices), indices.dtype)) % len(indices)
