@@ -17,8 +17,6 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 _LONGEST = 200
-# Python counts a truth value among its integers, and numpy a duration; JAX has no long doubles.
-_NO_NUMBERS: tuple[type, ...] = (bool, np.timedelta64, np.longdouble)
 _MOST = 2**31 - 1
 # Of the largest entry of a covariance, which rounding may change by this much.
 _ROUNDING = 1e-4
@@ -35,7 +33,7 @@ def check_whole(least: int = 1, /, **arguments: Any) -> None:
     It fits into 32 bits, which indices have.
     """
     for name, value in arguments.items():
-        is_whole = isinstance(value, int | np.integer) and not isinstance(value, _NO_NUMBERS)
+        is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
         if not is_whole or value < least:
             raise ValueError(f"{name}: {shown(value)} is not a whole number of at least {least}")
         if value > _MOST:
@@ -128,19 +126,11 @@ def check_key(key: Any, name: str = "key", *, batch: bool = False) -> None:
     """It is one typed key, or with `batch` a vector of at least one."""
     is_array = isinstance(key, jax.Array | np.ndarray)
     if not is_array or not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
-        raw = is_array and key.dtype == np.uint32
-        why = "is of JAX's old kind of key" if raw else "is no typed key"
         use = "jax.random.split(jax.random.key(0), seeds)" if batch else "jax.random.key(0)"
-        raise ValueError(f"{name}: {shown(key)} {why}; use {use}")
-    if batch and (key.ndim != 1 or key.shape[0] < 1):
-        raise ValueError(
-            f"{name}: shape {key.shape} is not that of one key a run, (seeds,);"
-            " use jax.random.split(key, seeds)"
-        )
-    if not batch and key.ndim != 0:
-        raise ValueError(
-            f"{name}: shape {key.shape} is not that of one key, (); monte_carlo takes many"
-        )
+        raise ValueError(f"{name}: {shown(key)} is no typed key; use {use}")
+    if key.ndim != batch or key.size < 1:
+        wanted = "one key a run, (seeds,)" if batch else "one key, (); monte_carlo takes many"
+        raise ValueError(f"{name}: shape {key.shape} is not that of {wanted}")
 
 
 def as_numbers(
@@ -149,69 +139,46 @@ def as_numbers(
     """The argument as an array of JAX or numpy that holds the same numbers for JAX.
 
     JAX alone would misread bytes of another order, keep the lower half of whole numbers beyond 32
-    bits, and drop masks. Raises `ValueError` for masked numbers, durations, anything but numbers,
-    complex ones unless allowed, and numbers that JAX's own type cannot hold. With `floating`, whole
-    numbers and booleans become floating point numbers.
+    bits, and drop masks. Raises `ValueError` for masked numbers, anything but numbers, complex ones
+    unless allowed, and numbers that JAX's own type cannot hold. With `floating`, whole numbers and
+    booleans become floating point numbers.
     """
     if isinstance(value, jax.ShapeDtypeStruct):
         return value
-    if isinstance(value, jax.Array):
-        _check_numbers(name, value, value, may_be_complex)
-        is_whole = floating and not jnp.issubdtype(value.dtype, jnp.inexact)
-        return value.astype(jnp.result_type(float)) if is_whole else value
     if np.ma.is_masked(value):
         raise ValueError(f"{name}: {shown(value)} is masked; fill it, as by .filled(np.nan)")
+    is_list = isinstance(value, list | tuple)
+    of_jax = any(isinstance(leaf, jax.Array) for leaf in (value if is_list else [value]))
     try:
-        array = np.asarray(value)
+        array = jnp.asarray(value) if of_jax else np.asarray(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name}: {shown(value)} is no array of numbers") from error
-    _check_numbers(name, array, value, may_be_complex)
-    if floating and not jnp.issubdtype(array.dtype, jnp.inexact):
-        array = array.astype(float)
-    return _of_jax(name, array)
-
-
-def _check_numbers(name: str, array: Any, value: Any, may_be_complex: bool) -> None:
-    """Raise a `ValueError` for an argument whose array is not one of numbers."""
-    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
-        raise ValueError(f"{name}: {shown(value)} is a key, no array of numbers")
-    if jnp.issubdtype(array.dtype, jnp.complexfloating) and not may_be_complex:
+    if not _has_numbers(array):
+        raise ValueError(f"{name}: {shown(value)} is no array of numbers")
+    if jnp.iscomplexobj(array) and not may_be_complex:
         # Later the imaginary part would be dropped silently, at the latest in a density.
         raise ValueError(
             f"{name}: {array.dtype} is complex; give the real and the imaginary part as two numbers"
         )
-    if jnp.issubdtype(array.dtype, np.timedelta64):
-        raise ValueError(
-            f"{name}: {array.dtype} is a duration; divide it by its unit, as np.timedelta64(1, 's')"
-        )
-    if not _has_numbers(array):
-        raise ValueError(f"{name}: {shown(value)} is no array of numbers")
+    if floating and not jnp.issubdtype(array.dtype, jnp.inexact):
+        array = array.astype(float)
+    return array if of_jax else _of_jax(name, array)
 
 
-def _of_jax(name: str, array: np.ndarray) -> np.ndarray:
+def _of_jax(name: str, array: Any) -> np.ndarray:
     """The array in the type that JAX gives it; a `ValueError` where numbers would change.
 
     Floating point numbers may be rounded.
     """
     shorter = {"g": np.float64, "G": np.complex128}.get(array.dtype.char, array.dtype)
-    native = np.dtype(shorter).newbyteorder("=")
-    dtype = jax.dtypes.canonicalize_dtype(native)
-    if array.dtype == dtype and array.dtype.isnative:
-        return array
+    dtype = jax.dtypes.canonicalize_dtype(np.dtype(shorter).newbyteorder("="))
     with np.errstate(over="ignore"):
         held = array.astype(dtype)
-    if jnp.issubdtype(dtype, np.inexact):
-        lost, instead = np.isfinite(array) & ~np.isfinite(held), "choose other units"
-    else:
-        lost, instead = held != array, "give floating point numbers"
+    is_whole = not jnp.issubdtype(dtype, np.inexact)
+    lost = held != array if is_whole else np.isfinite(array) & ~np.isfinite(held)
     if lost.any():
-        first = tuple(np.argwhere(lost)[0].tolist())
-        place = ", ".join(map(str, first))
-        where = f" at index {place if len(first) < 2 else f'({place})'}" if first else ""
-        raise ValueError(
-            f"{name}: {array[first]:g}{where} is more than {dtype} holds; set jax_enable_x64, or"
-            f" {instead}"
-        )
+        first = array[lost][0]
+        raise ValueError(f"{name}: {first:g} is more than {dtype} holds; set jax_enable_x64")
     return held
 
 
@@ -222,14 +189,7 @@ def to_array(name: str, *, floating: bool = True) -> Callable[[Any], Array]:
     """
 
     def convert(value: Any) -> Array:
-        if isinstance(value, list | tuple) and _holds_arrays(value):
-            try:
-                value = jnp.asarray(value)
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{name}: {shown(value)} is no array of numbers") from error
         numbers = as_numbers(name, value, floating=floating)
-        if isinstance(value, int | float) and not isinstance(value, np.generic):
-            return jnp.asarray(value, float if floating else None)
         return numbers if isinstance(numbers, jax.ShapeDtypeStruct) else jnp.asarray(numbers)  # pyright: ignore[reportReturnType]
 
     return convert
@@ -238,19 +198,13 @@ def to_array(name: str, *, floating: bool = True) -> Callable[[Any], Array]:
 def real_arrays(shape: str, /, **arguments: Any) -> Any:
     """The arguments as arrays of JAX in floating point, all of this shape, see `check_shape`.
 
-    Floating point numbers have 32 bits at least. One array alone comes as itself.
+    One array alone comes as itself.
     """
     check_shape(shape, **arguments)
-    arrays = []
-    for name, value in arguments.items():
-        array = jnp.asarray(as_numbers(name, value, floating=True))
-        is_short = jnp.finfo(array.dtype).bits < 32
-        arrays.append(array.astype(jnp.result_type(float)) if is_short else array)
+    arrays = [
+        jnp.asarray(as_numbers(name, value, floating=True)) for name, value in arguments.items()
+    ]
     return arrays if len(arrays) > 1 else arrays[0]
-
-
-def _holds_arrays(value: Any) -> bool:
-    return any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
 
 
 def check_positive_array(**arguments: Any) -> None:
@@ -313,22 +267,23 @@ def to_rows(width: int, name: str, value: Any) -> np.ndarray:
         raise ValueError(f"{name}: {shown(value)} are masked in part; fill them, as by .filled(0)")
     try:
         rows = np.asarray(value)
-        if rows.dtype.kind in "cmM":  # numpy would drop an imaginary part, or a unit
-            raise TypeError
-        rows = rows.astype(float)
+        if rows.dtype.kind not in "cmM":  # numpy would drop an imaginary part, or a unit
+            rows = rows.astype(float)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: {shown(value)} are no rows of {width} numbers") from error
     if rows.ndim > 0 and rows.size == 0:
         return np.zeros((0, width))
-    rows = rows[None] if rows.shape == (width,) else rows
-    if rows.ndim != 2 or rows.shape[1] != width:
-        raise ValueError(f"{name}: shape {rows.shape} is not that of rows of {width} numbers")
+    rows = np.atleast_2d(rows)
+    if rows.dtype != float or rows.ndim != 2 or rows.shape[1] != width:
+        raise ValueError(f"{name}: {rows.dtype}{rows.shape} are no rows of {width} numbers")
     return rows
 
 
 def _has_numbers(array: Any) -> bool:
     dtype = getattr(array, "dtype", None)
-    return dtype is not None and any(jnp.issubdtype(dtype, kind) for kind in (np.number, np.bool_))
+    is_duration = getattr(dtype, "kind", None) == "m"  # for numpy a whole number
+    kinds = (np.number, np.bool_)
+    return dtype is not None and not is_duration and any(jnp.issubdtype(dtype, k) for k in kinds)
 
 
 def check_scalars(**arguments: Any) -> None:
@@ -373,4 +328,4 @@ def shown(value: Any) -> str:
 
 def _is_number(value: Any) -> bool:
     numbers = (int, float, np.integer, np.floating)
-    return isinstance(value, numbers) and not isinstance(value, _NO_NUMBERS)
+    return isinstance(value, numbers) and not isinstance(value, bool)

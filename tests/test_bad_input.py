@@ -147,8 +147,8 @@ def test_as_many_units_as_features():
         (np.array([0.0, np.nan, 1.0]), "observations: NaN or infinite at index 1"),
         (np.array([0.0, 1.0, -np.inf]), "observations: NaN or infinite at index 2"),
         (np.array([0.0, 1j]), "observations: complex128 is complex"),
-        (np.array([0.0, 1e300, 1.0]), r"observations: 1e\+300 at index 1 is more than float32"),
-        ({"a": np.array([[0.0, 1.0], [-1e39, 0.0]])}, r"observations: -1e\+39 at index \(1, 0\)"),
+        (np.array([0.0, 1e300, 1.0]), r"observations: 1e\+300 is more than float32"),
+        ({"a": np.array([[0.0, 1.0], [-1e39, 0.0]])}, r"observations: -1e\+39 is more"),
     ],
 )
 def test_observations_that_cannot_be_run(observations, message):
