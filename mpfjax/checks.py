@@ -127,7 +127,9 @@ def check_key(key: Any, name: str = "key", *, batch: bool = False) -> None:
     is_array = isinstance(key, jax.Array | np.ndarray)
     if not is_array or not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         use = "jax.random.split(jax.random.key(0), seeds)" if batch else "jax.random.key(0)"
-        raise ValueError(f"{name}: {shown(key)} is no typed key; use {use}")
+        raise ValueError(
+            f"{name}: {shown(key)} is no typed key (one of JAX's old kind is none); use {use}"
+        )
     if key.ndim != batch or key.size < 1:
         wanted = "one key a run, (seeds,)" if batch else "one key, (); monte_carlo takes many"
         raise ValueError(f"{name}: shape {key.shape} is not that of {wanted}")
