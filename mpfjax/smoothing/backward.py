@@ -58,6 +58,18 @@ def draw(
     return jnp.minimum(indices, jnp.max(jnp.where(weights > 0, place, 0)))
 
 
+def draw_ends(
+    key: Key[Array, ""], mixtures: ParticleMixture, number: int, component: int | None
+) -> tuple[Int[Array, " k"], PyTree]:
+    """Indices and states of particles of the last mixture by their weights, or of a component."""
+    final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
+    log_weights = final.log_weights
+    if component is not None:
+        log_weights = jnp.where(final.component_indicators == component, log_weights, -jnp.inf)
+    indices = draw(key, (number,), log_weights)
+    return indices, jax.tree.map(lambda leaf: take(leaf, indices), final.particles)
+
+
 def log_transition_from(model: Any, mixture: ParticleMixture) -> Callable[[PyTree], Array]:
     """log D(state | x^i) of every particle, (n,), as a function of one state."""
     n = mixture.num_particles

@@ -41,17 +41,18 @@ from mpfjax.operations.gaussians import (
     Gaussian,
     Linear,
     applied,
+    cholesky,
     particles_first,
     product,
     sandwiched,
+    solve_lower,
     symmetric,
     transposed,
     without_missing,
 )
-from mpfjax.operations.matrices import cholesky, solve_lower
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
-from mpfjax.smoothing.backward import draw, draw_exactly
+from mpfjax.smoothing.backward import draw_ends, draw_exactly
 
 
 class Information(NamedTuple):
@@ -88,12 +89,8 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
     `mixtures` are those of x_0, ..., x_t; `inputs` are those of the steps between them.
     """
     key_last, key_steps = split(key, 2)
-    final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
-    log_weights, length = final.log_weights, mixtures.log_weights.shape[0] - 1
-    if component is not None:
-        log_weights = jnp.where(final.component_indicators == component, log_weights, -jnp.inf)
-    last = draw(key_last, (num_trajectories,), log_weights)
-    end = jax.tree.map(lambda leaf: take(leaf, last), final.particles)
+    length = mixtures.log_weights.shape[0] - 1
+    _, end = draw_ends(key_last, mixtures, num_trajectories, component)
 
     def back(carry: tuple[PyTree, Information], step: Any) -> tuple[Any, Any]:
         latent, future = carry
@@ -114,16 +111,14 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
     earlier = jax.tree.map(lambda leaf: leaf[:-1], mixtures)
     steps = (jax.random.split(key_steps, length), earlier, observations, inputs)
     _, (latents, futures) = jax.lax.scan(back, (end.latent, nothing), steps, reverse=True)
+    ended = lambda rows, row: jnp.concatenate([rows, row[None]])  # noqa: E731
+    latents = jax.tree.map(ended, latents, end.latent)
+    following = jax.tree.map(lambda leaf: leaf[1:], latents)
     start = with_moments(model, jax.tree.map(lambda leaf: leaf[0], latents))
-    following = jax.tree.map(
-        lambda rows, row: jnp.concatenate([rows[1:], row[None]]), latents, end.latent
-    )
     _, later = jax.lax.scan(forth, start, (following, observations, inputs))
     filtered = jax.tree.map(lambda row, rows: jnp.concatenate([row[None], rows]), start, later)
-    futures = jax.tree.map(lambda rows, row: jnp.concatenate([rows, row[None]]), futures, nothing)
-    return jax.tree.map(
-        lambda leaf: jnp.moveaxis(leaf, 0, 1), jax.vmap(_smoothed)(filtered, futures)
-    )
+    found = jax.vmap(_smoothed)(filtered, jax.tree.map(ended, futures, nothing))
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), found)
 
 
 def _nothing(mean: Float[Array, "n d"]) -> Information:

@@ -19,7 +19,7 @@ from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split_keys
 from mpfjax.operations.stored import take
 from mpfjax.running.scan import FilterRun
-from mpfjax.smoothing.backward import draw, draw_exactly, log_transition_from, walk
+from mpfjax.smoothing.backward import draw, draw_ends, draw_exactly, log_transition_from, walk
 from mpfjax.smoothing.history import mixtures_of, with_parents
 from mpfjax.smoothing.marginalised import check_marginalised, sample_marginalised
 
@@ -134,12 +134,7 @@ def draw_trajectories(
     `inputs` are those of the steps between mixtures.
     """
     key_final, key_steps, key_proposed = split_keys(key, 3)
-    final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
-    log_weights = final.log_weights
-    if component is not None:
-        log_weights = jnp.where(final.component_indicators == component, log_weights, -jnp.inf)
-    last = draw(key_final, (num_trajectories,), log_weights)
-    states = jax.tree.map(lambda leaf: take(leaf, last), final.particles)
+    last, states = draw_ends(key_final, mixtures, num_trajectories, component)
 
     def back(carry: tuple[PyTree, Array], step: Any) -> tuple[tuple[PyTree, Array], PyTree]:
         next_states, next_indices = carry
@@ -186,7 +181,6 @@ def _warn_of_few(trajectories: PyTree, particles: PyTree, log_weights: Float[Arr
     leaves = jax.tree.leaves((trajectories, particles, log_weights))
     if any(isinstance(leaf, Tracer) or not leaf.is_fully_addressable for leaf in leaves):
         return
-    log_weights = np.asarray(log_weights)
     drawn = _fingerprints(trajectories, slice(log_weights.shape[1]))
     if drawn is None or drawn.shape[1] < 2:
         return
@@ -197,7 +191,7 @@ def _warn_of_few(trajectories: PyTree, particles: PyTree, log_weights: Float[Arr
     own_pasts = (_num_distinct(pairs) - num_after).sum() / max((num_drawn - num_after).sum(), 1)
     if few.size == 0 or own_pasts > _SMALL_SHARE:
         return
-    there, weights = _fingerprints(particles, few), log_weights[few]
+    there, weights = _fingerprints(particles, few), np.asarray(log_weights)[few]
     # The likeliest particle stands for those without weight.
     likeliest = np.take_along_axis(there, np.argmax(weights, axis=1)[:, None], axis=1)
     possible = _num_distinct(np.where(weights > -np.inf, there, likeliest))

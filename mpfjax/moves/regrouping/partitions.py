@@ -110,7 +110,7 @@ class GroupBy(AbstractRegrouping):
         del key
         with saying("in function, of GroupBy, which is called with the particles"):
             labels: Any = self.function(mixture.particles)
-        n, dtype = mixture.num_particles, getattr(labels, "dtype", None)
+        n, dtype = mixture.num_particles, getattr(labels, "dtype", float)
         if jnp.shape(labels) != (n,) or not jnp.issubdtype(dtype, jnp.integer):
             raise ValueError(
                 f"function: it returned {shown(labels)}, not one whole number a particle, ({n},)"
