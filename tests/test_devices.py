@@ -27,8 +27,7 @@ from mpfjax.operations.islands import (
     over_islands,
 )
 from mpfjax.operations.segments import segment_sum
-from mpfjax.running.devices import choose_devices
-from mpfjax.running.threads import over_threads
+from mpfjax.running.devices import choose_devices, over_threads
 from tests import on_devices
 from tests.examples import make_mixture
 from tests.marking import thorough

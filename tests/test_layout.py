@@ -48,7 +48,7 @@ FLOORS = {
     "vision": ("files", "colour", "tracking", "boxes"),
     "lookahead": ("quadratics", "pilot", "twisted", "regression", "learned"),
     "running": (
-        "storage", "long_runs", "devices", "threads", "progress", "scan", "run", "islands",
+        "storage", "long_runs", "devices", "progress", "scan", "run", "islands",
         "studies",
     ),
 }  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mpfjax.operations import compiling
-from mpfjax.running import threads as on_threads
+from mpfjax.running import devices as on_threads
 
 
 def test_threads_that_come_first_share_one_program(monkeypatch):

@@ -13,9 +13,8 @@ from jaxtyping import PyTree
 from tqdm import tqdm
 
 from mpfjax.checks import check_type, check_whole, given
-from mpfjax.running.storage.descriptions import describe, differences, program_of
 from mpfjax.running.storage.files import as_path, load_arrays, read_description, write_arrays
-from mpfjax.running.storage.states import arrays_of, filled
+from mpfjax.running.storage.states import arrays_of, describe, differences, filled, program_of
 
 _NOTES = "notes"
 

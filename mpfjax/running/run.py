@@ -15,10 +15,9 @@ from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import Series, as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.random import split, split_keys
-from mpfjax.running.devices import choose_devices, over_devices
+from mpfjax.running.devices import choose_devices, num_processors, over_devices, over_threads
 from mpfjax.running.progress import shown_progress
 from mpfjax.running.scan import FilterRun, check_run, checked, first_mixture, scan
-from mpfjax.running.threads import num_processors, over_threads
 
 # How many particles, with the temporaries of a step, fit into a CPU's caches. Few components
 # have a row of particles each, which counts as so many times the particles.

@@ -34,7 +34,6 @@ from mpfjax.observations import as_series, check_series
 from mpfjax.operations.logarithms import default_float
 from mpfjax.running.run import monte_carlo
 from mpfjax.running.scan import FilterRun
-from mpfjax.running.storage.descriptions import describe, differences, fingerprint, named
 from mpfjax.running.storage.files import (
     as_path,
     load_arrays,
@@ -42,6 +41,7 @@ from mpfjax.running.storage.files import (
     write_arrays,
     write_whole,
 )
+from mpfjax.running.storage.states import describe, differences, fingerprint, named
 
 Values = Sequence[Any] | np.ndarray | Array
 
