@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 import mpfjax
 from benchmarks import figures as plotting
+from benchmarks.likelihood_tuning.labelled_boxes import boxes_around, labelled_states
 from benchmarks.likelihood_tuning.soft_colours import SoftColourModel
 from benchmarks.scenes import football_scene
 from mpfjax.console import format_table, write_figure, write_json
@@ -30,8 +31,6 @@ from mpfjax.tuning import (
 )
 from mpfjax.vision import (
     BoxState,
-    boxes_around,
-    labelled_states,
     read_frames,
     read_truth,
 )

@@ -32,6 +32,7 @@ from benchmarks.visual_tracking.pictures import NAMES, write_contact_sheet, writ
 from benchmarks.visual_tracking.scores import score, table, tracking_scores
 from benchmarks.visual_tracking.source import Source, open_source
 from mpfjax.console import exit_status, seed, whole, write_json
+from mpfjax.vision.boxes.following import Snapshot, follow, track_rows
 from mpfjax.vision.boxes.recipes import (
     MAX_COMPONENTS,
     PARTICLES_PER_COMPONENT,
@@ -39,7 +40,6 @@ from mpfjax.vision.boxes.recipes import (
     PRESETS,
     most_components,
 )
-from mpfjax.vision.boxes.snapshots import Snapshot, follow, track_rows
 from mpfjax.vision.files import boxes as box_files
 
 

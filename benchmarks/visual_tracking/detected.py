@@ -22,7 +22,7 @@ from mpfjax.vision import (
     Tracks,
     offline_rows,
 )
-from mpfjax.vision.boxes.snapshots import Snapshot
+from mpfjax.vision.boxes.following import Snapshot
 from mpfjax.vision.tracking.gaussian import Gaussian, boxes_of, places_of, units
 from mpfjax.vision.tracking.state import TrackerState
 from mpfjax.vision.tracking.tracker import WEAK_ERROR

@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.figures import draw_contact_sheet
 from benchmarks.visual_tracking.source import Source
 from mpfjax.console import write_figure
-from mpfjax.vision.boxes.snapshots import Snapshot, annotate
+from mpfjax.vision.boxes.following import Snapshot, annotate
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import frames
 

@@ -21,7 +21,7 @@ from mpfjax.command.arguments import (
 )
 from mpfjax.command.scoring import SCORES, scores_of
 from mpfjax.console import Clock, format_table, peak_memory, write_json
-from mpfjax.vision.boxes.follow_boxes import follow_boxes
+from mpfjax.vision.boxes.following import follow_boxes
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import drawing, frames
 from mpfjax.vision.files.threads import read_ahead, write_behind

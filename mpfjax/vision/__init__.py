@@ -2,15 +2,13 @@
 
 from mpfjax.vision.boxes.colour_model import BoxState as BoxState
 from mpfjax.vision.boxes.colour_model import ColourModel as ColourModel
-from mpfjax.vision.boxes.follow_boxes import follow_boxes as follow_boxes
+from mpfjax.vision.boxes.following import annotate as annotate
+from mpfjax.vision.boxes.following import follow as follow
+from mpfjax.vision.boxes.following import follow_boxes as follow_boxes
+from mpfjax.vision.boxes.following import track_rows as track_rows
 from mpfjax.vision.boxes.joint_colour import joint_colour_model as joint_colour_model
 from mpfjax.vision.boxes.joint_colour import object_boxes as object_boxes
-from mpfjax.vision.boxes.labels import boxes_around as boxes_around
-from mpfjax.vision.boxes.labels import labelled_states as labelled_states
 from mpfjax.vision.boxes.recipes import PRESETS as PRESETS
-from mpfjax.vision.boxes.snapshots import annotate as annotate
-from mpfjax.vision.boxes.snapshots import follow as follow
-from mpfjax.vision.boxes.snapshots import track_rows as track_rows
 from mpfjax.vision.colour.bins import HSVColours as HSVColours
 from mpfjax.vision.colour.bins import RGBColours as RGBColours
 from mpfjax.vision.files.boxes import read_detections as read_detections

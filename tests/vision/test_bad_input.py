@@ -92,17 +92,6 @@ TABLE = {
         {"boxes": "rows", "key": "key?"},
     ),
     "read_detections": (vision.read_detections, {}, {"path": "path"}),
-    "boxes_around": (
-        late(vision.boxes_around, model="colour"),
-        {"key": KEY, "states": STATES, "num_boxes": 3},
-        {"key": "key", "model": "kind", "states": "kind", "num_boxes": "count",
-         "reach": "positive", "stretch": "positive"},
-    ),
-    "labelled_states": (
-        late(vision.labelled_states, model="colour"),
-        {"boxes": BOXES[None]},
-        {"model": "kind", "boxes": "rows"},
-    ),
     "BackgroundSubtraction": (
         vision.BackgroundSubtraction,
         {},
@@ -143,8 +132,6 @@ def test_what_will_not_do_is_named(function, good, name, value):
         (vision.write_tracks, {"path": "/nowhere"}, "rows", [[0.5, 1, 2, 3, 4, 5]]),
         (vision.write_tracks, {"path": "/nowhere"}, "rows", [[1, 1, NAN, 3, 4, 5]]),
         (late(vision.object_boxes, model="joint"), {}, "states", STATES),
-        (late(vision.boxes_around, model="colour"), {"key": KEY, "states": STATES, "num_boxes": 3},
-         "stretch", 0.5),
     ],
 )  # fmt: skip
 def test_what_does_not_go_with_the_rest_is_named(function, good, name, value):

@@ -9,7 +9,7 @@ import pytest
 
 from mpfjax.mixture import single_component
 from mpfjax.vision import BoxState, ColourModel, RGBColours
-from mpfjax.vision.boxes.learned_colours import (
+from mpfjax.vision.boxes.hypotheses import (
     AdaptAppearance,
     LearnedColourModel,
 )

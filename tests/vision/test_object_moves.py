@@ -7,7 +7,7 @@ import numpy as np
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision.boxes.colour_model import BoxState
-from mpfjax.vision.boxes.object_moves import (
+from mpfjax.vision.boxes.hypotheses import (
     ObjectExclusion,
     PruneHypotheses,
 )

@@ -12,8 +12,8 @@ import pytest
 from benchmarks.scenes import football_scene
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import Detections, ObjectTracker, Tracks, track
-from mpfjax.vision.boxes.follow_boxes import follow_boxes
-from mpfjax.vision.boxes.object_moves import best_components
+from mpfjax.vision.boxes.following import follow_boxes
+from mpfjax.vision.boxes.hypotheses import best_components
 from mpfjax.vision.boxes.recipes import objects_filters
 from mpfjax.vision.files.frames import write_image
 from mpfjax.vision.tracking.adapters import LEAST_ROOM, MOST_ROOM, Rows

@@ -25,8 +25,9 @@ from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.transforms import with_resampling
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
-from mpfjax.vision.boxes.learned_colours import AdaptAppearance, LearnedColourModel
-from mpfjax.vision.boxes.object_moves import (
+from mpfjax.vision.boxes.hypotheses import (
+    AdaptAppearance,
+    LearnedColourModel,
     ObjectExclusion,
     PruneHypotheses,
 )

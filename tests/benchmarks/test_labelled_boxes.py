@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.likelihood_tuning.labelled_boxes import boxes_around, labelled_states
 from mpfjax import Autoregression, RandomWalk, WalkWithVelocity
 from mpfjax.vision.boxes.colour_model import ColourModel
-from mpfjax.vision.boxes.labels import boxes_around, labelled_states
 from mpfjax.vision.files.boxes import centred
 
 FRAME = np.full((40, 60, 3), 90, np.uint8)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mpfjax.vision.boxes.snapshots import Snapshot, annotate, track_rows
+from mpfjax.vision.boxes.following import Snapshot, annotate, track_rows
 from mpfjax.vision.files.drawing import PALETTE, with_tracks
 
 

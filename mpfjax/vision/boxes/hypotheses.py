@@ -1,12 +1,112 @@
-"""Moves for mixtures whose components stand for objects. The references tell objects apart."""
+"""Rival hypotheses about objects: colours that are learned, exclusion, and pruning."""
+
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt8
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.objects.exclusion import AbstractExclusion
+from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
+from mpfjax.vision.colour.histograms import IntegralHistogram, normalise
+
+
+class LearnedColourModel(ColourModel):
+    """A `ColourModel` of objects that change their appearance and that are hidden at times.
+
+        L(y | x) ∝ exp(-d / 2σ²) + exp(-d_hidden / 2σ²)
+
+    d is the squared distance of a `ColourModel`, including contrast: a share `anchor` of it is
+    the distance from the reference of the first frame, and the rest the distance from the
+    particle's own `appearance`. The second term stands for a hidden object, and does not depend on
+    the box. A hypothesis therefore stays near the place where its object vanished, and no
+    look-alike at a distance of d_hidden or more attracts it. `appearance` is part of the state, and
+    only `AdaptAppearance` changes it. All else is as in a `ColourModel`.
+
+    - `hidden_distance`: d_hidden, squared, in units of Σ_c B². In a street scene, people were at a
+      distance of .2 from themselves, .5 to .7 from others and 1 or more from the background.
+
+    Use it where objects hide behind others or turn round.
+    """
+
+    anchor: float = eqx.field(static=True, default=0.2)
+    hidden_distance: float = eqx.field(static=True, default=0.6)
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> BoxState:
+        """x_0 of the `ColourModel`, with the appearance of the reference."""
+        states = super().sample_initial(key, num_particles)
+        return _with_appearance(states, self.references[states.reference])
+
+    def log_likelihood(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
+    ) -> Float[Array, " n"]:
+        """log of the sum of the two terms, visible and hidden."""
+        log_seen, log_hidden, _ = self._seen(observation, states)
+        return jnp.logaddexp(log_seen, log_hidden)
+
+    def learned(
+        self,
+        observation: IntegralHistogram | UInt8[Array, "h w 3"],
+        states: BoxState,
+        rate: float,
+    ) -> BoxState:
+        """The states, after rate · P(seen | x, y) (h(x) - appearance) is added to appearances."""
+        log_seen, log_hidden, counts = self._seen(observation, states)
+        shown = normalise(counts, self.own(states)[0])
+        # A box that holds no pixel, or more than can be counted, has no colours to learn.
+        some = jnp.any(shown > 0, axis=(1, 2, 3)) & jnp.all(jnp.isfinite(shown), axis=(1, 2, 3))
+        share = jnp.where(some, rate * jax.nn.sigmoid(log_seen - log_hidden), 0.0)
+        share = share.astype(shown.dtype)[:, None, None, None]
+        past: Any = states.appearance
+        change = jnp.where(share > 0, shown, past) - past
+        return _with_appearance(states, past + share * change)
+
+    def _seen(
+        self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
+    ) -> tuple[Float[Array, " n"], Float[Array, ""], Float[Array, "n parts channels bins"]]:
+        """log of the two terms of the likelihood, and the colours in the boxes."""
+        counts, sides = self.counts(observation, states)
+        weights, references = self.own(states)
+        to_first = self.distances(counts, sides, weights, references)
+        appearance: Any = states.appearance
+        to_learned = self.distances(counts, sides, weights, appearance)
+        distances = self.anchor * to_first + (1 - self.anchor) * to_learned
+        log_hidden = -0.5 * self.hidden_distance / self.sigma**2
+        return -0.5 * distances / self.sigma**2, log_hidden.astype(distances.dtype), counts
+
+
+class AdaptAppearance(AbstractPropagation):
+    """Let every particle learn the colours in its box, in proportion to P(object is visible).
+
+        appearance <- appearance + rate · P(seen | x, y) (h(x) - appearance)
+
+    P(seen | x, y) is the share of the first term in the likelihood of the `LearnedColourModel`.
+    Rival hypotheses learn different appearances. The `anchor` of the model keeps a share of the
+    first frame's. The weights do not change.
+
+    The model changes with the data (`approximate` is true). Use it after `Propagate`.
+    """
+
+    model: LearnedColourModel
+    rate: float = eqx.field(static=True, default=0.1)
+
+    approximate = True
+    """appearances are learned from the same data that they explain."""
+
+    def __call__(
+        self,
+        key: Key[Array, ""],
+        mixture: ParticleMixture,
+        observation: IntegralHistogram | UInt8[Array, "h w 3"],
+    ) -> ParticleMixture:
+        """Learn from this frame."""
+        del key
+        return mixture.replace(
+            particles=self.model.learned(observation, mixture.particles, self.rate)
+        )
 
 
 class ObjectExclusion(AbstractExclusion):
@@ -104,3 +204,9 @@ def _log_shares(mixture: ParticleMixture, owners: Int[Array, " m"]) -> Float[Arr
     total = jnp.sum(jnp.exp(rivals - shift[:, None]), axis=1)
     log_total = shift + jnp.log(jnp.where(total > 0, total, 1.0))
     return jnp.where(mixture.active, masses - log_total, -jnp.inf)
+
+
+def _with_appearance(
+    states: BoxState, appearance: Float[Array, "n parts channels bins"]
+) -> BoxState:
+    return BoxState(states.box, states.reference, states.previous, appearance)
