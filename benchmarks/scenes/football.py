@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
 from mpfjax.checks import check_flag, check_key, check_whole
-from mpfjax.vision.files.drawing import draw_ellipse, draw_stroke
+from mpfjax.vision.files.drawing import blend, draw_stroke, window
 
 _PITCH_DEPTH = (22.0, 52.0)
 _PLAYER_HEIGHT = 1.85
@@ -247,7 +247,7 @@ def _draw_player(
     def limb(start: tuple, end: tuple, width: float, colour: np.ndarray) -> None:
         draw_stroke(frame, at(*start), at(*end), width * scale, colour)
 
-    draw_ellipse(frame, at(0.25, 0.0), (0.55 * scale, 0.13 * scale), np.zeros(3), opacity=0.4)
+    _draw_ellipse(frame, at(0.25, 0.0), (0.55 * scale, 0.13 * scale), np.zeros(3), opacity=0.4)
     for side, shade in ((-1.0, 0.82), (1.0, 1.0)):
         swing = side * gait * np.sin(phase)
         lift = 0.16 * gait * max(0.0, side * np.cos(phase))
@@ -267,5 +267,22 @@ def _draw_player(
     limb((lean - 0.08, 1.38), (-0.06, 1.02), 0.14, 0.92 * shirt)
     limb((lean + 0.08, 1.38), (0.06, 1.02), 0.14, shirt)
     limb((lean, 1.5), (lean, 1.56), 0.06, skin)
-    draw_ellipse(frame, at(1.2 * lean, 1.68), (0.115 * scale, 0.14 * scale), skin)
-    draw_ellipse(frame, at(1.2 * lean - 0.02 * heading, 1.76), (0.12 * scale, 0.08 * scale), hair)
+    _draw_ellipse(frame, at(1.2 * lean, 1.68), (0.115 * scale, 0.14 * scale), skin)
+    _draw_ellipse(frame, at(1.2 * lean - 0.02 * heading, 1.76), (0.12 * scale, 0.08 * scale), hair)
+
+
+def _draw_ellipse(
+    frame: Float[np.ndarray, "h w 3"],
+    centre: tuple[float, float],
+    radii: tuple[float, float],
+    colour: Float[np.ndarray, "3"],
+    opacity: float = 1.0,
+) -> None:
+    """Draw a filled ellipse along the axes."""
+    (cx, cy), (rx, ry) = centre, radii
+    found = window(frame, cx - rx - 1, cy - ry - 1, cx + rx + 1, cy + ry + 1)
+    if found is None:
+        return
+    part, x, y = found
+    inside = (1 - np.hypot((x - cx) / rx, (y - cy) / ry)) * min(rx, ry)
+    blend(part, np.clip(inside + 0.5, 0, 1) * opacity, colour)

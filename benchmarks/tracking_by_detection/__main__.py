@@ -39,8 +39,13 @@ from mpfjax.console import (
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import frames
-from mpfjax.vision.files.sequences import detection_files, last_frame, read_sequence_info
-from mpfjax.vision.files.truth import Truth, read_truth
+from mpfjax.vision.files.sequences import (
+    Truth,
+    detection_files,
+    last_frame,
+    read_sequence_info,
+    read_truth,
+)
 from mpfjax.vision.tracking.adapters import Rows
 from mpfjax.vision.tracking.track import online_rows, track
 from mpfjax.vision.tracking.tracker import ObjectTracker

@@ -15,12 +15,12 @@ from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import frames
 from mpfjax.vision.files.sequences import (
     SequenceInfo,
+    Truth,
     detection_files,
     last_frame,
     read_sequence_info,
     sequence_of,
 )
-from mpfjax.vision.files.truth import Truth
 
 DESCRIPTION = """\
 Track objects in a video or a folder of images. What to track comes from one of three: detections

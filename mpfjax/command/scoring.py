@@ -9,7 +9,7 @@ import numpy as np
 
 from mpfjax.metrics import multi_object_scores
 from mpfjax.metrics.tracking_scores import matches
-from mpfjax.vision.files.truth import Truth, read_truth
+from mpfjax.vision.files.sequences import Truth, read_truth
 
 SCORES = ("HOTA", "MOTA", "IDF1")
 _NO_SCORES = "no HOTA, MOTA and IDF1"

@@ -24,12 +24,14 @@ from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
 from mpfjax.operations.random import fast_key
 from mpfjax.vision.colour.bins import AbstractColours, RGBColours
 from mpfjax.vision.colour.histograms import (
+    LARGEST_NARROW,
+    SURROUND,
     IntegralHistogram,
     bhattacharyya,
     integral_histogram,
     normalise,
+    reference_histograms,
 )
-from mpfjax.vision.colour.references import LARGEST_NARROW, SURROUND, reference_histograms
 from mpfjax.vision.files.boxes import centred, check_boxes
 from mpfjax.vision.files.frames import check_frame
 

@@ -15,7 +15,6 @@ from jaxtyping import Array, Float, UInt8
 from mpfjax.filter import Filter
 from mpfjax.filters import mixture_particle_filter, particle_filter
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalkWithJumps, WalkWithVelocity
-from mpfjax.moves.base import AbstractMove, AbstractRegrouping
 from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.regrouping.kmeans import KMeans
@@ -43,8 +42,9 @@ def paper_filters(
     frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
 ) -> dict[str, Filter]:
     """The paper's model and parameters; thresholds of the MPF are in units of the mean box."""
+    size = _mean_size(frame, boxes)
     model = ColourModel.from_frame(frame, boxes, sigma=0.15, deviations=None, share_reference=True)
-    where: dict[str, Any] = {"features": _centre, "scale": boxes[:, 2:].mean(axis=0)}
+    where: dict[str, Any] = {"features": _centre, "scale": size}
     merge, split = Merge(None, 0.5, **where), Split(4.0, 0.5, min_share=0.15, **where)
     mixture = mixture_particle_filter(
         model,
@@ -67,19 +67,29 @@ def default_filters(
     it takes a long step. Components exclude each other. They split if they cover two places, and
     merge only after ten frames at the same place.
     """
-    check_frame(frame)
-    check_boxes(boxes, *frame.shape[:2])
-    size = boxes[:, 2:].mean(axis=0)
+    size = _mean_size(frame, boxes)
     steps = _steps(boxes)
     walk = _with_jumps(steps, probability=0.05)
     model = _own_references(frame, boxes, steps, walk, switch_probability=0.05)
     where: dict[str, Any] = {"features": _centre, "scale": size}
-    moves = [
-        Exclusion(strength=4.0, radius=0.5, **where),
-        Merge(None, 0.25, patience=10, **where),
-        Split(4.0, 0.5, min_share=0.15, **where),
-    ]
-    return _started_at_the_boxes(model, moves, size)
+    mixture = Filter(
+        model,
+        moves=[
+            Resample(particles_per_component=PARTICLES_PER_COMPONENT),
+            Propagate(model),
+            Exclusion(strength=4.0, radius=0.5, **where),
+            Merge(None, 0.25, patience=10, **where),
+            Split(4.0, 0.5, min_share=0.15, **where),
+        ],
+        num_particles=NUM_PARTICLES,
+        num_components=MAX_COMPONENTS,
+        # One component for each box.
+        initial_moves=[
+            KMeans(10, reseed=True, **_apart(size)),
+            Merge(None, 0.5, features=_reference),
+        ],
+    )
+    return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
 
 
 def objects_filters(
@@ -94,9 +104,7 @@ def objects_filters(
     pruned. Objects exclude each other where they are nearly at one place. They share the particles
     equally: 400 in all, and from four objects on 120 for each object.
     """
-    check_frame(frame)
-    check_boxes(boxes, *frame.shape[:2])
-    size = boxes[:, 2:].mean(axis=0)
+    size = _mean_size(frame, boxes)
     # Steps about a velocity are shorter than those of a random walk.
     steps = _steps(boxes) * np.array([0.3, 0.5, 1.0, 1.0])
     walk = _walking(_with_jumps(steps, probability=0.1, times=(8.0, 6.0)), boxes)
@@ -129,6 +137,12 @@ def objects_filters(
 def most_components(num_objects: int) -> int:
     """The most components of `objects_filters`: three hypotheses about each of many objects."""
     return max(MAX_COMPONENTS, HYPOTHESES * num_objects)
+
+
+def _mean_size(frame: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    check_frame(frame)
+    check_boxes(boxes, *frame.shape[:2])
+    return boxes[:, 2:].mean(axis=0)
 
 
 def _own_references(
@@ -173,31 +187,6 @@ def _walking(walk: RandomWalkWithJumps, boxes: np.ndarray) -> WalkWithVelocity:
     width, still = 0.1 * boxes[:, 2], np.zeros(len(boxes))
     speeds = np.stack([width, width, still, still], axis=1)
     return WalkWithVelocity(walk, (0.1, 0.1, 0.0, 0.0), speeds)
-
-
-def _started_at_the_boxes(
-    model: ColourModel, moves: list[AbstractMove], size: np.ndarray
-) -> dict[str, Filter]:
-    """Both filters; the mixture starts with one component for each box."""
-    mixture = Filter(
-        model,
-        moves=[
-            Resample(particles_per_component=PARTICLES_PER_COMPONENT),
-            Propagate(model),
-            *moves,
-        ],
-        num_particles=NUM_PARTICLES,
-        num_components=MAX_COMPONENTS,
-        initial_moves=_one_component_a_box(size),
-    )
-    return {"pf": particle_filter(model, NUM_PARTICLES), "mpf": mixture}
-
-
-def _one_component_a_box(size: np.ndarray) -> list[AbstractRegrouping]:
-    return [
-        KMeans(10, reseed=True, **_apart(size)),
-        Merge(None, 0.5, features=_reference),
-    ]
 
 
 def _apart(size: np.ndarray) -> dict[str, Any]:

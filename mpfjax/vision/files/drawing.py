@@ -38,33 +38,16 @@ def draw_stroke(
     """Draw a line of half-width `radius` with round ends; a dot where the ends coincide."""
     (x0, y0), (x1, y1) = start, end
     reach = radius + 1
-    window = _window(frame, min(x0, x1) - reach, min(y0, y1) - reach,
+    found = window(frame, min(x0, x1) - reach, min(y0, y1) - reach,
                      max(x0, x1) + reach, max(y0, y1) + reach)  # fmt: skip
-    if window is None:
+    if found is None:
         return
-    part, x, y = window
+    part, x, y = found
     dx, dy = x1 - x0, y1 - y0
     along = ((x - x0) * dx + (y - y0) * dy) / max(dx * dx + dy * dy, 1e-9)
     along = np.clip(along, 0, 1)
     distance = np.hypot(x - x0 - along * dx, y - y0 - along * dy)
-    _blend(part, np.clip(radius + 0.5 - distance, 0, 1) * opacity, colour)
-
-
-def draw_ellipse(
-    frame: Float[np.ndarray, "h w 3"],
-    centre: tuple[float, float],
-    radii: tuple[float, float],
-    colour: Float[np.ndarray, "3"],
-    opacity: float = 1.0,
-) -> None:
-    """Draw a filled ellipse along the axes."""
-    (cx, cy), (rx, ry) = centre, radii
-    window = _window(frame, cx - rx - 1, cy - ry - 1, cx + rx + 1, cy + ry + 1)
-    if window is None:
-        return
-    part, x, y = window
-    inside = (1 - np.hypot((x - cx) / rx, (y - cy) / ry)) * min(rx, ry)
-    _blend(part, np.clip(inside + 0.5, 0, 1) * opacity, colour)
+    blend(part, np.clip(radius + 0.5 - distance, 0, 1) * opacity, colour)
 
 
 def draw_box(
@@ -130,7 +113,7 @@ def with_tracks(
     return canvas
 
 
-def _window(
+def window(
     frame: np.ndarray, left: float, top: float, right: float, bottom: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """The part of the frame between these edges, and the centres of its pixels."""
@@ -144,5 +127,6 @@ def _window(
     return frame[y0:y1, x0:x1], np.arange(x0, x1)[None] + 0.5, np.arange(y0, y1)[:, None] + 0.5
 
 
-def _blend(part: np.ndarray, opacity: np.ndarray, colour: np.ndarray) -> None:
+def blend(part: np.ndarray, opacity: np.ndarray, colour: np.ndarray) -> None:
+    """Colour pixels, each by its opacity."""
     part += opacity[:, :, None] * (np.asarray(colour, float) - part)

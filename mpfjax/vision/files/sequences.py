@@ -1,16 +1,191 @@
-"""The metadata of a sequence's folder: its `seqinfo.ini`, and its files of detections."""
+"""What the folder of a sequence holds: its metadata, files of detections, and ground truth."""
 
 import configparser
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
-from mpfjax.checks import shown
-from mpfjax.vision.files.boxes import read_text
+from mpfjax.checks import check_one_of, check_type, given, shown
+from mpfjax.metrics.tracking_scores import IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT
+from mpfjax.vision.files.boxes import (
+    TRACK_COLUMNS,
+    TRACK_FORM,
+    check_identity,
+    read_rows,
+    read_text,
+)
 
+# MOTChallenge's classes: 1 are pedestrians; a track of one of these is no false positive. Rows of
+# the others (vehicles, occluders) only take part when boxes are matched.
+_CLASSES = range(1, 14)
+_PEDESTRIAN = 1
+_PERSON_ON_VEHICLE, _VEHICLE, _STATIC_PERSON, _DISTRACTOR, _REFLECTION = 2, 6, 7, 8, 12
+_NOT_TO_BLAME = {_PERSON_ON_VEHICLE, _STATIC_PERSON, _DISTRACTOR, _REFLECTION}
+# Their names where a labels.txt has them, from 1 on.
+_LABELS = [
+    *("pedestrian", "person on vehicle", "car", "bicycle", "motorbike", "non motorized vehicle"),
+    *("static person", "distractor", "occluder", "occluder on the ground", "occluder full"),
+    "reflection",
+]
+# VisDrone's categories: the first are regions without labels, the last other objects.
+_CATEGORIES = range(12)
+_KITTI_HEIGHT = 25.0
+_FLAG, _CLASS = 6, 7
+FORMATS = ("motchallenge", "visdrone", "uavdt", "cvat")
 _INFO = "seqinfo.ini"
+
+
+class Truth(NamedTuple):
+    """The true boxes of a sequence, from `read_truth`, in pixels, (x, y) the top-left corner.
+
+    - `objects`: (s, 6), rows (frame, id, x, y, w, h) of the objects to be tracked.
+    - `ignored`: (r, 6), rows (frame, kind, x, y, w, h) of what is not scored, with the kinds of
+      `mpfjax.metrics.tracking_scores.remove_ignored`.
+    - `min_height`: a tracked box of at most this height that matches nothing is not scored; 0 for
+      none.
+    """
+
+    objects: Float[np.ndarray, "s 6"]
+    ignored: Float[np.ndarray, "r 6"]
+    min_height: float = 0.0
+
+    def between(self, first: int, last: float = np.inf) -> "Truth":
+        """The rows of frames `first` to `last`, both included."""
+        objects, ignored = (
+            rows[(first <= rows[:, 0]) & (rows[:, 0] <= last)]
+            for rows in (self.objects, self.ignored)
+        )
+        return Truth(objects, ignored, self.min_height)
+
+
+def read_truth(path: str | Path, *, format: str | None = None) -> Truth:
+    """Read the ground truth of a sequence, and what its benchmark removes before scoring.
+
+    `path` is a file, or a folder with `gt.txt` or `gt/gt.txt`. Rows are frame,id,x,y,w,h,flag and
+    up to three more columns, frames count from 1, and rows whose flag is 0 do not count. What the
+    further columns mean is told by `format`, or else by the files:
+
+    - "motchallenge": the eighth column is a class. Only pedestrians (class 1) count; people on
+      vehicles, static persons, distractors and reflections are ignored objects, in MOT20 other
+      vehicles as well; the rest is unscored. It is taken where `labels.txt` holds the benchmark's
+      own classes, where the sequence is called MOT16, MOT17 or MOT20, or where there are nine
+      columns, the last of which is a visibility, and the classes are its own, pedestrians among
+      them.
+    - "visdrone": ten columns, the eighth a category. Categories 1 to 10 count; 0 and 11, and rows
+      whose seventh column is 0, are ignored regions. It is taken where ten columns are its own.
+    - "uavdt": all rows count, and those of the `..._gt_ignore.txt` beside it are ignored regions.
+      It is taken for files that are called `..._gt_whole.txt`, or M0000_gt.txt with any number.
+    - "cvat": classes are those of `labels.txt` beside it, and all of them count. It is taken where
+      there is such a file, and where nothing else tells.
+
+    An `ignore.txt` beside it adds rows frame,kind,x,y,w,h of kind 1, an ignored object, or 2, an
+    ignored region. The start of the sequence's name in `seqinfo.ini`, or else of the folder's,
+    tells the benchmark: "MOT20..." ignores one more class, "kitti..." has a `min_height` of 25
+    pixels.
+
+    Raises `ValueError` for a line that cannot be read, naming the file and the line, and for a file
+    without any row; `FileNotFoundError` where there is none. Use it with `multi_object_scores`. For
+    the rows of a tracker use `read_tracks`.
+    """
+    check_type((str, Path), "a path", path=path)
+    check_one_of(FORMATS, **given(format=format))
+    path = _truth_file(Path(path))
+    rows = read_rows(path, TRACK_FORM, TRACK_COLUMNS)
+    name = _name_of(path).lower()
+    table = np.full((len(rows), TRACK_COLUMNS.stop - 1), np.nan)
+    for here, row in zip(table, rows.values(), strict=True):
+        here[: len(row)] = row
+    format = _format_of(path, name, table) if format is None else format
+    boxes, counted, ignored = table[:, :6], table[:, _FLAG] != 0, np.zeros((0, 6))
+    if format == "motchallenge":
+        classes = _classes(path, rows, _CLASSES)
+        kinds = _NOT_TO_BLAME | ({_VEHICLE} if name.startswith("mot20") else set())
+        counted &= classes == _PEDESTRIAN
+        # In the order of the file, by which TrackEval breaks ties.
+        ignored = _as_ignored(boxes[~counted], UNSCORED_OBJECT)
+        ignored[np.isin(classes, sorted(kinds))[~counted], 1] = IGNORED_OBJECT
+    elif format == "visdrone":
+        counted &= np.isin(_classes(path, rows, _CATEGORIES), _CATEGORIES[1:-1])
+        ignored = _as_ignored(boxes[~counted], IGNORED_REGION)
+    elif format == "uavdt":
+        counted[:] = True
+        beside = path.with_name(re.sub(r"gt(_whole)?\.txt$", "gt_ignore.txt", path.name))
+        if beside != path and beside.is_file():
+            regions = read_rows(beside, TRACK_FORM, range(6, TRACK_COLUMNS.stop), holds=None)
+            ignored = _as_ignored([row[:6] for row in regions.values()], IGNORED_REGION)
+    for (number, row), counts in zip(rows.items(), counted, strict=True):
+        if counts:
+            check_identity(path, number, row)
+    ignored = np.concatenate([ignored, _ignore_file(path.parent / "ignore.txt")])
+    min_height = _KITTI_HEIGHT if name.startswith("kitti") else 0.0
+    return Truth(boxes[counted], ignored, min_height)
+
+
+def _truth_file(path: Path) -> Path:
+    if not path.is_dir():
+        return path
+    for name in ("gt.txt", "gt/gt.txt", "gt_whole.txt"):
+        if (path / name).is_file():
+            return path / name
+    raise FileNotFoundError(f"{path}: holds neither gt.txt nor gt/gt.txt")
+
+
+def _format_of(path: Path, name: str, table: Float[np.ndarray, "r 10"]) -> str:
+    """What the files and their columns say that they are."""
+    if re.fullmatch(r".*gt_whole|M\d+_gt", path.stem):
+        return "uavdt"
+    labels = path.with_name("labels.txt")
+    if labels.is_file():
+        lines = [line.strip().lower() for line in read_text(labels).splitlines() if line.strip()]
+        return "motchallenge" if lines[: len(_LABELS)] == _LABELS else "cvat"
+    flags, classes, truncations, occlusions = table[:, _FLAG:].T
+    has_classes = np.isin(classes, _CLASSES).all() and np.any(classes == _PEDESTRIAN)
+    if has_classes and re.match(r"mot(16|17|20)", name):
+        return "motchallenge"
+    if not np.isin(flags, [0, 1]).all():
+        return "cvat"
+    if np.isnan(occlusions).all() and has_classes:
+        visible = (truncations >= 0) & (truncations <= 1)
+        return "motchallenge" if visible.all() else "cvat"
+    few = np.isin(truncations, range(2)) & np.isin(occlusions, range(3))
+    return "visdrone" if (few & np.isin(classes, _CATEGORIES)).all() else "cvat"
+
+
+def _classes(path: Path, rows: dict[int, list[float]], known: range) -> np.ndarray:
+    """The class of every row."""
+    for number, row in rows.items():
+        if len(row) <= _CLASS or row[_CLASS] not in known:
+            raise ValueError(
+                f"{path}, line {number}: has no class from {known[0]} to {known[-1]} in its eighth"
+                " column"
+            )
+    return np.array([row[_CLASS] for row in rows.values()])
+
+
+def _as_ignored(boxes: Any, kind: int) -> Float[np.ndarray, "r 6"]:
+    """Rows frame,id,x,y,w,h as rows frame,kind,x,y,w,h."""
+    ignored = np.array(boxes, float).reshape(-1, 6)
+    ignored[:, 1] = kind
+    return ignored
+
+
+def _ignore_file(path: Path) -> Float[np.ndarray, "r 6"]:
+    """The rows of an ignore.txt; none where there is no such file."""
+    form = "frame,kind,x,y,w,h with the kind 1 or 2"
+    rows = read_rows(path, form, range(6, 7), holds=None) if path.is_file() else {}
+    for number, row in rows.items():
+        if row[1] not in (IGNORED_OBJECT, IGNORED_REGION):
+            raise ValueError(f"{path}, line {number}: {shown(row)} is not {form}")
+    return np.array(list(rows.values())).reshape(-1, 6)
+
+
+def _name_of(truth: Path) -> str:
+    """The name in the `seqinfo.ini` of the sequence, or that of its folder."""
+    folder = truth.parent.parent if truth.parent.name == "gt" else truth.parent
+    return read_sequence_info(folder).name or folder.resolve().name
 
 
 class SequenceInfo(NamedTuple):
@@ -46,7 +221,7 @@ def read_sequence_info(*folders: Path) -> SequenceInfo:
         raise ValueError(f"{path}: {error}") from error
     values = {key: value for name in parser.sections() for key, value in parser.items(name)}
     rate, length, height, width = (
-        _number(path, key, values.get(key.lower()))
+        _positive(path, key, values.get(key.lower()))
         for key in ("frameRate", "seqLength", "imHeight", "imWidth")
     )
     return SequenceInfo(
@@ -79,7 +254,7 @@ def _is_among(file: Path, folder: Path) -> bool:
     return file.absolute() in detection_files(folder)
 
 
-def _number(path: Path, key: str, value: str | None) -> float | None:
+def _positive(path: Path, key: str, value: str | None) -> float | None:
     """A positive number, None where there is none."""
     try:
         number = float(value or 0)
