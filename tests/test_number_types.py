@@ -18,7 +18,6 @@ import pytest
 import mpfjax
 from mpfjax import metrics
 from mpfjax.exact import grid_filter, kalman_filter, kalman_smoother
-from mpfjax.metrics.tracking_scores import coverage
 from mpfjax.smoothing import conditional_filter, smoothed_sums
 from mpfjax.vision import Detections
 from tests.marking import quick_of
@@ -86,7 +85,6 @@ TAKEN = {
     "multi_object_scores": (
         lambda values: list(metrics.multi_object_scores(values, ROWS).values()), "tracks", ROWS
     ),
-    "coverage": (lambda values: coverage(values, ROWS).on_object, "tracks", ROWS),
     "log_score": (
         lambda values: metrics.log_score(MODEL, MIXTURE, values), "observation", 2
     ),

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
+from benchmarks.coverage import REACH
 from benchmarks.gm_mpf import sizes
 from benchmarks.gm_mpf.filters import NAMES, make_filter, make_model
 from benchmarks.gm_mpf.targets import Targets
-from mpfjax.metrics.tracking_scores import REACH
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision.boxes.colour_model import ColourModel
 from mpfjax.vision.files import boxes as box_files

@@ -16,12 +16,12 @@ from tqdm import tqdm
 
 import mpfjax
 from benchmarks import figures as plotting
+from benchmarks.coverage import covers
 from benchmarks.likelihood_tuning.labelled_boxes import boxes_around, labelled_states
 from benchmarks.likelihood_tuning.soft_colours import SoftColourModel
 from benchmarks.scenes import football_scene
 from mpfjax.console import format_table, write_figure, write_json
 from mpfjax.metrics.tracking_quality import intersection_area
-from mpfjax.metrics.tracking_scores import covers
 from mpfjax.tuning import (
     LabelLikelihood,
     Positive,

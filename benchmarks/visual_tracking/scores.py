@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.coverage import coverage
 from benchmarks.visual_tracking.pictures import NAMES
 from benchmarks.visual_tracking.source import Source
 from mpfjax.console import format_table
 from mpfjax.metrics import multi_object_scores
-from mpfjax.metrics.tracking_scores import coverage
 
 
 def score(

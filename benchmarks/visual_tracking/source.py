@@ -7,9 +7,9 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from benchmarks.coverage import covers
 from benchmarks.scenes import football_scene
 from mpfjax.console import refuse_overwriting
-from mpfjax.metrics.tracking_scores import covers
 from mpfjax.vision import read_truth
 from mpfjax.vision.boxes.recipes import MAX_COMPONENTS
 from mpfjax.vision.files import boxes as box_files

@@ -145,21 +145,16 @@ def with_moments(model: Any, drawn: PyTree) -> PyTree:
     mean, covariance = _initial_moments(model, drawn)
     d = mean.shape[-1]
     return MarginalisedState(
-        drawn,
-        jnp.broadcast_to(mean, (n, d)),
-        jnp.broadcast_to(covariance, (n, d, d)),
+        drawn, jnp.broadcast_to(mean, (n, d)), jnp.broadcast_to(covariance, (n, d, d))
     )
 
 
-def _initial_moments(model: Any, latent: PyTree) -> tuple[Array, Array]:
+def _initial_moments(model: Any, latent: PyTree) -> list[Array]:
     """m0 and P0, checked."""
-    n = jax.tree.leaves(latent)[0].shape[0]
     moments = model.initial_moments(latent)
-    mean, covariance = _arrays(model, "initial_moments", moments, (1, 2), "m0 and P0")
-    d = mean.shape[-1]
-    _check_shape(model, "initial_moments", "P0", covariance, (d, d), n)
-    _check_shape(model, "initial_moments", "m0", mean, (d,), n)
-    return mean, covariance
+    d = _length(moments, 0, -1)
+    n = jax.tree.leaves(latent)[0].shape[0]
+    return _checked(model, "initial_moments", moments, n, m0=(d,), P0=(d, d))
 
 
 def predicted(model: Any, latent: PyTree, state: MarginalisedState) -> MarginalisedState:
@@ -279,9 +274,8 @@ def gaussian_of(state: MarginalisedState) -> Gaussian:
 
 def dynamics_of(model: Any, latent: PyTree, state: MarginalisedState) -> Linear:
     """F, b and Q, checked, the particles last."""
-    d = state.mean.shape[-1]
-    parts = model.dynamics(latent, state.latent)
-    return _linear(model, "dynamics", parts, "FbQ", d, d, state.mean.shape[0])
+    (n, d), parts = state.mean.shape, model.dynamics(latent, state.latent)
+    return _linear(*_checked(model, "dynamics", parts, n, F=(d, d), b=(d,), Q=(d, d)))
 
 
 def emission_of(model: Any, latent: PyTree, state: MarginalisedState) -> Linear | None:
@@ -289,27 +283,20 @@ def emission_of(model: Any, latent: PyTree, state: MarginalisedState) -> Linear 
     parts = model.emission(latent)
     if parts is None:
         return None
-    (n, d), p = state.mean.shape, jnp.shape(parts[0])[-2] if jnp.ndim(parts[0]) > 1 else 0
-    return _linear(model, "emission", parts, "HcR", p, d, n)
+    (n, d), p = state.mean.shape, _length(parts, 0, -2)
+    return _linear(*_checked(model, "emission", parts, n, H=(p, d), c=(p,), R=(p, p)))
 
 
 def latent_dynamics_of(
     model: Any, state: MarginalisedState
 ) -> tuple[Linear, Float[Array, "d k n"] | None]:
     """f, A and V of the mixed form, and S if there is one, checked, the particles last."""
-    parts = model.latent_dynamics(state.latent)
     (n, d), k = state.mean.shape, latent_rows(model, state.latent).shape[0]
-    if not isinstance(parts, tuple) or len(parts) not in (3, 4):
-        raise ValueError(
-            f"model: {model_name(model)}.latent_dynamics returned {shown(parts)}, not f, A and V,"
-            " nor f, A, V and S"
-        )
-    offset, matrix, noise, *rest = parts
-    mixed = _linear(model, "latent_dynamics", (matrix, offset, noise), "AfV", k, d, n)
-    if not rest:
-        return mixed, None
-    _check_shape(model, "latent_dynamics", "S", rest[0], (d, k), n)
-    return mixed, particles_last(jnp.asarray(rest[0]), 2)
+    parts, shapes = model.latent_dynamics(state.latent), {"f": (k,), "A": (k, d), "V": (k, k)}
+    if isinstance(parts, tuple) and len(parts) == 4:
+        shapes["S"] = (d, k)
+    offset, matrix, noise, *rest = _checked(model, "latent_dynamics", parts, n, **shapes)
+    return _linear(matrix, offset, noise), particles_last(rest[0], 2) if rest else None
 
 
 def observation_rows(
@@ -317,45 +304,37 @@ def observation_rows(
 ) -> Float[Array, "p 1"]:
     """y_t as a column, checked."""
     found: Any = model.linear_observation(observation)
-    p = seen.matrix.shape[0]
-    if not isinstance(found, jax.Array | np.ndarray | np.generic | float | int):
+    p, is_array = seen.matrix.shape[0], isinstance(found, jax.Array | np.ndarray | float | int)
+    shape = jnp.shape(found) if is_array else None
+    if shape != (p,) and not (p == 1 and shape == ()):
         raise ValueError(
-            f"observation: {shown(found)} is no array ({p},), as the H of"
-            f" {model_name(model)}.emission asks for; define linear_observation, which picks it"
-        )
-    if jnp.shape(found) != (p,) and not (p == 1 and jnp.shape(found) == ()):
-        raise ValueError(
-            f"observation: shape {jnp.shape(found)} is not ({p},), the rows of H, which"
-            f" {model_name(model)}.emission returned"
+            f"observation: shape {shape} of {shown(found)} is not ({p},), the rows of H that"
+            f" {model_name(model)}.emission returned; linear_observation may pick y_t"
         )
     return jnp.reshape(jnp.asarray(found, dtype), (p, 1))
 
 
-def _linear(model: Any, method: str, parts: Any, names: str, e: int, d: int, n: int) -> Linear:
-    ranks = (2, 1, 2)
-    arrays = _arrays(model, method, parts, ranks, f"{names[0]}, {names[1]} and {names[2]}")
-    for name, array, shape in zip(names, arrays, ((e, d), (e,), (e, e)), strict=True):
-        _check_shape(model, method, name, array, shape, n)
-    matrix, offset, noise = map(particles_last, arrays, ranks)
-    return Linear(matrix, offset, noise)
+def _linear(matrix: Array, offset: Array, noise: Array) -> Linear:
+    return Linear(particles_last(matrix, 2), particles_last(offset, 1), particles_last(noise, 2))
 
 
-def _arrays(
-    model: Any, method: str, parts: Any, ranks: tuple[int, ...], names: str
-) -> tuple[Array, ...]:
-    is_tuple = isinstance(parts, tuple | list) and len(parts) == len(ranks)
+def _length(parts: Any, place: int, axis: int) -> int:
+    """The length of an axis of an array among several; 0 where there is no such array."""
+    try:
+        return parts[place].shape[axis]
+    except (TypeError, IndexError, KeyError, AttributeError):
+        return 0
+
+
+def _checked(model: Any, method: str, parts: Any, n: int, **shapes: tuple[int, ...]) -> list[Array]:
+    """The arrays that a method returned, one for all particles or one for each."""
+    who = f"model: {model_name(model)}.{method} returned"
+    is_tuple = isinstance(parts, tuple | list) and len(parts) == len(shapes)
     if not is_tuple or not all(isinstance(part, jax.Array | np.ndarray) for part in parts):
-        raise ValueError(
-            f"model: {model_name(model)}.{method} returned {shown(parts)}, not the arrays {names}"
-        )
-    return tuple(jnp.asarray(part) for part in parts)
-
-
-def _check_shape(
-    model: Any, method: str, name: str, array: Any, shape: tuple[int, ...], n: int
-) -> None:
-    if jnp.shape(array) not in (shape, (n, *shape)):
-        raise ValueError(
-            f"model: {model_name(model)}.{method} returned {name} of shape {jnp.shape(array)},"
-            f" which is neither {shape} nor {(n, *shape)}"
-        )
+        raise ValueError(f"{who} {shown(parts)}, not the arrays {', '.join(shapes)}")
+    for (name, shape), part in zip(shapes.items(), parts, strict=True):
+        if part.shape not in (shape, (n, *shape)):
+            raise ValueError(
+                f"{who} {name} of shape {part.shape}, which is neither {shape} nor {(n, *shape)}"
+            )
+    return [jnp.asarray(part) for part in parts]

@@ -356,7 +356,9 @@ class Autoregression(AbstractDynamics):
 
 def _given(previous: Rows | None, dynamics: AbstractDynamics) -> Rows:
     if previous is None:
-        raise ValueError(f"previous: {type(dynamics).__name__} needs what is `remembered`")
+        raise ValueError(
+            f"previous: {type(dynamics).__name__} needs the past that remembered() gives"
+        )
     return previous
 
 

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks.coverage import coverage
 from benchmarks.scenes.football import football_scene
 from benchmarks.visual_tracking import __main__ as visual_tracking
-from mpfjax.metrics.tracking_scores import coverage
 from mpfjax.vision.files.boxes import read_tracks, write_tracks
 from mpfjax.vision.files.frames import read_frames, write_image, write_video
 from tests.marking import thorough

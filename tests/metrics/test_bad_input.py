@@ -8,7 +8,7 @@ import pytest
 import mpfjax
 from mpfjax import metrics
 from mpfjax.metrics.particle_scores import effective_dynamics
-from mpfjax.metrics.tracking_scores import coverage, remove_ignored
+from mpfjax.metrics.tracking_scores import remove_ignored
 from tests.examples import make_mixture
 from tests.refused import assert_named, refused
 
@@ -56,11 +56,6 @@ TABLE = {
         metrics.tracking_quality,
         {"estimates": jnp.ones((2, 3, 1, 4)), "truth": jnp.ones((3, 1, 4))},
         {"estimates": "array", "truth": "array", "num_last": "count"},
-    ),
-    "coverage": (
-        coverage,
-        {"tracks": ROWS, "objects": ROWS},
-        {"tracks": "rows", "objects": "rows", "others": "rows?"},
     ),
     "multi_object_scores": (
         metrics.multi_object_scores,

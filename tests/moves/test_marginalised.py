@@ -283,7 +283,7 @@ class Wrong(OnePath):
         ("P0", "Wrong.initial_moments returned P0 of shape"),
         ("F", "Wrong.dynamics returned F of shape"),
         ("b", "Wrong.dynamics returned b of shape"),
-        ("Q", "Wrong.dynamics returned .* not the arrays F, b and Q"),
+        ("Q", "Wrong.dynamics returned .* not the arrays F, b, Q"),
         ("R", "Wrong.emission returned c of shape"),
     ],
 )

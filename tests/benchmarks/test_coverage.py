@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mpfjax.metrics.tracking_scores import coverage, covers
+from benchmarks.coverage import coverage, covers
 
 
 def row(frame, id, x, y=0.0, w=10.0, h=20.0):
