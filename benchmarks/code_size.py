@@ -7,26 +7,22 @@ are those beside docstrings, comments and blank ones. A public name is one that 
 its public modules, exports. Arguments of a class are its fields, unless it has an `__init__`.
 """
 
-import argparse
 import ast
-import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
-from mpfjax.console import exit_status, format_table
+from benchmarks.harness import ROOT, command, table
 
 MODULES = ("", "exact", "metrics", "plotting", "smoothing", "tuning", "vision")
+COLUMNS = {
+    "checkout": "{checkout}", "files": "{files}", "lines of code": "{lines}",
+    "public names": "{names}", "most arguments of a call": "{most} ({name})",
+}  # fmt: skip
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Count, and print the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.code_size")
-    here = Path(__file__).resolve().parents[1]
-    parser.add_argument("checkouts", nargs="*", type=Path, default=[here], metavar="CHECKOUT")
-    options = parser.parse_args(arguments)
-    return exit_status(lambda: run(options.checkouts), arguments)
-
-
-def run(checkouts: list[Path]) -> None:
+@command()
+def main(*, checkouts: Annotated[Sequence[Path], "*"] = (ROOT,)) -> None:
     """A line for each checkout."""
     rows = []
     for checkout in checkouts:
@@ -40,11 +36,11 @@ def run(checkouts: list[Path]) -> None:
         names = public_names(package, trees)
         name, most = most_arguments(trees, names)
         lines = sum(map(lines_of_code, trees))
-        rows.append(
-            [str(checkout), f"{len(trees)}", f"{lines}", f"{len(names)}", f"{most} ({name})"]
-        )
-    titles = ["checkout", "files", "lines of code", "public names", "most arguments of a call"]
-    print(format_table(titles, rows))
+        rows.append({
+            "checkout": checkout, "files": len(trees), "lines": lines, "names": len(names),
+            "most": most, "name": name,
+        })  # fmt: skip
+    print(table(COLUMNS, rows))
 
 
 def lines_of_code(path: Path) -> int:
@@ -99,4 +95,4 @@ def num_arguments(node: ast.FunctionDef | ast.ClassDef) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -15,14 +15,9 @@ in milliseconds a frame.
 before and after. Into --out DIR go the table as first_result.json and nothing else.
 """
 
-import argparse
 import json
-import os
 import shutil
-import subprocess
-import sys
 import tempfile
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,12 +25,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from benchmarks.harness import ROOT, Count, Spent, command, in_process, settings_of, table
+from benchmarks.harness import data as write
 from benchmarks.scenes import football_scene
-from mpfjax.console import exit_status, format_table, whole, write_json
 from mpfjax.vision import write_tracks
 from mpfjax.vision.files.frames import write_image
 
-HERE = Path(__file__).resolve().parents[1]
 NUM_FRAMES = 60
 _BEGIN = """
 import time, json, jax, jax.numpy as jnp, numpy as np, mpfjax
@@ -86,12 +81,78 @@ class Job(NamedTuple):
     command: tuple[str, ...] = ()
 
 
-class Spent(NamedTuple):
-    """Seconds of a process, and its peak memory in MB."""
+@command(only="import")
+def main(
+    *,
+    before: Path | None = None,
+    rounds: Count = 1,
+    only: str = "",
+    data: Path = Path("../shared/data"),
+    out: Path = Path("results/first_result"),
+) -> None:
+    """Round after round of each job, in turns with the other checkout's; then the table.
 
-    cpu: float
-    wall: float
-    memory: float
+    - `before`: another checkout, beside this.
+    - `rounds`: of which the least counts.
+    - `only`: rows with this in their name.
+    """
+    if before is not None and not (before / "mpfjax").is_dir():
+        raise ValueError(f"--before: {before} holds no mpfjax")
+    roots = {"now": ROOT} if before is None else {"before": before, "now": ROOT}
+    results: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        scene = render(Path(folder) / "scene")
+        found = jobs(scene, Path(folder) / "out", data.resolve())
+        chosen = [job for job in found if only in job.name]
+        if not chosen:
+            raise ValueError(f"--only: no row has {only!r} in its name")
+        bytecode = Path(folder) / "bytecode"
+        for root in roots.values():
+            spent(Job("the imports", _IMPORT_ALL), root, bytecode / "x", bytecode)
+        for job in chosen:
+            row: dict[str, Any] = {"job": job.name}
+            for name, root in roots.items():
+                try:
+                    row[name] = least([cold_and_kept(job, root, bytecode) for _ in range(rounds)])
+                except ValueError:
+                    if root is ROOT:
+                        raise
+                    row[name] = None  # it has no such command yet
+            results.append(row)
+            lines = table(columns_of(roots), [row]).splitlines()
+            print("\n".join(lines if len(results) == 1 else lines[-1:]))
+    settings = settings_of({"rounds": rounds, "before": before})
+    write(out / "first_result.json", settings=settings, rows=results)
+    print(f"results: {out}/")
+
+
+def least(rounds: list[tuple[Spent, Spent]]) -> dict[str, dict[str, float]]:
+    """The least of each figure over the rounds."""
+    parts = np.round(np.array(rounds).min(axis=0), 4).tolist()
+    return {
+        name: dict(zip(Spent._fields, figures, strict=True))
+        for name, figures in zip(("cold", "kept"), parts, strict=True)
+    }
+
+
+def cold_and_kept(job: Job, root: Path, bytecode: Path) -> tuple[Spent, Spent]:
+    """A process with an empty folder of programs, and one with what that has left there."""
+    with tempfile.TemporaryDirectory() as folder:
+        cold, kept = (spent(job, root, Path(folder), bytecode) for _ in range(2))
+        return cold, kept
+
+
+def spent(job: Job, root: Path, programs: Path, bytecode: Path) -> Spent:
+    """What one process took, of a script that says so the part between the imports and the end."""
+    settings = {
+        "PYTHONPYCACHEPREFIX": str(bytecode),
+        "PYTHONDONTWRITEBYTECODE": "",
+        "JAX_COMPILATION_CACHE_DIR": str(programs),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+    }
+    found, lines = in_process(*(job.command or ("-c", job.script)), root=root, **settings)
+    return found._replace(**json.loads(lines[-1])) if job.script and lines else found
 
 
 def jobs(scene: Path, out: Path, data: Path) -> list[Job]:
@@ -145,110 +206,6 @@ def _first_box(truth: Path) -> str:
     return ",".join(f"{value:.0f}" for value in rows[inside][0, 2:6])
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run every job, print a table, and write the results."""
-    options = parse(arguments)
-    return exit_status(lambda: run(options), arguments)
-
-
-def parse(arguments: list[str] | None) -> argparse.Namespace:
-    """The options, or a message that names the one that cannot be run."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.first_result")
-    parser.add_argument("--before", type=Path, metavar="DIR", help="another checkout, beside this")
-    parser.add_argument("--rounds", type=whole(), default=1, help="of which the least counts")
-    parser.add_argument("--only", default="", metavar="TEXT", help="rows with this in their name")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
-    parser.add_argument("--out", default="results/first_result", metavar="DIR")
-    options = parser.parse_args(arguments)
-    if options.before is not None and not (options.before / "mpfjax").is_dir():
-        parser.error(f"--before: {options.before} holds no mpfjax")
-    return options
-
-
-def run(options: argparse.Namespace) -> None:
-    """Round after round of each job, in turns with the other checkout's; then the table."""
-    roots = {"now": HERE} if options.before is None else {"before": options.before, "now": HERE}
-    with tempfile.TemporaryDirectory() as folder:
-        scene = render(Path(folder) / "scene")
-        found = jobs(scene, Path(folder) / "out", options.data.resolve())
-        chosen = [job for job in found if options.only in job.name]
-        if not chosen:
-            raise ValueError(f"--only: no row has {options.only!r} in its name")
-        bytecode = Path(folder) / "bytecode"
-        for root in roots.values():
-            spent(Job("the imports", command=("-c", _IMPORT_ALL)), root, bytecode / "x", bytecode)
-        results = []
-        for job in chosen:
-            row: dict[str, Any] = {"job": job.name}
-            for name, root in roots.items():
-                try:
-                    run = partial(cold_and_kept, job, root, bytecode)
-                    row[name] = least(run, options)
-                except ValueError:
-                    if root is HERE:
-                        raise
-                    row[name] = None  # it has no such command yet
-            results.append(row)
-            print(table([row], list(roots)) if len(results) == 1 else lines([row], list(roots)))
-    out = Path(options.out)
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "first_result.json", {"jax": jax.__version__, "rows": results})
-    print(f"results: {out}/")
-
-
-def least(measure: Callable[[], tuple[Spent, Spent]], options: argparse.Namespace) -> dict:
-    """The least of each figure over the rounds."""
-    rounds = [measure() for _ in range(options.rounds)]
-    parts = {}
-    for index, name in enumerate(("cold", "kept")):
-        figures = np.array([found[index] for found in rounds]).min(axis=0)
-        parts[name] = dict(zip(Spent._fields, np.round(figures, 4).tolist(), strict=True))
-    return parts
-
-
-def cold_and_kept(job: Job, root: Path, bytecode: Path) -> tuple[Spent, Spent]:
-    """A process with an empty folder of programs, and one with what that has left there."""
-    with tempfile.TemporaryDirectory() as folder:
-        cold, kept = (spent(job, root, Path(folder), bytecode) for _ in range(2))
-        return cold, kept
-
-
-def spent(job: Job, root: Path, programs: Path, bytecode: Path) -> Spent:
-    """What one process took; a `ValueError` with its last line where it failed."""
-    settings = {
-        "PYTHONPATH": str(root),
-        "PYTHONPYCACHEPREFIX": str(bytecode),
-        "PYTHONDONTWRITEBYTECODE": "",
-        "JAX_COMPILATION_CACHE_DIR": str(programs),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
-    }
-    measured = [sys.executable, "-c", _MEASURE, *(job.command or ("-c", job.script))]
-    ended = subprocess.run(
-        measured, cwd=root, env={**os.environ, **settings}, capture_output=True, text=True
-    )
-    if ended.returncode != 0:
-        last = ended.stderr.strip().splitlines()[-1:]
-        raise ValueError(f"{job.name}: its process ended with {ended.returncode}: {last}")
-    found = json.loads(ended.stdout.splitlines()[-1])
-    if job.script:
-        found |= json.loads(ended.stdout.splitlines()[-2])
-    return Spent(found["cpu"], found["wall"], found["memory"])
-
-
-# A process of its own starts each job, so that what it has used is the job's alone.
-_MEASURE = """
-import json, resource, subprocess, sys, time
-began = time.perf_counter()
-code = subprocess.run([sys.executable, *sys.argv[1:]]).returncode
-used = resource.getrusage(resource.RUSAGE_CHILDREN)
-wall = time.perf_counter() - began
-memory = used.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
-print(json.dumps({"cpu": used.ru_utime + used.ru_stime, "wall": wall, "memory": memory}))
-sys.exit(code)
-"""
-
-
 def render(folder: Path) -> Path:
     """A football scene as images, with its truth for detections."""
     scene = football_scene(jax.random.key(0), NUM_FRAMES, num_players=8, num_opponents=0)
@@ -263,27 +220,25 @@ def render(folder: Path) -> Path:
     return folder
 
 
-def table(results: list[dict[str, Any]], names: list[str]) -> str:
-    """The results as text: seconds of the CPU, then seconds of the clock and memory when kept."""
-    parts = ("cold", "kept", "kept, clock", "kept, MB")
-    header = ["CPU seconds", *(f"{name}, {part}" for part in parts for name in names)]
-    return format_table(header, [_cells(row, names) for row in results])
+def columns_of(names: Any) -> dict[str, Any]:
+    """Seconds of the CPU, then seconds of the clock and memory when kept, of each checkout."""
+    parts = {
+        "cold": ("cold", "cpu"), "kept": ("kept", "cpu"), "kept, clock": ("kept", "wall"),
+        "kept, MB": ("kept", "memory"),
+    }  # fmt: skip
 
+    def cell(row: dict[str, Any], name: str, part: str, figure: str) -> str:
+        value = row[name][part][figure]
+        if figure == "memory":
+            return f"{value:.0f}"
+        return f"{1e3 * value:.1f} ms" if row["job"].startswith("drawing") else f"{value:.1f}"
 
-def lines(results: list[dict[str, Any]], names: list[str]) -> str:
-    """Rows without the header."""
-    return table(results, names).splitlines()[-1]
-
-
-def _cells(row: dict[str, Any], names: list[str]) -> list[str]:
-    time = (lambda s: f"{1e3 * s:.1f} ms") if row["job"].startswith("drawing") else "{:.1f}".format
-    figures = [("cold", "cpu"), ("kept", "cpu"), ("kept", "wall"), ("kept", "memory")]
-    cells = []
-    for part, figure in figures:
-        form = "{:.0f}".format if figure == "memory" else time
-        cells += [form(row[name][part][figure]) if row[name] else "-" for name in names]
-    return [f"{row['job']:40s}", *cells]
+    return {"CPU seconds": "{job:40s}"} | {
+        f"{name}, {title}": partial(cell, name=name, part=part, figure=figure)
+        for title, (part, figure) in parts.items()
+        for name in names
+    }
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -25,13 +25,11 @@ compiling is left out of it.
 Into --out DIR goes marginalised.json.
 """
 
-import argparse
 import importlib.util
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -39,10 +37,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 import mpfjax
-from benchmarks.masses import marginalised_bearings, measure
+from benchmarks import harness
+from benchmarks.harness import AtLeast2, Count, command
+from benchmarks.masses.__main__ import results, summary, truth
 from benchmarks.masses.filters import FILTERS
-from benchmarks.masses.scenes import SCENES
-from mpfjax.console import exit_status, format_table, whole, write_json
+from benchmarks.masses.scenes import SCENES, with_marginalised_velocity
 
 Once = Callable[[int], Any]
 PARTS = ("time", "regimes", "bearings")
@@ -51,50 +50,44 @@ STAYS, DYNAMICS, ERRORS = 0.8, 0.2, 10 * np.array([2.0, 1.0, 2.0, 1.0])
 _HOW = "dynamax is not there: pip install --no-deps dynamax; pip install tfp-nightly dm-tree"
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the parts, print a table of each, and write the results."""
-    options = parse(arguments)
-    return exit_status(lambda: run(options), arguments)
+@command(
+    particles=[20], steps=3, sizes=[10, 20], dynamax_sizes=[10], learned_sizes=[20], runs=3,
+    seeds=2, repeats=2, reference=200,
+)  # fmt: skip
+def main(
+    *,
+    parts: Sequence[Annotated[str, (*PARTS,)]] = PARTS,
+    particles: Sequence[Count] = (1000, 4000, 16_000, 64_000),
+    sizes: Sequence[Count] = (10, 30, 100, 300, 1000, 3000),
+    dynamax_sizes: Sequence[Count] = (10, 30, 100, 300),
+    learned_sizes: Sequence[Count] = (100, 150, 200, 1000),
+    runs: AtLeast2 = 100,
+    steps: Count = 100,
+    seeds: AtLeast2 = 20,
+    repeats: Count = 15,
+    reference: Count = 100_000,
+    out: Path = Path("results/marginalised"),
+) -> None:
+    """Part by part; what is finished is written.
 
-
-def parse(arguments: list[str] | None) -> argparse.Namespace:
-    """The options, or a message that names the one that cannot be run."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.marginalised")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument(
-        "--particles", type=whole(), nargs="+", default=[1000, 4000, 16_000, 64_000], metavar="N",
-        help="of the part on time",
-    )  # fmt: skip
-    parser.add_argument(
-        "--sizes", type=whole(), nargs="+", default=[10, 30, 100, 300, 1000, 3000], metavar="N",
-        help="of the part on regimes",
-    )  # fmt: skip
-    parser.add_argument(
-        "--dynamax-sizes", type=whole(), nargs="+", default=[10, 30, 100, 300], metavar="N",
-        help="of dynamax, whose program grows with N",
-    )  # fmt: skip
-    parser.add_argument(
-        "--learned-sizes", type=whole(), nargs="+", default=[100, 150, 200, 1000], metavar="N",
-        help="of the part on bearings",
-    )  # fmt: skip
-    parser.add_argument("--runs", type=whole(2), default=100, help="of the part on bearings")
-    parser.add_argument("--steps", type=whole(), default=100)
-    parser.add_argument("--seeds", type=whole(2), default=20)
-    parser.add_argument("--repeats", type=whole(), default=15, help="turns, each of all that run")
-    parser.add_argument("--reference", type=whole(), default=100_000, metavar="N")
-    parser.add_argument("--out", default="results/marginalised", metavar="DIR")
-    return parser.parse_args(arguments)
-
-
-def run(options: argparse.Namespace) -> None:
-    """Part by part; what is finished is written."""
-    out, results = Path(options.out), {}
-    out.mkdir(parents=True, exist_ok=True)
-    for part in options.parts:
-        header, rows = TABLES[part](options)
-        results[part] = [dict(zip(header, row, strict=True)) for row in rows]
-        print(format_table(header, [[_shown(value) for value in row] for row in rows]))
-        write_json(out / "marginalised.json", {"settings": vars(options), "results": results})
+    - `particles`: of the part on time.
+    - `sizes`: of the part on regimes.
+    - `dynamax_sizes`: of dynamax, whose program grows with N.
+    - `learned_sizes`: of the part on bearings.
+    - `runs`: of the part on bearings.
+    - `repeats`: turns, each of all that run.
+    """
+    settings, found = harness.settings_of(locals()), {}
+    tables = {
+        "time": lambda: time_of_steps(particles, steps, repeats),
+        "regimes": lambda: regimes(sizes, dynamax_sizes, steps, seeds, reference, repeats),
+        "bearings": lambda: bearings(learned_sizes, steps, runs, reference, repeats),
+    }
+    for part in parts:
+        found[part] = tables[part]()
+        columns = {name: lambda row, name=name: _shown(row[name]) for name in found[part][0]}
+        print(harness.table(columns, found[part]))
+        harness.data(out / "marginalised.json", settings=settings, results=found)
     print(f"results: {out}/")
 
 
@@ -103,15 +96,19 @@ def _shown(value: Any) -> str:
 
 
 def milliseconds(runs: dict[Any, Once], repeats: int) -> dict[Any, np.ndarray]:
-    """Processor time of each, turn by turn, after one call that compiles."""
-    taken: dict[Any, list[float]] = {name: [] for name in runs}
-    for turn in range(repeats + 1):
-        for name, once in runs.items():
-            start = time.process_time()
-            jax.block_until_ready(once(0))
-            if turn:
-                taken[name].append(1000 * (time.process_time() - start))
-    return {name: np.array(values) for name, values in taken.items()}
+    """Processor time of each, turn by turn."""
+    runs = {name: lambda _, once=once: once(0) for name, once in runs.items()}
+    taken = harness.turns(runs, repeats, clock=time.process_time)
+    return {name: 1000 * seconds for name, seconds in taken.items()}
+
+
+def evidence(filter: mpfjax.Filter, observations: Array) -> Once:
+    """log Ẑ of a seed."""
+    return lambda seed: (
+        mpfjax.run_filter(
+            jax.random.key(seed), filter, observations, harness.nothing
+        ).log_marginal_likelihood
+    )
 
 
 class SixNumbers(mpfjax.AbstractStateSpaceModel):
@@ -177,34 +174,28 @@ class SharedNoise(TwoAndFour):
         return 0.9 * previous_latent, 0.1 * jnp.eye(2, 4, k=2), 0.09 * jnp.eye(2)
 
 
-def time_of_steps(options: argparse.Namespace) -> tuple[list[str], list[list[Any]]]:
+def time_of_steps(sizes: Sequence[int], steps: int, repeats: int) -> list[dict[str, Any]]:
     """Nanoseconds a particle and step of each move, by N."""
-    observations = jax.random.normal(jax.random.key(1), (options.steps, 2))
+    observations = jax.random.normal(jax.random.key(1), (steps, 2))
     moves = {
         "plain": mpfjax.Propagate(SixNumbers()),
         "marginalised": mpfjax.PropagateMarginalised(TwoAndFour()),
         "marginalised, mixed": mpfjax.PropagateMarginalised(SharedNoise()),
     }
     rows = []
-    for size in options.particles:
-        runs = {}
-        for name, move in moves.items():
-            filter = mpfjax.Filter(move.model, [move], size)
-            runs[name] = lambda seed, filter=filter: _evidence(seed, filter, observations)
-        taken = milliseconds(runs, options.repeats)
-        for name, times in taken.items():
-            ratio = float(np.median(times / taken["plain"]))
-            rows.append([name, size, 1e6 * float(times.min()) / size / options.steps, ratio])
-    return ["move", "N", "ns a particle and step", "over the plain one"], rows
-
-
-def _evidence(seed: int, filter: mpfjax.Filter, observations: Array) -> Array:
-    run = mpfjax.run_filter(jax.random.key(seed), filter, observations, nothing)
-    return run.log_marginal_likelihood
-
-
-def nothing(mixture: mpfjax.ParticleMixture) -> None:
-    """What is collected."""
+    for size in sizes:
+        runs = {
+            name: evidence(mpfjax.Filter(move.model, [move], size), observations)
+            for name, move in moves.items()
+        }
+        taken = milliseconds(runs, repeats)
+        rows += [
+            {"move": name, "N": size,
+             "ns a particle and step": 1e6 * float(times.min()) / size / steps,
+             "over the plain one": harness.ratio(times, taken["plain"])}
+            for name, times in taken.items()
+        ]  # fmt: skip
+    return rows
 
 
 def manoeuvre() -> mpfjax.SwitchingLinearGaussianModel:
@@ -265,10 +256,13 @@ def of_mixture(mixture: mpfjax.ParticleMixture) -> Float[Array, "3"]:
     return shares(mixture.weights, latent)
 
 
-def regimes(options: argparse.Namespace) -> tuple[list[str], list[list[Any]]]:
+def regimes(
+    sizes: Sequence[int], dynamax_sizes: Sequence[int], steps: int, seeds: int, reference: int,
+    repeats: int,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Time and error of each filter and size."""
     model = manoeuvre()
-    observations = simulated(model, options.steps)
+    observations = simulated(model, steps)
     every = lambda size: mpfjax.Filter(model, [mpfjax.PropagateRegimes(model)], size)  # noqa: E731
     proposal = mpfjax.RegimeProposal(model)
     makes: dict[str, Callable[[int], mpfjax.Filter]] = {
@@ -280,34 +274,30 @@ def regimes(options: argparse.Namespace) -> tuple[list[str], list[list[Any]]]:
     runs: dict[tuple[str, int], Once] = {
         (name, size): filtered(make(size), observations)
         for name, make in makes.items()
-        for size in options.sizes
+        for size in sizes
     }
     if importlib.util.find_spec("dynamax") is None:
         print(f"{_HOW} fastprogress==1.0.3")
     else:
-        runs |= {
-            ("dynamax", size): by_dynamax(model, observations, size)
-            for size in options.dynamax_sizes
-        }
-    truth = np.asarray(filtered(every(options.reference), observations)(0))
+        runs |= {("dynamax", size): by_dynamax(model, observations, size) for size in dynamax_sizes}
+    known = np.asarray(filtered(every(reference), observations)(0))
     errors = {
-        name: float(np.sqrt(np.mean([(once(s) - truth) ** 2 for s in range(options.seeds)])))
+        name: float(np.sqrt(np.mean([(once(s) - known) ** 2 for s in range(seeds)])))
         for name, once in runs.items()
     }
-    taken = {name: float(np.median(t)) for name, t in milliseconds(runs, options.repeats).items()}
-    rows = []
-    for name, size in runs:
-        at = taken[name, size]
-        best = min(_error_at(at, taken, errors, own) for own in OURS)
-        rows.append([name, size, at, errors[name, size], errors[name, size] / best])
-    return ["filter", "N", "ms a run", "RMS error", "over our best then"], rows
+    taken = {name: float(np.median(times)) for name, times in milliseconds(runs, repeats).items()}
 
+    def error_at(at: float, name: str) -> float:
+        """In a time: between the filter's sizes on a line of logarithms, else the end."""
+        points = sorted((np.log(taken[key]), np.log(errors[key])) for key in runs if key[0] == name)
+        x, y = np.array(points).T
+        return float(np.exp(np.interp(np.log(at), x, y)))
 
-def _error_at(at: float, taken: dict, errors: dict, name: str) -> float:
-    """The error of a filter in a time: between its sizes on a line of logarithms, else the end."""
-    points = sorted((np.log(taken[key]), np.log(errors[key])) for key in taken if key[0] == name)
-    x, y = np.array(points).T
-    return float(np.exp(np.interp(np.log(at), x, y)))
+    return [
+        {"filter": key[0], "N": key[1], "ms a run": at, "RMS error": errors[key],
+         "over our best then": errors[key] / min(error_at(at, own) for own in OURS)}
+        for key, at in taken.items()
+    ]  # fmt: skip
 
 
 def filtered(filter: mpfjax.Filter, observations: Array) -> Once:
@@ -346,16 +336,13 @@ def by_dynamax(model: mpfjax.SwitchingLinearGaussianModel, observations: Array, 
     return lambda seed: once(jax.random.PRNGKey(seed))
 
 
-def bearings(options: argparse.Namespace) -> tuple[list[str], list[list[Any]]]:
+def bearings(
+    sizes: Sequence[int], steps: int, runs: int, reference: int, repeats: int
+) -> list[dict[str, Any]]:
     """Errors and time of each filter, and what was spent on learning."""
-    make, num_steps = SCENES["bearings"]
-    scene = make(num_steps, 0)
-    velocity = scene._replace(
-        model=marginalised_bearings.MarginalisedBearings(),
-        region=marginalised_bearings.is_above,
-        grouping=scene.grouping | {"features": marginalised_bearings.position},
-    )
-    known = measure.truth(scene, options.reference, 1)
+    scene = SCENES["bearings"][0](steps, 0)
+    velocity = with_marginalised_velocity(scene)
+    known = truth(scene, reference, 1)
     plain, size = FILTERS["MPF"], 1000
     for _ in range(2):  # the first one compiles
         start = time.process_time()
@@ -366,28 +353,21 @@ def bearings(options: argparse.Namespace) -> tuple[list[str], list[list[Any]]]:
         ("MPF", size): (scene, plain(scene, size), 0.0),
         ("MPF, marginalised velocity", size): (velocity, plain(velocity, size), 0.0),
     }
-    for fewer in options.learned_sizes:
-        filter = mpfjax.Filter(
-            learned.model, learned.moves, fewer, learned.num_components, learned.initial_moves
-        )
+    for fewer in sizes:
+        filter = learned.replace(num_particles=fewer)
         rows["MPF, learned look-ahead", fewer] = scene, filter, seconds
     observations = jnp.asarray(scene.observations)
-    runs: dict[Any, Once] = {
-        name: lambda seed, filter=filter: _evidence(seed, filter, observations)
-        for name, (_, filter, _) in rows.items()
-    }
-    taken = milliseconds(runs, options.repeats)
-    base, found = taken["MPF", size], []
+    once = {name: evidence(filter, observations) for name, (_, filter, _) in rows.items()}
+    taken, found = milliseconds(once, repeats), []
     for name, (own, filter, spent) in rows.items():
-        errors = measure.summary(measure.results(own, filter, options.runs, 0), known, own.truth)
-        ratio = float(np.median(taken[name] / base))
-        found.append([*name, errors["mass_rmse"], errors["log_z_rmse"], ratio, spent])
-    header = ["filter", "N", "error of masses", "error of log Ẑ", "time of a run", "s to learn"]
-    return header, found
-
-
-TABLES = {"time": time_of_steps, "regimes": regimes, "bearings": bearings}
+        errors = summary(results(own, filter, runs, 0), known, own.truth)
+        found.append({
+            "filter": name[0], "N": name[1], "error of masses": errors["mass_rmse"],
+            "error of log Ẑ": errors["log_z_rmse"],
+            "time of a run": harness.ratio(taken[name], taken["MPF", size]), "s to learn": spent,
+        })  # fmt: skip
+    return found
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

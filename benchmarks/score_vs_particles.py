@@ -2,12 +2,11 @@
 particles. Run with `python -m benchmarks.score_vs_particles`; `--help` lists the options.
 """
 
-import argparse
 import functools
 import shutil
-import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 import mpfjax
 from benchmarks import figures as plotting
-from mpfjax.console import exit_status, format_table, seed, whole, write_figure, write_json
+from benchmarks.harness import AtLeast2, Count, Seed, command, data, figures, settings_of, table
 from mpfjax.exact import grid_filter
 from mpfjax.metrics import mass_above, modes_represented
 
@@ -38,94 +37,89 @@ LABELS = {
     "gpf": "Gaussian particle filter",
     "gm_mpf": "Gaussian mixture particle filter",
 }
-OF_THE_PAPER = ["pf", "mpf", "guided_mpf"]
+OF_THE_PAPER = ("pf", "mpf", "guided_mpf")
+COLUMNS = {
+    "filter": lambda entry: LABELS[entry["filter"]],
+    "N": "{particles}",
+    "score": lambda entry: f"{np.mean(entry['scores']):.3f} ± {np.std(entry['scores']):.3f}",
+    "runs with score 1": lambda entry: f"{np.mean(np.array(entry['scores']) == 1):.3f}",
+    "weight of one": "{weight_mean:.2f} ± {weight_std:.2f}",
+    "mode mass error": "{mode_mass_error:.3f}",
+}
 OF_PARTICLES = ("positions", "occupied", "component_indicators")
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the study, print its table, and write its results and figures."""
-    options = parse(arguments)
-    return exit_status(lambda: run(options), arguments)
+@command(seeds=3, particles=[20, 40], filters=list(LABELS))
+def main(
+    *,
+    seeds: Count = 20,
+    particles: Sequence[AtLeast2] = (20, 50, 100, 200, 500, 1000),
+    filters: Sequence[Annotated[str, (*LABELS,)]] = OF_THE_PAPER,
+    components: Count = 2,
+    regroup_every: Count = 1,
+    out: Path = Path("results/score_vs_particles"),
+    resume: bool = False,
+    seed: Seed = 0,
+    data_seed: Seed = 2,
+) -> None:
+    """Run the study, print its table, and write its results and figures.
 
-
-def run(options: argparse.Namespace) -> None:
-    """All of it; with --resume, a run that was broken off goes on where it was."""
-    out = Path(options.out)
+    - `seeds`: runs of each filter at each size.
+    - `components`: the most that a mixture has.
+    - `regroup_every`: steps, not at every one.
+    - `resume`: take over what an interrupted run has finished.
+    - `seed`: of all the runs.
+    - `data_seed`: of the noise in the one data set; how hard it is differs much from draw to draw.
+    """
+    settings = settings_of(locals())
     model = mpfjax.QuadraticModel(SIGMA, SIGMA, LOW, HIGH)
-    truth, observations = simulate(options.data_seed)
+    truth, observations = simulate(data_seed)
     exact_mass = np.asarray(grid_filter(model, observations, jnp.linspace(*GRID)).mass_above(0.0))
 
     def write(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        results = [
-            summarise(cell["filter"], cell["num_particles"], cell, exact_mass) for cell in cells
-        ]
-        content = {"settings": settings_of(options), "results": results}
-        write_json(out / "score_vs_particles.json", content)
+        results = [summarise(cell, exact_mass) for cell in cells]
+        data(out / "score_vs_particles.json", settings=settings, results=results)
         return results
 
+    typical_size = min(particles, key=lambda n: abs(n - TYPICAL_NUM_PARTICLES))
+    small = [n for n in particles if n <= MOST_SHARED_SLOTS]
+    mixture = {
+        "max_components": components,
+        "regroup_every": regroup_every,
+        "regroup": [mpfjax.Merge(), mpfjax.Split(), mpfjax.KMeans()],
+    }
+    study = mpfjax.Study(
+        filters={name: functools.partial(build, name, model, mixture) for name in filters},
+        num_particles=list(dict.fromkeys(particles)),
+        keys=jax.random.split(jax.random.fold_in(jax.random.key(seed), 1), seeds),
+        observations=observations,
+        measure=functools.partial(measure, truth, typical_size),
+        collect=collect,
+    )
     unfinished = out / "unfinished"
-    study = study_of(options, model, truth, observations)
     try:
-        # One cell compiles while the one before it runs.
+        # One cell compiles while the one before it runs; all small filters run in as many slots.
         cells = mpfjax.run_study(
-            study,
-            unfinished,
-            resume=options.resume,
-            seeds_at_once=SEEDS_AT_ONCE,
-            cells_at_once=2,
-            slots=shared_slots(options.particles),
-        )
+            study, unfinished, resume=resume, seeds_at_once=SEEDS_AT_ONCE, cells_at_once=2,
+            slots=max(small) if len(small) > 1 else None,
+        )  # fmt: skip
     except KeyboardInterrupt:
         write(mpfjax.read_study(unfinished))
         raise
     results = write(cells)
-    print(as_table(results))
+    print(table(COLUMNS, sorted(results, key=lambda entry: list(LABELS).index(entry["filter"]))))
     typical = {
-        cell["filter"]: typical_run(cell)
-        for cell in cells
-        if cell["num_particles"] == typical_size(options.particles)
+        cell["filter"]: typical_run(cell) for cell in cells if cell["num_particles"] == typical_size
     }
-    figures = {
-        "typical_run": plotting.draw_typical_run(
-            typical, np.asarray(truth), np.asarray(observations), LABELS
-        ),
-        "score_vs_particles": plotting.draw_scores(results, LABELS),
-    }
-    for stem, figure in figures.items():
-        write_figure(out / f"{stem}.png", figure, dpi=150)
+    seen = np.asarray(truth), np.asarray(observations)
+    figures(
+        out,
+        typical_run=plotting.draw_typical_run(typical, *seen, LABELS),
+        score_vs_particles=plotting.draw_scores(results, LABELS),
+    )
     # The next run is to show what the code does then, not what it did now.
     shutil.rmtree(unfinished)
     print(f"results and figures: {out}/")
-
-
-def parse(arguments: list[str] | None) -> argparse.Namespace:
-    """The options, or a message that names the one that cannot be run."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.score_vs_particles")
-    parser.add_argument(
-        "--seeds", type=whole(), default=20, help="runs of each filter at each size"
-    )
-    parser.add_argument(
-        "--particles", type=whole(2), nargs="+", default=[20, 50, 100, 200, 500, 1000], metavar="N"
-    )
-    parser.add_argument("--filters", nargs="+", choices=list(LABELS), default=OF_THE_PAPER)
-    parser.add_argument(
-        "--components", type=whole(), default=2, metavar="M", help="the most that a mixture has"
-    )
-    parser.add_argument(
-        "--regroup-every", type=whole(), default=1, metavar="K", help="steps, not at every one"
-    )
-    parser.add_argument("--out", default="results/score_vs_particles", metavar="DIR")
-    parser.add_argument(
-        "--resume", action="store_true", help="take over what an interrupted run has finished"
-    )
-    parser.add_argument("--seed", type=seed, default=0, help="of all the runs")
-    parser.add_argument(
-        "--data-seed",
-        type=seed,
-        default=2,
-        help="of the noise in the one data set; how hard it is differs much from draw to draw",
-    )
-    return parser.parse_args(arguments)
 
 
 def simulate(seed: int) -> tuple[Float[Array, " t"], Float[Array, " t"]]:
@@ -174,37 +168,18 @@ def collect(mixture: mpfjax.ParticleMixture) -> dict[str, Array]:
     }
 
 
-def study_of(
-    options: argparse.Namespace,
-    model: mpfjax.QuadraticModel,
-    truth: Float[Array, " t"],
-    observations: Float[Array, " t"],
-) -> mpfjax.Study:
-    """All seeds of every filter at every size; particles are kept at the size of figure 1 only."""
-
-    def measure(run: mpfjax.FilterRun) -> dict[str, Array]:
-        particles = {k: run.collected[k] for k in OF_PARTICLES}
-        kept = {k: values for k, values in run.collected.items() if k not in OF_PARTICLES}
-        kept["both"] = both_represented(particles["positions"], particles["occupied"], truth)
-        size = num_particles(run.final)
-        if size == typical_size(options.particles):
-            kept |= {k: values[..., :size] for k, values in particles.items()}
-        return kept
-
-    mixture: dict[str, Any] = {
-        "max_components": options.components,
-        "regroup_every": options.regroup_every,
-        # As the tables were made.
-        "regroup": [mpfjax.Merge(), mpfjax.Split(), mpfjax.KMeans()],
-    }
-    return mpfjax.Study(
-        filters={name: functools.partial(build, name, model, mixture) for name in options.filters},
-        num_particles=list(dict.fromkeys(options.particles)),
-        keys=jax.random.split(jax.random.fold_in(jax.random.key(options.seed), 1), options.seeds),
-        observations=observations,
-        measure=measure,
-        collect=collect,
-    )
+def measure(
+    truth: Float[Array, " t"], typical_size: int, run: mpfjax.FilterRun
+) -> dict[str, Array]:
+    """What is kept of the runs of a cell; particles at the size of figure 1 only."""
+    particles = {k: run.collected[k] for k in OF_PARTICLES}
+    kept = {k: values for k, values in run.collected.items() if k not in OF_PARTICLES}
+    kept["both"] = both_represented(particles["positions"], particles["occupied"], truth)
+    usable = run.final.usable_slots  # N, where there are more slots
+    size = run.final.log_weights.shape[-1] if usable is None else int(usable[0])
+    if size == typical_size:
+        kept |= {k: values[..., :size] for k, values in particles.items()}
+    return kept
 
 
 @jax.jit
@@ -216,9 +191,7 @@ def both_represented(
     return modes_represented(positions, occupied, modes, RADIUS).all(axis=-1)
 
 
-def summarise(
-    name: str, num_particles: int, runs: dict[str, np.ndarray], exact_mass: np.ndarray
-) -> dict[str, Any]:
+def summarise(runs: dict[str, Any], exact_mass: np.ndarray) -> dict[str, Any]:
     """One entry of the results: scores, component one's weight, and the error of the modes' mass.
 
     The weight is taken over the steps at which a second component lives, where there are any: a
@@ -228,30 +201,13 @@ def summarise(
     weights = runs["weight"][two] if two.any() else runs["weight"].ravel()
     error = runs["mass_above"] - exact_mass[None]
     return {
-        "filter": name,
-        "particles": num_particles,
+        "filter": runs["filter"],
+        "particles": runs["num_particles"],
         "scores": [float(score) for score in runs["both"].mean(axis=1)],
         "weight_mean": float(weights.mean()),
         "weight_std": float(weights.std()),
         "mode_mass_error": float(np.sqrt((error**2).mean())),
     }
-
-
-def num_particles(runs: mpfjax.ParticleMixture) -> int:
-    """N of these runs, which may have more slots."""
-    usable = runs.usable_slots
-    return runs.log_weights.shape[-1] if usable is None else int(usable[0])
-
-
-def shared_slots(sizes: list[int]) -> int | None:
-    """In how many slots all small filters run, so that their sizes need not compile one by one."""
-    small = [n for n in sizes if n <= MOST_SHARED_SLOTS]
-    return max(small) if len(small) > 1 else None
-
-
-def typical_size(sizes: list[int]) -> int:
-    """The size of figure 1, or the one nearest to it."""
-    return min(sizes, key=lambda n: abs(n - TYPICAL_NUM_PARTICLES))
 
 
 def typical_run(runs: dict[str, np.ndarray]) -> "plotting.ParticleHistory":
@@ -266,44 +222,5 @@ def typical_run(runs: dict[str, np.ndarray]) -> "plotting.ParticleHistory":
     )
 
 
-def as_table(results: list[dict[str, Any]]) -> str:
-    """The results in a table for the terminal."""
-    rows = [
-        [
-            LABELS[entry["filter"]],
-            str(entry["particles"]),
-            f"{np.mean(entry['scores']):.3f} ± {np.std(entry['scores']):.3f}",
-            f"{np.mean(np.array(entry['scores']) == 1):.3f}",
-            f"{entry['weight_mean']:.2f} ± {entry['weight_std']:.2f}",
-            f"{entry['mode_mass_error']:.3f}",
-        ]
-        for entry in sorted(results, key=lambda entry: list(LABELS).index(entry["filter"]))
-    ]
-    header = ["filter", "N", "score", "runs with score 1", "weight of one", "mode mass error"]
-    return format_table(header, rows)
-
-
-def settings_of(options: argparse.Namespace) -> dict[str, Any]:
-    """Everything that a second run needs to be the same."""
-    return {
-        "steps": NUM_STEPS,
-        "amplitude": AMPLITUDE,
-        "period": PERIOD,
-        "sigma_x": SIGMA,
-        "sigma_y": SIGMA,
-        "initial": [LOW, HIGH],
-        "radius": RADIUS,
-        "max_components": options.components,
-        "regroup_every": options.regroup_every,
-        "seeds": options.seeds,
-        "particles": options.particles,
-        "filters": options.filters,
-        "seed": options.seed,
-        "data_seed": options.data_seed,
-        "jax": jax.__version__,
-        "mpfjax": mpfjax.__version__,
-    }
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

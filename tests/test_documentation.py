@@ -66,7 +66,9 @@ def test_the_commands_of_a_page_exist(page):
         sources = place.parent.rglob("*.py") if is_folder else [place]
         text = "".join(source.read_text(encoding="utf-8") for source in sources)
         for option in re.findall(r"(?<=\s)--[a-z-]+", arguments):
-            assert f'"{option}"' in text, f"{name} {option}"
+            argument = option.removeprefix("--").removeprefix("no-").replace("-", "_")
+            is_there = f'"{option}"' in text or re.search(rf"^    {argument}: ", text, re.MULTILINE)
+            assert is_there, f"{name} {option}"
 
 
 def test_readme_is_short_and_keeps_its_two_commands():

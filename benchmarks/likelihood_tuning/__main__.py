@@ -6,106 +6,325 @@ likelihood tuned on labelled frames, and trackers with and without it on held-ou
 `python -m benchmarks.likelihood_tuning`; `--help` lists the options.
 """
 
-import argparse
-import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from time import process_time
+from typing import Annotated, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array
+from scipy.optimize import minimize
 
 import mpfjax
-from benchmarks.likelihood_tuning.labels import CLIMB_STEPS as LABEL_STEPS
+from benchmarks import figures as plotting
+from benchmarks import harness
+from benchmarks.harness import AtLeast2, Count, Seed, command
 from benchmarks.likelihood_tuning.labels import SEQUENCES, run_labels
-from benchmarks.likelihood_tuning.scores import ESTIMATORS, FILTERS, MODELS, run_scores
-from benchmarks.likelihood_tuning.starts import (
-    CLIMB_STEPS,
-    CURVATURE_SEEDS,
-    RATE,
-    STARTS,
-    TUNED_PARTICLES,
-    TUNED_SEEDS,
-    run_starts,
-)
-from mpfjax.console import fill_in, seed, whole
+from benchmarks.score_vs_particles import HIGH, LOW, simulate
+from mpfjax.exact import grid_filter, kalman_filter
+from mpfjax.tuning import Positive, TuningRun, fit
+
+PARTS = ("a", "b", "c")
+ESTIMATORS = {
+    "none": "plain derivative",
+    "pathwise": "stop-gradient, draws differentiated",
+    "stop": "stop-gradient",
+}
+FILTERS = ("pf", "mpf")
+MODELS = {"linear_gaussian": ("a", "log q", "log r"), "quadratic": ("log σ_x", "log σ_y")}
+LINEAR_GAUSSIAN_STEPS = 50
+GRID, COARSE_GRID = (-3.0, 3.0, 1201), (-3.0, 3.0, 801)
+# Drawn once: under double precision the same key would draw another set.
+OBSERVATIONS = np.asarray(simulate(2)[1])
+STARTS = (0.04, 0.5)
+TUNED_PARTICLES, TUNED_SEEDS, CURVATURE_SEEDS = 200, 16, 128
+RATE, TOLERANCE = 0.15, 0.03
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the parts that were asked for, print their tables, write their results and figures."""
-    options = parse(arguments)
-    out = Path(options.out)
-    try:
-        if "a" in options.parts:
-            run_scores(options, settings_of(options), out)
-        if "b" in options.parts:
-            run_starts(options, settings_of(options), out)
-        if "c" in options.parts:
-            run_labels(options, out)
-    except FileNotFoundError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"interrupted: what was finished is in {out}", file=sys.stderr)
-        return 130
+@command(
+    runs=10, particles=[20], models=["quadratic"], filters=["pf"], estimators=["stop"], starts=1,
+    steps=2, sequences=["rendered"], label_runs=2, label_steps=2,
+)  # fmt: skip
+def main(
+    *,
+    parts: Sequence[Annotated[str, (*PARTS,)]] = PARTS,
+    runs: Count = 200,
+    particles: Sequence[AtLeast2] = (100, 1000),
+    estimators: Sequence[Annotated[str, (*ESTIMATORS,)]] = (*ESTIMATORS,),
+    models: Sequence[Annotated[str, (*MODELS,)]] = (*MODELS,),
+    filters: Sequence[Annotated[str, (*FILTERS,)]] = FILTERS,
+    starts: Count = 20,
+    steps: Count = 120,
+    sequences: Sequence[Annotated[str, (*SEQUENCES,)]] = SEQUENCES,
+    label_runs: AtLeast2 = 6,
+    label_steps: Count = 60,
+    seed: Seed = 0,
+    out: Path = Path("results/likelihood_tuning"),
+) -> None:
+    """Run the parts that were asked for, print their tables, write their results and figures.
+
+    - `runs`: a: seeds for each estimator.
+    - `particles`: a.
+    - `estimators`: a.
+    - `models`: a.
+    - `filters`: a.
+    - `starts`: b: random starts.
+    - `steps`: b: of each optimisation.
+    - `sequences`: c.
+    - `label_runs`: c: seeds of each filter.
+    - `label_steps`: c: of each optimisation.
+    """
+    settings = harness.settings_of(locals())
+    if "a" in parts:
+        tasks = {"linear_gaussian": linear_gaussian_task(), "quadratic": quadratic_task()}
+        results = []
+        for model, size, filter, estimator in harness.grid(
+            "cell", models, particles, filters, estimators
+        ):
+            results.append(measure(model, filter, size, estimator, tasks[model], runs, seed))
+            harness.data(out / "scores.json", settings=settings, results=results)
+        print(score_tables(results))
+    if "b" in parts:
+        run_starts(starts, steps, seed, settings, out)
+    if "c" in parts:
+        run_labels(sequences, label_runs, label_steps, seed, settings, out)
     print(f"results: {out}/")
-    return 0
 
 
-def parse(arguments: list[str] | None) -> argparse.Namespace:
-    """The options, or a message that names the one that cannot be run."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.likelihood_tuning")
-    parser.add_argument("--parts", nargs="+", choices=("a", "b", "c"), default=["a", "b", "c"])
-    parser.add_argument("--runs", type=whole(), help="a: seeds for each estimator; default: 200")
-    parser.add_argument(
-        "--particles", type=whole(2), nargs="+", metavar="N", help="a; default: 100 1000"
-    )
-    parser.add_argument("--estimators", nargs="+", choices=list(ESTIMATORS), help="a; default: all")
-    parser.add_argument("--models", nargs="+", choices=list(MODELS), help="a; default: all")
-    parser.add_argument("--filters", nargs="+", choices=FILTERS, help="a; default: all")
-    parser.add_argument("--starts", type=whole(), help="b: random starts; default: 20")
-    parser.add_argument(
-        "--steps", type=whole(), help=f"b: of each optimisation; default: {CLIMB_STEPS}"
-    )
-    parser.add_argument("--sequences", nargs="+", choices=SEQUENCES, help="c; default: all")
-    parser.add_argument("--label-runs", type=whole(2), help="c: seeds of each filter; default: 6")
-    parser.add_argument(
-        "--label-steps", type=whole(), help=f"c: of each optimisation; default: {LABEL_STEPS}"
-    )
-    parser.add_argument("--seed", type=seed, default=0)
-    parser.add_argument("--out", default="results/likelihood_tuning", metavar="DIR")
-    options = parser.parse_args(arguments)
-    defaults: dict[str, dict[str, Any]] = {
-        "a": {
-            "runs": 200,
-            "particles": [100, 1000],
-            "estimators": list(ESTIMATORS),
-            "models": list(MODELS),
-            "filters": FILTERS,
-        },
-        "b": {"starts": 20, "steps": CLIMB_STEPS},
-        "c": {"sequences": SEQUENCES, "label_runs": 6, "label_steps": LABEL_STEPS},
+def build_quadratic(point: Array) -> mpfjax.QuadraticModel:
+    """σ_x and σ_y from their logarithms."""
+    return mpfjax.QuadraticModel(jnp.exp(point[0]), jnp.exp(point[1]), LOW, HIGH)
+
+
+def exact_quadratic(grid: tuple[float, float, int]) -> Callable[[np.ndarray], tuple]:
+    """log Z and its gradient by the grid filter, under the precision of the caller."""
+    observations = jnp.asarray(OBSERVATIONS, float)
+    points = jnp.linspace(*grid)
+
+    def log_evidence(point: Array) -> Array:
+        return grid_filter(build_quadratic(point), observations, points).log_marginal_likelihood
+
+    both = jax.jit(jax.value_and_grad(log_evidence))
+    return lambda point: tuple(np.asarray(v, float) for v in both(jnp.asarray(point, float)))
+
+
+# --- part a: bias, spread and time of every gradient estimator against exact scores ---------------
+
+
+class Task(NamedTuple):
+    """A model as a function of a few numbers, data, and the exact score at the true numbers."""
+
+    build: Callable[[Array], Any]
+    observations: Array
+    point: Array
+    exact: np.ndarray
+
+
+def linear_gaussian_task() -> Task:
+    """A scalar autoregression seen with noise, data of its own."""
+
+    def build(point: Array) -> mpfjax.LinearGaussianModel:
+        a, q, r = point[0], jnp.exp(2 * point[1]), jnp.exp(2 * point[2])
+        one = jnp.ones((1, 1))
+        return mpfjax.LinearGaussianModel(
+            A=a * one, Q=q * one, H=one, R=r * one, m0=jnp.zeros(1), P0=one
+        )
+
+    rng = np.random.default_rng(0)
+    state, observations = 0.0, []
+    for _ in range(LINEAR_GAUSSIAN_STEPS):
+        state = 0.9 * state + 0.6 * rng.normal()
+        observations.append([state + 0.5 * rng.normal()])
+    data = jnp.array(observations)
+    point = jnp.array([0.7, np.log(0.8), np.log(0.4)], jnp.float32)
+    exact = jax.grad(lambda p: kalman_filter(build(p), data).log_marginal_likelihood)(point)
+    return Task(build, data, point, np.asarray(exact))
+
+
+def quadratic_task() -> Task:
+    """The quadratic model on the data of section 5.1, away from its maximum."""
+    point = np.log([0.12, 0.12])
+    with jax.enable_x64(True):
+        exact = exact_quadratic(GRID)(point)[1]
+    return Task(build_quadratic, jnp.asarray(OBSERVATIONS), jnp.asarray(point, jnp.float32), exact)
+
+
+def build_filter(name: str, model: Any, num_particles: int, estimator: str) -> mpfjax.Filter:
+    """The filter of that name with that estimator."""
+    if estimator != "pathwise":
+        if name == "pf":
+            return mpfjax.particle_filter(model, num_particles, gradient=estimator)
+        return mpfjax.mixture_particle_filter(model, num_particles, 2, gradient=estimator)
+    moves = [mpfjax.Resample(gradient="stop"), mpfjax.Propagate(model)]
+    if name == "pf":
+        return mpfjax.Filter(model, moves, num_particles)
+    grouping = [mpfjax.Merge(), mpfjax.Split(), mpfjax.KMeans()]
+    seeds = [mpfjax.KMeans(10, reseed=True)]
+    return mpfjax.Filter(model, [*moves, *grouping], num_particles, 2, initial_moves=seeds)
+
+
+def measure(
+    model: str, filter: str, n: int, estimator: str, task: Task, num_runs: int, seed: int
+) -> dict[str, Any]:
+    """Mean and spread of the score over seeds, and the processor time of a gradient and a run."""
+
+    def log_evidence(point: Array, key: Array) -> Array:
+        built = build_filter(filter, task.build(point), n, estimator)
+        run = mpfjax.run_filter(key, built, task.observations, harness.nothing)
+        return run.log_marginal_likelihood
+
+    keys = jax.random.split(jax.random.key(seed), num_runs)
+    given = task.point, keys
+    run = jax.jit(jax.vmap(log_evidence, in_axes=(None, 0)))
+    score = jax.jit(jax.vmap(jax.grad(log_evidence), in_axes=(None, 0)))
+    # The least processor time of three calls, which other programs disturb least.
+    calls = {"run": lambda _: run(*given), "score": lambda _: score(*given)}
+    taken = {name: t.min() for name, t in harness.turns(calls, 3, clock=process_time).items()}
+    scores = np.asarray(score(*given)).astype(float)
+    entry = {
+        "model": model, "filter": filter, "particles": n, "estimator": estimator, "runs": num_runs,
+        "exact": task.exact.tolist(), "finite_runs": int(np.isfinite(scores).all(axis=1).sum()),
+        "milliseconds": 1000 * taken["score"] / num_runs,
+        "cost_in_runs": taken["score"] / taken["run"],
+        "bias": None, "standard_error": None, "deviation": None,
+    }  # fmt: skip
+    if np.isfinite(scores).all():
+        entry["bias"] = scores.mean(axis=0) - task.exact
+        entry["standard_error"] = scores.std(axis=0, ddof=1) / np.sqrt(num_runs)
+        entry["deviation"] = scores.std(axis=0)
+    return entry
+
+
+def score_tables(results: list[dict[str, Any]]) -> str:
+    """The estimators in a table for the terminal, a block a model."""
+
+    def cell(entry: dict[str, Any], k: int) -> str:
+        if entry["bias"] is None:
+            return f"overflows in {entry['runs'] - entry['finite_runs']} runs"
+        error, deviation = entry["standard_error"][k], entry["deviation"][k]
+        return f"{entry['bias'][k]:+.2f} ± {error:.2f} ({deviation:.1f})"
+
+    blocks = []
+    for model in dict.fromkeys(entry["model"] for entry in results):
+        entries = [entry for entry in results if entry["model"] == model]
+        columns: dict[str, Any] = {"estimator": lambda entry: ESTIMATORS[entry["estimator"]]}
+        columns |= {"filter": "{filter}", "N": "{particles}"}
+        for k, name in enumerate(MODELS[model]):
+            title = f"{name} ({entries[0]['exact'][k]:.1f})"
+            columns[title] = lambda entry, k=k: cell(entry, k)
+        columns |= {"ms": "{milliseconds:.1f}", "runs": "{cost_in_runs:.1f}"}
+        title = f"{model}: bias ± standard error (deviation of one run) of the score, exact in ()"
+        blocks.append(f"{title}\n{harness.table(columns, entries)}")
+    return "\n\n".join(blocks)
+
+
+# --- part b: the quadratic model tuned from random starts, against the exact maximum --------------
+
+
+class Maximum(NamedTuple):
+    """The exact maximum in log σ_x, log σ_y, and the standard errors of these two."""
+
+    point: np.ndarray
+    errors: np.ndarray
+
+
+def exact_maximum() -> Maximum:
+    """By BFGS on the grid filter, in double precision."""
+    with jax.enable_x64(True):
+        both = exact_quadratic(GRID)
+        found = minimize(
+            lambda point: tuple(-value for value in both(point)), np.log([0.1, 0.06]), jac=True
+        )
+        step = 1e-3
+        columns = [
+            (both(found.x - offset)[1] - both(found.x + offset)[1]) / (2 * step)
+            for offset in step * np.eye(2)
+        ]
+    covariance = np.linalg.inv((np.stack(columns) + np.stack(columns).T) / 2)
+    return Maximum(found.x, np.sqrt(np.diagonal(covariance)))
+
+
+def run_starts(starts: int, steps: int, seed: int, settings: dict[str, Any], out: Path) -> None:
+    """Optimisation from every start, and compare with the exact maximum."""
+    maximum = exact_maximum()
+    rng = np.random.default_rng(seed)
+    places = np.exp(rng.uniform(*np.log(STARTS), size=(starts, 2)))
+    results: list[dict[str, Any]] = []
+    paths = []
+    for ((k, start),) in harness.grid("start", enumerate(places)):
+        run = optimisation(jax.random.fold_in(jax.random.key(seed), k), start, steps)
+        results.append(compare(start, run, maximum))
+        paths.append(np.stack([run.history["sigma_x"], run.history["sigma_y"]], axis=1))
+        harness.data(
+            out / "starts.json", settings=settings, exact=np.exp(maximum.point),
+            exact_relative_errors=maximum.errors, results=results,
+        )  # fmt: skip
+    numbers = lambda form, values: " ".join(form.format(value) for value in values)  # noqa: E731
+    columns = {
+        "start": lambda entry: numbers("{:.3f}", entry["start"]),
+        "end": lambda entry: numbers("{:.4f}", entry["end"]),
+        "off by": lambda entry: numbers("{:+.1%}", entry["relative_error"]),
+        "standard errors / exact": lambda e: numbers("{:.2f}", e["standard_errors_over_exact"]),
     }
-    for part, own in defaults.items():
-        fill_in(parser, options, part in options.parts, f"without part {part}", **own)
-    return options
+    print(harness.table(columns, results))
+    near = sum(np.abs(entry["relative_error"]).max() < TOLERANCE for entry in results)
+    best = numbers("{:.4f}", np.exp(maximum.point))
+    print(f"{near} of {starts} end within {TOLERANCE:.0%} of the exact maximum, {best}")
+    figure = plotting.draw_optimisations(*surface(), paths, np.exp(maximum.point))
+    harness.figures(out, optimisations=figure)
 
 
-def settings_of(options: argparse.Namespace) -> dict[str, Any]:
-    """Everything that a second run needs to be the same."""
+def optimisation(key: Array, start: np.ndarray, num_steps: int) -> TuningRun:
+    """The guided mixture particle filter's likelihood, climbed from one start."""
+    model = mpfjax.QuadraticModel(float(start[0]), float(start[1]), LOW, HIGH)
+    filter = mpfjax.mixture_particle_filter(
+        model,
+        TUNED_PARTICLES,
+        max_components=2,
+        proposal=mpfjax.GaussNewtonProposal(model),
+        noise="rqmc",
+        gradient="stop",
+    )
+    return fit(
+        key,
+        filter,
+        jnp.asarray(OBSERVATIONS),
+        optax.adam(optax.cosine_decay_schedule(RATE, num_steps)),
+        num_steps,
+        parameters={"sigma_x": lambda f: f.model.sigma_x, "sigma_y": lambda f: f.model.sigma_y},
+        transforms={"sigma_x": Positive(), "sigma_y": Positive()},
+        num_seeds=TUNED_SEEDS,
+        curvature_seeds=CURVATURE_SEEDS,
+        progress=False,
+    )
+
+
+def compare(start: np.ndarray, run: TuningRun, maximum: Maximum) -> dict[str, Any]:
+    """Where an optimisation ended, and its standard errors, relative to the exact ones."""
+    end = np.array([run.parameters["sigma_x"], run.parameters["sigma_y"]], float)
+    errors = None
+    if run.standard_errors is not None:
+        found = np.array([run.standard_errors["sigma_x"], run.standard_errors["sigma_y"]], float)
+        errors = (found / end / maximum.errors).tolist()
     return {
-        "runs": options.runs,
-        "particles": options.particles,
-        "starts": options.starts,
-        "steps": options.steps,
-        "seed": options.seed,
-        "tuned_particles": TUNED_PARTICLES,
-        "tuned_seeds": TUNED_SEEDS,
-        "curvature_seeds": CURVATURE_SEEDS,
-        "rate": RATE,
-        "start_range": STARTS,
-        "jax": jax.__version__,
-        "mpfjax": mpfjax.__version__,
+        "start": start.tolist(),
+        "end": end.tolist(),
+        "relative_error": (end / np.exp(maximum.point) - 1).tolist(),
+        "standard_errors_over_exact": errors,
+        "stopped": run.stopped,
     }
+
+
+def surface() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The exact log marginal likelihood on a grid of σ_x and σ_y."""
+    sigmas_x, sigmas_y = np.geomspace(0.03, 0.6, 16), np.geomspace(0.03, 0.6, 16)
+    both = exact_quadratic(COARSE_GRID)
+    values = [[both(np.log([x, y]))[0] for x in sigmas_x] for y in sigmas_y]
+    return sigmas_x, sigmas_y, np.array(values, float)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,15 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array
-from tqdm import tqdm
 
 import mpfjax
 from benchmarks import figures as plotting
+from benchmarks import harness
 from benchmarks.coverage import covers
 from benchmarks.likelihood_tuning.labelled_boxes import boxes_around, labelled_states
 from benchmarks.likelihood_tuning.soft_colours import SoftColourModel
 from benchmarks.scenes import football_scene
-from mpfjax.console import format_table, write_figure, write_json
 from mpfjax.metrics.tracking_quality import intersection_area
 from mpfjax.tuning import (
     LabelLikelihood,
@@ -45,7 +44,6 @@ STEPS = (0.25, 0.08, 0.01, 0.01)
 # From the dynamics, over the neighbourhood, and on the label in other sizes, so many of each.
 CANDIDATES, NEAR = 16, 0.2
 FRAMES_A_STEP = 8
-CLIMB_STEPS = 60
 RATE = 0.03
 KINDS = ("first", "last", "tuned")
 LEGENDS = ("reference of the first frame", "of the last labelled frame", "tuned")
@@ -188,41 +186,56 @@ def covered(estimates: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.array(pairs, float)
 
 
-def run_labels(options: Any, out: Path) -> None:
+def run_labels(
+    sequences: Sequence[str], runs: int, steps: int, seed: int, settings: dict[str, Any], out: Path
+) -> None:
     """Tune and judge on every sequence that there is."""
     results: list[dict[str, Any]] = []
     panels: list[tuple[str, dict[str, np.ndarray], int]] = []
-    for name in tqdm(options.sequences, disable=not sys.stderr.isatty(), unit="sequence"):
+    for (name,) in harness.grid("sequence", sequences):
         try:
-            labelled = read_labelled(name, options.seed)
+            labelled = read_labelled(name, seed)
         except FileNotFoundError as error:
             print(f"{name} left out: {error}", file=sys.stderr)
             continue
-        entries, curves, first = judge(name, labelled, options)
+        entries, curves, first = judge(name, labelled, runs, steps, seed)
         results += entries
         named: dict[str, np.ndarray] = dict(
             zip(LEGENDS, (curves[kind] for kind in KINDS), strict=True)
         )
         panels.append((f"{name}, {FILTERS[-1].upper()}", named, first))
-        write_json(out / "labels.json", {"settings": settings_of(options), "results": results})
+        harness.data(out / "labels.json", settings=settings, results=results)
     if not results:
         raise FileNotFoundError("--sequences: none of them is there")
-    print(as_label_table(results))
-    write_figure(out / "overlaps.png", plotting.draw_overlaps(panels), dpi=150)
+    rows = [
+        entry | {"measure": measure, **entry[measure]}
+        for entry in results
+        for measure in ("coverage", "overlap")
+    ]
+    columns: dict[str, Any] = {"sequence": "{sequence}", "filter": "{filter}", "": "{measure}"}
+    titles = ("first frame's", "last frame's", "tuned")
+    for title, kind in zip(titles, KINDS, strict=True):
+        columns[title] = f"{{{kind}[0]:.3f}} ± {{{kind}[1]:.3f}}"
+    for kind in ("first", "last"):
+        columns[f"than {kind}"] = lambda row, kind=kind: verdict(*row[f"gain_over_{kind}"])
+    print(harness.table(columns, rows))
+    print("References of the first and of the last labelled frame, and tuned from the first;")
+    print("held-out frames, mean ± standard error over runs; better or worse by two of them.")
+    harness.figures(out, overlaps=plotting.draw_overlaps(panels))
 
 
 def judge(
-    name: str, labelled: Labelled, options: Any
+    name: str, labelled: Labelled, runs: int, steps: int, seed: int
 ) -> tuple[list[dict[str, Any]], dict[str, np.ndarray], int]:
     """Entries of the results, the MPF's overlap over frames, and the first held-out frame."""
     half = len(labelled.frames) // 2
     seen = Labelled(labelled.frames[:half], labelled.boxes[:half])
-    key_tuning, key_runs = jax.random.split(jax.random.key(options.seed))
+    key_tuning, key_runs = jax.random.split(jax.random.key(seed))
     first, last = untuned_model(seen, 0), untuned_model(seen, -1)
-    run = tune(key_tuning, first, seen, options.label_steps)
+    run = tune(key_tuning, first, seen, steps)
     models = dict(zip(KINDS, (first, last, run.model), strict=True))
     frames, truth = jnp.asarray(labelled.frames[half:]), labelled.boxes[half:]
-    keys = jax.random.split(key_runs, options.label_runs)
+    keys = jax.random.split(key_runs, runs)
     builders = filters_of(seen.boxes[-1, :, 2:].mean(axis=0))
     optimisation = {
         "lambda": [float(first.lambda_), float(run.model.lambda_)],
@@ -258,28 +271,8 @@ def compare_scores(scores: dict[str, dict[str, np.ndarray]]) -> dict[str, Any]:
         means = {kind: scores[kind][measure].mean(axis=(1, 2)) for kind in KINDS}
         for kind in ("first", "last"):
             means[f"gain_over_{kind}"] = means["tuned"] - means[kind]
-        compared[measure] = {
-            kind: [float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))]
-            for kind, values in means.items()
-        }
+        compared[measure] = {kind: harness.mean_and_error(values) for kind, values in means.items()}
     return compared
-
-
-def as_label_table(results: list[dict[str, Any]]) -> str:
-    """Coverage and overlap with every likelihood, and whether the tuned one is better."""
-    rows = []
-    for entry in results:
-        for measure in ("coverage", "overlap"):
-            numbers = entry[measure]
-            cells = ["{:.3f} ± {:.3f}".format(*numbers[kind]) for kind in KINDS]
-            verdicts = [verdict(*numbers[f"gain_over_{kind}"]) for kind in ("first", "last")]
-            rows.append([entry["sequence"], entry["filter"], measure, *cells, *verdicts])
-    header = ["sequence", "filter", "", "first frame's", "last frame's", "tuned"]
-    return (
-        f"{format_table([*header, 'than first', 'than last'], rows)}\n"
-        "References of the first and of the last labelled frame, and tuned from the first;\n"
-        "held-out frames, mean ± standard error over runs; better or worse by two of them."
-    )
 
 
 def verdict(gain: float, error: float) -> str:
@@ -287,23 +280,3 @@ def verdict(gain: float, error: float) -> str:
     if abs(gain) <= 2 * error:
         return "no difference"
     return "better" if gain > 0 else "worse"
-
-
-def settings_of(options: Any) -> dict[str, Any]:
-    """Everything that a second run needs to be the same."""
-    return {
-        "sequences": list(options.sequences),
-        "last_frames": LAST_FRAME,
-        "runs": options.label_runs,
-        "steps": options.label_steps,
-        "seed": options.seed,
-        "num_particles": NUM_PARTICLES,
-        "max_components": MAX_COMPONENTS,
-        "bins_points_parts": [NUM_BINS, NUM_POINTS, NUM_PARTS],
-        "random_walk": STEPS,
-        "candidates": 3 * CANDIDATES,
-        "frames_a_step": FRAMES_A_STEP,
-        "rate": RATE,
-        "jax": jax.__version__,
-        "mpfjax": mpfjax.__version__,
-    }

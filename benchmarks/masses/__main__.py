@@ -16,190 +16,226 @@ the paired differences it is worse. --keys chooses other keys of the runs for th
 Into --out DIR go masses.json and masses.png.
 """
 
-import argparse
 import importlib.util
-import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+import mpfjax
 from benchmarks import figures as plotting
-from benchmarks.masses import measure
+from benchmarks import harness
+from benchmarks.harness import AtLeast2, Seed, command
 from benchmarks.masses.filters import FILTERS
 from benchmarks.masses.scenes import SCENES, Scene
-from mpfjax.console import exit_status, format_table, seed, whole, write_figure, write_json
 from mpfjax.models.base import starts_from_noise
 
 # A reference of so many particles where the likelihood of a particle is that of its pixels.
 _FEWER = {"look-alikes": 10}
+# Runs of the filter that says what is true where nothing else does; a mode with less is lost.
+REFERENCE_RUNS, LOST = 8, 0.01
 # A picture has room for as many lines as there are colours.
 _IN_THE_TABLE_ONLY = (
     "APF", "APF, rqmc", "MPF, 4 draws", "MPF, tempered", "MPF, look-ahead",
     "MPF, rqmc, look-ahead", "MPF, learned look-ahead",
     "MPF, pilot look-ahead", "MPF, rqmc, no look-ahead",
 )  # fmt: skip
+COLUMNS = {
+    "filter": "{filter}",
+    "N": "{N}",
+    "error of masses": "{mass_rmse:.3f} ± {mass_rmse_error:.3f}",
+    "lost": "{lost:.2f} ± {lost_error:.2f}",
+    "sd of log Ẑ": "{log_z_sd:.3f} ± {log_z_sd_error:.3f}",
+    "RMSE of log Ẑ": "{log_z_rmse:.3f} ± {log_z_rmse_error:.3f}",
+    "largest mass": "{largest_mass:.2f}",
+    "ms a step": "{ms:.3f}",
+}
+DIFFERENCES = {
+    "filter": "{filter}",
+    "N": "{N}",
+    "masses": "{masses_worse:+.1f}",
+    "log Ẑ": "{log_z_worse:+.1f}",
+    "lost": "{lost_worse:+.1f}",
+}
 
 
-def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
-    """The arguments, each checked."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.masses",
-        description="Errors of modes' masses and of log Ẑ, by filter and number of particles.",
-    )
-    parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
-    parser.add_argument("--filters", nargs="+", choices=list(FILTERS), default=list(FILTERS))
-    parser.add_argument(
-        "--particles", type=whole(2), nargs="+", default=[400, 1000, 4000], metavar="N"
-    )
-    parser.add_argument("--seeds", type=whole(2), default=100)
-    parser.add_argument("--steps", type=whole(2), help="of every scene; each has its own")
-    parser.add_argument(
-        "--reference", type=whole(2), default=1_000_000, metavar="N",
-        help="particles of the filter that says what is true, a tenth of it for look-alikes",
-    )  # fmt: skip
-    parser.add_argument("--seed", type=seed, default=0, help="of the scenes")
-    parser.add_argument(
-        "--keys", type=seed, metavar="SEED", help="of the filters' runs; by default that of scenes"
-    )
-    parser.add_argument("--out", type=Path, default=Path("results/masses"))
-    return parser.parse_args(arguments)
+@command(scenes=["jumps"], filters=["PF", "MPF"], particles=[40], seeds=3, steps=3)
+def main(
+    *,
+    scenes: Sequence[Annotated[str, (*SCENES,)]] = (*SCENES,),
+    filters: Sequence[Annotated[str, (*FILTERS,)]] = (*FILTERS,),
+    particles: Sequence[AtLeast2] = (400, 1000, 4000),
+    seeds: AtLeast2 = 100,
+    steps: AtLeast2 | None = None,
+    reference: AtLeast2 = 1_000_000,
+    seed: Seed = 0,
+    keys: Seed | None = None,
+    out: Path = Path("results/masses"),
+) -> None:
+    """Scene by scene; what is finished is written.
 
-
-def run(options: argparse.Namespace) -> None:
-    """Scene by scene; what is finished is written."""
-    options.out.mkdir(parents=True, exist_ok=True)
-    settings = {name: value for name, value in vars(options).items() if name != "out"}
-    rows: list[dict[str, Any]] = []
-    truths: dict[str, Any] = {}
-    with_particles = importlib.util.find_spec("particles") is not None
-    if not with_particles:
+    - `steps`: of every scene; each has its own.
+    - `reference`: particles of the filter that says what is true, a tenth of it for look-alikes.
+    - `seed`: of the scenes.
+    - `keys`: a seed of the filters' runs; by default that of scenes.
+    """
+    settings, rows, truths = harness.settings_of(locals()), [], {}
+    if importlib.util.find_spec("particles") is None:
         print("particles is not installed: pip install particles")
-    for name in options.scenes:
+    for name in scenes:
         make, num_steps = SCENES[name]
-        scene = make(options.steps or num_steps, options.seed)
-        reference = max(options.reference // _FEWER.get(name, 1), 2)
-        known = measure.truth(scene, reference, options.seed + 1)
-        truths[name] = {
-            "masses": known.masses.tolist(), "standard_errors": known.errors.tolist(),
-            "log_z": known.log_z, "log_z_error": known.log_z_error,
-        }  # fmt: skip
-        for num_particles in options.particles:
-            rows += _rows(name, scene, known, num_particles, options, with_particles)
-            write_json(
-                options.out / "masses.json", {"settings": settings, "truth": truths, "rows": rows}
-            )
-        sure = f"known to within {known.errors.max():.4f}; log Z {known.log_z:.2f}"
-        print(f"\n{name}: masses {_numbers(known.masses)}, {sure} ± {known.log_z_error:.2f}")
-        of_scene = [row for row in rows if row["scene"] == name]
-        print(table(of_scene))
-        if len(options.filters) > 1:
-            print(f"\nworse than {options.filters[0]} by so many standard errors:")
-            print(table_of_differences(of_scene))
+        scene = make(steps or num_steps, seed)
+        known = truth(scene, max(reference // _FEWER.get(name, 1), 2), seed + 1)
+        truths[name] = known._asdict()
+        own = []
+        for size in particles:
+            made = {each: FILTERS[each](scene, size) for each in filters}
+            for row in measure(scene, known, made, size, seeds, seed if keys is None else keys):
+                own.append({"scene": name, "N": size, **row})
+            harness.data(out / "masses.json", settings=settings, truth=truths, rows=rows + own)
+        rows += own
+        masses = ", ".join(f"{mass:.3f}" for mass in known.masses)
+        sure = f"known to within {known.standard_errors.max():.4f}; log Z {known.log_z:.2f}"
+        print(f"\n{name}: masses {masses}, {sure} ± {known.log_z_error:.2f}")
+        own.sort(key=lambda row: row["N"])
+        print(harness.table(COLUMNS, own))
+        if len(filters) > 1:
+            print(f"\nworse than {filters[0]} by so many standard errors:")
+            print(harness.table(DIFFERENCES, [row for row in own if "lost_worse" in row]))
         # Programs keep memory maps, of which a process has 65 530, and no other scene needs these.
         jax.clear_caches()
-    write_figure(options.out / "masses.png", picture(rows), dpi=130)
-    print(f"written to {options.out}")
+    harness.figures(out, dpi=130, masses=picture(rows))
+    print(f"written to {out}")
 
 
-def _rows(
-    name: str,
-    scene: Scene,
-    known: measure.Known,
-    num_particles: int,
-    options: argparse.Namespace,
-    with_particles: bool,
+class Known(NamedTuple):
+    """What is true, and how surely: errors are zero where a grid or symmetry tells it."""
+
+    masses: np.ndarray
+    standard_errors: np.ndarray
+    log_z: float
+    log_z_error: float
+
+
+class Found(NamedTuple):
+    """What the runs of a filter say: the masses of the regions, and log Ẑ."""
+
+    masses: np.ndarray  # (runs, regions)
+    log_z: np.ndarray  # (runs,)
+
+
+def truth(scene: Scene, num_particles: int, seed: int) -> Known:
+    """The masses and log Z, by the plain filter of so many particles where nothing else does."""
+    exactly, exact_log_z = (None, None) if scene.exact is None else scene.exact
+    if exactly is not None and exact_log_z is not None:
+        return Known(exactly, np.zeros_like(exactly), exact_log_z, 0.0)
+    filter = mpfjax.particle_filter(scene.model, num_particles)
+    rows, logs = [], []
+    for key in jax.random.split(jax.random.key(seed), REFERENCE_RUNS):
+        run = mpfjax.run_filter(key, filter, scene.observations, harness.nothing)
+        rows.append(np.asarray(scene.masses(run.final)))
+        logs.append(float(run.log_marginal_likelihood))
+    # Each run counts by its Ẑ: the masses of all particles together.
+    weights = np.exp(np.array(logs) - max(logs))
+    log_z = float(max(logs) + np.log(weights.mean()))
+    log_z_error = float(weights.std(ddof=1) / weights.mean() / np.sqrt(len(weights)))
+    if exactly is not None:
+        return Known(exactly, np.zeros_like(exactly), log_z, log_z_error)
+    weights /= weights.sum()
+    mean = weights @ np.stack(rows)
+    errors = np.sqrt(np.sum((weights[:, None] * (np.stack(rows) - mean)) ** 2, axis=0))
+    return Known(mean, errors, log_z, log_z_error)
+
+
+def measure(
+    scene: Scene, known: Known, filters: dict[str, mpfjax.Filter], size: int, seeds: int, seed: int
 ) -> list[dict[str, Any]]:
-    keys = options.seed if options.keys is None else options.keys
-    filters = {each: FILTERS[each](scene, num_particles) for each in options.filters}
-    times = measure.milliseconds(scene, filters, keys)
-    found = {
-        each: measure.results(scene, filter, options.seeds, keys)
-        for each, filter in filters.items()
+    """Errors and time of each filter, and how much worse it is than the first one."""
+    observations, key = jnp.asarray(scene.observations), jax.random.key(seed)
+
+    def once(filter: mpfjax.Filter) -> jax.Array:
+        run = mpfjax.run_filter(key, filter, observations, harness.nothing)
+        return run.log_marginal_likelihood
+
+    runs = {name: lambda _, filter=filter: once(filter) for name, filter in filters.items()}
+    times = {
+        name: 1e3 * float(np.median(seconds)) / len(observations)
+        for name, seconds in harness.turns(runs, 5).items()
     }
-    if with_particles and starts_from_noise(scene.model):
+    found = {name: results(scene, filter, seeds, seed) for name, filter in filters.items()}
+    if importlib.util.find_spec("particles") and starts_from_noise(scene.model):
         from benchmarks.masses import through_particles
 
-        found[through_particles.SQMC], times[through_particles.SQMC] = (
-            through_particles.results_and_time(scene, num_particles, options.seeds, keys)
-        )
-    first = options.filters[0]
-    rows: list[dict[str, Any]] = [
-        {"scene": name, "filter": each, "N": num_particles}
-        | measure.summary(of_runs, known, scene.truth) | {"ms": times[each]}
-        for each, of_runs in found.items()
-    ]  # fmt: skip
+        name = "SQMC of particles"
+        found[name], times[name] = through_particles.results_and_time(scene, size, seeds, seed)
+    first = losses(next(iter(found.values())), known, scene.truth)
+    rows = [
+        {"filter": name, **summary(of_runs, known, scene.truth), "ms": times[name]}
+        for name, of_runs in found.items()
+    ]
     for row in rows[1:]:
-        row |= measure.worse(found[row["filter"]], found[first], known, scene.truth)
+        own = losses(found[row["filter"]], known, scene.truth)
+        row |= {f"{what}_worse": harness.worse(own[what], first[what]) for what in own}
     return rows
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """A line for each filter and N."""
-    return format_table(
-        [
-            "filter",
-            "N",
-            "error of masses",
-            "lost",
-            "sd of log Ẑ",
-            "RMSE of log Ẑ",
-            "largest mass",
-            "ms a step",
-        ],
-        [
-            [
-                row["filter"],
-                str(row["N"]),
-                f"{row['mass_rmse']:.3f} ± {row['mass_rmse_error']:.3f}",
-                f"{row['lost']:.2f} ± {row['lost_error']:.2f}",
-                f"{row['log_z_sd']:.3f} ± {row['log_z_sd_error']:.3f}",
-                f"{row['log_z_rmse']:.3f} ± {row['log_z_rmse_error']:.3f}",
-                f"{row['largest_mass']:.2f}",
-                f"{row['ms']:.3f}",
-            ]
-            for row in sorted(rows, key=lambda row: row["N"])
-        ],
-    )
+def results(scene: Scene, filter: mpfjax.Filter, seeds: int, seed: int) -> Found:
+    """Of `seeds` runs of the filter, whose keys are split from that of `seed`."""
+    keys = jax.random.split(jax.random.key(seed), seeds)
+    run = mpfjax.monte_carlo(keys, filter, scene.observations, harness.nothing)
+    masses = jax.vmap(scene.masses)(run.final)
+    return Found(np.asarray(masses), np.asarray(run.log_marginal_likelihood))
 
 
-def table_of_differences(rows: list[dict[str, Any]]) -> str:
-    """A line for each filter but the first, and N."""
-    return format_table(
-        ["filter", "N", "masses", "log Ẑ", "lost"],
-        [
-            [row["filter"], str(row["N"])]
-            + [f"{row[what]:+.1f}" for what in ("masses_worse", "log_z_worse", "lost_worse")]
-            for row in sorted(rows, key=lambda row: row["N"])
-            if "masses_worse" in row
-        ],
-    )
+def losses(found: Found, known: Known, region: int) -> dict[str, np.ndarray]:
+    """Of each run: squared errors of the masses and of log Ẑ, and whether the mode is lost."""
+    return {
+        "masses": np.mean((found.masses - known.masses) ** 2, axis=1),
+        "log_z": (found.log_z - known.log_z) ** 2,
+        "lost": (found.masses[:, region] < LOST).astype(float),
+    }
+
+
+def summary(found: Found, known: Known, region: int) -> dict[str, float]:
+    """Errors of the masses and of log Ẑ, with standard errors.
+
+    `lost` is the share of runs that leave the true `region` less than a hundredth of the mass.
+    """
+    own = losses(found, known, region)
+    rmse, rmse_error = harness.rms_and_error(own["masses"])
+    log_rmse, log_rmse_error = harness.rms_and_error(own["log_z"])
+    lost, runs, deviation = own["lost"].mean(), len(own["lost"]), found.log_z.std(ddof=1)
+    return {
+        "mass_of_truth": float(found.masses[:, region].mean()),
+        "lost": float(lost), "lost_error": float(np.sqrt(lost * (1 - lost) / runs)),
+        "log_z_rmse": log_rmse, "log_z_rmse_error": log_rmse_error,
+        "mass_rmse": rmse, "mass_rmse_error": rmse_error,
+        "largest_mass": float(np.median(found.masses.max(axis=1))),
+        "log_z_sd": float(deviation),
+        "log_z_sd_error": float(deviation / np.sqrt(2 * (runs - 1))),
+        "log_z_mean": float(found.log_z.mean()),
+    }  # fmt: skip
 
 
 def picture(rows: list[dict[str, Any]]) -> Any:
     """For each scene the error of masses, and of log Ẑ beside it, against the time of a step."""
-    panels = []
-    for scene in dict.fromkeys(row["scene"] for row in rows):
-        line = []
-        for what, label in (("mass_rmse", "RMS error of masses"), ("log_z_sd", "sd of log Ẑ")):
-            lines: dict[str, list[tuple[float, float]]] = {}
-            for row in rows:
-                if row["scene"] == scene and row["filter"] not in _IN_THE_TABLE_ONLY:
-                    lines.setdefault(row["filter"], []).append((row["ms"], row[what]))
-            line.append(plotting.CostPanel(scene, "milliseconds a step", label, lines))
-        panels.append(line)
-    return plotting.draw_costs(panels)
 
+    def panel(scene: str, what: str, label: str) -> Any:
+        lines: dict[str, list[tuple[float, float]]] = {}
+        for row in rows:
+            if row["scene"] == scene and row["filter"] not in _IN_THE_TABLE_ONLY:
+                lines.setdefault(row["filter"], []).append((row["ms"], row[what]))
+        return plotting.CostPanel(scene, "milliseconds a step", label, lines)
 
-def _numbers(values: np.ndarray) -> str:
-    return ", ".join(f"{value:.3f}" for value in values)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the benchmark; bad input is one line on the error stream and exit status 2."""
-    return exit_status(lambda: run(parse_arguments(arguments)), arguments)
+    measures = {"mass_rmse": "RMS error of masses", "log_z_sd": "sd of log Ẑ"}
+    scenes = dict.fromkeys(row["scene"] for row in rows)
+    return plotting.draw_costs(
+        [[panel(scene, what, label) for what, label in measures.items()] for scene in scenes]
+    )
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -9,11 +9,17 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 import mpfjax
-from benchmarks.masses import bearings, corridor, jumps, look_alikes, mirror, terrain
+from benchmarks.masses import models
+from benchmarks.scenes import football_scene
 from mpfjax.exact import grid_filter
+from mpfjax.vision.boxes.colour_model import ColourModel
+from mpfjax.vision.colour.bins import RGBColours
+from mpfjax.vision.files.boxes import boxes_of_frame
 
 GRID = jnp.linspace(-5.0, 5.0, 4001)
 JUMP_GRID = jnp.linspace(-30.0, 30.0, 2401)
+# How far from the vehicle a particle may be and still count as near it, in kilometres.
+NEAR = 0.3
 
 
 class Scene(NamedTuple):
@@ -27,16 +33,20 @@ class Scene(NamedTuple):
     - `truth`: the region that the observations come from.
     """
 
-    model: mpfjax.AbstractStateSpaceModel
+    model: Any
     observations: np.ndarray
     region: Callable[[PyTree], Array]
-    num_regions: int
     max_components: int
     grouping: dict[str, Any]
     lookahead: Callable[[PyTree, PyTree], Array]
     exact: tuple[np.ndarray, float | None] | None = None
     features: Callable[[PyTree], Array] | None = None
     truth: int = 0
+    num_regions: int = 2
+
+    def masses(self, mixture: mpfjax.ParticleMixture) -> Array:
+        """The mass of each region."""
+        return mixture.average(jax.nn.one_hot(self.region(mixture.particles), self.num_regions))
 
 
 def flattened(model: Any, moved: Callable[[PyTree], PyTree]) -> Callable[[PyTree, PyTree], Array]:
@@ -44,130 +54,136 @@ def flattened(model: Any, moved: Callable[[PyTree], PyTree]) -> Callable[[PyTree
     return lambda observation, states: 0.5 * model.log_likelihood(observation, moved(states))
 
 
-def make_corridor(num_steps: int, seed: int) -> Scene:
+def by_sign(states: Array) -> Array:
+    """On which side of zero."""
+    return (states > 0).astype(jnp.int32)
+
+
+def itself(states: PyTree) -> PyTree:
+    """The place where a particle is."""
+    return states
+
+
+def of_grid(model: Any, observations: np.ndarray, grid: Array) -> tuple[np.ndarray, float]:
+    """The exact masses of the two sides of zero, and log Z."""
+    found = grid_filter(model, jnp.asarray(observations), grid)
+    above = float(found.mass_above(0.0)[-1])
+    return np.array([1 - above, above]), float(found.log_marginal_likelihood)
+
+
+def corridor(num_steps: int, seed: int) -> Scene:
     """Four doors that look alike: four masses of a quarter."""
-    model = corridor.Corridor()
-    path, observations = corridor.simulate(model, num_steps, seed)
+    model = models.Corridor()
+    path, observations = model.simulated(num_steps, seed)
     return Scene(
-        model, observations,
-        region=lambda states: corridor.section(model, states, path[-1]),
-        num_regions=corridor.NUM_DOORS,
-        max_components=8,
-        grouping={"scale": 1.0},
-        lookahead=flattened(model, lambda states: states + model.speed),
-        exact=(np.full(corridor.NUM_DOORS, 1 / corridor.NUM_DOORS), None),
+        model, observations, lambda states: model.section(states, path[-1]), 8, {"scale": 1.0},
+        flattened(model, lambda states: states + model.speed),
+        exact=(np.full(4, 1 / 4), None), num_regions=4,
     )  # fmt: skip
 
 
-def make_quadratic(num_steps: int, seed: int) -> Scene:
+def quadratic(num_steps: int, seed: int) -> Scene:
     """Section 5.1 of Vermaak et al. (2003), with independent draws of x_0; two masses of a half."""
     rng = np.random.default_rng(seed)
     model = mpfjax.QuadraticModel(initial_draw="independent")
     path = 2 * np.sin(2 * np.pi * np.arange(1, num_steps + 1) / 100)
     observations = (path**2 + 0.1 * rng.normal(size=num_steps)).astype(np.float32)
-    grid = grid_filter(model, jnp.asarray(observations), GRID)
-    above = float(grid.mass_above(0.0)[-1])
+    exact = of_grid(model, observations, GRID)
     return Scene(
-        model, observations,
-        region=lambda states: (states > 0).astype(jnp.int32),
-        num_regions=2,
-        max_components=2,
-        grouping={},
-        lookahead=flattened(model, lambda states: states),
-        exact=(np.array([1 - above, above]), float(grid.log_marginal_likelihood)),
+        model, observations, by_sign, 2, {}, flattened(model, itself), exact=exact,
         truth=int(path[-1] > 0),
     )  # fmt: skip
 
 
-def make_bearings(num_steps: int, seed: int) -> Scene:
+def bearings(num_steps: int, seed: int) -> Scene:
     """A target on either side of two lines of hydrophones."""
-    model = bearings.BearingsModel()
+    model = models.Bearings()
     return Scene(
-        model, bearings.observations(num_steps, seed),
-        region=bearings.is_above,
-        num_regions=2,
-        max_components=4,
-        grouping={"features": bearings.position, "scale": 4.0},
-        lookahead=flattened(model, model.transition_mean),
-        features=bearings.motion_and_turn,
-        truth=1,
+        model, model.simulated(num_steps, seed), lambda states: by_sign(states["motion"][:, 1]), 4,
+        {"features": lambda states: states["motion"][:, :2], "scale": 4.0},
+        flattened(model, model.transition_mean), features=models.motion_and_turn, truth=1,
     )  # fmt: skip
 
 
-def make_mirror(num_steps: int, seed: int) -> Scene:
+def with_marginalised_velocity(scene: Scene) -> Scene:
+    """The bearings with a Kalman filter in every particle, of velocity and push given the rest."""
+    place = lambda states: states.latent[:, :2]  # noqa: E731
+    return scene._replace(
+        model=models.MarginalisedBearings(),
+        region=lambda states: by_sign(states.latent[:, 1]),
+        grouping=scene.grouping | {"features": place},
+    )
+
+
+def mirror(num_steps: int, seed: int) -> Scene:
     """Two halves in four dimensions, each the mirror image of the other."""
-    model = mirror.MirrorModel()
+    model = models.Mirror()
     return Scene(
-        model, mirror.simulate(model, num_steps, seed),
-        region=lambda states: (states[:, 1] > 0).astype(jnp.int32),
-        num_regions=2,
-        max_components=4,
-        grouping={"features": lambda states: states[:, :2], "scale": 1.0},
-        lookahead=flattened(model, model.transition_mean),
-        exact=(np.array([0.5, 0.5]), None),
-        truth=1,
+        model, model.simulated(num_steps, seed), lambda states: by_sign(states[:, 1]), 4,
+        {"features": lambda states: states[:, :2], "scale": 1.0},
+        flattened(model, model.transition_mean), exact=(np.array([0.5, 0.5]), None), truth=1,
     )  # fmt: skip
 
 
-def make_terrain(num_steps: int, seed: int) -> Scene:
+def terrain(num_steps: int, seed: int) -> Scene:
     """A flight over hills: many modes, one of them near the vehicle."""
-    model = terrain.make_landscape(seed + 3)
-    path, observations = terrain.simulate(model, num_steps, seed + 3)
+    model = models.Terrain.drawn(seed + 3)
+    path, observations = model.simulated(num_steps, seed + 3)
     place = jnp.asarray(path[-1])
+
+    def is_near(states: Array) -> Array:
+        return (jnp.sum((states - place[None]) ** 2, axis=1) < NEAR**2).astype(jnp.int32)
+
     return Scene(
-        model, observations,
-        region=lambda states: terrain.is_near(states, place),
-        num_regions=2,
-        max_components=8,
-        grouping={"scale": 1.0},
-        lookahead=flattened(model, lambda states: states + model.velocity[None]),
-        truth=1,
+        model, observations, is_near, 8, {"scale": 1.0},
+        flattened(model, lambda states: states + model.velocity[None]), truth=1,
     )  # fmt: skip
 
 
-def make_jumps(num_steps: int, seed: int) -> Scene:
+def jumps(num_steps: int, seed: int) -> Scene:
     """A target that jumps now and then: two sides, and which of them is settled by and by."""
-    model = jumps.JumpModel()
-    path, observations = jumps.simulate(model, num_steps, seed + 4)
-    grid = grid_filter(model, jnp.asarray(observations), JUMP_GRID)
-    above = float(grid.mass_above(0.0)[-1])
+    model = models.Jumps()
+    path, observations = model.simulated(num_steps, seed + 4)
+    exact = of_grid(model, observations, JUMP_GRID)
     return Scene(
-        model, observations,
-        region=lambda states: (states > 0).astype(jnp.int32),
-        num_regions=2,
-        max_components=4,
-        grouping={"scale": 1.0},
-        lookahead=flattened(model, lambda states: states),
-        exact=(np.array([1 - above, above]), float(grid.log_marginal_likelihood)),
+        model, observations, by_sign, 4, {"scale": 1.0}, flattened(model, itself), exact=exact,
         truth=int(path[-1] > 0),
     )  # fmt: skip
 
 
-def make_look_alikes(num_steps: int, seed: int) -> Scene:
-    """Two players in the same kit."""
-    scene = look_alikes.LookAlikes(num_steps, seed + 1)
-    return Scene(
-        scene.model, scene.observations,
-        region=scene.nearest,
-        num_regions=2,
-        max_components=4,
-        grouping={"features": look_alikes.place, "scale": 20.0},
-        lookahead=flattened(scene.model, lambda states: states),
+def look_alikes(num_steps: int, seed: int) -> Scene:
+    """Two players of one team, seen by a camera: which of the two is it that was pointed at?
+
+    The colour model of section 5.2 knows the colours of their kit and starts on both. It follows
+    one object; which of the two, nothing in the picture says but the small differences of looks.
+    """
+    scene = football_scene(jax.random.key(seed + 1), num_steps + 1, num_players=2, num_opponents=3)
+    first, last = (boxes_of_frame(scene.tracks, frame) for frame in (1, num_steps + 1))
+    deviations = np.array([3.0, 2.0, 0.03, 0.03])
+    model = ColourModel.from_frame(
+        scene.frames[0], np.stack([first[1], first[2]]), colours=RGBColours(8), sigma=0.5,
+        dynamics=mpfjax.RandomWalk(jnp.asarray(deviations, jnp.float32)), deviations=deviations,
+        num_parts=2, share_reference=True,
     )  # fmt: skip
+    boxes = np.stack([last[1], last[2]])
+    centres = jnp.asarray(boxes[:, :2] + boxes[:, 2:] / 2, jnp.float32)
+
+    def nearest(states: PyTree) -> Array:
+        offsets = states.box[:, None, :2] - centres[None]
+        return jnp.argmin(jnp.sum(offsets**2, axis=2), axis=1).astype(jnp.int32)
+
+    place = lambda states: states.box[:, :2]  # noqa: E731
+    grouping = {"features": place, "scale": 20.0}
+    return Scene(model, scene.frames[1:], nearest, 4, grouping, flattened(model, itself))
 
 
 # The scene, and its number of steps.
 SCENES: dict[str, tuple[Callable[[int, int], Scene], int]] = {
-    "corridor": (make_corridor, 80),
-    "quadratic": (make_quadratic, 100),
-    "bearings": (make_bearings, 40),
-    "mirror": (make_mirror, 40),
-    "terrain": (make_terrain, 30),
-    "jumps": (make_jumps, 40),
-    "look-alikes": (make_look_alikes, 30),
+    "corridor": (corridor, 80),
+    "quadratic": (quadratic, 100),
+    "bearings": (bearings, 40),
+    "mirror": (mirror, 40),
+    "terrain": (terrain, 30),
+    "jumps": (jumps, 40),
+    "look-alikes": (look_alikes, 30),
 }
-
-
-def masses(scene: Scene, mixture: mpfjax.ParticleMixture) -> Array:
-    """The mass of each region."""
-    return mixture.average(jax.nn.one_hot(scene.region(mixture.particles), scene.num_regions))

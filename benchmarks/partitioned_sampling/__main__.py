@@ -17,104 +17,152 @@ of --ids is the hidden one. Into --out DIR go partitioned_sampling.json, the fig
 animation of a PS run that fails beside a DPS run that recovers. Objects are counted from 1.
 """
 
-import argparse
-import sys
+import time
+from argparse import ArgumentTypeError
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Annotated, Any
 
-from benchmarks.partitioned_sampling.command import run
-from benchmarks.partitioned_sampling.study import METHODS
-from mpfjax.console import exit_status, fill_in, positive, seed, whole
+from tqdm import tqdm
 
-NUM_SCENES, NUM_RUNS = 8, 50
-LAMBDAS, NUM_PARTICLES = [20.0, 30.0, 40.0, 50.0], 300
-REAL_LAMBDAS, REAL_NUM_PARTICLES = [20.0], 200
-
-
-def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
-    """The arguments, each checked as far as it can be without the frames."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.partitioned_sampling",
-        description="Joint PF, PS, DPS and independent filters (Smith and Gatica-Perez 2004).",
-    )
-    where = parser.add_argument_group("synthetic scenes")
-    where.add_argument(
-        "--scenes", type=whole(), metavar="S", help=f"how many; default: {NUM_SCENES}"
-    )
-    where.add_argument("--scene", type=seed, metavar="K", help="this key alone, kept or not")
-    where.add_argument(
-        "--keys", type=_key_range, metavar="A:B", help="the scenes among the keys A to B"
-    )
-    where.add_argument(
-        "--sensitivity", action="store_true", help="size, speed and momentum; at λ = 20"
-    )
-    real = parser.add_argument_group("real sequences")
-    real.add_argument(
-        "--sequence", type=Path, nargs="+", metavar="DIR", help="folders with img/ and gt.txt"
-    )
-    real.add_argument("--event", type=whole(), metavar="K", help="only the K-th event")
-    real.add_argument(
-        "--ids", type=whole(0), nargs="+", metavar="ID", help="of gt.txt, the hidden one first"
-    )
-    real.add_argument("--frames", metavar="A:B", help="frames A to B, counted from 1, both in")
-    parser.add_argument("--runs", type=whole(), default=NUM_RUNS, help="of each filter and scene")
-    parser.add_argument(
-        "--particles", type=whole(), metavar="N",
-        help=f"default: {NUM_PARTICLES} on synthetic scenes, or {REAL_NUM_PARTICLES}",
-    )  # fmt: skip
-    parser.add_argument(
-        "--lambdas", type=positive, nargs="+", metavar="λ", help="default: 20 30 40 50, or 20"
-    )
-    parser.add_argument(
-        "--methods", nargs="+", choices=list(METHODS), metavar="NAME",
-        help=f"of {', '.join(METHODS)}; default: all",
-    )  # fmt: skip
-    parser.add_argument("--seed", type=seed, default=0, help="of the filters")
-    parser.add_argument("--out", type=Path, default=Path("results/partitioned_sampling"))
-    options = parser.parse_args(arguments)
-    real_frames, chosen = bool(options.sequence), bool(options.ids or options.frames)
-    if not real_frames and chosen:
-        parser.error("--ids, --frames: without --sequence there is nothing to choose")
-    if chosen and len(options.sequence) > 1:
-        parser.error("--ids, --frames: of one --sequence, not of several")
-    picked = [f"--{name}" for name in ("scene", "keys", "sensitivity") if _given(options, name)]
-    if len(picked) > 1:
-        parser.error(f"{picked[0]}: not with {picked[1]}")
-    if options.sensitivity:
-        fill_in(parser, options, False, "with --sensitivity, which is at λ = 20", lambdas=[])
-        fill_in(parser, options, False, "with --sensitivity, which has its own", methods=[])
-    fill_in(parser, options, real_frames and not chosen, "without events of a --sequence", event=0)
-    fill_in(parser, options, not real_frames, "with --sequence", scene=-1, keys=())
-    one_choice = real_frames or options.scene >= 0 or bool(options.keys)
-    fill_in(
-        parser, options, not one_choice, "with --sequence, --scene or --keys", scenes=NUM_SCENES
-    )
-    if real_frames and options.sensitivity:
-        parser.error("--sensitivity: not with --sequence")
-    options.lambdas = options.lambdas or (REAL_LAMBDAS if real_frames else LAMBDAS)
-    options.methods = options.methods or list(METHODS)
-    options.lambdas = list(dict.fromkeys(options.lambdas))
-    options.methods = list(dict.fromkeys(options.methods))
-    if options.particles is None:
-        options.particles = REAL_NUM_PARTICLES if real_frames else NUM_PARTICLES
-    return options
+from benchmarks.harness import Count, Natural, Positive, Seed, command, data, settings_of
+from benchmarks.partitioned_sampling import scenes as scene_files
+from benchmarks.partitioned_sampling.pictures import write_pictures
+from benchmarks.partitioned_sampling.scenes import MOST_TRIED, Event, Scene, find_events
+from benchmarks.partitioned_sampling.sensitivity import CASES, run_sensitivity
+from benchmarks.partitioned_sampling.study import METHODS, filters, num_rows, study
+from benchmarks.partitioned_sampling.tables import (
+    Measured,
+    content_of,
+    measure_row,
+    print_tables,
+)
+from mpfjax.console import seed as read_seed
+from mpfjax.vision.files.frames import parse_range
 
 
-def _given(options: argparse.Namespace, name: str) -> bool:
-    return getattr(options, name) not in (None, False)
-
-
-def _key_range(text: str) -> range:
+def key_range(text: str) -> range:
+    """The keys A to B of A:B."""
     first, colon, last = text.partition(":")
-    low, high = seed(first), seed(last) if colon else -1
+    low, high = read_seed(first), read_seed(last) if colon else -1
     if high < low:
-        raise argparse.ArgumentTypeError(f"{text!r} is not A:B with A no more than B")
+        raise ArgumentTypeError(f"{text!r} is not A:B with A no more than B")
     return range(low, high + 1)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the benchmark; bad input is one line on the error stream and exit status 2."""
-    return exit_status(lambda: run(parse_arguments(arguments)), arguments)
+@command(scenes=1, runs=2, particles=20, lambdas=[20.0], methods=["joint", "ps", "dps"])
+def main(
+    *,
+    scenes: Count = 8,
+    scene: Seed | None = None,
+    keys: Annotated[range, key_range] | None = None,
+    sensitivity: bool = False,
+    sequence: Sequence[Path] = (),
+    event: Count | None = None,
+    ids: Sequence[Natural] = (),
+    frames: str | None = None,
+    runs: Count = 50,
+    particles: Count | None = None,
+    lambdas: Sequence[Positive] = (),
+    methods: Sequence[Annotated[str, (*METHODS,)]] = (*METHODS,),
+    seed: Seed = 0,
+    out: Path = Path("results/partitioned_sampling"),
+) -> None:
+    """All tables; what is there is written after every scene.
+
+    - `scenes`: how many synthetic ones.
+    - `scene`: that of this key alone, kept or not.
+    - `keys`: A:B, the scenes among the keys A to B.
+    - `sensitivity`: size, speed and momentum; at λ = 20.
+    - `sequence`: folders with img/ and gt.txt.
+    - `event`: only so many-th of the sequences.
+    - `ids`: of gt.txt, the hidden one first.
+    - `frames`: A:B, frames A to B, counted from 1, both in.
+    - `runs`: of each filter and scene.
+    - `particles`: 300 on synthetic scenes, or 200.
+    - `lambdas`: 20 30 40 50 on synthetic scenes, or 20.
+    - `seed`: of the filters.
+    """
+    chosen = {"--scene": scene, "--keys": keys, "--sensitivity": sensitivity or None}
+    given = [name for name, value in {**chosen, "--sequence": sequence or None}.items()
+             if value is not None]  # fmt: skip
+    if len(given) > 1:
+        raise ValueError(f"{given[0]}: not with {given[1]}")
+    if (ids or frames) and len(sequence) != 1:
+        raise ValueError("--ids, --frames: of one --sequence")
+    size = particles or (200 if sequence else 300)
+    if sensitivity:
+        run_sensitivity(out, CASES, range(MOST_TRIED), scenes, size, runs, seed)
+        return
+    if sequence:
+        found = _real_scenes(sequence, event, ids, frames)
+    elif scene is not None:
+        found = [(scene, scene_files.synthetic_scene(scene))]
+    else:
+        among, most = (range(MOST_TRIED), scenes) if keys is None else (keys, None)
+        found = scene_files.synthetic_scenes(among, most)
+    lambdas = list(dict.fromkeys(lambdas or ((20.0,) if sequence else (20.0, 30.0, 40.0, 50.0))))
+    settings = settings_of({
+        "orders": "objects in the order in which they move, counted from 1", "runs": runs,
+        "num_particles": size, "seed": seed, "lambdas": lambdas,
+    })  # fmt: skip
+    run(found, settings, list(dict.fromkeys(methods)), not sequence, out)
+
+
+def run(
+    found: Iterable[tuple[Any, Scene | None]], settings: dict[str, Any], methods: list[str],
+    synthetic: bool, out: Path,
+) -> None:  # fmt: skip
+    """Every filter on every scene; those that are None were not kept."""
+    cycles = synthetic and "ps" in methods
+    size, lambdas = settings["num_particles"], settings["lambdas"]
+    scenes: list[Scene] = []
+    measured: list[Measured] = []
+    passed_over: list[Any] = []
+    started = time.perf_counter()
+    for number, (name, scene) in enumerate(found):
+        if scene is None:
+            passed_over.append(name)
+            continue
+        # Numbers that do not fit come to light here, before anything compiles.
+        filters(scene, lambdas[0], size, methods)
+        scenes.append(scene)
+        total = num_rows(scene, lambdas, methods, cycles)
+        made = study(
+            scene, number, lambdas, size, methods, settings["runs"], settings["seed"],
+            cycles=cycles,
+        )  # fmt: skip
+        for row in tqdm(made, desc=scene.name, total=total, unit="row", disable=None):
+            measured.append(measure_row(scene, row, synthetic))
+        settings["seconds"] = round(time.perf_counter() - started, 1)
+        settings["passed_over"] = passed_over
+        content = content_of(scenes, measured)
+        data(out / "partitioned_sampling.json", settings=settings, **content)
+    if not scenes:
+        raise ValueError("--keys: the posterior keeps the scene of none of them")
+    print_tables(content)
+    write_pictures(out, scenes, [row for row, _ in measured], content)
+    if passed_over:
+        print(f"\n{len(passed_over)} keys were passed over: {passed_over}")
+    print(f"{settings['seconds']} s; written to {out}")
+
+
+def _real_scenes(
+    folders: Sequence[Path], event: int | None, ids: Sequence[int], span: str | None
+) -> Iterator[tuple[str, Scene]]:
+    if ids or span:
+        frames = parse_range(span, "--frames")
+        events = [(folders[0], Event(tuple(dict.fromkeys(ids)), frames))]
+    else:
+        events = [(folder, found) for folder in folders for found in find_events(folder)]
+    if event is not None:
+        if event > len(events):
+            raise ValueError(f"--event: {event} of {len(events)}")
+        events = [events[event - 1]]
+    for folder, found in events:
+        scene = scene_files.real_scene(folder, found)
+        yield scene.name, scene
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
+from benchmarks.harness import Z_95, wilson
 from mpfjax.metrics.tracking_quality import (
     precision,
     recall,
@@ -19,7 +20,6 @@ from mpfjax.metrics.tracking_quality import (
 # Recovered is who is tracked in each of the last frames: one alone may be a brush in passing.
 NUM_LAST = 3
 RATES = ("success", "recovery", "precision", "recall")
-_Z = float(stats.norm.ppf(0.975))
 
 
 class Rates(NamedTuple):
@@ -76,21 +76,6 @@ def pool(rates: Sequence[Rates]) -> Rates:
     return Rates(*(np.concatenate(parts) for parts in zip(*rates, strict=True)))
 
 
-def worst_order(rates: Sequence[Rates]) -> int:
-    """Which recovers least, and of several that do, which succeeds least."""
-    return min(
-        range(len(rates)), key=lambda i: (rates[i].recovered.mean(), rates[i].success.mean())
-    )
-
-
-def wilson(share: float, num_trials: int) -> list[float]:
-    """Wilson's 95% interval of a probability, from the share of trials that came true."""
-    middle = share + _Z**2 / (2 * num_trials)
-    reach = _Z * np.sqrt(share * (1 - share) / num_trials + _Z**2 / (4 * num_trials**2))
-    scale = 1 + _Z**2 / num_trials
-    return [float(max((middle - reach) / scale, 0)), float(min((middle + reach) / scale, 1))]
-
-
 def ratio(sums: np.ndarray, counts: np.ndarray) -> tuple[float, list[float]]:
     """Σ s_r / Σ c_r over runs r and its 95% interval; 0, and all of [0, 1], for no counts."""
     num_runs, total = len(counts), counts.sum()
@@ -100,20 +85,8 @@ def ratio(sums: np.ndarray, counts: np.ndarray) -> tuple[float, list[float]]:
     if num_runs == 1:
         return value, [0.0, 1.0]
     spread = ((sums - value * counts) ** 2).sum() * num_runs / (num_runs - 1)
-    reach = _Z * float(np.sqrt(spread)) / float(total)
+    reach = Z_95 * float(np.sqrt(spread)) / float(total)
     return value, [max(value - reach, 0.0), min(value + reach, 1.0)]
-
-
-def mean_with_interval(values: Sequence[float]) -> tuple[float, float, list[float]]:
-    """Mean, standard deviation and Student's 95% interval of the mean, over scenes."""
-    shares, num = np.asarray(values, float), len(values)
-    deviation = float(shares.std(ddof=1))
-    reach = float(stats.t.ppf(0.975, num - 1)) * deviation / num**0.5
-    return (
-        float(shares.mean()),
-        deviation,
-        [float(shares.mean()) - reach, float(shares.mean()) + reach],
-    )
 
 
 def over_scenes(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -126,9 +99,11 @@ def over_scenes(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
         kept = [name + end for name in RATES for end in ("", "_interval")]
         return mean | {name: entries[0][name] for name in kept}
     for name in RATES:
-        value, deviation, (low, high) = mean_with_interval([entry[name] for entry in entries])
+        shares = np.array([entry[name] for entry in entries])
+        value, deviation = float(shares.mean()), float(shares.std(ddof=1))
+        reach = float(stats.t.ppf(0.975, len(shares) - 1)) * deviation / len(shares) ** 0.5
         mean[name], mean[f"{name}_sd"] = value, deviation
-        mean[f"{name}_interval"] = [max(low, 0.0), min(high, 1.0)]
+        mean[f"{name}_interval"] = [max(value - reach, 0.0), min(value + reach, 1.0)]
     return mean
 
 

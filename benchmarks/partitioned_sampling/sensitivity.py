@@ -1,17 +1,17 @@
 """What tables 1 and 2 hang on: the size of objects, the distracter's speed, the momentum."""
 
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tqdm import tqdm
+import numpy as np
+from matplotlib.figure import Figure
 
-from benchmarks.partitioned_sampling.pictures import draw_sensitivity
+from benchmarks import figures as plotting
+from benchmarks import harness
 from benchmarks.partitioned_sampling.rates import Rates, measure, over_scenes, pool
 from benchmarks.partitioned_sampling.scenes import DEFAULT, Scene, Setting, synthetic_scenes
 from benchmarks.partitioned_sampling.study import Row, study
-from mpfjax.console import format_table, write_figure, write_json
 
 LAMBDA = 20.0
 FILTERS = {"joint": "joint PF", "ps": "PS, mean of orders", "dps": "DPS"}
@@ -36,6 +36,14 @@ CASES = [
 ]
 
 
+COLUMNS = {
+    "what": "{axis}", "value": "{value:g}", "filter": "{filter}", "success": "{success:.0%}",
+    "recovery": "{recovery:.0%}", "precision": "{precision:.0%}",
+    "interval of recovery": "[{recovery_interval[0]:.0%}, {recovery_interval[1]:.0%}]",
+    "scenes of keys": "{scenes} of {keys_tried}",
+}  # fmt: skip
+
+
 def run_sensitivity(
     out: Path, cases: Sequence[Case], keys: Sequence[int], num_scenes: int, num_particles: int,
     num_runs: int, seed: int,
@@ -48,44 +56,25 @@ def run_sensitivity(
     entries: list[dict[str, Any]] = []
     done: dict[Setting, list[dict[str, Any]]] = {}
     without: list[dict[str, Any]] = []
-    started = time.perf_counter()
-    for case in tqdm(cases, unit="setting", disable=None):
+    settings = harness.settings_of({
+        "lambda": LAMBDA, "num_particles": num_particles, "runs": num_runs, "seed": seed,
+        "keys": [keys[0], keys[-1]],
+    })  # fmt: skip
+    for (case,) in harness.grid("setting", cases):
         if case.setting not in done:
             done[case.setting] = _run_case(
                 case.setting, keys, num_scenes, num_particles, num_runs, seed
             )
         head = {"axis": case.axis, "value": case.value, "setting": case.setting._asdict()}
         entries += [head | entry for entry in done[case.setting]]
-        if not done[case.setting]:
-            without.append(head)
-        settings = {
-            "lambda": LAMBDA, "num_particles": num_particles, "runs": num_runs, "seed": seed,
-            "keys": [keys[0], keys[-1]], "seconds": round(time.perf_counter() - started, 1),
-        }  # fmt: skip
+        without += [] if done[case.setting] else [head]
         content = {"settings": settings, "entries": entries, "without_scenes": without}
-        write_json(out / "sensitivity.json", content)
-    print(sensitivity_text(entries))
+        harness.data(out / "sensitivity.json", **content)
+    print(harness.table(COLUMNS, entries))
     for head in without:
-        print(
-            f"{head['axis']} {head['value']:g}: no key from {keys[0]} to {keys[-1]} makes a scene"
-        )
-    drawn = [entry for entry in entries if entry["axis"] in CHOSEN]
-    if drawn:
-        write_figure(out / "sensitivity.png", draw_sensitivity(drawn, CHOSEN), dpi=110)
-
-
-def sensitivity_text(entries: Sequence[dict[str, Any]]) -> str:
-    """A line for each case and filter."""
-    rates = ("success", "recovery", "precision")
-    lines = [
-        [entry["axis"], f"{entry['value']:g}", entry["filter"],
-         *[f"{100 * entry[rate]:.0f}" for rate in rates],
-         "[{:.0f}, {:.0f}]".format(*(100 * end for end in entry["recovery_interval"])),
-         f"{entry['scenes']} of {entry['keys_tried']}"]
-        for entry in entries
-    ]  # fmt: skip
-    header = ["what", "value", "filter", *rates, "interval of recovery", "scenes of keys"]
-    return format_table(header, lines)
+        print(f"{head['axis']} {head['value']:g}: no key to {keys[-1]} makes a scene")
+    if drawn := [entry for entry in entries if entry["axis"] in CHOSEN]:
+        harness.figures(out, dpi=110, sensitivity=draw_sensitivity(drawn, CHOSEN))
 
 
 def _run_case(
@@ -94,11 +83,14 @@ def _run_case(
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Success and precision of objects 2 to 7 and recovery of object 1, for each filter."""
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in FILTERS}
-    tried = 0
-    for number, scene in _first_scenes(setting, keys, num_scenes):
+    tried = kept = 0
+    for number, (_, scene) in enumerate(synthetic_scenes(keys, setting=setting)):
+        if kept == num_scenes:
+            break
         tried = number + 1
         if scene is None:
             continue
+        kept += 1
         lean = scene._replace(collector=lambda _, scene=scene: scene.collector(False))
         rows = list(study(lean, number, [LAMBDA], num_particles, list(FILTERS), num_runs, seed))
         for name in FILTERS:
@@ -116,18 +108,47 @@ def _run_case(
     ]
 
 
-def _first_scenes(
-    setting: Setting, keys: Sequence[int], num_scenes: int
-) -> Iterator[tuple[int, Scene | None]]:
-    """The number and scene of each key until there are enough scenes, or no more keys."""
-    kept = 0
-    for number, (_, scene) in enumerate(synthetic_scenes(keys, setting=setting)):
-        kept += scene is not None
-        yield number, scene
-        if kept == num_scenes:
-            return
-
-
 def _pooled(rows: Sequence[Row], scene: Scene, objects: list[int]) -> Rates:
     measured = [measure(row.kept.boxes[:, :, objects], scene.truth[:, objects]) for row in rows]
     return pool(measured)
+
+
+def draw_sensitivity(entries: Sequence[dict[str, Any]], chosen: dict[str, Any]) -> Figure:
+    """Small multiples: a column for each thing that changes, a row for each rate.
+
+    `entries` hold `axis`, `value`, `filter` and the rates with intervals; `chosen` is the value
+    of each axis in the tables, at the dotted line.
+    """
+    axes_names = [name for name in chosen if any(entry["axis"] == name for entry in entries)]
+    panels = [("recovery", "recovery of object 1"), ("precision", "precision of objects 2-7")]
+    figure = Figure(figsize=(3.4 * len(axes_names), 5.4), layout="constrained")
+    axes = figure.subplots(len(panels), len(axes_names), squeeze=False, sharex="col", sharey="row")
+    filters = list(dict.fromkeys(entry["filter"] for entry in entries))
+    for column, axis_name in enumerate(axes_names):
+        for row, (rate, ylabel) in enumerate(panels):
+            axis = axes[row, column]
+            axis.axvline(chosen[axis_name], color="0.6", ls=":", lw=1.2)
+            own = [e for e in entries if e["axis"] == axis_name]
+            places = sorted({entry["value"] for entry in own})
+            step = min(np.diff(places), default=1.0)
+            for index, name in enumerate(filters):
+                points = [e for e in own if e["filter"] == name]
+                points.sort(key=lambda entry: entry["value"])
+                values = np.array([entry[rate] for entry in points])
+                ends = np.array([entry[f"{rate}_interval"] for entry in points]).T
+                shift = 0.06 * step * (index - (len(filters) - 1) / 2)
+                axis.errorbar(
+                    [entry["value"] + shift for entry in points], values,
+                    np.maximum([values - ends[0], ends[1] - values], 0), label=name,
+                    color=plotting.COLOURS[index], marker=plotting.MARKERS[index], ms=5, lw=1.3,
+                    capsize=3,
+                )  # fmt: skip
+            axis.set_xticks(places)
+            axis.grid(alpha=0.25)
+            axis.set_ylim(*((-0.03, 1.03) if rate == "recovery" else (0.5, 1.0)))
+            if column == 0:
+                axis.set_ylabel(ylabel)
+        axes[-1, column].set_xlabel(axis_name)
+    handles, names = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper center", ncols=len(names), fontsize=9)
+    return figure

@@ -1,29 +1,22 @@
-"""What goes into the file: every scene's rows, means over scenes, and what becomes of orders."""
+"""What is written and printed: every scene's rows, means over scenes, what becomes of orders."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
 
-from benchmarks.partitioned_sampling.claims import checks_of
+from benchmarks import harness
 from benchmarks.partitioned_sampling.rates import (
+    RATES,
     Rates,
     least_and_greatest,
     measure,
     over_scenes,
     pool,
-    worst_order,
 )
 from benchmarks.partitioned_sampling.scenes import Scene
 from benchmarks.partitioned_sampling.study import CYCLE, ORDERED, Order, Row
-
-# Of the orders of a scene; "first", "middle" and "last" is where the hard object stands.
-PLACES: dict[str, Callable[[int], int]] = {
-    "first": lambda num_objects: 0,
-    "middle": lambda num_objects: num_objects // 2,
-    "last": lambda num_objects: num_objects - 1,
-}
 
 
 class Measured(NamedTuple):
@@ -55,7 +48,7 @@ def content_of(scenes: Sequence[Scene], measured: Sequence[Measured]) -> dict[st
         summary[table] = [entry for scene in scenes for entry in _over_orders(scene, own)]
         means[table] = _means(tables[table] + summary[table])
     hard = [(row, rates[table]) for row, rates in measured]  # the last table is the hard object's
-    content = {
+    return {
         "scenes": [_scene_entry(scene) for scene in scenes],
         "tables": tables,
         "summary": summary,
@@ -63,7 +56,6 @@ def content_of(scenes: Sequence[Scene], measured: Sequence[Measured]) -> dict[st
         "circular_orders": circular_orders_of([pair for pair in hard if pair[0].method != CYCLE]),
         "other_cycles": cycles_of([pair for pair in hard if pair[0].method == CYCLE]),
     } | impoverishment(scenes, [row for row, _ in measured])
-    return content | {"checks": checks_of(content)}
 
 
 def table_row(row: Row, rates: Rates) -> dict[str, Any]:
@@ -88,22 +80,23 @@ def _scene_entry(scene: Scene) -> dict[str, Any]:
 
 
 def _over_orders(scene: Scene, measured: list[tuple[Row, Rates]]) -> list[dict[str, Any]]:
-    """Of a scene's orders of PS: their mean, the best and the worst, and by the object's place."""
+    """Of a scene's orders of PS: their mean, the worst, and by where the hard object stands.
+
+    The worst recovers least, and of several that do, succeeds least.
+    """
     entries = []
     own = [pair for pair in measured if pair[0].scene == scene.key and pair[0].method in ORDERED]
-    for method in ORDERED:
-        for lambda_ in dict.fromkeys(row.lambda_ for row, _ in own):
-            pairs = [pair for pair in own if (pair[0].lambda_, pair[0].method) == (lambda_, method)]
-            head = {"scene": scene.key, "lambda": lambda_, "method": method}
-            mean = pool([found for _, found in pairs])
-            entries.append(head | {"order": "mean"} | mean.as_dict())
-            row, found = pairs[worst_order([found for _, found in pairs])]
-            worst = [j + 1 for j in row.order or ()]
-            entries.append(head | {"order": "worst", "worst": worst} | found.as_dict())
-            for place, rank in PLACES.items():
-                at = rank(scene.num_objects)
-                found = next(r for row, r in pairs if row.order and row.order[at] == scene.hard)
-                entries.append(head | {"order": place} | found.as_dict())
+    for lambda_ in dict.fromkeys(row.lambda_ for row, _ in own):
+        pairs = [(row, found) for row, found in own if row.lambda_ == lambda_]
+        head = {"scene": scene.key, "lambda": lambda_, "method": pairs[0][0].method}
+        entries.append(head | {"order": "mean"} | pool([found for _, found in pairs]).as_dict())
+        row, found = min(pairs, key=lambda p: (p[1].recovered.mean(), p[1].success.mean()))
+        worst = [j + 1 for j in row.order or ()]
+        entries.append(head | {"order": "worst", "worst": worst} | found.as_dict())
+        ends = {"first": 0, "middle": scene.num_objects // 2, "last": scene.num_objects - 1}
+        for place, at in ends.items():
+            found = next(r for row, r in pairs if row.order and row.order[at] == scene.hard)
+            entries.append(head | {"order": place} | found.as_dict())
     return entries
 
 
@@ -138,17 +131,11 @@ def circular_orders_of(measured: list[tuple[Row, Rates]]) -> list[dict[str, Any]
         shares = np.array(counts) / num_runs
         expected = [least_and_greatest([share.mean()], num_runs, len(share)) for share in shares]
         least, greatest = np.mean(expected, axis=0)
-        entries.append(
-            {
-                "lambda": lambda_,
-                "num_orders": shares.shape[1],
-                "least": float(shares.min(axis=1).mean()),
-                "expected_least": float(least),
-                "greatest": float(shares.max(axis=1).mean()),
-                "expected_greatest": float(greatest),
-                "p": alike(shares, num_runs),
-            }
-        )
+        entries.append({
+            "lambda": lambda_, "num_orders": shares.shape[1], "p": alike(shares, num_runs),
+            "least": shares.min(axis=1).mean(), "expected_least": least,
+            "greatest": shares.max(axis=1).mean(), "expected_greatest": greatest,
+        })  # fmt: skip
     return entries
 
 
@@ -163,17 +150,13 @@ def cycles_of(measured: list[tuple[Row, Rates]]) -> dict[str, Any]:
     least, greatest = least_and_greatest(shares.mean(axis=1).tolist(), num_runs, len(orders))
     named = [[j + 1 for j in order or ()] for order in orders]
     return {
-        "lambda": measured[0][0].lambda_,
-        "num_cycles": len(orders),
-        "runs": num_runs,
-        "mean": float(means.mean()),
-        "best": {"order": named[int(means.argmax())], "recovery": float(means.max())},
-        "worst": {"order": named[int(means.argmin())], "recovery": float(means.min())},
-        "expected_greatest": greatest,
-        "expected_least": least,
+        "lambda": measured[0][0].lambda_, "num_cycles": len(orders), "runs": num_runs,
+        "mean": means.mean(), "expected_greatest": greatest, "expected_least": least,
+        "best": {"order": named[int(means.argmax())], "recovery": means.max()},
+        "worst": {"order": named[int(means.argmin())], "recovery": means.min()},
         "p": alike(shares, num_runs),
-        "recovery": {",".join(map(str, o)): float(m) for o, m in zip(named, means, strict=True)},
-    }
+        "recovery": {",".join(map(str, o)): m for o, m in zip(named, means, strict=True)},
+    }  # fmt: skip
 
 
 def alike(shares: np.ndarray, num_runs: int) -> float:
@@ -224,3 +207,131 @@ def impoverishment(scenes: Sequence[Scene], rows: Sequence[Row]) -> dict[str, An
             for name, values in reach.items()
         },
     }
+
+
+# --- the tables as text, beside the paper's ------------------------------------------------------
+
+# Table 1: success, precision, recall; table 2: recovery, precision, recall; tables 3 and 4:
+# success, recovery, precision, recall, PS by where the hidden object stands in the order.
+PAPER_TABLE_1 = {
+    20: {"joint": (97, 69, 69), "mean": (100, 90, 87), "dps": (100, 91, 86)},
+    30: {"joint": (97, 69, 68), "mean": (100, 91, 87), "dps": (100, 90, 86)},
+    40: {"joint": (93, 68, 68), "mean": (100, 91, 88), "dps": (100, 90, 87)},
+    50: {"joint": (96, 67, 66), "mean": (100, 91, 88), "dps": (100, 90, 87)},
+}
+PAPER_TABLE_2 = {
+    20: {"joint": (2, 27, 28), "mean": (19, 27, 26), "worst": (10, 17, 16), "dps": (42, 41, 36)},
+    30: {"joint": (2, 21, 21), "mean": (18, 24, 24), "worst": (8, 16, 16), "dps": (34, 36, 36)},
+    40: {"joint": (0, 23, 22), "mean": (21, 30, 29), "worst": (16, 18, 17), "dps": (38, 21, 22)},
+    50: {"joint": (2, 24, 23), "mean": (21, 28, 28), "worst": (12, 25, 24), "dps": (36, 23, 23)},
+}
+PAPER_TABLE_3 = (  # RealSeq1, 2 and 3
+    {"joint": (32, 78, 59, 98), "first": (18, 18, 60, 98), "last": (40, 96, 58, 98),
+     "dps": (100, 100, 62, 100)},
+    {"joint": (10, 32, 72, 86), "first": (0, 8, 55, 91), "last": (12, 40, 72, 86),
+     "dps": (78, 88, 58, 98)},
+    {"joint": (4, 8, 41, 70), "first": (70, 72, 51, 86), "last": (26, 28, 46, 77),
+     "dps": (36, 38, 51, 79)},
+)  # fmt: skip
+HEADERS = {
+    "1": "suc pre rcl",
+    "2": "rcv pre rcl",
+    "3": "suc rcv pre rcl, RealSeq1 | 2 | 3",
+}
+
+
+def paper_of(table: str, row: dict[str, Any]) -> str:
+    """What the paper has in the place of a row of means, or a dash."""
+    name = row["method"] if row["order"] is None else row["order"]
+    if table == "3":
+        found = [figures[name] for figures in PAPER_TABLE_3 if name in figures]
+    else:
+        figures = {"1": PAPER_TABLE_1, "2": PAPER_TABLE_2}[table].get(round(row["lambda"]), {})
+        found = [figures[name]] if name in figures else []
+    return " | ".join(" ".join(f"{value:3d}" for value in line) for line in found) or "-"
+
+
+TITLES = {
+    "joint": "joint PF (Non-PS)",
+    "ps": "PS",
+    "dps": "DPS",
+    "dps_evidence": "DPS, evidence",
+    "independent": "independent filters",
+    "clusters": "clusters that merge on contact",
+}
+
+
+def print_tables(content: dict[str, Any]) -> None:
+    """Every table with its intervals and the paper's figures."""
+    num = len(content["scenes"])
+    titles = {
+        "1": "table 1: the easy objects of the synthetic scenes",
+        "2": "table 2: the distracted object of the synthetic scenes",
+        "3": "tables 3 and 4: the hidden object of real sequences",
+    }
+    for name, means in content["means"].items():
+        which = f"means over {num} scenes, ± their deviation" if num > 1 else "one scene"
+        print(f"\n{titles[name]}; per cent, [95% interval], {which}")
+        columns: dict[str, Any] = {"λ": "{lambda:g}", "filter": row_name}
+        columns |= {rate: lambda row, rate=rate: _cell(row, rate) for rate in RATES}
+        columns[f"paper: {HEADERS[name]}"] = lambda row, name=name: paper_of(name, row)
+        print(harness.table(columns | {"runs": "{runs}"}, means))
+        if name != "1":
+            print("recovery in per cent, means over λ:")
+            print(scene_table(content, name))
+    print("\n".join(order_lines(content)))
+    print("\nfigure 4 or 8: U/N in per cent, objects in their own order")
+    for label, shares in content["uniqueness"].items():
+        print(f"  {label:24s}" + " ".join(f"{100 * share:5.1f}" for share in shares))
+
+
+def row_name(row: dict[str, Any]) -> str:
+    """The filter of a row of means."""
+    name = str(TITLES.get(row["method"], row["method"]))
+    ends: dict[Any, str] = {None: "", "mean": ", mean of orders"}
+    ends["worst"] = ", worst order of each scene"
+    return name + ends.get(row["order"], f", hard object {row['order']}")
+
+
+def scene_table(content: dict[str, Any], name: str) -> str:
+    """Each scene's recovery by every filter, the mean over λ."""
+    found: dict[Any, dict[str, list[float]]] = {}
+    for entry in content["tables"][name] + content["summary"][name]:
+        method = "PS mean" if entry["order"] == "mean" else entry["method"]
+        if entry["order"] in (None, "mean"):
+            found.setdefault(entry["scene"], {}).setdefault(method, []).append(entry["recovery"])
+    columns: dict[str, Any] = {
+        "scene": "{scene}", "posterior left": "{left}", "back": "{back}", "exactly": "{exact_back}"
+    }  # fmt: skip
+    for method in next(iter(found.values())):
+        columns[method] = lambda row, method=method: f"{100 * np.mean(row['by'][method]):.0f}"
+    rows = [scene | {"by": found[scene["scene"]]} for scene in content["scenes"]]
+    return harness.table(columns, rows)
+
+
+def order_lines(content: dict[str, Any]) -> list[str]:
+    """What circular orders are, one filter read at different moments, and what others are not."""
+    arrows = lambda order: "→".join(map(str, order))  # noqa: E731
+    lines = [
+        f"λ = {e['lambda']:g}: the worst of a scene's {e['num_orders']} circular orders"
+        f" recovers in {e['least']:.1%}, the best in {e['greatest']:.1%};"
+        f" draws of one binomial: {e['expected_least']:.1%} and"
+        f" {e['expected_greatest']:.1%}; all alike: p = {e['p']:.2f}"
+        for e in content["circular_orders"]
+    ]
+    if cycles := content["other_cycles"]:
+        worst, best = cycles["worst"], cycles["best"]
+        lines.append(
+            f"λ = {cycles['lambda']:g}: {cycles['num_cycles']} other cycles recover in"
+            f" {worst['recovery']:.1%} ({arrows(worst['order'])}) to {best['recovery']:.1%}"
+            f" ({arrows(best['order'])}), mean {cycles['mean']:.1%}; draws of one binomial:"
+            f" {cycles['expected_least']:.1%} to {cycles['expected_greatest']:.1%};"
+            f" all alike: p = {cycles['p']:.2g}"
+        )
+    return lines
+
+
+def _cell(row: dict[str, Any], rate: str) -> str:
+    low, high = (100 * end for end in row[f"{rate}_interval"])
+    spread = f" ±{100 * row[f'{rate}_sd']:2.0f}" if f"{rate}_sd" in row else ""
+    return f"{100 * row[rate]:3.0f} [{low:3.0f},{high:4.0f}]{spread}"

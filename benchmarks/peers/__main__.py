@@ -10,24 +10,31 @@ machine does meets all alike. None is timed before its log-likelihoods and effec
 agree with mpfjax's, and with the exact log-likelihood. Into --out DIR go peers.json and peers.png.
 """
 
-import argparse
 import importlib.util
-import os
-import platform
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import stats
 
-from benchmarks.peers.comparison import drop, time_cell
+from benchmarks import figures as plotting
+from benchmarks.harness import (
+    AtLeast2,
+    Count,
+    Positive,
+    command,
+    data,
+    figures,
+    settings_of,
+    table,
+)  # fmt: skip
 from benchmarks.peers.jobs import JOBS, Job, Quadratic
 from benchmarks.peers.libraries import LIBRARIES, model_of
-from benchmarks.peers.tables import as_tables, draw
 from benchmarks.peers.worker import Worker, stop_all
-from mpfjax.console import exit_status, positive, whole, write_figure, write_json
+from mpfjax.console import whole
 from mpfjax.exact import grid_filter, kalman_filter
 
 RIVALS = {  # and how each is installed
@@ -40,89 +47,77 @@ ON_DEVICES = "mpfjax_devices"
 MOST_PARTICLES = {"quadratic": 1_000_000, "constant_velocity": 10_000}
 GRID = (-4.0, 4.0, 1601)
 START_SECONDS = 120.0
+LEVEL = 1e-5  # of each test: a hundred of them refuse one that is right once in a thousand runs
+ROUNDING = 1e-4  # of float32 against float64, relative
+MOST_SPREAD = 1.0  # nats; log-likelihoods that spread more are not close enough to normal
+SLOW_SECONDS, FEWEST_REPEATS = 20.0, 3
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the comparison; 1 where a library was refused."""
-    options = parse(arguments)
-    refused: list[str] = []
-    return exit_status(lambda: run(options, refused), arguments) or int(bool(refused))
+@command(particles=[64], seeds=10, repeats=2)
+def main(
+    *,
+    particles: Sequence[AtLeast2] = (100, 1000, 10_000, 100_000),
+    jobs: Sequence[Annotated[str, (*JOBS,)]] = (*JOBS,),
+    seeds: Annotated[int, whole(3)] = 20,
+    repeats: Count = 9,
+    skip: Sequence[Annotated[str, (*RIVALS,)]] = (),
+    devices: Count = 1,
+    time_limit: Positive = 600.0,
+    out: Path = Path("results/peers"),
+) -> int:
+    """All cells in turn, each written as it is finished; 1 where a library was refused.
 
-
-def parse(arguments: list[str] | None) -> argparse.Namespace:
-    """The options, or a message that names the one that cannot be run."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.peers")
-    parser.add_argument(
-        "--particles", type=whole(2), nargs="+", default=[100, 1000, 10_000, 100_000], metavar="N"
-    )
-    parser.add_argument("--jobs", nargs="+", choices=list(JOBS), default=list(JOBS))
-    parser.add_argument("--seeds", type=whole(3), default=20, help="runs of each filter, at once")
-    parser.add_argument("--repeats", type=whole(), default=9, help="times that each cell is timed")
-    parser.add_argument("--skip", nargs="+", choices=list(RIVALS), default=[], help="libraries")
-    parser.add_argument(
-        "--devices", type=whole(), default=1, help="mpfjax on so many, beside on one"
-    )
-    parser.add_argument("--time-limit", type=positive, default=600.0, help="seconds, of one run")
-    parser.add_argument("--out", default="results/peers", metavar="DIR")
-    return parser.parse_args(arguments)
-
-
-def run(options: argparse.Namespace, refused: list[str]) -> None:
-    """All cells in turn, each written as it is finished; appends what is refused."""
-    out = Path(options.out)
-    libraries = chosen_libraries(options)
-    content: dict[str, Any] = {"settings": settings_of(options), "libraries": {}, "results": []}
-    for job_name in options.jobs:
-        exact = exact_log_likelihood(JOBS[job_name])
-        workers = {name: start(name, job_name, options.devices) for name in libraries}
+    - `seeds`: runs of each filter, at once.
+    - `repeats`: times that each cell is timed.
+    - `skip`: libraries.
+    - `devices`: mpfjax on so many, beside on one.
+    - `time_limit`: seconds, of one run.
+    """
+    settings = settings_of(locals())
+    results: list[dict[str, Any]] = []
+    found: dict[str, Any] = {}
+    for job in jobs:
+        exact = exact_log_likelihood(JOBS[job])
+        workers = {name: start(name, job, devices) for name in chosen_libraries(skip, devices)}
         try:
             for name, worker in list(workers.items()):
-                found = worker.answer(START_SECONDS)
-                if "error" in found:
-                    drop(workers, name, found["error"])
-                content["libraries"][name] = found
-            for num_particles in sorted(options.particles):
-                if num_particles > MOST_PARTICLES[job_name]:
-                    continue
-                place = {"job": job_name, "particles": num_particles}
-                for entry in time_cell(workers, num_particles, exact, options):
-                    content["results"].append(place | entry)
-                    if entry["refused"]:
-                        refused.append(entry["library"])
-                write_json(out / "peers.json", content)
+                found[name] = worker.answer(START_SECONDS)
+                if "error" in found[name]:
+                    drop(workers, name, found[name]["error"])
+            for size in sorted(particles):
+                if size <= MOST_PARTICLES[job]:
+                    request = {"particles": size, "seeds": seeds}
+                    cell = time_cell(workers, request, exact, repeats, time_limit)
+                    results += [{"job": job, "particles": size} | entry for entry in cell]
+                data(out / "peers.json", settings=settings, libraries=found, results=results)
         finally:
             stop_all(workers.values())
-    labels = labels_of(options.devices)
-    for job_name in options.jobs:
-        print(as_tables(job_name, content["results"], labels), end="\n\n")
-    write_figure(out / "peers.png", draw(content["results"], labels), dpi=150)
+    labels = LIBRARIES | {ON_DEVICES: f"mpfjax, {devices} devices"}
+    for job in jobs:
+        print(as_tables(job, results, labels), end="\n\n")
+    figures(out, peers=draw(results, labels))
     print(f"results and figure: {out}/")
+    return int(any(entry["refused"] for entry in results))
 
 
-def chosen_libraries(options: argparse.Namespace) -> list[str]:
+def chosen_libraries(skip: Sequence[str], num_devices: int) -> list[str]:
     """The names of what runs, mpfjax first; says which rival is not installed."""
-    chosen = ["mpfjax"] + ([ON_DEVICES] if options.devices > 1 else [])
-    for name, command in RIVALS.items():
-        if name in options.skip:
+    chosen = ["mpfjax"] + ([ON_DEVICES] if num_devices > 1 else [])
+    for name, how in RIVALS.items():
+        if name in skip:
             continue
         if importlib.util.find_spec(name) is None:
-            print(f"{name} is not installed and left out: {command}", file=sys.stderr)
+            print(f"{name} is not installed and left out: {how}", file=sys.stderr)
             continue
         chosen += ["particles", "particles_2"] if name == "particles" else [name]
     return chosen
 
 
-def labels_of(num_devices: int) -> dict[str, str]:
-    """What each library is called in tables."""
-    first, *rest = LIBRARIES.items()
-    return dict([first, (ON_DEVICES, f"mpfjax, {num_devices} devices"), *rest])
-
-
-def start(name: str, job_name: str, num_devices: int) -> Worker:
+def start(name: str, job: str, num_devices: int) -> Worker:
     """The process of a library; those of all start side by side."""
     if name == ON_DEVICES:
-        return Worker("mpfjax", job_name, num_devices)
-    return Worker(name, job_name, num_devices=1 if name == "mpfjax" else None)
+        return Worker("mpfjax", job, num_devices)
+    return Worker(name, job, num_devices=1 if name == "mpfjax" else None)
 
 
 def exact_log_likelihood(job: Job) -> float:
@@ -133,21 +128,148 @@ def exact_log_likelihood(job: Job) -> float:
     return float(kalman_filter(model, observations).log_marginal_likelihood)
 
 
-def settings_of(options: argparse.Namespace) -> dict[str, Any]:
-    """What a second run needs to be the same, and the machine."""
-    return {
-        "jobs": options.jobs,
-        "particles": sorted(options.particles),
-        "seeds": options.seeds,
-        "repeats": options.repeats,
-        "devices": options.devices,
-        "jax": jax.__version__,
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-        "machine": platform.machine(),
-        "processors": os.cpu_count(),
-    }
+# --- what is measured: whether a library gives mpfjax's answer, then its times, in turns ---------
+
+
+def drop(workers: dict[str, Worker], name: str, reason: str) -> None:
+    """Go on without a library that failed; not without mpfjax."""
+    workers.pop(name).stop()
+    if name == "mpfjax":
+        raise ValueError(f"mpfjax: {reason}")
+    print(f"{name} failed and is left out from here on: {reason}", file=sys.stderr)
+
+
+def time_cell(
+    workers: dict[str, Worker], request: dict[str, int], exact: float, repeats: int, limit: float
+) -> list[dict[str, Any]]:
+    """One entry for each library: times in seconds, memory in bytes above the imports'.
+
+    The first run of each is checked and counts as its start; then they take turns in random
+    order. One that is slow is timed less often.
+    """
+    order, runs = np.random.default_rng(0), {name: [] for name in workers}
+    reasons: dict[str, str | None] = {}
+    for turn in range(1 + repeats):
+        for name in list(workers) if turn == 0 else order.permutation(list(workers)).tolist():
+            own = [found["seconds"] for found in runs[name][1:]]
+            slow = sum(own) > SLOW_SECONDS and len(own) >= FEWEST_REPEATS
+            if slow or reasons.get(name) is not None:
+                continue
+            found = workers[name].run(limit, **request, seed=turn)
+            if "error" in found:
+                drop(workers, name, found["error"])
+                continue
+            runs[name].append(found)
+            if turn == 0:
+                reasons[name] = disagreement(found, runs["mpfjax"][0], exact)
+                if reasons[name] is not None:
+                    size = request["particles"]
+                    print(f"N = {size}: {name} is not timed: {reasons[name]}", file=sys.stderr)
+    entries: list[dict[str, Any]] = []
+    for name, reason in reasons.items():
+        first, *others = runs[name]
+        seconds = [found["seconds"] for found in others]
+        median = float(np.median(seconds)) if seconds else None
+        base = entries[0]["median"] if entries else median
+        entries.append({
+            "library": name, "refused": reason, "seconds": seconds, "median": median,
+            "ratio": None if median is None or base is None else median / base,
+            "start": None if median is None else max(first["seconds"] - median, 0.0),
+            # What particles' other processes take is not seen from the first.
+            "memory": None if name == "particles_2" else max(r["memory"] for r in runs[name]),
+            "log_likelihood_mean": float(np.mean(first["log_likelihoods"])),
+            "log_likelihood_std": float(np.std(first["log_likelihoods"])),
+            "effective_sample_size": float(np.mean(first["effective_sample_sizes"])),
+        })  # fmt: skip
+    return entries
+
+
+def disagreement(
+    found: Mapping[str, Any], reference: Mapping[str, Any], exact: float
+) -> str | None:
+    """Why these are not results of the same filter, or None.
+
+    Welch's test of log-likelihoods and of effective sample sizes against the reference's. And, as
+    E[Ẑ] = Z, log Ẑ + s²/2 against the exact log Z, where log Ẑ spreads little enough to be close
+    to normal.
+    """
+    for what in ("log_likelihoods", "effective_sample_sizes"):
+        ours, others = np.array(found[what]), np.array(reference[what])
+        if not np.isfinite(ours).all():
+            return f"{what.replace('_', ' ')} that are not finite"
+        gap = abs(ours.mean() - others.mean())
+        if gap <= ROUNDING * max(1.0, abs(others.mean())):
+            continue
+        test: Any = stats.ttest_ind(ours, others, equal_var=False)
+        if test.pvalue < LEVEL:
+            return f"mean {what.replace('_', ' ')} {ours.mean():.6g}, not {others.mean():.6g}"
+    estimates = np.array(found["log_likelihoods"])
+    number, variance = len(estimates), estimates.var(ddof=1)
+    if variance > MOST_SPREAD**2:
+        return None
+    gap = abs(estimates.mean() + variance / 2 - exact)
+    error = np.sqrt(variance / number + variance**2 / (2 * (number - 1)))
+    limit = stats.t.isf(LEVEL / 2, number - 1) * error + ROUNDING * max(1.0, abs(exact))
+    return f"log-likelihood {estimates.mean():.6g}, exactly {exact:.6g}" if gap > limit else None
+
+
+# --- tables and picture -------------------------------------------------------------------------
+
+
+def as_tables(job: str, results: list[dict[str, Any]], labels: Mapping[str, str]) -> str:
+    """Times with their ratios to mpfjax's, and below them starts and memory."""
+    own = [entry for entry in results if entry["job"] == job]
+    entries = {(entry["library"], entry["particles"]): entry for entry in own}
+    sizes = sorted({size for _, size in entries})
+    rows = [
+        {"label": labels[name], "cells": {size: entries.get((name, size), {}) for size in sizes}}
+        for name in dict.fromkeys(name for name, _ in entries)
+    ]
+
+    def one(title: str, form: Any) -> str:
+        columns = {f"N = {n}": lambda row, n=n: form(row["cells"][n]) for n in sizes}
+        return table({title: "{label}"} | columns, rows)
+
+    titles = one("median [ms], ratio", _time), one("start [s], memory [MB]", _start)
+    return "\n\n".join([JOBS[job].title, *titles])
+
+
+def _time(entry: Mapping[str, Any]) -> str:
+    if entry.get("refused"):
+        return "refused"
+    ratio = "" if entry["ratio"] is None else f" {entry['ratio']:6.2f}"
+    return f"{1000 * entry['median']:.4g}{ratio}"
+
+
+def _start(entry: Mapping[str, Any]) -> str:
+    memory = "-" if entry["memory"] is None else f"{entry['memory'] / 1e6:.0f}"
+    return f"{entry['start']:.1f} {memory:>5}"
+
+
+def draw(results: list[dict[str, Any]], labels: Mapping[str, str]) -> Any:
+    """Time against N, a panel for each job and a line for each library; particles' faster mode."""
+    panels = []
+    for job_name in dict.fromkeys(entry["job"] for entry in results):
+        lines: dict[str, dict[float, float]] = {}
+        for entry in results:
+            if entry["job"] != job_name or entry["median"] is None:
+                continue
+            # The two modes have one line.
+            name = entry["library"]
+            label = "particles" if name.startswith("particles") else labels[name]
+            line, size = lines.setdefault(label, {}), entry["particles"]
+            line[size] = min(1000 * entry["median"], line.get(size, np.inf))
+        job = JOBS[job_name]
+        panels.append(
+            plotting.CostPanel(
+                f"{job.title}, {job.num_steps} steps",
+                "number of particles $N$",
+                "time of all runs [ms]",
+                {label: list(line.items()) for label, line in lines.items()},
+            )
+        )
+    return plotting.draw_costs([panels])
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

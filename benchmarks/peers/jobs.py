@@ -1,28 +1,22 @@
-"""The two jobs of `benchmarks.peers` in numbers, the same for every library; numpy only."""
+"""The two jobs of `benchmarks.peers` in numbers, the same for every library; numpy only.
 
-from dataclasses import dataclass
+`initial` and `step` draw from numpy's global generator, which is the one that particles seeds.
+"""
+# ruff: noqa: NPY002
 
 import numpy as np
 
+LOG_2_PI = float(np.log(2 * np.pi))
 
-@dataclass(frozen=True)
+
 class Quadratic:
     """x_t = x_{t-1} + N(0, σ_x²), y_t = x_t² + N(0, σ_y²), x_0 uniform; the true state a sinusoid.
 
     Vermaak et al. (2003), section 5.1. States are scalars.
     """
 
-    title: str = "quadratic model, 1 dimension"
-    num_steps: int = 100
-    sigma_x: float = 0.1
-    sigma_y: float = 0.1
-    low: float = -2.5
-    high: float = 2.5
-
-    @property
-    def state_shape(self) -> tuple[int, ...]:
-        """()."""
-        return ()
+    title, num_steps, state_shape = "quadratic model, 1 dimension", 100, ()
+    sigma_x, sigma_y, low, high = 0.1, 0.1, -2.5, 2.5
 
     @property
     def observations(self) -> np.ndarray:
@@ -31,8 +25,20 @@ class Quadratic:
         noise = np.random.default_rng(0).standard_normal(self.num_steps)
         return (truth**2 + self.sigma_y * noise).astype(np.float32)
 
+    def initial(self, number: int) -> np.ndarray:
+        """x_0."""
+        return np.random.uniform(self.low, self.high, number)
 
-@dataclass(frozen=True)
+    def step(self, states: np.ndarray) -> np.ndarray:
+        """x_t given x_{t-1}."""
+        return states + self.sigma_x * np.random.standard_normal(states.shape)
+
+    def log_likelihood(self, y, states):
+        """log L(y_t | x_t), of arrays of numpy or JAX."""
+        log_scale = float(np.log(self.sigma_y)) + 0.5 * LOG_2_PI
+        return -0.5 * ((y - states**2) / self.sigma_y) ** 2 - log_scale
+
+
 class ConstantVelocity:
     """A point that moves in the plane with a noisy velocity, seen in its position.
 
@@ -40,35 +46,12 @@ class ConstantVelocity:
     N(0, σ_y² I), x_0 ~ N(0, I).
     """
 
-    title: str = "constant velocity, 4 dimensions"
-    num_steps: int = 50
-    sigma_x: float = 0.3
-    sigma_y: float = 1.0
-
-    @property
-    def state_shape(self) -> tuple[int, ...]:
-        """(4,)."""
-        return (4,)
-
-    @property
-    def A(self) -> np.ndarray:
-        """One step at the present velocity."""
-        return np.kron([[1.0, 1.0], [0.0, 1.0]], np.eye(2)).astype(np.float32)
-
-    @property
-    def Q(self) -> np.ndarray:
-        """White-noise acceleration over one step."""
-        return self.sigma_x**2 * np.kron([[1 / 3, 1 / 2], [1 / 2, 1.0]], np.eye(2)).astype("f4")
-
-    @property
-    def H(self) -> np.ndarray:
-        """The position."""
-        return np.eye(2, 4, dtype=np.float32)
-
-    @property
-    def R(self) -> np.ndarray:
-        """σ_y² I."""
-        return self.sigma_y**2 * np.eye(2, dtype=np.float32)
+    title, num_steps, state_shape = "constant velocity, 4 dimensions", 50, (4,)
+    sigma_x, sigma_y = 0.3, 1.0
+    A = np.kron([[1.0, 1.0], [0.0, 1.0]], np.eye(2)).astype(np.float32)
+    Q = sigma_x**2 * np.kron([[1 / 3, 1 / 2], [1 / 2, 1.0]], np.eye(2)).astype("f4")
+    H = np.eye(2, 4, dtype=np.float32)
+    R = sigma_y**2 * np.eye(2, dtype=np.float32)
 
     @property
     def observations(self) -> np.ndarray:
@@ -80,6 +63,20 @@ class ConstantVelocity:
             state = self.A @ state + factor @ rng.standard_normal(4)
             drawn.append(self.H @ state + self.sigma_y * rng.standard_normal(2))
         return np.array(drawn, np.float32)
+
+    def initial(self, number: int) -> np.ndarray:
+        """x_0."""
+        return np.random.standard_normal((number, 4))
+
+    def step(self, states: np.ndarray) -> np.ndarray:
+        """x_t given x_{t-1}."""
+        factor = np.linalg.cholesky(self.Q.astype(float)).T
+        return states @ self.A.T.astype(float) + np.random.standard_normal(states.shape) @ factor
+
+    def log_likelihood(self, y, states):
+        """log L(y_t | x_t), of arrays of numpy or JAX."""
+        log_scale = 2 * float(np.log(self.sigma_y)) + LOG_2_PI
+        return -0.5 * (((y - states[..., :2]) / self.sigma_y) ** 2).sum(-1) - log_scale
 
 
 Job = Quadratic | ConstantVelocity

@@ -89,40 +89,20 @@ def model_of(job: Job) -> Any:
     )
 
 
-class JaxFunctions(NamedTuple):
-    """A job in plain JAX, for the libraries that bring no models.
+def jax_functions(job: Job) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """(key, shape) -> x_0 and (key, x_{t-1}) -> x_t in plain JAX, in as few operations as can be.
 
     Each works on one state and on any number of them: leading axes come before the state's own.
     """
-
-    initial: Callable[[Any, tuple[int, ...]], Any]
-    """key and shape of the states -> x_0."""
-    transition: Callable[[Any, Any], Any]
-    """key and x_{t-1} -> x_t."""
-    log_likelihood: Callable[[Any, Any], Any]
-    """y_t and x_t -> log L(y_t | x_t)."""
-
-
-def jax_functions(job: Job) -> JaxFunctions:
-    """The job's model, in as few operations as there can be."""
     import jax
-    import jax.numpy as jnp
 
-    log_2_pi = float(np.log(2 * np.pi))
     if isinstance(job, Quadratic):
-        log_scale = float(np.log(job.sigma_y)) + 0.5 * log_2_pi
-        return JaxFunctions(
+        return (
             lambda key, shape: jax.random.uniform(key, shape, minval=job.low, maxval=job.high),
             lambda key, x: x + job.sigma_x * jax.random.normal(key, x.shape),
-            lambda y, x: -0.5 * ((y - x**2) / job.sigma_y) ** 2 - log_scale,
         )
     A, factor = job.A.T, np.linalg.cholesky(job.Q).T
-    log_scale = 2 * float(np.log(job.sigma_y)) + log_2_pi
-    return JaxFunctions(
-        jax.random.normal,
-        lambda key, x: x @ A + jax.random.normal(key, x.shape) @ factor,
-        lambda y, x: -0.5 * jnp.sum(((y - x[..., :2]) / job.sigma_y) ** 2, -1) - log_scale,
-    )
+    return jax.random.normal, lambda key, x: x @ A + jax.random.normal(key, x.shape) @ factor
 
 
 def through_blackjax(job: Job, num_particles: int) -> Callable[[Any], tuple[Any, Any, Any]]:
@@ -134,12 +114,12 @@ def through_blackjax(job: Job, num_particles: int) -> Callable[[Any], tuple[Any,
     import jax.numpy as jnp
     from blackjax.smc import base, resampling
 
-    functions = jax_functions(job)
+    initial, transition = jax_functions(job)
     observations = jnp.asarray(job.observations)
 
     def run(key: Any) -> tuple[Any, Any, Any]:
         initial_key, steps_key = jax.random.split(key)
-        states = functions.initial(initial_key, (num_particles, *job.state_shape))
+        states = initial(initial_key, (num_particles, *job.state_shape))
 
         def advance(state: Any, inputs: tuple[Any, Any]) -> tuple[Any, Any]:
             step_key, observation = inputs
@@ -147,8 +127,8 @@ def through_blackjax(job: Job, num_particles: int) -> Callable[[Any], tuple[Any,
             new, info = base.step(
                 step_key,
                 state,
-                update_fn=lambda keys, x, _: (functions.transition(keys[0], x), None),
-                weight_fn=lambda x: functions.log_likelihood(observation, x),
+                update_fn=lambda keys, x, _: (transition(keys[0], x), None),
+                weight_fn=lambda x: job.log_likelihood(observation, x),
                 resample_fn=resampling.systematic,
             )
             size = 1 / jnp.sum(new.weights**2)
@@ -173,21 +153,19 @@ def through_cuthbert(job: Job, num_particles: int) -> Callable[[Any], tuple[Any,
     from cuthbert.smc import particle_filter
     from cuthbertlib.resampling import systematic
 
-    functions = jax_functions(job)
+    initial, transition = jax_functions(job)
     observations = jnp.asarray(job.observations)
     filter = particle_filter.build_filter(
-        init_sample=lambda key: functions.initial(key, job.state_shape),
-        propagate_sample=lambda key, state, model_inputs: functions.transition(key, state),
-        log_potential=lambda state_prev, state, model_inputs: functions.log_likelihood(
-            model_inputs, state
-        ),
+        init_sample=lambda key: initial(key, job.state_shape),
+        propagate_sample=lambda key, state, model_inputs: transition(key, state),
+        log_potential=lambda previous, state, model_inputs: job.log_likelihood(model_inputs, state),
         n_filter_particles=num_particles,
         resampling_fn=systematic.resampling,
     )
 
     def run(key: Any) -> tuple[Any, Any, Any]:
         initial_key, steps_key = jax.random.split(key)
-        initial = filter.init_prepare(key=initial_key)._replace(model_inputs=observations[0])
+        state = filter.init_prepare(key=initial_key)._replace(model_inputs=observations[0])
 
         def advance(state: Any, inputs: tuple[Any, Any]) -> tuple[Any, Any]:
             step_key, observation = inputs
@@ -197,7 +175,7 @@ def through_cuthbert(job: Job, num_particles: int) -> Callable[[Any], tuple[Any,
             return state, (weights @ state.particles, 1 / jnp.sum(weights**2))
 
         keys = jax.random.split(steps_key, job.num_steps)
-        final, (means, sizes) = jax.lax.scan(advance, initial, (keys, observations))
+        final, (means, sizes) = jax.lax.scan(advance, state, (keys, observations))
         return means, sizes, final.log_normalizing_constant
 
     return run

@@ -1,13 +1,11 @@
-"""The jobs of `benchmarks.peers` through particles (Chopin and Papaspiliopoulos), in numpy.
+"""Models through particles (Chopin and Papaspiliopoulos), in numpy.
 
-A Feynman-Kac model of its own for each job, the fast way that its documentation shows beside
-state-space models of distribution objects, and `multiSMC` over the seeds. A module without JAX:
-particles' own processes import it. Draws come from numpy's global generator, which is the one that
-particles seeds.
+A Feynman-Kac model, the fast way that its documentation shows beside state-space models of
+distribution objects, and `multiSMC` over the seeds. A module without JAX: particles' own processes
+import it.
 """
-# The rivals are installed for this benchmark only.
+# The rivals are installed for the benchmarks only.
 # pyright: reportMissingImports=false
-# ruff: noqa: NPY002
 
 from collections.abc import Callable
 from typing import Any
@@ -16,55 +14,33 @@ import numpy as np
 import particles
 from particles import collectors
 
-from benchmarks.peers.jobs import ConstantVelocity, Job, Quadratic
 
-LOG_2_PI = np.log(2 * np.pi)
+class FeynmanKac(particles.FeynmanKac):
+    """The bootstrap filter of a job with `initial`, `step` and `log_likelihood`.
 
+    particles has no x_0 before the first observation: its time 0 is y_1, or with `with_start` x_0
+    and a potential of one, so that its time t is ours.
+    """
 
-class QuadraticFeynmanKac(particles.FeynmanKac):
-    """The bootstrap filter of the quadratic job; particles' time 0 is y_1."""
-
-    def __init__(self, job: Quadratic) -> None:
-        super().__init__(job.num_steps)
-        self.job = job
+    def __init__(self, job: Any, with_start: bool = False) -> None:
+        super().__init__(len(job.observations) + with_start)
+        self.job, self.with_start = job, with_start
         self.observations = job.observations.astype(float)
 
     def M0(self, N: int) -> np.ndarray:
-        """x_1: x_0 and a step."""
-        return self.M(0, np.random.uniform(self.job.low, self.job.high, N))
-
-    def M(self, t: int, xp: np.ndarray) -> np.ndarray:
-        """A step of the random walk."""
-        return xp + self.job.sigma_x * np.random.standard_normal(xp.shape)
-
-    def logG(self, t: int, xp: np.ndarray | None, x: np.ndarray) -> np.ndarray:
-        """log L(y_t | x_t)."""
-        noise = (self.observations[t] - x**2) / self.job.sigma_y
-        return -0.5 * noise**2 - (np.log(self.job.sigma_y) + 0.5 * LOG_2_PI)
-
-
-class ConstantVelocityFeynmanKac(particles.FeynmanKac):
-    """The bootstrap filter of the linear-Gaussian job; particles' time 0 is y_1."""
-
-    def __init__(self, job: ConstantVelocity) -> None:
-        super().__init__(job.num_steps)
-        self.A = job.A.T.astype(float)
-        self.factor = np.linalg.cholesky(job.Q.astype(float)).T
-        self.sigma_y = job.sigma_y
-        self.observations = job.observations.astype(float)
-
-    def M0(self, N: int) -> np.ndarray:
-        """x_1: x_0 and a step."""
-        return self.M(0, np.random.standard_normal((N, 4)))
+        """The first states."""
+        states = self.job.initial(N)
+        return states if self.with_start else self.job.step(states)
 
     def M(self, t: int, xp: np.ndarray) -> np.ndarray:
         """A step of the dynamics."""
-        return xp @ self.A + np.random.standard_normal(xp.shape) @ self.factor
+        return self.job.step(xp)
 
     def logG(self, t: int, xp: np.ndarray | None, x: np.ndarray) -> np.ndarray:
-        """log L(y_t | x_t)."""
-        noise = (self.observations[t] - x[:, :2]) / self.sigma_y
-        return -0.5 * (noise**2).sum(axis=1) - (2 * np.log(self.sigma_y) + LOG_2_PI)
+        """log L of the states, zero for x_0."""
+        if self.with_start and t == 0:
+            return np.zeros(len(x))
+        return self.job.log_likelihood(self.observations[t - self.with_start], x)
 
 
 def weighted_mean(weights: np.ndarray, states: np.ndarray) -> np.ndarray:
@@ -78,22 +54,16 @@ def outputs(filter: Any) -> tuple[np.ndarray, np.ndarray, float]:
     return np.array(summaries.moments), np.array(summaries.ESSs), filter.logLt
 
 
-def prepare(job: Job, num_particles: int, num_seeds: int, num_processes: int) -> Callable[[], Any]:
+def prepare(job: Any, num_particles: int, num_seeds: int, num_processes: int) -> Callable[[], Any]:
     """All seeds of the job, from numpy's global generator."""
-    kind = QuadraticFeynmanKac if isinstance(job, Quadratic) else ConstantVelocityFeynmanKac
-    model = kind(job)  # type: ignore[arg-type]
+    model = FeynmanKac(job)
 
     def run() -> tuple[np.ndarray, ...]:
         runs = particles.multiSMC(
-            fk=model,
-            N=num_particles,
-            nruns=num_seeds,
-            nprocs=num_processes,
-            out_func=outputs,
-            collect=[collectors.Moments(mom_func=weighted_mean)],
-            resampling="systematic",
+            fk=model, N=num_particles, nruns=num_seeds, nprocs=num_processes, out_func=outputs,
+            collect=[collectors.Moments(mom_func=weighted_mean)], resampling="systematic",
             ESSrmin=1.0,
-        )
+        )  # fmt: skip
         means, sizes, log_likelihoods = zip(*(run["output"] for run in runs), strict=True)
         return np.array(means), np.array(sizes), np.array(log_likelihoods)
 

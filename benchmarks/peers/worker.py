@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from benchmarks.peers.jobs import JOBS
 
@@ -43,25 +43,20 @@ class Worker:
         if processes is not None:
             command += ["--processes", *map(str, processes)]
         paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
+        self._process: Any = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
             env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
-        )
+        )  # fmt: skip
 
     def ask(self, **request: Any) -> None:
         """Have it run the job once with these `particles`, `seeds` and `seed`."""
-        try:
-            self._pipe("stdin").write(json.dumps(request) + "\n")
-            self._pipe("stdin").flush()
-        except BrokenPipeError:
-            pass  # what is wrong with it, `answer` finds out
+        with contextlib.suppress(BrokenPipeError):  # what is wrong with it, `answer` finds out
+            self._process.stdin.write(json.dumps(request) + "\n")
+            self._process.stdin.flush()
 
     def answer(self, time_limit: float) -> dict[str, Any]:
         """What it found, or {"error": why it did not}; after an error it has ended."""
-        pipe = self._pipe("stdout")
+        pipe = self._process.stdout
         if not select.select([pipe], [], [], time_limit)[0]:
             self.stop()
             return {"error": f"no answer within {time_limit:g} s"}
@@ -78,7 +73,7 @@ class Worker:
     def dismiss(self) -> None:
         """Tell it that there is no more to do; it may wait for others to be told as well."""
         with contextlib.suppress(BrokenPipeError):
-            self._pipe("stdin").close()
+            self._process.stdin.close()
 
     def stop(self, patience: float = 0.0) -> None:
         """End the process, whatever it is at, if it has not ended on its own by then."""
@@ -88,12 +83,7 @@ class Worker:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._pipe("stdout").close()
-
-    def _pipe(self, name: str) -> IO[str]:
-        pipe = getattr(self._process, name)
-        assert pipe is not None
-        return pipe
+        self._process.stdout.close()
 
 
 def stop_all(workers: Iterable[Worker]) -> None:

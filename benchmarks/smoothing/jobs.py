@@ -1,15 +1,22 @@
-"""What is smoothed, in numpy alone: two models, their observations, and the exact answers.
+"""What is smoothed: two models, their observations, the exact answers, and the filters.
 
 Every method estimates the same number, E[(1/T) Σ_t x_{t-1} x_t | y_1..y_T], which needs pairs of
 neighbouring states. The exact one is that of the Rauch-Tung-Striebel smoother, or of a smoother on
 a grid.
 """
 
+# particles draws from numpy's global generator.
+# ruff: noqa: NPY002
+
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+import mpfjax
+
+LOG_2_PI = np.log(2 * np.pi)
 GRID = np.linspace(-5.0, 5.0, 1001)
 
 
@@ -23,6 +30,11 @@ class Linear:
     q: float = 0.5
     r: float = 0.7
     p: float = 1.0
+
+    @property
+    def of_step(self) -> tuple[float, float]:
+        """The factor and the deviation of a step."""
+        return self.a, self.q
 
     @cached_property
     def observations(self) -> np.ndarray:
@@ -53,6 +65,25 @@ class Linear:
             mean = earlier
         return products / self.num_steps
 
+    def initial(self, number: int) -> np.ndarray:
+        """x_0, for particles."""
+        return self.p * np.random.standard_normal(number)
+
+    def log_likelihood(self, y: float, states: np.ndarray) -> np.ndarray:
+        """log L(y_t | x_t)."""
+        return -0.5 * ((y - states) / self.r) ** 2 - np.log(self.r) - 0.5 * LOG_2_PI
+
+    def model(self, independent: bool = False) -> mpfjax.AbstractStateSpaceModel:
+        """The model of the job; `independent` draws of x_0 are the only ones."""
+        rows = {"A": self.a, "Q": self.q**2, "H": 1.0, "R": self.r**2, "P0": self.p**2}
+        matrices = {name: np.full((1, 1), value, np.float32) for name, value in rows.items()}
+        return mpfjax.LinearGaussianModel(m0=np.zeros(1, np.float32), **matrices)
+
+    @property
+    def seen(self) -> np.ndarray:
+        """y_1..y_T as the model takes them."""
+        return self.observations.astype(np.float32)[:, None]
+
 
 @dataclass(frozen=True)
 class Quadratic:
@@ -63,6 +94,11 @@ class Quadratic:
     sigma_x: float = 0.1
     sigma_y: float = 0.1
     width: float = 2.5
+
+    @property
+    def of_step(self) -> tuple[float, float]:
+        """The factor and the deviation of a step."""
+        return 1.0, self.sigma_x
 
     @cached_property
     def observations(self) -> np.ndarray:
@@ -92,6 +128,47 @@ class Quadratic:
             backward /= backward.sum()
         return products / self.num_steps
 
+    def initial(self, number: int) -> np.ndarray:
+        """x_0, for particles."""
+        return np.random.uniform(-self.width, self.width, number)
+
+    def log_likelihood(self, y: float, states: np.ndarray) -> np.ndarray:
+        """log L(y_t | x_t)."""
+        scale = self.sigma_y
+        return -0.5 * ((y - states**2) / scale) ** 2 - np.log(scale) - 0.5 * LOG_2_PI
+
+    def model(self, independent: bool = False) -> mpfjax.AbstractStateSpaceModel:
+        """The model of the job; with `independent` draws of x_0 or stratified ones."""
+        draw = "independent" if independent else "stratified"
+        return mpfjax.QuadraticModel(self.sigma_x, self.sigma_y, -self.width, self.width, draw)
+
+    @property
+    def seen(self) -> np.ndarray:
+        """y_1..y_T as the model takes them."""
+        return self.observations.astype(np.float32)
+
 
 Job = Linear | Quadratic
 JOBS = {"linear": Linear, "quadratic": Quadratic}
+
+
+def _auxiliary(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:
+    proposal = mpfjax.GaussNewtonProposal(model)
+    plain = mpfjax.mixture_particle_filter(model, num_particles, 2)
+    return mpfjax.with_point_sets(mpfjax.with_lookahead(plain, proposal))
+
+
+def _guided(model: mpfjax.AbstractStateSpaceModel, num_particles: int) -> mpfjax.Filter:
+    proposal = mpfjax.GaussNewtonProposal(model)
+    return mpfjax.mixture_particle_filter(model, num_particles, 2, proposal=proposal, noise="rqmc")
+
+
+FILTERS: dict[str, Callable[[mpfjax.AbstractStateSpaceModel, int], mpfjax.Filter]] = {
+    "PF": mpfjax.particle_filter,
+    "multinomial PF": lambda model, num_particles: mpfjax.particle_filter(
+        model, num_particles, scheme="multinomial"
+    ),
+    "MPF": lambda model, num_particles: mpfjax.mixture_particle_filter(model, num_particles, 2),
+    "guided MPF": _guided,
+    "auxiliary MPF": _auxiliary,
+}

@@ -12,10 +12,8 @@ from matplotlib.figure import Figure
 
 import mpfjax
 from benchmarks import figures as plotting
-from benchmarks.smoothing.filters import make_model, observations_of
 from benchmarks.smoothing.jobs import Quadratic
 from mpfjax import tuning
-from mpfjax.console import format_table
 from mpfjax.exact import grid_filter
 
 NAMES = {"sigma_x": "$\\sigma_x$", "sigma_y": "$\\sigma_y$"}
@@ -34,6 +32,17 @@ class Draws(NamedTuple):
     seconds: float  # with compiling
 
 
+COLUMNS = {
+    "": "{parameter}",
+    "by": "{sampler}",
+    "mean": "{mean:.4f}",
+    "deviation": "{deviation:.4f}",
+    "standard errors off": "{standard_errors_off:+.1f}",
+    "effective samples": "{effective_samples:.0f}",
+    "a second": "{effective_samples_per_second:.1f}",
+}
+
+
 def log_prior(parameters: dict[str, Any]) -> Any:
     """The log density of both, on their own scale."""
     logs = {name: jnp.log(parameters[name]) for name in NAMES}
@@ -49,7 +58,7 @@ def sample_prior(key: Any) -> dict[str, Any]:
 
 def exact(job: Quadratic) -> dict[str, np.ndarray]:
     """The marginal density of each parameter on `AXIS`, by the grid filter."""
-    states, observations = jnp.linspace(*STATES), jnp.asarray(observations_of(job))
+    states, observations = jnp.linspace(*STATES), jnp.asarray(job.seen)
 
     @jax.jit
     def log_joint(pair: Any) -> Any:
@@ -71,11 +80,11 @@ def exact(job: Quadratic) -> dict[str, np.ndarray]:
 
 def measure(job: Quadratic, num_particles: int, num_steps: int, seed: int) -> dict[str, Draws]:
     """Each sampler on the same filter, from the same start."""
-    model: Any = make_model(job, independent=True)
+    model: Any = job.model(independent=True)
     filter = mpfjax.mixture_particle_filter(
         model, num_particles, 2, proposal=mpfjax.GaussNewtonProposal(model)
     )
-    observations = observations_of(job)
+    observations = job.seen
     chosen: dict[str, Any] = {
         "parameters": {
             "sigma_x": lambda filter: filter.model.sigma_x,
@@ -84,31 +93,22 @@ def measure(job: Quadratic, num_particles: int, num_steps: int, seed: int) -> di
         "transforms": {name: tuning.Positive() for name in NAMES},
         "progress": False,
     }
-    burn_in = num_steps // 10
     keys = jax.random.split(jax.random.key(seed), 3)
     found = {}
-
-    def of_chains(name: str, run: Any) -> None:
+    samplers = {"PMMH": tuning.metropolis_hastings, "particle Gibbs": tuning.particle_gibbs}
+    for key, (name, sample) in zip(keys[:2], samplers.items(), strict=True):
         start = time.perf_counter()
-        posterior = run()
+        posterior = sample(
+            key, filter, observations, num_steps=num_steps, num_chains=2, log_prior=log_prior,
+            proposal_deviations=0.2, **chosen,
+        )  # fmt: skip
         seconds = time.perf_counter() - start
-        kept = {each: np.asarray(posterior.parameters[each])[:, burn_in:] for each in NAMES}
+        kept = {
+            each: np.asarray(posterior.parameters[each])[:, num_steps // 10 :] for each in NAMES
+        }
         sizes = [_effective(np.log(values)) for values in kept.values()]
         flat = {each: values.ravel() for each, values in kept.items()}
         found[name] = Draws(flat, np.full(flat["sigma_x"].size, 1.0), min(sizes), seconds)
-
-    chains: dict[str, Any] = {
-        "num_steps": num_steps, "num_chains": 2, "log_prior": log_prior,
-        "proposal_deviations": 0.2,
-    }  # fmt: skip
-    of_chains(
-        "PMMH",
-        lambda: tuning.metropolis_hastings(keys[0], filter, observations, **chains, **chosen),
-    )
-    of_chains(
-        "particle Gibbs",
-        lambda: tuning.particle_gibbs(keys[1], filter, observations, **chains, **chosen),
-    )
     start = time.perf_counter()
     num_samples = max(6 * (num_steps // 10), 12)
     sequential = tuning.smc2(
@@ -150,23 +150,6 @@ def summary(truth: dict[str, np.ndarray], found: dict[str, Draws]) -> list[dict[
                 "effective_samples_per_second": draws.effective_samples / draws.seconds,
             })  # fmt: skip
     return entries
-
-
-def table(entries: list[dict[str, Any]]) -> str:
-    """A row for each parameter and sampler."""
-    rows = []
-    for entry in entries:
-        row = [entry["parameter"], entry["sampler"], f"{entry['mean']:.4f}"]
-        row.append(f"{entry['deviation']:.4f}")
-        if "seconds" in entry:
-            row.append(f"{entry['standard_errors_off']:+.1f}")
-            row.append(f"{entry['effective_samples']:.0f}")
-            row.append(f"{entry['effective_samples_per_second']:.1f}")
-        else:
-            row += ["", "", ""]
-        rows.append(row)
-    header = ["", "by", "mean", "deviation", "standard errors off", "effective samples", "a second"]
-    return format_table(header, rows)
 
 
 def picture(truth: dict[str, np.ndarray], found: dict[str, Draws]) -> Figure:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from benchmarks.masses import mirror
+from benchmarks.masses.models import Mirror
 from mpfjax import PilotLookahead
 from tests.examples import make_mixture
 from tests.user_models import Batched
@@ -55,8 +55,8 @@ def test_where_a_step_is_narrow_three_quarters_of_the_likelihood_are_trusted():
 @pytest.mark.thorough
 def test_it_halves_the_mean_squared_error_of_log_z_on_the_mirror_image():
     """Of 60 runs with keys that nothing was chosen on; the ratio expected is .36."""
-    model = mirror.MirrorModel()
-    observations = mirror.simulate(model, 40, 0)
+    model = Mirror()
+    observations = model.simulated(40, 0)
     keys = jax.random.split(jax.random.key(77), 60)
 
     def spread(filter):

@@ -3,73 +3,75 @@
     python -m benchmarks.hand_written_c
 
 The job is that of `benchmarks.peers` on the quadratic model: systematic resampling at every step,
-20 seeds; mean, effective sample size and log-likelihood come out. The C program (`filter.c`) is
-compiled by GCC for this processor. It is written for this model alone, keeps nothing else, and
-draws by the same Threefry and the same polynomials. Both share the seeds among threads, take turns,
-and are timed once their log-likelihoods agree with each other's and with the exact one.
+20 seeds; mean, effective sample size and log-likelihood come out. The C program (the file beside
+this one) is compiled by GCC for this processor. It is written for this model alone, keeps nothing
+else, and draws by the same Threefry and the same polynomials. Both share the seeds among threads,
+take turns, and are timed once their log-likelihoods agree with each other's and with the exact one.
 
 The parts are differences: a run that draws, one that weighs as well, and the whole filter. Printed
 are nanoseconds of processor time for a particle and step, medians over the turns, and the medians
 of the turns' ratios, of processor time and by the clock. Into --out DIR goes hand_written_c.json.
 """
 
-import argparse
 import ctypes
 import platform
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
-from benchmarks.peers.__main__ import exact_log_likelihood
-from benchmarks.peers.comparison import disagreement
+from benchmarks.harness import AtLeast2, Count, command, data, ratio, settings_of, table
+from benchmarks.peers.__main__ import disagreement, exact_log_likelihood
 from benchmarks.peers.jobs import Quadratic
 from benchmarks.peers.libraries import model_of, through_mpfjax
-from mpfjax.console import exit_status, format_table, whole, write_json
+from mpfjax.console import whole
 from mpfjax.moves import Propagate
 
-SOURCE = Path(__file__).with_name("filter.c")
+SOURCE = Path(__file__).with_suffix(".c")
 FLAGS = ["-O3", "-march=native", "-ffast-math", "-std=gnu11", "-shared", "-fPIC"]
 BLOCK = 64
 DRAW, WEIGH, ALL = 1, 2, 3
-PARTS = ["draw", "weigh", "resample", "all"]
-HEADER = ["N", "", *PARTS, "ratio", "by the clock"]
+COLUMNS = {
+    "N": "{particles}", "": "{who}", "draw": "{draw:.2f}", "weigh": "{weigh:.2f}",
+    "resample": "{resample:.2f}", "all": "{all:.2f}", "ratio": "{ratio:.1f}",
+    "by the clock": "{by_the_clock:.1f}",
+}  # fmt: skip
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Time both, print the table and write it."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.hand_written_c")
-    parser.add_argument(
-        "--particles", type=whole(2), nargs="+", default=[1000, 10_000, 100_000], metavar="N"
-    )
-    parser.add_argument("--seeds", type=whole(3), default=20, help="runs, at once")
-    parser.add_argument("--threads", type=whole(), default=2, help="of the C program")
-    parser.add_argument("--repeats", type=whole(), default=9, help="turns")
-    parser.add_argument("--out", default="results/hand_written_c", metavar="DIR")
-    options = parser.parse_args(arguments)
-    return exit_status(lambda: run(options), arguments)
+@command(particles=[999, 1025], repeats=2)
+def main(
+    *,
+    particles: Sequence[AtLeast2] = (1000, 10_000, 100_000),
+    seeds: Annotated[int, whole(3)] = 20,
+    threads: Count = 2,
+    repeats: Count = 9,
+    out: Path = Path("results/hand_written_c"),
+) -> None:
+    """Time both, print the table and write it.
 
-
-def run(options: argparse.Namespace) -> None:
-    """All numbers of particles in turn."""
-    job, library = Quadratic(), compiled()
-    exact, results = exact_log_likelihood(job), []
-    for num_particles in options.particles:
-        by_hand = HandWritten(library, job, num_particles, options.seeds, options.threads)
-        results.append(compare(by_hand, job, exact, options))
-    rows = [row for result in results for row in as_rows(result)]
-    print(format_table(HEADER, rows))
-    write_json(Path(options.out) / "hand_written_c.json", results)
+    - `seeds`: runs, at once.
+    - `threads`: of the C program.
+    - `repeats`: turns.
+    """
+    settings, job, library = settings_of(locals()), Quadratic(), compiled()
+    exact = exact_log_likelihood(job)
+    results: list[dict[str, Any]] = []
+    for size in particles:
+        by_hand = HandWritten(library, job, size, seeds, threads)
+        seconds = compare(by_hand, job, exact, seeds, repeats)
+        number = size * seeds * job.num_steps
+        results += [{"particles": size, **row} for row in as_rows(seconds, number)]
+    print(table(COLUMNS, results))
+    data(out / "hand_written_c.json", settings=settings, results=results)
 
 
 def compiled() -> Any:
@@ -101,16 +103,12 @@ class HandWritten:
 
     def prepared(self, seed: int) -> list[Given]:
         """What each run is given: keys, shifts of the points of resampling, and room."""
-        random = np.random.default_rng(seed)
-        num_steps = len(self._observations)
+        random, steps = np.random.default_rng(seed), len(self._observations)
         return [
-            (
-                random.integers(0, 2**32, (num_steps + 1, 2), np.uint32),
-                random.random(num_steps, np.float32),
-                arrays,
-            )
+            (random.integers(0, 2**32, (steps + 1, 2), np.uint32),
+             random.random(steps, np.float32), arrays)
             for arrays in self._arrays
-        ]
+        ]  # fmt: skip
 
     def run(self, runs: list[Given], parts: int = ALL) -> np.ndarray:
         """The means, sample sizes and increments of every run, (seeds, t, 3)."""
@@ -136,10 +134,6 @@ def _address(array: np.ndarray) -> ctypes.c_void_p:
 def through_parts(job: Quadratic, num_particles: int) -> dict[int, Callable[[Any], Any]]:
     """Runs of mpfjax over the keys: one that draws, one that weighs as well, and the filter."""
     model, observations = model_of(job), jnp.asarray(job.observations)
-
-    def collect(mixture: mpfjax.ParticleMixture) -> Any:
-        return mixture.mean(), mixture.effective_sample_size
-
     weighing = mpfjax.Filter(model, [Propagate(model)], num_particles)
     unseen = jnp.full_like(observations, jnp.nan)
 
@@ -149,7 +143,7 @@ def through_parts(job: Quadratic, num_particles: int) -> dict[int, Callable[[Any
         return jax.block_until_ready(run.collected)
 
     def weigh(keys: Any) -> Any:
-        run = mpfjax.monte_carlo(keys, weighing, observations, collect)
+        run = mpfjax.monte_carlo(keys, weighing, observations, _moments)
         return jax.block_until_ready(run.collected)
 
     return {DRAW: draw, WEIGH: weigh, ALL: through_mpfjax(job, num_particles)}
@@ -159,15 +153,18 @@ def _sum_of_states(mixture: mpfjax.ParticleMixture) -> Any:
     return jnp.sum(mixture.particles)
 
 
+def _moments(mixture: mpfjax.ParticleMixture) -> Any:
+    return mixture.mean(), mixture.effective_sample_size
+
+
 def compare(
-    by_hand: HandWritten, job: Quadratic, exact: float, options: argparse.Namespace
-) -> dict[str, Any]:
-    """The times of both at one number of particles; raises where their answers differ."""
-    num_particles = by_hand.num_particles
-    ours = through_parts(job, num_particles)
-    keys = [
-        jax.random.split(jax.random.key(seed), options.seeds) for seed in range(options.repeats)
-    ]
+    by_hand: HandWritten, job: Quadratic, exact: float, num_seeds: int, repeats: int
+) -> dict[tuple[str, int], np.ndarray]:
+    """Seconds of both by the processor and by the clock, (turns, 2), of each part; raises where
+    their answers differ.
+    """
+    ours = through_parts(job, by_hand.num_particles)
+    keys = [jax.random.split(jax.random.key(turn), num_seeds) for turn in range(repeats)]
     for part in ours.values():
         part(keys[0])
     _, sizes, log_likelihoods = ours[ALL](keys[0])
@@ -178,15 +175,14 @@ def compare(
         exact,
     )
     if reason is not None:
-        raise ValueError(f"N = {num_particles}: the C program's {reason}")
-    seconds = []
-    for seed, key in enumerate(keys):
-        runs, turn = by_hand.prepared(seed), {}
+        raise ValueError(f"N = {by_hand.num_particles}: the C program's {reason}")
+    taken: dict[tuple[str, int], list[tuple[float, float]]] = {}
+    for turn, key in enumerate(keys):
+        runs = by_hand.prepared(turn)
         for part, one in ours.items():
-            turn[f"mpfjax {part}"] = timed(one, key)
-            turn[f"C {part}"] = timed(by_hand.run, runs, part)
-        seconds.append(turn)
-    return {"particles": num_particles, "steps": job.num_steps * options.seeds, "seconds": seconds}
+            taken.setdefault(("mpfjax", part), []).append(timed(one, key))
+            taken.setdefault(("C", part), []).append(timed(by_hand.run, runs, part))
+    return {name: np.array(seconds) for name, seconds in taken.items()}
 
 
 def timed(run: Callable[..., Any], *arguments: Any) -> tuple[float, float]:
@@ -196,23 +192,28 @@ def timed(run: Callable[..., Any], *arguments: Any) -> tuple[float, float]:
     return time.process_time() - processor, time.perf_counter() - clock
 
 
-def as_rows(result: dict[str, Any]) -> list[list[str]]:
-    """A row for mpfjax, and one for the C program with the ratios."""
-    seconds, size = result["seconds"], result["steps"] * result["particles"]
+def as_rows(seconds: dict[tuple[str, int], np.ndarray], number: int) -> list[dict[str, Any]]:
+    """Nanoseconds of each part for mpfjax and for the C program, which has the ratios as well."""
     rows = []
     for who in ("mpfjax", "C"):
-        upto = [np.median([turn[f"{who} {part}"][0] for turn in seconds]) for part in (1, 2, 3)]
-        parts = [upto[0], upto[1] - upto[0], upto[2] - upto[1], upto[2]]
-        ratios = ["", ""]
-        if who == "C":
-            both = np.array(
-                [[turn[f"{name} {ALL}"] for name in ("mpfjax", "C")] for turn in seconds]
-            )
-            ratios = [f"{ratio:.1f}" for ratio in np.median(both[:, 0] / both[:, 1], axis=0)]
-        nanoseconds = [f"{1e9 * part / size:.2f}" for part in parts]
-        rows.append([str(result["particles"]), who, *nanoseconds, *ratios])
+        draw, weigh, whole = (
+            1e9 * np.median(seconds[who, part][:, 0]) / number for part in (DRAW, WEIGH, ALL)
+        )
+        rows.append(
+            {
+                "who": who,
+                "draw": draw,
+                "weigh": weigh - draw,
+                "resample": whole - weigh,
+                "all": whole,
+            }
+        )
+    ours, theirs = seconds["mpfjax", ALL], seconds["C", ALL]
+    rows[1] |= {
+        "ratio": ratio(ours[:, 0], theirs[:, 0]), "by_the_clock": ratio(ours[:, 1], theirs[:, 1])
+    }  # fmt: skip
     return rows
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

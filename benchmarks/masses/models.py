@@ -1,0 +1,431 @@
+"""The models of the scenes: what moves, and what is seen of it. Each has several modes."""
+
+from statistics import NormalDist
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key, PyTree
+
+import mpfjax
+
+
+class _FromNoise(mpfjax.AbstractStateSpaceModel):
+    """A model whose x_0 is made of standard normal numbers."""
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
+        """x_0."""
+        model: Any = self
+        noise = jax.random.normal(key, (num_particles, model.initial_noise_dimension))
+        return model.initial_from_noise(noise)
+
+
+def _log_normal(errors: Array, deviation: float) -> Array:
+    return -0.5 * (errors / deviation) ** 2 - jnp.log(deviation * jnp.sqrt(2 * jnp.pi))
+
+
+# --- a robot in a corridor with four identical doors ----------------------------------------------
+
+
+class Corridor(mpfjax.AbstractStateSpaceModel):
+    """A corridor that runs round a building, with a door every `spacing` metres.
+
+    The robot moves by `speed` metres a step, with a deviation `slip`, and measures how far the wall
+    is: further in front of a door, by the Gaussian profile of a niche. It starts anywhere. All
+    doors look alike, so the filtering distribution has four modes of exactly the same mass and
+    shape.
+
+    States are positions in metres along the way, not taken modulo the corridor's length, (n,);
+    observations are distances in metres, scalars.
+    """
+
+    num_doors, spacing = 4, 10.0
+    speed, slip = 0.5, 0.5
+    niche_depth, niche_width, sensor_error = 1.0, 1.0, 0.05
+    noise_dimension = initial_noise_dimension = 1
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, " n"]:
+        """x_0, anywhere in the corridor."""
+        return self.num_doors * self.spacing * jax.random.uniform(key, (num_particles,))
+
+    def initial_from_noise(self, noise: Float[Array, "n 1"]) -> Float[Array, " n"]:
+        """The same from standard normal numbers."""
+        return self.num_doors * self.spacing * jax.scipy.special.ndtr(noise[:, 0])
+
+    def transition_from_noise(
+        self, noise: Float[Array, "n 1"], states: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """x_t ~ N(x_{t-1} + speed, slip²)."""
+        return states + self.speed + self.slip * noise[:, 0]
+
+    def log_likelihood(
+        self, observation: Float[Array, ""], states: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """log N(y_t; distance to the wall, sensor_error²), without its constant."""
+        return -0.5 * ((observation - self.distance(states)) / self.sensor_error) ** 2
+
+    def distance(self, states: Float[Array, " n"]) -> Float[Array, " n"]:
+        """How much further the wall is than where there is no door."""
+        offsets = states - self.spacing * jnp.round(states / self.spacing)
+        return self.niche_depth * jnp.exp(-0.5 * (offsets / self.niche_width) ** 2)
+
+    def simulated(self, num_steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """A path (t,) and what is seen along it (t,)."""
+        rng = np.random.default_rng(seed)
+        steps = self.speed + self.slip * rng.normal(size=num_steps)
+        path = self.num_doors * self.spacing * rng.random() + np.cumsum(steps)
+        seen = np.asarray(self.distance(jnp.asarray(path)))
+        observations = seen + self.sensor_error * rng.normal(size=num_steps)
+        return path.astype(np.float32), observations.astype(np.float32)
+
+    def section(self, states: Float[Array, " n"], place: Float[Array, ""]) -> Int[Array, " n"]:
+        """Which of the four modes each particle is in, given where the robot is."""
+        return jnp.round((states - place) / self.spacing).astype(jnp.int32) % self.num_doors
+
+
+# --- a target on a line that jumps now and then ---------------------------------------------------
+
+
+class Jumps(_FromNoise):
+    """A random walk whose steps are long with a small probability, seen through its absolute value.
+
+    Both sides are possible, and the prior tells a little of which is which. A jump may lead to the
+    other side, so that what the first steps said is forgotten by and by. States and observations
+    are scalars, (n,) and ().
+    """
+
+    centre, spread = 1.0, 4.0  # of x_0
+    step, jump, jump_probability = 0.2, 4.0, 0.05
+    sensor_error = 0.2
+    noise_dimension, initial_noise_dimension = 2, 1
+
+    def initial_from_noise(self, noise: Float[Array, "n 1"]) -> Float[Array, " n"]:
+        """x_0 ~ N(centre, spread²)."""
+        return self.centre + self.spread * noise[:, 0]
+
+    def transition_from_noise(
+        self, noise: Float[Array, "n 2"], states: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """A step, long where the second number is among its largest."""
+        is_long = noise[:, 1] > NormalDist().inv_cdf(1 - self.jump_probability)
+        return states + jnp.where(is_long, self.jump, self.step) * noise[:, 0]
+
+    def log_transition(
+        self, states: Float[Array, " n"], previous_states: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """The mixture of both normal densities."""
+        steps = states - previous_states
+        return jnp.logaddexp(
+            jnp.log(1 - self.jump_probability) + _log_normal(steps, self.step),
+            jnp.log(self.jump_probability) + _log_normal(steps, self.jump),
+        )
+
+    def log_initial(self, states: Float[Array, " n"]) -> Float[Array, " n"]:
+        """log N(x_0; centre, spread²)."""
+        return _log_normal(states - self.centre, self.spread)
+
+    def log_likelihood(
+        self, observation: Float[Array, ""], states: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """log N(y_t; |x_t|, sensor_error²)."""
+        return _log_normal(observation - jnp.abs(states), self.sensor_error)
+
+    def simulated(self, num_steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """A path (t,) and the distances that are seen along it (t,)."""
+        rng = np.random.default_rng(seed)
+        is_long = rng.random(num_steps) < self.jump_probability
+        steps = np.where(is_long, self.jump, self.step) * rng.normal(size=num_steps)
+        path = self.centre + self.spread * rng.normal() + np.cumsum(steps)
+        seen = np.abs(path) + self.sensor_error * rng.normal(size=num_steps)
+        return path.astype(np.float32), seen.astype(np.float32)
+
+
+# --- a target whose distances to two posts are measured -------------------------------------------
+
+_START = np.array([5.0, 0.0, 0.0, 0.0], np.float32)
+_SPREAD = np.array([3.0, 3.0, 0.15, 0.15], np.float32)
+
+
+class Mirror(_FromNoise):
+    """Nearly constant velocity in the plane; nothing says on which side of two posts a target is.
+
+    Prior and dynamics are symmetric about the x axis, on which the posts stand. So the filtering
+    distribution has two modes in four dimensions, each the mirror image of the other, with a mass
+    of one half for ever. States are position and velocity, (n, 4); observations two distances.
+    """
+
+    posts = np.array([[0.0, 0.0], [10.0, 0.0]], np.float32)
+    push, sensor_error = 0.1, 0.5  # deviations of the acceleration, and of each distance
+    noise_dimension, initial_noise_dimension = 2, 4
+
+    def initial_from_noise(self, noise: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
+        """Around the point between the posts."""
+        return jnp.asarray(_START)[None] + jnp.asarray(_SPREAD)[None] * noise
+
+    def transition_from_noise(
+        self, noise: Float[Array, "n 2"], states: Float[Array, "n 4"]
+    ) -> Float[Array, "n 4"]:
+        """A step with the accelerations held."""
+        pushed = self.push * noise
+        places = states[:, :2] + states[:, 2:] + 0.5 * pushed
+        return jnp.concatenate([places, states[:, 2:] + pushed], axis=1)
+
+    def transition_mean(self, states: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
+        """A step without a push."""
+        return self.transition_from_noise(jnp.zeros_like(states[:, :2]), states)
+
+    def log_likelihood(
+        self, observation: Float[Array, "2"], states: Float[Array, "n 4"]
+    ) -> Float[Array, " n"]:
+        """Independent Gaussian errors of the two distances, without their constant."""
+        errors = (observation[None] - self.distances(states)) / self.sensor_error
+        return -0.5 * jnp.sum(errors**2, axis=1)
+
+    def distances(self, states: Float[Array, "n 4"]) -> Float[Array, "n 2"]:
+        """From each particle to each post."""
+        offsets = states[:, None, :2] - self.posts[None]
+        return jnp.sqrt(jnp.sum(offsets**2, axis=2))
+
+    def simulated(self, num_steps: int, seed: int) -> np.ndarray:
+        """The distances (t, 2) that are measured of a target on the upper side."""
+        rng = np.random.default_rng(seed)
+        states, seen = jnp.array([[3.0, 5.0, 0.15, -0.05]], jnp.float32), []
+        for _ in range(num_steps):
+            noise = jnp.asarray(rng.normal(size=(1, 2)), jnp.float32)
+            states = self.transition_from_noise(noise, states)
+            seen.append(
+                np.asarray(self.distances(states))[0] + self.sensor_error * rng.normal(size=2)
+            )
+        return np.array(seen, np.float32)
+
+
+# --- a manoeuvring target, seen by hydrophones that cannot tell left from right -------------------
+
+_SENSORS = np.array([[0.0, 0.0], [10.0, 0.0]], np.float32)
+_AXES = np.array([0.0, 0.1], np.float32)
+_TURNS = np.array([0.0, 0.12, -0.12], np.float32)
+_STAYS = 0.9
+# A normal number below the first keeps the mode; those above it, in equal parts, are for each mode.
+_DRAWS_OF_MODE = [NormalDist().inv_cdf(_STAYS + (1 - _STAYS) * i / 3) for i in range(3)]
+_ACCELERATION, _NOISE = 0.1, 0.1
+
+
+def _drawn_mode(noise: Float[Array, " n"], mode: Array) -> Array:
+    """The next mode, made of a standard normal number."""
+    drawn = sum((noise > bound).astype(jnp.int32) for bound in _DRAWS_OF_MODE[1:])
+    return jnp.where(noise < _DRAWS_OF_MODE[0], mode, drawn)
+
+
+def _heard(motion: Float[Array, "n 4"]) -> Float[Array, "2 n"]:
+    """The angles between each axis and the direction to the target, from 0 to pi."""
+    # A row for each array: in short rows nothing would run on vectors.
+    x, y = motion[None, :, 0] - _SENSORS[:, :1], motion[None, :, 1] - _SENSORS[:, 1:]
+    cos, sin = np.cos(_AXES)[:, None], np.sin(_AXES)[:, None]
+    return jnp.arctan2(jnp.abs(cos * y - sin * x), cos * x + sin * y)
+
+
+def _log_of_angles(observation: Float[Array, "2"], motion: Float[Array, "n d"]) -> Array:
+    """Independent Gaussian errors of the two angles."""
+    errors = (observation[:, None] - _heard(motion)) / _NOISE
+    return -0.5 * jnp.sum(errors**2, axis=0) - 2 * jnp.log(_NOISE * jnp.sqrt(2 * jnp.pi))
+
+
+def _moved(
+    motion: Float[Array, "n 4"], mode: Array, pushed: Float[Array, "n 2"]
+) -> Float[Array, "n 4"]:
+    """A step on: the velocity turned by the mode's angle and pushed, the position half-way."""
+    # Chosen by comparing: nothing that is fused with a gather runs on vectors.
+    is_turn = [mode == turn for turn in range(len(_TURNS))]
+    sin, cos = (jnp.select(is_turn, [*values]) for values in (np.sin(_TURNS), np.cos(_TURNS)))
+    x, y, across, along = motion.T
+    new_across = cos * across - sin * along + pushed[:, 0]
+    new_along = sin * across + cos * along + pushed[:, 1]
+    x, y = x + 0.5 * (across + new_across), y + 0.5 * (along + new_along)
+    return jnp.stack([x, y, new_across, new_along], axis=1)
+
+
+class Bearings(_FromNoise):
+    """Position, velocity and the mode of the turn; two angles without a sign are observed.
+
+    Each of two lines of hydrophones hears at which angle to its own axis the target is, and not on
+    which side. The axes are not quite in line, so that the target's mirror image is no exact one:
+    prior and dynamics tell a little of which is which, and the masses of the two are not equal.
+
+    States are a dict of `motion`, (n, 4), and `mode`, (n,), in {straight on, left, right}. The
+    mode stays with probability 0.9 and is otherwise drawn anew. The velocity turns by the mode's
+    angle, and two accelerations are added.
+    """
+
+    noise_dimension, initial_noise_dimension = 3, 4
+
+    def initial_from_noise(self, noise: Float[Array, "n 4"]) -> PyTree:
+        """Around the point between the two arrays, straight on."""
+        return {
+            "motion": _START[None] + _SPREAD[None] * noise,
+            "mode": jnp.zeros(len(noise), jnp.int32),
+        }
+
+    def transition_from_noise(self, noise: Float[Array, "n 3"], states: PyTree) -> PyTree:
+        """Two accelerations and a mode from three standard normal numbers."""
+        mode = _drawn_mode(noise[:, 2], states["mode"])
+        return {
+            "motion": _moved(states["motion"], mode, _ACCELERATION * noise[:, :2]),
+            "mode": mode,
+        }
+
+    def transition_mean(self, states: PyTree) -> PyTree:
+        """The same mode, and no push."""
+        motion = states["motion"]
+        return states | {"motion": _moved(motion, states["mode"], jnp.zeros_like(motion[:, :2]))}
+
+    def log_likelihood(self, observation: Float[Array, "2"], states: PyTree) -> Float[Array, " n"]:
+        """Of two angles."""
+        return _log_of_angles(observation, states["motion"])
+
+    def simulated(self, num_steps: int, seed: int) -> np.ndarray:
+        """What is heard of a target that goes straight on, turns, and goes on."""
+        rng = np.random.default_rng(seed)
+        motion, found = jnp.array([[3.0, 4.0, 0.12, -0.03]], jnp.float32), []
+        for step in range(num_steps):
+            turning = num_steps // 3 <= step < num_steps // 2
+            pushed = jnp.asarray(_ACCELERATION * rng.normal(size=(1, 2)), jnp.float32)
+            motion = _moved(motion, jnp.asarray([2 if turning else 0]), pushed)
+            found.append(np.asarray(_heard(motion))[:, 0] + _NOISE * rng.normal(size=2))
+        return np.array(found, np.float32)
+
+
+def motion_and_turn(states: PyTree) -> Float[Array, "n 5"]:
+    """The motion, and the angle by which the mode turns it: the mode's number says nothing."""
+    turn = jnp.asarray(_TURNS)[states["mode"]]
+    return jnp.concatenate([states["motion"], turn[:, None]], axis=1)
+
+
+class MarginalisedBearings(mpfjax.AbstractConditionallyLinearModel):
+    """`Bearings` in the mixed form: the position moves by the velocity, which has no draws.
+
+    The latent is the position, the mode, and the number that draws the next mode. The rest is the
+    velocity and the next push: it moves position and velocity alike, so that no noise is shared.
+    """
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n 4"]:
+        """Straight on, around the point between the two arrays."""
+        noise = mpfjax.normal(key, (num_particles, 3))
+        position = _START[None, :2] + _SPREAD[None, :2] * noise[:, :2]
+        return jnp.concatenate([position, jnp.zeros_like(noise[:, :1]), noise[:, 2:]], axis=1)
+
+    def initial_moments(self, latent: Float[Array, "n 4"]) -> tuple[Array, Array]:
+        """Of velocity and push."""
+        del latent
+        deviations = jnp.array([*_SPREAD[2:], _ACCELERATION, _ACCELERATION], jnp.float32)
+        return jnp.zeros(4), jnp.diag(deviations**2)
+
+    def latent_dynamics(self, previous_latent: Float[Array, "n 4"]) -> tuple[Array, Array, Array]:
+        """The mean of both velocities is added to the position; the next mode is known."""
+        mode = _drawn_mode(previous_latent[:, 3], previous_latent[:, 2].astype(jnp.int32))
+        moved = [previous_latent[:, :2], mode[:, None].astype(jnp.float32)]
+        offset = jnp.concatenate([*moved, jnp.zeros((len(mode), 1))], axis=1)
+        half = 0.5 * jnp.eye(2)[None]
+        of_velocity = half + 0.5 * _turned(mode)
+        matrix = jnp.concatenate([of_velocity, jnp.broadcast_to(half, of_velocity.shape)], axis=2)
+        return (
+            offset,
+            jnp.pad(matrix, ((0, 0), (0, 2), (0, 0))),
+            jnp.diag(jnp.array([0.0, 0.0, 0.0, 1.0])),
+        )
+
+    def dynamics(
+        self, latent: Float[Array, "n 4"], previous_latent: Float[Array, "n 4"]
+    ) -> tuple[Array, Array, Array]:
+        """The velocity turns and is pushed; the next push is new."""
+        del previous_latent
+        turned = _turned(latent[:, 2].astype(jnp.int32))
+        identity = jnp.broadcast_to(jnp.eye(2), turned.shape)
+        matrix = jnp.pad(jnp.concatenate([turned, identity], axis=2), ((0, 0), (0, 2), (0, 0)))
+        variance = _ACCELERATION**2
+        return matrix, jnp.zeros(4), jnp.diag(jnp.array([0.0, 0.0, variance, variance]))
+
+    def emission(self, latent: Float[Array, "n 4"]) -> None:
+        """The bearings say nothing of the velocity, given the position."""
+        del latent
+
+    def log_likelihood(self, observation: Float[Array, "2"], states: PyTree) -> Float[Array, " n"]:
+        """Of two angles."""
+        return _log_of_angles(observation, states)
+
+
+def _turned(mode: Array) -> Float[Array, "n 2 2"]:
+    cos, sin = (jnp.asarray(f(_TURNS), jnp.float32)[mode] for f in (np.cos, np.sin))
+    return jnp.stack([jnp.stack([cos, -sin], 1), jnp.stack([sin, cos], 1)], 1)
+
+
+# --- a vehicle above a landscape, which knows its speed and its height above ground ---------------
+
+
+class Terrain(mpfjax.AbstractStateSpaceModel):
+    """A flight at known velocity over a landscape of hills, with an altimeter.
+
+    Bergman (1999), Recursive Bayesian Estimation, chapter 7, in small. The height of the ground is
+    a sum of waves of random direction. The start may be anywhere in a square. Every contour line of
+    the first height is a mode, and the later heights leave fewer of them, of uneven masses.
+
+    - `waves`: wave numbers, in radians per kilometre. `amplitudes`, in hundreds of metres;
+      `phases`, in radians.
+    - `velocity`: in kilometres a step.
+
+    States are places in kilometres, (n, 2); observations are heights, scalars.
+    """
+
+    waves: Float[Array, "k 2"]
+    amplitudes: Float[Array, " k"]
+    phases: Float[Array, " k"]
+    velocity: Float[Array, "2"]
+    drift, side, sensor_error = 0.05, 10.0, 0.1  # of a step, of the square, of a height
+    noise_dimension = initial_noise_dimension = 2
+
+    @classmethod
+    def drawn(cls, seed: int) -> "Terrain":
+        """A landscape of 20 waves between one and a half and six kilometres long."""
+        rng = np.random.default_rng(seed)
+        lengths = rng.uniform(1.5, 6.0, size=20)
+        directions = rng.uniform(0, 2 * np.pi, size=20)
+        waves = (2 * np.pi / lengths * np.array([np.cos(directions), np.sin(directions)])).T
+        amplitudes = lengths / np.sqrt(np.sum(lengths**2) / 2)
+        phases = rng.uniform(0, 2 * np.pi, size=20)
+        numbers = (waves, amplitudes, phases, [0.12, 0.05])
+        return cls(*(jnp.asarray(np.asarray(values, np.float32)) for values in numbers))
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, "n 2"]:
+        """x_0, anywhere in the square."""
+        return self.side * jax.random.uniform(key, (num_particles, 2))
+
+    def initial_from_noise(self, noise: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
+        """The same from standard normal numbers."""
+        return self.side * jax.scipy.special.ndtr(noise)
+
+    def transition_from_noise(
+        self, noise: Float[Array, "n 2"], states: Float[Array, "n 2"]
+    ) -> Float[Array, "n 2"]:
+        """x_t ~ N(x_{t-1} + velocity, drift²)."""
+        return states + self.velocity[None] + self.drift * noise
+
+    def log_likelihood(
+        self, observation: Float[Array, ""], states: Float[Array, "n 2"]
+    ) -> Float[Array, " n"]:
+        """log N(y_t; height of the ground, sensor_error²), without its constant."""
+        return -0.5 * ((observation - self.height(states)) / self.sensor_error) ** 2
+
+    def height(self, states: Float[Array, "n 2"]) -> Float[Array, " n"]:
+        """The height of the ground below each place, in hundreds of metres."""
+        angles = states @ self.waves.T + self.phases[None]
+        return jnp.sin(angles) @ self.amplitudes
+
+    def simulated(self, num_steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """A path (t, 2) and the heights that are seen along it (t,)."""
+        rng = np.random.default_rng(seed)
+        steps = np.asarray(self.velocity) + self.drift * rng.normal(size=(num_steps, 2))
+        path = self.side * rng.uniform(0.3, 0.7, size=2) + np.cumsum(steps, axis=0)
+        path = path.astype(np.float32)
+        heights = np.asarray(self.height(jnp.asarray(path)))
+        seen = heights + self.sensor_error * rng.normal(size=num_steps)
+        return path, seen.astype(np.float32)
