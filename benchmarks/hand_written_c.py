@@ -34,7 +34,6 @@ from benchmarks.peers.__main__ import disagreement, exact_log_likelihood
 from benchmarks.peers.jobs import Quadratic
 from benchmarks.peers.libraries import model_of, through_mpfjax
 from mpfjax.console import whole
-from mpfjax.moves import Propagate
 
 SOURCE = Path(__file__).with_suffix(".c")
 FLAGS = ["-O3", "-march=native", "-ffast-math", "-std=gnu11", "-shared", "-fPIC"]
@@ -134,7 +133,7 @@ def _address(array: np.ndarray) -> ctypes.c_void_p:
 def through_parts(job: Quadratic, num_particles: int) -> dict[int, Callable[[Any], Any]]:
     """Runs of mpfjax over the keys: one that draws, one that weighs as well, and the filter."""
     model, observations = model_of(job), jnp.asarray(job.observations)
-    weighing = mpfjax.Filter(model, [Propagate(model)], num_particles)
+    weighing = mpfjax.Filter(model, [mpfjax.Propagate(model)], num_particles)
     unseen = jnp.full_like(observations, jnp.nan)
 
     def draw(keys: Any) -> Any:

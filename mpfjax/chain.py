@@ -1,59 +1,24 @@
-"""What a chain of moves needs beside the moves: checks, results, memory, parents, shared models."""
+"""What a chain of moves needs beside the moves: checks, one move, memory, faults, shared models."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import check_callable, check_whole, is_series, shown
+from mpfjax.checks import check_type, check_whole, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
-from mpfjax.models.inputs import with_inputs
-from mpfjax.moves.base import AbstractMove
-from mpfjax.moves.every import Every, with_inner
+from mpfjax.models.inputs import saying_that_none_were_given, with_inputs
+from mpfjax.moves.base import AbstractMove, Moves, name_of, with_inner, without_dead
+from mpfjax.moves.report import StepInfo
+from mpfjax.observations import Fault, faults_of
 from mpfjax.operations.islands import excess_over_islands, island_index, num_islands
 from mpfjax.operations.logarithms import scaled_log_sum_exp
-from mpfjax.operations.stored import take
 
-Moves = tuple[AbstractMove, ...]
-
-
-class FunctionMove(AbstractMove):
-    """A function `(key, mixture, observation) -> mixture` as a move; what it does is not known."""
-
-    function: Callable[..., ParticleMixture]
-
-    approximate = True
-
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
-    ) -> ParticleMixture:
-        """What the function returns."""
-        return self.function(key, mixture, observation)
-
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """Raise a `ValueError`: a function does not say what it does without an observation."""
-        del key, mixture
-        raise ValueError(f"moves: {self.function!r} does not define predict, for a missing y_t")
-
-
-def as_moves(moves: Any, name: str) -> Moves:
-    """The moves as a tuple; a `ValueError` for other things, or a single move without a list."""
-    if not is_series(moves):
-        raise ValueError(f"{name}: {shown(moves)} is not a list of moves")
-    moves = tuple(moves)
-    for move in moves:
-        check_callable("a move, (key, mixture, observation) -> mixture", **{name: move})
-    return tuple(m if isinstance(m, AbstractMove) else FunctionMove(m) for m in moves)
-
-
-def name_of(move: AbstractMove) -> str:
-    """The name of the move's class, or of the user's function."""
-    function = move.function if isinstance(move, FunctionMove) else move
-    return getattr(function, "__name__", type(function).__name__)
+BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 
 
 # Checks, before anything compiles.
@@ -108,18 +73,12 @@ def _check_parents(moves: Moves) -> None:
         return
     first = next((t for t, move in enumerate(moves) if move.propagates), 0)
     check_keep_parents("moves", moves[first:], "another move")
-    for move in moves:
-        inner = move.moves if isinstance(move, Every) and move.needs_parents else ()
-        if not all(m.needs_parents or m.regroups for m in inner):
-            raise ValueError(
-                "moves: an Every with a move that needs x_(t-1) may only regroup beside it"
-            )
 
 
 def check_keep_parents(argument: str, moves: Iterable[AbstractMove], needed_by: str) -> None:
     """Raise a `ValueError` that names a move after which particles have no single parents."""
     for move in with_inner(moves):
-        if not isinstance(move, Every) and not move.keeps_parents:
+        if not move.inner and not move.keeps_parents:
             raise ValueError(
                 f"{argument}: {name_of(move)} leaves no particle one parent x_(t-1), which"
                 f" {needed_by} needs"
@@ -134,35 +93,40 @@ def moved_by(
     key: Key[Array, ""],
     mixture: ParticleMixture,
     observation: PyTree,
-    moves: Moves,
-) -> ParticleMixture:
-    """The mixture after one move of the chain: by y_t, or by a prediction where that is None."""
-    if observation is None:
-        return check_result(move.predict(key, mixture), mixture, move)
-    after = (lambda moved: forgetting(moves, moved),) if isinstance(move, Every) else ()
-    run = lambda mixture: move(key, mixture, observation, *after)  # noqa: E731
-    if any(other.needs_parents for other in moves):
-        return check_result(_with_parents(run, move.propagates, mixture), mixture, move)
-    return check_result(run(mixture), mixture, move)
+    filter: Any,
+) -> tuple[ParticleMixture, Bool[Array, " m"]]:
+    """The mixture after one move of a filter's chain, and which components that resampled.
+
+    Without an observation the move only predicts. Where initial moves have weighed x_0, it is not
+    resampled before y_1 has weighed its particles too: that would undo a choice by y_1.
+    """
+    moves, none = filter.moves, jnp.zeros(mixture.num_components, bool)
+    with saying_that_none_were_given(filter.model):
+        if observation is None:
+            return check_result(move.predict(key, mixture), mixture, move), none
+        if move.propagates and mixture.parents is None and any(m.needs_parents for m in moves):
+            mixture = mixture.replace(parents=mixture.particles)
+        resampled = move.would_resample(mixture, observation)
+        after = (lambda moved: forgetting(moves, moved),) if move.inner else ()
+        moved = check_result(move(key, mixture, observation, *after), mixture, move)
+    if move.propagates:
+        return moved.replace(in_order=False), resampled
+    if not (move.resamples and filter.looks_at_first):
+        return moved, resampled
+    waits, before = mixture.log_scale != 0, mixture.replace(in_order=moved.in_order)
+    # Not by a condition, which would copy all that goes through it at every step.
+    keep = lambda new, old: new if new is old else jnp.where(waits, old, new)  # noqa: E731
+    return jax.tree.map(keep, moved, before), resampled & ~waits
 
 
-def _with_parents(
-    run: Callable[[ParticleMixture], Any], propagates: bool, mixture: ParticleMixture
-) -> Any:
-    """What the move returns, with x_{t-1} of the particles in their new slots."""
-    before = mixture.parents
-    if before is None:
-        if not propagates:
-            return run(mixture)
-        before = mixture.particles
-    # The slots that this move alone takes the particles from.
-    own = jnp.arange(mixture.num_particles, dtype=jnp.int32)
-    moved = run(mixture.replace(ancestor_indices=own))
-    places = moved.ancestor_indices
-    return moved.replace(
-        parents=jax.tree.map(lambda leaf: take(leaf, places), before),
-        ancestor_indices=take(mixture.ancestor_indices, places),
-    )
+def check_mixture(mixture: Any, num_components: int) -> None:
+    """Raise a `ValueError` for anything but a mixture that a filter of this M can go on from."""
+    check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
+    if mixture.num_components != num_components:
+        raise ValueError(
+            f"mixture: its num_components, {mixture.num_components}, is not the filter's,"
+            f" {num_components}"
+        )
 
 
 def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> ParticleMixture:
@@ -170,21 +134,17 @@ def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> Pa
     who = f"moves: {name_of(move)} returned"
     if not isinstance(moved, ParticleMixture):
         raise ValueError(f"{who} {shown(moved)}, no ParticleMixture")
-    names = ("particles", "log_weights", "component_indicators")
-    for name, new, old in ((n, getattr(moved, n), getattr(mixture, n)) for n in names):
-        structures = jax.tree.structure(new), jax.tree.structure(old)
-        if structures[0] != structures[1]:
-            raise ValueError(
-                f"{who} {name} of another structure, {structures[0]}, than it was given,"
-                f" {structures[1]}"
-            )
-        for own, given in zip(jax.tree.leaves(new), jax.tree.leaves(old), strict=True):
-            own_kind, kind = (
-                f"{jnp.result_type(leaf)}{list(jnp.shape(leaf))}" for leaf in (own, given)
-            )
-            if own_kind != kind:
-                raise ValueError(f"{who} {name} of {own_kind}, and was given {kind}")
+    for name in ("particles", "log_weights", "component_indicators"):
+        own, given = (_kinds(getattr(each, name)) for each in (moved, mixture))
+        if own != given:
+            raise ValueError(f"{who} {name} of {own}, and was given {given}")
     return moved
+
+
+def _kinds(tree: PyTree) -> str:
+    leaves, structure = jax.tree.flatten(tree)
+    kinds = [f"{jnp.result_type(leaf)}{list(jnp.shape(leaf))}" for leaf in leaves]
+    return f"{', '.join(kinds)} in {structure}"
 
 
 def normalised(
@@ -212,10 +172,7 @@ def forgetting(moves: Moves, mixture: ParticleMixture) -> ParticleMixture:
     """The mixture without any memory of components that have died."""
     if not mixture.memory:
         return mixture
-    memory, dead = mixture.memory, ~mixture.active
-    for move in moves:
-        memory = move.forget(memory, dead)
-    return mixture.replace(memory=memory)
+    return mixture.replace(memory=without_dead(moves, mixture.memory, ~mixture.active))
 
 
 def own_ancestors(mixture: ParticleMixture) -> ParticleMixture:
@@ -224,6 +181,38 @@ def own_ancestors(mixture: ParticleMixture) -> ParticleMixture:
     if num_islands() > 1:
         own += mixture.num_particles * island_index()
     return mixture.replace(ancestor_indices=own)
+
+
+# Programs, which return the faults that they met.
+
+
+def step_and_faults(
+    filter: Any,
+    key: Key[Array, "*keys"],
+    mixture: ParticleMixture,
+    observation: PyTree,
+    inputs: PyTree = None,
+) -> tuple[ParticleMixture, StepInfo, tuple[Fault, ...]]:
+    """A step inside a compiled program, and what `raise_faults` needs when that has ended.
+
+    `key` may hold the keys of the moves.
+    """
+    faults = faults_of(filter.model, observation, inputs)
+    moved, info = filter.with_inputs(inputs)._step(key, mixture, observation)
+    broken = Fault(~(info.log_likelihood_increment < jnp.inf), BROKEN_DENSITY)
+    return moved, info, (*faults, broken)
+
+
+def start_and_faults(
+    filter: Any,
+    keys: Key[Array, " keys"],
+    observation: PyTree,
+    inputs: PyTree,
+    particles: PyTree,
+) -> tuple[ParticleMixture, tuple[Fault, ...]]:
+    """The same for the mixture of x_0, of these particles."""
+    faults = faults_of(filter.model, observation, inputs)
+    return filter.with_inputs(inputs)._init(keys, observation, particles), faults
 
 
 # Models inside moves: a filter's own is stored once, and all of them are given their inputs.

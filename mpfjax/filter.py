@@ -1,66 +1,53 @@
 """A filter: a chain of moves on a particle mixture, one step at a time."""
 
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Int, Key, PyTree
+from jaxtyping import Array, Key, PyTree
 
 from mpfjax.chain import (
-    as_moves,
     check_chain,
+    check_mixture,
     forgetting,
     give_inputs,
     moved_by,
     normalised,
     own_ancestors,
+    start_and_faults,
+    step_and_faults,
     tie,
     untie,
 )
-from mpfjax.checks import check_key, check_one_of, check_type
+from mpfjax.checks import check_key, check_one_of
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, require_model
 from mpfjax.models.inputs import saying_that_none_were_given
 from mpfjax.models.noise import NOISES
-from mpfjax.moves.base import AbstractMove
-from mpfjax.moves.initial import sample_initial, waiting_for_choice
+from mpfjax.moves.base import AbstractMove, as_moves, initial_memory
+from mpfjax.moves.initial import sample_initial
 from mpfjax.moves.report import StepInfo, step_info
-from mpfjax.observations import Fault, faults_of, one_input, one_observation, raise_faults
-from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
+from mpfjax.observations import one_input, one_observation, raise_faults
+from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.islands import drawn_once
-from mpfjax.operations.random import split_keys
-
-BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
-
-
-class Start(NamedTuple):
-    """The start of a run: its key, and x_0 where that was drawn before."""
-
-    key: Key[Array, "*seeds"]
-    particles: PyTree = None
-    """one for each slot; the slots after the first `num_particles` are empty."""
-    num_particles: Int[Array, "*seeds"] | None = None
-    mixture: ParticleMixture | None = None
-    """the whole mixture of x_0."""
+from mpfjax.operations.random import split, split_keys
 
 
 class Filter(eqx.Module):
     """A particle filter: a chain of moves on a particle mixture.
 
-    One step applies the moves in order and normalises. The increment of the marginal likelihood is
-    the growth of the total mass, whatever the moves are.
+    One step applies the moves in order and normalises. The growth of the total mass is the
+    increment of the marginal likelihood, whatever the moves are.
 
     - `model`: draws x_0. Moves that hold the very same model share it. The filter is then a pytree
       with one copy of the model's parameters, and a gradient with respect to them is complete.
     - `moves`: callables `(key, mixture, observation) -> mixture`, usually `AbstractMove`s.
     - `num_particles`: N.
-    - `num_components`: M, the most components; the filters of the literature call it
-      `max_components`.
+    - `num_components`: M, the most components; recipes call it `max_components`.
     - `initial_moves`: moves of x_0, which are given y_1 where it is known: regrouping, such as
       `KMeans(reseed=True)`, and `SelectInitial`. What they weigh is part of the first increment.
-    - `initial_noise`: the noise of x_0 where the model has `initial_from_noise`: "independent", as
-      the model's own `sample_initial` draws it, or "rqmc"; see `Propagate`.
+    - `initial_noise`: of x_0, where the model has `initial_from_noise`: that of `Propagate`.
 
     Raises `ValueError` for N < 1, M < 1, N < M, no moves, moves that never use an observation, or
     fewer slots than `particles_per_component` asks for.
@@ -83,15 +70,13 @@ class Filter(eqx.Module):
         initial_noise: str = "independent",
     ) -> None:
         require_model(model, "Filter")
+        check_one_of(NOISES, initial_noise=initial_noise)
         moves = as_moves(moves, "moves")
-        initial_moves = as_moves(initial_moves, "initial_moves")
         check_chain(moves, num_particles, num_components)
         self.model = model
         self._moves = tie(moves, model)
-        self._initial_moves = tie(initial_moves, model)
-        self.num_particles = int(num_particles)
-        self.num_components = int(num_components)
-        check_one_of(NOISES, initial_noise=initial_noise)
+        self._initial_moves = tie(as_moves(initial_moves, "initial_moves"), model)
+        self.num_particles, self.num_components = int(num_particles), int(num_components)
         self.initial_noise = initial_noise
 
     @property
@@ -111,15 +96,11 @@ class Filter(eqx.Module):
 
     def replace(self, **changes: Any) -> "Filter":
         """The filter with other arguments; moves that share its model share the new one."""
-        model = changes.get("model", self.model)
-        own = {
-            "model": model,
-            "moves": untie(self._moves, model),
-            "num_particles": self.num_particles,
-            "num_components": self.num_components,
-            "initial_moves": untie(self._initial_moves, model),
-            "initial_noise": self.initial_noise,
-        }
+        kept = ("num_particles", "num_components", "initial_noise")
+        own = {name: getattr(self, name) for name in kept}
+        own["model"] = model = changes.get("model", self.model)
+        own["moves"] = untie(self._moves, model)
+        own["initial_moves"] = untie(self._initial_moves, model)
         return Filter(**own | changes)
 
     def init(
@@ -134,32 +115,26 @@ class Filter(eqx.Module):
         if observation is not None:
             observation = one_observation(observation)
         inputs = one_input(inputs, self.model)
-        start = Start(key, drawn_once(key, self._sample_initial))
-        mixture, faults = with_floats_traced(
-            lambda filter: _from_particles(filter, start, observation, inputs), self
-        )
-        return raise_faults(mixture, faults)
+        keys = split(key, 1 + len(self._initial_moves))
+        # Not in one program with the moves, on which the last digits of the draws would depend.
+        particles = drawn_once(keys[0], self._sample_initial)
+        return raise_faults(*_start(self, keys, observation, inputs, particles))
 
-    def _sample_initial(self, key: Key[Array, "*num"]) -> PyTree:
-        key_initial = split_keys(key, 1 + len(self._initial_moves))[0]
-        with saying_that_none_were_given(self.model):
-            return sample_initial(key_initial, self.model, self.num_particles, self.initial_noise)
+    def _sample_initial(self, key: Key[Array, ""]) -> PyTree:
+        return sample_initial(key, self.model, self.num_particles, self.initial_noise)
 
-    def _init(self, start: Start, observation: PyTree = None) -> ParticleMixture:
-        if start.mixture is not None:
-            return start.mixture
-        keys = split_keys(start.key, 1 + len(self._initial_moves))
-        particles = start.particles
+    def _init(
+        self, key: Key[Array, "*keys"], observation: PyTree = None, particles: PyTree = None
+    ) -> ParticleMixture:
+        """x_0 within a program, of these particles if they are there."""
+        key_drawn, *keys = split_keys(key, 1 + len(self._initial_moves))
         if particles is None:
             draw = self._sample_initial
-            particles = drawn_once(start.key, draw) if self._initial_moves else draw(start.key)
-        memory = {}
-        for move in self.moves:
-            memory |= move.initial_memory(self.num_components)
-        mixture = single_component(particles, self.num_components, start.num_particles)
-        mixture = mixture.replace(memory=memory)
-        for move_key, move in zip(keys[1:], self.initial_moves, strict=True):
-            with saying_that_none_were_given(self.model):
+            particles = drawn_once(key_drawn, draw) if keys else draw(key_drawn)
+        mixture = single_component(particles, self.num_components)
+        mixture = mixture.replace(memory=initial_memory(self.moves, self.num_components))
+        with saying_that_none_were_given(self.model):
+            for move_key, move in zip(keys, self.initial_moves, strict=True):
                 mixture = move(move_key, mixture, observation)
         if self.looks_at_first:
             mixture, log_mass = normalised(mixture, mixture)
@@ -209,63 +184,28 @@ class Filter(eqx.Module):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree, inputs: PyTree
     ) -> tuple[ParticleMixture, StepInfo]:
         check_key(key)
-        check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
-        if mixture.num_components != self.num_components:
-            raise ValueError(
-                f"mixture: its num_components, {mixture.num_components}, is not the filter's,"
-                f" {self.num_components}"
-            )
+        check_mixture(mixture, self.num_components)
         inputs = one_input(inputs, self.model)
-        *moved, faults = with_floats_traced(
-            lambda filter: _step_and_faults(filter, key, mixture, observation, inputs), self
-        )
+        *moved, faults = _one_step(self, key, mixture, observation, inputs)
         return raise_faults(tuple(moved), faults)
 
     def _step(
         self, key: Key[Array, "*keys"], mixture: ParticleMixture, observation: PyTree = None
     ) -> tuple[ParticleMixture, StepInfo]:
         """A step within a program; without an observation it only predicts."""
-        moves = waiting_for_choice(self.moves, self.initial_moves)
         mixture = own_ancestors(mixture)
         resampled = jnp.zeros(self.num_components, bool)
         increment = jnp.zeros((), mixture.log_weights.dtype)
-        for move_key, move in zip(split_keys(key, len(moves)), moves, strict=True):
-            with saying_that_none_were_given(self.model):
-                if observation is not None:
-                    resampled |= move.would_resample(mixture, observation)
-                moved = moved_by(move, move_key, mixture, observation, moves)
+        for move_key, move in zip(split_keys(key, len(self._moves)), self.moves, strict=True):
+            moved, redrawn = moved_by(move, move_key, mixture, observation, self)
             if observation is not None and not move.keeps_mass:
                 moved, log_growth = normalised(moved, mixture)
                 increment += log_growth
-            in_order = move.sorts or (moved.in_order and not move.propagates)
-            mixture = forgetting(moves, moved)
-            mixture = mixture.replace(in_order=in_order and observation is not None)
+            resampled |= redrawn
+            mixture = forgetting(self.moves, moved)
         mixture = mixture.replace(parents=None, in_order=False)
         return mixture, step_info(mixture, increment, resampled)
 
 
-def step_and_faults(
-    filter: Filter,
-    key: Key[Array, "*keys"],
-    mixture: ParticleMixture,
-    observation: PyTree,
-    inputs: PyTree = None,
-) -> tuple[ParticleMixture, StepInfo, tuple[Fault, ...]]:
-    """A step inside a compiled program, and what `raise_faults` needs when that has ended.
-
-    `key` may hold the keys of the moves.
-    """
-    faults = faults_of(filter.model, observation, inputs)
-    moved, info = filter.with_inputs(inputs)._step(key, mixture, observation)
-    broken = Fault(~(info.log_likelihood_increment < jnp.inf), BROKEN_DENSITY)
-    return moved, info, (*faults, broken)
-
-
-_step_and_faults = jit_on_wide_vectors(step_and_faults)
-
-
-@jit_on_wide_vectors
-def _from_particles(filter, start, observation, inputs):
-    # Not with the draws of x_0, whose last digits depend on the program that they are part of.
-    faults = faults_of(filter.model, observation, inputs)
-    return filter.with_inputs(inputs)._init(start, observation), faults
+_one_step = jit_with_floats_traced(step_and_faults)
+_start = jit_with_floats_traced(start_and_faults)

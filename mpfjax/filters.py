@@ -5,27 +5,24 @@ from typing import Any
 
 from jaxtyping import Array, PyTree
 
-from mpfjax.chain import as_moves
 from mpfjax.checks import check_one_of, check_type, check_whole
 from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead
 from mpfjax.models.base import AbstractStateSpaceModel, mapped
-from mpfjax.models.conditionally_linear import is_marginalised
+from mpfjax.models.conditionally_linear import is_marginalised, refuse_marginalised
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
 from mpfjax.models.noise import NOISES
-from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.base import AbstractMove, as_moves
 from mpfjax.moves.every import Every
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.objects.partitioned import Partitioned, check_orders
-from mpfjax.moves.propagation.marginalised import propagation
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
 from mpfjax.moves.regrouping.features import Scale
 from mpfjax.moves.regrouping.kmeans import KMeans
 from mpfjax.moves.regrouping.merge import Merge
 from mpfjax.moves.regrouping.partitions import Pool, RandomPartition
 from mpfjax.moves.regrouping.split import Split
-from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration
 from mpfjax.moves.resampling.ordering import SortBy
 from mpfjax.moves.resampling.resample import GRADIENTS, Resample
@@ -38,7 +35,7 @@ from mpfjax.transforms import (
 )
 
 # K-means starts from the components of a few steps before, and needs few iterations.
-_WARM_ITERATIONS = 2
+_WARM_ITERATIONS, _ITERATIONS = 2, 5
 _INITIAL_DRAWS = 4
 
 
@@ -59,7 +56,7 @@ def particle_filter(
     it for a filtering distribution with one mode. If there are several, it loses all but one.
     `noise="rqmc"` is `with_point_sets`, and `gradient="stop"`, for tuning, `with_score_gradient`.
     """
-    moves = [Resample(scheme, ess_threshold, sort_by=sort_by), propagation(model, proposal)]
+    moves = [Resample(scheme, ess_threshold, sort_by=sort_by), Propagate(model, proposal)]
     return _with(noise, gradient, Filter(model, moves, num_particles))
 
 
@@ -82,10 +79,11 @@ def auxiliary_particle_filter(
     x_t is drawn from p(x_t | x_{t-1}, y_t), and all weights are equal. Use it where the likelihood
     is narrow and y_t shows early which particles will survive.
     """
-    resample = AuxiliaryResample(Resample(scheme, ess_threshold, sort_by=sort_by), lookahead)
-    if proposal is None and isinstance(lookahead, AbstractProposal):
-        proposal = lookahead
-    return Filter(model, [resample, propagation(model, proposal)], num_particles)
+    plain = particle_filter(
+        model, num_particles, proposal=proposal, scheme=scheme, ess_threshold=ess_threshold,
+        sort_by=sort_by,
+    )  # fmt: skip
+    return with_lookahead(plain, lookahead)
 
 
 def mixture_particle_filter(
@@ -125,12 +123,11 @@ def mixture_particle_filter(
 
     Use it where the filtering distribution has several modes and all of them must be kept.
     """
-    moves = [Resample(scheme, ess_threshold), propagation(model, proposal)]
+    plain = particle_filter(
+        model, num_particles, proposal=proposal, scheme=scheme, ess_threshold=ess_threshold
+    )
     seen: dict[str, Any] = {"features": mapped(model, features), "scale": scale}
-    if regroup is None:
-        regroup = [Merge(**seen), Split(**seen), KMeans(_WARM_ITERATIONS, **seen)]
-    sizes = (num_particles, max_components)
-    filter = _mixture_filter(model, sizes, moves, regroup, regroup_every, seen)
+    filter = _mixture(plain, max_components, seen, _WARM_ITERATIONS, regroup, regroup_every)
     if max_components > 1:
         filter = with_selected_start(filter, _INITIAL_DRAWS)
     if noise == "rqmc" and proposal is None and not is_marginalised(model):
@@ -152,8 +149,15 @@ def gaussian_particle_filter(
     distribution close to one Gaussian, and cannot keep two modes. `importance` is that of
     `gaussian_mixture_particle_filter`.
     """
-    moves = _gaussian_moves(model, proposal, regeneration, importance)
-    return Filter(model, moves, num_particles)
+    refuse_marginalised(model, "gaussian_particle_filter")
+    redraw = GaussianRegeneration() if regeneration is None else regeneration
+    check_type(GaussianRegeneration, "a GaussianRegeneration", regeneration=redraw)
+    check_one_of(("propagated", "predictive_gaussian"), importance=importance)
+    if importance == "propagated":
+        return Filter(model, [redraw, Propagate(model, proposal)], num_particles)
+    if proposal is not None:
+        raise ValueError(f"importance: {importance!r} draws from no proposal, but one was given")
+    return Filter(model, [redraw, Predict(model), redraw, Reweight(model)], num_particles)
 
 
 def gaussian_mixture_particle_filter(
@@ -183,12 +187,11 @@ def gaussian_mixture_particle_filter(
     The filter is an approximation, good where each mode is close to a Gaussian. Raises
     `ValueError` for another `importance`, and for "predictive_gaussian" with a `proposal`.
     """
+    plain = gaussian_particle_filter(
+        model, num_particles, proposal=proposal, regeneration=regeneration, importance=importance
+    )
     seen: dict[str, Any] = {"features": mapped(model, features), "scale": scale}
-    if regroup is None:
-        regroup = [Merge(**seen), Split(**seen), KMeans(**seen)]
-    moves = _gaussian_moves(model, proposal, regeneration, importance)
-    sizes = (num_particles, max_components)
-    return _mixture_filter(model, sizes, moves, regroup, regroup_every, seen)
+    return _mixture(plain, max_components, seen, _ITERATIONS, regroup, regroup_every)
 
 
 def partitioned_sampling(
@@ -268,9 +271,7 @@ def independent_particle_filters(
     `PropagateIndependently`.
     """
     require_multi_object(model, "independent_particle_filters")
-    return Filter(
-        model, moves=[PropagateIndependently(model, scheme=scheme)], num_particles=num_particles
-    )
+    return Filter(model, [PropagateIndependently(model, scheme=scheme)], num_particles)
 
 
 def clustered_particle_filter(
@@ -300,39 +301,26 @@ def clustered_particle_filter(
     return Filter(model, moves=[move], num_particles=num_particles)
 
 
-def _gaussian_moves(
-    model: AbstractStateSpaceModel,
-    proposal: AbstractProposal | None,
-    regeneration: GaussianRegeneration | None,
-    importance: str,
-) -> list[AbstractMove]:
-    """Redraw, propagate and weigh; for some, redraw again before weighing."""
-    redraw = GaussianRegeneration() if regeneration is None else regeneration
-    check_type(GaussianRegeneration, "a GaussianRegeneration", regeneration=redraw)
-    check_one_of(("propagated", "predictive_gaussian"), importance=importance)
-    if importance == "propagated":
-        return [redraw, Propagate(model, proposal)]
-    if proposal is not None:
-        raise ValueError(f"importance: {importance!r} draws from no proposal, but one was given")
-    return [redraw, Predict(model), redraw, Reweight(model)]
-
-
-def _mixture_filter(
-    model: AbstractStateSpaceModel,
-    sizes: tuple[int, int],
-    moves: Sequence[AbstractMove],
-    regroup: Sequence[AbstractMove],
-    regroup_every: int,
+def _mixture(
+    plain: Filter,
+    max_components: int,
     seen: dict[str, Any],
+    num_iterations: int,
+    regroup: Sequence[AbstractMove] | None,
+    regroup_every: int,
 ) -> Filter:
-    """The given moves, then regrouping; x_0 grouped by K-means from seeds."""
-    num_particles, max_components = sizes
+    """The filter with many components, which moves regroup; x_0 grouped by K-means from seeds."""
     check_whole(max_components=max_components, regroup_every=regroup_every)
+    if regroup is None:
+        regroup = [Merge(**seen), Split(**seen), KMeans(num_iterations, **seen)]
     regroup = as_moves(regroup, "regroup")
     if regroup and regroup_every > 1:
         regroup = (Every(regroup_every, regroup),)
-    initial = [KMeans(10, reseed=True, **seen)]
-    return Filter(model, [*moves, *regroup], num_particles, max_components, initial)
+    return plain.replace(
+        moves=[*plain.moves, *regroup],
+        num_components=max_components,
+        initial_moves=[KMeans(10, reseed=True, **seen)],
+    )
 
 
 def _with(noise: str, gradient: str, filter: Filter) -> Filter:

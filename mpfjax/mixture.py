@@ -1,5 +1,6 @@
 """The particle mixture: one set of joint weights, and all that is derived from it."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -25,6 +26,7 @@ from mpfjax.operations.segments import (
     segment_sum,
     spread,
 )
+from mpfjax.operations.stored import take
 
 
 class MarginalisedState(NamedTuple):
@@ -64,8 +66,8 @@ class ParticleMixture(eqx.Module):
       `monte_carlo(..., slots=...)` sets it.
     - `parents`: within a step, x_{t-1} of each particle after the propagation, where a move of the
       chain asks for it (`AbstractMove.needs_parents`). Elsewhere it is None.
-    - `in_order`: within a step, whether a move has put each component's particles in an order
-      (`AbstractMove.sorts`), along which the propagation then spreads its point sets.
+    - `in_order`: within a step, whether a move has put each component's particles in an order,
+      along which a propagation that follows spreads its point sets.
     - `log_scale`: the logarithm of a common factor of all weights. It is kept apart from ℓ, which
       would lose its digits if a log-likelihood of a million were added. After a step it is zero.
       In a mixture of x_0 it is what the initial moves leave to the first increment.
@@ -251,6 +253,23 @@ class ParticleMixture(eqx.Module):
         log_weights = jnp.where(self.occupied, log_weights, -jnp.inf)
         return self.replace(log_weights=log_weights, log_scale=log_scale)
 
+    def at(self, slots: Int[Array, " k"]) -> "ParticleMixture":
+        """The particles of these slots, with all that belongs to them.
+
+        These are their weights, component indicators and ancestors, and within a step their
+        parents. A move that takes particles from other slots than their own takes them so.
+        """
+        return self.map_slots(lambda leaf: take(leaf, slots))
+
+    def repeated(self, number: int) -> "ParticleMixture":
+        """Each particle so many times, side by side, each time with its whole weight."""
+        return self.map_slots(lambda leaf: jnp.repeat(leaf, number, axis=0))
+
+    def map_slots(self, function: Callable[[Array], Array]) -> "ParticleMixture":
+        """The mixture after a function of each array that has an entry for each slot."""
+        own = {name: getattr(self, name) for name in _OF_SLOTS}
+        return self.replace(**jax.tree.map(function, own))
+
     def replace(self, **fields: PyTree) -> "ParticleMixture":
         """A copy with some fields changed."""
         own = {name: getattr(self, name) for name in self.__dataclass_fields__}
@@ -264,6 +283,9 @@ class ParticleMixture(eqx.Module):
                 " property of its own; jax.vmap over the leading axes, as in"
                 " jax.vmap(lambda mixture: mixture.mean())(mixtures)"
             )
+
+
+_OF_SLOTS = ("particles", "log_weights", "component_indicators", "ancestor_indices", "parents")
 
 
 def no_ancestors(mixture: ParticleMixture) -> Int[Array, " n"]:

@@ -42,7 +42,29 @@ class AbstractProposal(eqx.Module):
         """
 
 
-class NetworkProposal(AbstractProposal):
+class _GaussianProposal(AbstractProposal):
+    """A proposal whose draw is made of as many normal numbers as the state has."""
+
+    def propose(
+        self, key: Key[Array, ""], observation: PyTree, previous_states: Float[Array, "n ..."]
+    ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
+        """x_t from the Gaussian of every particle, and its log density."""
+        shape = (previous_states.shape[0], self.noise_dimension(previous_states))
+        noise = normal(key, shape, previous_states.dtype)
+        return self.propose_from_noise(noise, observation, previous_states)
+
+    def noise_dimension(self, previous_states: Float[Array, "n ..."]) -> int:
+        """d."""
+        return math.prod(previous_states.shape[1:])
+
+    @abc.abstractmethod
+    def propose_from_noise(
+        self, noise: Float[Array, "n d"], observation: PyTree, previous_states: PyTree
+    ) -> tuple[PyTree, Float[Array, " n"]]:
+        """The same, made of this noise."""
+
+
+class NetworkProposal(_GaussianProposal):
     """A Gaussian whose mean and deviations a network gives, from x_{t-1} and y_t.
 
     q = N(x_{t-1} + s a, diag(s exp b)²), (a, b) = network(x_{t-1}, y_t), for each particle. The
@@ -88,18 +110,6 @@ class NetworkProposal(AbstractProposal):
         network = eqx.tree_at(last, network, [0.1 * leaf for leaf in last(network)])
         return cls(network, scale)
 
-    def propose(
-        self, key: Key[Array, ""], observation: PyTree, previous_states: Float[Array, "n ..."]
-    ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
-        """x_t from the network's Gaussian of every particle, and its log density."""
-        shape = (previous_states.shape[0], self.noise_dimension(previous_states))
-        noise = normal(key, shape, previous_states.dtype)
-        return self.propose_from_noise(noise, observation, previous_states)
-
-    def noise_dimension(self, previous_states: Float[Array, "n ..."]) -> int:
-        """d."""
-        return math.prod(previous_states.shape[1:])
-
     def propose_from_noise(
         self,
         noise: Float[Array, "n d"],
@@ -134,7 +144,7 @@ class NetworkProposal(AbstractProposal):
         return previous + scale * shifts, scale * jnp.exp(log_widths)
 
 
-class GaussNewtonProposal(AbstractProposal):
+class GaussNewtonProposal(_GaussianProposal):
     """A Gaussian fitted by Gauss-Newton to L(y_t | x_t) D(x_t | x_{t-1}), for each particle.
 
     For models with additive Gaussian noise, x_t = f(x_{t-1}) + N(0, Q), y_t = h(x_t) + N(0, R).
@@ -165,18 +175,6 @@ class GaussNewtonProposal(AbstractProposal):
                 )
         check_whole(num_iterations=self.num_iterations)
         check_positive(inflation=self.inflation)
-
-    def propose(
-        self, key: Key[Array, ""], observation: PyTree, previous_states: Float[Array, "n ..."]
-    ) -> tuple[Float[Array, "n ..."], Float[Array, " n"]]:
-        """x_t from the fitted Gaussian of every particle, and its log density."""
-        shape = (previous_states.shape[0], self.noise_dimension(previous_states))
-        noise = normal(key, shape, previous_states.dtype)
-        return self.propose_from_noise(noise, observation, previous_states)
-
-    def noise_dimension(self, previous_states: Float[Array, "n ..."]) -> int:
-        """d."""
-        return math.prod(previous_states.shape[1:])
 
     def propose_from_noise(
         self,

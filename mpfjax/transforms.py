@@ -10,9 +10,7 @@ from mpfjax.checks import check_type, check_whole
 from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead, PilotLookahead
 from mpfjax.moves.base import AbstractMove
-from mpfjax.moves.every import Every
 from mpfjax.moves.initial import SelectInitial
-from mpfjax.moves.propagation.marginalised import PropagateMarginalised
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
@@ -20,26 +18,16 @@ from mpfjax.moves.resampling.ordering import HILBERT
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.proposals import AbstractProposal
 
-_PROPAGATIONS = (Propagate, PropagateMarginalised)
-_LOOKS = (*_PROPAGATIONS, PropagateNested)
-
 
 def map_moves(change: Callable[[Any], Any], filter: Filter) -> Filter:
     """The filter with `change(move)` in the place of each move.
 
-    It reaches the moves of an `Every` and the propagation of a `SelectInitial` too:
+    It reaches the moves that others run for the chain first, as those of an `Every`:
 
         map_moves(lambda m: Resample("ssp") if isinstance(m, Resample) else m, filter)
     """
     check_type(Filter, "a Filter", filter=filter)
-
-    def changed(move: Any) -> Any:
-        if isinstance(move, Every):
-            return Every(move.num_steps, [changed(inner) for inner in move.moves])
-        if isinstance(move, SelectInitial):
-            return dataclasses.replace(move, propagation=change(move.propagation))
-        return change(move)
-
+    changed = lambda move: change(move.map_inner(changed))  # noqa: E731
     return filter.replace(
         moves=[changed(move) for move in filter.moves],
         initial_moves=[changed(move) for move in filter.initial_moves],
@@ -53,13 +41,7 @@ def with_resampling(filter: Filter, resample: Resample) -> Filter:
     `with_resampling(filter, Resample(allocation="equal"))`.
     """
     check_type(Resample, "a Resample", resample=resample)
-
-    def other(move: Any) -> Any:
-        if isinstance(move, AuxiliaryResample):
-            return AuxiliaryResample(resample, move.lookahead)
-        return resample if isinstance(move, Resample) else move
-
-    return map_moves(other, filter)
+    return map_moves(lambda move: resample if isinstance(move, Resample) else move, filter)
 
 
 def with_point_sets(filter: Filter) -> Filter:
@@ -72,8 +54,6 @@ def with_point_sets(filter: Filter) -> Filter:
     """
 
     def in_order(move: Any) -> Any:
-        if isinstance(move, AuxiliaryResample):
-            return dataclasses.replace(move, resample=in_order(move.resample))
         if isinstance(move, Resample) and move.sort_by is None:
             return dataclasses.replace(move, sort_by=HILBERT)
         return move
@@ -94,18 +74,17 @@ def with_proposals_per_particle(filter: Filter, num_draws: int) -> Filter:
     """The filter in which each particle draws K of x_t and keeps one: `PropagateNested`.
 
     `num_draws` is K; with one, each particle draws once again. Raises `ValueError` for K < 1, and
-    for a filter without `Propagate` or `PropagateMarginalised`. Use it where the likelihood is
-    narrow and cheap, with four to sixteen draws.
+    for a filter without `Propagate`. Use it where the likelihood is narrow and cheap, with four to
+    sixteen draws.
     """
-    check_type(Filter, "a Filter", filter=filter)
     check_whole(num_draws=num_draws)
     _propagation_of(filter, "each particle draws")
 
     def nested(move: Any) -> Any:
+        if not move.draws_each:
+            return move
         plain = move.propagate if isinstance(move, PropagateNested) else move
-        if num_draws == 1 or not isinstance(plain, _PROPAGATIONS):
-            return plain
-        return PropagateNested(plain, num_draws)
+        return plain if num_draws == 1 else PropagateNested(plain, num_draws)
 
     return map_moves(nested, filter)
 
@@ -117,30 +96,29 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
     that is a proposal also draws x_t, where the filter has no other. Raises `ValueError` for a
     filter without `Resample`.
     """
-    check_type(Filter, "a Filter", filter=filter)
+    plain = map_moves(lambda m: m.resample if isinstance(m, AuxiliaryResample) else m, filter)
     look = PilotLookahead(filter.model) if lookahead is None else lookahead
-    if not any(isinstance(move, Resample | AuxiliaryResample) for move in filter.moves):
+    if not any(isinstance(move, Resample) for move in plain.moves):
         raise ValueError("filter: none of its moves is a Resample, which could look ahead")
 
     def ahead(move: Any) -> Any:
-        if isinstance(move, Resample | AuxiliaryResample):
-            resample = move if isinstance(move, Resample) else move.resample
-            return AuxiliaryResample(resample, look)
-        guided = isinstance(look, AbstractProposal) and isinstance(move, _PROPAGATIONS)
+        if isinstance(move, Resample):
+            return AuxiliaryResample(move, look)
+        guided = isinstance(look, AbstractProposal) and isinstance(move, Propagate)
         if guided and move.proposal is None:
             return dataclasses.replace(move, proposal=look)
         return move
 
-    return map_moves(ahead, filter)
+    return map_moves(ahead, plain)
 
 
 def with_selected_start(filter: Filter, num_draws: int) -> Filter:
     """The filter whose x_0 is chosen by y_1 among K N draws: a `SelectInitial` moves it first.
 
     `num_draws` is K; with one, x_0 is a plain draw again. The look at y_1 is that of the filter's
-    own propagation. Raises `ValueError` for K < 1, and for a filter without a `Propagate`,
-    `PropagateMarginalised` or `PropagateNested`. Use it where the prior is wide beside the
-    likelihood; `mixture_particle_filter` does so with four draws.
+    own propagation. Raises `ValueError` for K < 1, and for a filter without a `Propagate` or
+    `PropagateNested`. Use it where the prior is wide beside the likelihood;
+    `mixture_particle_filter` does so with four draws.
     """
     check_type(Filter, "a Filter", filter=filter)
     check_whole(num_draws=num_draws)
@@ -154,11 +132,12 @@ def with_selected_start(filter: Filter, num_draws: int) -> Filter:
 
 def _propagation_of(filter: Filter, what: str) -> Any:
     """The move that draws x_t one particle at a time; a `ValueError` where there is none."""
-    found = [move for move in filter.moves if isinstance(move, _LOOKS)]
+    check_type(Filter, "a Filter", filter=filter)
+    found = [move for move in filter.moves if move.draws_each]
     if not found:
         raise ValueError(
-            f"filter: {what} where Propagate, PropagateMarginalised or PropagateNested"
-            " propagates, and none of its moves is one"
+            f"filter: {what} where Propagate or PropagateNested propagates, and none of its moves"
+            " is one"
         )
     return found[0]
 

@@ -11,7 +11,6 @@ from scipy.stats import multivariate_normal
 import mpfjax
 from mpfjax import Filter, Resample
 from mpfjax.exact import grid_filter, kalman_filter
-from mpfjax.filter import Start
 from mpfjax.moves.resampling.ancestors import SCHEMES
 from tests.marking import quick_of, thorough
 from tests.precision import float64
@@ -612,7 +611,7 @@ def test_a_start_is_what_its_parts_give_one_after_the_other():
     filter = mpfjax.mixture_particle_filter(mpfjax.QuadraticModel(), 60, max_components=3)
     keys = jax.random.split(jax.random.key(0), 3)
     for key in keys:
-        chex.assert_trees_all_equal(filter.init(key), filter._init(Start(key)))
+        chex.assert_trees_all_equal(filter.init(key), filter._init(key))
 
 
 def test_the_mass_of_a_mixture_given_by_hand_counts_once_whatever_moves_leave_the_weights():

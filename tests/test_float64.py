@@ -11,7 +11,6 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import grid_filter
-from mpfjax.filter import Start
 from mpfjax.observations import Series
 from mpfjax.running.scan import scan
 from mpfjax.tuning import Positive, particle_gibbs
@@ -47,7 +46,7 @@ def test_every_chain_is_traced(chain):
     filter, seen = CHAINS[chain](quadratic()), jnp.asarray(SQUARES)
     present = jnp.isfinite(seen)
     run = eqx.filter_eval_shape(
-        lambda key: scan(Start(key), filter, Series(seen, present=present), None), KEY
+        lambda key: scan(key, filter, Series(seen, present=present), None), KEY
     )
     assert_double(run)
 

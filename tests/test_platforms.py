@@ -7,7 +7,6 @@ import pytest
 from jax import export
 
 import mpfjax
-from mpfjax.filter import Start
 from mpfjax.observations import Series
 from mpfjax.operations.prefix_sums import count_upto, exact_sum_before, sum_before
 from mpfjax.operations.stored import default_forms, stored
@@ -51,7 +50,7 @@ def test_a_whole_filter_is_lowered_for_a_gpu():
     filter = CHAINS["mpf"](MODEL)
 
     def run(key):
-        return scan(Start(key), filter, Series(OBSERVATIONS), None).log_marginal_likelihood
+        return scan(key, filter, Series(OBSERVATIONS), None).log_marginal_likelihood
 
     lowered = export.export(jax.jit(run), platforms=["cuda"])(jax.random.key(0))
     assert lowered.platforms == ("cuda",)

@@ -19,11 +19,11 @@ from mpfjax.lookahead.twisted import (
     Twist,
     TwistInitial,
     features_of,
-    noise_dimension_of,
 )
 from mpfjax.models.base import mapped, require_noise, starts_from_noise
 from mpfjax.models.conditionally_linear import is_mixed, with_moments
 from mpfjax.models.noise import noise_dtype
+from mpfjax.models.steps import noise_dimension
 from mpfjax.moves.every import Every
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.observations import as_series
@@ -114,7 +114,7 @@ def _knowing_nothing(
     states = jax.eval_shape(start, key)
     num_features = jax.eval_shape(partial(features_of, features), states).shape[1]
     size, dtype = filter.num_components, noise_dtype(states)
-    noise = jax.eval_shape(lambda states: jnp.zeros(noise_dimension_of(model, states)), states)
+    noise = jax.eval_shape(lambda states: jnp.zeros(noise_dimension(model, states)), states)
     one = neutral(size, num_features, noise.shape[0], dtype)
     steps = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (length + 1, *leaf.shape)), one)
     initial = None
@@ -148,5 +148,5 @@ def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
         if sum(isinstance(move, kind) for move in moves) != 1:
             raise ValueError(f"filter: its moves need one {needed}, in the chain itself")
     start = TwistInitial(filter.model, twist, filter.initial_noise)
-    kept = [ahead(move) for move in filter.initial_moves if not move.looks_ahead]
+    kept = [ahead(move) for move in filter.initial_moves if not move.weighs]
     return filter.replace(moves=moves, num_particles=num_particles, initial_moves=[start, *kept])

@@ -10,10 +10,10 @@ from jaxtyping import Array, Bool, Float, Key
 
 from mpfjax.filter import Filter
 from mpfjax.lookahead.quadratics import LocalQuadratics, neutral
-from mpfjax.lookahead.twisted import Twist, made_of, noise_dimension_of
+from mpfjax.lookahead.twisted import Twist
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.conditionally_linear import with_moments
-from mpfjax.models.steps import seen
+from mpfjax.models.steps import completed, made_of, noise_dimension, seen
 from mpfjax.observations import Series
 from mpfjax.running.scan import FilterRun
 
@@ -86,7 +86,7 @@ def _draw_points(
 ) -> _Points:
     """Draw every particle with equal frequency, so that none is lost, with noise from q_t."""
     num_experts, dimension = used.centres.shape
-    num_noises = noise_dimension_of(model, mixture.particles)
+    num_noises = noise_dimension(model, mixture.particles)
     num_coefficients = _num_coefficients(dimension + num_noises)
     needed = _PARTICLES_A_COEFFICIENT * num_coefficients
     copies = -(-2 * needed * num_experts // mixture.num_particles)
@@ -95,7 +95,7 @@ def _draw_points(
     features, log_weights = twist.features_of(states), repeated(mixture.log_weights)
     shape = (len(log_weights), num_noises + 1)
     noise, log_ratio = used.draw(jax.random.normal(key, shape, features.dtype), features)
-    unseen = made_of(model, noise, states)
+    unseen = completed(model, made_of(model, noise, states), states)
     moved, log_factors = seen(model, now.observations, unseen)
     log_likelihoods = sum(log_factors[1:], log_factors[0])
     if (present := now.present) is not None:

@@ -11,11 +11,10 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from mpfjax.lookahead.quadratics import LocalQuadratics
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.models.base import AbstractStateSpaceModel, HasInitialNoise, check_moved
-from mpfjax.models.conditionally_linear import is_marginalised, predicted, with_moments
+from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.noise import draw_noise, noise_dtype
-from mpfjax.models.steps import seen
+from mpfjax.models.steps import completed, made_of, noise_dimension, seen
 from mpfjax.moves.base import AbstractMove, AbstractPropagation, AbstractRegrouping
-from mpfjax.moves.propagation.marginalised import latent_made_of, latent_noise_dimension
 from mpfjax.moves.propagation.propagate import noise_of_slots
 from mpfjax.operations.logarithms import log_sum_exp
 
@@ -59,22 +58,6 @@ def features_of(features: Callable[[PyTree], Array] | None, states: PyTree) -> F
         return flatten_states(states)
     found = jnp.asarray(features(states))
     return found.reshape(found.shape[0], -1).astype(noise_dtype(states))
-
-
-def noise_dimension_of(model: Any, states: PyTree) -> int:
-    """How many standard normal numbers the model makes x_t of; of a marginalised one, z_t."""
-    if is_marginalised(model):
-        return latent_noise_dimension(model, states)
-    return model.noise_dimension
-
-
-def made_of(model: Any, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
-    """x_t of each particle, made of this noise; of a marginalised model z_t, with x predicted."""
-    if is_marginalised(model):
-        return predicted(model, latent_made_of(model, noise, states), states)
-    moved = model.transition_from_noise(noise, states)
-    check_moved(moved, states, model, "transition_from_noise")
-    return moved
 
 
 class TwistInitial(AbstractMove):
@@ -124,11 +107,12 @@ class PropagateTwisted(AbstractPropagation):
     ) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
         model, previous = self.move.model, mixture.particles
-        dimension = noise_dimension_of(model, previous) + 1
+        dimension = noise_dimension(model, previous) + 1
         noise = noise_of_slots(self.move.noise, key, dimension, mixture)
         psi = self.twist.next(mixture)
         drawn, log_ratio = psi.draw(noise, self.twist.features_of(previous))
-        states, log_factors = seen(model, observation, made_of(model, drawn, previous))
+        made = completed(model, made_of(model, drawn, previous), previous)
+        states, log_factors = seen(model, observation, made)
         return _counted(mixture.replace(particles=states).weighed(*log_factors, log_ratio))
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:

@@ -19,6 +19,7 @@ from mpfjax.models.conditionally_linear import (
     is_mixed,
     latent_from_noise,
     latent_rows,
+    log_latent_density,
     observation_rows,
     predicted,
     predicted_gaussian,
@@ -31,18 +32,61 @@ from mpfjax.operations.random import normal
 
 def moved(key: Key[Array, ""], model: Any, states: PyTree) -> PyTree:
     """x_t of each particle by the model's own law, checked; of a latent, with x predicted."""
-    if not is_marginalised(model):
-        drawn = model.sample_transition(key, states)
-        check_moved(drawn, states, model)
-        return drawn
-    states = _with_moments(model, states)
+    return completed(model, drawn(key, model, states), states)
+
+
+def drawn(key: Key[Array, ""], model: Any, states: PyTree) -> PyTree:
+    """What is drawn at random of x_t: all of it, or z_t where the rest has moments."""
+    before = drawn_part(model, states)
     if is_mixed(model):
-        num_rows = latent_rows(model, states.latent).shape[0]
-        noise = normal(key, (states.mean.shape[0], num_rows), noise_dtype(states))
-        latent = latent_from_noise(model, noise, states)
-    else:
-        latent = model.sample_transition(key, states.latent)
-    return predicted(model, latent, states)
+        noise = normal(key, before.shape, noise_dtype(states))
+        return latent_from_noise(model, noise, states)
+    draws = model.sample_transition(key, before)
+    check_moved(draws, before, model)
+    return draws
+
+
+def made_of(model: Any, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
+    """The same, made of this noise."""
+    before = drawn_part(model, states)
+    if is_mixed(model):
+        return latent_from_noise(model, noise, states)
+    who = f"model: {model_name(model)}.transition_from_noise"
+    with saying(f"in {who}, of noise of shape {noise.shape}, as noise_dimension says"):
+        draws = model.transition_from_noise(noise, before)
+    check_moved(draws, before, model, "transition_from_noise")
+    return draws
+
+
+def noise_dimension(model: Any, states: PyTree) -> int:
+    """k, the number of standard normal numbers that it is made of by the model's own law."""
+    if is_mixed(model):
+        return latent_rows(model, states.latent).shape[0]
+    return model.noise_dimension
+
+
+def drawn_part(model: Any, states: PyTree) -> PyTree:
+    """The part of the particles that is drawn, of x_{t-1} or of x_t."""
+    if not is_marginalised(model):
+        return states
+    latent = _with_moments(model, states).latent
+    if is_mixed(model):
+        latent_rows(model, latent)
+    return latent
+
+
+def completed(model: Any, draws: PyTree, states: PyTree) -> PyTree:
+    """x_t with what was drawn of it, the moments of the rest predicted from those of x_{t-1}."""
+    return predicted(model, draws, states) if is_marginalised(model) else draws
+
+
+def log_transition(model: Any, draws: PyTree, states: PyTree) -> Float[Array, " n"]:
+    """log D of what was drawn of x_t, given x_{t-1}, checked."""
+    if is_mixed(model):
+        return log_latent_density(model, draws, states)
+    values = model.log_transition(draws, drawn_part(model, states))
+    num_particles = jax.tree.leaves(draws)[0].shape[0]
+    return check_log_density(values, model, "log_transition", num_particles)
 
 
 def likelihoods(model: Any, observation: PyTree, states: PyTree) -> Float[Array, " n"]:

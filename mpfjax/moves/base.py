@@ -1,12 +1,15 @@
 """The kinds of moves of a filter, and their contracts."""
 
 import abc
+from collections import ChainMap
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
+from mpfjax.checks import check_callable, is_series, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.logarithms import without_gradient
 
@@ -29,13 +32,13 @@ class AbstractMove(eqx.Module):
     """whether the mass of all particles stays what it was, so that nothing is to be normalised."""
     propagates = False
     """whether it takes the particles from t-1 to t."""
+    draws_each = False
+    """whether it draws and weighs x_t of each particle without a look at the others, so that it may
+    be asked for several draws of each."""
     regroups = False
     """whether it changes the indicators and nothing else."""
     resamples = False
     """whether it redraws the particles by their weights."""
-    sorts = False
-    """whether it leaves each component's particles side by side in an order of its own, along which
-    a propagation that follows in the same step spreads its point sets."""
     needs_parents = False
     """whether it looks at `mixture.parents`, x_{t-1} of each particle that has x_t. If one of its
     moves does, a filter keeps them during the step. Otherwise they cost nothing."""
@@ -48,11 +51,10 @@ class AbstractMove(eqx.Module):
     keeps_families = True
     """whether it draws independently, or tells the memory of first ancestors, so that the errors of
     one run are known."""
-    looks_ahead = False
-    """whether its weights, as an initial move, wait for the likelihood that it has looked at. The
-    particles of x_0 are then not resampled before they have been weighed by it."""
     resampling = None
     """the `Resample` by which it redraws the particles, whose weights a look-ahead may change."""
+    inner = ()
+    """the moves that it runs from time to time."""
     particles_per_component = None
     """the slots that each component gets, where the move fixes their number."""
 
@@ -82,6 +84,11 @@ class AbstractMove(eqx.Module):
         del key
         return mixture
 
+    def map_inner(self, change: Callable[[Any], Any]) -> Any:
+        """The move with `change(move)` in the place of each move that it runs for the chain."""
+        del change
+        return self
+
     @property
     def reads(self) -> frozenset[str]:
         """The names of the memory of other moves that this move needs."""
@@ -104,6 +111,65 @@ class AbstractMove(eqx.Module):
         """
         del dead
         return memory
+
+
+Moves = tuple[AbstractMove, ...]
+
+
+class FunctionMove(AbstractMove):
+    """A function `(key, mixture, observation) -> mixture` as a move; what it does is not known."""
+
+    function: Callable[..., ParticleMixture]
+
+    approximate = True
+
+    def __call__(
+        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
+    ) -> ParticleMixture:
+        """What the function returns."""
+        return self.function(key, mixture, observation)
+
+    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
+        """Raise a `ValueError`: a function does not say what it does without an observation."""
+        del key, mixture
+        raise ValueError(f"moves: {self.function!r} does not define predict, for a missing y_t")
+
+
+def as_moves(moves: Any, name: str) -> Moves:
+    """The moves as a tuple; a `ValueError` for other things, or a single move without a list."""
+    if not is_series(moves):
+        raise ValueError(f"{name}: {shown(moves)} is not a list of moves")
+    moves = tuple(moves)
+    for move in moves:
+        check_callable("a move, (key, mixture, observation) -> mixture", **{name: move})
+    return tuple(m if isinstance(m, AbstractMove) else FunctionMove(m) for m in moves)
+
+
+def name_of(move: AbstractMove) -> str:
+    """The name of the move's class, or of the user's function."""
+    function = move.function if isinstance(move, FunctionMove) else move
+    return getattr(function, "__name__", type(function).__name__)
+
+
+def with_inner(moves: Iterable[AbstractMove]) -> Iterator[AbstractMove]:
+    """The moves, and after each of them those that it runs from time to time."""
+    for move in moves:
+        yield move
+        yield from with_inner(move.inner)
+
+
+def initial_memory(moves: Iterable[AbstractMove], num_components: int) -> dict[str, PyTree]:
+    """The initial memory of all moves."""
+    return dict(ChainMap(*(move.initial_memory(num_components) for move in moves)))
+
+
+def without_dead(
+    moves: Moves, memory: dict[str, PyTree], dead: Bool[Array, " m"]
+) -> dict[str, PyTree]:
+    """The memory of all moves without that of dead components."""
+    for move in moves:
+        memory = move.forget(memory, dead)
+    return memory
 
 
 class AbstractRegrouping(AbstractMove):
@@ -150,21 +216,6 @@ class AbstractResampling(AbstractMove):
     keeps_mass = True
     resamples = True
     keeps_families = False
-
-
-class AbstractAdaptiveResampling(AbstractResampling):
-    """A resampling of those components that are due, such as those of low effective sample size."""
-
-    @abc.abstractmethod
-    def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
-        """Which components of `mixture` the move would resample."""
-
-    def would_resample(
-        self, mixture: ParticleMixture, observation: PyTree = None
-    ) -> Bool[Array, " m"]:
-        """Those that are due."""
-        del observation
-        return self.is_due(mixture)
 
 
 class AbstractMarkovMove(AbstractMove):

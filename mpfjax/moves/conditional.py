@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
-from mpfjax.moves.base import AbstractAdaptiveResampling, AbstractPropagation
+from mpfjax.moves.base import AbstractPropagation, AbstractResampling
 from mpfjax.operations.stored import take
 
 REFERENCE = "reference"  # the name of its slot and time in a mixture's memory
@@ -82,7 +82,7 @@ class ConditionalPropagation(AbstractPropagation):
         return mixture.replace(particles=particles, memory=memory)
 
 
-class ConditionalResample(AbstractAdaptiveResampling):
+class ConditionalResample(AbstractResampling):
     """Resample within components, given that the reference has an offspring.
 
     The ancestor indices have the law of those of `Resample`, given that one slot of the reference's
@@ -92,15 +92,17 @@ class ConditionalResample(AbstractAdaptiveResampling):
 
     move: Any
 
-    def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
-        """Which components of `mixture` the move would resample."""
-        return self.move.is_due(mixture)
+    def would_resample(
+        self, mixture: ParticleMixture, observation: PyTree = None
+    ) -> Bool[Array, " m"]:
+        """Those that are due."""
+        return self.move.would_resample(mixture, observation)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
     ) -> ParticleMixture:
         """Resample every component that is due around the reference."""
-        reference, due = mixture.memory[REFERENCE], self.is_due(mixture)
+        reference, due = mixture.memory[REFERENCE], self.move.is_due(mixture)
         resampled, ancestors = self.move.redraw(key, mixture, due, keep=reference["slot"])
         memory = resampled.memory | {REFERENCE: reference | {"slot": ancestors.kept}}
         return resampled.replace(memory=memory)

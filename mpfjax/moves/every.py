@@ -1,6 +1,6 @@
 """Every: other moves, at every k-th step only."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
-from mpfjax.checks import check_whole, is_series, shown
+from mpfjax.checks import check_whole
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.base import AbstractMove, as_moves, initial_memory, name_of, without_dead
 from mpfjax.operations.random import split
 
 _MOST_STEPS = 2**31 - 1  # that int32 counts
@@ -38,7 +38,15 @@ class Every(AbstractMove):
     def __init__(self, num_steps: int, moves: Iterable[AbstractMove]) -> None:
         check_whole(num_steps=num_steps)
         self.num_steps = min(int(num_steps), _MOST_STEPS)
-        self.moves = _as_inner_moves(moves)
+        self.moves = as_moves(moves, "moves")
+        if not self.moves:
+            raise ValueError("moves: there must be at least one to run at every k-th step")
+        for move in self.moves:
+            if not move.keeps_mass:
+                raise ValueError(
+                    f"moves: {name_of(move)} neither regroups, resamples nor moves by a Markov"
+                    " kernel; what propagates belongs into the chain, at every step"
+                )
 
     @property
     def approximate(self) -> bool:
@@ -47,6 +55,15 @@ class Every(AbstractMove):
 
     weighs = False
     keeps_mass = True
+
+    @property
+    def inner(self) -> tuple[AbstractMove, ...]:
+        """The moves."""
+        return self.moves
+
+    def map_inner(self, change: Callable[[Any], Any]) -> "Every":
+        """The same with other moves."""
+        return Every(self.num_steps, [change(move) for move in self.moves])
 
     @property
     def keeps_families(self) -> bool:
@@ -96,7 +113,8 @@ class Every(AbstractMove):
         A filter calls `after` after each of its moves: moves with memory forget dead components,
         whose labels the next move may use again.
         """
-        after = self._forgetting if after is None else after
+        own = lambda moved: moved.replace(memory=self.forget(moved.memory, ~moved.active))  # noqa: E731
+        after = own if after is None else after
         runs, steps = self._runs(mixture), self._steps(mixture) + 1
         counted = mixture.memory | {self.name: {"steps": steps % self.num_steps}}
         mixture = mixture.replace(memory=counted)
@@ -105,7 +123,7 @@ class Every(AbstractMove):
             moved = mixture
             for move_key, move in zip(split(key, len(self.moves)), self.moves, strict=True):
                 moved = after(move(move_key, moved, observation))
-            return moved
+            return moved.replace(in_order=False)  # it is so at every k-th step alone
 
         if not all(move.regroups for move in self.moves):
             return jax.lax.cond(runs, run, lambda: mixture)
@@ -122,45 +140,15 @@ class Every(AbstractMove):
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
         """The number of steps since the moves last ran, and the moves' own memory."""
-        memory: dict[str, PyTree] = {self.name: {"steps": jnp.zeros((), jnp.int32)}}
-        for move in self.moves:
-            memory |= move.initial_memory(num_components)
-        return memory
+        own = {self.name: {"steps": jnp.zeros((), jnp.int32)}}
+        return own | initial_memory(self.moves, num_components)
 
     def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
         """The memory without the moves' memory of dead components."""
-        for move in self.moves:
-            memory = move.forget(memory, dead)
-        return memory
-
-    def _forgetting(self, mixture: ParticleMixture) -> ParticleMixture:
-        return mixture.replace(memory=self.forget(mixture.memory, ~mixture.active))
+        return without_dead(self.moves, memory, dead)
 
     def _steps(self, mixture: ParticleMixture) -> Int[Array, ""]:
         return mixture.memory[self.name]["steps"]
 
     def _runs(self, mixture: ParticleMixture) -> Bool[Array, ""]:
         return self._steps(mixture) == self.num_steps - 1
-
-
-def _as_inner_moves(moves: Any) -> tuple[AbstractMove, ...]:
-    if not is_series(moves):
-        raise ValueError(f"moves: {shown(moves)} is not a list of moves")
-    moves = tuple(moves)
-    if not moves:
-        raise ValueError("moves: there must be at least one to run at every k-th step")
-    for move in moves:
-        if not (isinstance(move, AbstractMove) and move.keeps_mass):
-            raise ValueError(
-                f"moves: {shown(move)} neither regroups, resamples nor moves by a Markov kernel;"
-                " a propagation belongs into the chain, since without it the state would not move"
-            )
-    return moves
-
-
-def with_inner(moves: Iterable[Any]) -> Iterator[Any]:
-    """The moves, and after each of them those that it runs from time to time."""
-    for move in moves:
-        yield move
-        if isinstance(move, Every):
-            yield from with_inner(move.moves)

@@ -1,13 +1,14 @@
 """x_0: its draws, and the choice among many draws by the first observation."""
 
+from collections.abc import Callable
 from typing import Any, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_numbered, check_one_of, check_type, check_whole
+from mpfjax.checks import check_numbered, check_one_of, check_whole, shown
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -16,15 +17,14 @@ from mpfjax.models.base import (
     starts_from_noise,
 )
 from mpfjax.models.conditionally_linear import with_moments
+from mpfjax.models.inputs import saying_that_none_were_given
 from mpfjax.models.noise import NOISES, draw_noise
-from mpfjax.moves.base import AbstractMove, AbstractResampling
-from mpfjax.moves.propagation.marginalised import PropagateMarginalised
-from mpfjax.moves.propagation.nested import PropagateNested
-from mpfjax.moves.propagation.propagate import Propagate
-from mpfjax.moves.resampling.ordering import HILBERT, sorted_order
+from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.resampling.ancestors import draw_ancestors
+from mpfjax.moves.resampling.line import in_line
+from mpfjax.moves.resampling.ordering import HILBERT
 from mpfjax.operations.logarithms import default_float, exp, finite_or_zero, largest
-from mpfjax.operations.prefix_sums import count_starts, sum_before
-from mpfjax.operations.random import split, uniform
+from mpfjax.operations.random import split
 from mpfjax.operations.stored import stored, take
 
 # A particle that the first observation tells nothing of keeps a quarter of its chance, so that no
@@ -39,14 +39,15 @@ def sample_initial(
     noise: str = "independent",
 ) -> PyTree:
     """The particles of x_0, of this noise if the model can; raises for leaves of another length."""
-    if noise == "independent" or not starts_from_noise(model):
-        particles = model.sample_initial(key, num_particles)
-    else:
-        maker = cast(HasInitialNoise, model)
-        shape = (num_particles, maker.initial_noise_dimension)
-        particles = maker.initial_from_noise(draw_noise(noise, key, shape, default_float()))
-    check_states(particles, model, "sample_initial", num_particles)
-    return with_moments(model, particles)
+    with saying_that_none_were_given(model):
+        if noise == "independent" or not starts_from_noise(model):
+            particles = model.sample_initial(key, num_particles)
+        else:
+            maker = cast(HasInitialNoise, model)
+            shape = (num_particles, maker.initial_noise_dimension)
+            particles = maker.initial_from_noise(draw_noise(noise, key, shape, default_float()))
+        check_states(particles, model, "sample_initial", num_particles)
+        return with_moments(model, particles)
 
 
 class SelectInitial(AbstractMove):
@@ -59,11 +60,11 @@ class SelectInitial(AbstractMove):
     increment, and Ẑ stays unbiased. A wide prior is covered as by K N particles, at the cost of
     2 K more draws of x_1 in the whole run.
 
-    Without an observation it does nothing. A `Resample` of the first step waits: it would undo the
-    choice before y_1 has weighed the particles.
+    Without an observation it does nothing. Where an initial move weighs x_0, the chain's `Resample`
+    waits for y_1: it would undo the choice.
 
-    - `propagation`: draws x_1, and weighs it: a `Propagate`, `PropagateMarginalised` or
-      `PropagateNested`, usually the filter's own.
+    - `propagation`: draws x_1, and weighs it: a `Propagate` or `PropagateNested`, usually the
+      filter's own.
     - `num_draws`: K.
     - `noise`: that of the draws of x_0, as `Filter.initial_noise`. With "rqmc" they are kept in
       order along a Hilbert curve.
@@ -72,19 +73,21 @@ class SelectInitial(AbstractMove):
     propagation, K < 1 and unknown noise. Use it where the prior is wide beside the likelihood.
     """
 
-    propagation: Propagate | PropagateMarginalised | PropagateNested
+    propagation: Any
     num_draws: int = eqx.field(static=True, default=4)
     noise: str = eqx.field(static=True, default="independent")
 
     def __check_init__(self) -> None:
-        kinds = (Propagate, PropagateMarginalised, PropagateNested)
-        what = "a Propagate, PropagateMarginalised or PropagateNested"
-        check_type(kinds, what, propagation=self.propagation)
+        if not getattr(self.propagation, "draws_each", False):
+            raise ValueError(
+                f"propagation: {shown(self.propagation)} does not draw x_1 of each x_0"
+            )
         check_whole(num_draws=self.num_draws)
         check_one_of(NOISES, noise=self.noise)
 
-    looks_ahead = True
-    """the weights undo a choice by the next observation."""
+    def map_inner(self, change: Callable[[Any], Any]) -> "SelectInitial":
+        """The same with another propagation."""
+        return SelectInitial(change(self.propagation), self.num_draws, self.noise)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
@@ -96,21 +99,23 @@ class SelectInitial(AbstractMove):
         num_drawn = self.num_draws * mixture.num_particles
         check_numbered("draws up to", 2 * num_drawn, num_draws=self.num_draws)
         drawn = sample_initial(key_drawn, self.propagation.model, num_drawn, self.noise)
-        pool = single_component(drawn, mixture.num_components)
+        pool = single_component(drawn)
         log_factors = self._look(key_look, pool, observation)
         chances = trusted(log_factors, pool.occupied.astype(log_factors.dtype))
         chances = stored(jax.lax.stop_gradient(chances))
-        order = None
-        if self.noise == "rqmc":
-            order = sorted_order(pool, pool.component_indicators, HILBERT)
-        kept = _kept(key_kept, chances, mixture.num_particles, order)
+        weighed = pool.replace(log_weights=jnp.log(chances).astype(default_float()))
+        sort_by = HILBERT if self.noise == "rqmc" else None
+        line = in_line(jax.lax.stop_gradient(weighed), sort_by=sort_by)
+        n = mixture.num_particles
+        targets = jnp.full(1, n, jnp.int32)
+        kept = draw_ancestors(key_kept, line, targets, "systematic", num_slots=n).particles
         trust = take(chances, kept).astype(default_float())
         # No ν is below a quarter, so that their inverses need no logarithms to be summed.
         total = jnp.sum(1 / trust)
         particles = jax.tree.map(lambda leaf: take(leaf, kept), drawn)
         return single_component(particles, mixture.num_components).replace(
             log_weights=-jnp.log(trust * total),
-            log_scale=jnp.log(total / mixture.num_particles),
+            log_scale=jnp.log(total / n),
             memory=mixture.memory,
         )
 
@@ -119,66 +124,9 @@ class SelectInitial(AbstractMove):
     ) -> Float[Array, "2 n"]:
         """The logarithms of the weights of two draws of x_1 of each particle, up to a constant."""
         # Stored, so that x_1 is drawn on vectors, and once, not wherever its likelihood is used.
-        twice = lambda leaf: stored(jnp.repeat(leaf, 2, axis=0))  # noqa: E731
-        drawn = pool.replace(
-            particles=jax.tree.map(twice, pool.particles),
-            log_weights=twice(pool.log_weights),
-            component_indicators=twice(pool.component_indicators),
-            ancestor_indices=twice(pool.ancestor_indices),
-        )
+        drawn = pool.repeated(2).map_slots(stored)
         drawn = self.propagation(key, drawn, observation)
         return stored(drawn.log_weights).reshape(-1, 2).T
-
-
-class Waiting(AbstractResampling):
-    """A resampling that waits while the weights of x_0 are not those of an observation yet.
-
-    `SelectInitial` leaves a mass for the first increment. Until the propagation has weighed its
-    particles, to resample by their weights would undo the choice.
-    """
-
-    move: AbstractResampling
-
-    @property
-    def approximate(self) -> bool:
-        """Whether the move is."""
-        return self.move.approximate
-
-    @property
-    def sorts(self) -> bool:
-        """Whether the move does; while it waits, particles stand as `SelectInitial` left them."""
-        return self.move.sorts
-
-    @property
-    def needs_parents(self) -> bool:
-        """Whether the move does."""
-        return self.move.needs_parents
-
-    def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
-        """The memory without the move's memory of dead components."""
-        return self.move.forget(memory, dead)
-
-    def would_resample(
-        self, mixture: ParticleMixture, observation: PyTree = None
-    ) -> Bool[Array, " m"]:
-        """Which components the move would resample, unless it waits."""
-        return self.move.would_resample(mixture, observation) & (mixture.log_scale == 0)
-
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
-    ) -> ParticleMixture:
-        """The resampled mixture, or the one given."""
-        waits = mixture.log_scale != 0
-        # Not by a condition, which would copy all that goes through it at every step.
-        keep = lambda new, old: new if new is old else jnp.where(waits, old, new)  # noqa: E731
-        return jax.tree.map(keep, self.move(key, mixture, observation), mixture)
-
-
-def waiting_for_choice(moves: tuple[Any, ...], initial_moves: tuple[Any, ...]) -> tuple[Any, ...]:
-    """The moves of a step; after an initial move that looks ahead, the resampling ones wait."""
-    if not any(move.looks_ahead for move in initial_moves):
-        return moves
-    return tuple(Waiting(move) if move.resamples else move for move in moves)
 
 
 def trusted(log_factors: Float[Array, "2 n"], weights: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -207,20 +155,3 @@ def trusted(log_factors: Float[Array, "2 n"], weights: Float[Array, " n"]) -> Fl
     trust = jnp.where(mean > 0, jnp.minimum(2 * correlation / (1 + correlation), MOST_TRUST), 0.0)
     ratios = (first + second) / jnp.where(mean > 0, 2 * mean, 1.0)
     return 1 + trust * (ratios - 1)
-
-
-def _kept(
-    key: Key[Array, ""],
-    chances: Float[Array, " p"],
-    num_kept: int,
-    order: Int[Array, " p"] | None,
-) -> Int[Array, " n"]:
-    """Which particle of the pool each slot takes: systematic draws in proportion to ν."""
-    weights = chances if order is None else take(chances, order)
-    before, total = sum_before(weights)
-    # Slot s has the point s + shift, and takes the particle whose interval holds it.
-    points = before * (num_kept / total) - uniform(key, (), weights.dtype)
-    starts = jnp.ceil(points).astype(jnp.int32)
-    places = count_starts(jnp.maximum(starts, 0), num_kept)
-    places = jnp.clip(places, 0, weights.shape[0] - 1)
-    return places if order is None else take(order, places)

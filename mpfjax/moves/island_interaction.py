@@ -69,21 +69,6 @@ class IslandInteraction(AbstractMove):
                 f"num_particles: {mixture.num_particles} of an island cannot be dealt evenly to"
                 f" {num_islands()} islands, as IslandInteraction does"
             )
-        slots = (
-            mixture.particles,
-            mixture.log_weights,
-            mixture.component_indicators,
-            mixture.ancestor_indices,
-        )
-        particles, log_weights, components, ancestors = jax.lax.cond(
-            self.is_due(mixture),
-            lambda slots: jax.tree.map(deal_to_islands, slots),
-            lambda slots: slots,
-            slots,
-        )
-        return mixture.replace(
-            particles=particles,
-            log_weights=log_weights,
-            component_indicators=components,
-            ancestor_indices=ancestors,
+        return jax.lax.cond(
+            self.is_due(mixture), lambda: mixture.map_slots(deal_to_islands), lambda: mixture
         )

@@ -1,21 +1,24 @@
 """Metropolis moves: each x_t moves by a kernel that keeps its own target; the weights stay."""
 
 import abc
+import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import check_exponent, check_inner_share, check_one_of, check_whole
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, require, require_model
 from mpfjax.models.conditionally_linear import refuse_marginalised
-from mpfjax.models.steps import likelihoods
+from mpfjax.models.steps import likelihoods, log_transition
 from mpfjax.moves.base import AbstractMarkovMove
-from mpfjax.moves.propagation.propagate import log_transition
 from mpfjax.operations.logarithms import add_gradient, without_gradient
+from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.random import normal, split, uniform
 
 
@@ -49,13 +52,23 @@ class AbstractMetropolis(AbstractMarkovMove):
     is s times the standard deviation of the dynamics, where log s is uniform between log
     `least_step` and 0 and drawn anew each time. The standard deviation is that of new draws from
     D(. | x_{t-1}). Integer parts of the state do not move.
+
+    - `model`: with `log_transition`.
+    - `num_steps`: how many steps each particle takes.
+    - `least_step`: the smallest s.
+    - `exponent`: β, for a likelihood that enters by powers, as with `Reweight(model, exponent)`.
+    - `gradient`: "none" differentiates the draws, "stop" the density of the state after the move,
+      as with `gradient` of `Propagate`.
+
+    Raises `ValueError` for a model without `log_transition`, no steps, a least step or an exponent
+    out of range.
     """
 
-    model: eqx.AbstractVar[AbstractStateSpaceModel]
-    num_steps: eqx.AbstractVar[int]
-    least_step: eqx.AbstractVar[float]
-    exponent: eqx.AbstractVar[float]
-    gradient: eqx.AbstractVar[str]
+    model: AbstractStateSpaceModel
+    num_steps: int = eqx.field(static=True, default=1)
+    least_step: float = eqx.field(static=True, default=0.02)
+    exponent: float = eqx.field(static=True, default=1.0)
+    gradient: str = eqx.field(static=True, default="none")
 
     def __check_init__(self) -> None:
         who = type(self).__name__
@@ -113,118 +126,73 @@ class RandomWalkMetropolis(AbstractMetropolis):
     The difference of two draws from the dynamics is symmetric and has twice their covariance. Every
     particle therefore walks in the units and along the correlations of its own dynamics.
     Differential evolution (ter Braak 2006) uses differences of particles in the same way, but is
-    not exact here. See `AbstractMetropolis`.
+    not exact here. See `AbstractMetropolis`, which has the arguments.
 
-    - `model`: with `log_transition`.
-    - `num_steps`: how many steps each particle takes.
-    - `least_step`: the smallest s.
-    - `exponent`: β, for a likelihood that enters by powers, as with `Reweight(model, exponent)`.
-    - `gradient`: "none" differentiates the draws, "stop" the density of the state after the move,
-      as with `gradient` of `Propagate`.
-
-    Each step takes two draws of the dynamics, and one evaluation of D and L. Raises `ValueError`
-    for a model without `log_transition`, no steps, a least step or an exponent out of range. Use it
-    after a resampling that leaves few distinct particles.
+    Each step takes two draws of the dynamics, and one evaluation of D and L. Use it after a
+    resampling that leaves few distinct particles.
     """
-
-    model: AbstractStateSpaceModel
-    num_steps: int = eqx.field(static=True, default=1)
-    least_step: float = eqx.field(static=True, default=0.02)
-    exponent: float = eqx.field(static=True, default=1.0)
-    gradient: str = eqx.field(static=True, default="none")
 
     def propose(
         self, key: Key[Array, ""], length: Float[Array, " n"], states: PyTree, target: _Target
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """x + s (a - b) / √2, whose reverse step has the same density."""
+        rows, back = _as_rows(states)
         first, second = _two_draws(key, self.model, target.parents)
-
-        def walk(state: Array, a: Array, b: Array) -> Array:
-            return state + _rows(length, state) * (a - b) / jnp.sqrt(2).astype(state.dtype)
-
-        return _on_floats(walk, states, first, second), jnp.zeros_like(length)
+        step = length.astype(rows.dtype)[:, None] * (first - second) / math.sqrt(2)
+        return back(rows + step), jnp.zeros_like(length)
 
 
 class MetropolisAdjustedLangevin(AbstractMetropolis):
     """Metropolis steps along the gradient: x' = x + s²/2 C ∇ log π(x) + s C^½ ξ, ξ ~ N(0, I).
 
     MALA (Roberts and Tweedie 1996) for π = D L^β, the gradient by JAX. C is diagonal: the variances
-    of the dynamics, from pairs of fresh draws for all parents. See `AbstractMetropolis`; arguments
-    and errors are those of `RandomWalkMetropolis`. Each step takes two draws of the dynamics, two
-    gradients and an evaluation of D and L. Use it in more than a few dimensions, where D and L are
-    smooth.
+    of the dynamics, from pairs of fresh draws for all parents. See `AbstractMetropolis`, which has
+    the arguments. Each step takes two draws of the dynamics, two gradients and an evaluation of D
+    and L. Use it in more than a few dimensions, where D and L are smooth.
     """
-
-    model: AbstractStateSpaceModel
-    num_steps: int = eqx.field(static=True, default=1)
-    least_step: float = eqx.field(static=True, default=0.02)
-    exponent: float = eqx.field(static=True, default=1.0)
-    gradient: str = eqx.field(static=True, default="none")
 
     def propose(
         self, key: Key[Array, ""], length: Float[Array, " n"], states: PyTree, target: _Target
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """A step of the Langevin diffusion, and the reverse step's log density relative to it."""
+        rows, back = _as_rows(states)
         key_spread, key_noise = split(key, 2)
         first, second = _two_draws(key_spread, self.model, target.parents)
-        deviations = _on_floats(_deviation, first, second)
-        floats, rest = eqx.partition(states, eqx.is_inexact_array)
+        deviations = jnp.sqrt(0.5 * jnp.mean((first - second) ** 2, axis=0))
+        unit = length.astype(rows.dtype)[:, None] * deviations[None]
 
-        def drift(floats: PyTree) -> PyTree:
+        def drift(rows: Float[Array, "n d"]) -> Float[Array, "n d"]:
             """s/2 C^½ ∇ log π, in the units of the noise."""
 
-            def total(floats: PyTree) -> Float[Array, ""]:
-                log_dynamics, log_likelihood = target(eqx.combine(floats, rest))
+            def total(rows: Float[Array, "n d"]) -> Float[Array, ""]:
+                log_dynamics, log_likelihood = target(back(rows))
                 return jnp.sum(log_dynamics) + target.exponent * jnp.sum(log_likelihood)
 
-            half = lambda slope, unit: 0.5 * _rows(length, slope) * unit * slope  # noqa: E731
-            return _on_floats(half, jax.grad(total)(floats), deviations)
+            return 0.5 * unit * jax.grad(total)(rows)
 
-        leaves, structure = jax.tree.flatten(floats)
-        keys = split(key_noise, len(leaves))
-        drawn = [
-            normal(key, leaf.shape, leaf.dtype) for key, leaf in zip(keys, leaves, strict=True)
-        ]
-        noise, forth = jax.tree.unflatten(structure, drawn), drift(floats)
-        go = lambda x, unit, a, b: x + _rows(length, x) * unit * (a + b)  # noqa: E731
-        proposed = _on_floats(go, floats, deviations, forth, noise)
-        back = drift(proposed)
+        noise, forth = normal(key_noise, rows.shape, rows.dtype), drift(rows)
+        proposed = rows + unit * (forth + noise)
         # The noise of the reverse step, from x' to x.
-        log_ratio = _sum_of_rows(
-            lambda a, b, xi: 0.5 * (xi**2 - (a + b + xi) ** 2), forth, back, noise
-        )
-        return eqx.combine(proposed, rest), log_ratio.astype(length.dtype)
+        reverse = forth + drift(proposed) + noise
+        log_ratio = row_sums(0.5 * (noise**2 - reverse**2))
+        return back(proposed), log_ratio.astype(length.dtype)
 
 
-def _two_draws(key: Key[Array, ""], model: Any, parents: PyTree) -> tuple[PyTree, PyTree]:
-    first, second = split(key, 2)
+def _as_rows(states: PyTree) -> tuple[Float[Array, "n d"], Callable[[Array], PyTree]]:
+    """The floating point numbers of each particle as a row, and what makes states of such rows."""
+    floats, rest = eqx.partition(states, eqx.is_inexact_array)
+    unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], floats))[1]
+    rows = jax.vmap(lambda one: ravel_pytree(one)[0])(floats)
+    return rows, lambda rows: eqx.combine(jax.vmap(unravel)(rows), rest)
+
+
+def _two_draws(key: Key[Array, ""], model: Any, parents: PyTree) -> tuple[Array, Array]:
+    """Two draws of x_t from each parent, as rows."""
     draw = lambda key: without_gradient(model.sample_transition(key, parents))  # noqa: E731
-    return draw(first), draw(second)
-
-
-def _deviation(first: Array, second: Array) -> Array:
-    """The standard deviation of the dynamics in every entry of the state, over all particles."""
-    return jnp.sqrt(0.5 * jnp.mean((first - second) ** 2, axis=0, keepdims=True))
-
-
-def _on_floats(function: Any, states: PyTree, *others: PyTree) -> PyTree:
-    """Apply the function to floating point leaves; the others are those of the first tree."""
-
-    def of_leaf(leaf: Any, *rest: Any) -> Any:
-        return function(leaf, *rest) if eqx.is_inexact_array(leaf) else leaf
-
-    return jax.tree.map(of_leaf, states, *others)
-
-
-def _sum_of_rows(function: Any, *trees: PyTree) -> Float[Array, " n"]:
-    values = jax.tree.leaves(jax.tree.map(function, *trees))
-    return sum(jnp.sum(value.reshape(value.shape[0], -1), axis=1) for value in values)  # pyright: ignore[reportReturnType]
+    first, second = (_as_rows(draw(own))[0] for own in split(key, 2))
+    return first, second
 
 
 def _where(taken: Bool[Array, " n"], new: PyTree, old: PyTree) -> PyTree:
-    return jax.tree.map(lambda a, b: jnp.where(_rows(taken, a), a, b), new, old)
-
-
-def _rows(per_particle: Array, values: Array) -> Array:
-    row = per_particle.reshape(-1, *[1] * (values.ndim - 1))
-    return row if row.dtype == bool else row.astype(values.dtype)
+    rows = lambda leaf: taken.reshape(-1, *[1] * (leaf.ndim - 1))  # noqa: E731
+    return jax.tree.map(lambda a, b: jnp.where(rows(a), a, b), new, old)

@@ -163,6 +163,12 @@ def is_traced(tree: PyTree) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
+def jit_with_floats_traced(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    """`jit_on_wide_vectors` of a function of a filter first, by `with_floats_traced`."""
+    compiled = jit_on_wide_vectors(function)
+    return lambda filter, *rest: with_floats_traced(lambda own: compiled(own, *rest), filter)
+
+
 # The errors of JAX where Python asks for the value of a traced number.
 _NEEDS_VALUE = (
     jax.errors.ConcretizationTypeError,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_key, check_whole
-from mpfjax.filter import Filter, Start
+from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
@@ -83,7 +83,7 @@ def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any
 
 def _run_block(keys, filter, series, collect):
     """The islands of one device."""
-    run_one = lambda key: scan(Start(key), filter, series, collect)  # noqa: E731
+    run_one = lambda key: scan(key, filter, series, collect)  # noqa: E731
     return jax.vmap(run_one, axis_name=ISLAND_AXIS)(keys)
 
 

@@ -5,19 +5,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_flag, check_key, check_whole, given
-from mpfjax.filter import Filter, Start
+from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.initial import sample_initial
-from mpfjax.observations import Series, as_series
+from mpfjax.observations import as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
-from mpfjax.operations.random import split, split_keys
 from mpfjax.running.devices import choose_devices, num_processors, over_devices, over_threads
 from mpfjax.running.progress import shown_progress
-from mpfjax.running.scan import FilterRun, check_run, checked, first_mixture, scan
+from mpfjax.running.scan import FilterRun, check_run, checked, first_mixture, initial_keys, scan
 
 # How many particles, with the temporaries of a step, fit into a CPU's caches. Few components
 # have a row of particles each, which counts as so many times the particles.
@@ -94,10 +91,9 @@ def monte_carlo(
       a thread for each processor, if there is enough to do.
     - `slots`: the length of the particle arrays, at least N; the slots after the first N stay
       empty. None is N. Filters that differ in N alone compile once if they have the same `slots`:
-      1000, for example, for N = 50, 200 and 1000; but the choice of x_0 by y_1 among more draws
-      compiles for each N. Each then costs as much as 1000 particles. A run has the law of one
-      without `slots`, though not the same particles. `collect` sees the empty slots as well, with
-      `occupied` false.
+      1000, for example, for N = 50, 200 and 1000; the start alone compiles for each N. Each
+      then costs as much as 1000 particles. A run has the law of one without `slots`, though not the
+      same particles. `collect` sees the empty slots as well, with `occupied` false.
 
     Raises `ValueError` for more devices than there are, fewer slots than particles, and `slots`
     with the moves that need every slot, `PropagateIndependently` and `PropagateInClusters`.
@@ -106,12 +102,16 @@ def monte_carlo(
     check_run(filter, collect)
     check_flag(progress=progress)
     check_whole(**given(slots=slots))
+    if slots is not None and slots < filter.num_particles:
+        raise ValueError(f"slots: {slots} is no whole number of at least N, {filter.num_particles}")
     series = as_series(observations, filter.model, inputs, missing)
 
     def run(filter: Filter) -> FilterRun:
-        starts = Start(keys)
+        starts = (keys, None)
         if slots is not None:
-            starts, filter = _in_slots(keys, filter, slots, series)
+            # A program of its own, since draws and moves of x_0 may depend on N.
+            starts = (keys, _start_each(keys, filter, series, int(slots)))
+            filter = filter.replace(num_particles=int(slots))
         arguments = (filter, series, collect, *bars)
         leave_to_caller = devices is None and is_traced((starts, arguments))
         chosen = None if leave_to_caller else choose_devices(devices)
@@ -125,71 +125,34 @@ def monte_carlo(
 
 @jit_on_wide_vectors
 def _run(key, filter, series, collect, bar=None):
-    return scan(Start(key), filter, series, collect, bar)
-
-
-def _in_slots(
-    keys: Key[Array, " seeds"], filter: Filter, slots: int, series: Series
-) -> tuple[Start, Filter]:
-    """The starts of the runs and the filter, both with this number of slots whatever N is."""
-    num_particles = filter.num_particles
-    if slots < num_particles:
-        raise ValueError(f"slots: {slots} is no whole number of at least N, {num_particles}")
-    # A model's draws may depend on N, as stratified draws do. So these are programs of their own;
-    # all filters of a model share the first one.
-    larger = filter.replace(num_particles=int(slots))
-    if filter.looks_at_first:
-        return Start(keys, mixture=_start_each(keys, filter, series, int(slots))), larger
-    particles = _sample_each(keys, filter.model, filter.initial_noise, num_particles, int(slots))
-    return Start(keys, particles, jnp.full(keys.shape, num_particles, jnp.int32)), larger
-
-
-@jit_on_wide_vectors
-def _sample_each(keys, model, noise, num_particles, slots):
-    """x_0 of each run, as `Filter.init` draws it."""
-
-    def sample(key: Key[Array, ""]) -> PyTree:
-        key_initial = split_keys(split_keys(key, 2)[0], 1)[0]
-        return _filled(sample_initial(key_initial, model, num_particles, noise), slots)
-
-    return jax.vmap(sample)(keys)
+    return scan(key, filter, series, collect, bar)
 
 
 @jit_on_wide_vectors
 def _start_each(keys, filter, series, slots):
-    """The mixture of x_0 of each run, where y_1 has a part in it."""
-    num_initial = 1 + len(filter._initial_moves)
+    """The mixture of x_0 of each run, in this number of slots."""
 
     def start(key: Key[Array, ""]) -> ParticleMixture:
-        keys_initial = split(split_keys(key, 2)[0], num_initial)
-        mixture = first_mixture(Start(keys_initial), filter, series)
-        is_empty = jnp.arange(slots) >= filter.num_particles
-        log_weights = _filled(mixture.log_weights, slots)
-        return mixture.replace(
-            particles=_filled(mixture.particles, slots),
-            log_weights=jnp.where(is_empty, -jnp.inf, log_weights),
-            component_indicators=_filled(mixture.component_indicators, slots),
-            ancestor_indices=jnp.arange(slots, dtype=jnp.int32),
-            usable_slots=jnp.asarray(filter.num_particles, jnp.int32),
+        mixture = first_mixture(initial_keys(key, filter), filter, series)
+        number = jnp.asarray(filter.num_particles, jnp.int32)
+        slot = jnp.arange(slots, dtype=jnp.int32)
+        # Those that stay empty hold one of the particles as well.
+        filled = mixture.at(jnp.minimum(slot, number - 1))
+        return filled.replace(
+            log_weights=jnp.where(slot < number, filled.log_weights, -jnp.inf),
+            ancestor_indices=slot,
+            usable_slots=number,
         )
 
     return jax.vmap(start)(keys)
 
 
-def _filled(particles: PyTree, slots: int) -> PyTree:
-    """The particles in so many slots; those that stay empty hold one of them as well."""
-
-    def fill(leaf: Array) -> Array:
-        return leaf[np.minimum(np.arange(slots), leaf.shape[0] - 1)]
-
-    return jax.tree.map(fill, particles)
-
-
 def _run_each(starts, filter, series, collect, bar=None):
-    num_runs = starts.key.shape[0]
+    num_runs = starts[0].shape[0]
     size = _group_size(num_runs, filter)
     bar = None if bar is None else bar._replace(num_runs=size)
-    run_together = jax.vmap(lambda start: scan(start, filter, series, collect, bar))
+    run = lambda key, initial: scan(key, filter, series, collect, bar, initial)  # noqa: E731
+    run_together = lambda starts: jax.vmap(run)(*starts)  # noqa: E731
     if size == num_runs:
         return run_together(starts)
     in_groups = jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), starts)
@@ -211,7 +174,7 @@ _run_all = jit_on_wide_vectors(_run_each)
 
 def _run_on_threads(starts, filter, series, collect, *bars):
     """All runs on one device; on a CPU, several threads share them."""
-    num_runs = starts.key.shape[0]
+    num_runs = starts[0].shape[0]
     num_worth_it = num_runs * filter.num_particles // _WORTH_A_THREAD
     num_threads = min(num_processors(), num_runs, num_worth_it)
     keeps_all = collect is None  # threads would hold two copies of it for a while

@@ -12,12 +12,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from mpfjax.chain import BROKEN_DENSITY
 from mpfjax.checks import check_callable, check_type, given, saying
-from mpfjax.filter import BROKEN_DENSITY, Filter, Start, StepInfo
+from mpfjax.filter import Filter, StepInfo
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Series
 from mpfjax.operations.islands import num_islands
-from mpfjax.operations.random import split_for_run
+from mpfjax.operations.random import split, split_for_run, split_keys
 from mpfjax.running.progress import Bar, advance_bar
 
 
@@ -39,15 +40,16 @@ class FilterRun(eqx.Module):
 
 
 def scan(
-    start: Start,
+    key: Key[Array, ""],
     filter: Filter,
     series: Series,
     collect: Callable[[ParticleMixture], PyTree] | None,
     bar: Bar | None = None,
+    initial: ParticleMixture | None = None,
 ) -> FilterRun:
-    """`run_filter` under the caller's jit, its arguments unchecked."""
+    """`run_filter` under the caller's jit, its arguments unchecked, from an `initial` mixture."""
     num_initial, num_moves = 1 + len(filter._initial_moves), len(filter._moves)
-    keys_initial, keys = split_for_run(start.key, num_initial, series.length, num_moves)
+    keys_initial, keys = split_for_run(key, num_initial, series.length, num_moves)
 
     def advance(
         mixture: ParticleMixture, step: tuple[Array, Series, Array | None]
@@ -61,27 +63,33 @@ def scan(
         return mixture, (kept, report_of(info))
 
     numbers = None if bar is None else jnp.arange(series.length, dtype=jnp.int32)
-    initial = first_mixture(start._replace(key=keys_initial), filter, series)
+    if initial is None:
+        initial = first_mixture(keys_initial, filter, series)
     final, outputs = jax.lax.scan(advance, initial, (keys, series, numbers))
     return run_of(initial, final, *outputs)
 
 
-def first_mixture(start: Start, filter: Filter, series: Series) -> ParticleMixture:
+def initial_keys(key: Key[Array, ""], filter: Filter) -> Key[Array, " i"]:
+    """The keys with which a run with this key draws and moves x_0."""
+    return split(split_keys(key, 2)[0], 1 + len(filter._initial_moves))
+
+
+def first_mixture(key: Key[Array, "*keys"], filter: Filter, series: Series) -> ParticleMixture:
     """The mixture of x_0 that the first step goes on from, given y_1 where it is there.
 
     On islands it has the share of one of them in the mass of all.
     """
     log_islands = math.log(num_islands())
     if not filter.looks_at_first:
-        mixture = filter._init(start)
+        mixture = filter._init(key)
         return mixture.replace(log_weights=mixture.log_weights - log_islands)
     first = jax.tree.map(lambda leaf: leaf[0], series)
     given = filter.with_inputs(first.inputs)
-    look = lambda: given._init(start, first.observations)  # noqa: E731
+    look = lambda: given._init(key, first.observations)  # noqa: E731
     if first.present is None:
         mixture = look()
     else:
-        mixture = jax.lax.cond(first.present, look, lambda: given._init(start))
+        mixture = jax.lax.cond(first.present, look, lambda: given._init(key))
     return mixture.replace(log_scale=mixture.log_scale - log_islands)
 
 

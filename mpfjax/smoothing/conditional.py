@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import as_numbers, check_flag, check_key, check_type, shown
-from mpfjax.filter import Filter, Start
+from mpfjax.filter import Filter
 from mpfjax.models.base import AbstractStateSpaceModel, model_name, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.moves.conditional import REFERENCE, ConditionalPropagation, Reference, at, put
@@ -18,7 +18,7 @@ from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import Series, as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.random import split, uniform
-from mpfjax.running.scan import FilterRun, checked, scan
+from mpfjax.running.scan import FilterRun, checked, initial_keys, scan
 from mpfjax.smoothing.backward import draw, log_transitions
 from mpfjax.smoothing.history import ancestors_of, mixtures_of, paths_through
 from mpfjax.smoothing.trajectories import draw_trajectories
@@ -136,7 +136,8 @@ def renew(
     particles = _independent_initial(key_initial, filter.model, n)
     start = jax.tree.map(lambda leaf, own: put(leaf, own[0], first_slot), particles, trajectory)
     around = _around(filter, Reference(trajectory, first_slot))
-    run = scan(Start(key_run, start), around, series, None)
+    initial = around._init(initial_keys(key_run, around), particles=start)
+    run = scan(key_run, around, series, None, initial=initial)
     reference = run.collected.memory[REFERENCE]["slot"]
     log_weights = jax.vmap(at)(run.collected.log_weights, reference)
     seen = (log_weights > -jnp.inf) & ~run.degenerate

@@ -34,7 +34,7 @@ from mpfjax.models.conditionally_linear import (
     with_moments,
 )
 from mpfjax.models.inputs import with_inputs
-from mpfjax.moves.propagation.marginalised import log_latent_transition
+from mpfjax.models.steps import log_transition
 from mpfjax.operations import gaussians
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.gaussians import (
@@ -225,7 +225,7 @@ def _indices(
         own, *of_future = trajectory
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), own)
         law = predicted_gaussian(model, copies, state)
-        log_density = log_latent_transition(model, copies, state)
+        log_density = log_transition(model, copies, state)
         seen = emission_of(model, copies, state)
         if seen is not None:
             rows = observation_rows(model, observation, seen, state.mean.dtype)

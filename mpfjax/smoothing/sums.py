@@ -20,7 +20,7 @@ from mpfjax.checks import (
     saying,
     shown,
 )
-from mpfjax.filter import Filter, Start
+from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
@@ -120,7 +120,7 @@ def _smooth(key, filter, series, options):
     key_initial, key_steps, key_backward = split_keys(key, 3)
     length = series.length
     step_keys = jax.random.split(key_steps, length)
-    initial = first_mixture(Start(key_initial), filter, series)
+    initial = first_mixture(key_initial, filter, series)
     num_kept = 1 if lag is None else lag + 1
     states = initial.particles
     shapes = jax.eval_shape(partial(_of_states, function), states, states)

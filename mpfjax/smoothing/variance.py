@@ -12,14 +12,13 @@ from mpfjax.chain import check_keep_parents
 from mpfjax.checks import check_callable, check_type, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.base import AbstractMove, with_inner
 from mpfjax.moves.eve_indices import (
     EVE_INDICES,
     evidence_variance,
     mass_variances,
     with_new_eve_indices,
 )
-from mpfjax.moves.every import with_inner
 from mpfjax.operations.logarithms import log_sum_exp
 from mpfjax.running.scan import FilterRun
 

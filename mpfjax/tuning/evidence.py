@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_type
-from mpfjax.filter import Filter, Start
+from mpfjax.filter import Filter
 from mpfjax.moves.base import AbstractMove
 from mpfjax.observations import Series, as_series, gathered
 from mpfjax.proposals import AbstractProposal
@@ -30,7 +30,7 @@ class LogEvidence(eqx.Module):
         total = 0.0
         for g, group in enumerate(self.groups):
             keys = jax.random.split(jax.random.fold_in(key, g), group.length)
-            run = lambda key, series: scan(Start(key), filter, series, _nothing)  # noqa: E731
+            run = lambda key, series: scan(key, filter, series, _nothing)  # noqa: E731
             total += jnp.sum(jax.vmap(run)(keys, group).log_marginal_likelihood)
         return jnp.asarray(total)
 

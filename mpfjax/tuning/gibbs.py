@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import check_callable, check_key, check_type, given, saying, shown
-from mpfjax.filter import Filter, Start
+from mpfjax.filter import Filter
 from mpfjax.models.base import require
 from mpfjax.models.inputs import with_inputs
 from mpfjax.models.steps import likelihoods
@@ -206,7 +206,7 @@ class _Kernel(AbstractKernel):
         key_run, key_back = jax.random.split(key)
         filter = self.problem.at(reals)
         series = self.joint.series
-        run = scan(Start(key_run), filter, series, None)
+        run = scan(key_run, filter, series, None)
         drawn = draw_trajectory(
             key_back, filter.model, run, series.inputs, self.backward, checked=False
         )

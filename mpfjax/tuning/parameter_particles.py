@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mpfjax.filter import Filter, Start
+from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.observations import Series
@@ -44,7 +44,7 @@ class FilterOf(eqx.Module):
 
     def start(self, key: Key[Array, ""], filter: Filter) -> ParticleMixture:
         """The mixture of x_0."""
-        return first_mixture(Start(key), filter, self.series)
+        return first_mixture(key, filter, self.series)
 
     def step(
         self, key: Key[Array, ""], filter: Filter, mixture: ParticleMixture, t: Int[Array, ""]

@@ -292,10 +292,23 @@ def test_parts_of_other_shapes_are_named(part, message):
         mpfjax.run_filter(KEY, mpfjax.particle_filter(Wrong(LINEAR, part), 4), SERIES)
 
 
+def test_the_marginalised_step_is_that_of_the_same_moves():
+    ratios = []
+    for moves in (
+        [Resample(), PropagateMarginalised(MODEL)],
+        [Resample(), mpfjax.Propagate(MODEL)],
+        [Resample(), mpfjax.Predict(MODEL), mpfjax.Reweight(MODEL)],
+    ):
+        run = mpfjax.run_filter(KEY, Filter(MODEL, moves, 2000), OBSERVATIONS)
+        ratios.append(float(run.log_marginal_likelihood) - truth().log_evidence[-1])
+    assert ratios[0] == ratios[1]
+    np.testing.assert_allclose(ratios, 0.0, atol=0.1)
+
+
 def test_misuse_is_named():
     with pytest.raises(ValueError, match="observation: shape"):
         mpfjax.run_filter(KEY, ONE, SERIES[:, :1])
-    for make in (mpfjax.Propagate, mpfjax.Predict, mpfjax.Reweight, mpfjax.PropagateTempered):
+    for make in (mpfjax.PropagateTempered, lambda model: mpfjax.Reweight(model, 0.5)):
         with pytest.raises(ValueError, match=r"model: .* is conditionally linear"):
             make(MODEL)
     with pytest.raises(ValueError, match=r"object_model: .* is conditionally linear"):

@@ -38,7 +38,7 @@ class Watch(AbstractMarkovMove):
     needs_parents = property(lambda self: True)
 
     def __call__(self, key, mixture, observation=None):
-        return mixture.replace(memory={"parents": mixture.parents})
+        return mixture.replace(memory=mixture.memory | {"parents": mixture.parents})
 
     def initial_memory(self, num_components):
         return {"parents": jnp.zeros((64, 2))}
@@ -68,10 +68,13 @@ def test_a_move_leaves_the_target_as_it_is(move):
     np.testing.assert_array_equal(moved.log_weights, mixture.log_weights)
 
 
-def test_parents_follow_their_particles():
+@pytest.mark.parametrize(
+    "again", [Resample("multinomial"), Every(2, [Resample("multinomial")])], ids=["each", "every"]
+)
+def test_parents_follow_their_particles(again):
     """Through resampling before and after the propagation, they are the states of the ancestors."""
     watched = Watch()
-    moves = [Resample(), Propagate(MODEL), Resample("multinomial"), watched]
+    moves = [Resample(), Propagate(MODEL), again, watched]
     filter = Filter(MODEL, moves, 64, 3, initial_moves=[KMeans(3, reseed=True)])
     run = mpfjax.run_filter(jax.random.key(0), filter, OBSERVATIONS)
     before, after = run.collected.particles[0], run.final
@@ -134,8 +137,6 @@ class TestArguments:
         regenerated = Every(2, [GaussianRegeneration()])
         with pytest.raises(ValueError, match="GaussianRegeneration leaves no particle one parent"):
             Filter(MODEL, [Propagate(MODEL), regenerated, move], 8)
-        with pytest.raises(ValueError, match="may only regroup beside it"):
-            Filter(MODEL, [Propagate(MODEL), Every(2, [Resample(), move])], 8)
         with pytest.raises(ValueError, match="comes before any propagation"):
             move(jax.random.key(0), Filter(MODEL, [Propagate(MODEL)], 8).init(jax.random.key(0)), 0)
 

@@ -100,7 +100,6 @@ def test_a_density_that_is_nan_is_said_and_not_resampled_away():
         ({"exponents": (0.5, 0.2, 1.0)}, "exponents"),
         ({"exponents": (0.1, 0.5)}, "exponents"),
         ({"exponents": ()}, "exponents"),
-        ({"exponents": "all"}, "exponents"),
         ({"num_moves": 0}, "num_moves"),
         ({"least_step": 1.5}, "least_step"),
         ({"resample": Resample(sort_by="hilbert")}, "sort_by"),

@@ -12,7 +12,6 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.noise import draw_family_noise, noise_dtype
 from mpfjax.moves.base import AbstractPropagation
-from mpfjax.moves.propagation.marginalised import PropagateMarginalised
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.operations.random import split, uniform
 from mpfjax.operations.stored import take
@@ -27,7 +26,7 @@ class PropagateNested(AbstractPropagation):
     of K N particles that keeps one child of each parent. Ẑ is that of K N particles, and unbiased.
     The model is evaluated K N times, but only N particles are resampled, sorted and regrouped.
 
-    - `propagate`: the `Propagate`, or `PropagateMarginalised`, that draws. With its noise "rqmc"
+    - `propagate`: the `Propagate` that draws. With its noise "rqmc"
       the draws of a family fill K strata of the first dimension of the noise, and one more
       dimension of the same point set says which of them is kept. So what is kept is spread over
       slot and noise as well.
@@ -37,12 +36,14 @@ class PropagateNested(AbstractPropagation):
     kept. Use it where the likelihood is narrow and cheap, with four to sixteen draws.
     """
 
-    propagate: Propagate | PropagateMarginalised
+    propagate: Propagate
     num_draws: int = eqx.field(static=True, default=4)
 
+    draws_each = True
+    """each particle moves without a look at the others."""
+
     def __check_init__(self) -> None:
-        kinds = (Propagate, PropagateMarginalised)
-        check_type(kinds, "a Propagate, nor a PropagateMarginalised", propagate=self.propagate)
+        check_type(Propagate, "a Propagate", propagate=self.propagate)
         check_whole(num_draws=self.num_draws)
         if self.propagate.gradient == "stop":
             raise ValueError("propagate: gradient 'stop' does not see which draw is kept")
@@ -83,7 +84,8 @@ class PropagateNested(AbstractPropagation):
     ) -> tuple[ParticleMixture, Float[Array, " n"]]:
         """The weighed mixture of all draws, and the uniform numbers by which draws are selected."""
         n, k, propagate = mixture.num_particles, self.num_draws, self.propagate
-        repeated = _repeated(mixture, k)
+        repeated = mixture.repeated(k)
+        repeated = repeated.replace(log_weights=repeated.log_weights - math.log(k))
         if propagate.noise == "independent":
             key_draws, key_kept = split(key, 2)
             shares = uniform(key_kept, (n,), mixture.log_weights.dtype)
@@ -94,20 +96,3 @@ class PropagateNested(AbstractPropagation):
             mixture.component_indicators, mixture.num_components, not mixture.in_order,
         )  # fmt: skip
         return propagate.from_noise(noise, repeated, observation), shares
-
-
-def _repeated(mixture: ParticleMixture, num_draws: int) -> ParticleMixture:
-    """Every particle K times, side by side, with its weight shared among them."""
-    n = mixture.num_particles
-
-    def repeat(leaf: Array) -> Array:
-        shape = leaf.shape[1:]
-        rows = jnp.broadcast_to(leaf.reshape(n, 1, *shape), (n, num_draws, *shape))
-        return rows.reshape(n * num_draws, *shape)
-
-    return mixture.replace(
-        particles=jax.tree.map(repeat, mixture.particles),
-        log_weights=repeat(mixture.log_weights) - math.log(num_draws),
-        component_indicators=repeat(mixture.component_indicators),
-        ancestor_indices=repeat(mixture.ancestor_indices),
-    )

@@ -1,32 +1,36 @@
 """Propagation from t-1 to t: the bootstrap proposal, and any proposal with its own density."""
 
-from typing import Any, cast
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_exponent, check_one_of, check_type, saying
+from mpfjax.checks import check_exponent, check_one_of, check_type
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
-    HasTransitionDensity,
-    HasTransitionNoise,
-    check_log_density,
     check_moved,
     is_made_of_noise,
-    model_name,
     require,
     require_model,
     require_noise,
 )
-from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.conditionally_linear import is_mixed, refuse_marginalised, require_marginalised
 from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
-from mpfjax.models.steps import likelihoods
+from mpfjax.models.steps import (
+    completed,
+    drawn,
+    drawn_part,
+    likelihoods,
+    log_transition,
+    made_of,
+    noise_dimension,
+    seen,
+)
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.conditional import ConditionalPropagation, Reference
-from mpfjax.operations.logarithms import add_gradient, finite_max
+from mpfjax.operations.logarithms import add_gradient, finite_max, without_gradient
 from mpfjax.proposals import AbstractProposal
 
 
@@ -63,14 +67,11 @@ class Propagate(AbstractPropagation):
     gradient: str = eqx.field(static=True, default="none")
     noise: str = eqx.field(static=True, default="independent")
 
+    draws_each = True
+    """each particle moves without a look at the others."""
+
     def __check_init__(self) -> None:
-        _check_whole_states(self.model, type(self).__name__)
-        check_propagated_gradient(self.gradient, self.model)
-        check_noise(self.noise, self.model, self.proposal)
-        if self.proposal is not None:
-            what = "a proposal, such as GaussNewtonProposal(model)"
-            check_type(AbstractProposal, what, proposal=self.proposal)
-            require(self.model, "log_transition", f"proposal {type(self.proposal).__name__}")
+        _check_draws(self, self.proposal)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -80,47 +81,46 @@ class Propagate(AbstractPropagation):
             noise = noise_of_slots(self.noise, key, self.noise_dimension(mixture), mixture)
             return self.from_noise(noise, mixture, observation)
         if self.proposal is None:
-            return _weigh(self.model, self.predict(key, mixture), observation)
-        drawn = self.proposal.propose(key, observation, mixture.particles)
-        return self._weighed(drawn, mixture, observation)
+            return _weighed(self.model, self.predict(key, mixture), observation)
+        draws = self.proposal.propose(key, observation, mixture.particles)
+        return self._proposed(draws, mixture, observation)
 
     def from_noise(
         self, noise: Float[Array, "n k"], mixture: ParticleMixture, observation: PyTree
     ) -> ParticleMixture:
         """The same with x_t made of this noise, a row for each slot."""
         if self.proposal is None:
-            moved = _made_of(noise, self.model, mixture, self.gradient)
-            return _weigh(self.model, moved, observation)
+            draws = made_of(self.model, noise, mixture.particles)
+            moved = _moved(draws, self.model, mixture, self.gradient)
+            return _weighed(self.model, moved, observation)
         proposal: Any = self.proposal
-        drawn = proposal.propose_from_noise(noise, observation, mixture.particles)
-        return self._weighed(drawn, mixture, observation)
+        draws = proposal.propose_from_noise(noise, observation, mixture.particles)
+        return self._proposed(draws, mixture, observation)
 
     def noise_dimension(self, mixture: ParticleMixture) -> int:
         """k, the number of standard normal numbers that x_t is made of."""
-        if self.proposal is None:
-            return cast(HasTransitionNoise, self.model).noise_dimension
         proposal: Any = self.proposal
+        if proposal is None:
+            return noise_dimension(self.model, mixture.particles)
         return proposal.noise_dimension(mixture.particles)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) and leave the weights, for a step without an observation."""
-        # The noise may be that of the proposal alone.
-        spreads = self.proposal is None or is_made_of_noise(self.model)
-        noise = self.noise if spreads else "independent"
-        return predict(key, self.model, mixture, self.gradient, noise)
+        return predict(key, self.model, mixture, self.gradient, self.noise)
 
-    def _weighed(
+    def _proposed(
         self,
-        drawn: tuple[PyTree, Float[Array, " n"]],
+        proposed: tuple[PyTree, Float[Array, " n"]],
         mixture: ParticleMixture,
         observation: PyTree,
     ) -> ParticleMixture:
         """The mixture of the proposal's draws, with the log density of each."""
-        (states, log_density), previous = drawn, mixture.particles
-        check_moved(states, previous, self.proposal, "propose")
+        (draws, log_density), previous = proposed, mixture.particles
+        check_moved(draws, drawn_part(self.model, previous), self.proposal, "propose")
         if self.gradient == "stop":
-            states, log_density = jax.lax.stop_gradient((states, log_density))
-        return self.weighed(mixture.replace(particles=states), observation, previous, log_density)
+            draws, log_density = without_gradient((draws, log_density))
+        moved = mixture.replace(particles=completed(self.model, draws, previous))
+        return self.weighed(moved, observation, previous, log_density)
 
     def weighed(
         self,
@@ -131,13 +131,42 @@ class Propagate(AbstractPropagation):
     ) -> ParticleMixture:
         """The weights of x_t times L, and D / q where each has been drawn with a log q."""
         if log_density is None:
-            return _weigh(self.model, mixture, observation)
-        log_ratio = log_transition(self.model, mixture.particles, previous) - log_density
-        return _weigh(self.model, mixture, observation, log_ratio)
+            return _weighed(self.model, mixture, observation)
+        draws = drawn_part(self.model, mixture.particles)
+        log_ratio = log_transition(self.model, draws, previous) - log_density
+        return _weighed(self.model, mixture, observation, log_ratio)
 
     def around(self, reference: Reference) -> ConditionalPropagation:
         """The same around the trajectory, where noise and proposal allow it."""
         return ConditionalPropagation(self, reference)
+
+
+class PropagateMarginalised(Propagate):
+    """Draw z_t, predict, weigh by the predictive density of y_t, and update by it.
+
+    The step of a Rao-Blackwellised particle filter, or mixture Kalman filter (Chen and Liu 2000;
+    Doucet, de Freitas, Murphy and Russell 2000), for an `AbstractConditionallyLinearModel`. Each
+    particle (z, m, P) draws z_t, and its Kalman filter predicts x_t. The weight is multiplied by
+
+        p(y_t | z_0, ..., z_t, y_1..y_{t-1}) = N(y_t; H m + c, H P Hᵀ + R)
+
+    and by the likelihood of what is seen of z_t alone. Then the Kalman filter is updated. Joint
+    weights then have their mixture weights updated as in `Propagate`, and Ẑ is unbiased. In the
+    mixed form, z_t is drawn from its law given y_1..y_{t-1}, N(f + A m, A P Aᵀ + V), and first
+    updates x_{t-1}. The covariance is updated in Joseph's form, which keeps it positive in float32.
+
+    - `proposal`: z_t ~ q in place of its own law, as `RegimeProposal(model)`. An `AbstractProposal`
+      whose `propose(key, observation, particles)` is given the particles (latent, mean,
+      covariance) of t - 1, and returns z_t and log q. The factor is then p(y_t | ...) p(z_t) / q.
+    - `gradient`, `noise`: those of `Propagate`, of the draw of z_t. Moments are differentiated.
+
+    Without an observation z_t is drawn by its own law, and moments are predicted. Raises
+    `ValueError` for another model, and as `Propagate` does. `particle_filter`,
+    `mixture_particle_filter` and `auxiliary_particle_filter` use it for such a model.
+    """
+
+    def __check_init__(self) -> None:
+        require_marginalised(self.model, "PropagateMarginalised")
 
 
 class Predict(AbstractPropagation):
@@ -152,15 +181,11 @@ class Predict(AbstractPropagation):
     gradient: str = eqx.field(static=True, default="none")
     noise: str = eqx.field(static=True, default="independent")
 
-    def __check_init__(self) -> None:
-        _check_whole_states(self.model, type(self).__name__)
-        check_propagated_gradient(self.gradient, self.model)
-        check_noise(self.noise, self.model)
+    weighs = False
+    """the observation changes no weight."""
 
-    @property
-    def weighs(self) -> bool:
-        """False: the observation changes no weight."""
-        return False
+    def __check_init__(self) -> None:
+        _check_draws(self)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -198,8 +223,10 @@ class Reweight(AbstractPropagation):
     exponent: float = eqx.field(static=True, default=1.0)
 
     def __check_init__(self) -> None:
-        _check_whole_states(self.model, "Reweight")
+        require_model(self.model, "Reweight")
         check_exponent(exponent=self.exponent)
+        if self.exponent != 1:
+            refuse_marginalised(self.model, "a part of the likelihood", "take exponent 1")
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -207,16 +234,11 @@ class Reweight(AbstractPropagation):
         """Reweight every particle by y_t."""
         del key
         if self.exponent == 1:
-            return _weigh(self.model, mixture, observation)
+            return _weighed(self.model, mixture, observation)
         log_factors = likelihoods(self.model, observation, mixture.particles)
         # Differences would be lost to rounding beside a large common constant.
         common = finite_max(jnp.where(mixture.occupied, log_factors, -jnp.inf))
         return mixture.weighed(self.exponent * (log_factors - common), self.exponent * common[None])
-
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """The mixture unchanged: there is no observation."""
-        del key
-        return mixture
 
     def around(self, reference: Reference) -> "Reweight":
         """The move itself, which weighs the trajectory as any other."""
@@ -224,33 +246,25 @@ class Reweight(AbstractPropagation):
         return self
 
 
-def _check_whole_states(model: Any, needed_by: str) -> None:
-    """Raise a `ValueError` for what is no model, or one whose particles carry moments."""
-    require_model(model, needed_by)
-    refuse_marginalised(model, needed_by)
-
-
-def check_propagated_gradient(gradient: str, model: object) -> None:
-    """Raise a `ValueError` for an unknown gradient, or one whose density the model lacks.
-
-    A model that is None lacks nothing.
-    """
-    check_one_of(("none", "stop"), gradient=gradient)
-    if gradient == "stop" and model is not None:
+def _check_draws(move: Any, proposal: Any = None) -> None:
+    """Raise a `ValueError` for a gradient, noise or proposal that the model cannot have."""
+    model = move.model
+    require_model(model, type(move).__name__)
+    check_one_of(("none", "stop"), gradient=move.gradient)
+    check_one_of(NOISES, noise=move.noise)
+    # The mixed form has the law of z_t and its noise whatever the model's methods are.
+    has_law, needs_noise = is_mixed(model), move.noise != "independent"
+    if move.gradient == "stop" and not has_law:
         require(model, "log_transition", "gradient='stop'")
-
-
-def check_noise(noise: str, model: object, proposal: object = None) -> None:
-    """Raise a `ValueError` for unknown noise, or one that model or proposal cannot be made of."""
-    check_one_of(NOISES, noise=noise)
-    if noise == "independent":
-        return
-    if proposal is None:
-        if model is not None:
-            require_noise(model, f"noise={noise!r}")
-        return
-    for method in ("propose_from_noise", "noise_dimension"):
-        require(proposal, method, f"noise={noise!r}", "proposal")
+    if proposal is not None:
+        what = "a proposal, such as GaussNewtonProposal(model) or RegimeProposal(model)"
+        check_type(AbstractProposal, what, proposal=proposal)
+        if not has_law:
+            require(model, "log_transition", f"proposal {type(proposal).__name__}")
+        for method in ("propose_from_noise", "noise_dimension") if needs_noise else ():
+            require(proposal, method, f"noise={move.noise!r}", "proposal")
+    elif needs_noise and not has_law:
+        require_noise(model, f"noise={move.noise!r}")
 
 
 def noise_of_slots(
@@ -271,57 +285,34 @@ def predict(
     noise: str = "independent",
 ) -> ParticleMixture:
     """Draws of x_t, with the weights' derivatives times D / ⊥D where the draws have none."""
-    if noise != "independent":
-        dimension = cast(HasTransitionNoise, model).noise_dimension
-        return _made_of(noise_of_slots(noise, key, dimension, mixture), model, mixture, gradient)
-    states = model.sample_transition(key, mixture.particles)
-    check_moved(states, mixture.particles, model)
-    return _moved(states, model, mixture, gradient)
-
-
-def _made_of(
-    noise: Float[Array, "n k"],
-    model: AbstractStateSpaceModel,
-    mixture: ParticleMixture,
-    gradient: str,
-) -> ParticleMixture:
-    """The mixture of x_t made of this noise."""
-    who = f"model: {model_name(model)}.transition_from_noise"
-    with saying(f"in {who}, of noise of shape {noise.shape}, as noise_dimension says"):
-        states = cast(HasTransitionNoise, model).transition_from_noise(noise, mixture.particles)
-    check_moved(states, mixture.particles, model, "transition_from_noise")
-    return _moved(states, model, mixture, gradient)
+    states = mixture.particles
+    # The noise may be that of a proposal alone.
+    if noise != "independent" and (is_mixed(model) or is_made_of_noise(model)):
+        numbers = noise_of_slots(noise, key, noise_dimension(model, states), mixture)
+        draws = made_of(model, numbers, states)
+    else:
+        draws = drawn(key, model, states)
+    return _moved(draws, model, mixture, gradient)
 
 
 def _moved(
-    states: PyTree, model: AbstractStateSpaceModel, mixture: ParticleMixture, gradient: str
+    draws: PyTree, model: AbstractStateSpaceModel, mixture: ParticleMixture, gradient: str
 ) -> ParticleMixture:
-    """The mixture with these states, and the density that "stop" differentiates."""
-    if gradient == "none":
-        return mixture.replace(particles=states)
-    states = jax.lax.stop_gradient(states)
-    log_density = log_transition(model, states, mixture.particles)
-    log_density = jnp.where(mixture.occupied, log_density.astype(mixture.log_weights.dtype), 0.0)
-    return mixture.replace(
-        particles=states, log_weights=add_gradient(mixture.log_weights, log_density)
-    )
+    """The mixture with these draws, and their density, which "stop" differentiates."""
+    previous, log_weights = mixture.particles, mixture.log_weights
+    if gradient == "stop":
+        draws = without_gradient(draws)
+        log_density = log_transition(model, draws, previous).astype(log_weights.dtype)
+        log_weights = add_gradient(log_weights, jnp.where(mixture.occupied, log_density, 0.0))
+    return mixture.replace(particles=completed(model, draws, previous), log_weights=log_weights)
 
 
-def log_transition(
-    model: AbstractStateSpaceModel, states: PyTree, previous_states: PyTree
-) -> Float[Array, " n"]:
-    """log D of each particle, checked."""
-    values = cast(HasTransitionDensity, model).log_transition(states, previous_states)
-    num_particles = jax.tree.leaves(states)[0].shape[0]
-    return check_log_density(values, model, "log_transition", num_particles)
-
-
-def _weigh(
+def _weighed(
     model: AbstractStateSpaceModel,
     mixture: ParticleMixture,
     observation: PyTree,
-    log_ratio: Float[Array, " n"] | None = None,
+    *log_ratio: Float[Array, " n"],
 ) -> ParticleMixture:
-    """The weights times L, and times D / q where the draw was not from D."""
-    log_factors = likelihoods(model, observation, mixture.particles)
-    return mixture.weighed(*[log_factors] if log_ratio is None else [log_factors, log_ratio])
+    """The particles updated by y_t, their weights times L, and D / q where that is the ratio."""
+    states, log_factors = seen(model, observation, mixture.particles)
+    return mixture.replace(particles=states).weighed(*log_factors, *log_ratio)

@@ -151,19 +151,10 @@ class PropagateRegimes(AbstractPropagation):
 
         Where one point of the line follows the other, each regime then has its share of them.
         """
-        n, state = mixture.num_particles, mixture.particles
-        parents = jnp.tile(jnp.arange(n, dtype=jnp.int32), len(latents))
-        return mixture.replace(
-            particles=MarginalisedState(
-                jax.tree.map(lambda *rows: jnp.concatenate(rows), *latents),
-                take(state.mean, parents),
-                take(state.covariance, parents),
-            ),
-            log_weights=take(mixture.log_weights, parents),
-            component_indicators=take(mixture.component_indicators, parents),
-            ancestor_indices=take(mixture.ancestor_indices, parents),
-            memory={},
-        )
+        parents = jnp.tile(jnp.arange(mixture.num_particles, dtype=jnp.int32), len(latents))
+        family = mixture.at(parents)
+        latent = jax.tree.map(lambda *rows: jnp.concatenate(rows), *latents)
+        return family.replace(particles=family.particles._replace(latent=latent), memory={})
 
     def _chosen(
         self, key: Key[Array, ""], mixture: ParticleMixture, family: ParticleMixture
@@ -191,13 +182,12 @@ class PropagateRegimes(AbstractPropagation):
         log_weights = take(family.log_weights, places)
         log_least = spread(log_or_nothing(threshold) + line.log_units, slots.components)
         gain = jax.lax.stop_gradient(jnp.maximum(log_least - log_weights, 0.0))
-        latent, mean, covariance = jax.tree.map(lambda leaf: take(leaf, places), family.particles)
-        return mixture.replace(
-            particles=predicted(self.model, latent, MarginalisedState(latent, mean, covariance)),
+        kept = family.at(places)
+        return kept.replace(
+            particles=predicted(self.model, kept.particles.latent, kept.particles),
             log_weights=jnp.where(slots.filled, log_weights + gain, -jnp.inf),
             component_indicators=slots.components,
-            ancestor_indices=take(family.ancestor_indices, places),
-            log_scale=family.log_scale,
+            memory=mixture.memory,
         )
 
 

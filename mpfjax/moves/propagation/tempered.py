@@ -1,5 +1,6 @@
 """Tempered propagation: the likelihood enters by powers, and particles move in between."""
 
+import itertools
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -12,21 +13,18 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, require_model, require_noise
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import noise_dtype
-from mpfjax.models.steps import likelihoods
+from mpfjax.models.steps import likelihoods, made_of
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.logarithms import finite_max
 from mpfjax.operations.random import normal, split, uniform
 
-EXPONENTS = (1 / 64, 1 / 16, 1 / 4, 1.0)
-
 
 class TemperedParticles(NamedTuple):
-    """What is resampled between the stages: x_t, and all that it takes to draw it again."""
+    """What is resampled between the stages: x_t, the noise that it is made of, and log L."""
 
     states: PyTree
-    parents: PyTree
     noise: Float[Array, "n d"]
     log_likelihoods: Float[Array, " n"]
 
@@ -45,7 +43,7 @@ class PropagateTempered(AbstractPropagation):
     `least_step` and 0.
 
     - `model`: with `transition_from_noise`.
-    - `resample`: the resampling between the stages; None is `Resample()`.
+    - `resample`: the resampling between the stages.
     - `exponents`: β_1 < β_2 < ... < 1; the last is 1.
     - `num_moves`: moves after each stage but the last.
     - `least_step`: the smallest s.
@@ -58,33 +56,25 @@ class PropagateTempered(AbstractPropagation):
     """
 
     model: AbstractStateSpaceModel
-    resample: Resample
-    exponents: tuple[float, ...] = eqx.field(static=True)
-    num_moves: int = eqx.field(static=True)
-    least_step: float = eqx.field(static=True)
+    resample: Resample = eqx.field(default_factory=Resample)
+    exponents: tuple[float, ...] = eqx.field(
+        converter=tuple, static=True, default=(1 / 64, 1 / 16, 1 / 4, 1.0)
+    )
+    num_moves: int = eqx.field(static=True, default=1)
+    least_step: float = eqx.field(static=True, default=0.02)
 
-    def __init__(
-        self,
-        model: AbstractStateSpaceModel,
-        resample: Resample | None = None,
-        *,
-        exponents: tuple[float, ...] = EXPONENTS,
-        num_moves: int = 1,
-        least_step: float = 0.02,
-    ) -> None:
-        require_model(model, "PropagateTempered")
-        refuse_marginalised(model, "PropagateTempered")
-        require_noise(model, "PropagateTempered")
-        self.model = model
-        self.resample = Resample() if resample is None else resample
+    def __check_init__(self) -> None:
+        require_model(self.model, "PropagateTempered")
+        refuse_marginalised(self.model, "PropagateTempered")
+        require_noise(self.model, "PropagateTempered")
         check_type(Resample, "a Resample", resample=self.resample)
         if self.resample.sort_by is not None:
             raise ValueError("resample: sort_by has no use between the stages")
-        self.exponents = _rising(exponents)
-        check_whole(num_moves=num_moves)
-        self.num_moves = int(num_moves)
-        check_inner_share(least_step=least_step)
-        self.least_step = float(least_step)
+        rises = all(a < b for a, b in itertools.pairwise((0.0, *self.exponents)))
+        if not rises or self.exponents[-1:] != (1.0,):
+            raise ValueError(f"exponents: {shown(self.exponents)} do not rise from above 0 to 1")
+        check_whole(num_moves=self.num_moves)
+        check_inner_share(least_step=self.least_step)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -94,15 +84,15 @@ class PropagateTempered(AbstractPropagation):
         key_noise, key_stages = split(key, 2)
         parents = mixture.particles
         noise = normal(key_noise, (n, model.noise_dimension), noise_dtype(parents))
-        states = model.transition_from_noise(noise, parents)
+        states = made_of(model, noise, parents)
         log_likelihoods = likelihoods(self.model, observation, states)
         # Resampling may lose a NaN, or a particle whose likelihood is infinite.
         broken = jnp.any(mixture.occupied & ~(log_likelihoods < jnp.inf))
         # Differences between stages would be lost to rounding beside a large common constant.
         common = finite_max(jnp.where(mixture.occupied, log_likelihoods, -jnp.inf))
         log_likelihoods = log_likelihoods - common
-        travellers = TemperedParticles(states, parents, noise, log_likelihoods)
-        mixture = mixture.replace(particles=travellers)
+        travellers = TemperedParticles(states, noise, log_likelihoods)
+        mixture = mixture.replace(particles=travellers, parents=parents)
         mixture = mixture.weighed(self.exponents[0] * log_likelihoods)
 
         def next_stage(
@@ -141,25 +131,13 @@ class PropagateTempered(AbstractPropagation):
         n, dtype = mixture.num_particles, now.noise.dtype
         step = jnp.asarray(self.least_step, dtype) ** uniform(key_step, (n, 1), dtype)
         noise = jnp.sqrt(1 - step**2) * now.noise + step * normal(key_noise, now.noise.shape, dtype)
-        states = cast(Any, self.model).transition_from_noise(noise, now.parents)
+        states = made_of(self.model, noise, mixture.parents)
         log_likelihoods = likelihoods(self.model, observation, states) - common
         log_ratio = exponent * log_likelihoods - exponent * now.log_likelihoods
         taken = jnp.log(uniform(key_taken, (n,), dtype)) < log_ratio
-        proposed = TemperedParticles(states, now.parents, noise, log_likelihoods)
+        proposed = TemperedParticles(states, noise, log_likelihoods)
 
         def pick(new: Array, old: Array) -> Array:
             return jnp.where(taken.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
         return mixture.replace(particles=jax.tree.map(pick, proposed, now))
-
-
-def _rising(exponents: Any) -> tuple[float, ...]:
-    """The exponents as numbers, or a `ValueError` unless they rise from above zero to one."""
-    try:
-        numbers = tuple(float(number) for number in exponents)
-    except (TypeError, ValueError):
-        numbers = ()
-    rises = all(low < high for low, high in zip((0.0, *numbers), numbers, strict=False))
-    if not numbers or not rises or numbers[-1] != 1.0:
-        raise ValueError(f"exponents: {shown(exponents)} do not rise from above 0 to 1")
-    return numbers

@@ -1,10 +1,9 @@
 """Resampling with a look-ahead: the auxiliary particle filter as a move."""
 
+from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import check_callable, check_type, saying, shown
@@ -52,20 +51,17 @@ class AuxiliaryResample(AbstractMove):
             what = "a function of an observation and states, nor a proposal"
             check_callable(what, lookahead=self.lookahead)
 
-    @property
-    def sorts(self) -> bool:
-        """Whether the resampling does."""
-        return self.resample.sorts
+    def map_inner(self, change: Callable[[Any], Any]) -> "AuxiliaryResample":
+        """The same with another `Resample`."""
+        return AuxiliaryResample(change(self.resample), self.lookahead)
 
     @property
     def resampling(self) -> Resample:
         """The `Resample` that draws."""
         return self.resample
 
-    @property
-    def weighs(self) -> bool:
-        """False: the weights are divided by the look-ahead again."""
-        return False
+    weighs = False
+    """the weights are divided by the look-ahead again."""
 
     @property
     def reads(self) -> frozenset[str]:
@@ -104,13 +100,9 @@ class AuxiliaryResample(AbstractMove):
         with saying("in lookahead, which is called with an observation and the particles"):
             look = getattr(look, "log_normaliser", look)
             values = look(observation, mixture.particles)
-        if not isinstance(values, jax.Array | np.ndarray) or jnp.iscomplexobj(values):
-            raise ValueError(f"lookahead: it returned {shown(values)}, no real array")
-        if values.shape != (mixture.num_particles,):
-            raise ValueError(
-                f"lookahead: it returned shape {values.shape}, not one value a particle,"
-                f" ({mixture.num_particles},)"
-            )
+        expected = (mixture.num_particles,)
+        if jnp.shape(values) != expected or jnp.iscomplexobj(values):
+            raise ValueError(f"lookahead: it returned {shown(values)}, no real array {expected}")
         log_factors = jnp.asarray(values).astype(mixture.log_weights.dtype)
         seen = mixture.weighed(log_factors).active
         is_seen = spread(seen, mixture.component_indicators) | ~(log_factors < jnp.inf)

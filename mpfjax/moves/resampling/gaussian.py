@@ -6,20 +6,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import check_callable, check_one_of, check_positive, check_whole, given
 from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
 from mpfjax.models.noise import NOISES, draw_noise, stratified_normal
 from mpfjax.moves.base import AbstractResampling
 from mpfjax.moves.regrouping.features import origin, summarise
-from mpfjax.moves.resampling.allocation import allocate_slots, place_slots
 from mpfjax.moves.resampling.ordering import sorted_order
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.matrices import cholesky
 from mpfjax.operations.random import split
-from mpfjax.operations.segments import segment_argmax, spread
-from mpfjax.operations.stored import take
+from mpfjax.operations.segments import spread
 
 
 class GaussianRegeneration(AbstractResampling):
@@ -41,9 +39,8 @@ class GaussianRegeneration(AbstractResampling):
       curve, as `Propagate(noise="rqmc")` needs them.
 
     With a singular Σ_m, draws stay in its plane; a component of one particle, or of copies of one,
-    gives that particle again. With `where`, ancestors are the resampled particles; without it, the
-    heaviest particle of the component. Raises `ValueError` for an inflation that is not positive,
-    an unknown noise or particles_per_component < 1.
+    gives that particle again. A draw has no single ancestor. Raises `ValueError` for an inflation
+    that is not positive, an unknown noise or particles_per_component < 1.
     """
 
     particles_per_component: int | None = eqx.field(static=True, default=None)
@@ -57,20 +54,10 @@ class GaussianRegeneration(AbstractResampling):
         check_positive(inflation=self.inflation)
         check_one_of((*NOISES, "stratified"), noise=self.noise)
 
-    @property
-    def approximate(self) -> bool:
-        """True: each component is replaced by a Gaussian."""
-        return True
-
-    @property
-    def sorts(self) -> bool:
-        """Whether the draws are put in order."""
-        return self.noise == "rqmc"
-
-    @property
-    def keeps_parents(self) -> bool:
-        """False: a draw of a Gaussian comes from all particles of its component."""
-        return False
+    approximate = True
+    """each component is replaced by a Gaussian."""
+    keeps_parents = False
+    """a draw of a Gaussian comes from all particles of its component."""
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
@@ -78,14 +65,16 @@ class GaussianRegeneration(AbstractResampling):
         """Redraw every living component."""
         del observation
         key_noise, key_rest = split(key, 2)
-        if self.where is None:
-            vacated = self._vacated(mixture)
-            drawn = self._draw(key_noise, mixture.particles, mixture, vacated)
-            return self._in_line(vacated, drawn)
-        resample = Resample(particles_per_component=self.particles_per_component)
+        # The slots dealt anew; where the whole state is redrawn, nothing else is used of it.
+        resample = Resample(
+            particles_per_component=self.particles_per_component,
+            allocation="equal" if self.where is None else "variance",
+        )
         vacated = resample(key_rest, mixture)
-        drawn = self._draw(key_noise, self.where(mixture.particles), mixture, vacated)
-        return self._in_line(vacated, eqx.tree_at(self.where, vacated.particles, drawn))
+        drawn = self._draw(key_noise, self._redrawn(mixture.particles), mixture, vacated)
+        if self.where is not None:
+            drawn = eqx.tree_at(self.where, vacated.particles, drawn)
+        return self._in_line(vacated, drawn)
 
     def _in_line(self, vacated: ParticleMixture, drawn: PyTree) -> ParticleMixture:
         """The mixture of these draws, ordered if the next noise is a point set over its slots."""
@@ -94,34 +83,13 @@ class GaussianRegeneration(AbstractResampling):
             return mixture
         labels = mixture.component_indicators
         labels = jnp.where(mixture.occupied, labels, mixture.num_components)
-        order = sorted_order(mixture, labels, self._redrawn)
-        return mixture.replace(
-            particles=jax.tree.map(lambda leaf: take(leaf, order), mixture.particles),
-            log_weights=take(mixture.log_weights, order),
-            component_indicators=take(mixture.component_indicators, order),
-        )
+        own = lambda particles: flatten_states(self._redrawn(particles))  # noqa: E731
+        order = sorted_order(mixture, labels, own)
+        return mixture.at(order).replace(in_order=True)
 
-    def _redrawn(self, particles: PyTree) -> Float[Array, "n d"]:
-        """The part of the state that is redrawn, flattened."""
-        return flatten_states(particles if self.where is None else self.where(particles))
-
-    def _vacated(self, mixture: ParticleMixture) -> ParticleMixture:
-        """The slots dealt anew, each holding its component's heaviest particle."""
-        m, counts = mixture.num_components, mixture.component_counts
-        targets = allocate_slots(
-            jnp.zeros_like(counts), counts > 0, mixture.num_usable_slots,
-            self.particles_per_component,
-        )  # fmt: skip
-        slots = place_slots(targets, mixture.num_particles)
-        shares = jnp.maximum(targets, 1).astype(mixture.log_weights.dtype)
-        log_weights = spread(mixture.log_mixture_weights - jnp.log(shares), slots.components)
-        heaviest = segment_argmax(mixture.log_weights, mixture.component_indicators, m)
-        parents = spread(heaviest, slots.components)
-        return mixture.replace(
-            particles=jax.tree.map(lambda leaf: take(leaf, parents), mixture.particles),
-            log_weights=jnp.where(slots.filled, log_weights, -jnp.inf),
-            component_indicators=slots.components,
-        )
+    def _redrawn(self, particles: PyTree) -> PyTree:
+        """The part of the state that is redrawn."""
+        return particles if self.where is None else self.where(particles)
 
     def _draw(
         self,

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import check_callable, check_one_of, check_share, check_whole, given
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractAdaptiveResampling
+from mpfjax.moves.base import AbstractResampling
 from mpfjax.moves.conditional import ConditionalResample, Reference
 from mpfjax.moves.eve_indices import with_offspring
 from mpfjax.moves.resampling.allocation import (
@@ -28,7 +28,7 @@ ALLOCATIONS = ("variance", "equal")
 GRADIENTS = ("none", "stop")
 
 
-class Resample(AbstractAdaptiveResampling):
+class Resample(AbstractResampling):
     """Draw each component's particles anew in proportion to their weights w_i.
 
     Components are resampled independently of each other, which keeps the support of every mode
@@ -103,11 +103,6 @@ class Resample(AbstractAdaptiveResampling):
             )
 
     @property
-    def sorts(self) -> bool:
-        """Whether particles are sorted, those that are not resampled as well."""
-        return self.sort_by is not None
-
-    @property
     def biases_score(self) -> bool:
         """Whether it may resample, and without a gradient."""
         return self.gradient == "none" and self.ess_threshold > 0
@@ -122,6 +117,13 @@ class Resample(AbstractAdaptiveResampling):
         if self.particles_per_component is not None:
             due = due | (counts != self.particles_per_component)
         return due & (counts > 0)
+
+    def would_resample(
+        self, mixture: ParticleMixture, observation: PyTree = None
+    ) -> Bool[Array, " m"]:
+        """Those that are due."""
+        del observation
+        return self.is_due(mixture)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
@@ -165,11 +167,10 @@ class Resample(AbstractAdaptiveResampling):
             log_weights = add_gradient(jax.lax.stop_gradient(log_weights), old)
         if not all_are_due:
             log_weights = jnp.where(spread(due, slots.components), log_weights, old)
-        redrawn = mixture.replace(
-            particles=jax.tree.map(lambda leaf: take(leaf, parents), mixture.particles),
+        redrawn = mixture.at(parents).replace(
             log_weights=jnp.where(slots.filled, log_weights, -jnp.inf),
             component_indicators=slots.components if m > 1 else mixture.component_indicators,
-            ancestor_indices=take(mixture.ancestor_indices, parents),
+            in_order=self.sort_by is not None,
         )
         return with_offspring(redrawn, mixture, parents, targets, due), ancestors
 
