@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.checks import check_finite_array, real_arrays, shown
+from mpfjax.checks import real_arrays, shown
 from mpfjax.models.base import check_log_density, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.inputs import saying_that_none_were_given, with_inputs
@@ -89,18 +89,16 @@ def _width(grid: Any) -> Any:
 
 def _checked_grid(grid: Any) -> tuple[Float[Array, " g"], Any]:
     """The points and the width; a `ValueError` unless they ascend evenly, as far as is known."""
-    points = real_arrays("...", grid=grid)
-    if points.ndim != 1 or points.shape[0] < 2:
-        raise ValueError(f"grid: shape {points.shape} is not one row of at least two points")
+    points = real_arrays("points", grid=grid)
+    if len(points) < 2:
+        raise ValueError(f"grid: shape {points.shape} is not that of two points or more")
     width = _width(grid)
-    if isinstance(points, Tracer):
-        return points, width
-    check_finite_array(grid=points)
-    known = np.asarray(points)  # within a caller's jit, too
-    even = float(known[0]) + width * np.arange(len(known))
-    rounding = 4 * np.finfo(known.dtype).eps * np.abs(even).max()
-    if not (width > rounding and np.abs(known - even).max() <= rounding):
-        raise ValueError(f"grid: {shown(grid)} does not ascend in even steps")
+    if not isinstance(points, Tracer):
+        known = np.asarray(points)  # within a caller's jit, too
+        even = float(known[0]) + width * np.arange(len(known))
+        rounding = 4 * np.finfo(known.dtype).eps * np.abs(even).max()
+        if not (width > rounding and np.abs(known - even).max() <= rounding):
+            raise ValueError(f"grid: {shown(grid)} does not ascend in even steps")
     return points, width
 
 

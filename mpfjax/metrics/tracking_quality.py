@@ -69,9 +69,7 @@ def success_rate(
 
     Raises `ValueError` for no runs or no frames.
     """
-    _check(track_states)
-    fine = track_states if present is None else track_states | ~present[None]
-    return jnp.mean(jnp.all(fine, axis=1).astype(jnp.result_type(float)), axis=0)
+    return recovery_rate(track_states, present, num_last=max(track_states.shape[1], 1))
 
 
 def recovery_rate(
@@ -86,7 +84,8 @@ def recovery_rate(
     `num_last` frames that have a true box. An object that is tracked throughout fulfils this too.
     Raises `ValueError` for no runs or no frames, or `num_last` below 1.
     """
-    _check(track_states)
+    if 0 in track_states.shape[:2]:
+        raise ValueError(f"track_states: shape {track_states.shape} holds no runs or no frames")
     check_whole(num_last=num_last)
     if present is None:
         present = jnp.ones(track_states.shape[1:], bool)
@@ -113,10 +112,8 @@ def tracking_quality(
         raise ValueError(
             f"truth: shape {truth.shape} is not {estimates.shape[1:]}, that of one run's estimates"
         )
-    check_whole(num_last=num_last)
     present = jnp.all(jnp.isfinite(truth), axis=-1)
     states = track_state(estimates, truth[None])
-    _check(states)
     tracked = states.astype(estimates.dtype)
     count = jnp.sum(tracked, axis=(0, 1))
 
@@ -138,8 +135,3 @@ def _share(area: Float[Array, "*batch"], boxes: Float[Array, "*#batch 4"]) -> Fl
     # Apart from rounding, a part of a box has no more area than the box.
     meets = area > 0
     return jnp.where(meets, jnp.minimum(area / jnp.where(meets, whole, 1.0), 1.0), 0.0)
-
-
-def _check(track_states: Bool[Array, "runs t *objects"]) -> None:
-    if 0 in track_states.shape[:2]:
-        raise ValueError(f"track_states: shape {track_states.shape} holds no runs or no frames")
