@@ -20,6 +20,7 @@ from mpfjax.checks import (
     check_rows,
     check_scalars,
     check_shape,
+    check_type,
     shown,
     to_array,
 )
@@ -236,6 +237,7 @@ class WalkWithVelocity(AbstractDynamics):
     )
 
     def __check_init__(self) -> None:
+        check_type(RandomWalk, "a walk such as RandomWalk(deviations)", walk=self.walk)
         d, gain = self.walk.deviations.shape[-1], np.asarray(self.gain)
         if len(gain) not in (1, d) or not ((gain >= 0) & (gain <= 1)).all():
             raise ValueError(f"gain: {self.gain} is not one or {d} numbers in [0, 1]")
