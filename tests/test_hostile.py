@@ -274,13 +274,12 @@ RUN = {
     "conditional_filter": (
         mpfjax.smoothing.conditional_filter,
         {"key": KEY, "filter": FILTER, "observations": np.ones(2, np.float32),
-         "trajectory": np.ones(3, np.float32), "backward": True, "missing": "error"},
+         "trajectory": np.ones(3, np.float32), "backward": True},
     ),
     "smoothed_sums": (
         mpfjax.smoothing.smoothed_sums,
         {"key": KEY, "filter": FILTER, "observations": np.ones(2, np.float32),
-         "function": difference, "lag": None, "method": "exact", "num_draws": 2,
-         "missing": "error"},
+         "function": difference, "lag": None, "method": "exact", "num_draws": 2},
     ),
     "trace_ancestors": (mpfjax.smoothing.trace_ancestors, {"mixtures": HISTORY}),
     "with_first_ancestors": (mpfjax.smoothing.with_first_ancestors, {"filter": INDEPENDENT}),

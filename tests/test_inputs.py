@@ -201,8 +201,9 @@ def test_smoothed_means_are_those_of_the_kalman_smoother(method):
     def by_sums(key):
         # With a lag of the whole series, each term is smoothed by all observations.
         found = smoothed_sums(
-            key, filter, OBSERVATIONS, lambda before, after: jnp.stack([before, after], axis=1),
-            lag=LENGTH, method=name, num_draws=2 if name == "exact" else 30, inputs=given,
+            key, filter, mpfjax.Series(OBSERVATIONS, given),
+            lambda before, after: jnp.stack([before, after], axis=1),
+            lag=LENGTH, method=name, num_draws=2 if name == "exact" else 30,
         )  # fmt: skip
         return jnp.concatenate([found.terms[:1, 0], found.terms[:, 1]])
 

@@ -41,8 +41,6 @@ def learn_lookahead(
     *,
     num_particles: int | None = None,
     features: Callable[[PyTree], Array] | None = None,
-    inputs: PyTree = None,
-    missing: str = "error",
 ) -> Filter:
     """Learn a filter that looks ahead to all later observations, when it resamples and when it
     draws.
@@ -78,7 +76,7 @@ def learn_lookahead(
       of ψ stay. Each pass is kept whole while ψ is fitted. Take more where a mode may be missed.
     - `features`: φ, in which log ψ is nearly quadratic, (states) -> (n, d); of one particle, if the
       model is wrapped by `per_particle`. None is the flattened state.
-    - `inputs`, `missing`: those of `run_filter`; steps without an observation are looked over.
+    - `observations`: arrays, or a `Series`; steps without an observation are looked over.
 
     For a conditionally linear model ε is the noise of z_t, L the density of y_t given z_0, ..., z_t
     and y_1..y_{t-1}, and φ that of the particles: by default of the latent and the mean.
@@ -94,13 +92,13 @@ def learn_lookahead(
     model: Any = filter.model
     if not is_mixed(model):
         require_noise(model, "learn_lookahead")
-    series = as_series(observations, model, inputs, missing)
+    series = as_series(observations, model)
     twist = _knowing_nothing(key, filter, series.length, mapped(model, features))
     learners = num_particles or _LEARNERS * filter.num_particles
     for pass_key in jax.random.split(key, num_passes):
         run_key, fit_key = jax.random.split(pass_key)
         twisted = _twisted(filter, twist, learners)
-        run = run_filter(run_key, twisted, observations, inputs=inputs, missing=missing)
+        run = run_filter(run_key, twisted, series)
         twist = fit_lookahead(fit_key, twisted, twist, run, series)
     return _twisted(filter, twist, filter.num_particles)
 

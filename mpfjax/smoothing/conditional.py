@@ -49,8 +49,6 @@ def conditional_filter(
     trajectory: PyTree,
     *,
     backward: bool = True,
-    inputs: PyTree = None,
-    missing: str = "error",
 ) -> ConditionalRun:
     """Run a filter around a trajectory that is kept, and draw a new one from all its particles.
 
@@ -76,7 +74,7 @@ def conditional_filter(
     - `backward`: draw the new trajectory by backward sampling, which needs the model's
       `log_transition`. Without it, by the genealogy: it then differs from the old one only
       in the last steps, unless N is large.
-    - `observations`, `inputs`, `missing`: as for `run_filter`.
+    - `observations`: arrays, or a `Series`.
 
     x_0 is drawn one particle at a time, also where the model would draw it in strata, and no
     `SelectInitial` chooses it. The model's `sample_transition` must draw particles independently of
@@ -93,7 +91,7 @@ def conditional_filter(
     check_type(Filter, "a Filter", filter=filter)
     check_flag(backward=backward)
     check_conditional(filter, backward, "conditional_filter")
-    series = as_series(observations, filter.model, inputs, missing)
+    series = as_series(observations, filter.model)
     trajectory = _as_states(trajectory, filter.model, series.length + 1)
     # Checked before the run: backward sampling could not recover an impossible trajectory.
     _require(eqx.filter_jit(possible_times)(filter.model, trajectory, series.inputs))

@@ -65,8 +65,6 @@ def smoothed_sums(
     lag: int | None = None,
     method: str = "exact",
     num_draws: int = 2,
-    inputs: PyTree = None,
-    missing: str = "error",
 ) -> SmoothedSums:
     """E[Σ_t h(x_{t-1}, x_t) | y], online: PaRIS, in memory that does not grow with t.
 
@@ -86,7 +84,7 @@ def smoothed_sums(
       the ancestor and goes on by steps of independent Metropolis-Hastings, O(N), and is as exact.
     - `num_draws`: how many particles J are drawn for each particle. With one, few distinct
       particles of early times are left, as in a genealogy. Two are enough.
-    - `observations`, `inputs`, `missing`: as in `run_filter`.
+    - `observations`: arrays, or a `Series`.
 
     Raises `ValueError` for a model without `log_transition`, values that are not one a particle,
     "mcmc" where a move leaves no single ancestors, and as `run_filter` does; a RuntimeError where
@@ -105,7 +103,7 @@ def smoothed_sums(
     if method == "mcmc":
         check_keep_parents("filter", filter.moves, "smoothed_sums with method 'mcmc'")
     check_whole(num_draws=num_draws)
-    series = as_series(observations, filter.model, inputs, missing)
+    series = as_series(observations, filter.model)
     if lag is not None:
         lag = min(lag, series.length - 1)
     options = (mapped(filter.model, function), lag, method, num_draws)

@@ -14,7 +14,7 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, require, require_model
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
 from mpfjax.models.inputs import saying_that_none_were_given, with_inputs
-from mpfjax.observations import as_arrays, steps_of_inputs
+from mpfjax.observations import as_arrays, gathered, steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split_keys
 from mpfjax.operations.stored import take
@@ -56,7 +56,8 @@ def sample_trajectories(
       N grows.
     - `num_steps`: of "mcmc"; None is one.
     - `inputs`: u_1, ..., u_t, the known inputs that the run had.
-    - `observations`: y_1..y_t, which a conditionally linear model needs and no other takes.
+    - `observations`: y_1..y_t, arrays or a `Series`, which a conditionally linear model needs and
+      no other takes; a NaN is a missing number.
       Backward sampling is then that of Lindsten, Bunch, Särkkä, Schön and Godsill (2016): latents
       are drawn, and the result is a `MarginalisedState` of them with the mean and the covariance of
       each x_s given these and y_1..y_t. It needs a whole run, with x_0, and method "exact".
@@ -84,8 +85,8 @@ def sample_trajectories(
         check_whole(0, component=component)
         _check_component(stacked, component)
     if is_marginalised(model) or observations is not None:
+        observations = as_arrays(gathered(observations).observations)
         check_marginalised(model, stacked, observations, method)
-        observations = as_arrays(observations)
         drawn = sample_marginalised(
             key, model, stacked, observations, inputs, num_trajectories, component
         )

@@ -59,7 +59,7 @@ CASES = {
 @cache
 def learned(case):
     model, make, observations = CASES[case]
-    return learn_lookahead(jax.random.key(0), make(model), observations, 3, missing="skip")
+    return learn_lookahead(jax.random.key(0), make(model), mpfjax.Series.skipping(observations), 3)
 
 
 def moments(mixture):
@@ -163,7 +163,7 @@ def test_a_conditionally_linear_model_learns_too(case):
     """E[Ẑ/Z] = 1 and E[Ẑ/Z E[x]] = E[x | y], and the noise of log Ẑ falls to a share of it."""
     model, observations, share = MARGINALISED[case]
     plain = mpfjax.particle_filter(model, 60)
-    ahead = learn_lookahead(jax.random.key(0), plain, observations, 3, missing="skip")
+    ahead = learn_lookahead(jax.random.key(0), plain, mpfjax.Series.skipping(observations), 3)
     if model is REGIMES:
         exact = switching_filter(model, observations)
     else:

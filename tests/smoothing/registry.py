@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
+from mpfjax import Series
 from mpfjax.smoothing import (
     conditional_filter,
     sample_trajectories,
@@ -62,7 +63,7 @@ def _backward(**options):
 def _online(**options):
     def smooth(key, filter, observations):
         function = statistics_for(filter.model)
-        found = smoothed_sums(key, filter, observations, function, missing="skip", **options)
+        found = smoothed_sums(key, filter, Series.skipping(observations), function, **options)
         rows = found.sums if found.terms is None else found.terms
         return found.run.log_likelihood_increments, rows
 
@@ -70,7 +71,7 @@ def _online(**options):
 
 
 def _conditional(key, filter, observations, trajectory):
-    found = conditional_filter(key, filter, observations, trajectory, missing="skip")
+    found = conditional_filter(key, filter, Series.skipping(observations), trajectory)
     return _of_paths(filter.model, found.trajectory[None], jnp.ones(1))
 
 

@@ -161,7 +161,7 @@ def call(trajectory=(0.5, 0.6, 0.7, 0.8), *, filter=None, observations=ONES, **o
 
 
 def test_nothing_but_missing_observations():
-    found = call(observations=np.full(3, np.nan, np.float32), missing="skip")
+    found = call(observations=mpfjax.Series.skipping(np.full(3, np.nan, np.float32)))
     assert float(found.run.log_marginal_likelihood) == 0.0
     assert np.isfinite(found.trajectory).all()
 
@@ -207,7 +207,6 @@ class TestBadInput:
             ({"trajectory": "abcd"}, "trajectory: .*abcd"),
             ({"trajectory": np.zeros(4, complex)}, "trajectory: complex128 is complex"),
             ({"backward": 1}, "backward: 1"),
-            ({"missing": "no"}, "missing: 'no'"),
             ({"observations": np.full(3, np.nan)}, "observations: NaN"),
         ],
     )

@@ -19,7 +19,7 @@ def test_the_filters_run_is_that_of_run_filter_and_a_long_lag_is_none():
     filter = mpfjax.particle_filter(ONE, 60)
     run = mpfjax.run_filter(jax.random.key(3), filter, SEEN, missing="skip")
     whole, lagged = (
-        smoothed_sums(jax.random.key(3), filter, SEEN, statistics, lag=lag, missing="skip")
+        smoothed_sums(jax.random.key(3), filter, mpfjax.Series.skipping(SEEN), statistics, lag=lag)
         for lag in (None, 50)
     )
     for sums in (whole, lagged):
