@@ -249,12 +249,16 @@ def wilson(share: float, num_trials: int, z: float = Z_95) -> list[float]:
 # --- what comes out ---------------------------------------------------------------------------
 
 
-def table(columns: Mapping[str, str | Callable[[Any], str]], entries: Iterable[Mapping]) -> str:
+def table(columns: Mapping[str, Any] | None, entries: Sequence[Mapping[str, Any]]) -> str:
     """A table in plain text, a line for each entry.
 
     A column is a format string of the entry's values, such as "{rms:.3f} ± {error:.3f}", or a
-    function of the entry; where a value is None or missing, it is a dash.
+    function of the entry; where a value is None or missing, it is a dash. Without columns, each
+    value stands under its name, numbers with three digits.
     """
+
+    def shown(value: Any) -> str:
+        return f"{value:.3g}" if isinstance(value, float) else str(value)
 
     def cell(form: str | Callable[[Any], str], entry: Mapping) -> str:
         try:
@@ -262,6 +266,9 @@ def table(columns: Mapping[str, str | Callable[[Any], str]], entries: Iterable[M
         except (KeyError, TypeError):
             return "-"
 
+    columns = columns or {
+        name: lambda entry, name=name: shown(entry[name]) for name in dict.fromkeys(entries[0])
+    }
     rows = [[cell(form, entry) for form in columns.values()] for entry in entries]
     return format_table(list(columns), rows)
 

@@ -361,20 +361,17 @@ def price_table(entries: list[dict[str, Any]], calls: list[dict[str, Any]]) -> s
         fitted = fit_slope(numbers, times)
         return "-" if fitted is None else f"{fitted:.2f}"
 
+    titles = "time over the plain filter's", f"(its first call: {first['pf', 1]:.1f} s)"
+    sizes = sorted({entry["components"] for entry in entries})
     rows: list[dict[str, Any]] = []
     for name, title in PRICED.items():
-        for n in numbers:
-            form = lambda m, name=name, n=n: f"{found[name, n, m]['ratio']:.2f}"  # noqa: E731
-            rows.append({"title": title, "what": f"N = {n}", "form": form})
-        form = lambda m, name=name: slope(name, m)  # noqa: E731
-        rows.append({"title": title, "what": "slope in N", "form": form})
-        form = lambda m, name=name: f"{first[name, m]:.1f}"  # noqa: E731
-        rows.append({"title": title, "what": "first call [s]", "form": form})
-    columns: dict[str, Any] = {"time over the plain filter's": "{title}"}
-    columns[f"(its first call: {first['pf', 1]:.1f} s)"] = "{what}"
-    for m in sorted({entry["components"] for entry in entries}):
-        columns[f"M = {m}"] = lambda row, m=m: row["form"](m)
-    return table(columns, rows)
+        lines = {f"N = {n}": [f"{found[name, n, m]['ratio']:.2f}" for m in sizes] for n in numbers}
+        lines["slope in N"] = [slope(name, m) for m in sizes]
+        lines["first call [s]"] = [f"{first[name, m]:.1f}" for m in sizes]
+        for what, cells in lines.items():
+            values = zip((f"M = {m}" for m in sizes), cells, strict=True)
+            rows.append({titles[0]: title, titles[1]: what, **dict(values)})
+    return table(None, rows)
 
 
 # --- devices, processes and islands -------------------------------------------------------------

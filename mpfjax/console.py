@@ -66,22 +66,6 @@ def finite(text: str) -> float:
     return number
 
 
-def fill_in(
-    parser: argparse.ArgumentParser,
-    options: argparse.Namespace,
-    is_used: bool,
-    why: str,
-    /,
-    **defaults: Any,
-) -> None:
-    """Set options that are None to their defaults; a given option without effect is an error."""
-    for name, default in defaults.items():
-        if getattr(options, name) is None:
-            setattr(options, name, default)
-        elif not is_used:
-            parser.error(f"argument --{name.replace('_', '-')}: does nothing {why}")
-
-
 def write_figure(path: Path, figure: Any, dpi: int = 150) -> None:
     """Write a matplotlib figure as PNG, for pages, and beside it as PDF, for print."""
     layout = figure.get_layout_engine()

@@ -217,11 +217,12 @@ def as_table(results: list[dict[str, Any]], estimate: str) -> str:
         low, high = cells[label, scene]["interval"]
         return f"{cells[label, scene]['rate']:.3f} [{low:.2f}, {high:.2f}]"
 
-    columns: dict[str, Any] = {f"recovery, {estimate}": "{label}"}
-    for scene in dict.fromkeys(line["scene"] for line in results):
-        columns[scene] = lambda row, scene=scene: text(row["label"], scene)
-    labels = dict.fromkeys(line["label"] for line in results)
-    return harness.table(columns, [{"label": label} for label in labels])
+    scenes = dict.fromkeys(line["scene"] for line in results)
+    rows = [
+        {f"recovery, {estimate}": label} | {scene: text(label, scene) for scene in scenes}
+        for label in dict.fromkeys(line["label"] for line in results)
+    ]
+    return harness.table(None, rows)
 
 
 def draw(results: list[dict[str, Any]]) -> Figure:

@@ -1,6 +1,7 @@
 """What tables 1 and 2 hang on: the size of objects, the distracter's speed, the momentum."""
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -119,36 +120,34 @@ def draw_sensitivity(entries: Sequence[dict[str, Any]], chosen: dict[str, Any]) 
     `entries` hold `axis`, `value`, `filter` and the rates with intervals; `chosen` is the value
     of each axis in the tables, at the dotted line.
     """
-    axes_names = [name for name in chosen if any(entry["axis"] == name for entry in entries)]
-    panels = [("recovery", "recovery of object 1"), ("precision", "precision of objects 2-7")]
-    figure = Figure(figsize=(3.4 * len(axes_names), 5.4), layout="constrained")
-    axes = figure.subplots(len(panels), len(axes_names), squeeze=False, sharex="col", sharey="row")
-    filters = list(dict.fromkeys(entry["filter"] for entry in entries))
-    for column, axis_name in enumerate(axes_names):
-        for row, (rate, ylabel) in enumerate(panels):
-            axis = axes[row, column]
-            axis.axvline(chosen[axis_name], color="0.6", ls=":", lw=1.2)
-            own = [e for e in entries if e["axis"] == axis_name]
-            places = sorted({entry["value"] for entry in own})
-            step = min(np.diff(places), default=1.0)
-            for index, name in enumerate(filters):
-                points = [e for e in own if e["filter"] == name]
-                points.sort(key=lambda entry: entry["value"])
-                values = np.array([entry[rate] for entry in points])
-                ends = np.array([entry[f"{rate}_interval"] for entry in points]).T
-                shift = 0.06 * step * (index - (len(filters) - 1) / 2)
-                axis.errorbar(
-                    [entry["value"] + shift for entry in points], values,
-                    np.maximum([values - ends[0], ends[1] - values], 0), label=name,
-                    color=plotting.COLOURS[index], marker=plotting.MARKERS[index], ms=5, lw=1.3,
-                    capsize=3,
-                )  # fmt: skip
-            axis.set_xticks(places)
-            axis.grid(alpha=0.25)
-            axis.set_ylim(*((-0.03, 1.03) if rate == "recovery" else (0.5, 1.0)))
-            if column == 0:
-                axis.set_ylabel(ylabel)
-        axes[-1, column].set_xlabel(axis_name)
+    shown = [name for name in chosen if any(entry["axis"] == name for entry in entries)]
+    panels = (
+        ("recovery", "recovery of object 1", (-0.03, 1.03)),
+        ("precision", "precision of objects 2-7", (0.5, 1.0)),
+    )
+    figure = Figure(figsize=(3.4 * len(shown), 5.4), layout="constrained")
+    axes = figure.subplots(len(panels), len(shown), squeeze=False, sharex="col", sharey="row")
+    for (column, name), (row, (rate, label, limits)) in product(
+        enumerate(shown), enumerate(panels)
+    ):
+        axis, own = axes[row, column], [entry for entry in entries if entry["axis"] == name]
+        places = sorted({entry["value"] for entry in own})
+        step = min(np.diff(places), default=1.0)
+        axis.axvline(chosen[name], color="0.6", ls=":", lw=1.2)
+        for index, filter in enumerate(FILTERS.values()):
+            points = [
+                (e["value"], e[rate], *e[f"{rate}_interval"]) for e in own if e["filter"] == filter
+            ]
+            x, y, low, high = np.array(sorted(points)).reshape(-1, 4).T
+            axis.errorbar(
+                x + 0.06 * step * (index - 1), y, np.maximum([y - low, high - y], 0), label=filter,
+                color=plotting.COLOURS[index], marker=plotting.MARKERS[index], ms=5, lw=1.3,
+                capsize=3,
+            )  # fmt: skip
+        axis.set(
+            xticks=places, ylim=limits, xlabel=name if row else "", ylabel="" if column else label
+        )
+        axis.grid(alpha=0.25)
     handles, names = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=len(names), fontsize=9)
     return figure

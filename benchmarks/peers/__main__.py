@@ -221,14 +221,15 @@ def as_tables(job: str, results: list[dict[str, Any]], labels: Mapping[str, str]
     own = [entry for entry in results if entry["job"] == job]
     entries = {(entry["library"], entry["particles"]): entry for entry in own}
     sizes = sorted({size for _, size in entries})
-    rows = [
-        {"label": labels[name], "cells": {size: entries.get((name, size), {}) for size in sizes}}
-        for name in dict.fromkeys(name for name, _ in entries)
-    ]
+    names = dict.fromkeys(name for name, _ in entries)
 
     def one(title: str, form: Any) -> str:
-        columns = {f"N = {n}": lambda row, n=n: form(row["cells"][n]) for n in sizes}
-        return table({title: "{label}"} | columns, rows)
+        rows = [
+            {title: labels[name]}
+            | {f"N = {n}": form(entries[name, n]) if (name, n) in entries else "-" for n in sizes}
+            for name in names
+        ]
+        return table(None, rows)
 
     titles = one("median [ms], ratio", _time), one("start [s], memory [MB]", _start)
     return "\n\n".join([JOBS[job].title, *titles])
@@ -237,11 +238,15 @@ def as_tables(job: str, results: list[dict[str, Any]], labels: Mapping[str, str]
 def _time(entry: Mapping[str, Any]) -> str:
     if entry.get("refused"):
         return "refused"
+    if entry["median"] is None:
+        return "-"
     ratio = "" if entry["ratio"] is None else f" {entry['ratio']:6.2f}"
     return f"{1000 * entry['median']:.4g}{ratio}"
 
 
 def _start(entry: Mapping[str, Any]) -> str:
+    if entry["start"] is None:
+        return "-"
     memory = "-" if entry["memory"] is None else f"{entry['memory'] / 1e6:.0f}"
     return f"{entry['start']:.1f} {memory:>5}"
 

@@ -31,11 +31,6 @@ class Linear:
     r: float = 0.7
     p: float = 1.0
 
-    @property
-    def of_step(self) -> tuple[float, float]:
-        """The factor and the deviation of a step."""
-        return self.a, self.q
-
     @cached_property
     def observations(self) -> np.ndarray:
         """y_1..y_T."""
@@ -69,6 +64,10 @@ class Linear:
         """x_0, for particles."""
         return self.p * np.random.standard_normal(number)
 
+    def of_step(self) -> tuple[float, float]:
+        """The factor and the deviation of a step."""
+        return self.a, self.q
+
     def log_likelihood(self, y: float, states: np.ndarray) -> np.ndarray:
         """log L(y_t | x_t)."""
         return -0.5 * ((y - states) / self.r) ** 2 - np.log(self.r) - 0.5 * LOG_2_PI
@@ -94,11 +93,6 @@ class Quadratic:
     sigma_x: float = 0.1
     sigma_y: float = 0.1
     width: float = 2.5
-
-    @property
-    def of_step(self) -> tuple[float, float]:
-        """The factor and the deviation of a step."""
-        return 1.0, self.sigma_x
 
     @cached_property
     def observations(self) -> np.ndarray:
@@ -131,6 +125,10 @@ class Quadratic:
     def initial(self, number: int) -> np.ndarray:
         """x_0, for particles."""
         return np.random.uniform(-self.width, self.width, number)
+
+    def of_step(self) -> tuple[float, float]:
+        """The factor and the deviation of a step."""
+        return 1.0, self.sigma_x
 
     def log_likelihood(self, y: float, states: np.ndarray) -> np.ndarray:
         """log L(y_t | x_t)."""

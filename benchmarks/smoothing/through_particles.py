@@ -25,17 +25,17 @@ class FeynmanKac(through_particles.FeynmanKac):
 
     def M(self, t: int, xp: np.ndarray) -> np.ndarray:
         """A step of the dynamics."""
-        factor, scale = self.job.of_step
+        factor, scale = self.job.of_step()
         return factor * xp + scale * np.random.standard_normal(xp.shape)
 
     def logpt(self, t: int, xp: np.ndarray, x: np.ndarray) -> np.ndarray:
         """log D(x_t | x_{t-1})."""
-        factor, scale = self.job.of_step
+        factor, scale = self.job.of_step()
         return -0.5 * ((x - factor * xp) / scale) ** 2 + self.upper_bound_log_pt(t)
 
     def upper_bound_log_pt(self, t: int) -> float:
         """The largest log D."""
-        return float(-np.log(self.job.of_step[1]) - 0.5 * LOG_2_PI)
+        return float(-np.log(self.job.of_step()[1]) - 0.5 * LOG_2_PI)
 
     def add_func(self, t: int, xp: np.ndarray | None, x: np.ndarray) -> np.ndarray:
         """x_{t-1} x_t."""
