@@ -217,7 +217,8 @@ def _axes(study: Study) -> dict[str, list[Any]]:
     axes: dict[str, list[Any]] = {}
     given_axes = {"filters": list(study.filters), "num_particles": study.num_particles}
     for name, values in (given_axes | dict(study.settings)).items():
-        if isinstance(values, str | bytes | Mapping) or np.ndim(np.array(values, object)) == 0:
+        is_array = isinstance(values, np.ndarray | jax.Array) and values.ndim > 0
+        if isinstance(values, str | bytes) or not (is_array or isinstance(values, Sequence)):
             raise ValueError(f"{name}: {shown(values)} are no values, [value, ...]")
         axes[name] = [_plain(name, value) for value in values]
         if not axes[name] or len(set(axes[name])) < len(axes[name]):
