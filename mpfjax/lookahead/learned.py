@@ -24,7 +24,6 @@ from mpfjax.models.base import mapped, require_noise, starts_from_noise
 from mpfjax.models.conditionally_linear import is_mixed, with_moments
 from mpfjax.models.noise import noise_dtype
 from mpfjax.models.steps import noise_dimension
-from mpfjax.moves.every import Every
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.observations import as_series
 from mpfjax.running.run import run_filter
@@ -126,8 +125,6 @@ def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
     """The filter whose moves look ahead by `twist`; a `ValueError` for one that cannot."""
 
     def ahead(move: Any) -> Any:
-        if isinstance(move, Every):
-            return Every(move.num_steps, [ahead(inner) for inner in move.moves])
         if move.regroups:
             return RegroupTwisted(move, twist)
         if move.resampling is not None:
@@ -136,6 +133,8 @@ def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
             return AuxiliaryResample(equally, twist)
         if hasattr(move, "from_noise") and move.gradient == "none":
             return PropagateTwisted(dataclasses.replace(move, proposal=None), twist)
+        if move.inner:
+            return move.map_inner(ahead)
         raise ValueError(
             f"filter: {type(move).__name__}, one of its moves, cannot look ahead; Resample,"
             " Propagate or PropagateMarginalised of gradient 'none', and regrouping can"

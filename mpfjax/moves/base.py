@@ -76,7 +76,7 @@ class AbstractMove(eqx.Module):
         del reference
         raise ValueError(
             f"filter: {type(self).__name__} cannot keep a trajectory, as conditional SMC does;"
-            " regrouping moves, Resample, Propagate, Predict and Reweight can"
+            " regrouping, Resample, AuxiliaryResample, Propagate, Predict and Reweight can"
         )
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:

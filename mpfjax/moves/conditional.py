@@ -92,6 +92,10 @@ class ConditionalResample(AbstractResampling):
 
     move: Any
 
+    def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
+        """Which components of `mixture` the move would resample."""
+        return self.move.is_due(mixture)
+
     def would_resample(
         self, mixture: ParticleMixture, observation: PyTree = None
     ) -> Bool[Array, " m"]:
@@ -102,10 +106,21 @@ class ConditionalResample(AbstractResampling):
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
     ) -> ParticleMixture:
         """Resample every component that is due around the reference."""
-        reference, due = mixture.memory[REFERENCE], self.move.is_due(mixture)
+        return self.redraw(key, mixture, self.is_due(mixture))[0]
+
+    def redraw(
+        self, key: Key[Array, ""], mixture: ParticleMixture, due: Bool[Array, " m"]
+    ) -> tuple[ParticleMixture, Any]:
+        """`Resample.redraw` around the reference."""
+        reference = mixture.memory[REFERENCE]
         resampled, ancestors = self.move.redraw(key, mixture, due, keep=reference["slot"])
         memory = resampled.memory | {REFERENCE: reference | {"slot": ancestors.kept}}
-        return resampled.replace(memory=memory)
+        return resampled.replace(memory=memory), ancestors
+
+    @property
+    def particles_per_component(self) -> int | None:
+        """That of the move."""
+        return self.move.particles_per_component
 
 
 def at(values: Array, place: Int[Array, ""]) -> Array:

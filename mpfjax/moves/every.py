@@ -72,7 +72,7 @@ class Every(AbstractMove):
 
     def around(self, reference: Any) -> "Every":
         """The moves around the trajectory, at the same steps."""
-        return Every(self.num_steps, [move.around(reference) for move in self.moves])
+        return self.map_inner(lambda move: move.around(reference))
 
     @property
     def needs_parents(self) -> bool:

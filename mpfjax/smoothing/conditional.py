@@ -80,12 +80,12 @@ def conditional_filter(
     `SelectInitial` chooses it. The model's `sample_transition` must draw particles independently of
     each other.
 
-    Raises `ValueError` for a filter that is no chain of regrouping moves, `Resample`, `Propagate`,
-    `Predict`, `Reweight` and `Every` of these; a conditionally linear model; a proposal without
-    `log_density`; noise that is not independent; a model without `log_transition`, unless
-    `backward` is false; a trajectory of other shapes or types than the model's states, or of
-    density zero (RuntimeError within jit). Use it in a Gibbs sampler of your own;
-    `mpfjax.tuning.particle_gibbs` is one for parameters.
+    Raises `ValueError` for a filter that is no chain of regrouping moves, `Resample`,
+    `AuxiliaryResample`, `Propagate`, `Predict`, `Reweight` and `Every` of these; a conditionally
+    linear model; a proposal without `log_density`; noise that is not independent; a model without
+    `log_transition`, unless `backward` is false; a trajectory of other shapes or types than the
+    model's states, or of density zero (RuntimeError within jit). Use it in a Gibbs sampler of your
+    own; `mpfjax.tuning.particle_gibbs` is one for parameters.
     """
     check_key(key)
     check_type(Filter, "a Filter", filter=filter)

@@ -44,6 +44,13 @@ CASES = {
         ),
         False,
     ),
+    "looking ahead, adaptive": (
+        chain(
+            mpfjax.AuxiliaryResample(Resample("stratified", 0.7), lambda y, x: -((y - x**2) ** 2)),
+            Propagate(QUADRATIC), *EAGER, n=8, m=3,
+        ),
+        True,
+    ),
     "resampled every second step": (
         chain(mpfjax.Every(2, [Resample("ssp"), KMeans(2)]), Propagate(QUADRATIC), n=8, m=3),
         True,

@@ -10,6 +10,7 @@ from mpfjax.checks import check_callable, check_type, saying, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.moves.base import AbstractMove
+from mpfjax.moves.conditional import ConditionalResample, Reference
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
@@ -40,11 +41,11 @@ class AuxiliaryResample(AbstractMove):
     likelihood is narrow.
     """
 
-    resample: Resample
+    resample: Resample | ConditionalResample
     lookahead: Any
 
     def __check_init__(self) -> None:
-        check_type(Resample, "a Resample", resample=self.resample)
+        check_type((Resample, ConditionalResample), "a Resample", resample=self.resample)
         if isinstance(self.lookahead, AbstractProposal):
             require(self.lookahead, "log_normaliser", "AuxiliaryResample", "lookahead")
         elif not hasattr(self.lookahead, "at_step_of"):
@@ -55,8 +56,12 @@ class AuxiliaryResample(AbstractMove):
         """The same with another `Resample`."""
         return AuxiliaryResample(change(self.resample), self.lookahead)
 
+    def around(self, reference: Reference) -> "AuxiliaryResample":
+        """The same around the trajectory, whose offspring are weighed as any."""
+        return self.map_inner(lambda move: move.around(reference))
+
     @property
-    def resampling(self) -> Resample:
+    def resampling(self) -> Resample | ConditionalResample:
         """The `Resample` that draws."""
         return self.resample
 
