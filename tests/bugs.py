@@ -1,0 +1,121 @@
+"""Puts bugs into a copy of the code, one at a time: a test must fail on each.
+
+    python -m tests.bugs [NAME ...] [--jobs N]
+
+copies the checkout for each bug of `BUGS`, or for the named ones, changes one line, and runs the
+tests that must notice. It prints what noticed, and fails where a bug survives, or where its line
+is no longer there. The tests are run on the unchanged code first.
+"""
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+COPIED = ("mpfjax", "tests", "benchmarks", "pyproject.toml")
+
+
+class Bug(NamedTuple):
+    """One line of a file of mpfjax as it is, as it is broken, and the tests that must fail."""
+
+    file: str
+    line: str
+    broken: str
+    tests: str
+
+
+BUGS = {
+    "the proposal's density has the wrong sign": Bug(
+        "moves/propagation/propagate.py",
+        "log_ratio = log_transition(self.model, states, previous) - log_density",
+        "log_ratio = log_transition(self.model, states, previous) + log_density",
+        "tests/test_exact_answers.py -k guided",
+    ),
+    "nested propagation sums over proposals": Bug(
+        "moves/propagation/nested.py",
+        "log_weights=repeat(mixture.log_weights) - math.log(num_draws),",
+        "log_weights=repeat(mixture.log_weights),",
+        "tests/test_exact_answers.py -k proposals",
+    ),
+    "MALA forgets its step back": Bug(
+        "moves/metropolis.py",
+        "lambda a, b, xi: 0.5 * (xi**2 - (a + b + xi) ** 2), forth, back, noise",
+        "lambda a, b, xi: 0.5 * (xi**2 - (a + a + xi) ** 2), forth, back, noise",
+        "tests/test_exact_answers.py -k Langevin",
+    ),
+    "densities are stale after an accepted step": Bug(
+        "moves/metropolis.py",
+        "densities = _where(taken, those, densities)",
+        "densities = densities",
+        "tests/test_exact_answers.py -k RandomWalk",
+    ),
+    "prior masses of DPS count the dead": Bug(
+        "moves/objects/partitioned.py",
+        "log_total = log_sum_exp(jnp.where(alive, prior, -jnp.inf))",
+        "log_total = log_sum_exp(prior)",
+        "tests/test_exact_answers.py -k dps",
+    ),
+    "slots are dealt by variances, not by their roots": Bug(
+        "moves/resampling/allocation.py",
+        "demands = masses * jnp.sqrt(variances)",
+        "demands = masses * variances",
+        "tests/test_exact_answers.py -k slots",
+    ),
+    "PMMH accepts by the same number at every step": Bug(
+        "tuning/metropolis.py",
+        "accepted = accepts(key_accept, found.log_density - before)",
+        "accepted = accepts(jax.random.key(0), found.log_density - before)",
+        "tests/test_exact_answers.py -k chains",
+    ),
+}
+
+
+def survives(bug: Bug | None, tests: str) -> str:
+    """An empty string where the tests fail on the bug, or what is wrong."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name in COPIED:
+            source, target = REPOSITORY / name, Path(folder) / name
+            shutil.copytree(source, target) if source.is_dir() else shutil.copy(source, target)
+        if bug is not None:
+            file = Path(folder) / "mpfjax" / bug.file
+            code = file.read_text(encoding="utf-8") if file.exists() else ""
+            if code.count(bug.line) != 1:
+                return f"{bug.file} holds its line {code.count(bug.line)} times"
+            file.write_text(code.replace(bug.line, bug.broken), encoding="utf-8")
+        command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-m", "", "-p"]
+        run = subprocess.run(
+            [*command, "no:cacheprovider", *tests.split()], cwd=folder, capture_output=True,
+            text=True,
+        )  # fmt: skip
+    if bug is None:
+        return "" if run.returncode == 0 else f"tests fail without a bug:\n{run.stdout[-2000:]}"
+    # 1 is a failed test; any other status is a broken run.
+    if run.returncode not in (0, 1):
+        return f"the tests could not run:\n{run.stdout[-2000:]}"
+    return "" if run.returncode == 1 else "SURVIVES"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.bugs")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="part of a bug's name; all")
+    parser.add_argument("--jobs", type=int, default=2)
+    options = parser.parse_args()
+    wanted = options.names or [""]
+    bugs = {name: bug for name, bug in BUGS.items() if any(part in name for part in wanted)}
+    tests = sorted({bug.tests for bug in bugs.values()})
+    with ThreadPoolExecutor(options.jobs) as pool:
+        cases = [(f"no bug: {test}", pool.submit(survives, None, test)) for test in tests]
+        cases += [(name, pool.submit(survives, bug, bug.tests)) for name, bug in bugs.items()]
+        found = {name: future.result() for name, future in cases}
+    for name, what in found.items():
+        print(f"{what or 'as it should be':<16} {name}")
+    return int(any(found.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
