@@ -12,7 +12,7 @@ from jax.experimental.compilation_cache import compilation_cache
 import mpfjax
 from mpfjax import keep_programs
 from mpfjax.filter import step_and_faults
-from mpfjax.vision.boxes import follow_boxes as drawn
+from mpfjax.vision.boxes import following as drawn
 from mpfjax.vision.boxes.recipes import objects_filters
 
 CONFIG: Any = jax.config
@@ -92,5 +92,5 @@ def test_nor_does_the_program_that_follows_drawn_boxes():
     mixture = eqx.filter_jit(drawn._begin)(filter, key)
     counted = eqx.filter_jit(drawn._counted)(filter.model, jnp.asarray(frame))
     arguments = (filter, 1, key, jnp.asarray(1), mixture, counted)
-    program = eqx.filter_jit(drawn._advance).lower(*arguments)
+    program = eqx.filter_jit(drawn._advance_boxes).lower(*arguments)
     assert "callback" not in program.as_text()
