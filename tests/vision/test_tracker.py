@@ -163,6 +163,14 @@ def test_a_second_box_of_an_object_begins_no_other():
     assert all(living(each) == [1] for each in tracks)
 
 
+def test_a_detection_between_two_is_less_probably_ones_own():
+    apart, close = run([[(5, 5), (45, 5)]] * 5)[-1], run([[(20, 5), (22.2, 5)]] * 3)[-1]
+    own = [each.probabilities[each.identities > 0] for each in (apart, close)]
+    assert own[0].min() > 0.995 > own[1].max() > 0
+    unseen = run([[(5, 5)]] * 3 + [[None]])[-1]
+    assert unseen.probabilities.tolist() == [0.0] * M
+
+
 def test_nothing_leaks_over_many_random_frames():
     """Detections that come, go, jump, overlap, and lie outside; every frame is checked."""
     rng = np.random.default_rng(1)
