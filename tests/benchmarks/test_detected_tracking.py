@@ -224,4 +224,4 @@ def test_frames_of_changing_size_are_named(untracked, tmp_path, capsys):
     frames = list(street(walkers, 8))
     folder = sequence_of(tmp_path / "cut", [*frames[:5], *(frame[:50] for frame in frames[5:])])
     assert run("--sequence", folder, "--out", tmp_path / "out") == 2
-    assert "frames of different sizes, (72, 96) and (50, 96)" in capsys.readouterr().err
+    assert "frame 6 is 96 x 50, and those before it 96 x 72" in capsys.readouterr().err
