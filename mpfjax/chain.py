@@ -10,8 +10,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import check_type, check_whole, shown
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel
-from mpfjax.models.inputs import saying_that_none_were_given, with_inputs
+from mpfjax.models.base import AbstractStateSpaceModel, saying_that_none_were_given, with_inputs
 from mpfjax.moves.base import AbstractMove, Moves, name_of, with_inner, without_dead
 from mpfjax.moves.report import StepInfo
 from mpfjax.observations import Fault, faults_of

@@ -22,8 +22,7 @@ from mpfjax.chain import (
 )
 from mpfjax.checks import check_key, check_one_of
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import AbstractStateSpaceModel, require_model
-from mpfjax.models.inputs import saying_that_none_were_given
+from mpfjax.models.base import AbstractStateSpaceModel, require_model, saying_that_none_were_given
 from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import AbstractMove, as_moves, initial_memory
 from mpfjax.moves.initial import sample_initial

@@ -10,8 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree
 
 from mpfjax.checks import as_numbers, check_one_of, check_shape
-from mpfjax.models.base import model_name
-from mpfjax.models.inputs import takes_inputs
+from mpfjax.models.base import model_name, takes_inputs
 
 
 class Series(eqx.Module):

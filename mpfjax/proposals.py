@@ -19,8 +19,7 @@ from mpfjax.checks import (
     check_whole,
     to_array,
 )
-from mpfjax.models.base import model_name, require
-from mpfjax.models.inputs import has_attribute
+from mpfjax.models.base import has_attribute, model_name, require
 from mpfjax.operations.matrices import cholesky, solve_lower
 from mpfjax.operations.random import normal
 

@@ -10,9 +10,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from mpfjax.checks import real_arrays, shown
-from mpfjax.models.base import check_log_density, require
+from mpfjax.models.base import check_log_density, require, saying_that_none_were_given, with_inputs
 from mpfjax.models.conditionally_linear import refuse_marginalised
-from mpfjax.models.inputs import saying_that_none_were_given, with_inputs
 from mpfjax.models.steps import likelihoods
 from mpfjax.observations import Series, as_series
 from mpfjax.operations.logarithms import log_or_nothing, log_sum_exp, softmax

@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from mpfjax.checks import as_numbers, check_shape, check_type
-from mpfjax.models.inputs import with_inputs
+from mpfjax.models.base import with_inputs
 from mpfjax.models.linear import LinearGaussianModel
 from mpfjax.observations import Series, gathered, steps_of_inputs
 from mpfjax.operations.matrices import cholesky

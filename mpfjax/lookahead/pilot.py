@@ -1,7 +1,7 @@
 """A look-ahead that a model made of noise has of itself."""
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, HasTransitionNoise, require_noise
+from mpfjax.models.base import AbstractStateSpaceModel, require_noise
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import noise_dtype
 from mpfjax.models.steps import likelihoods
@@ -49,7 +49,7 @@ class PilotLookahead(eqx.Module):
     def _log_factors(
         self, observation: PyTree, states: PyTree, weights: Float[Array, " n"]
     ) -> Float[Array, " n"]:
-        model: Any = cast(HasTransitionNoise, self.model)
+        model: Any = self.model
         ones = jnp.ones((weights.shape[0], model.noise_dimension), noise_dtype(states))
         seen = [
             likelihoods(self.model, observation, model.transition_from_noise(noise, states))

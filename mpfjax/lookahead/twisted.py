@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.lookahead.quadratics import LocalQuadratics
 from mpfjax.mixture import ParticleMixture, flatten_states
-from mpfjax.models.base import AbstractStateSpaceModel, HasInitialNoise, check_moved
+from mpfjax.models.base import AbstractStateSpaceModel, check_moved
 from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.noise import draw_noise, noise_dtype
 from mpfjax.models.steps import completed, made_of, noise_dimension, seen
@@ -77,7 +77,7 @@ class TwistInitial(AbstractMove):
         del observation
         if self.twist.initial is None:
             return mixture
-        psi, model = self.twist.initial, cast(HasInitialNoise, self.model)
+        psi, model = self.twist.initial, cast(Any, self.model)
         shape, dtype = (mixture.num_particles, model.initial_noise_dimension + 1), psi.slopes.dtype
         noise = draw_noise(self.noise, key, shape, dtype)
         drawn, log_ratio = psi.draw(noise, jnp.zeros((shape[0], 1), dtype))

@@ -1,10 +1,14 @@
-"""The interface of a state-space model, and the wrapper for models of one particle."""
+"""The interface of a state-space model, its known inputs u_t, what it must have and return, and the
+wrapper for models of one particle.
+"""
 
 import abc
+import contextlib
+import copy
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,7 +17,6 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_whole, shown
-from mpfjax.models.inputs import replaced, takes_inputs, with_inputs
 from mpfjax.models.noise import noise_dtype
 from mpfjax.operations.random import direction_numbers, normal, split
 
@@ -95,41 +98,60 @@ class AbstractStateSpaceModel(eqx.Module):
         return simulate(key, self, num_steps, inputs)
 
 
-@runtime_checkable
-class HasTransitionDensity(Protocol):
-    """A model that can evaluate its own dynamics, log D(x_t | x_{t-1})."""
-
-    def log_transition(self, states: Any, previous_states: Any) -> Float[Array, " n"]:
-        """log D(x_t | x_{t-1}) of every particle."""
-        ...
-
-
-@runtime_checkable
-class HasTransitionNoise(Protocol):
-    """A model whose x_t can be made of noise that is given to it."""
-
-    @property
-    def noise_dimension(self) -> int:
-        """k, how many standard normal numbers x_t is made of."""
-        ...
-
-    def transition_from_noise(self, noise: Float[Array, "n k"], states: Any) -> Any:
-        """x_t of every particle, given x_{t-1} and its noise."""
-        ...
+def takes_inputs(model: Any) -> bool:
+    """Whether a model takes u_t: it has a field `inputs`, or its own `with_inputs`."""
+    if hasattr(type(model), "takes_inputs"):
+        return model.takes_inputs
+    # A model of one particle may be of any class.
+    return hasattr(model, "with_inputs") or hasattr(model, "inputs")
 
 
-@runtime_checkable
-class HasInitialNoise(Protocol):
-    """A model whose x_0 can be made of noise that is given to it."""
+def has_attribute(model: Any, name: str) -> bool:
+    """Whether the model has it; a property may need inputs, which are not there before a run."""
+    try:
+        return hasattr(model, name)
+    except Exception:
+        return True
 
-    @property
-    def initial_noise_dimension(self) -> int:
-        """k, how many standard normal numbers x_0 is made of."""
-        ...
 
-    def initial_from_noise(self, noise: Float[Array, "n k"]) -> Any:
-        """x_0 of every particle, given its noise."""
-        ...
+def with_inputs(model: Any, inputs: PyTree) -> Any:
+    """The model with u_t, or unchanged where there is none, or where it takes none."""
+    if inputs is None or not takes_inputs(model):
+        return model
+    if hasattr(model, "with_inputs"):
+        return model.with_inputs(inputs)
+    return replaced(model, inputs=inputs)
+
+
+def replaced(model: Any, **fields: Any) -> Any:
+    """A copy of a model with some fields set, without checks or conversions."""
+    changed = copy.copy(model)
+    for name, value in fields.items():
+        object.__setattr__(changed, name, value)
+    return changed
+
+
+@contextlib.contextmanager
+def saying_that_none_were_given(model: Any) -> Iterator[None]:
+    """Add to an error about None that the model's field `inputs` is None.
+
+    A model may do without inputs. So whether it needs them is known only where it fails.
+    """
+    try:
+        yield
+    except Exception as error:
+        while not hasattr(model, "inputs"):  # of one particle, or of one object
+            model = getattr(model, "model", getattr(model, "object_model", error))
+            if model is error:
+                raise
+        note = (
+            f"mpfjax: inputs: there are none, so {type(model).__name__}.inputs is None; give"
+            " u_1, ..., u_t by inputs=... (x_0 has no input)"
+        )
+        said = getattr(error, "__notes__", [])
+        if model.inputs is None and "None" in str(error) and note not in said:
+            error.add_note(note)
+        raise
 
 
 def is_made_of_noise(model: Any) -> bool:

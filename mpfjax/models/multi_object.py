@@ -14,9 +14,9 @@ from mpfjax.checks import (
     check_flag,
     check_positive_array,
     check_scalars,
+    check_type,
     check_whole,
     given,
-    shown,
     to_array,
 )
 from mpfjax.mixture import flatten_states
@@ -24,11 +24,12 @@ from mpfjax.models.base import (
     AbstractStateSpaceModel,
     check_log_density,
     is_made_of_noise,
-    model_name,
+    replaced,
     require_model,
+    takes_inputs,
+    with_inputs,
 )
 from mpfjax.models.conditionally_linear import refuse_marginalised
-from mpfjax.models.inputs import replaced, takes_inputs, with_inputs
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.random import split
 
@@ -344,9 +345,7 @@ class PairwiseRepulsion(eqx.Module):
 
 def require_multi_object(model: Any, needed_by: str) -> None:
     """Raise a `ValueError` where `model` is not of several objects."""
-    if not isinstance(model, MultiObjectModel):
-        who = model_name(model) if hasattr(model, "sample_initial") else shown(model)
-        raise ValueError(f"model: {who} is no MultiObjectModel, which {needed_by} needs")
+    check_type(MultiObjectModel, f"a MultiObjectModel, which {needed_by} needs", model=model)
 
 
 def _is_array(leaf: Any) -> bool:

@@ -20,15 +20,15 @@ from mpfjax.models.base import (
     require,
     require_model,
     require_noise,
+    saying_that_none_were_given,
+    takes_inputs,
+    with_inputs,
 )
 from mpfjax.models.conditionally_linear import (
-    is_marginalised,
     is_mixed,
-    log_latent_density,
     with_moments,
 )
-from mpfjax.models.inputs import saying_that_none_were_given, takes_inputs, with_inputs
-from mpfjax.models.steps import likelihoods, moved
+from mpfjax.models.steps import drawn_part, likelihoods, log_transition, moved
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 _KEYS, _PLACES, _DRAWS = 64, 4, 32  # of the draws that must differ
@@ -174,9 +174,9 @@ def _check_transition(key: Key[Array, ""], model: Any, states: PyTree) -> None:
         one = jax.tree.map(lambda leaf: jnp.repeat(leaf[None], _SIBLINGS, axis=0), state)
         parents = moved(keys[0], model, one)
         children = moved(keys[1], model, parents)
-        pair = [jax.tree.map(lambda leaf: leaf[rows], children)]
+        pair = [jax.tree.map(lambda leaf: leaf[rows], drawn_part(model, children))]
         pair += [jax.tree.map(lambda leaf: leaf[columns], parents)]
-        return _log_transition(model, *pair).reshape(_SIBLINGS, _SIBLINGS), parents
+        return log_transition(model, *pair).reshape(_SIBLINGS, _SIBLINGS), parents
 
     keys = [jax.random.split(key, _FAMILIES) for key in (key_parents, key_children)]
     of_each = lambda pair: of_family(*pair)  # noqa: E731
@@ -205,17 +205,6 @@ def _check_transition(key: Key[Array, ""], model: Any, states: PyTree) -> None:
                 f"{who} is not the density of sample_transition: draws come from other x_(t-1) than"
                 " it says; does a factor that depends on x_(t-1) lack?"
             )
-
-
-def _log_transition(model: Any, states: PyTree, previous: PyTree) -> Float[Array, " n"]:
-    """log D, of a conditionally linear model that of its latent."""
-    if is_mixed(model):
-        return log_latent_density(model, states.latent, previous)
-    if is_marginalised(model):
-        states, previous = states.latent, previous.latent
-    values = model.log_transition(states, previous)
-    number = jax.tree.leaves(states)[0].shape[0]
-    return check_log_density(values, model, "log_transition", number)
 
 
 def simulate(

@@ -12,12 +12,11 @@ from mpfjax.checks import check_numbered, check_one_of, check_whole, shown
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
-    HasInitialNoise,
     check_states,
+    saying_that_none_were_given,
     starts_from_noise,
 )
 from mpfjax.models.conditionally_linear import with_moments
-from mpfjax.models.inputs import saying_that_none_were_given
 from mpfjax.models.noise import NOISES, draw_noise
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.resampling.ancestors import draw_ancestors
@@ -43,7 +42,7 @@ def sample_initial(
         if noise == "independent" or not starts_from_noise(model):
             particles = model.sample_initial(key, num_particles)
         else:
-            maker = cast(HasInitialNoise, model)
+            maker = cast(Any, model)
             shape = (num_particles, maker.initial_noise_dimension)
             particles = maker.initial_from_noise(draw_noise(noise, key, shape, default_float()))
         check_states(particles, model, "sample_initial", num_particles)

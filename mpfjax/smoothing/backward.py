@@ -14,8 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import check_log_density
-from mpfjax.models.inputs import with_inputs
+from mpfjax.models.base import check_log_density, with_inputs
 from mpfjax.operations.logarithms import exp, finite_or_zero
 from mpfjax.operations.matrices import draw_columns
 from mpfjax.operations.prefix_sums import (

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.mixture import MarginalisedState, ParticleMixture
+from mpfjax.models.base import with_inputs
 from mpfjax.models.conditionally_linear import (
     decorrelated,
     dynamics_of,
@@ -33,7 +34,6 @@ from mpfjax.models.conditionally_linear import (
     updated,
     with_moments,
 )
-from mpfjax.models.inputs import with_inputs
 from mpfjax.models.steps import log_transition
 from mpfjax.operations import gaussians
 from mpfjax.operations.compiling import jit_on_wide_vectors

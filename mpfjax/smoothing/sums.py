@@ -22,9 +22,8 @@ from mpfjax.checks import (
 )
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import mapped, require
+from mpfjax.models.base import mapped, require, with_inputs
 from mpfjax.models.conditionally_linear import refuse_marginalised
-from mpfjax.models.inputs import with_inputs
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.logarithms import as_inexact

@@ -11,9 +11,14 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import check_key, check_one_of, check_whole, given
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, require, require_model
+from mpfjax.models.base import (
+    AbstractStateSpaceModel,
+    require,
+    require_model,
+    saying_that_none_were_given,
+    with_inputs,
+)
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
-from mpfjax.models.inputs import saying_that_none_were_given, with_inputs
 from mpfjax.observations import as_arrays, gathered, steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split_keys

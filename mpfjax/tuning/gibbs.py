@@ -12,8 +12,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import check_callable, check_key, check_type, given, saying, shown
 from mpfjax.filter import Filter
-from mpfjax.models.base import require
-from mpfjax.models.inputs import with_inputs
+from mpfjax.models.base import require, with_inputs
 from mpfjax.models.steps import likelihoods
 from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import Series
