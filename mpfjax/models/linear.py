@@ -74,7 +74,7 @@ class LinearGaussianModel(AbstractStateSpaceModel):
             if array is not None and array.shape != shape:
                 raise ValueError(
                     f"{name}: shape {array.shape} is not {shape}, for m0 of shape {self.m0.shape},"
-                    f" H of shape {self.H.shape} and B of shape {np.shape(self.B)}"
+                    f" H of shape {self.H.shape} and {k} inputs"
                 )
             if array is not None and name != "inputs":
                 check_finite_array(**{name: array})
