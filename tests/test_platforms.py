@@ -1,5 +1,7 @@
 """What would run on a GPU: its forms are lowered for one, and give the same numbers here."""
 
+import contextlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,8 +10,9 @@ from jax import export
 
 import mpfjax
 from mpfjax.observations import Series
+from mpfjax.operations import stored as forms
 from mpfjax.operations.prefix_sums import count_upto, exact_sum_before, sum_before
-from mpfjax.operations.stored import default_forms, stored
+from mpfjax.operations.stored import stored
 from mpfjax.running.scan import scan
 from tests.marking import quick_of
 from tests.registry import CHAINS
@@ -29,6 +32,16 @@ FORMS = {
         ).ancestor_indices
     ),
 }
+
+
+@contextlib.contextmanager
+def default_forms():
+    """Within it the default forms run on a CPU as well, so that they can be tried without a GPU."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(forms, "_only_the_default_forms", True)
+        jax.clear_caches()
+        yield
+    jax.clear_caches()
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -26,7 +26,9 @@ _FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
 _settings: Any = jax.config  # whose attributes no type checker knows
 
 
-def cpu_options(soon: bool = False, one_thread: bool = False) -> dict[str, int | str]:
+def cpu_options(
+    soon: bool = False, one_thread: bool = False, *, older_emitters: bool = False
+) -> dict[str, int | str]:
     """The compiler's options on a CPU: vectors of 512 bits, and sums in one piece.
 
     XLA's default is vectors of 256 bits; a machine without wider ones uses its widest. By default
@@ -34,30 +36,22 @@ def cpu_options(soon: bool = False, one_thread: bool = False) -> dict[str, int |
     longer than the whole. Where JAX is set to optimise little, they stay, since sums are then not
     on vectors. Where a program is to be compiled `soon`, LLVM optimises less. Where each processor
     runs a program of its own, none is to be divided among threads (`one_thread`): its parts would
-    only wait for each other. An option that XLA_FLAGS sets is left out, and there are none on other
+    only wait for each other. `older_emitters` are those of `in_little_memory`, in place of the
+    vectors' width. An option that XLA_FLAGS sets is left out, and there are none on other
     platforms.
     """
     if jax.default_backend() != "cpu":
         return {}
-    options = {_VECTOR_WIDTH: 512} | _sums_in_one() | _little_optimised(soon)
-    if one_thread:
-        without = [options.get(_WITHOUT_PASSES), _THREADS_OF_ITS_OWN]
-        options[_WITHOUT_PASSES] = ",".join(filter(None, without))
+    optimised = not jax.config.read("jax_disable_most_optimizations")
+    options = _older_emitters() if older_emitters else {_VECTOR_WIDTH: 512}
+    in_one_piece = optimised and jax.__version_info__[:2] >= _SUMS_ON_VECTORS
+    without = [_TREE_SUMS] * in_one_piece + [_THREADS_OF_ITS_OWN] * one_thread
+    if without:
+        options = options | {_WITHOUT_PASSES: ",".join(without)}
+    if soon and optimised:
+        options = options | {_OPTIMISATION: 1}
     flags = os.environ.get("XLA_FLAGS", "")
     return {name: value for name, value in options.items() if name not in flags}
-
-
-def _sums_in_one() -> dict[str, int | str]:
-    optimised = not jax.config.read("jax_disable_most_optimizations")
-    if optimised and jax.__version_info__[:2] >= _SUMS_ON_VECTORS:
-        return {_WITHOUT_PASSES: _TREE_SUMS}
-    return {}
-
-
-def _little_optimised(soon: bool) -> dict[str, int | str]:
-    if soon and not jax.config.read("jax_disable_most_optimizations"):
-        return {_OPTIMISATION: 1}
-    return {}
 
 
 def jit_with(
@@ -112,11 +106,7 @@ def in_little_memory(soon: bool = False) -> dict[str, int | str]:
     whose operations are over as soon as they have started. There are no options on other platforms,
     nor any that XLA_FLAGS sets or this XLA does not have.
     """
-    if jax.default_backend() != "cpu":
-        return {}
-    flags = os.environ.get("XLA_FLAGS", "")
-    options = _older_emitters() | _sums_in_one() | _little_optimised(soon)
-    return {name: value for name, value in options.items() if name not in flags}
+    return cpu_options(soon, older_emitters=True)
 
 
 @functools.cache

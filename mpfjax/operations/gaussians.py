@@ -41,10 +41,7 @@ def product(left: Float[Array, "d k #n"], right: Float[Array, "k e #n"]) -> Floa
 
 def applied(matrix: Float[Array, "d k #n"], vector: Float[Array, "k #n"]) -> Float[Array, "d n"]:
     """A v."""
-    total = matrix[:, 0] * vector[None, 0]
-    for k in range(1, matrix.shape[1]):
-        total = total + matrix[:, k] * vector[None, k]
-    return total
+    return product(matrix, vector[:, None])[:, 0]
 
 
 def transposed(matrix: Float[Array, "d e n"]) -> Float[Array, "e d n"]:

@@ -65,19 +65,9 @@ def _most_of_many_runs(
     return most_of_runs(jnp.max(numbers)), False
 
 
-@jax.custom_batching.custom_vmap
 def any_run(is_needed: Bool[Array, ""]) -> Bool[Array, ""]:
     """Whether it is needed in any run of the caller's `vmap`, the same for all of them."""
-    return is_needed
-
-
-@any_run.def_vmap
-def _any_run_of_many(
-    axis_size: int, in_batched: list[bool], is_needed: Bool[Array, " b"]
-) -> tuple[Bool[Array, ""], bool]:
-    del axis_size, in_batched
-    # A `vmap` around this one combines its own runs.
-    return any_run(jnp.any(is_needed)), False
+    return most_of_runs(is_needed.astype(jnp.int32)) > 0
 
 
 def num_islands() -> int:

@@ -33,8 +33,6 @@ from mpfjax.operations.stored import (
 _ONE_BLOCK = 128
 _LANES_OF_ROWS = 4
 _FEW = 64
-# A sum of so few numbers takes no vector.
-_FEWEST = 16
 # A sum in float32 of more numbers than these has too few bits for the fraction. The limit is a
 # number of particles, which is static: filters below it have the draws that they always had.
 MOST_IN_ONE_FLOAT = 100_000
@@ -127,8 +125,6 @@ def few_upto(values: Shaped[Array, " n"]) -> Int[Array, " n"]:
         return jnp.cumsum(values, dtype=jnp.int32)
     place = jnp.arange(n, dtype=jnp.int32)
     counts = values.astype(jnp.int32)
-    if n <= _FEWEST:
-        return jnp.sum(jnp.where(place[None] <= place[:, None], counts[None], 0), 1, jnp.int32)
     # Over the first axis the sums run on vectors, but XLA would repeat them for every use.
     sums = jnp.sum(jnp.where(place[:, None] <= place[None], counts[:, None], 0), 0, jnp.int32)
     return stored(sums)

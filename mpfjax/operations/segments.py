@@ -47,8 +47,6 @@ _LANES = 8
 # A sum over the entries runs on vectors where they lie side by side, column by column: up to ten
 # times as fast. To bring many columns into that order costs more than it gains.
 _FEW_COLUMNS = 9
-# Up to this many masked entries, a scatter takes longer to compile than it could ever save.
-_HANDFUL = 2**12
 # In float32, a million equal numbers, added one after the other, give a thousandth too much.
 _LONGEST_SUM = 2**10
 # The segments that occur are kept in the bits of at most this many words.
@@ -86,7 +84,7 @@ def spread_stored(
 
     A choice between few values runs on vectors anyway.
     """
-    if values.shape[0] <= FEW_CHOICES or _is_handful(len(segments), values.shape[0]):
+    if values.shape[0] <= FEW_CHOICES:
         return spread(values, segments)
     return spread(stored(values), segments)
 
@@ -108,9 +106,6 @@ def column_sums(
     columns: Float[Array, "c n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, "num_segments c"]:
     """`segment_sum` of values that lie column by column, each entry beside the next."""
-    if _is_handful(columns.shape[1], num_segments):
-        member = _members(segments, num_segments)
-        return jnp.sum(jnp.where(member, columns[:, None], jnp.zeros((), columns.dtype)), axis=2).T
     if len(columns) <= _FEW_COLUMNS:
         # A sum of several columns at once would be of columns that are chosen number by number.
         few = are_masked(columns.shape[1], num_segments)
@@ -132,23 +127,12 @@ def are_masked(n: int, num_segments: int) -> bool:
     return num_segments <= FEW_SEGMENTS or n * num_segments <= _FEW_MASKED
 
 
-def _is_handful(n: int, num_segments: int) -> bool:
-    """Whether hardly any segment has two entries, and there are few: masks compile into one loop.
-
-    A tracker has a particle for each object, and most of its time to the first frame is compiling.
-    """
-    return n <= num_segments and n * num_segments <= _HANDFUL
-
-
 @partial(jax.jit, static_argnames="num_segments")
 def segment_max(
     values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " num_segments"]:
     """The largest value in each segment, -inf in an empty one."""
-    if not are_masked(len(values), num_segments):
-        return _scattered("max", values, segments, num_segments, -jnp.inf)
-    member = _members(segments, num_segments)
-    return largest(jnp.where(member, values[None], jnp.array(-jnp.inf, values.dtype)), axis=1)
+    return segment_reduce("max", values, segments, num_segments, -jnp.inf)
 
 
 @partial(jax.jit, static_argnames="num_segments")
@@ -286,19 +270,13 @@ def segment_argmax(
     largest = jnp.maximum(segment_max(values, segments, num_segments), limits.min)
     is_largest = values >= spread_stored(largest, segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
-    if not are_masked(n, num_segments):
-        return _scattered("min", stored(index), segments, num_segments, n - 1)
-    member = _members(segments, num_segments)
-    return jnp.min(jnp.where(member, index[None], n - 1), axis=1)
+    return segment_reduce("min", stored(index), segments, num_segments, n - 1)
 
 
 def first_places(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " num_segments"]:
     """The first index with each segment's label, n - 1 for a label that does not occur."""
     n = segments.shape[0]
-    index = jnp.arange(n, dtype=jnp.int32)
-    if not are_masked(n, num_segments):
-        return _scattered("min", index, segments, num_segments, n - 1)
-    return jnp.min(jnp.where(_members(segments, num_segments), index[None], n - 1), axis=1)
+    return segment_reduce("min", jnp.arange(n, dtype=jnp.int32), segments, num_segments, n - 1)
 
 
 def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, " num_places"]:

@@ -6,8 +6,7 @@ not fuse across the call of a function that it must not inline, and a call that 
 no time. An operation has one form for CPUs and another for all other platforms.
 """
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +15,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, PyTree, Shaped, UInt32
 
-_only_the_default_forms = False
+_only_the_default_forms = False  # set by tests, which try them without a GPU
 VECTOR = 32
 # Powers of two fill the vectors; sizes far from 32 make more rows or longer products.
 _BLOCKS = (VECTOR, 16, 40, 48, 24, 56, 28, 36, 20, 44, 52)
@@ -33,19 +32,6 @@ def on_platform(
     if _only_the_default_forms:
         return default(*operands)
     return jax.lax.platform_dependent(*operands, cpu=cpu, default=default)
-
-
-@contextlib.contextmanager
-def default_forms() -> Iterator[None]:
-    """Within it the default forms run on a CPU as well, so that they can be tried without a GPU."""
-    global _only_the_default_forms
-    _only_the_default_forms = True
-    jax.clear_caches()
-    try:
-        yield
-    finally:
-        _only_the_default_forms = False
-        jax.clear_caches()
 
 
 def whole_blocks(n: int) -> int:
