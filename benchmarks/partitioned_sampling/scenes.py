@@ -30,7 +30,7 @@ from benchmarks.partitioned_sampling.posterior import (
 from benchmarks.scenes import NoPath, distracter_scene
 from mpfjax import vision
 from mpfjax.metrics.particle_scores import effective_dynamics, uniqueness
-from mpfjax.vision.boxes.joint_colour import PAPER_DEVIATIONS, with_lambda
+from mpfjax.vision.boxes.joint_colour import PAPER_DEVIATIONS
 from mpfjax.vision.files import boxes as box_files
 
 PAPER_WIDTH = 360  # the frames in which a step deviates by two pixels
@@ -278,7 +278,12 @@ def real_scene(folder: Path, event: Event) -> Scene:
             truth[t, j] = own.get(id, np.nan)
     deviations = np.array(PAPER_DEVIATIONS)
     deviations[:2] *= stills.shape[2] / PAPER_WIDTH
-    model = vision.joint_colour_model(stills[0], truth[0], deviations=tuple(deviations.tolist()))
+    steps = tuple(deviations.tolist())
+
+    def model_at(lambda_: float) -> mpfjax.MultiObjectModel:
+        return vision.joint_colour_model(stills[0], truth[0], lambda_=lambda_, deviations=steps)
+
+    model = model_at(1.0)
     span = f"{first}-{first + len(stills) - 1}"
     name = f"{folder.name}, objects {', '.join(map(str, ids))}, frames {span}"
 
@@ -295,6 +300,6 @@ def real_scene(folder: Path, event: Event) -> Scene:
 
     return Scene(
         f"{folder.name} {ids[0]} {span}", name, stills, first, truth, 0, jnp.asarray(stills),
-        lambda lambda_: with_lambda(model, lambda_),
+        model_at,
         lambda everything: collect if everything else collect_boxes, deviations[:2],
     )  # fmt: skip

@@ -8,7 +8,7 @@ import pytest
 
 import mpfjax
 from mpfjax.vision.boxes.colour_model import ColourModel
-from mpfjax.vision.boxes.joint_colour import joint_colour_model, object_boxes, with_lambda
+from mpfjax.vision.boxes.joint_colour import joint_colour_model, object_boxes
 from mpfjax.vision.colour.bins import HSVColours, RGBColours
 
 KEY = jax.random.key(0)
@@ -61,7 +61,7 @@ def test_the_likelihood_is_the_papers_formula(frame):
     states = states_at(model, *(centres() + shifts))
     value = eqx.filter_jit(model.log_likelihood)(jnp.asarray(frame), states)
     np.testing.assert_allclose(value, [-7.0 * total], rtol=1e-4)
-    three = with_lambda(model, 21.0)
+    three = joint_colour_model(frame, BOXES, lambda_=21.0, colours=RGBColours(8), num_parts=2)
     other = eqx.filter_jit(three.log_likelihood)(jnp.asarray(frame), states)
     np.testing.assert_allclose(other, 3 * value, rtol=1e-5)
 
@@ -126,10 +126,10 @@ def test_a_template_from_elsewhere(frame):
     np.testing.assert_allclose(drawn, centres()[0], atol=1)
 
 
-def test_another_lambda_and_order_are_the_same_program(model):
+def test_another_lambda_and_order_are_the_same_program(frame):
     """They differ in the values of arrays alone, on which no compilation depends."""
     one, other = (
-        mpfjax.partitioned_sampling(with_lambda(model, lambda_), 12, order)
+        mpfjax.partitioned_sampling(joint_colour_model(frame, BOXES, lambda_=lambda_), 12, order)
         for lambda_, order in ((10.0, (0, 1, 2)), (40.0, (2, 0, 1)))
     )
     arrays, rest = zip(

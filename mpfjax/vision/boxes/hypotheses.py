@@ -199,11 +199,7 @@ def _log_shares(mixture: ParticleMixture, owners: Int[Array, " m"]) -> Float[Arr
     """log of each component's share of the mass of its object, -inf for a dead one."""
     masses = mixture.log_mixture_weights
     rivals = jnp.where(_same_object(mixture, owners), masses[None], -jnp.inf)
-    heaviest = jnp.max(rivals, axis=1)
-    shift = jnp.where(jnp.isfinite(heaviest), heaviest, 0.0)
-    total = jnp.sum(jnp.exp(rivals - shift[:, None]), axis=1)
-    log_total = shift + jnp.log(jnp.where(total > 0, total, 1.0))
-    return jnp.where(mixture.active, masses - log_total, -jnp.inf)
+    return jnp.where(mixture.active, masses - jax.nn.logsumexp(rivals, axis=1), -jnp.inf)
 
 
 def _with_appearance(

@@ -1,7 +1,6 @@
 """Several objects, each recognised by its colours, as in Smith and Gatica-Perez (2004)."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -58,7 +57,10 @@ def joint_colour_model(
     Use it where each object has colours of its own.
     """
     boxes = to_rows(4, "boxes", boxes)
-    sigma = _sigma(lambda_, num_parts)
+    check_positive(lambda_=lambda_)
+    check_whole(num_parts=num_parts)
+    # σ of exp(-(mean of d²) / 2σ²) for exp(-λ (sum of d²)).
+    sigma = float((2 * lambda_ * num_parts) ** -0.5)
     steps = positive_deviations(deviations, 1).reshape(4)
     momentum = Autoregression.with_momentum(_MOMENTUM, jnp.asarray(steps, float))
     templates = {} if templates is None else templates
@@ -94,14 +96,6 @@ def joint_colour_model(
     )
 
 
-def with_lambda(model: MultiObjectModel, lambda_: float) -> MultiObjectModel:
-    """A `joint_colour_model` with another λ, whose filters compile to the same programs."""
-    colour_model: Any = model.object_model
-    sigma = _sigma(lambda_, colour_model.references.shape[-3])
-    sigma = jnp.full_like(colour_model.sigma, sigma)
-    return eqx.tree_at(lambda m: m.object_model.sigma, model, sigma)
-
-
 def object_boxes(model: MultiObjectModel, states: BoxState) -> Float[Array, "n objects 4"]:
     """(x, y, w, h) of every object of every particle, (x, y) the top-left corner, in pixels.
 
@@ -116,13 +110,6 @@ def object_boxes(model: MultiObjectModel, states: BoxState) -> Float[Array, "n o
         return jnp.concatenate([boxes[:, :2] - 0.5 * boxes[:, 2:], boxes[:, 2:]], axis=1)
 
     return eqx.filter_vmap(place, in_axes=(0, 1), out_axes=1)(model.object_model, states)
-
-
-def _sigma(lambda_: float, num_parts: int) -> float:
-    """σ of exp(-(mean of d²) / 2σ²) for exp(-λ (sum of d²))."""
-    check_positive(lambda_=lambda_)
-    check_whole(num_parts=num_parts)
-    return float((2 * lambda_ * num_parts) ** -0.5)
 
 
 def _one_each(model: ColourModel) -> ColourModel:

@@ -107,7 +107,10 @@ def objects_filters(
     size = _mean_size(frame, boxes)
     # Steps about a velocity are shorter than those of a random walk.
     steps = _steps(boxes) * np.array([0.3, 0.5, 1.0, 1.0])
-    walk = _walking(_with_jumps(steps, probability=0.1, times=(8.0, 6.0)), boxes)
+    walk = _with_jumps(steps, probability=0.1, times=(8.0, 6.0))
+    # Places keep their velocity, which is about a tenth of a width a frame at first.
+    speeds = 0.1 * boxes[:, 2:3] * np.array([[1.0, 1.0, 0.0, 0.0]])
+    walk = WalkWithVelocity(walk, (0.1, 0.1, 0.0, 0.0), speeds)
     model: Any = _own_references(frame, boxes, steps, walk, kind=LearnedColourModel)
     apart = _apart(size)
     learn = AdaptAppearance(model, rate=0.03)
@@ -180,13 +183,6 @@ def _with_jumps(
 ) -> RandomWalkWithJumps:
     """Some steps of the places are longer by this factor; sizes never jump."""
     return RandomWalkWithJumps(steps, steps * np.array([*times, 1.0, 1.0]), probability)
-
-
-def _walking(walk: RandomWalkWithJumps, boxes: np.ndarray) -> WalkWithVelocity:
-    """Places keep their velocity, which is about a tenth of a width a frame at first."""
-    width, still = 0.1 * boxes[:, 2], np.zeros(len(boxes))
-    speeds = np.stack([width, width, still, still], axis=1)
-    return WalkWithVelocity(walk, (0.1, 0.1, 0.0, 0.0), speeds)
 
 
 def _apart(size: np.ndarray) -> dict[str, Any]:
