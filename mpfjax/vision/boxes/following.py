@@ -182,7 +182,7 @@ def _followed(
     model: Any = filter.model
     # It runs once, and takes longer to compile than to run.
     little = in_little_memory(soon=True)
-    mixture = jit_with(little, _begin)(filter, key)
+    mixture = jit_with(little, Filter.init)(filter, key)
     # With XLA's newer emitters it takes longer to compile, and half the time to run.
     count = jit_with(cpu_options(soon=True), _counted)
     advance = jit_with(little, _advance_boxes)
@@ -191,10 +191,6 @@ def _followed(
         counted = count(model, still)
         mixture, tracks, faults = advance(filter, len(boxes), key, np.asarray(t), mixture, counted)
         yield jax.device_get(raise_faults(tracks, faults))
-
-
-def _begin(filter: Filter, key: Array) -> ParticleMixture:
-    return filter.init(key)
 
 
 def _counted(model: LearnedColourModel, frame: Array) -> IntegralHistogram:

@@ -239,8 +239,8 @@ def detection_files(folder: Path) -> list[Path]:
 
 def sequence_of(detections: Path) -> Path | None:
     """The folder of the sequence to which a file of detections belongs, by its path, or None."""
-    folders = Path(detections).absolute().parents[:2]
-    return next((folder for folder in folders if _is_among(detections, folder)), None)
+    file = Path(detections).absolute()
+    return next((folder for folder in file.parents[:2] if file in detection_files(folder)), None)
 
 
 def last_frame(info: SequenceInfo, *rows: np.ndarray) -> int:
@@ -248,10 +248,6 @@ def last_frame(info: SequenceInfo, *rows: np.ndarray) -> int:
     if info.length is not None:
         return info.length
     return int(max((found[:, 0].max() for found in rows if len(found)), default=0))
-
-
-def _is_among(file: Path, folder: Path) -> bool:
-    return file.absolute() in detection_files(folder)
 
 
 def _positive(path: Path, key: str, value: str | None) -> float | None:
