@@ -240,13 +240,12 @@ RUN = {
     "run_filter": (
         mpfjax.run_filter,
         {"key": KEY, "filter": FILTER, "observations": np.ones(2, np.float32),
-         "collect": nothing, "missing": "error", "progress": False},
+         "collect": nothing, "missing": "error"},
     ),
     "monte_carlo": (
         mpfjax.monte_carlo,
         {"keys": KEY[None], "filter": FILTER, "observations": np.ones(2, np.float32),
-         "collect": nothing, "missing": "error", "devices": None, "slots": None,
-         "progress": False},
+         "collect": nothing, "missing": "error", "devices": None, "slots": None},
     ),
     "run_islands": (
         mpfjax.run_islands,

@@ -56,7 +56,7 @@ FLOORS = {
     "vision": ("files", "colour", "tracking", "boxes"),
     "lookahead": ("quadratics", "pilot", "twisted", "regression", "learned"),
     "running": (
-        "storage", "long_runs", "devices", "progress", "scan", "run", "islands",
+        "storage", "long_runs", "devices", "scan", "run", "islands",
         "studies",
     ),
 }  # fmt: skip

@@ -7,13 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.checks import check_flag, check_key, check_whole, given
+from mpfjax.checks import check_key, check_whole, given
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import choose_devices, num_processors, over_devices, over_threads
-from mpfjax.running.progress import shown_progress
 from mpfjax.running.scan import FilterRun, check_run, checked, first_mixture, initial_keys, scan
 
 # How many particles, with the temporaries of a step, fit into a CPU's caches. Few components
@@ -30,7 +29,6 @@ def run_filter(
     *,
     inputs: PyTree = None,
     missing: str = "error",
-    progress: bool = False,
 ) -> FilterRun:
     """Run a filter over observations y_1..y_t in one scan.
 
@@ -47,9 +45,6 @@ def run_filter(
       NaN or an infinity. "skip" treats such steps as missing and only predicts. A model with
       `handles_missing = True` gets the NaN; with "skip", only a step of nothing but NaN is
       missing.
-    - `progress`: show a bar of the steps. The run is then another program, which calls the host up
-      to a hundred times and is not found in a cache of programs. Within the caller's own jit there
-      is no bar.
 
     Raises `ValueError` before anything compiles: for an argument of another kind, no observations,
     leaves of different lengths, complex numbers, numbers that JAX's type cannot hold, or inputs of
@@ -58,12 +53,9 @@ def run_filter(
     """
     check_key(key)
     check_run(filter, collect)
-    check_flag(progress=progress)
     series = as_series(observations, filter.model, inputs, missing)
-    with shown_progress(progress, series.length, (key, filter, series)) as bar:
-        bars = () if bar is None else (bar,)
-        run = lambda filter: _run(key, filter, series, collect, *bars)  # noqa: E731
-        return checked(with_floats_traced(run, filter))
+    run = lambda filter: _run(key, filter, series, collect)  # noqa: E731
+    return checked(with_floats_traced(run, filter))
 
 
 def monte_carlo(
@@ -76,7 +68,6 @@ def monte_carlo(
     missing: str = "error",
     devices: int | Sequence[Any] | None = None,
     slots: int | None = None,
-    progress: bool = False,
 ) -> FilterRun:
     """Run a filter once for each key, all on the same observations and inputs, under `vmap`.
 
@@ -100,7 +91,6 @@ def monte_carlo(
     """
     check_key(keys, "keys", batch=True)
     check_run(filter, collect)
-    check_flag(progress=progress)
     check_whole(**given(slots=slots))
     if slots is not None and slots < filter.num_particles:
         raise ValueError(f"slots: {slots} is no whole number of at least N, {filter.num_particles}")
@@ -112,20 +102,15 @@ def monte_carlo(
             # A program of its own, since draws and moves of x_0 may depend on N.
             starts = (keys, _start_each(keys, filter, series, int(slots)))
             filter = filter.replace(num_particles=int(slots))
-        arguments = (filter, series, collect, *bars)
+        arguments = (filter, series, collect)
         leave_to_caller = devices is None and is_traced((starts, arguments))
         chosen = None if leave_to_caller else choose_devices(devices)
         return over_devices(_run_each, _run_on_threads, starts, arguments, chosen)
 
-    num_steps = keys.shape[0] * series.length
-    with shown_progress(progress, num_steps, (keys, filter, series)) as bar:
-        bars = () if bar is None else (bar,)
-        return checked(with_floats_traced(run, filter))
+    return checked(with_floats_traced(run, filter))
 
 
-@jit_on_wide_vectors
-def _run(key, filter, series, collect, bar=None):
-    return scan(key, filter, series, collect, bar)
+_run = jit_on_wide_vectors(scan)
 
 
 @jit_on_wide_vectors
@@ -147,11 +132,10 @@ def _start_each(keys, filter, series, slots):
     return jax.vmap(start)(keys)
 
 
-def _run_each(starts, filter, series, collect, bar=None):
+def _run_each(starts, filter, series, collect):
     num_runs = starts[0].shape[0]
     size = _group_size(num_runs, filter)
-    bar = None if bar is None else bar._replace(num_runs=size)
-    run = lambda key, initial: scan(key, filter, series, collect, bar, initial)  # noqa: E731
+    run = lambda key, initial: scan(key, filter, series, collect, initial)  # noqa: E731
     run_together = lambda starts: jax.vmap(run)(*starts)  # noqa: E731
     if size == num_runs:
         return run_together(starts)
@@ -172,13 +156,13 @@ def _group_size(num_runs: int, filter: Filter) -> int:
 _run_all = jit_on_wide_vectors(_run_each)
 
 
-def _run_on_threads(starts, filter, series, collect, *bars):
+def _run_on_threads(starts, filter, series, collect):
     """All runs on one device; on a CPU, several threads share them."""
     num_runs = starts[0].shape[0]
     num_worth_it = num_runs * filter.num_particles // _WORTH_A_THREAD
     num_threads = min(num_processors(), num_runs, num_worth_it)
     keeps_all = collect is None  # threads would hold two copies of it for a while
-    arguments = (filter, series, collect, *bars)
+    arguments = (filter, series, collect)
     leave_to_caller = is_traced((starts, arguments)) or jax.default_backend() != "cpu"
     if num_threads < 2 or keeps_all or leave_to_caller:
         return _run_all(starts, *arguments)

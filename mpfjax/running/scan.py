@@ -19,7 +19,6 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Series
 from mpfjax.operations.islands import num_islands
 from mpfjax.operations.random import split, split_for_run, split_keys
-from mpfjax.running.progress import Bar, advance_bar
 
 
 class FilterRun(eqx.Module):
@@ -44,7 +43,6 @@ def scan(
     filter: Filter,
     series: Series,
     collect: Callable[[ParticleMixture], PyTree] | None,
-    bar: Bar | None = None,
     initial: ParticleMixture | None = None,
 ) -> FilterRun:
     """`run_filter` under the caller's jit, its arguments unchecked, from an `initial` mixture."""
@@ -52,20 +50,17 @@ def scan(
     keys_initial, keys = split_for_run(key, num_initial, series.length, num_moves)
 
     def advance(
-        mixture: ParticleMixture, step: tuple[Array, Series, Array | None]
+        mixture: ParticleMixture, step: tuple[Array, Series]
     ) -> tuple[ParticleMixture, PyTree]:
-        step_keys, now, number = step
+        step_keys, now = step
         mixture, info = step_or_predict(filter, step_keys, mixture, now)
         with saying("in collect, which is called with the mixture after each step"):
             kept = mixture if collect is None else collect(mixture)
-        if bar is not None and number is not None:
-            advance_bar(bar, number, series.length)
         return mixture, (kept, report_of(info))
 
-    numbers = None if bar is None else jnp.arange(series.length, dtype=jnp.int32)
     if initial is None:
         initial = first_mixture(keys_initial, filter, series)
-    final, outputs = jax.lax.scan(advance, initial, (keys, series, numbers))
+    final, outputs = jax.lax.scan(advance, initial, (keys, series))
     return run_of(initial, final, *outputs)
 
 
