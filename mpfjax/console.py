@@ -46,24 +46,19 @@ seed = whole(0, 2**32 - 1)
 
 def positive(text: str) -> float:
     """The type of an option that is a positive, finite number."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not 0 < number < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive, finite number")
-    return number
+    return _number(text, lambda number: 0 < number < math.inf, "a positive, finite number")
 
 
 def finite(text: str) -> float:
     """The type of an option that is a finite number."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
-    return number
+    return _number(text, math.isfinite, "a finite number")
+
+
+def _number(text: str, holds: Callable[[float], bool], what: str) -> float:
+    with contextlib.suppress(ValueError):
+        if holds(number := float(text)):
+            return number
+    raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
 
 
 def write_figure(path: Path, figure: Any, dpi: int = 150) -> None:

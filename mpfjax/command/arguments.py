@@ -58,6 +58,15 @@ class Source(NamedTuple):
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """The arguments, checked as far as possible without the frames."""
+    parser, track = _parsers()
+    given = sys.argv[1:] if arguments is None else arguments
+    options = parser.parse_args(_with_boxes_joined(given))
+    _check(track, options)
+    return options
+
+
+def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
+    """That of the whole command line, and that of `track`."""
     parser = argparse.ArgumentParser(prog="mpfjax", description="Particle filters that track.")
     package = importlib.import_module(__name__.partition(".")[0])
     parser.add_argument("--version", action="version", version=f"mpfjax {package.__version__}")
@@ -105,8 +114,11 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         action="store_true",
         help="write an object's first frames too, from before it was believed in",
     )
-    given = sys.argv[1:] if arguments is None else arguments
-    options = parser.parse_args(_with_boxes_joined(given))
+    return parser, track
+
+
+def _check(track: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """An error of `track` for options that do not go together."""
     if not (options.detections or options.detect or options.box) and _has_pixels(options.source):
         if _is_text(options.source):
             track.error(
@@ -125,7 +137,6 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
             track.error("argument --camera-motion pixels: not allowed with --detect")
         if not _has_pixels(options.source):
             track.error(f"argument --camera-motion pixels: {options.source} has no pixels")
-    return options
 
 
 def _existing(text: str) -> Path:
