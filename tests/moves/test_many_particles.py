@@ -16,6 +16,7 @@ from mpfjax.moves.resampling.allocation import place_slots
 from mpfjax.moves.resampling.ancestors import SCHEMES as SCHEMES_BY_NAME
 from mpfjax.moves.resampling.ancestors import Dealt
 from mpfjax.moves.resampling.line import in_line
+from mpfjax.operations import prefix_sums
 from mpfjax.smoothing.backward import draw
 from tests.examples import make_mixture
 from tests.marking import quick_of, thorough

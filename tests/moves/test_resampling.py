@@ -11,6 +11,7 @@ import pytest
 from mpfjax import Resample
 from mpfjax.moves.resampling.allocation import place_slots
 from mpfjax.moves.resampling.ancestors import random_points
+from mpfjax.operations import prefix_sums
 from tests.examples import make_mixture
 from tests.marking import quick_of, thorough
 
