@@ -29,7 +29,12 @@ MOVES = {
     "ssp, adaptive": Resample("ssp", ess_threshold=0.8),
 }
 # Of one component, of two, and of one particle each.
-CASES = {f"{name}, M = {m}": (name, m) for name in MOVES for m in (1, 2, 8)}
+CASES = {
+    f"{name}, M = {m}": (name, m)
+    for name, move in MOVES.items()
+    for m in (1, 2, 8)
+    if (move.particles_per_component or 1) * m <= len(WEIGHTS)
+}
 # One of each scheme and of each way to stand in line, to share the slots and to choose who is due.
 QUICK_CASES = (
     "systematic, M = 1",
