@@ -138,7 +138,7 @@ class Sampling:
         return checked_prior(log_prior, self.problem, first, "at a draw of sample_prior")
 
     def run(
-        self, kernel: AbstractKernel, settings: Mapping[str, Any], functions: Mapping[str, Any]
+        self, kernel: AbstractKernel, settings: dict[str, Any], functions: dict[str, Any]
     ) -> Outcome:
         """All steps; the last two arguments are those of `identity_of`."""
         plan, caller = self.plan, self.caller

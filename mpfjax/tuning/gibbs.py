@@ -150,8 +150,8 @@ def particle_gibbs(
     (reals, kept, accepted, renewed), fields = sampling.run(
         kernel, {"observations": joint.series}, functions
     )
-    parameters = problem.constrained_rows(reals)
-    return GibbsPosterior(parameters, kept, accepted, renewed, **fields)
+    drawn = problem.constrained_rows(reals)
+    return GibbsPosterior(drawn, kept, accepted, renewed, **fields)
 
 
 class LogJoint(eqx.Module):

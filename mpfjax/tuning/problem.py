@@ -18,7 +18,7 @@ _DECLARED = "eqx.field(converter=jnp.asarray)"
 
 Parameters = Mapping[str, Callable[[Any], PyTree]] | None
 Reals = dict[str, Array]
-Objective = Callable[[Key[Array, ""], Any], Float[Array, ""]]
+Objective = Callable[..., Any]
 
 
 class Problem(eqx.Module):
@@ -27,7 +27,7 @@ class Problem(eqx.Module):
     leaves: list[Any]
     transforms: dict[str, AbstractTransform]
     objective: Objective
-    """of a seed and the tree that the leaves are of; its arrays are the data."""
+    """of a seed and the tree that the leaves are of, a scalar; its arrays are the data."""
     tuned: tuple[tuple[str, int], ...] = eqx.field(static=True)
     """the parameters' names, and where they are among the leaves."""
     structure: Any = eqx.field(static=True)
