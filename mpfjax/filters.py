@@ -83,6 +83,8 @@ def auxiliary_particle_filter(
         model, num_particles, proposal=proposal, scheme=scheme, ess_threshold=ess_threshold,
         sort_by=sort_by,
     )  # fmt: skip
+    if lookahead is None:
+        raise ValueError("lookahead: None; with_lookahead(particle_filter(...)) makes one")
     return with_lookahead(plain, lookahead)
 
 

@@ -107,7 +107,8 @@ class AuxiliaryResample(AbstractMove):
             values = look(observation, mixture.particles)
         expected = (mixture.num_particles,)
         if jnp.shape(values) != expected or jnp.iscomplexobj(values):
-            raise ValueError(f"lookahead: it returned {shown(values)}, no real array {expected}")
+            found = f"{shown(values)} of shape {jnp.shape(values)}"
+            raise ValueError(f"lookahead: it returned {found}, not real numbers {expected}")
         log_factors = jnp.asarray(values).astype(mixture.log_weights.dtype)
         seen = mixture.weighed(log_factors).active
         is_seen = spread(seen, mixture.component_indicators) | ~(log_factors < jnp.inf)

@@ -38,21 +38,18 @@ class Resample(AbstractResampling):
 
     - `scheme`: "systematic" (the default: least noise, O(n)), "stratified", "multinomial" (the
       textbook's, most noise), "residual" or "ssp" (Gerber, Chopin and Whiteley 2019: as even as
-      systematic, and consistent in whatever order the particles stand; ten times slower than
-      it, and several times faster than "multinomial").
+      systematic, and consistent in whatever order the particles stand; ten times slower).
     - `ess_threshold`: a component is resampled if its effective sample size is below this share of
-      its particles. 1.0 resamples at every step. Under `vmap`, a lower threshold reduces the noise
-      but not the time.
+      its particles. 1.0 resamples at every step. Under `vmap`, a lower one saves no time.
     - `particles_per_component`: None shares all slots among the living components that are
       resampled, as `allocation` says. A number k gives each living component k particles and
       leaves the other slots empty, as section 5.2 of the paper does.
     - `allocation`: how the components share the slots, where neither `particles_per_component` nor
       `share_by` says it. "variance" deals component m a number in proportion to
       (k_m Σ_{c_i = m} exp 2ℓ_i)^(1/2) = π_m (k_m / ESS_m)^(1/2), which leaves Ẑ the least variance
-      (Neyman 1934), and shares a quarter to a half equally, so that every mode stays alive. Its
-      masses are as exact as the plain filter's, or more so, and log Ẑ is in most scenes;
-      docs/masses.md has the reasons. "equal" is the paper's: it keeps modes of little mass
-      longest, and log Ẑ is less exact.
+      (Neyman 1934), and shares a quarter to a half equally, so that every mode stays alive (see
+      docs/masses.md). "equal" is the paper's: it keeps modes of little mass longest, and log Ẑ is
+      less exact.
     - `share_by`: a function that gives each particle the whole number of its group, the same within
       a component. Groups with a component that is resampled share the slots equally, and so do the
       components within a group. None makes no groups. Use it where components are rival hypotheses
@@ -63,9 +60,7 @@ class Resample(AbstractResampling):
       through them. "hilbert" takes all floating point numbers of the state. Systematic and
       stratified resampling in a good order change the distribution least (Kitagawa 1996). With
       the "rqmc" noise of `Propagate`, it is array randomised quasi-Monte Carlo (L'Ecuyer, Lécot
-      and Tuffin 2008; Gerber and Chopin 2015). Use it where masses or likelihoods must be
-      accurate and a sort is worth its time: on the quadratic model it made the error of the
-      modes' masses four or five times smaller.
+      and Tuffin 2008; Gerber and Chopin 2015). Use it where masses or likelihoods must be accurate.
     - `gradient`: what a derivative of the filter sees of the resampling.
         - "none": nothing. The drawn indices are constants, and the derivative of the log marginal
           likelihood is NOT an estimate of the score: its bias stays however many particles there
@@ -73,8 +68,8 @@ class Resample(AbstractResampling):
         - "stop": the new weights are w_a / ⊥w_a times the old share, where ⊥ is `stop_gradient`
           (Ścibior and Wood 2021, DPF-SGR). Values are the same to the bit; derivatives of Ẑ are
           unbiased. For parameters of the dynamics, `Propagate` and `Partitioned` have it too.
-      The masses of the components have their derivative in both. Component indicators are whole
-      numbers and have none. That is no error, since regrouping does not change the distribution.
+      The masses of the components have their derivative in both. Indicators have none, and need
+      none, since regrouping does not change the distribution.
 
     Raises `ValueError` for an unknown scheme or gradient or allocation, a threshold outside [0, 1],
     k < 1, and k together with `share_by`.
