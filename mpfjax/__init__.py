@@ -22,7 +22,6 @@ from mpfjax.models.base import per_particle as per_particle
 from mpfjax.models.conditionally_linear import (
     AbstractConditionallyLinearModel as AbstractConditionallyLinearModel,
 )
-from mpfjax.models.dynamics import AbstractDynamics as AbstractDynamics
 from mpfjax.models.dynamics import Autoregression as Autoregression
 from mpfjax.models.dynamics import RandomWalk as RandomWalk
 from mpfjax.models.dynamics import RandomWalkWithJumps as RandomWalkWithJumps

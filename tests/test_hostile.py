@@ -22,6 +22,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import mpfjax
+from mpfjax.models.dynamics import AbstractDynamics
 
 pytestmark = pytest.mark.usefixtures("as_installed")
 
@@ -362,7 +363,7 @@ def assert_sound(made):
         if max(abs(made.low), abs(made.high)) < 1e3:
             states = made.sample_initial(KEY, 4)
             assert_finite((states, made.log_transition(states, states)))
-    elif isinstance(made, mpfjax.AbstractDynamics) and made.is_shared:
+    elif isinstance(made, AbstractDynamics) and made.is_shared:
         rows = jnp.ones((4, jax.tree.leaves(made)[0].shape[-1]))
         assert_finite(made.sample(KEY, rows, rows))
     elif isinstance(made, mpfjax.PairwiseRepulsion) and made.position is None:

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 import mpfjax
+from benchmarks.partitioned_sampling.effective_dynamics import effective_dynamics
 from benchmarks.partitioned_sampling.posterior import (
     Verdict,
     Window,
@@ -29,7 +30,7 @@ from benchmarks.partitioned_sampling.posterior import (
 )
 from benchmarks.scenes import NoPath, distracter_scene
 from mpfjax import vision
-from mpfjax.metrics.particle_scores import effective_dynamics, uniqueness
+from mpfjax.metrics import uniqueness
 from mpfjax.vision.boxes.joint_colour import PAPER_DEVIATIONS
 from mpfjax.vision.files import boxes as box_files
 

@@ -4,7 +4,7 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, PyTree
 
 from mpfjax.checks import (
     check_not_negative_array,
@@ -128,42 +128,14 @@ def uniqueness(mixture: ParticleMixture) -> Float[Array, " objects"]:
     step lowers it for the objects that have moved, as in the paper's figure 4. Raises `ValueError`
     for particles of other shapes.
     """
-    _check(mixture)
-    distinct = jax.vmap(lambda states: _distinct_rows(states, mixture), in_axes=1)
-    return distinct(mixture.particles) / jnp.asarray(
-        mixture.num_usable_slots, mixture.log_weights.dtype
-    )
-
-
-def effective_dynamics(mixture: ParticleMixture) -> PyTree:
-    """The variance of each object's parameters over the particles: every leaf (J, ...).
-
-    Smith and Gatica-Perez (2004), section 3.1, at the end of a step. Every filled slot counts
-    the same, whatever its weight: it measures how far the search reaches, and not the posterior.
-    Divided by the variance of the dynamics' noise, it is the percentage of figure 4. Resampling
-    lowers it for the first objects of an order; for the last it may exceed 100%. Raises
-    `ValueError` for particles of other shapes.
-    """
-    _check(mixture)
-    occupied = mixture.occupied
-
-    def variance(leaf: Shaped[Array, "n objects *rest"]) -> Float[Array, "objects *rest"]:
-        if not jnp.issubdtype(leaf.dtype, jnp.floating):
-            leaf = leaf.astype(mixture.log_weights.dtype)
-        filled = occupied.reshape(-1, *[1] * (leaf.ndim - 1))
-        count = jnp.maximum(jnp.sum(occupied.astype(leaf.dtype)), 1.0)
-        mean = jnp.sum(jnp.where(filled, leaf, 0.0), axis=0) / count
-        squares = jnp.where(filled, (leaf - mean[None]) ** 2, 0.0)
-        return jnp.sum(squares, axis=0) / count
-
-    return jax.tree.map(variance, mixture.particles)
-
-
-def _check(mixture: ParticleMixture) -> None:
     check_type(ParticleMixture, "a ParticleMixture", mixture=mixture)
     shapes = [leaf.shape for leaf in jax.tree.leaves(mixture.particles)]
     if any(len(shape) < 2 for shape in shapes):
         raise ValueError(f"mixture: particles of shapes {shapes} are not of objects, (n, J, ...)")
+    distinct = jax.vmap(lambda states: _distinct_rows(states, mixture), in_axes=1)
+    return distinct(mixture.particles) / jnp.asarray(
+        mixture.num_usable_slots, mixture.log_weights.dtype
+    )
 
 
 def _distinct_rows(states: PyTree, mixture: ParticleMixture) -> Float[Array, ""]:

@@ -206,17 +206,11 @@ def updated(
     return MarginalisedState(state.latent, mean, covariance), jnp.broadcast_to(log_density, (n,))
 
 
-def latent_law(model: Any, state: MarginalisedState) -> Gaussian:
-    """N(f + A m, A P Aᵀ + V), the law of z_t in the mixed form, the particles last."""
-    mixed, _ = latent_dynamics_of(model, state)
-    return gaussians.predict(filtered_gaussian(model, state), mixed)
-
-
 def latent_from_noise(
     model: Any, noise: Float[Array, "n k"], state: MarginalisedState
 ) -> Float[Array, "n k"]:
-    """z_t of the mixed form, made of standard normal noise."""
-    law = latent_law(model, state)
+    """z_t ~ N(f + A m, A P Aᵀ + V) of the mixed form, made of standard normal noise."""
+    law = gaussians.predict(filtered_gaussian(model, state), latent_dynamics_of(model, state)[0])
     drawn = law.mean + applied(cholesky(law.covariance), noise.T.astype(law.mean.dtype))
     return drawn.T.reshape(state.latent.shape)
 

@@ -7,7 +7,6 @@ import pytest
 
 import mpfjax
 from mpfjax import metrics
-from mpfjax.metrics.particle_scores import effective_dynamics
 from mpfjax.metrics.tracking_scores import remove_ignored
 from tests.examples import make_mixture
 from tests.refused import assert_named, refused
@@ -68,7 +67,6 @@ TABLE = {
         {"tracks": "rows", "truth": "rows", "ignored": "rows", "min_height": "not negative"},
     ),
     "uniqueness": (metrics.uniqueness, {"mixture": MIXTURE}, {"mixture": "kind"}),
-    "effective_dynamics": (effective_dynamics, {"mixture": MIXTURE}, {"mixture": "kind"}),
 }
 
 
@@ -91,7 +89,6 @@ def test_what_will_not_do_is_named(function, good, name, value):
         (metrics.tracking_quality, TABLE["tracking_quality"][1], "truth", jnp.ones((2, 1, 4))),
         (metrics.mass_above, {"threshold": 0.0}, "mixture", IN_A_PLANE),
         (metrics.uniqueness, {}, "mixture", MIXTURE),
-        (effective_dynamics, {}, "mixture", MIXTURE),
         (metrics.multi_object_scores, {"tracks": ROWS, "truth": ROWS}, "frames", (3, 2)),
     ],
 )  # fmt: skip

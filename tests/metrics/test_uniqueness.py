@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.metrics.particle_scores import effective_dynamics, uniqueness
+from benchmarks.partitioned_sampling.effective_dynamics import effective_dynamics
+from mpfjax.metrics import uniqueness
 from tests.examples import make_mixture
 
 NUM_OBJECTS, NUM_PARTICLES, VARIANCE = 7, 300, 4.0
