@@ -152,7 +152,7 @@ BUILT = {
     ),
     "PropagateTempered": (
         mpfjax.PropagateTempered,
-        {"model": MODEL, "resample": None, "exponents": (0.1, 1.0), "num_moves": 1,
+        {"model": MODEL, "resample": mpfjax.Resample(), "exponents": (0.1, 1.0), "num_moves": 1,
          "least_step": 0.05},
     ),
     "Partitioned": (

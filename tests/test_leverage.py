@@ -193,7 +193,8 @@ def test_all_that_is_tuned_agrees_on_leverage(name):
     gradient = "stop" if name == "fit" else "none"
     filter = mpfjax.particle_filter(Leverage(jnp.array(-0.3)), 100, gradient=gradient)
     returns = simulated()
-    given = {"observations": returns, "inputs": inputs_of(returns), "progress": False}
+    series = mpfjax.Series(returns, inputs_of(returns))
+    given = {"observations": series, "progress": False}
     found = ESTIMATES[name](jax.random.key(1), filter, RHO_BY_NAME | given)
     error = found.std(ddof=1) / np.sqrt(len(found))
     assert error < 0.2 * deviation

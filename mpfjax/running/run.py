@@ -10,6 +10,7 @@ from jaxtyping import Array, Key, PyTree
 from mpfjax.checks import check_key, check_whole, given
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.eve_indices import EVE_INDICES, with_new_eve_indices
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import choose_devices, num_processors, over_devices, over_threads
@@ -123,6 +124,8 @@ def _start_each(keys, filter, series, slots):
         slot = jnp.arange(slots, dtype=jnp.int32)
         # Those that stay empty hold one of the particles as well.
         filled = mixture.at(jnp.minimum(slot, number - 1))
+        if EVE_INDICES in mixture.memory:
+            filled = with_new_eve_indices(filled)
         return filled.replace(
             log_weights=jnp.where(slot < number, filled.log_weights, -jnp.inf),
             ancestor_indices=slot,

@@ -149,7 +149,7 @@ class Sampling:
         identity = identity_of(plan.checkpoint, settings, functions)
         run = LongRun(caller, plan.last, plan.checkpoint, plan.progress, lambda step: identity)
         at = eqx.filter_eval_shape(self._chains_at, kernel, self.key, self._own_start())
-        report = eqx.filter_eval_shape(_all_steps, kernel, self.key, at[0], 0).report
+        report = eqx.filter_eval_shape(_one_step, kernel, self.key, at[0], 0).report
         none = jax.tree.map(lambda leaf: np.empty((0, *leaf.shape), leaf.dtype), report)
         start = lambda: State(0, self._started(kernel), none)  # noqa: E731
         state, stopped = run.go(State(0, at[0], none), start, self._advance(kernel, report))
@@ -261,6 +261,10 @@ def _all_steps(kernel: Any, key: Key[Array, ""], chains: Chains, step: Any) -> S
     num_chains = jax.tree.leaves(chains.states)[0].shape[0]
     keys = jax.random.split(jax.random.fold_in(key, step), num_chains)
     return jax.vmap(kernel.step, in_axes=(0, 0, None))(keys, chains.states, chains.walk)
+
+
+# Traced once for calls of the same shapes: only the shapes of its report are asked for.
+_one_step = jit_on_wide_vectors(_all_steps)
 
 
 @jit_on_wide_vectors

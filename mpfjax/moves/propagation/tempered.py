@@ -29,6 +29,14 @@ class TemperedParticles(NamedTuple):
     log_likelihoods: Float[Array, " n"]
 
 
+def _numbers(exponents: Any) -> Any:
+    """The exponents as a tuple of numbers; what is none stays, and is refused by its name."""
+    try:
+        return tuple(float(number) for number in exponents)
+    except (TypeError, ValueError):
+        return exponents
+
+
 class PropagateTempered(AbstractPropagation):
     """Draw x_t ~ D, then weigh it by L^β1, L^(β2-β1), ... up to L, moving particles in between.
 
@@ -58,7 +66,7 @@ class PropagateTempered(AbstractPropagation):
     model: AbstractStateSpaceModel
     resample: Resample = eqx.field(default_factory=Resample)
     exponents: tuple[float, ...] = eqx.field(
-        converter=tuple, static=True, default=(1 / 64, 1 / 16, 1 / 4, 1.0)
+        converter=_numbers, static=True, default=(1 / 64, 1 / 16, 1 / 4, 1.0)
     )
     num_moves: int = eqx.field(static=True, default=1)
     least_step: float = eqx.field(static=True, default=0.02)
@@ -70,8 +78,9 @@ class PropagateTempered(AbstractPropagation):
         check_type(Resample, "a Resample", resample=self.resample)
         if self.resample.sort_by is not None:
             raise ValueError("resample: sort_by has no use between the stages")
-        rises = all(a < b for a, b in itertools.pairwise((0.0, *self.exponents)))
-        if not rises or self.exponents[-1:] != (1.0,):
+        numbers = self.exponents if isinstance(self.exponents, tuple) else ()
+        rises = all(a < b for a, b in itertools.pairwise((0.0, *numbers)))
+        if not rises or numbers[-1:] != (1.0,):
             raise ValueError(f"exponents: {shown(self.exponents)} do not rise from above 0 to 1")
         check_whole(num_moves=self.num_moves)
         check_inner_share(least_step=self.least_step)
