@@ -39,7 +39,6 @@ from mpfjax.moves.base import AbstractRegrouping as AbstractRegrouping
 from mpfjax.moves.base import AbstractResampling as AbstractResampling
 from mpfjax.moves.every import Every as Every
 from mpfjax.moves.initial import SelectInitial as SelectInitial
-from mpfjax.moves.island_interaction import IslandInteraction as IslandInteraction
 from mpfjax.moves.metropolis import AbstractMetropolis as AbstractMetropolis
 from mpfjax.moves.metropolis import MetropolisAdjustedLangevin as MetropolisAdjustedLangevin
 from mpfjax.moves.metropolis import RandomWalkMetropolis as RandomWalkMetropolis
@@ -55,9 +54,9 @@ from mpfjax.moves.propagation.propagate import Reweight as Reweight
 from mpfjax.moves.propagation.regimes import PropagateRegimes as PropagateRegimes
 from mpfjax.moves.propagation.regimes import RegimeProposal as RegimeProposal
 from mpfjax.moves.propagation.tempered import PropagateTempered as PropagateTempered
-from mpfjax.moves.prune import Prune as Prune
 from mpfjax.moves.regrouping.kmeans import KMeans as KMeans
 from mpfjax.moves.regrouping.merge import Merge as Merge
+from mpfjax.moves.regrouping.merge import Prune as Prune
 from mpfjax.moves.regrouping.partitions import GroupBy as GroupBy
 from mpfjax.moves.regrouping.partitions import Pool as Pool
 from mpfjax.moves.regrouping.partitions import RandomPartition as RandomPartition
@@ -71,13 +70,14 @@ from mpfjax.operations.random import normal as normal
 from mpfjax.proposals import AbstractProposal as AbstractProposal
 from mpfjax.proposals import GaussNewtonProposal as GaussNewtonProposal
 from mpfjax.proposals import NetworkProposal as NetworkProposal
+from mpfjax.running.islands import IslandInteraction as IslandInteraction
 from mpfjax.running.islands import run_islands as run_islands
 from mpfjax.running.long_runs import Checkpoint as Checkpoint
 from mpfjax.running.run import monte_carlo as monte_carlo
 from mpfjax.running.run import run_filter as run_filter
 from mpfjax.running.scan import FilterRun as FilterRun
-from mpfjax.running.storage.states import load_checkpoint as load_checkpoint
-from mpfjax.running.storage.states import save_checkpoint as save_checkpoint
+from mpfjax.running.storage import load_checkpoint as load_checkpoint
+from mpfjax.running.storage import save_checkpoint as save_checkpoint
 from mpfjax.running.studies import Study as Study
 from mpfjax.running.studies import read_study as read_study
 from mpfjax.running.studies import run_study as run_study

@@ -1,4 +1,4 @@
-"""What a chain of moves needs beside the moves: checks, one move, memory, faults, shared models."""
+"""What a chain needs beside its moves: reports, checks, one move, memory, faults, shared models."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -12,12 +12,61 @@ from mpfjax.checks import check_type, check_whole, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, saying_that_none_were_given, with_inputs
 from mpfjax.moves.base import AbstractMove, Moves, name_of, with_inner, without_dead
-from mpfjax.moves.report import StepInfo
+from mpfjax.moves.eve_indices import EVE_INDICES, evidence_variance, mass_variances
 from mpfjax.observations import Fault, faults_of
 from mpfjax.operations.islands import excess_over_islands, island_index, num_islands
 from mpfjax.operations.logarithms import scaled_log_sum_exp
 
 BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
+
+
+# The report of a step.
+
+
+class StepInfo(eqx.Module):
+    """The report of a step, which comes with its mixture."""
+
+    log_likelihood_increment: Float[Array, ""]
+    """log p(y_t | y_1..y_{t-1}), estimated; -inf where every particle has zero likelihood."""
+    effective_sample_sizes: Float[Array, " m"]
+    """of each component of the new mixture, zero for a dead one."""
+    mixture_weights: Float[Array, " m"]
+    """the mass of each component of the new mixture."""
+    resampled: Bool[Array, " m"]
+    """which components of the mixture that the step was given were resampled."""
+    degenerate: Bool[Array, ""]
+    """whether every particle had zero likelihood: the weights are then those of the prediction."""
+    labels_ran_out: Bool[Array, ""]
+    """whether all M > 1 labels are in use, so that more modes share one; see `Split.is_diffuse`."""
+    log_marginal_likelihood_error: Float[Array, ""] | None = None
+    """the standard error of log Ẑ of all steps so far, from this one run; None unless the filter
+    is one of `mpfjax.smoothing.with_first_ancestors`."""
+    mixture_weight_errors: Float[Array, " m"] | None = None
+    """the standard error of each mixture weight; None likewise."""
+
+
+def step_info(
+    mixture: ParticleMixture, increment: Float[Array, ""], resampled: Bool[Array, " m"]
+) -> StepInfo:
+    """The report of a step that ended in this mixture."""
+    degenerate = increment == -jnp.inf
+    of_evidence = of_masses = None
+    # Families may have members on several islands.
+    if EVE_INDICES in mixture.memory and num_islands() == 1:
+        variance = jnp.where(degenerate, jnp.inf, evidence_variance(mixture))
+        of_evidence = jnp.sqrt(jnp.maximum(variance, 0.0))
+        of_masses = jnp.sqrt(jnp.maximum(mass_variances(mixture), 0.0))
+    sizes = mixture.component_effective_sample_sizes
+    return StepInfo(
+        log_likelihood_increment=increment,
+        effective_sample_sizes=sizes,
+        mixture_weights=mixture.mixture_weights,
+        resampled=resampled,
+        degenerate=degenerate,
+        labels_ran_out=jnp.all(sizes > 0) & (mixture.num_components > 1),
+        log_marginal_likelihood_error=of_evidence,
+        mixture_weight_errors=of_masses,
+    )
 
 
 # Checks, before anything compiles.

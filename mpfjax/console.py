@@ -20,7 +20,7 @@ from typing import Any
 from tqdm import tqdm
 
 from mpfjax.operations.compiling import keep_programs
-from mpfjax.running.storage.files import write_whole
+from mpfjax.running.storage import write_whole
 
 
 def whole(least: int = 1, most: int = 2**31 - 1) -> Callable[[str], int]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.chain import (
+    StepInfo,
     check_chain,
     check_mixture,
     forgetting,
@@ -17,6 +18,7 @@ from mpfjax.chain import (
     own_ancestors,
     start_and_faults,
     step_and_faults,
+    step_info,
     tie,
     untie,
 )
@@ -26,7 +28,6 @@ from mpfjax.models.base import AbstractStateSpaceModel, require_model, saying_th
 from mpfjax.models.noise import NOISES
 from mpfjax.moves.base import AbstractMove, as_moves, initial_memory
 from mpfjax.moves.initial import sample_initial
-from mpfjax.moves.report import StepInfo, step_info
 from mpfjax.observations import one_input, one_observation, raise_faults
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.islands import drawn_once

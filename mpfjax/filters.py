@@ -24,7 +24,7 @@ from mpfjax.moves.regrouping.merge import Merge
 from mpfjax.moves.regrouping.partitions import Pool, RandomPartition
 from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration
-from mpfjax.moves.resampling.ordering import SortBy
+from mpfjax.moves.resampling.line import SortBy
 from mpfjax.moves.resampling.resample import GRADIENTS, Resample
 from mpfjax.proposals import AbstractProposal
 from mpfjax.transforms import (

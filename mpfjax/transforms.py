@@ -14,7 +14,7 @@ from mpfjax.moves.initial import SelectInitial
 from mpfjax.moves.propagation.nested import PropagateNested
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
-from mpfjax.moves.resampling.ordering import HILBERT
+from mpfjax.moves.resampling.line import HILBERT
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.proposals import AbstractProposal
 

@@ -49,9 +49,8 @@ FLOORS = {
         "prefix_sums", "segments", "sorting",
     ),
     "moves": (
-        "base", "eve_indices", "conditional", "island_interaction", "every",
-        "regrouping", "resampling", "prune", "propagation",
-        "metropolis", "objects", "initial", "report",
+        "base", "eve_indices", "conditional", "every", "regrouping", "resampling", "propagation",
+        "metropolis", "objects", "initial",
     ),
     "vision": ("files", "colour", "tracking", "boxes"),
     "lookahead": ("quadratics", "pilot", "twisted", "regression", "learned"),

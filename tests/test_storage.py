@@ -15,8 +15,7 @@ import pytest
 
 import mpfjax
 from mpfjax.operations.random import fast_key
-from mpfjax.running.storage.files import load_arrays, write_arrays
-from mpfjax.running.storage.states import describe
+from mpfjax.running.storage import describe, load_arrays, write_arrays
 from tests.examples import make_mixture
 from tests.full_disk import no_room_beyond
 

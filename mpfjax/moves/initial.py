@@ -20,8 +20,7 @@ from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.noise import NOISES, draw_noise
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.resampling.ancestors import draw_ancestors
-from mpfjax.moves.resampling.line import in_line
-from mpfjax.moves.resampling.ordering import HILBERT
+from mpfjax.moves.resampling.line import HILBERT, in_line
 from mpfjax.operations.logarithms import default_float, exp, finite_or_zero, largest
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import stored, take

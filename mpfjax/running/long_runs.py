@@ -13,8 +13,17 @@ from jaxtyping import PyTree
 from tqdm import tqdm
 
 from mpfjax.checks import check_type, check_whole, given
-from mpfjax.running.storage.files import as_path, load_arrays, read_description, write_arrays
-from mpfjax.running.storage.states import arrays_of, describe, differences, filled, program_of
+from mpfjax.running.storage import (
+    arrays_of,
+    as_path,
+    describe,
+    differences,
+    filled,
+    load_arrays,
+    program_of,
+    read_description,
+    write_arrays,
+)
 
 _NOTES = "notes"
 

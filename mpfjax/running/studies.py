@@ -34,14 +34,17 @@ from mpfjax.observations import as_series, check_series
 from mpfjax.operations.logarithms import default_float
 from mpfjax.running.run import monte_carlo
 from mpfjax.running.scan import FilterRun
-from mpfjax.running.storage.files import (
+from mpfjax.running.storage import (
     as_path,
+    describe,
+    differences,
+    fingerprint,
     load_arrays,
+    named,
     read_description,
     write_arrays,
     write_whole,
 )
-from mpfjax.running.storage.states import describe, differences, fingerprint, named
 
 Values = Sequence[Any] | np.ndarray | Array
 

@@ -19,8 +19,7 @@ from scipy.optimize import minimize
 import mpfjax
 from mpfjax import Checkpoint
 from mpfjax.exact import kalman_filter
-from mpfjax.running.storage.files import load_arrays, write_arrays
-from mpfjax.running.storage.states import program_of
+from mpfjax.running.storage import load_arrays, program_of, write_arrays
 from mpfjax.tuning import Interval, Positive, fit, standard_errors
 from tests.full_disk import no_room_beyond
 from tests.user_models import ScalarLinear
@@ -359,7 +358,7 @@ class TestOptimisers:
         """Where addresses and the order of sets are others."""
         code = """
 import jax, jax.numpy as jnp, mpfjax, optax
-from mpfjax.running.storage.states import describe, program_of
+from mpfjax.running.storage import describe, program_of
 filter = mpfjax.mixture_particle_filter(mpfjax.QuadraticModel(0.3, 0.3, -2.5, 2.5), 20, 2)
 optimizer = optax.chain(optax.clip(1.0), optax.adam(optax.cosine_decay_schedule(0.05, 100)))
 reals = {"b": jnp.ones(()), "a": jnp.ones(3)}

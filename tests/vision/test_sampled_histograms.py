@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from mpfjax.vision import HSVColours, RGBColours
-from mpfjax.vision.colour.histograms import bhattacharyya, integral_histogram, normalise
-from mpfjax.vision.colour.sampled_histograms import SampledBoxes
+from mpfjax.vision.colour.histograms import (
+    SampledBoxes,
+    bhattacharyya,
+    integral_histogram,
+    normalise,
+)
 
 RNG = np.random.default_rng(0)
 FRAME = RNG.integers(0, 256, (30, 40, 3), dtype=np.uint8)

@@ -13,7 +13,7 @@ from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
 from mpfjax.models.noise import NOISES, draw_noise, stratified_normal
 from mpfjax.moves.base import AbstractResampling
 from mpfjax.moves.regrouping.features import origin, summarise
-from mpfjax.moves.resampling.ordering import sorted_order
+from mpfjax.moves.resampling.line import sorted_order
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.matrices import cholesky
 from mpfjax.operations.random import split

@@ -18,8 +18,7 @@ from mpfjax.moves.resampling.allocation import (
     demands_of_groups,
 )
 from mpfjax.moves.resampling.ancestors import SCHEMES, Ancestors, draw_ancestors
-from mpfjax.moves.resampling.line import Line, in_line
-from mpfjax.moves.resampling.ordering import SortBy, check_sort_by
+from mpfjax.moves.resampling.line import Line, SortBy, check_sort_by, in_line
 from mpfjax.operations.logarithms import add_gradient
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import stored, take

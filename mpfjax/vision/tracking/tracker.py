@@ -17,8 +17,7 @@ from mpfjax.checks import (
     given,
 )
 from mpfjax.vision.colour.bins import HSVColours
-from mpfjax.vision.colour.histograms import normalise
-from mpfjax.vision.colour.sampled_histograms import SampledBoxes
+from mpfjax.vision.colour.histograms import SampledBoxes, normalise
 from mpfjax.vision.tracking.associate import (
     compatible,
     learned_colours,
