@@ -39,6 +39,7 @@ from benchmarks.harness import (
 )  # fmt: skip
 from benchmarks.peers.worker import Worker, stop_all
 from mpfjax.operations.compiling import cpu_options
+from mpfjax.running.islands import IslandInteraction
 
 FILTERS = {
     "pf": "PF",
@@ -431,7 +432,7 @@ ISLAND_COLUMNS = {
 def run_as_islands(num_particles: int, repeats: int) -> dict[str, Any]:
     """One particle filter on so many particles, its islands exchanging when they have to."""
     model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
-    moves = [mpfjax.IslandInteraction(), mpfjax.Resample(), mpfjax.Propagate(model)]
+    moves = [IslandInteraction(), mpfjax.Resample(), mpfjax.Propagate(model)]
     filter = mpfjax.Filter(model, moves, num_particles // NUM_ISLANDS)
     observations = observed(ISLAND_STEPS)
 

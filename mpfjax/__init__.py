@@ -14,8 +14,6 @@ from mpfjax.filters import independent_particle_filters as independent_particle_
 from mpfjax.filters import mixture_particle_filter as mixture_particle_filter
 from mpfjax.filters import particle_filter as particle_filter
 from mpfjax.filters import partitioned_sampling as partitioned_sampling
-from mpfjax.lookahead.pilot import PilotLookahead as PilotLookahead
-from mpfjax.mixture import MarginalisedState as MarginalisedState
 from mpfjax.mixture import ParticleMixture as ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel as AbstractStateSpaceModel
 from mpfjax.models.base import per_particle as per_particle
@@ -38,19 +36,12 @@ from mpfjax.moves.base import AbstractPropagation as AbstractPropagation
 from mpfjax.moves.base import AbstractRegrouping as AbstractRegrouping
 from mpfjax.moves.base import AbstractResampling as AbstractResampling
 from mpfjax.moves.every import Every as Every
-from mpfjax.moves.initial import SelectInitial as SelectInitial
-from mpfjax.moves.metropolis import AbstractMetropolis as AbstractMetropolis
 from mpfjax.moves.metropolis import MetropolisAdjustedLangevin as MetropolisAdjustedLangevin
 from mpfjax.moves.metropolis import RandomWalkMetropolis as RandomWalkMetropolis
-from mpfjax.moves.objects.clusters import PropagateInClusters as PropagateInClusters
-from mpfjax.moves.objects.exclusion import Exclusion as Exclusion
-from mpfjax.moves.objects.independent import PropagateIndependently as PropagateIndependently
 from mpfjax.moves.objects.partitioned import Partitioned as Partitioned
 from mpfjax.moves.propagation.nested import PropagateNested as PropagateNested
-from mpfjax.moves.propagation.propagate import Predict as Predict
 from mpfjax.moves.propagation.propagate import Propagate as Propagate
 from mpfjax.moves.propagation.propagate import PropagateMarginalised as PropagateMarginalised
-from mpfjax.moves.propagation.propagate import Reweight as Reweight
 from mpfjax.moves.propagation.regimes import PropagateRegimes as PropagateRegimes
 from mpfjax.moves.propagation.regimes import RegimeProposal as RegimeProposal
 from mpfjax.moves.propagation.tempered import PropagateTempered as PropagateTempered
@@ -70,7 +61,6 @@ from mpfjax.operations.random import normal as normal
 from mpfjax.proposals import AbstractProposal as AbstractProposal
 from mpfjax.proposals import GaussNewtonProposal as GaussNewtonProposal
 from mpfjax.proposals import NetworkProposal as NetworkProposal
-from mpfjax.running.islands import IslandInteraction as IslandInteraction
 from mpfjax.running.islands import run_islands as run_islands
 from mpfjax.running.long_runs import Checkpoint as Checkpoint
 from mpfjax.running.run import monte_carlo as monte_carlo
@@ -82,7 +72,6 @@ from mpfjax.running.studies import Study as Study
 from mpfjax.running.studies import read_study as read_study
 from mpfjax.running.studies import run_study as run_study
 from mpfjax.smoothing.forecasts import forecast as forecast
-from mpfjax.transforms import map_moves as map_moves
 from mpfjax.transforms import with_lookahead as with_lookahead
 from mpfjax.transforms import with_point_sets as with_point_sets
 from mpfjax.transforms import with_proposals_per_particle as with_proposals_per_particle

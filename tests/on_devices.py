@@ -18,7 +18,7 @@ import numpy as np
 import mpfjax
 from mpfjax.observations import Series
 from mpfjax.running.devices import over_devices
-from mpfjax.running.islands import _run_block, _run_on_one
+from mpfjax.running.islands import IslandInteraction, _run_block, _run_on_one
 
 OBSERVATIONS = (1.5, 1.0, 0.4, 0.9)
 NUM_KEYS = 11  # neither 2 nor 8 divides it
@@ -48,7 +48,7 @@ def islands_filter(num_particles=32):
     """A mixture whose islands exchange particles whenever their masses differ at all."""
     model = quadratic()
     moves = [
-        mpfjax.IslandInteraction(1.0), mpfjax.Resample(), mpfjax.Propagate(model), mpfjax.KMeans(2),
+        IslandInteraction(1.0), mpfjax.Resample(), mpfjax.Propagate(model), mpfjax.KMeans(2),
     ]  # fmt: skip
     return mpfjax.Filter(model, moves, num_particles, 2, [mpfjax.KMeans(2, reseed=True)])
 

@@ -17,7 +17,6 @@ from mpfjax import (
     AbstractRegrouping,
     AbstractResampling,
     Every,
-    Exclusion,
     Filter,
     GaussianRegeneration,
     GaussNewtonProposal,
@@ -28,15 +27,15 @@ from mpfjax import (
     MultiObjectModel,
     Partitioned,
     Pool,
-    Predict,
     Propagate,
     PropagateTempered,
     RandomPartition,
     RandomWalkMetropolis,
     Resample,
-    Reweight,
     Split,
 )
+from mpfjax.moves.objects.exclusion import Exclusion
+from mpfjax.moves.propagation.propagate import Predict, Reweight
 
 NUM_PARTICLES = 48
 # On either side of the number of components up to which they are worked on as rows.

@@ -7,6 +7,9 @@ import pytest
 
 import mpfjax
 from mpfjax import Filter, KMeans, Merge, Propagate, Resample, Split
+from mpfjax.moves.objects.exclusion import Exclusion
+from mpfjax.moves.propagation.propagate import Predict
+from mpfjax.running.islands import IslandInteraction
 from tests.user_models import DriftOfOne, TrickyQuadraticModel, nothing_traced
 
 MODEL = TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0)
@@ -93,9 +96,9 @@ def test_a_move_that_returns_no_such_mixture(change, named):
     "moves",
     [
         [Resample()],
-        [mpfjax.Predict(MODEL)],
-        [Resample(), mpfjax.Predict(MODEL), KMeans(), mpfjax.Prune()],
-        [mpfjax.Every(2, [Resample(), Merge()]), mpfjax.Exclusion(), mpfjax.IslandInteraction()],
+        [Predict(MODEL)],
+        [Resample(), Predict(MODEL), KMeans(), mpfjax.Prune()],
+        [mpfjax.Every(2, [Resample(), Merge()]), Exclusion(), IslandInteraction()],
         [mpfjax.AuxiliaryResample(Resample(), lambda observation, states: -states)],
     ],
 )

@@ -28,6 +28,7 @@ from mpfjax.operations.islands import (
 )
 from mpfjax.operations.segments import segment_sum
 from mpfjax.running.devices import choose_devices, over_threads
+from mpfjax.running.islands import IslandInteraction
 from tests import on_devices
 from tests.examples import make_mixture
 from tests.marking import thorough
@@ -119,9 +120,9 @@ def island_chains():
     seeded, regroup = [mpfjax.KMeans(2, reseed=True)], mpfjax.KMeans(2)
     return {
         "pf": mpfjax.Filter(MODEL, [resample, propagate], 12),
-        "pf, exchange": mpfjax.Filter(MODEL, [mpfjax.IslandInteraction(), adaptive, propagate], 12),
+        "pf, exchange": mpfjax.Filter(MODEL, [IslandInteraction(), adaptive, propagate], 12),
         "mixture, exchange": mpfjax.Filter(
-            MODEL, [resample, propagate, mpfjax.IslandInteraction(0.9), regroup], 12, 2, seeded
+            MODEL, [resample, propagate, IslandInteraction(0.9), regroup], 12, 2, seeded
         ),
     }
 
@@ -177,7 +178,7 @@ class TestIslands:
         def mass(mixture):
             return mixture.log_mass
 
-        for before in ([], [mpfjax.IslandInteraction(1.0)]):
+        for before in ([], [IslandInteraction(1.0)]):
             filter = mpfjax.Filter(model, [*before, mpfjax.Resample(), propagate], 8)
             run = mpfjax.run_islands(jax.random.key(6), filter, OBSERVATIONS, mass, num_islands=8)
             assert np.isfinite(run.log_marginal_likelihood)
@@ -253,7 +254,7 @@ class TestExchange:
             return leaf.reshape(g, n, *leaf.shape[1:]) if leaf.ndim else jnp.repeat(leaf, g)
 
         islands = jax.tree.map(on_each, whole)
-        move = mpfjax.IslandInteraction(threshold)
+        move = IslandInteraction(threshold)
         return islands, on_islands(lambda part: move(jax.random.key(0), part), islands)
 
     def test_evens_the_masses_and_keeps_every_particle(self):
@@ -276,15 +277,15 @@ class TestExchange:
 
     def test_outside_islands_does_nothing(self):
         mixture = make_mixture(np.zeros(5), np.zeros(5), np.zeros(5), 1)
-        assert mpfjax.IslandInteraction()(jax.random.key(0), mixture) is mixture
+        assert IslandInteraction()(jax.random.key(0), mixture) is mixture
 
     @pytest.mark.parametrize("threshold", [-0.1, 1.1])
     def test_bad_thresholds(self, threshold):
         with pytest.raises(ValueError, match="threshold: "):
-            mpfjax.IslandInteraction(threshold)
+            IslandInteraction(threshold)
 
     def test_slots_that_cannot_be_dealt_evenly(self):
-        filter = mpfjax.Filter(MODEL, [mpfjax.IslandInteraction(), mpfjax.Propagate(MODEL)], 13)
+        filter = mpfjax.Filter(MODEL, [IslandInteraction(), mpfjax.Propagate(MODEL)], 13)
         with pytest.raises(ValueError, match=r"num_particles: 13 of an island .* 2 islands"):
             mpfjax.run_islands(jax.random.key(0), filter, OBSERVATIONS, num_islands=2)
 
@@ -484,7 +485,7 @@ def test_a_constant_moves_the_evidence_of_islands_and_nothing_else(num_component
     def run(constant, taken_off):
         model = TrickyQuadraticModel(0.3, 0.5, constant=constant, taken_off=taken_off)
         moves = [
-            mpfjax.IslandInteraction(0.9),
+            IslandInteraction(0.9),
             mpfjax.Resample(),
             mpfjax.Propagate(model),
             mpfjax.KMeans(2),

@@ -11,6 +11,7 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
+from mpfjax.moves.propagation.propagate import Predict, Reweight
 from tests.examples import example_mixtures
 from tests.marking import quick_of, thorough
 from tests.user_models import BLINDED, Batched, ScalarLinear
@@ -144,13 +145,13 @@ def test_propagation_with_stopped_gradients_is_the_same_to_the_bit(kind):
         "guided": lambda gradient: mpfjax.Propagate(
             MODEL, mpfjax.GaussNewtonProposal(MODEL), gradient
         ),
-        "halves": lambda gradient: mpfjax.Predict(MODEL, gradient),
+        "halves": lambda gradient: Predict(MODEL, gradient),
         "partitioned": lambda gradient: mpfjax.Partitioned(
             joint, resample=mpfjax.Resample(gradient=gradient, allocation="equal")
         ),
     }[kind]
     model, observation = (joint, TWO[0]) if kind == "partitioned" else (MODEL, ONE[0])
-    moves = [make("none"), mpfjax.Reweight(model)]
+    moves = [make("none"), Reweight(model)]
     mixture = mpfjax.Filter(model, moves, NUM_PARTICLES).init(jax.random.key(6))
     moved = [
         eqx.filter_jit(make(gradient))(jax.random.key(7), mixture, observation)
@@ -165,8 +166,8 @@ def test_steps_without_an_observation_keep_the_score_unbiased():
 
     def log_evidence(model, key):
         resample = mpfjax.Resample("multinomial", 0.5, gradient="stop")
-        moves = [resample, mpfjax.Predict(model, "stop")]
-        filter = mpfjax.Filter(model, [*moves, mpfjax.Reweight(model)], NUM_PARTICLES)
+        moves = [resample, Predict(model, "stop")]
+        filter = mpfjax.Filter(model, [*moves, Reweight(model)], NUM_PARTICLES)
         run = mpfjax.run_filter(key, filter, observations, nothing, missing="skip")
         return run.log_marginal_likelihood
 
@@ -229,7 +230,7 @@ def test_gradients_are_finite_where_weights_and_components_vanish():
         lambda model: mpfjax.particle_filter(model, 10, gradient="stop"),
         lambda model: mpfjax.mixture_particle_filter(model, 10, 2, gradient="stop"),
         lambda model: mpfjax.Propagate(model, gradient="stop"),
-        lambda model: mpfjax.Predict(model, gradient="stop"),
+        lambda model: Predict(model, gradient="stop"),
         lambda model: mpfjax.run_filter(
             jax.random.key(0),
             mpfjax.with_score_gradient(

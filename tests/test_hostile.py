@@ -22,7 +22,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import mpfjax
+from mpfjax.lookahead.pilot import PilotLookahead
 from mpfjax.models.dynamics import AbstractDynamics
+from mpfjax.moves.initial import SelectInitial
+from mpfjax.moves.objects.clusters import PropagateInClusters
+from mpfjax.moves.objects.exclusion import Exclusion
+from mpfjax.moves.objects.independent import PropagateIndependently
+from mpfjax.moves.propagation.propagate import Predict, Reweight
+from mpfjax.running.islands import IslandInteraction
+from mpfjax.smoothing.variance import log_marginal_likelihood_variance, mixture_weight_errors
 
 pytestmark = pytest.mark.usefixtures("as_installed")
 
@@ -98,7 +106,7 @@ BUILT = {
         mpfjax.AuxiliaryResample,
         {"resample": mpfjax.Resample(), "lookahead": mpfjax.GaussNewtonProposal(MODEL)},
     ),
-    "PilotLookahead": (mpfjax.PilotLookahead, {"model": MODEL}),
+    "PilotLookahead": (PilotLookahead, {"model": MODEL}),
     "GaussianRegeneration": (
         mpfjax.GaussianRegeneration,
         {"particles_per_component": 2, "where": None, "inflation": 1.0, "noise": "independent"},
@@ -118,15 +126,15 @@ BUILT = {
     "RandomPartition": (mpfjax.RandomPartition, {"num_sets": 2}),
     "GroupBy": (mpfjax.GroupBy, {"function": nothing}),
     "Exclusion": (
-        mpfjax.Exclusion, {"strength": 1.0, "radius": 0.5, "features": None, "scale": 1.0}
+        Exclusion, {"strength": 1.0, "radius": 0.5, "features": None, "scale": 1.0}
     ),
     "Every": (mpfjax.Every, {"num_steps": 2, "moves": [mpfjax.KMeans(1)]}),
     "Prune": (mpfjax.Prune, {"least_share": 1e-3}),
-    "IslandInteraction": (mpfjax.IslandInteraction, {"threshold": 0.5}),
+    "IslandInteraction": (IslandInteraction, {"threshold": 0.5}),
     "Propagate": (
         mpfjax.Propagate, {"model": MODEL, "proposal": None, "gradient": "none", "noise": "rqmc"}
     ),
-    "Predict": (mpfjax.Predict, {"model": MODEL, "gradient": "none", "noise": "rqmc"}),
+    "Predict": (Predict, {"model": MODEL, "gradient": "none", "noise": "rqmc"}),
     "PropagateMarginalised": (
         mpfjax.PropagateMarginalised,
         {"model": SWITCHING, "proposal": None, "gradient": "none", "noise": "rqmc"},
@@ -138,7 +146,7 @@ BUILT = {
         {"transition_matrix": EYE, "F": EYE, "Q": EYE, "H": EYE, "R": EYE, "m0": np.zeros(1),
          "P0": EYE, "b": None, "c": np.zeros(1), "initial_probabilities": np.ones(1)},
     ),
-    "Reweight": (mpfjax.Reweight, {"model": MODEL, "exponent": 0.5}),
+    "Reweight": (Reweight, {"model": MODEL, "exponent": 0.5}),
     **{
         move.__name__: (
             move,
@@ -160,10 +168,10 @@ BUILT = {
         {"model": JOINT, "orders": None, "resample": None, "reassembly": "prior"},
     ),
     "PropagateIndependently": (
-        mpfjax.PropagateIndependently, {"model": JOINT, "scheme": "systematic"}
+        PropagateIndependently, {"model": JOINT, "scheme": "systematic"}
     ),
     "PropagateInClusters": (
-        mpfjax.PropagateInClusters,
+        PropagateInClusters,
         {"model": JOINT, "start": "apart", "split_after": None, "scheme": "systematic"},
     ),
     "Filter": (
@@ -172,7 +180,7 @@ BUILT = {
          "num_components": 1, "initial_moves": (), "initial_noise": "rqmc"},
     ),
     "SelectInitial": (
-        mpfjax.SelectInitial,
+        SelectInitial,
         {"propagation": mpfjax.Propagate(MODEL), "num_draws": 2, "noise": "rqmc"},
     ),
     "with_selected_start": (mpfjax.with_selected_start, {"filter": FILTER, "num_draws": 2}),
@@ -283,9 +291,9 @@ RUN = {
     ),
     "trace_ancestors": (mpfjax.smoothing.trace_ancestors, {"mixtures": HISTORY}),
     "with_first_ancestors": (mpfjax.smoothing.with_first_ancestors, {"filter": INDEPENDENT}),
-    "mixture_weight_errors": (mpfjax.smoothing.mixture_weight_errors, {"run": TRACED}),
+    "mixture_weight_errors": (mixture_weight_errors, {"run": TRACED}),
     "log_marginal_likelihood_variance": (
-        mpfjax.smoothing.log_marginal_likelihood_variance, {"run": TRACED}
+        log_marginal_likelihood_variance, {"run": TRACED}
     ),
 }  # fmt: skip
 # What an argument is called further down.
@@ -398,10 +406,9 @@ def test_every_public_constructor_and_runner_is_tried():
     others = {name for name in public - tried if not name.startswith(("Abstract", "_"))}
     # Records of results, what takes no argument to check, and what other tests are about.
     assert others == {
-        "FilterRun", "StepInfo", "Series", "Checkpoint", "ParticleMixture", "MarginalisedState",
-        "Pool",
+        "FilterRun", "StepInfo", "Series", "Checkpoint", "ParticleMixture", "Pool",
         "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
-        "NetworkProposal", "keep_programs", "check_model", "map_moves",
+        "NetworkProposal", "keep_programs", "check_model",
     } - tried  # fmt: skip
 
 

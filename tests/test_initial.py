@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.moves.initial import trusted
+from mpfjax.moves.initial import SelectInitial, trusted
 from mpfjax.smoothing import conditional_filter, with_first_ancestors
 
 KEY = jax.random.key(0)
@@ -160,7 +160,7 @@ def test_what_a_chain_weighs_before_it_propagates_counts():
     propagate = mpfjax.Propagate(model)
     filter = mpfjax.Filter(
         model, [tilt, mpfjax.Resample(), propagate], 200,
-        initial_moves=[mpfjax.SelectInitial(propagate, 8)],
+        initial_moves=[SelectInitial(propagate, 8)],
     )  # fmt: skip
     keys = jax.random.split(KEY, 400)
     found = mpfjax.monte_carlo(keys, filter, np.array([observation], np.float32), nothing)
@@ -191,7 +191,7 @@ def test_a_resampling_that_waits_forgets_dead_components_all_the_same():
     propagate = mpfjax.Propagate(model)
     filter = mpfjax.Filter(
         model, [CountingResample(), propagate], 30, 3,
-        initial_moves=[mpfjax.SelectInitial(propagate, 4)],
+        initial_moves=[SelectInitial(propagate, 4)],
     )  # fmt: skip
     ages = mpfjax.run_filter(KEY, filter, OBSERVATIONS).final.memory["ages"]
     np.testing.assert_array_equal(ages, [2, 0, 0])  # two components have no particles, one waited
@@ -202,7 +202,7 @@ def test_every_second_step_is_the_second_and_the_fourth():
     propagate = mpfjax.Propagate(model)
     filter = mpfjax.Filter(
         model, [mpfjax.Every(2, [mpfjax.Resample()]), propagate], 100,
-        initial_moves=[mpfjax.SelectInitial(propagate, 4)],
+        initial_moves=[SelectInitial(propagate, 4)],
     )  # fmt: skip
     run = mpfjax.run_filter(KEY, filter, np.full(5, 3.0, np.float32))
     np.testing.assert_array_equal(run.resampled[:, 0], [False, True, False, True, False])

@@ -16,6 +16,7 @@ from jax.scipy.stats import norm
 
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter, kalman_smoother
+from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.smoothing import sample_trajectories, smoothed_sums
 from tests.marking import thorough
 
@@ -256,7 +257,7 @@ EVERYWHERE = {
     ),
     "families": own_chain(lambda model: mpfjax.PropagateNested(mpfjax.Propagate(model), 2)),
     "stages": own_chain(lambda model: mpfjax.PropagateTempered(model)),
-    "predict and weigh": own_chain(mpfjax.Predict, mpfjax.Reweight),
+    "predict and weigh": own_chain(Predict, Reweight),
     "a proposal with a model of its own": own_chain(
         lambda model: mpfjax.Propagate(
             model, mpfjax.GaussNewtonProposal(Driven(jnp.array(0.5), inputs=model.inputs))

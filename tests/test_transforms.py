@@ -16,7 +16,6 @@ from mpfjax import (
     Propagate,
     PropagateNested,
     Resample,
-    SelectInitial,
     with_lookahead,
     with_point_sets,
     with_proposals_per_particle,
@@ -25,6 +24,7 @@ from mpfjax import (
     with_selected_start,
 )
 from mpfjax.lookahead.pilot import PilotLookahead
+from mpfjax.moves.initial import SelectInitial
 
 KEY = jax.random.key(0)
 MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)

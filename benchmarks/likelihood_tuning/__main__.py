@@ -25,7 +25,8 @@ from benchmarks.harness import AtLeast2, Count, Seed, command
 from benchmarks.likelihood_tuning.labels import SEQUENCES, run_labels
 from benchmarks.score_vs_particles import HIGH, LOW, simulate
 from mpfjax.exact import grid_filter, kalman_filter
-from mpfjax.tuning import Positive, TuningRun, fit
+from mpfjax.tuning import Positive, fit
+from mpfjax.tuning.optimisation import TuningRun
 
 PARTS = ("a", "b", "c")
 ESTIMATORS = {

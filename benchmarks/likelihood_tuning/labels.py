@@ -21,13 +21,8 @@ from benchmarks.likelihood_tuning.labelled_boxes import boxes_around, labelled_s
 from benchmarks.likelihood_tuning.soft_colours import SoftColourModel
 from benchmarks.scenes import football_scene
 from mpfjax.metrics.tracking_quality import intersection_area
-from mpfjax.tuning import (
-    LabelLikelihood,
-    Positive,
-    TuningRun,
-    maximise,
-    transition_candidates,
-)
+from mpfjax.tuning import LabelLikelihood, Positive, maximise, transition_candidates
+from mpfjax.tuning.optimisation import TuningRun
 from mpfjax.vision import (
     BoxState,
     read_frames,

@@ -35,13 +35,12 @@ from mpfjax.console import whole
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.running.scan import FilterRun
 from mpfjax.smoothing import (
-    log_marginal_likelihood_variance,
-    mixture_weight_errors,
     sample_trajectories,
     smoothed_sums,
     trace_ancestors,
     with_first_ancestors,
 )
+from mpfjax.smoothing.variance import log_marginal_likelihood_variance, mixture_weight_errors
 
 PARTS = ("accuracy", "modes", "variance", "posteriors")
 # The only scheme for which a single run tells the variance.

@@ -15,16 +15,11 @@ import mpfjax
 from benchmarks.visual_tracking.source import Source
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractPropagation
-from mpfjax.vision import (
-    BackgroundSubtraction,
-    Detections,
-    ObjectTracker,
-    Tracks,
-    offline_rows,
-)
+from mpfjax.vision import BackgroundSubtraction, Detections, ObjectTracker, Tracks
 from mpfjax.vision.boxes.following import Snapshot
 from mpfjax.vision.tracking.gaussian import Gaussian, boxes_of, places_of, units
 from mpfjax.vision.tracking.state import TrackerState
+from mpfjax.vision.tracking.track import offline_rows
 from mpfjax.vision.tracking.tracker import WEAK_ERROR
 
 MAX_DETECTIONS, MAX_OBJECTS, PARTICLES = 32, 24, 16

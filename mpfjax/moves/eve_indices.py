@@ -2,7 +2,7 @@
 
 A filter keeps them only if an `EveIndices` is in the memory of the mixture of x_0. `Resample` then
 updates it, wherever it is in a chain or within a move.
-`mpfjax.smoothing.log_marginal_likelihood_variance` has the equations.
+`mpfjax.smoothing.variance.log_marginal_likelihood_variance` has the equations.
 """
 
 import equinox as eqx

@@ -2,19 +2,14 @@
 
 from mpfjax.tuning.curvature import standard_errors as standard_errors
 from mpfjax.tuning.densities import log_density as log_density
-from mpfjax.tuning.gibbs import GibbsPosterior as GibbsPosterior
 from mpfjax.tuning.gibbs import particle_gibbs as particle_gibbs
 from mpfjax.tuning.inference_data import to_inference_data as to_inference_data
 from mpfjax.tuning.labels import LabelLikelihood as LabelLikelihood
 from mpfjax.tuning.labels import transition_candidates as transition_candidates
-from mpfjax.tuning.metropolis import Posterior as Posterior
 from mpfjax.tuning.metropolis import metropolis_hastings as metropolis_hastings
-from mpfjax.tuning.optimisation import TuningRun as TuningRun
 from mpfjax.tuning.optimisation import fit as fit
 from mpfjax.tuning.optimisation import maximise as maximise
-from mpfjax.tuning.sequential import SequentialPosterior as SequentialPosterior
 from mpfjax.tuning.sequential import smc2 as smc2
-from mpfjax.tuning.transforms import AbstractTransform as AbstractTransform
 from mpfjax.tuning.transforms import Interval as Interval
 from mpfjax.tuning.transforms import Positive as Positive
 from mpfjax.tuning.transforms import Simplex as Simplex

@@ -16,14 +16,11 @@ from mpfjax.vision.files.boxes import read_tracks as read_tracks
 from mpfjax.vision.files.boxes import write_tracks as write_tracks
 from mpfjax.vision.files.frames import read_frames as read_frames
 from mpfjax.vision.files.frames import write_video as write_video
-from mpfjax.vision.files.sequences import Truth as Truth
 from mpfjax.vision.files.sequences import read_truth as read_truth
 from mpfjax.vision.tracking.background import BackgroundSubtraction as BackgroundSubtraction
 from mpfjax.vision.tracking.detections import Detections as Detections
-from mpfjax.vision.tracking.gaussian import CameraMotion as CameraMotion
 from mpfjax.vision.tracking.optical_flow import OpticalFlow as OpticalFlow
 from mpfjax.vision.tracking.state import Tracks as Tracks
-from mpfjax.vision.tracking.track import offline_rows as offline_rows
 from mpfjax.vision.tracking.track import online_rows as online_rows
 from mpfjax.vision.tracking.track import track as track
 from mpfjax.vision.tracking.tracker import ObjectTracker as ObjectTracker

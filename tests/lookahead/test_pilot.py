@@ -8,7 +8,7 @@ import pytest
 
 import mpfjax
 from benchmarks.masses.models import Mirror
-from mpfjax import PilotLookahead
+from mpfjax.lookahead.pilot import PilotLookahead
 from tests.examples import make_mixture
 from tests.user_models import Batched
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax import MultiObjectModel, PairwiseRepulsion, PropagateInClusters
+from mpfjax import MultiObjectModel, PairwiseRepulsion
 from mpfjax.exact import kalman_filter
+from mpfjax.moves.objects.clusters import PropagateInClusters
 from tests.examples import stack, walker
 
 KEY = jax.random.key(0)

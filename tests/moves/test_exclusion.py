@@ -5,7 +5,7 @@ import jax
 import numpy as np
 import pytest
 
-from mpfjax import Exclusion
+from mpfjax.moves.objects.exclusion import Exclusion
 from tests.examples import make_mixture
 
 KEY = jax.random.key(0)

@@ -7,6 +7,7 @@ import pytest
 
 import mpfjax
 from mpfjax import MultiObjectModel
+from mpfjax.moves.objects.independent import PropagateIndependently
 
 KEY = jax.random.key(0)
 
@@ -51,7 +52,7 @@ def test_each_object_is_resampled_by_its_own_likelihood_alone():
 def test_bad_input():
     with pytest.raises(ValueError, match="scheme: 'optimal'"):
         mpfjax.independent_particle_filters(MODEL, 20, scheme="optimal")
-    move = mpfjax.PropagateIndependently(MODEL)
+    move = PropagateIndependently(MODEL)
     mixture = mpfjax.distributed_partitioned_sampling(MODEL, 20).init(KEY)
     with pytest.raises(ValueError, match="mixture: 3 components, not one"):
         move(KEY, mixture, jnp.ones(3))

@@ -20,6 +20,7 @@ from mpfjax import (
     Resample,
 )
 from mpfjax.exact import kalman_filter, switching_filter
+from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.moves.propagation.regimes import children
 from tests.marking import thorough
 from tests.switching import (
@@ -297,7 +298,7 @@ def test_the_marginalised_step_is_that_of_the_same_moves():
     for moves in (
         [Resample(), PropagateMarginalised(MODEL)],
         [Resample(), mpfjax.Propagate(MODEL)],
-        [Resample(), mpfjax.Predict(MODEL), mpfjax.Reweight(MODEL)],
+        [Resample(), Predict(MODEL), Reweight(MODEL)],
     ):
         run = mpfjax.run_filter(KEY, Filter(MODEL, moves, 2000), OBSERVATIONS)
         ratios.append(float(run.log_marginal_likelihood) - truth().log_evidence[-1])
@@ -308,7 +309,7 @@ def test_the_marginalised_step_is_that_of_the_same_moves():
 def test_misuse_is_named():
     with pytest.raises(ValueError, match="observation: shape"):
         mpfjax.run_filter(KEY, ONE, SERIES[:, :1])
-    for make in (mpfjax.PropagateTempered, lambda model: mpfjax.Reweight(model, 0.5)):
+    for make in (mpfjax.PropagateTempered, lambda model: Reweight(model, 0.5)):
         with pytest.raises(ValueError, match=r"model: .* is conditionally linear"):
             make(MODEL)
     with pytest.raises(ValueError, match=r"object_model: .* is conditionally linear"):

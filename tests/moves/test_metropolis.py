@@ -11,17 +11,16 @@ from mpfjax import (
     Every,
     Filter,
     GaussianRegeneration,
-    IslandInteraction,
     KMeans,
     MetropolisAdjustedLangevin,
-    Predict,
     Propagate,
     RandomWalkMetropolis,
     Resample,
-    Reweight,
 )
 from mpfjax.exact import kalman_filter
 from mpfjax.moves.base import AbstractMarkovMove
+from mpfjax.moves.propagation.propagate import Predict, Reweight
+from mpfjax.running.islands import IslandInteraction
 from tests.marking import thorough
 from tests.user_models import ScalarLinear
 

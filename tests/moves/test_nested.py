@@ -9,6 +9,7 @@ import pytest
 import mpfjax
 from mpfjax import GaussNewtonProposal, Propagate, PropagateNested
 from mpfjax.exact import grid_filter
+from mpfjax.moves.propagation.propagate import Reweight
 from tests.examples import make_mixture
 from tests.marking import thorough
 
@@ -107,7 +108,7 @@ def test_an_empty_slot_and_a_hopeless_family_stay_without_weight():
         ({"propagate": Propagate(MODEL), "num_draws": 0}, "num_draws"),
         ({"propagate": Propagate(MODEL), "num_draws": 1.5}, "num_draws"),
         ({"propagate": Propagate(MODEL, gradient="stop")}, "stop"),
-        ({"propagate": mpfjax.Reweight(MODEL)}, "propagate"),
+        ({"propagate": Reweight(MODEL)}, "propagate"),
     ],
 )
 def test_what_will_not_do_is_named(as_installed, arguments, message):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpfjax import QuadraticModel, mixture_particle_filter, monte_carlo, run_filter
-from mpfjax.smoothing import batch_estimate
+from mpfjax.smoothing.variance import batch_estimate
 from tests.marking import thorough
 
 MODEL = QuadraticModel(initial_draw="independent")

@@ -9,6 +9,7 @@ import pytest
 
 import mpfjax
 from mpfjax import Filter, KMeans, Merge, Propagate, RandomPartition, Resample, Split
+from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.smoothing import conditional_filter
 from tests.marking import quick_of
 from tests.smoothing.exact_smoothers import grid_smoother, grid_trajectories
@@ -40,7 +41,7 @@ CASES = {
     "many components, sorted, of fixed number": (
         chain(
             Resample("stratified", particles_per_component=2, sort_by=lambda x: -x),
-            mpfjax.Predict(QUADRATIC), mpfjax.Reweight(QUADRATIC), RandomPartition(4), n=11, m=5,
+            Predict(QUADRATIC), Reweight(QUADRATIC), RandomPartition(4), n=11, m=5,
         ),
         False,
     ),
@@ -238,7 +239,7 @@ class TestBadInput:
                 "proposal: WithoutDensity defines no log_density",
             ),
             (
-                lambda: Filter(Walled(), [mpfjax.Reweight(Walled())], 6),
+                lambda: Filter(Walled(), [Reweight(Walled())], 6),
                 "filter: .*one Propagate or Predict",
             ),
             (

@@ -11,11 +11,8 @@ import pytest
 import mpfjax
 from mpfjax import Every, Filter, KMeans, Propagate, Resample
 from mpfjax.exact import kalman_filter
-from mpfjax.smoothing import (
-    log_marginal_likelihood_variance,
-    mixture_weight_errors,
-    with_first_ancestors,
-)
+from mpfjax.smoothing import with_first_ancestors
+from mpfjax.smoothing.variance import log_marginal_likelihood_variance, mixture_weight_errors
 from tests.marking import thorough
 from tests.registry import RandomLabels
 

@@ -7,7 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.tuning import GibbsPosterior, Posterior, SequentialPosterior, to_inference_data
+from mpfjax.tuning import to_inference_data
+from mpfjax.tuning.gibbs import GibbsPosterior
+from mpfjax.tuning.metropolis import Posterior
+from mpfjax.tuning.sequential import SequentialPosterior
 
 RNG = np.random.default_rng(0)
 CHAINS = Posterior(

@@ -9,6 +9,7 @@ import pytest
 from jax.scipy.stats import norm
 
 import mpfjax
+from mpfjax.mixture import MarginalisedState
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.tuning import (
     LabelLikelihood,
@@ -78,7 +79,7 @@ def test_of_a_conditionally_linear_model_labels_carry_moments():
     """A known x has no variance: L is then N(y; H x + c, R) of the regime, in numpy."""
     model, y = switching.MODEL, switching.OBSERVATIONS[:2]
     regimes, places = np.array([[0], [2]], np.int32), np.array([[[0.5, 0.0]], [[-0.3, 0.2]]])
-    labels = mpfjax.MarginalisedState(
+    labels = MarginalisedState(
         jnp.asarray(regimes), jnp.asarray(places, jnp.float32), jnp.zeros((2, 1, 2, 2))
     )
     rivals = transition_candidates(jax.random.key(0), model, labels, 50)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.scenes import football_scene
-from mpfjax.vision import CameraMotion, Detections, ObjectTracker, track
-from mpfjax.vision.tracking.gaussian import Gaussian
+from mpfjax.vision import Detections, ObjectTracker, track
+from mpfjax.vision.tracking.gaussian import CameraMotion, Gaussian
 from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV comes with the extra 'video', which 'test' brings")
