@@ -126,7 +126,8 @@ def test_a_new_reader_is_two_clicks_away(page, words):
 
 
 def test_the_step_that_is_shown_is_the_one_that_runs():
-    shown = re.search(r"^def _step\(.*?^```", (DOCS / "inside.md").read_text("utf-8"), re.M | re.S)
+    readme = (DOCS.parent / "README.md").read_text("utf-8")
+    shown = re.search(r"^def _step\(.*?^```", readme, re.M | re.S)
     lines = inspect.getsource(mpfjax.Filter._step).splitlines()
     body = lines[next(k for k, line in enumerate(lines) if line.endswith('predicts."""')) + 1 :]
     assert [line.strip() for line in shown[0].splitlines()[1:-1]] == [line.strip() for line in body]

@@ -155,6 +155,7 @@ class FollowDetections(AbstractPropagation):
         """Follow the detections, and begin components."""
         decided, found = mixture.memory[DECIDED], observation.detections
         noises, owner = decided.tracker.noise.noises, mixture.component_indicators
+        assert found.rows is not None  # `from_boxes` says them
         mine = found.rows[None] == decided.tracks.detections[:, None]
         rows = jnp.argmax(mine, axis=1)
         place, there = places_of(found.boxes[rows]), jnp.any(mine, axis=1)[owner]
