@@ -26,7 +26,8 @@ import numpy as np
 from benchmarks.tracking_by_detection import football
 from mpfjax.console import exit_status, format_table, whole, write_json
 from mpfjax.metrics import multi_object_scores
-from mpfjax.vision import OpticalFlow, online_rows, read_frames, read_truth, track
+from mpfjax.vision import OpticalFlow, read_frames, read_truth, track
+from mpfjax.vision.tracking.track import online_rows
 
 SCORES = ("HOTA", "MOTA", "IDF1", "id_switches")
 

@@ -36,6 +36,7 @@ from mpfjax.moves.base import AbstractPropagation as AbstractPropagation
 from mpfjax.moves.base import AbstractRegrouping as AbstractRegrouping
 from mpfjax.moves.base import AbstractResampling as AbstractResampling
 from mpfjax.moves.every import Every as Every
+from mpfjax.moves.initial import SelectInitial as SelectInitial
 from mpfjax.moves.metropolis import MetropolisAdjustedLangevin as MetropolisAdjustedLangevin
 from mpfjax.moves.metropolis import RandomWalkMetropolis as RandomWalkMetropolis
 from mpfjax.moves.objects.partitioned import Partitioned as Partitioned
@@ -72,6 +73,7 @@ from mpfjax.running.studies import Study as Study
 from mpfjax.running.studies import read_study as read_study
 from mpfjax.running.studies import run_study as run_study
 from mpfjax.smoothing.forecasts import forecast as forecast
+from mpfjax.transforms import map_moves as map_moves
 from mpfjax.transforms import with_lookahead as with_lookahead
 from mpfjax.transforms import with_point_sets as with_point_sets
 from mpfjax.transforms import with_proposals_per_particle as with_proposals_per_particle

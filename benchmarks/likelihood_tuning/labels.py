@@ -21,13 +21,11 @@ from benchmarks.likelihood_tuning.labelled_boxes import boxes_around, labelled_s
 from benchmarks.likelihood_tuning.soft_colours import SoftColourModel
 from benchmarks.scenes import football_scene
 from mpfjax.metrics.tracking_quality import intersection_area
-from mpfjax.tuning import LabelLikelihood, Positive, maximise, transition_candidates
+from mpfjax.tuning import LabelLikelihood, Positive, maximise
+from mpfjax.tuning.labels import transition_candidates
 from mpfjax.tuning.optimisation import TuningRun
-from mpfjax.vision import (
-    BoxState,
-    read_frames,
-    read_truth,
-)
+from mpfjax.vision import read_frames, read_truth
+from mpfjax.vision.boxes.colour_model import BoxState
 
 SEQUENCES = ("rendered", "otb_jogging", "vot_basketball")
 LAST_FRAME = {"rendered": 120, "otb_jogging": 307, "vot_basketball": 300}

@@ -31,7 +31,7 @@ from benchmarks.partitioned_sampling.posterior import (
 from benchmarks.scenes import NoPath, distracter_scene
 from mpfjax import vision
 from mpfjax.metrics import uniqueness
-from mpfjax.vision.boxes.joint_colour import PAPER_DEVIATIONS
+from mpfjax.vision.boxes.joint_colour import PAPER_DEVIATIONS, object_boxes
 from mpfjax.vision.files import boxes as box_files
 
 PAPER_WIDTH = 360  # the frames in which a step deviates by two pixels
@@ -289,7 +289,7 @@ def real_scene(folder: Path, event: Event) -> Scene:
     name = f"{folder.name}, objects {', '.join(map(str, ids))}, frames {span}"
 
     def collect_boxes(mixture: mpfjax.ParticleMixture) -> Kept:
-        return Kept(mixture.average(vision.object_boxes(model, mixture.particles)))
+        return Kept(mixture.average(object_boxes(model, mixture.particles)))
 
     def collect(mixture: mpfjax.ParticleMixture) -> Kept:
         return Kept(

@@ -5,4 +5,8 @@ from mpfjax.smoothing.conditional import conditional_filter as conditional_filte
 from mpfjax.smoothing.history import trace_ancestors as trace_ancestors
 from mpfjax.smoothing.sums import smoothed_sums as smoothed_sums
 from mpfjax.smoothing.trajectories import sample_trajectories as sample_trajectories
+from mpfjax.smoothing.variance import (
+    log_marginal_likelihood_variance as log_marginal_likelihood_variance,
+)
+from mpfjax.smoothing.variance import mixture_weight_errors as mixture_weight_errors
 from mpfjax.smoothing.variance import with_first_ancestors as with_first_ancestors

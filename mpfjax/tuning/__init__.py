@@ -5,7 +5,6 @@ from mpfjax.tuning.densities import log_density as log_density
 from mpfjax.tuning.gibbs import particle_gibbs as particle_gibbs
 from mpfjax.tuning.inference_data import to_inference_data as to_inference_data
 from mpfjax.tuning.labels import LabelLikelihood as LabelLikelihood
-from mpfjax.tuning.labels import transition_candidates as transition_candidates
 from mpfjax.tuning.metropolis import metropolis_hastings as metropolis_hastings
 from mpfjax.tuning.optimisation import fit as fit
 from mpfjax.tuning.optimisation import maximise as maximise

@@ -1,13 +1,11 @@
 """Computer vision: frames, boxes, colour histograms, detections, the object tracker."""
 
-from mpfjax.vision.boxes.colour_model import BoxState as BoxState
 from mpfjax.vision.boxes.colour_model import ColourModel as ColourModel
 from mpfjax.vision.boxes.following import annotate as annotate
 from mpfjax.vision.boxes.following import follow as follow
 from mpfjax.vision.boxes.following import follow_boxes as follow_boxes
 from mpfjax.vision.boxes.following import track_rows as track_rows
 from mpfjax.vision.boxes.joint_colour import joint_colour_model as joint_colour_model
-from mpfjax.vision.boxes.joint_colour import object_boxes as object_boxes
 from mpfjax.vision.boxes.recipes import PRESETS as PRESETS
 from mpfjax.vision.colour.bins import HSVColours as HSVColours
 from mpfjax.vision.colour.bins import RGBColours as RGBColours
@@ -21,6 +19,5 @@ from mpfjax.vision.tracking.background import BackgroundSubtraction as Backgroun
 from mpfjax.vision.tracking.detections import Detections as Detections
 from mpfjax.vision.tracking.optical_flow import OpticalFlow as OpticalFlow
 from mpfjax.vision.tracking.state import Tracks as Tracks
-from mpfjax.vision.tracking.track import online_rows as online_rows
 from mpfjax.vision.tracking.track import track as track
 from mpfjax.vision.tracking.tracker import ObjectTracker as ObjectTracker

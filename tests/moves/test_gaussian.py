@@ -10,7 +10,7 @@ import mpfjax
 from mpfjax import GaussianRegeneration
 from mpfjax.exact import kalman_filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.vision import BoxState
+from mpfjax.vision.boxes.colour_model import BoxState
 from tests.marking import thorough
 
 NUM_DRAWS = 2000

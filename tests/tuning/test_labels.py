@@ -11,13 +11,8 @@ from jax.scipy.stats import norm
 import mpfjax
 from mpfjax.mixture import MarginalisedState
 from mpfjax.models.base import AbstractStateSpaceModel
-from mpfjax.tuning import (
-    LabelLikelihood,
-    Positive,
-    maximise,
-    transition_candidates,
-)
-from mpfjax.tuning.labels import label_log_posteriors
+from mpfjax.tuning import LabelLikelihood, Positive, maximise
+from mpfjax.tuning.labels import label_log_posteriors, transition_candidates
 from tests import switching
 
 

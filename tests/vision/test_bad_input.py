@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from mpfjax import vision
+from mpfjax.vision.boxes.colour_model import BoxState
+from mpfjax.vision.boxes.joint_colour import object_boxes
 from tests.refused import INFINITY, NAN, NOTHING, assert_named, refused
 
 VIDEO = "reading, writing and detecting in frames needs the extra 'video', which 'test' brings"
 KEY = jax.random.key(0)
 FRAME = np.random.default_rng(0).integers(0, 256, (40, 50, 3), dtype=np.uint8)
 BOXES = np.array([[5.0, 5, 10, 20], [20, 10, 10, 15]])
-STATES = vision.BoxState(jnp.ones((3, 4)), jnp.zeros(3, jnp.int32))
+STATES = BoxState(jnp.ones((3, 4)), jnp.zeros(3, jnp.int32))
 OF_FRAME = {"frame": FRAME, "boxes": BOXES}
 COLOUR = {"frame": "array", "boxes": "rows", "sigma": "positive", "num_parts": "count",
           "deviations": "four?", "dynamics": "kind?", "switch_probability": "share"}  # fmt: skip
@@ -54,7 +56,7 @@ TABLE = {
          "colours": "kind?", "deviations": "four", "templates": "kind?"},
     ),
     "object_boxes": (
-        late(vision.object_boxes, model="joint"),
+        late(object_boxes, model="joint"),
         {"states": STATES},
         {"states": "kind"},
     ),
@@ -131,7 +133,7 @@ def test_what_will_not_do_is_named(function, good, name, value):
         (vision.ObjectTracker, {}, "scores", (0.5, NAN)),
         (vision.write_tracks, {"path": "/nowhere"}, "rows", [[0.5, 1, 2, 3, 4, 5]]),
         (vision.write_tracks, {"path": "/nowhere"}, "rows", [[1, 1, NAN, 3, 4, 5]]),
-        (late(vision.object_boxes, model="joint"), {}, "states", STATES),
+        (late(object_boxes, model="joint"), {}, "states", STATES),
     ],
 )  # fmt: skip
 def test_what_does_not_go_with_the_rest_is_named(function, good, name, value):

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from mpfjax.vision import (
-    BoxState,
     ColourModel,
     Detections,
     ObjectTracker,
     RGBColours,
     joint_colour_model,
 )
+from mpfjax.vision.boxes.colour_model import BoxState
 from mpfjax.vision.colour.histograms import integral_histogram, normalise
 
 HEIGHT, WIDTH, BINS = 600, 620, 4

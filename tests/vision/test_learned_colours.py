@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mpfjax.mixture import single_component
-from mpfjax.vision import BoxState, ColourModel, RGBColours
+from mpfjax.vision import ColourModel, RGBColours
+from mpfjax.vision.boxes.colour_model import BoxState
 from mpfjax.vision.boxes.hypotheses import (
     AdaptAppearance,
     LearnedColourModel,

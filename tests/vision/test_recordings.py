@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from mpfjax.metrics import multi_object_scores
-from mpfjax.vision import ObjectTracker, online_rows, read_detections, read_truth, track
+from mpfjax.vision import ObjectTracker, read_detections, read_truth, track
 from mpfjax.vision.files.sequences import last_frame, read_sequence_info
 from mpfjax.vision.tracking.adapters import Rows
+from mpfjax.vision.tracking.track import online_rows
 from tests.marking import thorough
 
 pytestmark = pytest.mark.real_data
