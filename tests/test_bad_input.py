@@ -59,10 +59,13 @@ def test_no_moves():
     [
         (lambda mixture: None, "None, no ParticleMixture"),
         (lambda mixture: (mixture, 0.0), "no ParticleMixture"),
-        (lambda mixture: mixture.replace(particles={"x": mixture.particles}), "another structure"),
+        (
+            lambda mixture: mixture.replace(particles={"x": mixture.particles}),
+            "in PyTreeDef.*x.*, and was given",
+        ),
         (
             lambda mixture: mixture.replace(particles=mixture.particles[:5]),
-            r"float32\[5\], and was",
+            r"float32\[5\] in .*, and was given float32\[10\]",
         ),
         (
             lambda mixture: mixture.replace(log_weights=mixture.log_weights.astype(jnp.float16)),

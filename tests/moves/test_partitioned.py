@@ -251,7 +251,9 @@ class TestOrders:
             mpfjax.distributed_partitioned_sampling,
             mpfjax.independent_particle_filters,
         ):
-            with pytest.raises(ValueError, match="model: LinearGaussianModel is no MultiObject"):
+            with pytest.raises(
+                ValueError, match="(?s)model: LinearGaussianModel.*is not a MultiObject"
+            ):
                 named(walker(), 10)
 
 

@@ -280,7 +280,7 @@ def test_rows_that_are_not_finite_are_an_error_at_once(column, value):
         ("frame 1: 2 scores for 1 boxes", ([[1.0, 2, 3, 4]], [1.0, 2.0])),
         ("frame 1: scores 'many' are no numbers", ([[1.0, 2, 3, 4]], "many")),
         ("frame 1: None is no array", None),
-        ("frame 1: shape", [[1.0, 2, 3]]),
+        ("frame 1: float64", [[1.0, 2, 3]]),
         ("frame 1: 'boxes'", "boxes"),
     ],
 )
