@@ -287,7 +287,7 @@ def test_bad_input():
         named(APART, 10, split_after=0)
     with pytest.raises(ValueError, match="scheme: 'optimal'"):
         named(APART, 10, scheme="optimal")
-    with pytest.raises(ValueError, match="(?s)model: LinearGaussianModel.*is not a MultiObject"):
+    with pytest.raises(ValueError, match=r"(?s)model: LinearGaussianModel.*is not a MultiObject"):
         named(walker(), 10)
 
     class WithoutDensity(mpfjax.AbstractStateSpaceModel):

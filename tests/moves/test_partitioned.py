@@ -252,7 +252,7 @@ class TestOrders:
             mpfjax.independent_particle_filters,
         ):
             with pytest.raises(
-                ValueError, match="(?s)model: LinearGaussianModel.*is not a MultiObject"
+                ValueError, match=r"(?s)model: LinearGaussianModel.*is not a MultiObject"
             ):
                 named(walker(), 10)
 
