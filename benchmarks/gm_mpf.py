@@ -49,7 +49,7 @@ PAPER_MILLISECONDS = {
 }  # fmt: skip
 
 
-@command(frames="1:12", particles=[20], seeds=2)
+@command(frames="129:140", particles=[20], seeds=2)
 def main(
     *,
     sequence: Path | None = None,
