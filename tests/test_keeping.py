@@ -89,7 +89,7 @@ def test_nor_does_the_program_that_follows_drawn_boxes():
     frame = np.zeros((40, 50, 3), np.uint8)
     filter = objects_filters(frame, np.array([[5.0, 5, 10, 20]]))["mpf"]
     key = jax.random.key(0)
-    mixture = eqx.filter_jit(drawn._begin)(filter, key)
+    mixture = filter.init(key)
     counted = eqx.filter_jit(drawn._counted)(filter.model, jnp.asarray(frame))
     arguments = (filter, 1, key, jnp.asarray(1), mixture, counted)
     program = eqx.filter_jit(drawn._advance_boxes).lower(*arguments)

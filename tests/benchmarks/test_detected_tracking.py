@@ -5,6 +5,7 @@ import json
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 from tqdm import tqdm
 
 from benchmarks.visual_tracking import __main__ as visual_tracking
@@ -175,7 +176,7 @@ def test_a_grey_video_is_tracked_by_its_values(tmp_path):
     """Images of one channel in a folder: the colour models see three equal ones."""
     folder = sequence_of(tmp_path, ())
     for i, frame in enumerate(street(walkers), 1):
-        write_image(folder / "img" / f"{i:06d}.png", frame[:, :, 0])
+        Image.fromarray(frame[:, :, 0]).save(folder / "img" / f"{i:06d}.png")
     source = Source("grey", lambda: read_frames(folder), 1, NUM, np.zeros((0, 4)), None, False)
     rows, _ = tracked(folder, detect_all(source).boxes)
     assert np.isfinite(rows).all()
