@@ -408,7 +408,7 @@ def test_every_public_constructor_and_runner_is_tried():
     assert others == {
         "FilterRun", "StepInfo", "Series", "Checkpoint", "ParticleMixture", "Pool",
         "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
-        "NetworkProposal", "keep_programs", "check_model",
+        "NetworkProposal", "keep_programs", "check_model", "map_moves",
     } - tried  # fmt: skip
 
 
