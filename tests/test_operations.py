@@ -130,7 +130,10 @@ def test_the_last_position_before_each_point():
     rng = np.random.default_rng(7)
     places = np.sort(np.round(rng.random(300) ** 2 * 64 * 2**12) / 2**12)
     points = np.append(rng.random(500) * 64, places)
-    parts = lambda values: prefix_sums.as_positions(jnp.asarray(values, jnp.float32))  # noqa: E731
+
+    def parts(values):
+        return prefix_sums.as_positions(jnp.asarray(values, jnp.float32))
+
     found = eqx.filter_jit(prefix_sums.last_before)(parts(places), parts(points), 64)
     points = points.astype(np.float32)
     np.testing.assert_array_equal(found, np.searchsorted(places, points, "right") - 1)

@@ -34,7 +34,9 @@ def test_it_is_run_as_the_keywords_are(series):
 
 
 def test_within_jit_it_is_the_same():
-    run = lambda series: mpfjax.run_filter(KEY, FILTER, series).log_marginal_likelihood  # noqa: E731
+    def run(series):
+        return mpfjax.run_filter(KEY, FILTER, series).log_marginal_likelihood
+
     series = Series.skipping(HOLED, INPUTS)
     np.testing.assert_allclose(jax.jit(run)(series), run(series), rtol=1e-6)
 

@@ -301,7 +301,10 @@ class TestOptimisers:
 
     def program(self, optimizer):
         reals = {"r": jnp.ones(())}
-        first = lambda reals: optimizer.update(reals, optimizer.init(reals), reals)  # noqa: E731
+
+        def first(reals):
+            return optimizer.update(reals, optimizer.init(reals), reals)
+
         return program_of(first, reals)
 
     def same(self, one, other):
