@@ -1,20 +1,40 @@
 """Checks of arguments. Each raises a `ValueError` that names the argument, its value and what is
 allowed.
 
-Arguments are given by name: `check_whole(1, num_particles=num_particles)`. An argument that may be
-None goes through `given`, which leaves out None: `check_positive(**given(max_distance=None))`.
+An annotation says what an argument may be, and is checked: a function by `@checked`, the fields of
+a class by `Checked` among its bases.
+
+    class Split(Checked):
+        min_share: Annotated[float, share(0.5)] = 0.1     # or a name from here, as Share, Count
+        features: Callable[[PyTree], Array] | None = None
+        noise: Literal["independent", "rqmc"] = "independent"
+
+Checked are numbers and arrays with a `Rule`, `Literal`, `bool`, `Callable`, keys, and the library's
+own classes; `| None` adds None. Any other annotation is for readers alone.
 """
 
 import contextlib
+import dataclasses
+import functools
+import inspect
 import math
+import types
+import typing
 from collections.abc import Callable, Collection, Iterable, Iterator
-from typing import Any, TypeGuard
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, ParamSpec, TypeGuard, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
+
+P = ParamSpec("P")
+R = TypeVar("R")
+T = TypeVar("T")
 
 _LONGEST = 200
 _MOST = 2**31 - 1
@@ -310,6 +330,171 @@ def _check_entries(holds: Callable[..., Any], what: str, arguments: dict[str, An
             raise ValueError(f"{name}: shape {np.shape(array)} holds no number")
         if not np.all(holds(np.asarray(array))):
             raise ValueError(f"{name}: {shown(array)} is not {what} throughout")
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What an argument must be, beside its type: `Annotated[float, Rule(isfinite, "finite")]`.
+
+    `check`: takes the argument's value and its name, and raises a `ValueError`.
+    """
+
+    check: Callable[[Any, str], None]
+    what: str
+
+    def __repr__(self) -> str:
+        return self.what
+
+
+def number(holds: Callable[[Any], bool], what: str) -> Rule:
+    """The rule for a number of which this holds; `what` says so in words."""
+
+    def check(value: Any, name: str) -> None:
+        if not (_is_number(value) and holds(value)):
+            raise ValueError(f"{name}: {shown(value)} is not {what}")
+
+    return Rule(check, what)
+
+
+def whole(least: int) -> Rule:
+    """The rule for a whole number from `least` on."""
+    return Rule(
+        lambda value, name: check_whole(least, **{name: value}),
+        f"a whole number of at least {least}",
+    )
+
+
+def share(most: float = 1.0) -> Rule:
+    """The rule for a number in [0, most]."""
+    return number(lambda value: 0 <= value <= most, f"a number in [0, {most:g}]")
+
+
+def entries(holds: Callable[[np.ndarray], Any], what: str) -> Rule:
+    """The rule for an array with this in all its entries, where its values are known."""
+    return Rule(lambda value, name: _check_entries(holds, what, {name: value}), what)
+
+
+def one_of(choices: Iterable[str]) -> Rule:
+    """The rule for one of some strings, where they are not written out as a `Literal`."""
+    names = tuple(choices)
+    return Rule(lambda value, name: check_one_of(names, **{name: value}), f"one of {sorted(names)}")
+
+
+Count = Annotated[int, whole(1)]
+CountOrZero = Annotated[int, whole(0)]
+Finite = Annotated[float, number(math.isfinite, "a finite number")]
+Positive = Annotated[float, number(lambda x: 0 < x < math.inf, "a positive, finite number")]
+NotNegative = Annotated[float, number(lambda x: 0 <= x < math.inf, "a finite number of at least 0")]
+Share = Annotated[float, share()]
+InnerShare = Annotated[float, number(lambda x: 0 < x < 1, "a number in (0, 1)")]
+Exponent = Annotated[float, number(lambda x: 0 < x <= 1, "a number in (0, 1]")]
+# For arrays: `Annotated[Float[Array, " d"], POSITIVE]`.
+POSITIVE = entries(lambda array: (array > 0) & np.isfinite(array), "positive and finite")
+NOT_NEGATIVE = entries(lambda array: (array >= 0) & np.isfinite(array), "finite and not negative")
+FINITE = entries(np.isfinite, "finite")
+
+
+class Checked(eqx.Module):
+    """A base of classes whose fields are checked by their annotations."""
+
+    def __check_init__(self) -> None:
+        rules = _rules(type(self))
+        for field in dataclasses.fields(self):
+            if field.name in rules:
+                rules[field.name].check(getattr(self, field.name), field.name)
+
+
+def checked(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, with its arguments checked by their annotations before it runs."""
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        values = signature.bind(*args, **kwargs).arguments
+        for name, rule in _rules(function).items():
+            if name in values:
+                rule.check(values[name], name)
+        return function(*args, **kwargs)
+
+    return call
+
+
+def checked_by(check: Callable[[Any, str], None]) -> Callable[[type[T]], type[T]]:
+    """For a class: arguments of it are checked by `check`, which takes a value and its name.
+
+    Without it they must be instances.
+    """
+
+    def marked(kind: type[T]) -> type[T]:
+        _CHECKS[kind] = check
+        return kind
+
+    return marked
+
+
+_CHECKS: dict[type, Callable[[Any, str], None]] = {}
+
+
+@functools.cache
+def _rules(owner: Any) -> dict[str, Rule]:
+    """By name, the rules for the arguments of a function or the fields of a class."""
+    is_class = isinstance(owner, type)
+    # A user's subclass says by its annotations what it likes.
+    told = [base for base in owner.__mro__[::-1] if _is_ours(base)] if is_class else [owner]
+    hints: dict[str, Any] = {}
+    for each in told:
+        hints |= inspect.get_annotations(each, eval_str=True)
+    rules = {name: _rule(hint) for name, hint in hints.items() if name != "return"}
+    return {name: rule for name, rule in rules.items() if rule is not None}
+
+
+def _is_ours(kind: type) -> bool:
+    return kind.__module__.startswith("mpfjax.")
+
+
+def _rule(hint: Any) -> Rule | None:
+    """What an annotation asks for; None for one that says nothing to check."""
+    origin, choices = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        return next((extra for extra in choices[1:] if isinstance(extra, Rule)), None)
+    if origin in (typing.Union, types.UnionType):
+        return _any_of([_rule(choice) for choice in choices if choice is not types.NoneType])
+    if origin is Literal:
+        return one_of(choices)
+    if origin is Callable:
+        return Rule(lambda value, name: check_callable("a function", **{name: value}), "a function")
+    if hint is bool:
+        return Rule(lambda value, name: check_flag(**{name: value}), "True or False")
+    if getattr(hint, "dtype", None) is jaxtyping.Key and hint.index_variadic is None:
+        is_batch = len(hint.dims) > 0
+        return Rule(lambda value, name: check_key(value, name, batch=is_batch), "typed keys")
+    if isinstance(hint, type) and _is_ours(hint):
+        what = f"{'an' if hint.__name__[0] in 'AEIO' else 'a'} {hint.__name__}"
+        is_one = lambda value, name: check_type(hint, what, **{name: value})  # noqa: E731
+        return Rule(_CHECKS.get(hint, is_one), what)
+    return None
+
+
+def _any_of(rules: list[Rule | None]) -> Rule | None:
+    """The rule that lets pass None and what one of these does; None where one checks nothing."""
+    known = [rule for rule in rules if rule is not None]
+    if len(known) < len(rules):
+        return None
+    what = " or ".join(rule.what for rule in known)
+
+    def check(value: Any, name: str) -> None:
+        if value is None:
+            return
+        if len(known) == 1:
+            known[0].check(value, name)
+            return
+        for rule in known:
+            with contextlib.suppress(ValueError):
+                rule.check(value, name)
+                return
+        raise ValueError(f"{name}: {shown(value)} is not {what}")
+
+    return Rule(check, what)
 
 
 @contextlib.contextmanager

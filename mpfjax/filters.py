@@ -5,14 +5,14 @@ from typing import Any
 
 from jaxtyping import Array, PyTree
 
-from mpfjax.checks import check_one_of, check_type, check_whole
+from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead
 from mpfjax.models.base import AbstractStateSpaceModel, mapped
 from mpfjax.models.conditionally_linear import is_marginalised, refuse_marginalised
 from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
-from mpfjax.models.noise import NOISES
-from mpfjax.moves.base import AbstractMove, as_moves
+from mpfjax.models.noise import Noise
+from mpfjax.moves.base import AbstractMove, Gradient, as_moves
 from mpfjax.moves.every import Every
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
@@ -25,7 +25,7 @@ from mpfjax.moves.regrouping.partitions import Pool, RandomPartition
 from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration
 from mpfjax.moves.resampling.line import SortBy
-from mpfjax.moves.resampling.resample import GRADIENTS, Resample
+from mpfjax.moves.resampling.resample import Resample, Scheme
 from mpfjax.proposals import AbstractProposal
 from mpfjax.transforms import (
     with_lookahead,
@@ -39,16 +39,17 @@ _WARM_ITERATIONS, _ITERATIONS = 2, 5
 _INITIAL_DRAWS = 4
 
 
+@checked
 def particle_filter(
     model: AbstractStateSpaceModel,
-    num_particles: int,
+    num_particles: Count,
     *,
     proposal: AbstractProposal | None = None,
-    scheme: str = "systematic",
-    ess_threshold: float = 1.0,
+    scheme: Scheme = "systematic",
+    ess_threshold: Share = 1.0,
     sort_by: SortBy | None = None,
-    noise: str = "independent",
-    gradient: str = "none",
+    noise: Noise = "independent",
+    gradient: Gradient = "none",
 ) -> Filter:
     """The standard particle filter: resample, propagate.
 
@@ -60,14 +61,15 @@ def particle_filter(
     return _with(noise, gradient, Filter(model, moves, num_particles))
 
 
+@checked
 def auxiliary_particle_filter(
     model: AbstractStateSpaceModel,
-    num_particles: int,
+    num_particles: Count,
     lookahead: Lookahead,
     *,
     proposal: AbstractProposal | None = None,
-    scheme: str = "systematic",
-    ess_threshold: float = 1.0,
+    scheme: Scheme = "systematic",
+    ess_threshold: Share = 1.0,
     sort_by: SortBy | None = None,
 ) -> Filter:
     """The auxiliary particle filter: resample by w times a look-ahead to y_t, propagate.
@@ -88,20 +90,21 @@ def auxiliary_particle_filter(
     return with_lookahead(plain, lookahead)
 
 
+@checked
 def mixture_particle_filter(
     model: AbstractStateSpaceModel,
-    num_particles: int,
-    max_components: int,
+    num_particles: Count,
+    max_components: Count,
     *,
     proposal: AbstractProposal | None = None,
-    scheme: str = "systematic",
-    ess_threshold: float = 1.0,
+    scheme: Scheme = "systematic",
+    ess_threshold: Share = 1.0,
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
     regroup: Sequence[AbstractMove] | None = None,
-    regroup_every: int = 3,
-    noise: str = "independent",
-    gradient: str = "none",
+    regroup_every: Count = 3,
+    noise: Noise = "independent",
+    gradient: Gradient = "none",
 ) -> Filter:
     """The mixture particle filter: resample within components, propagate, regroup.
 
@@ -137,9 +140,10 @@ def mixture_particle_filter(
     return _with(noise, gradient, filter)
 
 
+@checked
 def gaussian_particle_filter(
     model: AbstractStateSpaceModel,
-    num_particles: int,
+    num_particles: Count,
     *,
     proposal: AbstractProposal | None = None,
     regeneration: GaussianRegeneration | None = None,
@@ -153,7 +157,6 @@ def gaussian_particle_filter(
     """
     refuse_marginalised(model, "gaussian_particle_filter")
     redraw = GaussianRegeneration() if regeneration is None else regeneration
-    check_type(GaussianRegeneration, "a GaussianRegeneration", regeneration=redraw)
     check_one_of(("propagated", "predictive_gaussian"), importance=importance)
     if importance == "propagated":
         return Filter(model, [redraw, Propagate(model, proposal)], num_particles)
@@ -162,10 +165,11 @@ def gaussian_particle_filter(
     return Filter(model, [redraw, Predict(model), redraw, Reweight(model)], num_particles)
 
 
+@checked
 def gaussian_mixture_particle_filter(
     model: AbstractStateSpaceModel,
-    num_particles: int,
-    max_components: int,
+    num_particles: Count,
+    max_components: Count,
     *,
     proposal: AbstractProposal | None = None,
     regeneration: GaussianRegeneration | None = None,
@@ -173,7 +177,7 @@ def gaussian_mixture_particle_filter(
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
     regroup: Sequence[AbstractMove] | None = None,
-    regroup_every: int = 1,
+    regroup_every: Count = 1,
 ) -> Filter:
     """GM-MPF: redraw each component from the Gaussian of its moments, propagate, regroup.
 
@@ -196,13 +200,14 @@ def gaussian_mixture_particle_filter(
     return _mixture(plain, max_components, seen, _ITERATIONS, regroup, regroup_every)
 
 
+@checked
 def partitioned_sampling(
     model: MultiObjectModel,
-    num_particles: int,
+    num_particles: Count,
     order: str | Sequence[int] | Array | None = None,
     *,
-    scheme: str = "systematic",
-    ess_threshold: float = 1.0,
+    scheme: Scheme = "systematic",
+    ess_threshold: Share = 1.0,
 ) -> Filter:
     """Partitioned sampling: resample, then move one object after the other.
 
@@ -224,14 +229,15 @@ def partitioned_sampling(
     return Filter(model, moves, num_particles)
 
 
+@checked
 def distributed_partitioned_sampling(
     model: MultiObjectModel,
-    num_particles: int,
+    num_particles: Count,
     orders: str | Sequence[Sequence[int]] | Array | None = None,
     reassembly: str = "prior",
     *,
-    scheme: str = "systematic",
-    ess_threshold: float = 1.0,
+    scheme: Scheme = "systematic",
+    ess_threshold: Share = 1.0,
 ) -> Filter:
     """DPS: the particles are dealt into C sets, and the objects move in another order in each.
 
@@ -262,8 +268,9 @@ def distributed_partitioned_sampling(
     )
 
 
+@checked
 def independent_particle_filters(
-    model: MultiObjectModel, num_particles: int, *, scheme: str = "systematic"
+    model: MultiObjectModel, num_particles: Count, *, scheme: Scheme = "systematic"
 ) -> Filter:
     """A small particle filter for each object, as if there were no other.
 
@@ -276,13 +283,14 @@ def independent_particle_filters(
     return Filter(model, [PropagateIndependently(model, scheme=scheme)], num_particles)
 
 
+@checked
 def clustered_particle_filter(
     model: MultiObjectModel,
-    num_particles: int,
+    num_particles: Count,
     *,
     start: str = "apart",
     split_after: int | None = None,
-    scheme: str = "systematic",
+    scheme: Scheme = "systematic",
 ) -> Filter:
     """A joint filter of clusters of objects; clusters merge where objects meet.
 
@@ -305,14 +313,13 @@ def clustered_particle_filter(
 
 def _mixture(
     plain: Filter,
-    max_components: int,
+    max_components: Count,
     seen: dict[str, Any],
     num_iterations: int,
     regroup: Sequence[AbstractMove] | None,
-    regroup_every: int,
+    regroup_every: Count,
 ) -> Filter:
     """The filter with many components, which moves regroup; x_0 grouped by K-means from seeds."""
-    check_whole(max_components=max_components, regroup_every=regroup_every)
     if regroup is None:
         regroup = [Merge(**seen), Split(**seen), KMeans(num_iterations, **seen)]
     regroup = as_moves(regroup, "regroup")
@@ -327,7 +334,5 @@ def _mixture(
 
 def _with(noise: str, gradient: str, filter: Filter) -> Filter:
     """The filter with the two options of recipes that are transforms."""
-    check_one_of(NOISES, noise=noise)
-    check_one_of(GRADIENTS, gradient=gradient)
     filter = with_point_sets(filter) if noise == "rqmc" else filter
     return with_score_gradient(filter) if gradient == "stop" else filter

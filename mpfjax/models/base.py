@@ -16,11 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_whole, shown
+from mpfjax.checks import check_whole, checked_by, shown
 from mpfjax.models.noise import noise_dtype
 from mpfjax.operations.random import direction_numbers, normal, split
 
 
+@checked_by(lambda model, name: require_model(model, "a filter", name))
 class AbstractStateSpaceModel(eqx.Module):
     """A Markov state x_t with observations y_t; all methods act on all particles at once.
 

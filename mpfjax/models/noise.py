@@ -1,12 +1,14 @@
 """Standard normal and uniform draws: independent, or spread evenly over particles."""
 
 from functools import partial
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree, UInt32
 
+from mpfjax.checks import one_of
 from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.random import (
     MOST_DIMENSIONS,
@@ -23,6 +25,7 @@ from mpfjax.operations.segments import first_places, spread
 from mpfjax.operations.stored import stored
 
 NOISES = ("independent", "rqmc")
+Noise = Annotated[str, one_of(NOISES)]
 _UNUSED = 9  # bits of 32 that no draw of 23 bits shows
 
 

@@ -3,18 +3,20 @@
 import abc
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
-from mpfjax.checks import check_callable, is_series, shown
+from mpfjax.checks import Checked, check_callable, is_series, one_of, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.logarithms import without_gradient
 
+Gradient = Annotated[str, one_of(("none", "stop"))]
 
-class AbstractMove(eqx.Module):
+
+class AbstractMove(Checked):
     """A step of a filter, `(key, mixture, observation) -> mixture`.
 
     The kind of a move is its contract. An `AbstractRegrouping` does not change the distribution.

@@ -1,14 +1,14 @@
 """The features of the state that regrouping uses, and their units."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from mpfjax.checks import check_callable, check_positive_array, given, shown
+from mpfjax.checks import POSITIVE, Checked, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations.logarithms import as_inexact, exp, finite_or_zero
 from mpfjax.operations.segments import are_masked, column_sums, segment_max, spread_stored
@@ -26,7 +26,7 @@ def _as_units(scale: Any) -> tuple[float, ...]:
         raise ValueError(f"scale: {shown(scale)} is no number, nor one a feature") from error
 
 
-class ByFeatures(eqx.Module):
+class ByFeatures(Checked):
     """A move for which particles are near or far by their features, measured in `scale`.
 
     - `features`: maps the particles to (n,) or (n, k) features; None takes the whole state,
@@ -38,13 +38,9 @@ class ByFeatures(eqx.Module):
     """
 
     features: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None, kw_only=True)
-    scale: tuple[float, ...] = eqx.field(
+    scale: Annotated[tuple[float, ...], POSITIVE] = eqx.field(
         static=True, default=(1.0,), converter=_as_units, kw_only=True
     )
-
-    def __check_init__(self) -> None:
-        check_callable("a function of the particles", **given(features=self.features))
-        check_positive_array(scale=np.asarray(self.scale))
 
     def features_of(self, mixture: ParticleMixture) -> Float[Array, "n k"]:
         """The features of every particle, relative to their average, zero in an empty slot.

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_flag, check_whole
+from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.regrouping.features import ByFeatures
@@ -34,12 +34,8 @@ class KMeans(AbstractRegrouping, ByFeatures):
     Raises `ValueError` for fewer than one iteration, and a scale that is not positive.
     """
 
-    num_iterations: int = eqx.field(static=True, default=5)
+    num_iterations: Count = eqx.field(static=True, default=5)
     reseed: bool = eqx.field(static=True, default=False, kw_only=True)
-
-    def __check_init__(self) -> None:
-        check_whole(num_iterations=self.num_iterations)
-        check_flag(reseed=self.reseed)
 
     def regroup(
         self, key: Key[Array, ""], mixture: ParticleMixture

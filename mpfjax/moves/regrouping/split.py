@@ -1,13 +1,13 @@
 """Split: a component that has become too diffuse is divided in two."""
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_not_negative, check_share, check_whole, given
+from mpfjax.checks import Count, NotNegative, share
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping
 from mpfjax.moves.regrouping.features import (
@@ -46,16 +46,11 @@ class Split(AbstractRegrouping, ByFeatures):
     relabelling only.
     """
 
-    min_deviations: float = eqx.field(static=True, default=4.0)
-    min_distance: float = eqx.field(static=True, default=0.0)
-    min_share: float = eqx.field(static=True, default=0.05, kw_only=True)
-    num_iterations: int = eqx.field(static=True, default=3, kw_only=True)
-    sample_size: int | None = eqx.field(static=True, default=32, kw_only=True)
-
-    def __check_init__(self) -> None:
-        check_not_negative(min_deviations=self.min_deviations, min_distance=self.min_distance)
-        check_share(0.5, min_share=self.min_share)
-        check_whole(num_iterations=self.num_iterations, **given(sample_size=self.sample_size))
+    min_deviations: NotNegative = eqx.field(static=True, default=4.0)
+    min_distance: NotNegative = eqx.field(static=True, default=0.0)
+    min_share: Annotated[float, share(0.5)] = eqx.field(static=True, default=0.05, kw_only=True)
+    num_iterations: Count = eqx.field(static=True, default=3, kw_only=True)
+    sample_size: Count | None = eqx.field(static=True, default=32, kw_only=True)
 
     def regroup(
         self, key: Key[Array, ""], mixture: ParticleMixture

@@ -8,14 +8,14 @@ curve.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped, UInt32
 
-from mpfjax.checks import check_callable, saying, shown
+from mpfjax.checks import saying, shown
 from mpfjax.mixture import ParticleMixture, points
 from mpfjax.operations.islands import cond_if_any
 from mpfjax.operations.logarithms import as_inexact, exp, finite_or_zero, log_or_nothing
@@ -41,7 +41,7 @@ from mpfjax.operations.sorting import (
 from mpfjax.operations.stored import stored, take
 
 HILBERT = "hilbert"
-SortBy = Callable[[PyTree], Array] | str
+SortBy = Callable[[PyTree], Array] | Literal["hilbert"]
 _STEEPNESS = 1.702  # the logistic function of this multiple is nearly the normal CDF
 
 
@@ -201,12 +201,6 @@ def in_line(
         is_drawn |= (log_weights > -jnp.inf) & take(whole(stays, False), order)
     totals = runs.sums(relative)
     return Line(n, relative, totals, log_largest, is_drawn, order, labels, runs)
-
-
-def check_sort_by(sort_by: SortBy | None) -> None:
-    """Raise a `ValueError` for what is neither a function, nor "hilbert", nor None."""
-    if sort_by is not None and not (isinstance(sort_by, str) and sort_by == HILBERT):
-        check_callable('a function of the particles, nor "hilbert"', sort_by=sort_by)
 
 
 def sorted_order(

@@ -1,15 +1,16 @@
 """Resampling within components: systematic, stratified, multinomial, residual or SSP."""
 
 from collections.abc import Callable
+from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
-from mpfjax.checks import check_callable, check_one_of, check_share, check_whole, given
+from mpfjax.checks import Count, Share, one_of
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractResampling
+from mpfjax.moves.base import AbstractResampling, Gradient
 from mpfjax.moves.conditional import ConditionalResample, Reference
 from mpfjax.moves.eve_indices import with_offspring
 from mpfjax.moves.resampling.allocation import (
@@ -18,13 +19,13 @@ from mpfjax.moves.resampling.allocation import (
     demands_of_groups,
 )
 from mpfjax.moves.resampling.ancestors import SCHEMES, Ancestors, draw_ancestors
-from mpfjax.moves.resampling.line import Line, SortBy, check_sort_by, in_line
+from mpfjax.moves.resampling.line import Line, SortBy, in_line
 from mpfjax.operations.logarithms import add_gradient
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import stored, take
 
-ALLOCATIONS = ("variance", "equal")
-GRADIENTS = ("none", "stop")
+Scheme = Annotated[str, one_of(SCHEMES)]
+Allocation = Annotated[str, one_of(("variance", "equal"))]
 
 
 class Resample(AbstractResampling):
@@ -74,22 +75,15 @@ class Resample(AbstractResampling):
     k < 1, and k together with `share_by`.
     """
 
-    scheme: str = eqx.field(static=True, default="systematic")
-    ess_threshold: float = eqx.field(static=True, default=1.0)
-    particles_per_component: int | None = eqx.field(static=True, default=None)
+    scheme: Scheme = eqx.field(static=True, default="systematic")
+    ess_threshold: Share = eqx.field(static=True, default=1.0)
+    particles_per_component: Count | None = eqx.field(static=True, default=None)
     sort_by: SortBy | None = eqx.field(static=True, default=None)
-    gradient: str = eqx.field(static=True, default="none")
-    allocation: str = eqx.field(static=True, default="variance")
+    gradient: Gradient = eqx.field(static=True, default="none")
+    allocation: Allocation = eqx.field(static=True, default="variance")
     share_by: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
-        check_one_of(SCHEMES, scheme=self.scheme)
-        check_share(ess_threshold=self.ess_threshold)
-        check_whole(**given(particles_per_component=self.particles_per_component))
-        check_sort_by(self.sort_by)
-        check_one_of(GRADIENTS, gradient=self.gradient)
-        check_one_of(ALLOCATIONS, allocation=self.allocation)
-        check_callable("a function of the particles", **given(share_by=self.share_by))
         if self.share_by is not None and self.particles_per_component is not None:
             raise ValueError(
                 "share_by: groups have no effect where particles_per_component is"
