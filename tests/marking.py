@@ -1,4 +1,4 @@
-"""Which cases of a test run always, and which only where all are asked for."""
+"""Which cases of a test run always, which before anything is taken in, and which weekly."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -6,19 +6,27 @@ from typing import Any
 import pytest
 
 
-def thorough(cases: Iterable[Any]) -> list[Any]:
-    """The cases for `parametrize`, marked: they test the same behaviour as others, differently.
-
-    `python -m pytest` leaves them out, `python -m pytest -m thorough` runs them alone; what is
-    taken in has passed both.
-    """
+def marked(mark: pytest.MarkDecorator, cases: Iterable[Any]) -> list[Any]:
+    """The cases for `parametrize`, all with this mark."""
     return [
-        pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.thorough)
-        for case in cases
+        pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=mark) for case in cases
     ]
 
 
+def exactness(cases: Iterable[Any]) -> list[Any]:
+    """The cases, marked: they compare with an exact answer, and take too long to run always."""
+    return marked(pytest.mark.exactness, cases)
+
+
+def weekly(cases: Iterable[Any]) -> list[Any]:
+    """The cases, marked: they need many processes, programs or minutes."""
+    return marked(pytest.mark.weekly, cases)
+
+
 def quick_of(cases: Iterable[Any], always: Iterable[Any]) -> list[Any]:
-    """All the cases, those that are not among `always` marked as thorough."""
+    """All the cases, those that are not among `always` marked as `exactness`."""
     always = list(always)
-    return [case if case in always else thorough([case])[0] for case in cases]
+    return [case if case in always else exactness([case])[0] for case in cases]
+
+
+thorough = exactness

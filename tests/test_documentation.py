@@ -3,26 +3,28 @@
 import importlib.util
 import inspect
 import re
-import sys
 from pathlib import Path
 
 import jax
+import nbformat
 import pytest
+from nbclient import NotebookClient
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser, SkipParser
 
 import mpfjax
-from tests.marking import quick_of
+from tests.marking import marked, weekly
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
-PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"]
-PAGES += sorted(path for path in DOCS.rglob("*.md") if "notebooks" not in path.parts)
-NAMES = [str(page.relative_to(REPOSITORY)) for page in PAGES]
+README, CONTRIBUTING = REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"
+PAGES = [README, CONTRIBUTING, *sorted(DOCS.rglob("*.md"))]
+TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES if "notebooks" not in page.parts}
+WITH_CODE = [page for page in TEXTS if page != README and "```python" in TEXTS[page]]
+GALLERY = [page for page in WITH_CODE if page.parent.name == "gallery"]
+GUIDES = [page for page in WITH_CODE if page.parent.name != "gallery"]
+NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
 COMMAND = re.compile(r"python -m (benchmarks\.[a-z_]+|mpfjax\b)((?: [^\n`|#]*)?)")
-WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
-# The others are run where the thorough tests are.
-QUICK_PAGES = [page for page in WITH_CODE if page.stem in ("README",)]
 
 sybil = Sybil(parsers=[PythonCodeBlockParser(), SkipParser()], path=str(REPOSITORY))
 
@@ -33,32 +35,43 @@ def stem(page: Path) -> str:
 
 
 @pytest.mark.usefixtures("as_installed")
-@pytest.mark.parametrize("page", quick_of(WITH_CODE, QUICK_PAGES), ids=stem)
+@pytest.mark.parametrize(
+    "page", [README, *marked(pytest.mark.pages, GUIDES), *weekly(GALLERY)], ids=stem
+)
 def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     """All blocks of a page in their order, as a reader runs them: without the tests' strictness."""
-    document = sybil.parse(page)
-    if page.parent.name == "gallery":  # there the code draws the page's picture
-        monkeypatch.chdir(tmp_path)
-    examples = list(document.examples())
+    examples = list(sybil.parse(page).examples())
     assert examples
+    if page in GALLERY:  # there the code draws the page's picture
+        monkeypatch.chdir(tmp_path)
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         for example in examples:
             example.evaluate()
-    if page.parent.name == "gallery":
+    if page in GALLERY:
         assert [path.name for path in tmp_path.iterdir()] == [f"{page.stem}.png"]
-        assert (page.parent / f"{page.stem}.png").exists()
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/start.md"])
-def test_the_first_lines_keep_programs(page):
-    example = next(iter(sybil.parse(REPOSITORY / page).examples()))
-    assert "mpfjax.keep_programs()" in example.parsed.splitlines()[2]
+@pytest.mark.weekly
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=stem)
+def test_a_notebook_runs_in_its_short_form(path, monkeypatch):
+    monkeypatch.setenv("MPFJAX_SHORT", "1")
+    resources = {"metadata": {"path": path.parent}}
+    notebook = nbformat.read(path, as_version=4)
+    NotebookClient(notebook, timeout=240, kernel_name="python3", resources=resources).execute()
 
 
-@pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_the_commands_of_a_page_exist(page):
-    """Each module, and each option that a command gives it."""
-    for name, arguments in COMMAND.findall(page.read_text(encoding="utf-8")):
+def test_notebooks_hold_their_outputs():
+    for path in NOTEBOOKS:
+        cells = nbformat.read(path, as_version=4).cells
+        outputs = [output for cell in cells for output in cell.get("outputs", ())]
+        assert any("image/png" in output.get("data", {}) for output in outputs), path
+        assert not any(output.output_type == "error" for output in outputs), path
+
+
+@pytest.mark.parametrize("page", TEXTS, ids=stem)
+def test_commands_and_files_that_a_page_names_exist(page):
+    """Each module, each option that a command gives it, each link to a file."""
+    for name, arguments in COMMAND.findall(TEXTS[page]):
         module = importlib.util.find_spec(name if name != "mpfjax" else "mpfjax.__main__")
         assert module is not None, name
         place = Path(module.origin)
@@ -69,65 +82,33 @@ def test_the_commands_of_a_page_exist(page):
             argument = option.removeprefix("--").removeprefix("no-").replace("-", "_")
             is_there = f'"{option}"' in text or re.search(rf"^    {argument}: ", text, re.MULTILINE)
             assert is_there, f"{name} {option}"
-
-
-def test_readme_is_short_and_keeps_its_two_commands():
-    lines = (REPOSITORY / "README.md").read_text(encoding="utf-8").splitlines()
-    assert len(lines) <= 150
-    assert "    python -m pip install -e . && python -m benchmarks.score_vs_particles" in lines
-    assert '    python -m pip install -e ".[test]" && python -m pytest' in lines
-
-
-@pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_pictures_and_pages_that_a_page_links_to_exist(page):
-    """Links to files; Sphinx checks those between pages too, but not README's."""
-    text = page.read_text(encoding="utf-8")
-    for link in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", text):
+    for link in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", TEXTS[page]):
         target = (page.parent / link).resolve()
         shown = REPOSITORY / "notebooks" / target.name  # copied into docs/ as the site is built
         assert target.exists() or shown.exists(), link
 
 
-def test_every_public_name_is_on_an_api_page():
-    sys.path.insert(0, str(DOCS / "_ext"))
-    try:
-        api = importlib.import_module("api_names")
-    finally:
-        sys.path.remove(str(DOCS / "_ext"))
-    text = "".join(path.read_text(encoding="utf-8") for path in (DOCS / "api").glob("*.md"))
+def test_walks_end_at_files_that_are_there():
+    """And what one names as a function is defined in the file that it names with it."""
+    walks = TEXTS[CONTRIBUTING].split("\nWalks,")[1].split("\n## ")[0]
+    for path in re.findall(r"`(\w+/[^`]*)`", walks):
+        assert (REPOSITORY / path).exists(), path
+    for name, path in re.findall(r"`(\w+)` in `([^`]+\.py)`", walks):
+        assert re.search(rf"^def {name}\b", (REPOSITORY / path).read_text("utf-8"), re.M), name
+
+
+def test_every_public_name_is_on_an_api_page(monkeypatch):
+    monkeypatch.syspath_prepend(DOCS / "_ext")
+    names = importlib.import_module("api_names").public_names()
+    text = "".join(TEXTS[page] for page in TEXTS if page.parent.name == "api")
     shown = re.findall(r"^\.\. auto(?:class|function|data):: (\S+)", text, re.MULTILINE)
     assert len(shown) == len(set(shown)), "a name stands on two pages"
-    names = api.public_names()
     # Pages also show what functions return, under the names of their files.
     assert set(names.values()) <= {names.get(name, name) for name in shown}
 
 
-@pytest.mark.parametrize(
-    ("page", "words"),
-    [
-        ("model.md", "## Known inputs"),
-        ("extending.md", "### A move with memory"),
-        ("index.md", "## How to cite"),
-        ("filters.md", "## How many components (M)"),
-        ("filters.md", "If there are more modes than M"),
-        ("tuning.md", "**`num_samples`**"),
-    ],
-    ids=lambda value: value.strip("#*` "),
-)
-def test_a_new_reader_is_two_clicks_away(page, words):
-    """From the index, by the links of its text and of one page after it."""
-    assert words in (DOCS / page).read_text(encoding="utf-8")
-    reached = {"index.md"}
-    for _click in range(2):
-        texts = [(DOCS / name).read_text(encoding="utf-8") for name in reached]
-        links = {link for text in texts for link in re.findall(r"\]\(([a-z_]+\.md)", text)}
-        reached |= {link for link in links if (DOCS / link).exists()}
-    assert page in reached
-
-
 def test_the_step_that_is_shown_is_the_one_that_runs():
-    readme = (DOCS.parent / "README.md").read_text("utf-8")
-    shown = re.search(r"^def _step\(.*?^```", readme, re.M | re.S)
+    shown = re.search(r"^def _step\(.*?^```", TEXTS[README], re.M | re.S)
     lines = inspect.getsource(mpfjax.Filter._step).splitlines()
     body = lines[next(k for k, line in enumerate(lines) if line.endswith('predicts."""')) + 1 :]
     assert [line.strip() for line in shown[0].splitlines()[1:-1]] == [line.strip() for line in body]

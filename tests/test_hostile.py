@@ -1,7 +1,7 @@
 """Hostile arguments, generated: a call works, or its error names the argument.
 
 One or two arguments of a good call are replaced by whatever the generator comes up with. What is
-built in spite of it, draws and weighs finite numbers. `pytest -m hostile` runs a hundred thousand.
+built in spite of it, draws and weighs finite numbers. `pytest -m weekly` runs a hundred thousand.
 """
 
 import array
@@ -431,7 +431,7 @@ def test_runners_work_or_name_the_argument(call):
     outcome(RUN[name][0], arguments, changed)
 
 
-@pytest.mark.hostile
+@pytest.mark.weekly
 def test_a_hundred_thousand_constructors():
     found = collections.Counter()
 
