@@ -328,6 +328,8 @@ def _check_entries(holds: Callable[..., Any], what: str, arguments: dict[str, An
             continue
         if np.size(array) == 0:
             raise ValueError(f"{name}: shape {np.shape(array)} holds no number")
+        if not _has_numbers(array if hasattr(array, "dtype") else np.asarray(array)):
+            raise ValueError(f"{name}: {shown(array)} is no array of numbers")
         if not np.all(holds(np.asarray(array))):
             raise ValueError(f"{name}: {shown(array)} is not {what} throughout")
 

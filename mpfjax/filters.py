@@ -1,7 +1,7 @@
 """The filters of the literature, each a few lines that name its moves."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from jaxtyping import Array, PyTree
 
@@ -34,6 +34,7 @@ from mpfjax.transforms import (
     with_selected_start,
 )
 
+Importance = Literal["propagated", "predictive_gaussian"]
 # K-means starts from the components of a few steps before, and needs few iterations.
 _WARM_ITERATIONS, _ITERATIONS = 2, 5
 _INITIAL_DRAWS = 4
@@ -147,7 +148,7 @@ def gaussian_particle_filter(
     *,
     proposal: AbstractProposal | None = None,
     regeneration: GaussianRegeneration | None = None,
-    importance: str = "propagated",
+    importance: Importance = "propagated",
 ) -> Filter:
     """The Gaussian particle filter: redraw from the Gaussian of the moments, propagate.
 
@@ -157,7 +158,6 @@ def gaussian_particle_filter(
     """
     refuse_marginalised(model, "gaussian_particle_filter")
     redraw = GaussianRegeneration() if regeneration is None else regeneration
-    check_one_of(("propagated", "predictive_gaussian"), importance=importance)
     if importance == "propagated":
         return Filter(model, [redraw, Propagate(model, proposal)], num_particles)
     if proposal is not None:
@@ -173,7 +173,7 @@ def gaussian_mixture_particle_filter(
     *,
     proposal: AbstractProposal | None = None,
     regeneration: GaussianRegeneration | None = None,
-    importance: str = "propagated",
+    importance: Importance = "propagated",
     features: Callable[[PyTree], Array] | None = None,
     scale: Scale = 1.0,
     regroup: Sequence[AbstractMove] | None = None,

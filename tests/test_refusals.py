@@ -1,0 +1,397 @@
+"""What a call refuses: by name, with the value, before anything compiles.
+
+Annotations say what most arguments may be: all are tried here with values that will not do. What
+depends on more than one argument, or shows only as a filter runs, stands in the table `REFUSED`.
+"""
+
+import collections
+import functools
+import inspect
+import re
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import mpfjax
+from mpfjax import Filter, KMeans, Merge, Propagate, Resample, checks, smoothing
+from mpfjax.moves.initial import SelectInitial
+from mpfjax.moves.objects.clusters import PropagateInClusters
+from mpfjax.moves.objects.exclusion import Exclusion
+from mpfjax.moves.objects.independent import PropagateIndependently
+from mpfjax.moves.propagation.propagate import Predict, Reweight
+from mpfjax.running.islands import IslandInteraction
+from tests.user_models import DriftOfOne
+
+pytestmark = pytest.mark.usefixtures("as_installed")
+
+KEY = jax.random.key(0)
+MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
+JOINT = mpfjax.MultiObjectModel(MODEL, 2, shared_observation=True)
+FILTER = mpfjax.particle_filter(MODEL, 4)
+MIXTURE = FILTER.init(KEY)
+TWO = np.ones(2, np.float32)
+HISTORY = mpfjax.run_filter(KEY, FILTER, TWO)
+EYE, ZERO = np.eye(1), np.zeros(1)
+LINEAR = {"A": EYE, "Q": EYE, "H": EYE, "R": EYE, "m0": ZERO, "P0": EYE}
+SWITCHING = mpfjax.SwitchingLinearGaussianModel(EYE, EYE, EYE, EYE, EYE, ZERO, EYE)
+NAN, INFINITY = float("nan"), float("inf")
+BAD = (
+    None, True, 0, 1, 2, -1, 2**40, 0.5, 2.5, NAN, INFINITY, -0.1, "", "systematic", "x", b"x", 1j,
+    object(), int, len, [], {}, [1.0], [[1.0]], [-1.0], np.zeros(0), np.array([np.nan, 1.0]),
+    np.array(["a"]), np.array([1 + 1j, 2]), np.array([1, 2], "m8[s]"), np.zeros((2, 2)),
+    np.ma.masked_array([1.0, 2.0], [True, False]), jnp.array(0.5), jnp.array(2), KEY, KEY[None],
+    jax.random.PRNGKey(0), MODEL, JOINT, FILTER, MIXTURE, mpfjax.QuadraticModel, Resample(),
+)  # fmt: skip
+
+
+def nothing(mixture):
+    return None
+
+
+def difference(previous_states, states):
+    return states - previous_states
+
+
+# The arguments of a good call that have no default, or whose default leaves something out.
+GOOD = {
+    mpfjax.QuadraticModel: {},
+    mpfjax.LinearGaussianModel: LINEAR,
+    mpfjax.RandomWalk: {"deviations": [1.0, 2.0]},
+    mpfjax.RandomWalkWithJumps: {
+        "deviations": [1.0], "jump_deviations": [5.0], "jump_probability": 0.1
+    },
+    mpfjax.WalkWithVelocity: {
+        "walk": mpfjax.RandomWalk([1.0]), "gain": 0.1, "initial_velocity": [0.5]
+    },
+    mpfjax.Autoregression: {"A1": EYE, "A2": EYE, "B": EYE, "mean": ZERO},
+    mpfjax.PairwiseRepulsion: {"strength": 1.0, "radius": 2.0},
+    mpfjax.MultiObjectModel: {"object_model": MODEL, "num_objects": 2},
+    mpfjax.SwitchingLinearGaussianModel: {
+        "transition_matrix": EYE, "F": EYE, "Q": EYE, "H": EYE, "R": EYE, "m0": ZERO, "P0": EYE
+    },
+    mpfjax.per_particle: {"model": DriftOfOne()},
+    mpfjax.GaussNewtonProposal: {"model": MODEL},
+    mpfjax.RegimeProposal: {"model": SWITCHING},
+    Resample: {"particles_per_component": 2},
+    mpfjax.AuxiliaryResample: {
+        "resample": Resample(), "lookahead": mpfjax.GaussNewtonProposal(MODEL)
+    },
+    mpfjax.GaussianRegeneration: {"particles_per_component": 2},
+    KMeans: {}, Merge: {"max_distance": 2.0}, mpfjax.Split: {},
+    mpfjax.RandomPartition: {"num_sets": 2},
+    mpfjax.GroupBy: {"function": nothing},
+    mpfjax.Prune: {},
+    Exclusion: {"strength": 1.0, "radius": 0.5},
+    mpfjax.Every: {"num_steps": 2, "moves": [KMeans(1)]},
+    IslandInteraction: {},
+    Propagate: {"model": MODEL}, Predict: {"model": MODEL}, Reweight: {"model": MODEL},
+    mpfjax.PropagateMarginalised: {"model": SWITCHING},
+    mpfjax.PropagateRegimes: {"model": SWITCHING},
+    mpfjax.RandomWalkMetropolis: {"model": MODEL},
+    mpfjax.MetropolisAdjustedLangevin: {"model": MODEL},
+    mpfjax.PropagateNested: {"propagate": Propagate(MODEL), "num_draws": 2},
+    mpfjax.PropagateTempered: {"model": MODEL, "resample": Resample(), "exponents": (0.1, 1.0)},
+    mpfjax.Partitioned: {"model": JOINT},
+    PropagateIndependently: {"model": JOINT},
+    PropagateInClusters: {"model": JOINT},
+    SelectInitial: {"propagation": Propagate(MODEL), "num_draws": 2},
+    Filter: {"model": MODEL, "moves": [Propagate(MODEL)], "num_particles": 4},
+    mpfjax.with_selected_start: {"filter": FILTER, "num_draws": 2},
+    mpfjax.with_proposals_per_particle: {"filter": FILTER, "num_draws": 2},
+    mpfjax.with_lookahead: {"filter": FILTER},
+    mpfjax.with_point_sets: {"filter": FILTER},
+    mpfjax.with_score_gradient: {"filter": FILTER},
+    mpfjax.with_resampling: {"filter": FILTER, "resample": Resample()},
+    mpfjax.particle_filter: {"model": MODEL, "num_particles": 4},
+    mpfjax.auxiliary_particle_filter: {
+        "model": MODEL, "num_particles": 4, "lookahead": mpfjax.GaussNewtonProposal(MODEL)
+    },
+    mpfjax.mixture_particle_filter: {"model": MODEL, "num_particles": 4, "max_components": 2},
+    mpfjax.gaussian_particle_filter: {"model": MODEL, "num_particles": 4},
+    mpfjax.gaussian_mixture_particle_filter: {
+        "model": MODEL, "num_particles": 4, "max_components": 2
+    },
+    mpfjax.partitioned_sampling: {"model": JOINT, "num_particles": 4},
+    mpfjax.distributed_partitioned_sampling: {"model": JOINT, "num_particles": 4},
+    mpfjax.independent_particle_filters: {"model": JOINT, "num_particles": 4},
+    mpfjax.clustered_particle_filter: {"model": JOINT, "num_particles": 4},
+    mpfjax.run_filter: {"key": KEY, "filter": FILTER, "observations": TWO, "collect": nothing},
+    mpfjax.monte_carlo: {
+        "keys": KEY[None], "filter": FILTER, "observations": TWO, "collect": nothing
+    },
+    mpfjax.run_islands: {
+        "key": KEY, "filter": FILTER, "observations": TWO, "collect": nothing, "num_islands": 2
+    },
+    mpfjax.Study: {
+        "filters": {"pf": lambda num_particles: FILTER}, "num_particles": [4], "keys": KEY[None],
+        "observations": TWO,
+    },
+    mpfjax.forecast: {"key": KEY, "filter": FILTER, "mixture": MIXTURE, "num_steps": 2},
+    smoothing.sample_trajectories: {
+        "key": KEY, "model": MODEL, "mixtures": HISTORY, "num_trajectories": 2
+    },
+    smoothing.smoothed_sums: {
+        "key": KEY, "filter": FILTER, "observations": TWO, "function": difference
+    },
+    smoothing.conditional_filter: {
+        "key": KEY, "filter": FILTER, "observations": TWO,
+        "trajectory": np.ones(3, np.float32),
+    },
+}  # fmt: skip
+RUNNERS = tuple(list(GOOD)[-7:])
+# What an argument is called further down.
+ALSO = {"max_components": "num_components", "order": "orders", "object_model": "model"}
+
+
+def arguments_of(function):
+    """By name, the parameters of a call, without those of insiders."""
+    parameters = inspect.signature(function).parameters.values()
+    return [parameter for parameter in parameters if not parameter.name.startswith("_")]
+
+
+NUMBERS = (
+    (checks.Count, (0, -1, 2.5, 2.0, True, None, "3", 2**31, jnp.array(3)), (1, np.int64(5))),
+    (checks.Positive, (0, -1.0, NAN, INFINITY, True, None, "1", [1.0]), (1, np.float32(2.0))),
+    (checks.NotNegative, (-1e-9, NAN, INFINITY, False, None), (0, 1.5)),
+    (checks.Finite, (NAN, -INFINITY, 1j, None), (-1.5, 0)),
+    (Annotated[float, checks.share(0.5)], (-0.1, 0.6, NAN, None, "0"), (0, np.float64(0.25))),
+    (checks.InnerShare, (0, 1, -0.1, NAN, True, None), (0.5, np.float32(0.1))),
+    (checks.Exponent, (0, 1.1, NAN, None), (0.5, 1)),
+    (bool, (0, 1.0, None, "yes"), (True, np.bool_(False))),
+    (checks.Count | None, (0, "3"), (None, 2)),
+)
+
+
+@pytest.mark.parametrize(("kind", "refused", "accepted"), NUMBERS)
+def test_a_rule_refuses_and_lets_pass(kind, refused, accepted):
+    @checks.checked
+    def call(size: kind):
+        return size
+
+    for value in refused:
+        with pytest.raises(ValueError, match=r"^size: "):
+            call(value)
+    assert [call(value) for value in accepted] == list(accepted)
+
+
+def refusals(function):
+    """(name, value) for each value of `BAD` that the annotation of an argument rules out."""
+    for name, rule in checks._rules(function).items():
+        for value in BAD if not name.startswith("_") else ():
+            try:
+                rule.check(value, name)
+            except ValueError:
+                yield name, value
+
+
+@pytest.mark.parametrize("function", GOOD, ids=lambda function: function.__name__)
+def test_what_an_annotation_rules_out_is_refused_by_name(function):
+    good = GOOD[function]
+    assert function(**good) is not None
+    defaults = {parameter.name: parameter.default for parameter in arguments_of(function)}
+    for name, value in refusals(function):
+        if name in defaults and value is not defaults[name]:
+            with pytest.raises(ValueError, match=rf"^{name}: "):
+                function(**good | {name: value})
+
+
+def test_every_public_call_is_tried():
+    public = {name for name, value in vars(mpfjax).items() if callable(value)}
+    tried = {function.__name__ for function in GOOD}
+    others = {name for name in public - tried if not name.startswith(("_", "Abstract"))}
+    # Records of results, what takes no argument to check, and what other tests are about.
+    assert others == {
+        "FilterRun", "StepInfo", "Series", "Checkpoint", "ParticleMixture", "Pool",
+        "load_checkpoint", "save_checkpoint", "normal", "read_study", "run_study",
+        "NetworkProposal", "keep_programs", "check_model", "map_moves",
+    }  # fmt: skip
+
+
+numbers = st.one_of(st.integers(-3, 6), st.floats(width=32), st.floats())
+values = st.one_of(
+    st.sampled_from(BAD),
+    numbers,
+    st.lists(numbers, max_size=3),
+    st.lists(st.lists(st.floats(-2, 2), min_size=1, max_size=2), max_size=2),
+    st.lists(numbers, max_size=3).map(np.array),
+)
+BUILDERS = [function for function in GOOD if function not in RUNNERS]
+
+
+@st.composite
+def calls(draw, functions):
+    """A function, the arguments of a call, and the names of those that are hostile."""
+    function = draw(st.sampled_from(functions))
+    names = sorted(parameter.name for parameter in arguments_of(function))
+    changed = draw(st.lists(st.sampled_from(names), min_size=1, max_size=2, unique=True))
+    return function, GOOD[function] | {name: draw(values) for name in changed}, changed
+
+
+def works_or_is_named(function, arguments, changed):
+    """Whether the call works; where it does not, the error names one of the changed arguments."""
+    try:
+        function(**arguments)
+        return True
+    except (ValueError, TypeError) as error:
+        message = "\n".join([str(error), *getattr(error, "__notes__", [])])
+    except RuntimeError as error:  # broken densities, which are found as the filter runs
+        message = str(error)
+        changed = [*changed, "observation", "density"]
+    names = {name for argument in changed for name in (argument, ALSO.get(argument, argument))}
+    assert any(re.search(rf"\b{name}\b", message) for name in names), (
+        f"{function.__name__} {changed}: {message}"
+    )
+    return False
+
+
+unhurried = functools.partial(
+    settings,
+    deadline=None,
+    database=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+@unhurried(max_examples=500)
+@given(calls(BUILDERS))
+def test_constructors_work_or_name_the_argument(call):
+    works_or_is_named(*call)
+
+
+@unhurried(max_examples=60)
+@given(calls(RUNNERS))
+def test_runners_work_or_name_the_argument(call):
+    works_or_is_named(*call)
+
+
+@pytest.mark.weekly
+def test_a_hundred_thousand_constructors():
+    found = collections.Counter()
+
+    @unhurried(max_examples=100_000)
+    @given(calls(BUILDERS))
+    def check(call):
+        found[works_or_is_named(*call)] += 1
+
+    check()
+    print(dict(found))
+
+
+def wrong(**methods):
+    """A model of a scalar with some of its methods replaced."""
+    good = {
+        "sample_initial": lambda self, key, n: jnp.zeros(n),
+        "sample_transition": lambda self, key, states: states,
+        "log_likelihood": lambda self, observation, states: -states,
+    }
+    return type("Wrong", (mpfjax.AbstractStateSpaceModel,), good | methods)()
+
+
+def run(filter, observations=TWO, **options):
+    return mpfjax.run_filter(KEY, filter, observations, **options)
+
+
+def run_of(model, **options):
+    return run(mpfjax.particle_filter(model, 10, **options))
+
+
+def after(change):
+    """A run of a filter with a move of the user's that does this to the mixture."""
+    return run(Filter(MODEL, [Propagate(MODEL), lambda key, m, y: change(m)], 4))
+
+
+# By room: words of the message, and the call.
+REFUSED = (
+    # filters and moves
+    ("num_particles: 3 is less than num_components, 4",
+     lambda: mpfjax.mixture_particle_filter(MODEL, 3, 4)),
+    ("particles_per_component: 20 for each of 10",
+     lambda: mpfjax.with_resampling(
+         mpfjax.mixture_particle_filter(MODEL, 199, 10), Resample(particles_per_component=20))),
+    ("moves: ", lambda: Filter(MODEL, [], 10)),
+    *(
+        (r"moves: \w+.* never weigh the particles", lambda moves=moves: Filter(MODEL, moves, 10))
+        for moves in ([Resample()], [Resample(), Predict(MODEL), KMeans(), mpfjax.Prune()])
+    ),
+    ("max_deviations, max_distance: ", lambda: Merge(None)),
+    ("scale: 2 units for 1 features",
+     lambda: mpfjax.mixture_particle_filter(MODEL, 20, 2, scale=[1.0, 2.0]).init(KEY)),
+    ("share_by: groups have no effect",
+     lambda: Resample(particles_per_component=2, share_by=nothing)),
+    ("(?s)moves: .* returned None, no ParticleMixture", lambda: after(lambda m: None)),
+    ("(?s)moves: .* in PyTreeDef.*x.*, and was given",
+     lambda: after(lambda m: m.replace(particles={"x": m.particles}))),
+    ("(?s)moves: .* log_weights of float16",
+     lambda: after(lambda m: m.replace(log_weights=m.log_weights.astype(jnp.float16)))),
+    # observations
+    ("observations: the leading axis t is empty", lambda: run(FILTER, jnp.zeros((0,)))),
+    (r"observations: shapes .* jnp.asarray\(observations\)", lambda: run(FILTER, [0.0, 1.0])),
+    ("observations: shapes", lambda: run(FILTER, {"a": jnp.zeros(3), "b": jnp.zeros(4)})),
+    ("observations: there are none", lambda: run(FILTER, {})),
+    ("observations: NaN or infinite at index 1", lambda: run(FILTER, np.array([0.0, NAN, 1.0]))),
+    ("observations: complex128 is complex", lambda: run(FILTER, np.array([0.0, 1j]))),
+    (r"observations: 1e\+300 is more than float32", lambda: run(FILTER, np.array([0.0, 1e300]))),
+    ("missing: 'ignore'", lambda: run(FILTER, missing="ignore")),
+    (r"observation: shape \(2,\)", lambda: run(FILTER, jnp.zeros((3, 2)))),
+    ("observation: complex64 is complex", lambda: FILTER.step(KEY, MIXTURE, jnp.array(1j))),
+    # models
+    ("model: .* is a class; write QuadraticModel",
+     lambda: mpfjax.particle_filter(mpfjax.QuadraticModel, 10)),
+    ("model: DriftOfOne.sample_initial.*per_particle",
+     lambda: mpfjax.particle_filter(DriftOfOne(), 10)),
+    *(
+        ("model: Wrong.sample_initial returned",
+         lambda s=states: run_of(wrong(sample_initial=lambda self, key, n: s)))
+        for states in (None, {}, 0.0, jnp.zeros((3, 10)))
+    ),
+    *(
+        ("model: Wrong.sample_transition returned",
+         lambda f=moved: run_of(wrong(sample_transition=lambda self, key, states: f(states))))
+        for moved in (jnp.int32, lambda states: states[:, None], lambda states: {"x": states})
+    ),
+    *(
+        ("model: Wrong.log_likelihood returned",
+         lambda v=values: run_of(wrong(log_likelihood=lambda self, y, states: v)))
+        for values in (None, 0.0, jnp.zeros((10, 1)), jnp.zeros(10, jnp.complex64))
+    ),
+    (r"model: Wrong.log_transition returned shape \(3,\)",
+     lambda: run_of(
+         wrong(log_transition=lambda self, states, previous: jnp.zeros(3)), gradient="stop")),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("words", "call"), REFUSED, ids=lambda part: str(part)[:40])
+def test_what_is_refused_for_another_reason(words, call):
+    with pytest.raises(ValueError, match=words):
+        call()
+
+
+def test_an_error_within_the_likelihood_says_what_it_was_given():
+    with pytest.raises(TypeError) as caught:
+        FILTER.step(KEY, MIXTURE, {"y": 1.0})
+    assert any("log_likelihood" in note and "'y'" in note for note in caught.value.__notes__)
+
+
+def test_arrays_become_those_of_jax():
+    assert checks.to_array("size")([1, 2]).dtype == jnp.float32
+    assert checks.to_array("size", floating=False)([1, 2]).dtype == jnp.int32
+    for value in (None, "a", {}, 1j, KEY, np.ma.masked_array([1.0], [True])):
+        with pytest.raises(ValueError, match=r"^size: "):
+            checks.to_array("size")(value)
+
+
+def test_traced_values_pass():
+    @checks.checked
+    def call(size: Annotated[jax.Array, checks.POSITIVE]):
+        return size
+
+    eqx.filter_jit(call)(jnp.array(-1.0))
+    with pytest.raises(ValueError, match=r"^size: "):
+        call(jnp.array(-1.0))
