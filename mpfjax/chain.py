@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import check_type, check_whole, shown
+from mpfjax.checks import shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, saying_that_none_were_given, with_inputs
 from mpfjax.moves.base import AbstractMove, Moves, name_of, with_inner, without_dead
@@ -74,7 +74,6 @@ def step_info(
 
 def check_chain(moves: Moves, num_particles: int, num_components: int) -> None:
     """Raise a `ValueError` for moves that make no filter of this size."""
-    check_whole(num_particles=num_particles, num_components=num_components)
     if num_particles < num_components:
         raise ValueError(
             f"num_particles: {num_particles} is less than num_components, {num_components};"
@@ -167,9 +166,8 @@ def moved_by(
     return jax.tree.map(keep, moved, before), resampled & ~waits
 
 
-def check_mixture(mixture: Any, num_components: int) -> None:
-    """Raise a `ValueError` for anything but a mixture that a filter of this M can go on from."""
-    check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
+def check_mixture(mixture: ParticleMixture, num_components: int) -> None:
+    """Raise a `ValueError` for a mixture that a filter of this M cannot go on from."""
     if mixture.num_components != num_components:
         raise ValueError(
             f"mixture: its num_components, {mixture.num_components}, is not the filter's,"

@@ -22,10 +22,10 @@ from mpfjax.chain import (
     tie,
     untie,
 )
-from mpfjax.checks import check_key, check_one_of
+from mpfjax.checks import Count, checked
 from mpfjax.mixture import ParticleMixture, single_component
-from mpfjax.models.base import AbstractStateSpaceModel, require_model, saying_that_none_were_given
-from mpfjax.models.noise import NOISES
+from mpfjax.models.base import AbstractStateSpaceModel, saying_that_none_were_given
+from mpfjax.models.noise import Noise
 from mpfjax.moves.base import AbstractMove, as_moves, initial_memory
 from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import one_input, one_observation, raise_faults
@@ -60,17 +60,16 @@ class Filter(eqx.Module):
     num_components: int = eqx.field(static=True)
     initial_noise: str = eqx.field(static=True)
 
+    @checked
     def __init__(
         self,
         model: AbstractStateSpaceModel,
         moves: Iterable[Callable[..., ParticleMixture]],
-        num_particles: int,
-        num_components: int = 1,
+        num_particles: Count,
+        num_components: Count = 1,
         initial_moves: Iterable[AbstractMove] = (),
-        initial_noise: str = "independent",
+        initial_noise: Noise = "independent",
     ) -> None:
-        require_model(model, "Filter")
-        check_one_of(NOISES, initial_noise=initial_noise)
         moves = as_moves(moves, "moves")
         check_chain(moves, num_particles, num_components)
         self.model = model
@@ -103,6 +102,7 @@ class Filter(eqx.Module):
         own["initial_moves"] = untie(self._initial_moves, model)
         return Filter(**own | changes)
 
+    @checked
     def init(
         self, key: Key[Array, ""], observation: PyTree = None, *, inputs: PyTree = None
     ) -> ParticleMixture:
@@ -111,7 +111,6 @@ class Filter(eqx.Module):
         Give it y_1, and u_1 if there are inputs, where an initial move looks at them, such as
         `SelectInitial`; without y_1 that move does nothing. y_1 is then given to `step` as well.
         """
-        check_key(key)
         if observation is not None:
             observation = one_observation(observation)
         inputs = one_input(inputs, self.model)
@@ -180,10 +179,10 @@ class Filter(eqx.Module):
         """
         return self._run(key, mixture, None, inputs)
 
+    @checked
     def _run(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree, inputs: PyTree
     ) -> tuple[ParticleMixture, StepInfo]:
-        check_key(key)
         check_mixture(mixture, self.num_components)
         inputs = one_input(inputs, self.model)
         *moved, faults = _one_step(self, key, mixture, observation, inputs)

@@ -39,6 +39,8 @@ Importance = Literal["propagated", "predictive_gaussian"]
 _WARM_ITERATIONS, _ITERATIONS = 2, 5
 _INITIAL_DRAWS = 4
 
+Importance = Literal["propagated", "predictive_gaussian"]
+
 
 @checked
 def particle_filter(

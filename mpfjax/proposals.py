@@ -3,7 +3,7 @@
 import abc
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -11,20 +11,13 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import (
-    check_callable,
-    check_key,
-    check_positive,
-    check_positive_array,
-    check_whole,
-    to_array,
-)
+from mpfjax.checks import POSITIVE, Checked, Count, Positive, checked, to_array
 from mpfjax.models.base import has_attribute, model_name, require
 from mpfjax.operations.matrices import cholesky, solve_lower
 from mpfjax.operations.random import normal
 
 
-class AbstractProposal(eqx.Module):
+class AbstractProposal(Checked):
     """A way to draw x_t given x_{t-1} and y_t, with the density of each draw."""
 
     @abc.abstractmethod
@@ -82,27 +75,21 @@ class NetworkProposal(_GaussianProposal):
     """
 
     network: Callable[[Float[Array, " k"]], Float[Array, " two_d"]]
-    scale: Float[Array, "*d"] = eqx.field(converter=to_array("scale"))
-
-    def __check_init__(self) -> None:
-        check_callable("a network, from one vector to one", network=self.network)
-        check_positive_array(scale=self.scale)
+    scale: Annotated[Float[Array, "*d"], POSITIVE] = eqx.field(converter=to_array("scale"))
 
     @classmethod
+    @checked
     def create(
         cls,
         key: Key[Array, ""],
-        state_size: int,
-        observation_size: int,
+        state_size: Count,
+        observation_size: Count,
         scale: float | Float[Array, " d"],
         *,
-        width: int = 16,
-        depth: int = 2,
+        width: Count = 16,
+        depth: Count = 2,
     ) -> "NetworkProposal":
         """An untrained one: a small network, whose draws are about N(x_{t-1}, scale²)."""
-        check_key(key)
-        check_whole(state_size=state_size, observation_size=observation_size)
-        check_whole(width=width, depth=depth)
         sizes = (state_size + observation_size, 2 * state_size)
         network = eqx.nn.MLP(*sizes, width, depth, jax.nn.tanh, key=key)
         last = lambda net: (net.layers[-1].weight, net.layers[-1].bias)  # noqa: E731
@@ -160,8 +147,8 @@ class GaussNewtonProposal(_GaussianProposal):
     """
 
     model: Any
-    num_iterations: int = eqx.field(static=True, default=4)
-    inflation: float = eqx.field(static=True, default=1.1)
+    num_iterations: Count = eqx.field(static=True, default=4)
+    inflation: Positive = eqx.field(static=True, default=1.1)
 
     def __check_init__(self) -> None:
         for method in ("transition_mean", "observation_mean"):
@@ -172,8 +159,6 @@ class GaussNewtonProposal(_GaussianProposal):
                     f"model: {model_name(self.model)} has no {matrix},"
                     " which GaussNewtonProposal needs"
                 )
-        check_whole(num_iterations=self.num_iterations)
-        check_positive(inflation=self.inflation)
 
     def propose_from_noise(
         self,

@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 
-from mpfjax.checks import check_type, check_whole
+from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead, PilotLookahead
 from mpfjax.moves.base import AbstractMove
@@ -19,6 +19,7 @@ from mpfjax.moves.resampling.resample import Resample
 from mpfjax.proposals import AbstractProposal
 
 
+@checked
 def map_moves(change: Callable[[Any], Any], filter: Filter) -> Filter:
     """The filter with `change(move)` in the place of each move.
 
@@ -26,7 +27,6 @@ def map_moves(change: Callable[[Any], Any], filter: Filter) -> Filter:
 
         map_moves(lambda m: Resample("ssp") if isinstance(m, Resample) else m, filter)
     """
-    check_type(Filter, "a Filter", filter=filter)
     changed = lambda move: change(move.map_inner(changed))  # noqa: E731
     return filter.replace(
         moves=[changed(move) for move in filter.moves],
@@ -34,16 +34,17 @@ def map_moves(change: Callable[[Any], Any], filter: Filter) -> Filter:
     )
 
 
+@checked
 def with_resampling(filter: Filter, resample: Resample) -> Filter:
     """The filter with this `Resample` in the place of the chain's own, looking ahead as they did.
 
     Raises `ValueError` for anything but a `Resample`. Use it for other slots of components:
     `with_resampling(filter, Resample(allocation="equal"))`.
     """
-    check_type(Resample, "a Resample", resample=resample)
     return map_moves(lambda move: resample if isinstance(move, Resample) else move, filter)
 
 
+@checked
 def with_point_sets(filter: Filter) -> Filter:
     """The filter whose draws are randomised quasi-Monte Carlo: sequential quasi-Monte Carlo.
 
@@ -61,6 +62,7 @@ def with_point_sets(filter: Filter) -> Filter:
     return _everywhere(map_moves(in_order, filter), "noise", "rqmc").replace(initial_noise="rqmc")
 
 
+@checked
 def with_score_gradient(filter: Filter) -> Filter:
     """The filter whose derivatives estimate the score, for tuning: gradient "stop" everywhere.
 
@@ -70,14 +72,14 @@ def with_score_gradient(filter: Filter) -> Filter:
     return _everywhere(filter, "gradient", "stop")
 
 
-def with_proposals_per_particle(filter: Filter, num_draws: int) -> Filter:
+@checked
+def with_proposals_per_particle(filter: Filter, num_draws: Count) -> Filter:
     """The filter in which each particle draws K of x_t and keeps one: `PropagateNested`.
 
     `num_draws` is K; with one, each particle draws once again. Raises `ValueError` for K < 1, and
     for a filter without `Propagate`. Use it where the likelihood is narrow and cheap, with four to
     sixteen draws.
     """
-    check_whole(num_draws=num_draws)
     _propagation_of(filter, "each particle draws")
 
     def nested(move: Any) -> Any:
@@ -89,6 +91,7 @@ def with_proposals_per_particle(filter: Filter, num_draws: int) -> Filter:
     return map_moves(nested, filter)
 
 
+@checked
 def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter:
     """The filter that resamples by its weights times a look-ahead ν to y_t: `AuxiliaryResample`.
 
@@ -112,7 +115,8 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
     return map_moves(ahead, plain)
 
 
-def with_selected_start(filter: Filter, num_draws: int) -> Filter:
+@checked
+def with_selected_start(filter: Filter, num_draws: Count) -> Filter:
     """The filter whose x_0 is chosen by y_1 among K N draws: a `SelectInitial` moves it first.
 
     `num_draws` is K; with one, x_0 is a plain draw again. The look at y_1 is that of the filter's
@@ -120,8 +124,6 @@ def with_selected_start(filter: Filter, num_draws: int) -> Filter:
     `PropagateNested`. Use it where the prior is wide beside the likelihood;
     `mixture_particle_filter` does so with four draws.
     """
-    check_type(Filter, "a Filter", filter=filter)
-    check_whole(num_draws=num_draws)
     others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
     if num_draws == 1:
         return filter.replace(initial_moves=others)
@@ -132,7 +134,6 @@ def with_selected_start(filter: Filter, num_draws: int) -> Filter:
 
 def _propagation_of(filter: Filter, what: str) -> Any:
     """The move that draws x_t one particle at a time; a `ValueError` where there is none."""
-    check_type(Filter, "a Filter", filter=filter)
     found = [move for move in filter.moves if move.draws_each]
     if not found:
         raise ValueError(
@@ -144,7 +145,6 @@ def _propagation_of(filter: Filter, what: str) -> Any:
 
 def _everywhere(filter: Filter, field: str, value: str) -> Filter:
     """The filter with another value of a field in all moves that have it, also within others."""
-    check_type(Filter, "a Filter", filter=filter)
 
     def has_it(node: Any) -> bool:
         return isinstance(node, AbstractMove) and field in node.__dataclass_fields__

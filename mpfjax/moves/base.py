@@ -55,6 +55,8 @@ class AbstractMove(Checked):
     one run are known."""
     resampling = None
     """the `Resample` by which it redraws the particles, whose weights a look-ahead may change."""
+    keeps_trajectories = False
+    """whether conditional SMC, which keeps one trajectory, may run it as it is."""
     inner = ()
     """the moves that it runs from time to time."""
     particles_per_component = None
@@ -76,6 +78,8 @@ class AbstractMove(Checked):
     def around(self, reference: Any) -> "AbstractMove":
         """The move in conditional SMC, which keeps one trajectory, a `Reference`; most cannot."""
         del reference
+        if self.keeps_trajectories:
+            return self
         raise ValueError(
             f"filter: {type(self).__name__} cannot keep a trajectory, as conditional SMC does;"
             " regrouping, Resample, AuxiliaryResample, Propagate, Predict and Reweight can"
@@ -174,6 +178,9 @@ def without_dead(
     return memory
 
 
+Regrouped = tuple[Int[Array, " n"], dict[str, PyTree]]
+
+
 class AbstractRegrouping(AbstractMove):
     """A move that rewrites the component indicators and nothing else, so that it is exact.
 
@@ -184,11 +191,10 @@ class AbstractRegrouping(AbstractMove):
     weighs = False
     keeps_mass = True
     regroups = True
+    keeps_trajectories = True
 
     @abc.abstractmethod
-    def regroup(
-        self, key: Key[Array, ""], mixture: ParticleMixture
-    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+    def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The new component indicators, and the new memory of the mixture."""
 
     def __call__(
@@ -200,11 +206,6 @@ class AbstractRegrouping(AbstractMove):
         # Indicators are whole numbers and have no derivative.
         indicators, memory = self.regroup(key, without_gradient(mixture))
         return mixture.replace(component_indicators=indicators, memory=memory)
-
-    def around(self, reference: Any) -> "AbstractRegrouping":
-        """The move itself, for which the trajectory that is kept is like any other."""
-        del reference
-        return self
 
 
 class AbstractResampling(AbstractMove):

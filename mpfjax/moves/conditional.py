@@ -1,20 +1,21 @@
-"""Moves around a reference trajectory, which conditional SMC uses in place of a filter's moves.
+"""The propagation around a reference trajectory, as conditional SMC propagates.
 
 A conditional filter keeps one trajectory x*_0, ..., x*_t. At every time it occupies one slot, the
-reference slot; the other slots are those of an ordinary filter. Two moves differ: the propagation
-puts x*_t into the slot, and the resampling gives the slot at least one offspring.
-`mpfjax.smoothing.conditional_filter` explains why this is exact.
+reference slot, which the mixture's memory holds; the other slots are those of an ordinary filter.
+Two moves differ: the propagation puts x*_t into the slot, and `Resample`, where it finds the slot
+in the memory, gives it at least one offspring. `mpfjax.smoothing.conditional_filter` explains why
+this is exact.
 """
 
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, Key, PyTree
+from jaxtyping import Array, Int, Key, PyTree
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
-from mpfjax.moves.base import AbstractPropagation, AbstractResampling
+from mpfjax.moves.base import AbstractPropagation
 from mpfjax.operations.stored import take
 
 REFERENCE = "reference"  # the name of its slot and time in a mixture's memory
@@ -80,47 +81,6 @@ class ConditionalPropagation(AbstractPropagation):
         particles = jax.tree.map(lambda leaf, own: put(leaf, own, slot), mixture.particles, now)
         memory = mixture.memory | {REFERENCE: {"slot": slot, "time": time + 1}}
         return mixture.replace(particles=particles, memory=memory)
-
-
-class ConditionalResample(AbstractResampling):
-    """Resample within components, given that the reference has an offspring.
-
-    The ancestor indices have the law of those of `Resample`, given that one slot of the reference's
-    component, each with equal probability, has the reference for its parent. `draw_ancestors` says
-    how. Other components are resampled as usual. `move` is the filter's own `Resample`.
-    """
-
-    move: Any
-
-    def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
-        """Which components of `mixture` the move would resample."""
-        return self.move.is_due(mixture)
-
-    def would_resample(
-        self, mixture: ParticleMixture, observation: PyTree = None
-    ) -> Bool[Array, " m"]:
-        """Those that are due."""
-        return self.move.would_resample(mixture, observation)
-
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
-    ) -> ParticleMixture:
-        """Resample every component that is due around the reference."""
-        return self.redraw(key, mixture, self.is_due(mixture))[0]
-
-    def redraw(
-        self, key: Key[Array, ""], mixture: ParticleMixture, due: Bool[Array, " m"]
-    ) -> tuple[ParticleMixture, Any]:
-        """`Resample.redraw` around the reference."""
-        reference = mixture.memory[REFERENCE]
-        resampled, ancestors = self.move.redraw(key, mixture, due, keep=reference["slot"])
-        memory = resampled.memory | {REFERENCE: reference | {"slot": ancestors.kept}}
-        return resampled.replace(memory=memory), ancestors
-
-    @property
-    def particles_per_component(self) -> int | None:
-        """That of the move."""
-        return self.move.particles_per_component
 
 
 def at(values: Array, place: Int[Array, ""]) -> Array:

@@ -1,6 +1,6 @@
 """Every: other moves, at every k-th step only."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -8,12 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
-from mpfjax.checks import check_whole
+from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, as_moves, initial_memory, name_of, without_dead
 from mpfjax.operations.random import split
 
-_MOST_STEPS = 2**31 - 1  # that int32 counts
+
+def _of_moves(together: Callable[..., bool], name: str) -> Any:
+    return property(lambda self: together(getattr(move, name) for move in self.moves))
 
 
 class Every(AbstractMove):
@@ -32,13 +34,10 @@ class Every(AbstractMove):
     every step the state would not move. Use it where regrouping is a large part of the time.
     """
 
-    num_steps: int = eqx.field(static=True)
-    moves: tuple[Any, ...]
+    num_steps: Count = eqx.field(static=True)
+    moves: tuple[Any, ...] = eqx.field(converter=lambda moves: as_moves(moves, "moves"))
 
-    def __init__(self, num_steps: int, moves: Iterable[AbstractMove]) -> None:
-        check_whole(num_steps=num_steps)
-        self.num_steps = min(int(num_steps), _MOST_STEPS)
-        self.moves = as_moves(moves, "moves")
+    def __check_init__(self) -> None:
         if not self.moves:
             raise ValueError("moves: there must be at least one to run at every k-th step")
         for move in self.moves:
@@ -48,13 +47,13 @@ class Every(AbstractMove):
                     " kernel; what propagates belongs into the chain, at every step"
                 )
 
-    @property
-    def approximate(self) -> bool:
-        """Whether any of the moves departs from the exact recursion."""
-        return any(move.approximate for move in self.moves)
-
     weighs = False
     keeps_mass = True
+    # What is so of any of the moves, and what is so of all.
+    approximate = _of_moves(any, "approximate")
+    needs_parents = _of_moves(any, "needs_parents")
+    keeps_parents = _of_moves(all, "keeps_parents")
+    keeps_families = _of_moves(all, "keeps_families")
 
     @property
     def inner(self) -> tuple[AbstractMove, ...]:
@@ -65,24 +64,9 @@ class Every(AbstractMove):
         """The same with other moves."""
         return Every(self.num_steps, [change(move) for move in self.moves])
 
-    @property
-    def keeps_families(self) -> bool:
-        """Whether all of the moves do."""
-        return all(move.keeps_families for move in self.moves)
-
     def around(self, reference: Any) -> "Every":
         """The moves around the trajectory, at the same steps."""
         return self.map_inner(lambda move: move.around(reference))
-
-    @property
-    def needs_parents(self) -> bool:
-        """Whether any of the moves does."""
-        return any(move.needs_parents for move in self.moves)
-
-    @property
-    def keeps_parents(self) -> bool:
-        """Whether all of the moves do."""
-        return all(move.keeps_parents for move in self.moves)
 
     @property
     def name(self) -> str:

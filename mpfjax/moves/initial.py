@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_numbered, check_one_of, check_whole, shown
+from mpfjax.checks import Count, check_numbered, shown
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -17,7 +17,7 @@ from mpfjax.models.base import (
     starts_from_noise,
 )
 from mpfjax.models.conditionally_linear import with_moments
-from mpfjax.models.noise import NOISES, draw_noise
+from mpfjax.models.noise import Noise, draw_noise
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.resampling.ancestors import draw_ancestors
 from mpfjax.moves.resampling.line import HILBERT, in_line
@@ -72,16 +72,14 @@ class SelectInitial(AbstractMove):
     """
 
     propagation: Any
-    num_draws: int = eqx.field(static=True, default=4)
-    noise: str = eqx.field(static=True, default="independent")
+    num_draws: Count = eqx.field(static=True, default=4)
+    noise: Noise = eqx.field(static=True, default="independent")
 
     def __check_init__(self) -> None:
         if not getattr(self.propagation, "draws_each", False):
             raise ValueError(
                 f"propagation: {shown(self.propagation)} does not draw x_1 of each x_0"
             )
-        check_whole(num_draws=self.num_draws)
-        check_one_of(NOISES, noise=self.noise)
 
     def map_inner(self, change: Callable[[Any], Any]) -> "SelectInitial":
         """The same with another propagation."""

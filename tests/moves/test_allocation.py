@@ -23,7 +23,7 @@ MOVE = Resample()
 
 @eqx.filter_jit
 def _resampled(move, mixture):
-    due = move.is_due(mixture)
+    due = move.would_resample(mixture)
     line = in_line(mixture, ~due[mixture.component_indicators])
     targets = move.deal(mixture, line, due)
     return targets, move(jax.random.key(0), mixture)

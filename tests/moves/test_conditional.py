@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mpfjax import ParticleMixture, Resample
-from mpfjax.moves.conditional import REFERENCE, ConditionalResample
+from mpfjax.moves.conditional import REFERENCE
 from tests.marking import quick_of
 
 NUM_RUNS = 20_000
@@ -78,8 +78,8 @@ def drawn(request):
         key_reference, key_plain, key_around = jax.random.split(key, 3)
         slot = jax.random.categorical(key_reference, jnp.log(jnp.asarray(WEIGHTS, jnp.float32)))
         mixture = mixture_around(slot.astype(jnp.int32), m)
-        around = ConditionalResample(MOVES[name])(key_around, mixture)
-        return slot, MOVES[name](key_plain, mixture), around
+        around = MOVES[name](key_around, mixture)
+        return slot, MOVES[name](key_plain, mixture.replace(memory={})), around
 
     found = one(jax.random.split(jax.random.key(5), NUM_RUNS))
     return Drawn(CASES[request.param], *jax.tree.map(np.asarray, found))

@@ -180,7 +180,9 @@ class TestResampling:
 def move_due(name, mixture):
     """Which components the move redraws."""
     move = WITHIN_COMPONENTS[name]
-    return np.asarray(move.is_due(mixture) if isinstance(move, Resample) else mixture.active)
+    return np.asarray(
+        move.would_resample(mixture) if isinstance(move, Resample) else mixture.active
+    )
 
 
 def all_due(name, mixture):

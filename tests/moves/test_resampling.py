@@ -244,7 +244,7 @@ class TestAllocation:
         log_weights = np.concatenate([np.arange(10) / 10, [5.0] + [0.0] * 9])
         mixture = make_mixture(np.arange(20.0), log_weights, np.repeat([0, 1], 10), 2)
         move = Resample(ess_threshold=0.5)
-        np.testing.assert_array_equal(move.is_due(mixture), [False, True])
+        np.testing.assert_array_equal(move.would_resample(mixture), [False, True])
         moved = draw(move, mixture)
         np.testing.assert_array_equal(moved.ancestor_indices[:10], np.arange(10))
         np.testing.assert_array_equal(moved.log_weights[:10], mixture.log_weights[:10])
@@ -257,10 +257,10 @@ class TestAllocation:
         for threshold in (0.1, 0.2, 0.3, 0.9):
             expected = (np.asarray(sizes) < threshold * np.asarray(counts)) & (counts > 0)
             np.testing.assert_array_equal(
-                Resample(ess_threshold=threshold).is_due(mixture), expected
+                Resample(ess_threshold=threshold).would_resample(mixture), expected
             )
-        assert not Resample(ess_threshold=0.0).is_due(mixture).any()
-        np.testing.assert_array_equal(Resample().is_due(mixture), [True, True, True, False])
+        assert not Resample(ess_threshold=0.0).would_resample(mixture).any()
+        np.testing.assert_array_equal(Resample().would_resample(mixture), [True, True, True, False])
 
 
 class TestSorted:
@@ -294,7 +294,7 @@ def test_one_component_that_is_not_due_keeps_its_particles_among_empty_slots(
     empty = np.arange(40) % 4 == 1
     mixture = make_mixture(np.arange(40.0), np.where(empty, -np.inf, 0.0), np.zeros(40), 1)
     move = Resample("systematic", 0.5, particles_per_component)
-    assert not np.asarray(move.is_due(mixture)).any()
+    assert not np.asarray(move.would_resample(mixture)).any()
     moved = draw(move, mixture)
     np.testing.assert_array_equal(moved.log_weights, mixture.log_weights)
     np.testing.assert_array_equal(moved.particles, mixture.particles)

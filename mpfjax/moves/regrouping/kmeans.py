@@ -3,11 +3,11 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractRegrouping
+from mpfjax.moves.base import AbstractRegrouping, Regrouped
 from mpfjax.moves.regrouping.features import ByFeatures
 from mpfjax.operations.islands import most_of_runs
 from mpfjax.operations.matrices import row_sums
@@ -37,9 +37,7 @@ class KMeans(AbstractRegrouping, ByFeatures):
     num_iterations: Count = eqx.field(static=True, default=5)
     reseed: bool = eqx.field(static=True, default=False, kw_only=True)
 
-    def regroup(
-        self, key: Key[Array, ""], mixture: ParticleMixture
-    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+    def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """Each particle to the component whose centroid is nearest."""
         del key
         features, occupied, m = self.features_of(mixture), mixture.occupied, mixture.num_components

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
-from mpfjax.checks import check_inner_share, check_positive, check_whole, given
+from mpfjax.checks import Count, InnerShare, Positive
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractMove, AbstractRegrouping
+from mpfjax.moves.base import AbstractMove, AbstractRegrouping, Regrouped
 from mpfjax.moves.regrouping.features import ByFeatures, relative_weights, separation, summarise
 from mpfjax.operations.segments import spread, spread_stored
 from mpfjax.operations.stored import take
@@ -32,16 +32,13 @@ class Merge(AbstractRegrouping, ByFeatures):
     a patience below 1. Exact: a relabelling only.
     """
 
-    max_deviations: float | None = eqx.field(static=True, default=1.0)
-    max_distance: float | None = eqx.field(static=True, default=None)
-    patience: int = eqx.field(static=True, default=1, kw_only=True)
+    max_deviations: Positive | None = eqx.field(static=True, default=1.0)
+    max_distance: Positive | None = eqx.field(static=True, default=None)
+    patience: Count = eqx.field(static=True, default=1, kw_only=True)
 
     def __check_init__(self) -> None:
-        conditions = given(max_deviations=self.max_deviations, max_distance=self.max_distance)
-        if not conditions:
+        if self.max_deviations is None and self.max_distance is None:
             raise ValueError("max_deviations, max_distance: at least one must be given")
-        check_positive(**conditions)
-        check_whole(patience=self.patience)
 
     def initial_memory(self, num_components: int) -> dict[str, PyTree]:
         """How many times in a row each pair of components has overlapped, where patience counts."""
@@ -49,9 +46,7 @@ class Merge(AbstractRegrouping, ByFeatures):
             return {}
         return {"overlap_durations": jnp.zeros((num_components, num_components), jnp.int32)}
 
-    def regroup(
-        self, key: Key[Array, ""], mixture: ParticleMixture
-    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+    def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The lowest label of the chain of overlapping components that each particle is in."""
         del key
         overlap = self._overlap(mixture)
@@ -118,10 +113,7 @@ class Prune(AbstractMove):
     where hypotheses that turned out wrong hold particles that others need.
     """
 
-    least_share: float = eqx.field(static=True, default=1e-6)
-
-    def __check_init__(self) -> None:
-        check_inner_share(least_share=self.least_share)
+    least_share: InnerShare = eqx.field(static=True, default=1e-6)
 
     approximate = True
     """the mass of the pruned components is lost."""

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, Key, PyTree
 
-from mpfjax.checks import check_callable, check_whole, given, saying, shown
+from mpfjax.checks import Count, saying, shown
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractRegrouping
+from mpfjax.moves.base import AbstractRegrouping, Regrouped
 from mpfjax.operations.prefix_sums import count_upto
 from mpfjax.operations.random import bits
 from mpfjax.operations.stored import take
@@ -23,9 +23,7 @@ class Pool(AbstractRegrouping):
     before a `Resample` in which the components should compete. Exact: a relabelling only.
     """
 
-    def regroup(
-        self, key: Key[Array, ""], mixture: ParticleMixture
-    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+    def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """Component 0 for every particle."""
         del key
         return jnp.zeros_like(mixture.component_indicators), mixture.memory
@@ -44,14 +42,9 @@ class RandomPartition(AbstractRegrouping):
     should stand for the same distribution, as when `Partitioned` gives each an order of its own.
     """
 
-    num_sets: int | None = eqx.field(static=True, default=None)
+    num_sets: Count | None = eqx.field(static=True, default=None)
 
-    def __check_init__(self) -> None:
-        check_whole(**given(num_sets=self.num_sets))
-
-    def regroup(
-        self, key: Key[Array, ""], mixture: ParticleMixture
-    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+    def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """A random set for every particle."""
         n = mixture.num_particles
         num_sets = mixture.num_components if self.num_sets is None else self.num_sets
@@ -92,9 +85,6 @@ class GroupBy(AbstractRegrouping):
 
     function: Callable[[PyTree], Int[Array, " n"]] = eqx.field(static=True)
 
-    def __check_init__(self) -> None:
-        check_callable("a function of the particles", function=self.function)
-
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
     ) -> ParticleMixture:
@@ -103,9 +93,7 @@ class GroupBy(AbstractRegrouping):
         indicators, _ = self.regroup(key, mixture)
         return mixture.replace(component_indicators=indicators)
 
-    def regroup(
-        self, key: Key[Array, ""], mixture: ParticleMixture
-    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+    def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The label of every particle; that of an empty slot is moved into [0, M)."""
         del key
         with saying("in function, of GroupBy, which is called with the particles"):

@@ -5,11 +5,11 @@ from typing import Annotated, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from mpfjax.checks import Count, NotNegative, share
 from mpfjax.mixture import ParticleMixture
-from mpfjax.moves.base import AbstractRegrouping
+from mpfjax.moves.base import AbstractRegrouping, Regrouped
 from mpfjax.moves.regrouping.features import (
     ByFeatures,
     relative_weights,
@@ -52,9 +52,7 @@ class Split(AbstractRegrouping, ByFeatures):
     num_iterations: Count = eqx.field(static=True, default=3, kw_only=True)
     sample_size: Count | None = eqx.field(static=True, default=32, kw_only=True)
 
-    def regroup(
-        self, key: Key[Array, ""], mixture: ParticleMixture
-    ) -> tuple[Int[Array, " n"], dict[str, PyTree]]:
+    def regroup(self, key: Key[Array, ""], mixture: ParticleMixture) -> Regrouped:
         """The lighter half of every component that is too diffuse, to a free label."""
         del key
         # Computed outside the condition, where XLA shares them with neighbouring moves.
@@ -62,9 +60,9 @@ class Split(AbstractRegrouping, ByFeatures):
         parent = mixture.component_indicators
 
         def split() -> Int[Array, " n"]:
-            halves = self._halves(mixture, features)
-            labels = free_labels(halves.splits, halves.deviations, active)
-            moves = (halves.side == spread_stored(halves.lighter, parent)) & mixture.occupied
+            side, lighter, deviations, splits = self._halves(mixture, features)
+            labels = free_labels(splits, deviations, active)
+            moves = (side == spread_stored(lighter, parent)) & mixture.occupied
             return jnp.where(moves, spread_stored(labels, parent), parent)
 
         return cond_if_any(jnp.any(~active), split, lambda: parent), mixture.memory
@@ -75,10 +73,14 @@ class Split(AbstractRegrouping, ByFeatures):
         Where `StepInfo.labels_ran_out`, these are the ones in which several modes share a label.
         """
         mixture = without_gradient(mixture)
-        return self._halves(mixture, self.features_of(mixture)).splits
+        return self._halves(mixture, self.features_of(mixture))[-1]
 
-    def _halves(self, mixture: ParticleMixture, features: Float[Array, "n k"]) -> "_Halves":
-        """Each component cut in two."""
+    def _halves(
+        self, mixture: ParticleMixture, features: Float[Array, "n k"]
+    ) -> tuple[Int[Array, " n"], Int[Array, " m"], Float[Array, " m"], Bool[Array, " m"]]:
+        """Each component cut in two: the half that each particle is in; and of each component the
+        lighter half, how many deviations they are apart, and whether that is enough.
+        """
         m, size = mixture.num_components, self.sample_size
         weights, parent = relative_weights(mixture), mixture.component_indicators
         particles = _Particles(features, weights, parent, mixture.occupied)
@@ -99,18 +101,7 @@ class Split(AbstractRegrouping, ByFeatures):
             & (distance > self.min_distance)
         )
         lighter = jnp.where(masses[1] <= masses[0], 1, 0)
-        return _Halves(side, lighter, deviations, splits)
-
-
-class _Halves(NamedTuple):
-    """The half of each particle; and of each component which half is lighter, how many deviations
-    the halves are apart, and whether that is enough.
-    """
-
-    side: Int[Array, " n"]
-    lighter: Int[Array, " m"]
-    deviations: Float[Array, " m"]
-    splits: Bool[Array, " m"]
+        return side, lighter, deviations, splits
 
 
 class _Particles(NamedTuple):

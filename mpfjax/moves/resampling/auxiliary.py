@@ -6,11 +6,10 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import check_callable, check_type, saying, shown
+from mpfjax.checks import check_callable, saying, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.moves.base import AbstractMove
-from mpfjax.moves.conditional import ConditionalResample, Reference
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
@@ -41,11 +40,10 @@ class AuxiliaryResample(AbstractMove):
     likelihood is narrow.
     """
 
-    resample: Resample | ConditionalResample
+    resample: Resample
     lookahead: Any
 
     def __check_init__(self) -> None:
-        check_type((Resample, ConditionalResample), "a Resample", resample=self.resample)
         if isinstance(self.lookahead, AbstractProposal):
             require(self.lookahead, "log_normaliser", "AuxiliaryResample", "lookahead")
         elif not hasattr(self.lookahead, "at_step_of"):
@@ -56,17 +54,15 @@ class AuxiliaryResample(AbstractMove):
         """The same with another `Resample`."""
         return AuxiliaryResample(change(self.resample), self.lookahead)
 
-    def around(self, reference: Reference) -> "AuxiliaryResample":
-        """The same around the trajectory, whose offspring are weighed as any."""
-        return self.map_inner(lambda move: move.around(reference))
-
     @property
-    def resampling(self) -> Resample | ConditionalResample:
+    def resampling(self) -> Resample:
         """The `Resample` that draws."""
         return self.resample
 
     weighs = False
     """the weights are divided by the look-ahead again."""
+    keeps_trajectories = True
+    """offspring of the one that is kept are weighed as any."""
 
     @property
     def reads(self) -> frozenset[str]:
@@ -82,7 +78,8 @@ class AuxiliaryResample(AbstractMove):
         self, mixture: ParticleMixture, observation: PyTree = None
     ) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
-        return self.resample.is_due(mixture.weighed(self._log_factors(mixture, observation)))
+        weighed = mixture.weighed(self._log_factors(mixture, observation))
+        return self.resample.would_resample(weighed)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -91,7 +88,7 @@ class AuxiliaryResample(AbstractMove):
         log_factors = self._log_factors(mixture, observation)
         # Resampling may lose a NaN, or a particle whose look-ahead is infinite.
         broken = jnp.any(mixture.occupied & ~(log_factors < jnp.inf))
-        due = self.resample.is_due(mixture.weighed(log_factors))
+        due = self.resample.would_resample(mixture.weighed(log_factors))
         log_factors = jnp.where(spread(due, mixture.component_indicators), log_factors, 0.0)
         drawn, ancestors = self.resample.redraw(key, mixture.weighed(log_factors), due)
         drawn = drawn.weighed(-take(log_factors, ancestors.particles))

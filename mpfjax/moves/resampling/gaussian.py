@@ -1,6 +1,7 @@
 """Gaussian regeneration: redraw each component from the Gaussian of its own moments."""
 
 from collections.abc import Callable
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -8,9 +9,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.checks import check_callable, check_one_of, check_positive, check_whole, given
+from mpfjax.checks import Count, Positive
 from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
-from mpfjax.models.noise import NOISES, draw_noise, stratified_normal
+from mpfjax.models.noise import draw_noise, stratified_normal
 from mpfjax.moves.base import AbstractResampling
 from mpfjax.moves.regrouping.features import origin, summarise
 from mpfjax.moves.resampling.line import sorted_order
@@ -43,16 +44,12 @@ class GaussianRegeneration(AbstractResampling):
     that is not positive, an unknown noise or particles_per_component < 1.
     """
 
-    particles_per_component: int | None = eqx.field(static=True, default=None)
+    particles_per_component: Count | None = eqx.field(static=True, default=None)
     where: Callable[[PyTree], PyTree] | None = eqx.field(static=True, default=None)
-    inflation: float = eqx.field(static=True, default=1.0)
-    noise: str = eqx.field(static=True, default="independent")
-
-    def __check_init__(self) -> None:
-        check_whole(**given(particles_per_component=self.particles_per_component))
-        check_callable("a function that chooses from the state", **given(where=self.where))
-        check_positive(inflation=self.inflation)
-        check_one_of((*NOISES, "stratified"), noise=self.noise)
+    inflation: Positive = eqx.field(static=True, default=1.0)
+    noise: Literal["independent", "stratified", "rqmc"] = eqx.field(
+        static=True, default="independent"
+    )
 
     approximate = True
     """each component is replaced by a Gaussian."""

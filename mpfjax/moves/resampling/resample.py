@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 from mpfjax.checks import Count, Share, one_of
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractResampling, Gradient
-from mpfjax.moves.conditional import ConditionalResample, Reference
+from mpfjax.moves.conditional import REFERENCE
 from mpfjax.moves.eve_indices import with_offspring
 from mpfjax.moves.resampling.allocation import (
     allocate_slots,
@@ -95,8 +95,11 @@ class Resample(AbstractResampling):
         """Whether it may resample, and without a gradient."""
         return self.gradient == "none" and self.ess_threshold > 0
 
-    def is_due(self, mixture: ParticleMixture) -> Bool[Array, " m"]:
+    def would_resample(
+        self, mixture: ParticleMixture, observation: PyTree = None
+    ) -> Bool[Array, " m"]:
         """Which components of `mixture` the move would resample."""
+        del observation
         if self.ess_threshold == 1.0:
             return mixture.active
         counts = mixture.component_counts
@@ -106,33 +109,26 @@ class Resample(AbstractResampling):
             due = due | (counts != self.particles_per_component)
         return due & (counts > 0)
 
-    def would_resample(
-        self, mixture: ParticleMixture, observation: PyTree = None
-    ) -> Bool[Array, " m"]:
-        """Those that are due."""
-        del observation
-        return self.is_due(mixture)
-
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
     ) -> ParticleMixture:
         """Resample every component that is due."""
-        return self.redraw(key, mixture, self.is_due(mixture))[0]
+        return self.redraw(key, mixture, self.would_resample(mixture))[0]
 
     def redraw(
-        self,
-        key: Key[Array, ""],
-        mixture: ParticleMixture,
-        due: Bool[Array, " m"],
-        keep: Int[Array, ""] | None = None,
+        self, key: Key[Array, ""], mixture: ParticleMixture, due: Bool[Array, " m"]
     ) -> tuple[ParticleMixture, Ancestors]:
         """Resample the components that are `due`; with `ess_threshold` 1 all living ones are.
 
-        The particle `keep` has an offspring whatever is drawn, as `draw_ancestors` does it.
+        In conditional SMC the kept trajectory has an offspring whatever is drawn, and the ancestors
+        have their ordinary law, given that one slot of its component, each with equal probability,
+        has it for its parent. `draw_ancestors` says how.
         """
         n, m = mixture.num_particles, mixture.num_components
         all_are_due = self.ess_threshold == 1.0
         stays = None if all_are_due else ~spread(due, mixture.component_indicators)
+        reference = mixture.memory.get(REFERENCE)
+        keep = None if reference is None else reference["slot"]
         if keep is not None:
             is_kept = jnp.arange(n, dtype=jnp.int32) == keep
             stays = is_kept if stays is None else stays | is_kept
@@ -160,6 +156,9 @@ class Resample(AbstractResampling):
             component_indicators=slots.components if m > 1 else mixture.component_indicators,
             in_order=self.sort_by is not None,
         )
+        if reference is not None:
+            kept = {REFERENCE: reference | {"slot": ancestors.kept}}
+            redrawn = redrawn.replace(memory=mixture.memory | kept)
         return with_offspring(redrawn, mixture, parents, targets, due), ancestors
 
     @property
@@ -169,11 +168,8 @@ class Resample(AbstractResampling):
 
     keeps_families = True
     """it updates the memory of first ancestors."""
-
-    def around(self, reference: Reference) -> ConditionalResample:
-        """The same around the trajectory."""
-        del reference
-        return ConditionalResample(self)
+    keeps_trajectories = True
+    """it finds the slot of the one that is kept in the memory."""
 
     def deal(
         self, mixture: ParticleMixture, line: Line, due: Bool[Array, " m"]
