@@ -118,8 +118,8 @@ class TestOtherStates:
         [
             (make_mixture([0, 0, 0], [0, 0, 0], [0, 0, 0], 3, MIXTURE.memory), "num_components"),
             (make_mixture([0, 0], [0, 0], [0, 0], 2, MIXTURE.memory), r"particles.*\[3\].*\[2\]"),
-            (MIXTURE.replace(memory={}), "ages.* is only there"),
-            (MIXTURE.replace(memory=MIXTURE.memory | {"x": jnp.ones(1)}), "x.* is only here"),
+            (MIXTURE.replace(memory={}), "ages.* there and not here"),
+            (MIXTURE.replace(memory=MIXTURE.memory | {"x": jnp.ones(1)}), "x.* is not there"),
             (MIXTURE.replace(particles=jnp.zeros(3, jnp.int32)), "particles.*float32.*int32"),
         ],
     )
@@ -322,15 +322,6 @@ class TestCheckpointsThatLie:
         like = {"small": 0, "large": 0, "complex": 0j, "yes": True}
         assert describe(state) == describe(like)
         assert mpfjax.load_checkpoint(path, like) == state
-
-
-@pytest.mark.usefixtures("as_installed")
-@pytest.mark.parametrize("path", ["", None, 3, b"bytes", ["list"]])
-def test_a_path_that_is_none_is_named(path):
-    with pytest.raises(ValueError, match=r"^path: "):
-        mpfjax.save_checkpoint(path, MIXTURE)
-    with pytest.raises(ValueError, match=r"^path: "):
-        mpfjax.load_checkpoint(path, MIXTURE)
 
 
 class TestFullDisk:

@@ -1,7 +1,6 @@
 """Runs distributed over devices, of this process or of all, and over threads of a CPU."""
 
 import functools
-import hashlib
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -19,9 +18,9 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, PyTree
 
-from mpfjax.checks import is_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors
 from mpfjax.operations.islands import DEVICE_AXIS
+from mpfjax.running.storage import fingerprint, is_key
 
 
 def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
@@ -34,12 +33,12 @@ def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
     available = jax.devices()
     if devices is None:
         chosen = _default_devices(available)
-    elif isinstance(devices, int | np.integer) and not isinstance(devices, bool | np.timedelta64):
+    elif isinstance(devices, int):
         if not 1 <= devices <= len(available):
             raise ValueError(f"devices: {devices} asked for, and there are {len(available)}")
-        chosen = available[: int(devices)]
+        chosen = available[:devices]
     else:
-        chosen = list(devices) if is_series(devices) else []
+        chosen = list(devices)
         if not chosen or not all(isinstance(device, jax.Device) for device in chosen):
             raise ValueError(f"devices: {devices} is not a number or some of jax.devices()")
         if len(set(chosen)) < len(chosen):
@@ -71,7 +70,7 @@ def over_devices(
         return run_on_one(inputs, *arguments)
     num_inputs = length_of(inputs)
     padding = -num_inputs % len(devices)
-    padded = _filled_up(inputs, num_inputs + padding)
+    padded = _at(inputs, np.arange(num_inputs + padding)) if padding else inputs
     mesh = Mesh(np.array(devices), (DEVICE_AXIS,))
     if not traced:
         padded = _placed(padded, NamedSharding(mesh, P(DEVICE_AXIS)))
@@ -88,12 +87,10 @@ def length_of(inputs: PyTree) -> int:
     return jax.tree.leaves(inputs)[0].shape[0]
 
 
-def _filled_up(inputs: PyTree, length: int) -> PyTree:
-    """The inputs, the last one repeated up to this number."""
-    last = length_of(inputs) - 1
-    if length == last + 1:
-        return inputs
-    return jax.tree.map(lambda leaf: leaf[np.minimum(np.arange(length), last)], inputs)
+def _at(inputs: PyTree, index: Any) -> PyTree:
+    """The inputs of these numbers, the last one for those beyond it."""
+    index = jnp.minimum(index, length_of(inputs) - 1)
+    return jax.tree.map(lambda leaf: leaf[index], inputs)
 
 
 @jit_on_wide_vectors
@@ -133,12 +130,8 @@ def _placed(tree: PyTree, where: Any) -> PyTree:
 
 def _require_same_everywhere(arrays: PyTree) -> None:
     """Raise if the processes do not hold the same numbers; they exchange a digest only."""
-    digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(arrays):
-        if not _is_global(leaf):
-            values = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
-            digest.update(f"{values.dtype} {values.shape}".encode() + values.tobytes())
-    own = np.frombuffer(digest.digest(), np.uint8)
+    held = [leaf for leaf in jax.tree.leaves(arrays) if not _is_global(leaf)]
+    own = np.frombuffer(bytes.fromhex(fingerprint(held)), np.uint8)
     if (multihost_utils.process_allgather(own) != own[None]).any():
         raise ValueError("keys, filter, observations: not the same in every process")
 
@@ -147,7 +140,7 @@ def _global(leaf: Any, sharding: NamedSharding) -> Array:
     """An array over all processes, of which each holds a copy of the whole."""
     if _is_global(leaf):
         return leaf
-    if _is_key(leaf):
+    if is_key(leaf):
         data = _global(jax.random.key_data(leaf), sharding)
         return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
     values = np.asarray(jnp.asarray(leaf))
@@ -156,10 +149,6 @@ def _global(leaf: Any, sharding: NamedSharding) -> Array:
 
 def _is_global(leaf: Any) -> bool:
     return isinstance(leaf, jax.Array) and not leaf.is_fully_addressable
-
-
-def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _gathered(tree: PyTree, mesh: Mesh) -> PyTree:
@@ -204,8 +193,7 @@ def over_threads(
 
 
 def _block_of_runs(run, first, size, inputs, arguments):
-    index = jnp.minimum(first + np.arange(size), length_of(inputs) - 1)
-    return run(jax.tree.map(lambda leaf: leaf[index], inputs), *arguments)
+    return run(_at(inputs, first + np.arange(size)), *arguments)
 
 
 _run_block = jit_on_wide_vectors(_block_of_runs)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Key, PyTree
 
-from mpfjax.checks import check_key, check_share, check_whole
+from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
@@ -26,16 +26,17 @@ from mpfjax.operations.islands import (
 )
 from mpfjax.operations.logarithms import softmax
 from mpfjax.running.devices import choose_devices, over_devices
-from mpfjax.running.scan import FilterRun, check_run, checked, scan
+from mpfjax.running.scan import FilterRun, scan, sound
 
 
+@checked
 def run_islands(
     key: Key[Array, ""],
     filter: Filter,
     observations: PyTree,
     collect: Callable[[ParticleMixture], PyTree] | None = None,
     *,
-    num_islands: int,
+    num_islands: Count,
     devices: int | Sequence[Any] | None = None,
 ) -> FilterRun:
     """Run one filter of G islands, each a copy of `filter`, over many devices.
@@ -66,9 +67,6 @@ def run_islands(
     divide G. Use it if one filter is too large or too slow for one device. For many runs of a
     filter that fits on one device, use `monte_carlo`.
     """
-    check_key(key)
-    check_run(filter, collect)
-    check_whole(num_islands=num_islands)
     series = as_series(observations, filter.model)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_islands, dtype=jnp.uint32))
 
@@ -78,7 +76,7 @@ def run_islands(
         chosen = None if leave_to_caller else _dividing(num_islands, devices)
         return over_devices(_run_block, _run_on_one, keys, arguments, chosen)
 
-    return checked(_joined(with_floats_traced(run, filter), collect is None))
+    return sound(_joined(with_floats_traced(run, filter), collect is None))
 
 
 def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any]:
@@ -161,10 +159,7 @@ class IslandInteraction(AbstractMove):
     not divide the number of slots of an island.
     """
 
-    threshold: float = eqx.field(static=True, default=0.5)
-
-    def __check_init__(self) -> None:
-        check_share(threshold=self.threshold)
+    threshold: Share = eqx.field(static=True, default=0.5)
 
     weighs = False
     keeps_mass = True

@@ -5,6 +5,7 @@ import os
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -12,11 +13,10 @@ import numpy as np
 from jaxtyping import PyTree
 from tqdm import tqdm
 
-from mpfjax.checks import check_type, check_whole, given
+from mpfjax.checks import Checked, Count
 from mpfjax.running.storage import (
     arrays_of,
-    as_path,
-    describe,
+    described,
     differences,
     filled,
     load_arrays,
@@ -28,8 +28,7 @@ from mpfjax.running.storage import (
 _NOTES = "notes"
 
 
-@dataclass(frozen=True)
-class Checkpoint:
+class Checkpoint(Checked):
     """The file from which a long run goes on: `fit`, `maximise`, and the samplers of parameters.
 
     - `path`: a .npz file, without pickles. If it exists, the same call goes on from it, the same to
@@ -40,18 +39,16 @@ class Checkpoint:
       name and by the data and numbers of the call, and no longer by the program that JAX makes of
       the functions, such as a prior or an optimiser, which another version of JAX may change.
 
-    Raises `ValueError` for something that is no path of a file, and an `every` below one.
+    Raises `ValueError` for the path of a directory, and an `every` below one.
     """
 
     path: str | os.PathLike[str]
-    every: int = 50
+    every: Count = 50
     name: str | None = None
 
-    def __post_init__(self) -> None:
-        if as_path(self.path).is_dir():
+    def __check_init__(self) -> None:
+        if Path(self.path).is_dir():
             raise ValueError(f"path: {self.path} is a directory, not a file")
-        check_whole(every=self.every)
-        check_type(str, "a name", **given(name=self.name))
 
 
 class State(NamedTuple):
@@ -139,9 +136,9 @@ class LongRun:
 
     def _loaded(self, like: State) -> State | None:
         """The state that the file holds, None without a file; a `ValueError` for another run's."""
-        if self.checkpoint is None or not as_path(self.checkpoint.path).exists():
+        if self.checkpoint is None or not Path(self.checkpoint.path).exists():
             return None
-        path = as_path(self.checkpoint.path)
+        path = Path(self.checkpoint.path)
         arrays = load_arrays(path)
         notes: dict[str, Any] = read_description(path, arrays, _NOTES) if _NOTES in arrays else {}
         if notes.get("caller") != self.caller:
@@ -168,11 +165,7 @@ def identity_of(
     """
     if checkpoint is None:
         return {}
-    told = {
-        f"{part}{place}": text
-        for part, value in settings.items()
-        for place, text in describe(value, values=True).items()
-    }
+    told = described(**settings)
     if checkpoint.name is not None:
         return told | {"name": checkpoint.name}
     programs = {part: program_of(*call) for part, call in functions.items() if call[0] is not None}

@@ -1,20 +1,20 @@
 """Running a filter over observations: once, or once for each of many keys."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.checks import check_key, check_whole, given
+from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.eve_indices import EVE_INDICES, with_new_eve_indices
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import choose_devices, num_processors, over_devices, over_threads
-from mpfjax.running.scan import FilterRun, check_run, checked, first_mixture, initial_keys, scan
+from mpfjax.running.scan import FilterRun, first_mixture, initial_keys, scan, sound
 
 # How many particles, with the temporaries of a step, fit into a CPU's caches. Few components
 # have a row of particles each, which counts as so many times the particles.
@@ -22,6 +22,7 @@ _IN_NEAR_CACHE, _IN_CACHE = 2**15, 2**16
 _WORTH_A_THREAD = 2**9  # particles in all runs of the thread
 
 
+@checked
 def run_filter(
     key: Key[Array, ""],
     filter: Filter,
@@ -29,7 +30,7 @@ def run_filter(
     collect: Callable[[ParticleMixture], PyTree] | None = None,
     *,
     inputs: PyTree = None,
-    missing: str = "error",
+    missing: Literal["error", "skip"] = "error",
 ) -> FilterRun:
     """Run a filter over observations y_1..y_t in one scan.
 
@@ -52,13 +53,12 @@ def run_filter(
     a model that has no place for them. Raises `ValueError` during tracing for a model whose draws
     or densities have the wrong shape or type, and RuntimeError if its densities give NaN.
     """
-    check_key(key)
-    check_run(filter, collect)
     series = as_series(observations, filter.model, inputs, missing)
     run = lambda filter: _run(key, filter, series, collect)  # noqa: E731
-    return checked(with_floats_traced(run, filter))
+    return sound(with_floats_traced(run, filter))
 
 
+@checked
 def monte_carlo(
     keys: Key[Array, " seeds"],
     filter: Filter,
@@ -66,9 +66,9 @@ def monte_carlo(
     collect: Callable[[ParticleMixture], PyTree] | None = None,
     *,
     inputs: PyTree = None,
-    missing: str = "error",
+    missing: Literal["error", "skip"] = "error",
     devices: int | Sequence[Any] | None = None,
-    slots: int | None = None,
+    slots: Count | None = None,
 ) -> FilterRun:
     """Run a filter once for each key, all on the same observations and inputs, under `vmap`.
 
@@ -90,9 +90,6 @@ def monte_carlo(
     Raises `ValueError` for more devices than there are, fewer slots than particles, and `slots`
     with the moves that need every slot, `PropagateIndependently` and `PropagateInClusters`.
     """
-    check_key(keys, "keys", batch=True)
-    check_run(filter, collect)
-    check_whole(**given(slots=slots))
     if slots is not None and slots < filter.num_particles:
         raise ValueError(f"slots: {slots} is no whole number of at least N, {filter.num_particles}")
     series = as_series(observations, filter.model, inputs, missing)
@@ -108,7 +105,7 @@ def monte_carlo(
         chosen = None if leave_to_caller else choose_devices(devices)
         return over_devices(_run_each, _run_on_threads, starts, arguments, chosen)
 
-    return checked(with_floats_traced(run, filter))
+    return sound(with_floats_traced(run, filter))
 
 
 _run = jit_on_wide_vectors(scan)

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.chain import BROKEN_DENSITY
-from mpfjax.checks import check_callable, check_type, given, saying
+from mpfjax.checks import saying
 from mpfjax.filter import Filter, StepInfo
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Series
@@ -133,7 +133,7 @@ def step_or_predict(
     )
 
 
-def checked(run: FilterRun) -> FilterRun:
+def sound(run: FilterRun) -> FilterRun:
     """The run, or an error where a density of the model was NaN or infinite.
 
     A RuntimeWarning, one for all runs, where no step of a run had any likelihood.
@@ -155,9 +155,3 @@ def checked(run: FilterRun) -> FilterRun:
             stacklevel=3,
         )
     return run
-
-
-def check_run(filter: Any, collect: Any) -> None:
-    """Raise a `ValueError` for anything but a filter, or a `collect` that cannot be called."""
-    check_type(Filter, "a Filter", filter=filter)
-    check_callable("a function of a mixture", **given(collect=collect))

@@ -3,15 +3,15 @@
 A file is written whole or not at all, and loads without running code.
 """
 
+import contextlib
 import dataclasses
+import glob
 import hashlib
 import json
 import os
-import platform
 import re
 import secrets
-import zipfile
-import zlib
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,9 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from mpfjax.checks import check_type
-
 _MOST_SHOWN = 4
+_DAY = 24 * 60 * 60
 
 
 def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
@@ -34,9 +33,8 @@ def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
       or a `Filter`. Of other things, such as a network's activation, only the name is written.
     - `path`: a .npz file without pickles. After an interruption it is the old file or the new one.
 
-    Raises `ValueError` for something that is no path. Raises `OSError` if the file cannot be
-    written, for example on a full disk; the old file is then still there. Call it every thousand
-    steps, for example, of a filter that runs for a long time:
+    Raises `OSError` if the file cannot be written, for example on a full disk; the old file is then
+    still there. Call it every thousand steps, for example, of a filter that runs for a long time:
 
         state = {"mixture": filter.init(key), "t": 0}
         if path.exists():
@@ -48,7 +46,7 @@ def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
                 mpfjax.save_checkpoint(path, state)
     """
     description = {"description": np.array(json.dumps(describe(state)))}
-    write_arrays(as_path(path), arrays_of(state) | description)
+    write_arrays(path, arrays_of(state) | description)
 
 
 def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
@@ -62,7 +60,7 @@ def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
     file that is cut off, damaged, no checkpoint, or does not hold what it says, and for the
     checkpoint of another state, naming what differs.
     """
-    path = as_path(path)
+    path = Path(path)
     arrays = load_arrays(path)
     saved, own = read_description(path, arrays), describe(like)
     if saved != own:
@@ -132,6 +130,15 @@ def describe(tree: PyTree, *, values: bool = False) -> dict[str, str]:
     }
 
 
+def described(**parts: PyTree) -> dict[str, str]:
+    """All leaves of some pytrees with their values, by part and place."""
+    return {
+        f"{part}{place}": text
+        for part, tree in parts.items()
+        for place, text in describe(tree, values=True).items()
+    }
+
+
 def fingerprint(tree: PyTree) -> str:
     """SHA-256 of all that a pytree holds: its description and its arrays' bytes."""
     digest = hashlib.sha256(json.dumps(describe(tree)).encode())
@@ -161,14 +168,11 @@ def _constants(program: Any) -> Iterator[Any]:
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     """The first few differences between two descriptions, in words."""
-    found = []
-    for name in sorted(there.keys() | here.keys()):
-        if name not in there:
-            found.append(f"{name} is only here")
-        elif name not in here:
-            found.append(f"{name} is only there")
-        elif there[name] != here[name]:
-            found.append(f"{name} is {there[name]} there and {here[name]} here")
+    found = [
+        f"{name} is {there.get(name, 'not')} there and {here.get(name, 'not')} here"
+        for name in sorted(there.keys() | here.keys())
+        if there.get(name) != here.get(name)
+    ]
     more = len(found) - _MOST_SHOWN
     return "; ".join(found[:_MOST_SHOWN]) + (f"; and {more} more" if more > 0 else "")
 
@@ -227,14 +231,6 @@ def _static_fields(tree: PyTree, place: tuple[Any, ...]) -> dict[str, str]:
     return found
 
 
-def as_path(path: str | os.PathLike[str], name: str = "path") -> Path:
-    """The path, or a `ValueError` naming the argument where it is none or empty."""
-    check_type((str, os.PathLike), "a path", **{name: path})
-    if not os.fspath(path):
-        raise ValueError(f"{name}: '' is no path; '.' is the folder that this runs in")
-    return Path(path)
-
-
 def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
     """Write a file so that an interruption or an error leaves the old one or the new one.
 
@@ -245,8 +241,7 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     # Writers that shared a name would write into each other's file, and take it from each other.
-    ours = f"{platform.node()}-{os.getpid()}"
-    partial = path.with_name(f"{path.name}.{ours}-{secrets.token_hex(8)}.partial")
+    partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")
     _remove_what_the_killed_left(path)
     try:
         with open(partial, "xb") as file:
@@ -264,24 +259,11 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
 
 
 def _remove_what_the_killed_left(path: Path) -> None:
-    """Remove temporary files for this path that processes on this machine left when killed."""
-    if os.name != "posix":
-        return
-    name = re.compile(rf"{re.escape(f'{path.name}.{platform.node()}')}-(\d+)-[0-9a-f]+\.partial")
-    for other in path.parent.iterdir():
-        found = name.fullmatch(other.name)
-        if found is not None and not _is_running(int(found[1])):
-            other.unlink(missing_ok=True)
-
-
-def _is_running(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+    """Remove what writers of this path left unfinished, a day ago or longer."""
+    for other in path.parent.glob(f"{glob.escape(path.name)}.*.partial"):
+        with contextlib.suppress(OSError):
+            if other.stat().st_mtime < time.time() - _DAY:
+                other.unlink()
 
 
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> None:
@@ -292,22 +274,7 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
     for name, array in arrays.items():
         if array.dtype.hasobject or array.dtype.kind == "V":
             raise ValueError(f"{name}: an array of {array.dtype} does not load without pickles")
-
-    def write(file: BinaryIO) -> None:
-        # Not by np.savez, which takes an array named "file" for its first argument.
-        with zipfile.ZipFile(file, "w") as archive:
-            for name, array in arrays.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                    np.lib.format.write_array(member, array, allow_pickle=False)
-
-    write_whole(path, write)
-
-
-# The errors that a flipped bit may lead to; the last is for an unknown compression or encryption.
-_DAMAGE = (
-    zipfile.BadZipFile, zlib.error, EOFError, OSError, MemoryError, OverflowError, ValueError,
-    RuntimeError,
-)  # fmt: skip
+    write_whole(path, lambda file: np.savez(file, **arrays))  # pyright: ignore[reportArgumentType]
 
 
 def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
@@ -315,13 +282,10 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     with open(path, "rb") as file:
         try:
             found = np.load(file, allow_pickle=False)
-            if not isinstance(found, Mapping):
-                raise ValueError("it holds one array")
-            arrays: dict[str, np.ndarray] = dict(found)
-            others = [name for name in arrays if not isinstance(arrays[name], np.ndarray)]
-            if others:
-                raise ValueError(f"{others[0]} is no array")
-        except _DAMAGE as error:
+            arrays = {name: found[name] for name in found.files}
+            if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+                raise ValueError("what it holds is no array")
+        except Exception as error:  # a flipped bit may lead to any
             raise ValueError(f"{path}: cut off, damaged or no .npz file ({error})") from error
     return arrays
 

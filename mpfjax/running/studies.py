@@ -9,25 +9,16 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 from tqdm import tqdm
 
-from mpfjax.checks import (
-    check_callable,
-    check_flag,
-    check_key,
-    check_type,
-    check_whole,
-    given,
-    shown,
-)
+from mpfjax.checks import Checked, Count, check_callable, check_type, check_whole, checked, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import as_series, check_series
@@ -35,10 +26,8 @@ from mpfjax.operations.logarithms import default_float
 from mpfjax.running.run import monte_carlo
 from mpfjax.running.scan import FilterRun
 from mpfjax.running.storage import (
-    as_path,
-    describe,
+    described,
     differences,
-    fingerprint,
     load_arrays,
     named,
     read_description,
@@ -51,7 +40,7 @@ Values = Sequence[Any] | np.ndarray | Array
 _MANIFEST = "study.json"
 _CELL = "cell"
 _STUDY = "study"
-_TAKEN = ("filter", "num_particles", _CELL, _STUDY)
+_TAKEN = ("filter", "num_particles", "file", _CELL, _STUDY)
 _CELL_FILE = re.compile(r"(\d+)-[\w.+-]*\.npz")  # as `_cells` names them
 
 
@@ -65,8 +54,7 @@ def nothing(mixture: ParticleMixture) -> None:
     del mixture
 
 
-@dataclass(frozen=True, eq=False)
-class Study:
+class Study(Checked):
     """A grid of filters x N x settings. Each cell is the Monte Carlo runs of one filter.
 
     Raises `ValueError` for an argument of another kind, an axis that is empty or has a value twice,
@@ -88,29 +76,28 @@ class Study:
     collect: Callable[[ParticleMixture], PyTree] | None = nothing
     """as for `run_filter`, for `measure` to use; None keeps all of every mixture."""
 
-    def __post_init__(self) -> None:
-        check_type(Mapping, "functions by name, {name: function}", filters=self.filters)
-        check_type(Mapping, "values by name, {name: [value, ...]}", settings=self.settings)
-        what = "a function that builds a filter"
-        check_callable(what, **{f"filters: {name}": f for name, f in self.filters.items()})
-        check_callable("a function of a cell's runs", measure=self.measure)
-        check_callable("a function of a mixture", **given(collect=self.collect))
-        check_key(self.keys, "keys", batch=True)
+    def __check_init__(self) -> None:
+        what = "a dictionary, {name: value}"
+        check_type(Mapping, what, filters=self.filters, settings=self.settings)
+        for name, build in self.filters.items():
+            check_callable("a function that builds a filter", **{f"filters: {name}": build})
         for name in self.settings:
-            if not isinstance(name, str) or name in _TAKEN:
-                raise ValueError(f"settings: {name!r} is no name, or one that a cell has already")
-        check_whole(**{f"num_particles: {n!r}": n for n in _axes(self)["num_particles"]})
+            if name in _TAKEN:
+                raise ValueError(f"settings: {name!r} is a name that a cell has already")
+        for number in _axes(self)["num_particles"]:
+            check_whole(num_particles=number)
         check_series(self.observations)
 
 
+@checked
 def run_study(
     study: Study,
     directory: str | os.PathLike[str],
     *,
     resume: bool = False,
-    seeds_at_once: int | None = None,
-    cells_at_once: int = 1,
-    slots: int | None = None,
+    seeds_at_once: Count | None = None,
+    cells_at_once: Count = 1,
+    slots: Count | None = None,
 ) -> list[dict[str, Any]]:
     """Run every cell of a study; with `resume`, go on where it was interrupted or killed.
 
@@ -143,14 +130,11 @@ def run_study(
     one directory, which the first one writes. Use it where a loop over `monte_carlo` would take
     long.
     """
-    check_type(Study, "a Study", study=study)
-    check_whole(**given(seeds_at_once=seeds_at_once, slots=slots), cells_at_once=cells_at_once)
-    check_flag(resume=resume)
-    directory = _as_directory(directory)
+    directory = Path(directory)
     cells = _cells(study)
     digest = _claim(directory, _manifest(study), resume)
     results = _finished(directory, digest)
-    pending = [cell for cell in cells if cell.text not in results]
+    pending = [cell for cell in cells if cell.file not in results]
     if results and jax.process_index() == 0:
         print(f"{directory}: {_said(directory)} taken over, {len(pending)} to run")
     if jax.process_count() > 1:
@@ -165,12 +149,12 @@ def run_study(
         if jax.process_index() == 0:
             mark = {_CELL: np.array(json.dumps({_STUDY: digest} | cell.description))}
             write_arrays(directory / cell.file, measured | mark)
-        results[cell.text] = cell.description | measured
+        results[cell.file] = cell.description | measured
 
     with tqdm(total=len(cells), initial=len(results), unit="cell", disable=None) as bar:
         for _ in _in_turn(finish, pending, cells_at_once):
             bar.update()
-    return [results[cell.text] for cell in cells]
+    return [results[cell.file] for cell in cells]
 
 
 def read_study(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
@@ -180,17 +164,15 @@ def read_study(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
     directory without a study, and `ValueError` for files in it that are cut off, damaged or from
     another study.
     """
-    directory = _as_directory(directory)
+    directory = Path(directory)
     return list(_finished(directory, _digest(_read_manifest(directory / _MANIFEST))).values())
 
 
-@dataclass(frozen=True)
-class _Cell:
+class _Cell(NamedTuple):
     """One filter at one size under one combination of settings."""
 
     file: str
     description: dict[str, Any]
-    text: str
     filter: Filter
 
 
@@ -211,34 +193,32 @@ def _cells(study: Study) -> list[_Cell]:
         as_series(study.observations, filter.model)
         words = [name, f"N{num_particles}", *(f"{k}_{v}" for k, v in settings.items())]
         stem = re.sub(r"[^\w.+-]+", "_", "-".join([f"{index:04d}", *words]))[:100]
-        cells.append(_Cell(f"{stem}.npz", description, json.dumps(description), filter))
+        cells.append(_Cell(f"{stem}.npz", description, filter))
     return cells
 
 
 def _axes(study: Study) -> dict[str, list[Any]]:
     """The values along each axis of the grid, the filters' names first, as JSON can hold them."""
-    axes: dict[str, list[Any]] = {}
-    given_axes = {"filters": list(study.filters), "num_particles": study.num_particles}
-    for name, values in (given_axes | dict(study.settings)).items():
-        is_array = isinstance(values, np.ndarray | jax.Array) and values.ndim > 0
-        if isinstance(values, str | bytes) or not (is_array or isinstance(values, Sequence)):
-            raise ValueError(f"{name}: {shown(values)} are no values, [value, ...]")
-        axes[name] = [_plain(name, value) for value in values]
-        if not axes[name] or len(set(axes[name])) < len(axes[name]):
-            raise ValueError(f"{name}: {shown(values)} is empty or has the same twice")
-    return {"filter": axes.pop("filters"), **axes}
+    axes = {"num_particles": study.num_particles, **study.settings}
+    named = {name: _listed(name, values) for name, values in axes.items()}
+    return {"filter": _listed("filters", list(study.filters)), **named}
 
 
-def _plain(name: str, value: Any) -> Any:
-    is_array = isinstance(value, np.generic | np.ndarray | jax.Array)
-    if is_array and value.ndim == 0 and not jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
-        value = value.item()
-    if value is not None and not isinstance(value, str | int | float | bool):
-        raise ValueError(
-            f"{name}: {shown(value)} is no number or string; name it, and let the filter's function"
-            " look it up"
-        )
-    return value
+def _listed(name: str, values: Any) -> list[Any]:
+    """The values along one axis; a `ValueError` for what is no list of numbers and strings."""
+    values = values.tolist() if isinstance(values, np.ndarray | jax.Array) else values
+    if isinstance(values, str) or not isinstance(values, Sequence):
+        raise ValueError(f"{name}: {shown(values)} are no values, [value, ...]")
+    plain = [value.item() if isinstance(value, np.generic) else value for value in values]
+    for value in plain:
+        if not isinstance(value, str | int | float | None):
+            raise ValueError(
+                f"{name}: {shown(value)} is no number or string; name it, and let the filter's"
+                " function look it up"
+            )
+    if not plain or len(set(plain)) < len(plain):
+        raise ValueError(f"{name}: {shown(values)} is empty or has the same twice")
+    return plain
 
 
 def _manifest(study: Study) -> dict[str, Any]:
@@ -247,18 +227,12 @@ def _manifest(study: Study) -> dict[str, Any]:
     versions = [f"mpfjax {package.__version__}", f"jax {jax.__version__}"]
     manifest = {
         "axes": _axes(study),
-        "keys": _summary(study.keys),
-        "observations": _summary(study.observations),
+        **described(keys=study.keys, observations=study.observations),
         "measure": named(study.measure),
         "collect": named(study.collect),
         "versions": [*versions, str(default_float())],
     }
     return json.loads(json.dumps(manifest))
-
-
-def _summary(tree: PyTree) -> str:
-    shapes = ", ".join(f"{place} {kind}".strip() for place, kind in describe(tree).items())
-    return f"{shapes} ({fingerprint(tree)[:16]})"
 
 
 def _digest(manifest: dict[str, Any]) -> str:
@@ -296,13 +270,6 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: cut off, damaged or no study ({error})") from error
 
 
-def _as_directory(directory: str | os.PathLike[str]) -> Path:
-    path = as_path(directory, "directory")
-    if path.exists() and not path.is_dir():
-        raise ValueError(f"directory: {path} is a file")
-    return path
-
-
 def _cell_files(directory: Path) -> list[Path]:
     """The files of finished cells, in the order of the cells."""
     found = [(_CELL_FILE.fullmatch(path.name), path) for path in directory.glob("*.npz")]
@@ -317,20 +284,19 @@ def _said(directory: Path) -> str:
 
 
 def _finished(directory: Path, digest: str) -> dict[str, dict[str, Any]]:
-    """The finished cells, described and with what was measured, by the text of the description."""
+    """The finished cells by their files: described, and with what was measured."""
     # An error, not a warning and a second run: if one file is damaged, others may be as well.
     results, faults = {}, []
     for path in _cell_files(directory):
         try:
             arrays = load_arrays(path)
             description = read_description(path, arrays, _CELL)
+            if description.pop(_STUDY, None) != digest:
+                raise ValueError(f"{path}: results of another study")
             del arrays[_CELL]
+            results[path.name] = description | arrays
         except ValueError as error:
             faults.append(str(error))
-            continue
-        if description.pop(_STUDY, None) != digest:
-            faults.append(f"{path}: results of another study")
-        results[json.dumps(description)] = description | arrays
     if faults:
         raise ValueError("; ".join([*faults, "delete these, and only their cells are run again"]))
     return results

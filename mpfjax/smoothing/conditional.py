@@ -18,7 +18,7 @@ from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import Series, as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.random import split, uniform
-from mpfjax.running.scan import FilterRun, checked, initial_keys, scan
+from mpfjax.running.scan import FilterRun, initial_keys, scan, sound
 from mpfjax.smoothing.backward import draw, log_transitions
 from mpfjax.smoothing.history import ancestors_of, mixtures_of, paths_through
 from mpfjax.smoothing.trajectories import draw_trajectories
@@ -97,7 +97,7 @@ def conditional_filter(
     _require(eqx.filter_jit(possible_times)(filter.model, trajectory, series.inputs))
     run = lambda filter: _run(key, filter, series, trajectory, backward)  # noqa: E731
     found = with_floats_traced(run, filter)
-    found = eqx.tree_at(lambda found: found.run, found, checked(found.run))
+    found = eqx.tree_at(lambda found: found.run, found, sound(found.run))
     if isinstance(found.possible, Tracer):
         return eqx.error_if(found, ~jnp.all(found.possible), _IMPOSSIBLE)
     _require(found.possible)

@@ -31,10 +31,10 @@ from mpfjax.operations.random import split, split_keys
 from mpfjax.operations.stored import take
 from mpfjax.running.scan import (
     FilterRun,
-    checked,
     first_mixture,
     report_of,
     run_of,
+    sound,
     step_or_predict,
 )
 from mpfjax.smoothing.backward import draw, draw_exactly, log_transition_from, walk
@@ -107,7 +107,7 @@ def smoothed_sums(
         lag = min(lag, series.length - 1)
     options = (mapped(filter.model, function), lag, method, num_draws)
     sums = with_floats_traced(lambda filter: _smooth(key, filter, series, options), filter)
-    return SmoothedSums(sums.sums, sums.terms, checked(sums.run))
+    return SmoothedSums(sums.sums, sums.terms, sound(sums.run))
 
 
 @jit_on_wide_vectors

@@ -193,7 +193,7 @@ class TestResuming:
         for other, named in (
             ({"thinning": 1}, "thinning is 2 there and 1 here"),
             ({"num_chains": 3}, "num_chains is .* there and 3 here"),
-            ({"checkpoint": Checkpoint(path, name="mine")}, "name is only here"),
+            ({"checkpoint": Checkpoint(path, name="mine")}, "name is not there"),
             (
                 other_function(sampler),
                 "draw is" if sampler is gibbs else "log_prior is",
