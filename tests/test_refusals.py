@@ -364,6 +364,20 @@ REFUSED = (
     (r"model: Wrong.log_transition returned shape \(3,\)",
      lambda: run_of(
          wrong(log_transition=lambda self, states, previous: jnp.zeros(3)), gradient="stop")),
+    # runs and studies
+    ("slots: 3 is no whole number of at least N, 4",
+     lambda: mpfjax.monte_carlo(KEY[None], FILTER, TWO, slots=3)),
+    *(
+        (words, lambda changes=changes: mpfjax.Study(**GOOD[mpfjax.Study] | changes))
+        for words, changes in (
+            ("filters: pf: Filter", {"filters": {"pf": FILTER}}),
+            ("num_particles: 8 are no values", {"num_particles": 8}),
+            (r"num_particles: \[8, 8\] is empty or has the same", {"num_particles": [8, 8]}),
+            ("num_particles: 8.5 is not a whole number", {"num_particles": [8.5]}),
+            ("settings: 'filter' is a name", {"settings": {"filter": [1]}}),
+            ("noise: .* no number or string; name it", {"settings": {"noise": [ZERO]}}),
+        )
+    ),
 )  # fmt: skip
 
 
