@@ -20,9 +20,10 @@ from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.noise import Noise, draw_noise
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.resampling.ancestors import draw_ancestors
-from mpfjax.moves.resampling.line import HILBERT, in_line
+from mpfjax.moves.resampling.line import HILBERT, Line, sorted_order
 from mpfjax.operations.logarithms import default_float, exp, finite_or_zero, largest
 from mpfjax.operations.random import split
+from mpfjax.operations.segments import whole
 from mpfjax.operations.stored import stored, take
 
 # A particle that the first observation tells nothing of keeps a quarter of its chance, so that no
@@ -99,9 +100,11 @@ class SelectInitial(AbstractMove):
         log_factors = self._look(key_look, pool, observation)
         chances = trusted(log_factors, pool.occupied.astype(log_factors.dtype))
         chances = stored(jax.lax.stop_gradient(chances))
-        weighed = pool.replace(log_weights=jnp.log(chances).astype(default_float()))
-        sort_by = HILBERT if self.noise == "rqmc" else None
-        line = in_line(jax.lax.stop_gradient(weighed), sort_by=sort_by)
+        is_sorted = self.noise == "rqmc"
+        order = sorted_order(pool, pool.component_indicators, HILBERT) if is_sorted else None
+        weights = whole(chances if order is None else take(chances, order), 0.0)
+        totals = jnp.sum(weights, keepdims=True)
+        line = Line(num_drawn, weights, totals, jnp.zeros_like(totals), weights > 0, order)
         n = mixture.num_particles
         targets = jnp.full(1, n, jnp.int32)
         kept = draw_ancestors(key_kept, line, targets, "systematic", num_slots=n).particles

@@ -32,7 +32,7 @@ from mpfjax.operations.stored import (
 
 _ONE_BLOCK = 128
 _LANES_OF_ROWS = 4
-_FEW = 64
+_FEWEST, _FEW = 16, 64
 # A sum in float32 of more numbers than these has too few bits for the fraction. The limit is a
 # number of particles, which is static: filters below it have the draws that they always had.
 MOST_IN_ONE_FLOAT = 100_000
@@ -125,9 +125,9 @@ def few_upto(values: Shaped[Array, " n"]) -> Int[Array, " n"]:
         return jnp.cumsum(values, dtype=jnp.int32)
     place = jnp.arange(n, dtype=jnp.int32)
     counts = values.astype(jnp.int32)
-    # Over the first axis the sums run on vectors, but XLA would repeat them for every use.
+    # Over the first axis the sums run on vectors, but XLA repeats them for every use.
     sums = jnp.sum(jnp.where(place[:, None] <= place[None], counts[:, None], 0), 0, jnp.int32)
-    return stored(sums)
+    return sums if n <= _FEWEST else stored(sums)
 
 
 def count_starts(starts: Int[Array, "*rows n"], num_slots: int) -> Int[Array, " num_slots"]:

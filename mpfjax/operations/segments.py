@@ -270,7 +270,9 @@ def segment_argmax(
     largest = jnp.maximum(segment_max(values, segments, num_segments), limits.min)
     is_largest = values >= spread_stored(largest, segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
-    return segment_reduce("min", stored(index), segments, num_segments, n - 1)
+    if not are_masked(n, num_segments):
+        index = stored(index)
+    return segment_reduce("min", index, segments, num_segments, n - 1)
 
 
 def first_places(segments: Int[Array, " n"], num_segments: int) -> Int[Array, " num_segments"]:
