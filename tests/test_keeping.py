@@ -5,15 +5,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 import mpfjax
 from mpfjax import keep_programs
 from mpfjax.filter import step_and_faults
-from mpfjax.vision.boxes import following as drawn
-from mpfjax.vision.boxes.recipes import objects_filters
 
 CONFIG: Any = jax.config
 SETTINGS = [
@@ -82,15 +79,3 @@ def test_a_step_raises_of_what_it_saw_and_its_program_calls_nothing_back(transfo
         jax.block_until_ready(step(jnp.full((), jnp.nan)))
     with pytest.raises(RuntimeError, match="observation: NaN or infinite"):
         jax.block_until_ready(jax.vmap(step)(jnp.array([1.0, jnp.inf])))
-
-
-@pytest.mark.thorough
-def test_nor_does_the_program_that_follows_drawn_boxes():
-    frame = np.zeros((40, 50, 3), np.uint8)
-    filter = objects_filters(frame, np.array([[5.0, 5, 10, 20]]))["mpf"]
-    key = jax.random.key(0)
-    mixture = filter.init(key)
-    counted = eqx.filter_jit(drawn._counted)(filter.model, jnp.asarray(frame))
-    arguments = (filter, 1, key, jnp.asarray(1), mixture, counted)
-    program = eqx.filter_jit(drawn._advance_boxes).lower(*arguments)
-    assert "callback" not in program.as_text()

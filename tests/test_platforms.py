@@ -14,7 +14,7 @@ from mpfjax.operations import stored as forms
 from mpfjax.operations.prefix_sums import count_upto, exact_sum_before, sum_before
 from mpfjax.operations.stored import stored
 from mpfjax.running.scan import scan
-from tests.marking import quick_of
+from tests.marking import weekly
 from tests.registry import CHAINS
 
 MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
@@ -69,7 +69,7 @@ def test_a_whole_filter_is_lowered_for_a_gpu():
     assert lowered.platforms == ("cuda",)
 
 
-@pytest.mark.parametrize("chain", quick_of(CHAINS, ["pf"]))
+@pytest.mark.parametrize("chain", ["pf", *weekly(name for name in CHAINS if name != "pf")])
 def test_a_chain_on_the_default_forms_is_the_same_filter(chain):
     """Most runs; in the others a particle stands on the border between two offspring.
 
