@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from mpfjax.checks import check_whole, shown
+from mpfjax.checks import CountOrZero, checked, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
 
 # Okabe and Ito's palette (2008), which people with colour blindness can tell apart.
@@ -18,9 +18,10 @@ COLOURS = (
 MARKERS = "osD^vP*X<>"
 
 
+@checked
 def draw_components(
     mixtures: ParticleMixture,
-    index: int = 0,
+    index: CountOrZero = 0,
     *,
     truth: np.ndarray | None = None,
     least_mass: float = 0.01,
@@ -43,7 +44,6 @@ def draw_components(
             f"mixtures: log-weights of shape {mixtures.log_weights.shape}, not (t, n); keep them by"
             " run_filter(..., collect=None)"
         )
-    check_whole(0, index=index)
     masses, means, variances = map(np.asarray, jax.vmap(_moments)(mixtures))
     if index >= means.shape[2]:
         raise ValueError(f"index: {shown(index)} of a state of {means.shape[2]} numbers")

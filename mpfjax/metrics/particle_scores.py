@@ -1,28 +1,24 @@
 """Scores of weighted particles: of forecasts, of modes that are kept, of how many differ."""
 
 import math
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from mpfjax.checks import (
-    check_not_negative_array,
-    check_positive,
-    check_shape,
-    check_type,
-    real_arrays,
-)
+from mpfjax.checks import NOT_NEGATIVE, POSITIVE, checked, real_arrays
 from mpfjax.mixture import ParticleMixture, flatten_states
-from mpfjax.models.base import AbstractStateSpaceModel, require_model
+from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.steps import likelihoods
 from mpfjax.observations import one_observation
 from mpfjax.operations.logarithms import log_sum_exp
 
 
+@checked
 def crps(
     values: Float[Array, "*batch n"],
-    weights: Float[Array, "*batch n"],
+    weights: Annotated[Float[Array, "*batch n"], NOT_NEGATIVE],
     observations: Float[Array, " *batch"],
 ) -> Float[Array, " *batch"]:
     """The continuous ranked probability score of weighted draws, in the unit of the values.
@@ -38,14 +34,12 @@ def crps(
     """
     values, weights = real_arrays("... n", values=values, weights=weights)
     observations = real_arrays("...", observations=observations)
-    check_not_negative_array(weights=weights)
-    if weights.shape != values.shape:
-        raise ValueError(f"weights: shape {weights.shape} is not that of values, {values.shape}")
-    if observations.shape != values.shape[:-1]:
-        raise ValueError(
-            f"observations: shape {observations.shape} is not {values.shape[:-1]}, one for each row"
-            " of values"
-        )
+    for name, given, wanted in (
+        ("weights", weights, values.shape),
+        ("observations", observations, values.shape[:-1]),
+    ):
+        if given.shape != wanted:
+            raise ValueError(f"{name}: shape {given.shape} is not {wanted}, by that of values")
     errors = jnp.where(weights > 0, values - observations[..., None], 0.0)
     order = jnp.argsort(errors, axis=-1)
     errors = jnp.take_along_axis(errors, order, axis=-1)
@@ -55,6 +49,7 @@ def crps(
     return 2 * jnp.sum(shares * errors * ((errors > 0).astype(errors.dtype) - middles), axis=-1)
 
 
+@checked
 def log_score(
     model: AbstractStateSpaceModel, mixture: ParticleMixture, observation: PyTree
 ) -> Float[Array, ""]:
@@ -69,19 +64,18 @@ def log_score(
     Raises `ValueError` for anything but a model and a mixture, and for a likelihood of another
     shape.
     """
-    require_model(model, "log_score")
-    check_type(ParticleMixture, "a mixture, as in a Forecast", mixture=mixture)
     observation = one_observation(observation)
     values = likelihoods(model, observation, mixture.particles)
     joint = jnp.where(mixture.occupied, mixture.log_weights + values, -jnp.inf)
     return -log_sum_exp(joint)
 
 
+@checked
 def modes_represented(
     positions: Float[Array, "*batch n"],
     occupied: Bool[Array, "*batch n"],
     modes: Float[Array, "*batch k"],
-    radius: float,
+    radius: Annotated[float | Float[Array, ""], POSITIVE],
 ) -> Bool[Array, "*batch k"]:
     """Whether some particle of positive weight lies within `radius` of each mode.
 
@@ -90,26 +84,23 @@ def modes_represented(
     model whose modes are known. Raises `ValueError` for anything but arrays, masks of another shape
     than the positions, and a radius that is not positive and finite.
     """
-    check_shape("... n", occupied=occupied)
     positions = real_arrays("... n", positions=positions)
     modes = real_arrays("... k", modes=modes)
     if occupied.shape != positions.shape:
         raise ValueError(f"occupied: shape {occupied.shape} is no mask of the positions")
     if modes.shape[:-1] != positions.shape[:-1]:
         raise ValueError(f"modes: shape {modes.shape} does not go with that of {positions.shape}")
-    if not isinstance(radius, jax.Array):
-        check_positive(radius=radius)
     distance = jnp.abs(positions[..., None, :] - modes[..., :, None])
     return jnp.any((distance < radius) & occupied[..., None, :], axis=-1)
 
 
+@checked
 def mass_above(mixture: ParticleMixture, threshold: float) -> Float[Array, ""]:
     """P(x_t > threshold | y_1..y_t) of a scalar state; a particle at the threshold counts half.
 
     The particles' estimate of `GridFilterRun.mass_above`. With a threshold between two modes it is
     the mass of the upper one. Raises `ValueError` for anything but a mixture of scalar states.
     """
-    check_type(ParticleMixture, "a ParticleMixture", mixture=mixture)
     shapes = [leaf.shape for leaf in jax.tree.leaves(mixture.particles)]
     if len(shapes) != 1 or math.prod(shapes[0]) != mixture.num_particles:
         raise ValueError(f"mixture: particles of shapes {shapes} are no scalars")
@@ -119,6 +110,7 @@ def mass_above(mixture: ParticleMixture, threshold: float) -> Float[Array, ""]:
     return mixture.average(above.astype(mixture.log_weights.dtype))
 
 
+@checked
 def uniqueness(mixture: ParticleMixture) -> Float[Array, " objects"]:
     """U/N of each object: its distinct hypotheses as a share of all particles.
 
@@ -128,7 +120,6 @@ def uniqueness(mixture: ParticleMixture) -> Float[Array, " objects"]:
     step lowers it for the objects that have moved, as in the paper's figure 4. Raises `ValueError`
     for particles of other shapes.
     """
-    check_type(ParticleMixture, "a ParticleMixture", mixture=mixture)
     shapes = [leaf.shape for leaf in jax.tree.leaves(mixture.particles)]
     if any(len(shape) < 2 for shape in shapes):
         raise ValueError(f"mixture: particles of shapes {shapes} are not of objects, (n, J, ...)")

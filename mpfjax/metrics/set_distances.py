@@ -6,14 +6,17 @@ total cost, with each entry in at most one pair, and add a cost for each entry w
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.checks import check_callable, check_positive, check_shape, real_arrays
+from mpfjax.checks import Positive, check_shape, checked, number, real_arrays
+
+Order = Annotated[float, number(lambda p: 1 <= p < np.inf, "a finite number of at least 1")]
+Alpha = Annotated[float, number(lambda alpha: 0 < alpha <= 2, "a number in (0, 2]")]
 
 
 @jax.jit  # without it, every call outside of `jax.jit` would compile the search again
@@ -71,12 +74,13 @@ def euclidean(estimates: Float[Array, "k d"], truths: Float[Array, "l d"]) -> Fl
     return jnp.where(coincide, 0.0, jnp.sqrt(jnp.where(coincide, 1.0, squares)))
 
 
+@checked
 def ospa(
     estimates: Float[Array, "k d"],
     truths: Float[Array, "l d"],
     *,
-    cutoff: float,
-    order: float = 2.0,
+    cutoff: Positive,
+    order: Order = 2.0,
     estimate_mask: Bool[Array, " k"] | None = None,
     truth_mask: Bool[Array, " l"] | None = None,
     base_distance: Callable[[Array, Array], Array] = euclidean,
@@ -99,13 +103,14 @@ def ospa(
     return cutoff * pairing.distance(order, 1.0) / size ** (1.0 / order)
 
 
+@checked
 def gospa(
     estimates: Float[Array, "k d"],
     truths: Float[Array, "l d"],
     *,
-    cutoff: float,
-    order: float = 2.0,
-    alpha: float = 2.0,
+    cutoff: Positive,
+    order: Order = 2.0,
+    alpha: Alpha = 2.0,
     estimate_mask: Bool[Array, " k"] | None = None,
     truth_mask: Bool[Array, " l"] | None = None,
     base_distance: Callable[[Array, Array], Array] = euclidean,
@@ -122,9 +127,6 @@ def gospa(
     Raises `ValueError` as `ospa` does, and for an alpha outside (0, 2]. Use it to score trackers
     that may lose objects or invent them, with alpha at 2.
     """
-    check_positive(alpha=alpha)
-    if alpha > 2:
-        raise ValueError(f"alpha: {alpha} is not in (0, 2]")
     pairing = _paired(estimates, truths, cutoff, order, estimate_mask, truth_mask, base_distance)
     near = pairing.is_pair & ~(pairing.distances >= 1.0)
     localisation = jnp.sum(jnp.where(near, (cutoff * pairing.distances) ** order, 0.0))
@@ -149,13 +151,9 @@ def _paired(
     estimates: Any, truths: Any, cutoff: float, order: float, estimate_mask: Any, truth_mask: Any,
     base_distance: Callable[[Array, Array], Array],
 ) -> _Pairing:  # fmt: skip
-    """The cheapest pairing of the two sets; a `ValueError` for arguments that will not do."""
+    """The cheapest pairing of the two sets; a `ValueError` for sets that will not do."""
     estimates = real_arrays("number d", estimates=estimates)
     truths = real_arrays("number d", truths=truths)
-    check_positive(cutoff=cutoff, order=order)
-    if order < 1:
-        raise ValueError(f"order: {order} is less than 1")
-    check_callable("a function of two sets", base_distance=base_distance)
     is_estimate = _mask("estimate_mask", estimate_mask, estimates.shape[0])
     is_truth = _mask("truth_mask", truth_mask, truths.shape[0])
     distances = base_distance(estimates, truths) / cutoff
@@ -210,6 +208,4 @@ def _mask(name: str, mask: Any, size: int) -> Bool[Array, " k"]:
     if mask is None:
         return jnp.ones(size, bool)
     check_shape(f"{size}", **{name: mask})
-    if mask.dtype != bool:
-        raise ValueError(f"{name}: {mask.dtype} is no mask")
-    return jnp.asarray(mask)
+    return jnp.asarray(mask, bool)

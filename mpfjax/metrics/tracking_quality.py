@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.checks import check_whole, real_arrays
+from mpfjax.checks import Count, checked, real_arrays
 
 
 class TrackingQuality(NamedTuple):
@@ -72,11 +72,12 @@ def success_rate(
     return recovery_rate(track_states, present, num_last=max(track_states.shape[1], 1))
 
 
+@checked
 def recovery_rate(
     track_states: Bool[Array, "runs t *objects"],
     present: Bool[Array, "t *objects"] | None = None,
     *,
-    num_last: int = 1,
+    num_last: Count = 1,
 ) -> Float[Array, "*objects"]:
     """The share of runs that are tracked throughout or have recovered from a loss.
 
@@ -86,7 +87,6 @@ def recovery_rate(
     """
     if 0 in track_states.shape[:2]:
         raise ValueError(f"track_states: shape {track_states.shape} holds no runs or no frames")
-    check_whole(num_last=num_last)
     if present is None:
         present = jnp.ones(track_states.shape[1:], bool)
     to_come = jnp.cumsum(present[::-1].astype(jnp.int32), axis=0)[::-1]

@@ -5,7 +5,7 @@ from types import ModuleType
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.checks import check_not_negative, to_rows
+from mpfjax.checks import NotNegative, checked, to_rows
 
 # The kinds of objects and regions that are not scored, in the second column of their rows.
 IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT = 1, 2, 3
@@ -13,13 +13,14 @@ _ROUNDING = float(np.finfo(float).eps)
 _SETTINGS = {"THRESHOLD": 0.5, "PRINT_CONFIG": False}
 
 
+@checked
 def multi_object_scores(
     tracks: Float[np.ndarray, "r 6"],
     truth: Float[np.ndarray, "s 6"],
     frames: tuple[int, int] | None = None,
     *,
     ignored: Float[np.ndarray, "i 6"] | None = None,
-    min_height: float = 0.0,
+    min_height: NotNegative = 0.0,
 ) -> dict[str, float]:
     """Score tracks against the true boxes as TrackEval does, by the overlap of boxes (IoU).
 
@@ -42,7 +43,6 @@ def multi_object_scores(
     published trackers.
     """
     tracks, truth = _checked(tracks, "tracks"), _checked(truth, "truth")
-    check_not_negative(min_height=min_height)
     if frames is not None:
         first, last = frames
         if not first <= last:
@@ -70,11 +70,12 @@ def multi_object_scores(
     return {name: float(score) for name, score in scores.items()}
 
 
+@checked
 def remove_ignored(
     tracks: Float[np.ndarray, "r 6"],
     truth: Float[np.ndarray, "s 6"],
     ignored: Float[np.ndarray, "i 6"],
-    min_height: float = 0.0,
+    min_height: NotNegative = 0.0,
 ) -> Float[np.ndarray, "k 6"]:
     """The tracked boxes that count, as MOTChallenge and KITTI choose them before they score.
 
@@ -97,7 +98,6 @@ def remove_ignored(
     ignored = _rows(ignored, "ignored")
     for kind in np.setdiff1d(ignored[:, 1], (IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT)):
         raise ValueError(f"ignored: {kind:g} is none of the kinds 1, 2 and 3")
-    check_not_negative(min_height=min_height)
     if len(ignored) == 0 and min_height == 0:
         return tracks
     regions = ignored[:, 1] == IGNORED_REGION

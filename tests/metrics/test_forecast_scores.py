@@ -41,44 +41,11 @@ class TestCrps:
         found = crps(1.0 + 2.0 * quantiles, jnp.full(4000, 1 / 4000), jnp.asarray(1.0 + 2.0 * z))
         assert float(found) == pytest.approx(expected, rel=1e-3)
 
-    @pytest.mark.usefixtures("as_installed")
-    @pytest.mark.parametrize(
-        ("change", "named"),
-        [
-            ({"weights": jnp.ones((2, 4))}, r"weights: shape \(2, 4\)"),
-            ({"observations": jnp.ones(3)}, r"observations: shape \(3,\) is not \(2,\)"),
-        ],
-    )
-    def test_shapes_that_do_not_fit_are_named(self, change, named):
-        good = {
-            "values": jnp.ones((2, 3)),
-            "weights": jnp.ones((2, 3)),
-            "observations": jnp.ones(2),
-        }
-        with pytest.raises(ValueError, match=named):
-            crps(**good | change)
-
 
 class TestLogScore:
-    @pytest.mark.thorough
-    def test_one_step_ahead_is_the_next_increment(self):
-        """Up to the Monte Carlo error of two predictions."""
-        model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
-        filter = mpfjax.mixture_particle_filter(model, 2000, 2)
-        run = mpfjax.run_filter(jax.random.key(0), filter, jnp.array([1.2, 1.0]))
-        ahead = mpfjax.forecast(jax.random.key(1), filter, run.final, 1)
-        mixture = jax.tree.map(lambda leaf: leaf[0], ahead.mixtures)
-        _, info = filter.step(jax.random.key(2), run.final, jnp.asarray(0.8))
-        score = log_score(model, mixture, jnp.asarray(0.8))
-        assert float(score) == pytest.approx(-float(info.log_likelihood_increment), abs=0.1)
-        by_hand = np.exp(mixture.log_weights) @ np.exp(
-            np.asarray(model.log_likelihood(jnp.asarray(0.8), mixture.particles), float)
-        )
-        assert float(score) == pytest.approx(-np.log(by_hand), abs=1e-4)
-
     def test_of_a_conditionally_linear_model_x_is_integrated_out(self):
         """The sum over all sequences of regimes has -log p(y_4 | y_1..y_3)."""
-        filter = mpfjax.mixture_particle_filter(switching.MODEL, 4000, 2)
+        filter = mpfjax.particle_filter(switching.MODEL, 4000)
         run = mpfjax.run_filter(jax.random.key(0), filter, switching.OBSERVATIONS[:3])
         ahead = mpfjax.forecast(jax.random.key(1), filter, run.final, 1)
         mixture = jax.tree.map(lambda leaf: leaf[0], ahead.mixtures)

@@ -102,22 +102,3 @@ def test_an_object_that_is_never_tracked_has_zeros():
     truth, estimates = jnp.broadcast_to(G, (3, 1, 4)), jnp.full((2, 3, 1, 4), 500.0)
     quality = tracking_quality(estimates, truth)
     np.testing.assert_array_equal(jnp.stack(quality), 0.0)
-
-
-def test_vmap_is_a_loop():
-    rng = np.random.default_rng(1)
-    estimates = jnp.asarray(rng.uniform(0, 40, (3, 4, 5, 2, 4)))
-    truth = jnp.asarray(rng.uniform(0, 40, (5, 2, 4)))
-    together = jax.vmap(tracking_quality, in_axes=(0, None))(estimates, truth)
-    for k in range(3):
-        for one, many in zip(tracking_quality(estimates[k], truth), together, strict=True):
-            np.testing.assert_allclose(many[k], one, rtol=1e-5)
-
-
-def test_bad_input():
-    with pytest.raises(ValueError, match=r"track_states: shape \(0, 5\)"):
-        success_rate(STATES[:0])
-    with pytest.raises(ValueError, match=r"track_states: shape \(4, 0\)"):
-        recovery_rate(STATES[:, :0])
-    with pytest.raises(ValueError, match="num_last: 0"):
-        recovery_rate(STATES, num_last=0)

@@ -55,21 +55,6 @@ def test_tracks_that_change_objects_half_way():
 
 
 @needs_trackeval
-def test_one_miss():
-    """Four matches of a whole track, and three whose track has 3 of its object's 4 boxes."""
-    association = (4 * 1 + 3 * (3 / 4)) / 7
-    check(
-        multi_object_scores(TRUTH[:-1], TRUTH),
-        DetA=7 / 8,
-        AssA=association,
-        HOTA=(7 / 8 * association) ** 0.5,
-        MOTA=7 / 8,
-        IDF1=7 / 7.5,
-        misses=1,
-    )
-
-
-@needs_trackeval
 @pytest.mark.parametrize("frame", [2, 9])
 def test_one_false_positive(frame):
     """In a frame of its own as well, where there is no object."""
@@ -81,14 +66,6 @@ def test_one_false_positive(frame):
         IDF1=8 / 8.5,
         false_positives=1,
     )
-
-
-@needs_trackeval
-def test_boxes_that_are_off():
-    """An overlap of 0.62 is a match at 12 of the 19 thresholds of HOTA, and at 0.5."""
-    truth = np.array([row(t, 1, 0.0, w=81.0) for t in (1, 2, 3)])
-    off = np.array([row(t, 1, 19.0, w=81.0) for t in (1, 2, 3)])
-    check(multi_object_scores(off, truth), DetA=12 / 19, AssA=12 / 19, HOTA=12 / 19, MOTP=0.62)
 
 
 @needs_trackeval
@@ -113,23 +90,6 @@ def test_overlap_by_hand():
     expected = [[1, 0.25, 0], [25 / 175, 4 / 121, 0], [0, 0, 0], [0, 0, 0]]
     np.testing.assert_allclose(overlap(boxes, objects), expected)
     assert overlap(np.zeros((0, 4)), objects).shape == (0, 3)
-
-
-@pytest.mark.parametrize(
-    ("tracks", "truth", "frames", "message"),
-    [
-        (TRUTH, NONE, None, "truth: there are no true boxes"),
-        (TRUTH, TRUTH, (5, 9), "truth: there are no true boxes"),
-        (TRUTH, TRUTH, (3, 2), "frames: 2, the last, comes before 3"),
-        (TRUTH[[0, 1, 0]], TRUTH, None, "tracks: id 1 has more than one box in frame 1"),
-        (TRUTH, TRUTH[[2, 3, 3]], None, "truth: id 2 has more than one box in frame 2"),
-        (TRUTH + np.nan, TRUTH, None, "tracks: holds numbers that are not finite"),
-        (TRUTH, TRUTH + np.inf, None, "truth: holds numbers that are not finite"),
-    ],
-)
-def test_input_without_a_score(tracks, truth, frames, message):
-    with pytest.raises(ValueError, match=message):
-        multi_object_scores(tracks, truth, frames)
 
 
 def test_a_missing_trackeval_says_how_to_install_it(monkeypatch):

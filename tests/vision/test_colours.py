@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import rgb_to_hsv
 
-from mpfjax.vision.colour.bins import HSVColours, RGBColours, hue_saturation_value
+from mpfjax.vision.colour.bins import HSVColours, hue_saturation_value
 from mpfjax.vision.colour.histograms import integral_histogram
 
 
@@ -46,26 +46,3 @@ def test_hsv_counts_by_colour_or_by_value(frame):
     reached = expected[:20].reshape(5, 4) > 0
     np.testing.assert_array_equal(reached, np.tile([False, True, True, True], (5, 1)))
     assert expected[20:].min() > 0
-
-
-def test_bins_cover_their_range(frame):
-    for colours in (RGBColours(7), HSVColours(3, 5, 4), HSVColours(1, 1, 1)):
-        bins = np.asarray(colours.bins(jnp.asarray(frame)))
-        assert bins.shape == (40, 50, colours.num_channels)
-        np.testing.assert_array_equal(np.unique(bins), np.arange(colours.num_bins))
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: RGBColours(0), "num_bins: 0"),
-        (lambda: RGBColours(257), "num_bins: 257"),
-        (lambda: HSVColours(num_hues=0), "num_hues: 0"),
-        (lambda: HSVColours(num_values=-1), "num_values: -1"),
-        (lambda: HSVColours(least_saturation=1.5), "least_saturation: 1.5"),
-        (lambda: HSVColours(least_value=-0.1), "least_value: -0.1"),
-    ],
-)
-def test_misuse_is_named(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mpfjax.vision import Detections, ObjectTracker, track
+from mpfjax.vision import ObjectTracker, track
 
 TRACKER = ObjectTracker(6, frames_per_second=25)
 NUM_FRAMES = 40
@@ -51,13 +51,6 @@ def test_a_gap_at_the_border_of_all_detections_so_far_ends_nobody(step):
     assert alone(boxes) == [[1]] * 14
 
 
-def test_a_detection_beyond_all_others_so_far_is_an_object():
-    rows = np.array([[t, -1, 100 + 50 * t * (t > 3), 100, 20, 40, 1] for t in range(1, 4)])
-    far = np.array([[t, -1, 900.0 + t, 700, 20, 40, 1] for t in range(4, 9)])
-    tracks = list(track(None, np.concatenate([rows, far]), TRACKER))
-    assert 2 in np.asarray(tracks[-1].identities)[np.asarray(tracks[-1].shown)]
-
-
 def test_who_leaves_a_frame_of_known_size_ends_and_who_enters_there_is_another():
     """The centre passes the right border, at 640, in the ninth frame."""
     leaving = [[580.0 + 6 * t, 200, 20, 40] for t in range(8)]
@@ -70,34 +63,11 @@ def test_who_leaves_a_frame_of_known_size_ends_and_who_enters_there_is_another()
     assert living(tracks[-1]) == [2]
 
 
-@pytest.mark.parametrize("given", ["frames", "size"])
-def test_what_bounds_the_tracks_is_the_frame_with_pixels_and_without(given):
-    """The last detection, at the border of 64 x 48, reaches beyond where the prediction leaves."""
-    found = [np.array([[46 + 3.0 * t, 10, 10, 20]]) for t in range(5)]
-    found += [np.zeros((0, 4))] * 6
-    frames = np.zeros((len(found), 48, 64, 3), np.uint8)
-    if given == "frames":
-        tracks = list(track(frames, iter(found), TRACKER, use_colours=False))
-    else:
-        tracks = list(track(None, iter(found), TRACKER, frame_size=(48, 64)))
-    assert living(tracks[4]) == [1]
-    assert living(tracks[-1]) == []
-
-
 @pytest.mark.parametrize("every", [2, 7, 12, 13, 14, 15, 19, 24, 25])
 def test_a_motionless_object_that_is_rarely_detected_is_one_object(every):
     boxes = [(100, 100, 10, 20) if t % every == 0 else None for t in range(12 * every + 1)]
     identities = alone(boxes)
     assert [identities[t] for t in range(0, len(boxes), every)] == [[1]] * 13
-
-
-def test_a_motionless_object_that_is_detected_at_random_is_one_object():
-    rng = np.random.default_rng(1)
-    for _ in range(3):
-        seen = np.cumsum(rng.integers(1, 25, 20))
-        boxes = [(100, 100, 10, 20) if t == 0 or t in seen else None for t in range(seen[-1] + 1)]
-        identities = alone(boxes)
-        assert [identities[t] for t in seen] == [[1]] * 20
 
 
 # --- coordinates ---------------------------------------------------------------------------
@@ -121,14 +91,6 @@ def test_the_origin_of_the_coordinates_changes_nothing(origin, form):
     assert max(max(living(tracks)) for tracks in far) == 4
 
 
-def test_boxes_in_degrees_are_tracked_as_those_in_metres_are():
-    """Boxes of some metres, at 48 degrees north: a ten thousandth of a degree."""
-    rows = crowd()
-    degrees = rows * np.array([1, 1, 1e-5, 1e-5, 1e-5, 1e-5, 1])
-    tracks = list(track(None, placed(degrees, 48.2, 16.4), TRACKER))
-    assert all(living(one) == [1, 2, 3, 4] for one in tracks)
-
-
 def test_the_origin_moves_the_bounds_of_the_frame_too():
     """A lone object leaves on the right, with coordinates that are large and a frame that is so."""
     side = 10_000_000
@@ -137,12 +99,6 @@ def test_the_origin_moves_the_bounds_of_the_frame_too():
     tracks = list(track(None, iter(found), TRACKER, frame_size=(side, side)))
     assert living(tracks[6]) == [1]
     assert living(tracks[-1]) == []
-
-
-def test_boxes_finer_than_float32_at_their_place_are_refused_by_name():
-    with pytest.raises(ValueError, match=r"boxes: .*float32.*origin"):
-        Detections.from_boxes(np.array([[5e6, 5e6, 0.6, 1.8]]), 2)
-    Detections.from_boxes(np.array([[5e6, 5e6, 600, 1800]]), 2)
 
 
 # --- masked arrays -------------------------------------------------------------------------
@@ -188,35 +144,3 @@ def test_masked_boxes_of_a_frame_are_no_detections_and_rows_are_those_given():
         np.testing.assert_array_equal(
             a.detections, np.where(b.detections < 0, -1, b.detections + 1)
         )
-
-
-def test_masked_boxes_given_to_a_step_are_no_detections():
-    boxes = np.array([[10.0, 10, 5, 9], [90, 90, 5, 9], [40, 40, 5, 9]])
-    found = Detections.from_boxes(masked(boxes, [1], range(4)), 4, np.array([1, 2, 3.0]))
-    expected = Detections.from_boxes(boxes[[0, 2]], 4, np.array([1, 3.0]))
-    np.testing.assert_array_equal(found.boxes, expected.boxes)
-    np.testing.assert_array_equal(found.scores, expected.scores)
-    assert np.asarray(found.rows)[:2].tolist() == [0, 2]
-
-
-def test_masked_scores_are_an_error():
-    rows = masked(crowd(3), [5], [6])
-    with pytest.raises(ValueError, match=r"score.* masked"):
-        list(track(None, rows, TRACKER))
-    found = [
-        (boxes, np.ma.masked_where(np.arange(4) == 1, scores))
-        for boxes, scores in by_frame(crowd(3))
-    ]
-    with pytest.raises(ValueError, match=r"frame 1: scores .* masked"):
-        list(track(None, iter(found), TRACKER))
-    with pytest.raises(ValueError, match=r"scores: .* masked"):
-        Detections.from_boxes(found[0][0], 4, found[0][1])
-
-
-def test_a_masked_frame_is_no_detection_and_a_mask_without_entries_changes_nothing():
-    rows = crowd(8)
-    expected = list(track(None, rows, TRACKER))
-    same(list(track(None, np.ma.array(rows), TRACKER)), expected)
-    more, bad = spoilt(rows)
-    same(list(track(None, masked(more, bad, [0]), TRACKER)), expected)
-    same(list(track(None, masked(rows, range(9), [1]), TRACKER)), expected)  # the id is not read

@@ -34,11 +34,6 @@ def test_or_a_hypothesis_about_one_of_the_given_boxes():
     assert rows[:, :2].tolist() == [[1, 1], [1, 2], [2, 1], [3, 1], [3, 1], [3, 2]]
 
 
-def test_without_references_there_is_no_such_track():
-    with pytest.raises(ValueError, match="by_reference: the snapshots"):
-        track_rows(snapshots(references=False), by_reference=True)
-
-
 def drawn_on_dark():
     """A dark frame, and a snapshot of one box and one particle near its lower right corner."""
     snapshot = Snapshot(

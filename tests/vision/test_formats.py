@@ -6,7 +6,6 @@ import pytest
 from mpfjax.metrics import multi_object_scores
 from mpfjax.metrics.tracking_scores import IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT
 from mpfjax.vision import read_detections, read_tracks, read_truth
-from mpfjax.vision.files.boxes import write_tracks
 from mpfjax.vision.files.sequences import SequenceInfo, read_sequence_info
 
 
@@ -140,15 +139,6 @@ def test_the_format_may_be_said(tmp_path, format, counted):
     assert ids(truth_of(tmp_path, lines, format=format).objects) == counted
 
 
-def test_a_format_that_does_not_fit_is_refused_by_the_line(tmp_path):
-    lines = rows_with("1,1,1", "1,2,1", "0,14,1", "1,1,1")
-    for format, line in {"motchallenge": 3, "visdrone": 3}.items():
-        with pytest.raises(ValueError, match=rf"gt\.txt, line {line}: has no class from"):
-            truth_of(tmp_path, lines, format=format)
-    with pytest.raises(ValueError, match="format: 'coco' is not one of"):
-        truth_of(tmp_path, lines, format="coco")
-
-
 def test_an_object_without_an_identity_is_refused_by_the_line(tmp_path):
     """CVAT writes -1 for shapes that are no tracks."""
     with pytest.raises(ValueError, match=r"gt\.txt, line 2: -1 is no id"):
@@ -225,19 +215,6 @@ def test_other_headers_and_frames_are_refused_by_the_line(tmp_path, reader, text
         READERS[reader](path)
 
 
-def test_what_is_ignored_in_frame_0_is_refused_and_an_empty_list_is_none(tmp_path):
-    (tmp_path / "ignore.txt").write_text("# frame,kind\n")
-    assert len(truth_of(tmp_path, ["1,1,5,5,9,9,1"]).ignored) == 0
-    (tmp_path / "ignore.txt").write_text("0,2,5,5,9,9\n")
-    with pytest.raises(ValueError, match=r"ignore\.txt, line 1: lies in frame 0"):
-        truth_of(tmp_path, ["1,1,5,5,9,9,1"])
-
-
-def test_tracks_of_frame_0_are_not_written(tmp_path):
-    with pytest.raises(ValueError, match=r"rows: .* is not frame,id"):
-        write_tracks(tmp_path / "tracks.txt", np.array([[0, 1, 5, 5, 9, 9.0]]))
-
-
 # --- seqinfo.ini ----------------------------------------------------------------------------
 
 INFO = SequenceInfo("MOT17-02", 30.0, 600, (1080, 1920))
@@ -261,15 +238,3 @@ LINES = "name=MOT17-02\nframeRate=30\nseqLength=600\nimWidth=1920\nimHeight=1080
 def test_the_metadata_of_a_sequence_are_read_however_they_are_written(tmp_path, text):
     (tmp_path / "seqinfo.ini").write_bytes(text.encode())
     assert read_sequence_info(tmp_path) == INFO
-
-
-def test_names_may_hold_blanks_and_what_is_missing_is_none(tmp_path):
-    (tmp_path / "seqinfo.ini").write_text("[Sequence]\nname = A street: two\nframeRate=\n")
-    assert read_sequence_info(tmp_path) == SequenceInfo(name="A street: two")
-
-
-@pytest.mark.parametrize("line", ["frameRate=thirty", "frameRate=29,97", "= 30"])
-def test_metadata_that_are_no_numbers_are_refused_by_name(tmp_path, line):
-    (tmp_path / "seqinfo.ini").write_text(f"[Sequence]\n{line}\n")
-    with pytest.raises(ValueError, match=r"seqinfo\.ini"):
-        read_sequence_info(tmp_path)

@@ -60,13 +60,6 @@ def test_counts_are_numpys(frame, num_bins, num_parts, wide_counts, soon):
     np.testing.assert_array_equal(np.asarray(counts), expected)
 
 
-def test_bands_make_up_the_box(frame):
-    table = integral_histogram(jnp.asarray(frame), RGBColours(30))
-    boxes = jnp.asarray(random_boxes(40))
-    whole, bands = counted(table, boxes), counted(table, boxes, 3)
-    np.testing.assert_array_equal(np.asarray(bands.sum(axis=1)), np.asarray(whole[:, 0]))
-
-
 @pytest.mark.parametrize(
     "box",
     [
@@ -89,21 +82,6 @@ def test_a_box_without_pixels_is_empty_and_lies_farthest(frame, box):
     np.testing.assert_array_equal(np.asarray(bhattacharyya(normalise(counts), reference)), 1.0)
 
 
-def test_a_box_too_large_for_its_counter_is_unknown_and_exact_in_a_wide_one():
-    frame = jnp.zeros((300, 300, 3), jnp.uint8)
-    box = jnp.asarray([(150.0, 150.0, 290.0, 290.0)])
-    assert jnp.isnan(integral_histogram(frame, RGBColours(4)).counts(box)).all()
-    assert (
-        integral_histogram(frame, RGBColours(4), wide_counts=True).counts(box)[0, 0, 0, 0] == 290**2
-    )
-
-
-def test_counts_survive_the_counter_wrapping_around():
-    frame = jnp.zeros((300, 300, 3), jnp.uint8)
-    box = jnp.asarray([(280.0, 280.0, 40.0, 40.0)])
-    assert integral_histogram(frame, RGBColours(4)).counts(box)[0, 0, 0, 0] == 1600
-
-
 def test_the_table_is_built_once_for_all_runs(frame):
     boxes = jnp.asarray(random_boxes(6)).reshape(2, 3, 4)
 
@@ -114,16 +92,3 @@ def test_the_table_is_built_once_for_all_runs(frame):
     (build,) = [e for e in program.jaxpr.eqns if "table" in str(e.params.get("name"))]
     # Rows, columns and colours, without an axis of runs.
     assert [len(variable.aval.shape) for variable in build.outvars] == [3]
-
-
-def test_bhattacharyya_against_its_formula():
-    rng = np.random.default_rng(2)
-    a, b = rng.dirichlet(np.ones(30), size=(2, 5))
-    expected = 1 - np.sqrt(a * b).sum(axis=1)
-    np.testing.assert_allclose(
-        np.asarray(bhattacharyya(jnp.asarray(a, jnp.float32), jnp.asarray(b, jnp.float32))),
-        expected,
-        atol=1e-6,
-    )
-    same = jnp.asarray(a, jnp.float32)
-    np.testing.assert_allclose(np.asarray(bhattacharyya(same, same)), 0.0, atol=1e-6)

@@ -6,10 +6,7 @@ import pytest
 
 from mpfjax.vision import (
     ColourModel,
-    Detections,
-    ObjectTracker,
     RGBColours,
-    joint_colour_model,
 )
 from mpfjax.vision.boxes.colour_model import BoxState
 from mpfjax.vision.colour.histograms import integral_histogram, normalise
@@ -121,26 +118,3 @@ def test_growing_beyond_all_counts_is_not_rewarded(frame):
     countable = (60 * scales) ** 2 < 2**16
     np.testing.assert_allclose(found[countable], 0.0, atol=1e-3)
     np.testing.assert_allclose(found[~countable], -3 / (2 * 0.15**2), rtol=1e-5)
-
-
-def test_templates_of_many_pixels_are_learned(frame):
-    box = box_of(65_536)
-    model = joint_colour_model(frame, box[None], num_parts=1, colours=COLOURS)
-    np.testing.assert_allclose(
-        model.object_model.references[0, 0, 0], numpy_shares(frame, box), rtol=1e-5
-    )
-
-
-@pytest.mark.thorough
-def test_a_tracker_learns_the_colours_of_large_objects(frame):
-    """An object that grows beyond what 16 bits count."""
-    tracker = ObjectTracker(1)
-    state = tracker.init()
-    for w, h in [(250, 255), (262, 262), (270, 270), (280, 280)]:
-        box = [[(WIDTH - w) / 2, (HEIGHT - h) / 2, w, h]]
-        found = Detections.from_boxes(np.array(box), 1)
-        state, tracks = tracker.step(None, state, frame, found)
-    assert w * h > 2**16
-    assert tracks.identities.tolist() == [1]
-    bands = np.asarray(state.colours).reshape(3, -1)
-    np.testing.assert_allclose(bands.sum(axis=1), 1.0, rtol=1e-4)

@@ -75,15 +75,6 @@ def test_the_likelihood_and_what_is_learned_by_hand(anchor, hidden, rate):
     np.testing.assert_array_equal(moved.particles.box, states.box)
 
 
-def test_with_nothing_learned_and_nothing_hidden_it_is_the_colour_model():
-    inner = colour_model(contrast=0.25)
-    model = learned_model(0.25, anchor=0.5, hidden_distance=1e3)
-    states, frame = states_of(inner), jnp.asarray(NOW)
-    bare = BoxState(states.box, states.reference)
-    expected = inner.log_likelihood(frame, bare)
-    np.testing.assert_allclose(model.log_likelihood(frame, states), expected, rtol=1e-5)
-
-
 def test_outside_the_frame_nothing_is_learned_and_the_object_is_hidden():
     inner = colour_model()
     model = learned_model(hidden_distance=0.1)
@@ -93,7 +84,3 @@ def test_outside_the_frame_nothing_is_learned_and_the_object_is_hidden():
     assert not np.allclose(learned.appearance[2], states.appearance[2])
     hidden = -0.5 * 0.1 / 0.5**2
     assert model.log_likelihood(frame, states)[0] == pytest.approx(hidden, abs=0.01)
-
-
-def test_it_says_that_it_is_approximate():
-    assert AdaptAppearance(learned_model()).approximate

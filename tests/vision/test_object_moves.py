@@ -52,8 +52,3 @@ def test_pruning_compares_within_an_object_only():
     assert moved.active.tolist() == [True, False, True, True]
     kept = np.asarray(moved.log_weights)[[0, 2, 3]]
     np.testing.assert_allclose(kept, np.log([0.5, 4e-3, 1e-4]), rtol=1e-6)
-
-
-def test_both_say_that_they_are_approximate():
-    assert ObjectExclusion().approximate
-    assert PruneHypotheses().approximate

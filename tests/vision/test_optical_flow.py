@@ -140,45 +140,6 @@ def test_no_motion_is_known_where_there_is_none_to_find(frames):
     assert not flow_between(*frames).known
 
 
-def test_after_a_cut_the_next_motion_is_known_again():
-    flow, matrix = OpticalFlow(), similarity(0, 1, (3, 0))
-    known = [
-        bool(flow(frame).known) for frame in (texture(1), texture(2), warped(texture(2), matrix))
-    ]
-    assert known == [False, False, True]
-
-
-def test_a_frame_that_boxes_cover_tells_nothing():
-    everything = np.array([[-5.0, -5.0, 2.0 * WIDTH, 2.0 * HEIGHT]])
-    assert not flow_between(texture(), texture(), everything, everything).known
-
-
-def test_grey_frames_and_colour_frames_tell_the_same():
-    frame, matrix = texture(), similarity(0.01, 1.0, (5, 2))
-    pair = frame, warped(frame, matrix)
-    grey = flow_between(*pair)
-    one_channel = flow_between(*(image[:, :, None] for image in pair))
-    colour = flow_between(*(np.repeat(image[:, :, None], 3, axis=2) for image in pair))
-    turned = flow_between(*(np.asfortranarray(image) for image in pair))
-    for other in (one_channel, colour, turned):
-        np.testing.assert_allclose(other.shift, grey.shift, atol=0.05)
-
-
-@pytest.mark.parametrize(
-    ("frame", "boxes", "message"),
-    [
-        (texture().astype(float), None, "frame: float64 is not uint8"),
-        (texture().astype(np.uint16), None, "frame: uint16 is not uint8"),
-        (np.zeros((4, 4, 4), np.uint8), None, r"frame: \(4, 4, 4\)"),
-        (np.zeros(4, np.uint8), None, r"frame: \(4,\)"),
-        (texture(), np.zeros((2, 3)), "boxes: "),
-    ],
-)
-def test_what_is_no_frame_is_named(frame, boxes, message):
-    with pytest.raises(ValueError, match=message):
-        OpticalFlow()(frame, boxes)
-
-
 # --- what a tracker makes of it -------------------------------------------------------------------
 
 
@@ -258,17 +219,6 @@ def test_an_object_without_detections_moves_with_the_picture():
     assert distances(detections[-1], boxes[-1]).min() > 6
 
 
-def test_an_unknown_motion_is_left_to_the_detections():
-    """Blank frames with "pixels" give what "detections" does, to rounding."""
-    frames, boxes = shaken()
-    blank = [np.zeros_like(frame) for frame in frames]
-    got = run(blank, boxes, camera_motion="pixels")
-    expected = run(blank, boxes, camera_motion="detections")
-    for one, other in zip(got, expected, strict=True):
-        np.testing.assert_array_equal(one.identities, other.identities)
-        np.testing.assert_allclose(one.boxes, other.boxes, atol=1e-3)
-
-
 def test_wrong_motions_from_pixels_are_overruled_by_the_detections():
     """Jumps of 5 pixels, which the camera did not make, are taken out again."""
     boxes = shaken(1)[1][0]
@@ -298,15 +248,3 @@ def test_without_opencv_detections_alone_tell_the_motion(monkeypatch):
         np.testing.assert_array_equal(one.boxes, other.boxes)
     with pytest.raises(ImportError, match="pip install opencv-python-headless"):
         track(frames, boxes, TRACKER, camera_motion="pixels")
-
-
-@pytest.mark.parametrize(
-    ("frames", "motion", "message"),
-    [
-        (None, "pixels", "camera_motion: 'pixels' needs frames"),
-        ([texture()], "flow", "camera_motion: 'flow'"),
-    ],
-)
-def test_a_request_that_cannot_be_met_is_named(frames, motion, message):
-    with pytest.raises(ValueError, match=message):
-        track(frames, [np.zeros((0, 4))], TRACKER, camera_motion=motion)

@@ -147,14 +147,6 @@ def test_a_full_house_takes_no_more_and_the_next_free_place_is_filled():
     assert living(tracks[-1]) == [2, 3, 4, 5]
 
 
-def test_of_more_than_there_is_room_for_the_strongest_are_tracked():
-    corners = [(2, 2), (14, 2), (26, 2), (38, 2), (50, 2), (2, 30)]
-    tracks = run([corners] * 2, scores=lambda t: [0.9, 0.8, 1.0, 0.6, 0.95, 0.85])
-    assert all(each.full for each in tracks)
-    np.testing.assert_allclose(sorted(tracks[-1].boxes[:, 0]), [5, 5, 29, 53], atol=1)
-    assert not run([corners[:4]])[-1].full
-
-
 def test_a_second_box_of_an_object_begins_no_other():
     tracks = run(
         [[(20, 20)]] * 4,
@@ -226,19 +218,6 @@ def test_who_looks_alike_in_place_is_told_by_colour():
     tracks = run([corners(t) for t in range(13)], pixels=True)
     first = 1 if box_of(tracks[0], 1)[0] < box_of(tracks[0], 2)[0] else 2
     assert box_of(tracks[-1], first)[0] > box_of(tracks[-1], 3 - first)[0]
-
-
-@pytest.mark.parametrize(
-    ("frame", "said"),
-    [
-        (np.zeros((20, 30), np.uint8), r"frame: \(20, 30\) is not the shape"),
-        (np.zeros((20, 30, 1), np.uint8), r"frame: \(20, 30, 1\) is not the shape"),
-        (np.zeros((20, 30, 3), np.float32), "frame: float32 is not uint8"),
-    ],
-)
-def test_a_frame_without_colours_is_named(as_installed, frame, said):
-    with pytest.raises(ValueError, match=said):
-        TRACKER.step(None, TRACKER.init(), frame, detections([]))
 
 
 # --- scores and classes --------------------------------------------------------------------
@@ -318,15 +297,6 @@ def test_boxes_of_other_classes_are_no_doubles_and_the_likelier_class_is_taken()
     assert rows == {1: {0}, 2: {1}} or rows == {1: {1}, 2: {0}}
 
 
-def test_detections_keep_the_labels_of_their_rows(as_installed):
-    boxes = boxes_at([(3 * t, 5) for t in range(8)])
-    found = Detections.from_boxes(boxes, 3, np.arange(8.0), labels=np.arange(8))
-    assert found.labels.tolist() == [5, 6, 7]
-    for labels, said in (([-1], "whole numbers from 0"), ([1, 2], "one a box")):
-        with pytest.raises(ValueError, match=f"^labels: .*{said}"):
-            Detections.from_boxes(boxes[:1], 3, labels=np.array(labels))
-
-
 # --- a camera that shakes ------------------------------------------------------------------
 
 
@@ -355,28 +325,3 @@ def test_still_objects_before_a_shaking_camera_are_shown_from_the_second_second_
 
 
 # --- settings ------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("max_objects", 0),
-        ("frames_per_second", 0.0),
-        ("frames_per_second", float("nan")),
-        ("scores", "ranked"),
-        ("scores", (0.5,)),
-        ("scores", (0.6, 0.5)),
-        ("class_matters", "sometimes"),
-        ("class_matters", True),
-    ],
-)
-def test_a_bad_setting_is_named(as_installed, name, value):
-    with pytest.raises(ValueError, match=f"^{name}: "):
-        ObjectTracker(**{name: value})
-
-
-def test_a_step_needs_detections_and_a_state(as_installed):
-    with pytest.raises(ValueError, match=r"^detections: "):
-        TRACKER.step(None, TRACKER.init(), None, np.ones((1, 4)))
-    with pytest.raises(ValueError, match=r"^state: "):
-        TRACKER.step(None, None, None, detections([]))

@@ -201,22 +201,3 @@ def test_a_truth_is_found_in_its_folder_and_cut_to_frames(tmp_path):
     later = truth.between(2)
     np.testing.assert_array_equal(later.objects[:, :2], [[2, 1]])
     np.testing.assert_array_equal(later.ignored, [[2, 1, 0, 0, 9, 9]])
-
-
-@pytest.mark.parametrize(
-    "line", ["1,4,0,0,9,9", "1,2,0,0,9", "1,2,0,0,9,nan", "1.5,2,0,0,9,9", "one,2,0,0,9,9"]
-)
-def test_a_line_of_what_is_ignored_that_does_not_parse_is_named(tmp_path, line):
-    (tmp_path / "gt.txt").write_text("1,1,5,5,9,9,1\n")
-    (tmp_path / "ignore.txt").write_text(f"1,2,0,0,9,9\n{line}\n")
-    with pytest.raises(ValueError, match=r"ignore\.txt, line 2: .* kind 1 or 2"):
-        read_truth(tmp_path / "gt.txt")
-
-
-@pytest.mark.parametrize(("last", "counted"), [("3,1", 2), ("-1,-1,-1", 2), ("4.5,1,0", 2)])
-def test_other_columns_than_motchallenges_classes_change_nothing(tmp_path, last, counted):
-    """Somebody's cars, and the places in metres of MOT15."""
-    (tmp_path / "gt.txt").write_text(f"1,1,5,5,9,9,1,{last}\n1,2,50,5,9,9,1,{last}\n")
-    truth = read_truth(tmp_path)
-    assert len(truth.objects) == counted
-    assert len(truth.ignored) == 0

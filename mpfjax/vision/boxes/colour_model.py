@@ -8,17 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt8
 
-from mpfjax.checks import (
-    check_not_negative,
-    check_positive,
-    check_shape,
-    check_share,
-    check_type,
-    check_whole,
-    given,
-    shown,
-    to_rows,
-)
+from mpfjax.checks import Count, NotNegative, Positive, Share, check_shape, checked, shown
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
 from mpfjax.operations.random import fast_key
@@ -197,20 +187,21 @@ class ColourModel(AbstractBoxModel):
     wide_counts: bool = eqx.field(static=True, default=False)
 
     @classmethod
+    @checked
     def from_frame(
         cls,
         frame: UInt8[np.ndarray, "h w 3"],
         boxes: Float[np.ndarray, "k 4"],
         *,
         colours: AbstractColours | None = None,
-        sigma: float = 0.15,
+        sigma: Positive = 0.15,
         deviations: Float[np.ndarray, "..."] | None = None,
         dynamics: AbstractDynamics | None = None,
-        num_parts: int = 1,
+        num_parts: Count = 1,
         weigh_colours: bool = False,
         share_reference: bool = False,
-        switch_probability: float = 0.0,
-        contrast: float = 0.0,
+        switch_probability: Share = 0.0,
+        contrast: NotNegative = 0.0,
     ) -> "ColourModel":
         """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
 
@@ -230,21 +221,11 @@ class ColourModel(AbstractBoxModel):
         a number that is not positive, and for a probability outside [0, 1].
         """
         check_frame(frame)
-        boxes = to_rows(4, "boxes", boxes)
-        if len(boxes) == 0:
-            raise ValueError("boxes: there are none")
-        check_boxes(boxes, *frame.shape[:2])
+        boxes = check_boxes(boxes, *frame.shape[:2])
         colours = RGBColours() if colours is None else colours
-        check_type(AbstractColours, "AbstractColours such as RGBColours()", colours=colours)
-        kind = "AbstractDynamics such as RandomWalk(deviations)"
-        check_type(AbstractDynamics, kind, **given(dynamics=dynamics))
         deviations = positive_deviations(
             np.sqrt(PAPER_VARIANCES) if deviations is None else deviations, len(boxes)
         )
-        check_positive(sigma=sigma)
-        check_whole(num_parts=num_parts)
-        check_share(switch_probability=switch_probability)
-        check_not_negative(contrast=contrast)
         places = jnp.asarray(centred(boxes), float)
         references, weights = reference_histograms(frame, colours, places, num_parts, weigh_colours)
         if share_reference:
@@ -335,10 +316,7 @@ def _distances(
 
 def positive_deviations(deviations: Any, num_boxes: int) -> np.ndarray:
     """Four positive numbers, for all boxes or a row for each, or a `ValueError`."""
-    try:
-        numbers = np.asarray(deviations, float)
-    except (TypeError, ValueError):
-        numbers = np.zeros(0)
+    numbers = np.asarray(deviations, float)
     fits = numbers.shape in ((4,), (num_boxes, 4))
     if not fits or not np.all((numbers > 0) & np.isfinite(numbers)):
         raise ValueError(f"deviations: {shown(deviations)} are not four positive numbers a box")

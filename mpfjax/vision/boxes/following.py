@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import check_flag, check_key, check_type, check_whole, to_rows
+from mpfjax.checks import Count, CountOrZero, checked, to_rows
 from mpfjax.filter import Filter, step_and_faults
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import Fault, one_observation, raise_faults
@@ -43,18 +43,17 @@ class Snapshot(NamedTuple):
     references: Any = None
 
 
+@checked
 def follow(
     filter: Filter, keys: Key[Array, " runs"], frames: Iterable[UInt8[np.ndarray, "h w 3"]]
 ) -> Iterator[Snapshot]:
     """Run a filter of boxes online, once for each key, and yield a snapshot for each frame.
 
     The filter's model has a method `boxes(states)`, as `ColourModel` does. A frame is read only
-    after the frame before it is done, so that frames may come from a camera. Raises `TypeError` for
-    anything but a filter, and `ValueError` for keys that are not a stack of keys. Use it with the
-    `PRESETS`, and `track_rows` to make tracks of the snapshots.
+    after the frame before it is done, so that frames may come from a camera. Raises `ValueError`
+    for anything but a filter and a stack of keys. Use it with the `PRESETS`, and `track_rows` to
+    make tracks of the snapshots.
     """
-    check_type(Filter, "a Filter", filter=filter)
-    check_key(keys, "keys", batch=True)
     return _follow(filter, keys, frames)
 
 
@@ -85,8 +84,13 @@ def _advance(filter, keys, t, mixtures, frame):
     return jax.vmap(step)(keys, mixtures)
 
 
+@checked
 def track_rows(
-    snapshots: list[Snapshot], run: int = 0, first: int = 1, *, by_reference: bool = False
+    snapshots: list[Snapshot],
+    run: CountOrZero = 0,
+    first: CountOrZero = 1,
+    *,
+    by_reference: bool = False,
 ) -> Float[np.ndarray, "rows 6"]:
     """Rows (frame, id, x, y, w, h) of one run: an id for each life of each component.
 
@@ -96,8 +100,6 @@ def track_rows(
     hypothesis. Raises `ValueError` for a run or a frame that is not a whole number from 0 on, and
     where snapshots have no references.
     """
-    check_whole(0, run=run, first=first)
-    check_flag(by_reference=by_reference)
     if by_reference and any(snapshot.references is None for snapshot in snapshots):
         raise ValueError("by_reference: the snapshots are of particles without a reference")
     rows, alive, next_id = [], {}, 1
@@ -117,10 +119,11 @@ def track_rows(
     return np.round(np.array(rows, float).reshape(-1, 6), 3)
 
 
+@checked
 def annotate(
     frame: UInt8[np.ndarray, "h w 3"],
     snapshot: Snapshot,
-    zoom: int = 1,
+    zoom: Count = 1,
     crop: tuple[slice, slice] = (slice(None), slice(None)),
 ) -> UInt8[np.ndarray, "zh zw 3"]:
     """A frame, cropped and enlarged, with the particles and mean boxes of the first run.
@@ -129,7 +132,6 @@ def annotate(
     negative numbers count from the end. `zoom` is the side in pixels to which each pixel is
     enlarged. Raises `ValueError` for a zoom that is not a whole number from 1 on.
     """
-    check_whole(zoom=zoom)
     canvas = frame[crop].repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
     top, left = (part.indices(n)[0] for part, n in zip(crop, frame.shape[:2], strict=True))
     corner = np.array([left, top], float)
@@ -143,6 +145,7 @@ def annotate(
     return np.clip(canvas, 0, 255).astype(np.uint8)
 
 
+@checked
 def follow_boxes(
     frames: Iterable[UInt8[np.ndarray, "..."]],
     boxes: Float[np.ndarray, "k 4"],
@@ -163,12 +166,10 @@ def follow_boxes(
     frames as `track` does. Use it if no detector finds the objects, and a user draws boxes around
     them.
     """
-    check_type(Iterable, "frames one after the other", frames=frames)
     boxes = to_rows(4, "boxes", boxes)
     if len(boxes) == 0:
         raise ValueError("boxes: there are none")
     key = jax.random.key(0) if key is None else key
-    check_key(key)
     return _followed(of_one_kind(frames), boxes, key)
 
 

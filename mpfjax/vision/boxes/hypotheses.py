@@ -1,5 +1,6 @@
 """Rival hypotheses about objects: colours that are learned, exclusion, and pruning."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -38,7 +39,7 @@ class LearnedColourModel(ColourModel):
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> BoxState:
         """x_0 of the `ColourModel`, with the appearance of the reference."""
         states = super().sample_initial(key, num_particles)
-        return _with_appearance(states, self.references[states.reference])
+        return dataclasses.replace(states, appearance=self.references[states.reference])
 
     def log_likelihood(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
@@ -62,7 +63,7 @@ class LearnedColourModel(ColourModel):
         share = share.astype(shown.dtype)[:, None, None, None]
         past: Any = states.appearance
         change = jnp.where(share > 0, shown, past) - past
-        return _with_appearance(states, past + share * change)
+        return dataclasses.replace(states, appearance=past + share * change)
 
     def _seen(
         self, observation: IntegralHistogram | UInt8[Array, "h w 3"], states: BoxState
@@ -200,9 +201,3 @@ def _log_shares(mixture: ParticleMixture, owners: Int[Array, " m"]) -> Float[Arr
     masses = mixture.log_mixture_weights
     rivals = jnp.where(_same_object(mixture, owners), masses[None], -jnp.inf)
     return jnp.where(mixture.active, masses - jax.nn.logsumexp(rivals, axis=1), -jnp.inf)
-
-
-def _with_appearance(
-    states: BoxState, appearance: Float[Array, "n parts channels bins"]
-) -> BoxState:
-    return BoxState(states.box, states.reference, states.previous, appearance)

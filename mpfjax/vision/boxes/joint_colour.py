@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt8
 
-from mpfjax.checks import check_positive, check_shape, check_type, check_whole, to_rows
+from mpfjax.checks import Count, Positive, check_shape, checked, to_rows
 from mpfjax.models.dynamics import Autoregression
 from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel, positive_deviations
@@ -18,12 +18,13 @@ _MOMENTUM = 0.5
 PAPER_DEVIATIONS = (2.0, 2.0, 0.001, 0.001)
 
 
+@checked
 def joint_colour_model(
     frame: UInt8[np.ndarray, "h w 3"],
     boxes: Float[np.ndarray, "objects 4"],
     *,
-    lambda_: float = 20.0,
-    num_parts: int = 2,
+    lambda_: Positive = 20.0,
+    num_parts: Count = 2,
     colours: AbstractColours | None = None,
     deviations: Sequence[float] = PAPER_DEVIATIONS,
     templates: Mapping[int, tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "4"]]]
@@ -57,14 +58,10 @@ def joint_colour_model(
     Use it where each object has colours of its own.
     """
     boxes = to_rows(4, "boxes", boxes)
-    check_positive(lambda_=lambda_)
-    check_whole(num_parts=num_parts)
     # σ of exp(-(mean of d²) / 2σ²) for exp(-λ (sum of d²)).
     sigma = float((2 * lambda_ * num_parts) ** -0.5)
     steps = positive_deviations(deviations, 1).reshape(4)
     momentum = Autoregression.with_momentum(_MOMENTUM, jnp.asarray(steps, float))
-    templates = {} if templates is None else templates
-    check_type(Mapping, "frames and boxes, {index: (frame, box)}", templates=templates)
 
     def learn(frame: np.ndarray, boxes: np.ndarray) -> ColourModel:
         return ColourModel.from_frame(
@@ -78,7 +75,7 @@ def joint_colour_model(
         )
 
     model = learn(frame, boxes)
-    for j, template in templates.items():
+    for j, template in (templates or {}).items():
         if j not in range(len(boxes)):
             raise ValueError(f"templates: {j} is none of the {len(boxes)} objects, from 0 on")
         try:
@@ -96,13 +93,13 @@ def joint_colour_model(
     )
 
 
+@checked
 def object_boxes(model: MultiObjectModel, states: BoxState) -> Float[Array, "n objects 4"]:
     """(x, y, w, h) of every object of every particle, (x, y) the top-left corner, in pixels.
 
     For particles of a `joint_colour_model`, whose leaves are (n, J, ...). Raises `ValueError` for
     states of another kind or shape.
     """
-    check_type(BoxState, "a BoxState", states=states)
     check_shape(f"n {model.num_objects} 4", states=states.box)
 
     def place(colour_model: ColourModel, states: BoxState) -> Float[Array, "n 4"]:

@@ -31,8 +31,6 @@ from mpfjax.vision.boxes.hypotheses import (
     PruneHypotheses,
 )
 from mpfjax.vision.colour.bins import RGBColours
-from mpfjax.vision.files.boxes import check_boxes
-from mpfjax.vision.files.frames import check_frame
 
 NUM_PARTICLES, MAX_COMPONENTS, PARTICLES_PER_COMPONENT = 200, 10, 20
 HYPOTHESES, PARTICLES_PER_HYPOTHESIS = 3, 40
@@ -42,7 +40,7 @@ def paper_filters(
     frame: UInt8[np.ndarray, "h w 3"], boxes: Float[np.ndarray, "k 4"]
 ) -> dict[str, Filter]:
     """The paper's model and parameters; thresholds of the MPF are in units of the mean box."""
-    size = _mean_size(frame, boxes)
+    size = boxes[:, 2:].mean(axis=0)
     model = ColourModel.from_frame(frame, boxes, sigma=0.15, deviations=None, share_reference=True)
     where: dict[str, Any] = {"features": _centre, "scale": size}
     merge, split = Merge(None, 0.5, **where), Split(4.0, 0.5, min_share=0.15, **where)
@@ -67,7 +65,7 @@ def default_filters(
     it takes a long step. Components exclude each other. They split if they cover two places, and
     merge only after ten frames at the same place.
     """
-    size = _mean_size(frame, boxes)
+    size = boxes[:, 2:].mean(axis=0)
     steps = _steps(boxes)
     walk = _with_jumps(steps, probability=0.05)
     model = _own_references(frame, boxes, steps, walk, switch_probability=0.05)
@@ -104,7 +102,7 @@ def objects_filters(
     pruned. Objects exclude each other where they are nearly at one place. They share the particles
     equally: 400 in all, and from four objects on 120 for each object.
     """
-    size = _mean_size(frame, boxes)
+    size = boxes[:, 2:].mean(axis=0)
     # Steps about a velocity are shorter than those of a random walk.
     steps = _steps(boxes) * np.array([0.3, 0.5, 1.0, 1.0])
     walk = _with_jumps(steps, probability=0.1, times=(8.0, 6.0))
@@ -140,12 +138,6 @@ def objects_filters(
 def most_components(num_objects: int) -> int:
     """The most components of `objects_filters`: three hypotheses about each of many objects."""
     return max(MAX_COMPONENTS, HYPOTHESES * num_objects)
-
-
-def _mean_size(frame: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    check_frame(frame)
-    check_boxes(boxes, *frame.shape[:2])
-    return boxes[:, 2:].mean(axis=0)
 
 
 def _own_references(

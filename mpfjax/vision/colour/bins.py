@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
-from mpfjax.checks import check_share, check_whole
+from mpfjax.checks import Checked, Count, Share
 
 
-class AbstractColours(eqx.Module):
+class AbstractColours(Checked):
     """A way to sort the pixels of an RGB frame into bins, in one or more channels.
 
     Each channel has a normalised histogram of its own. The squared distances of the channels are
@@ -34,13 +34,10 @@ class AbstractColours(eqx.Module):
 class RGBColours(AbstractColours):
     """Red, green and blue on their own, each in `num_bins` equal bins.
 
-    Vermaak et al. (2003), section 5.2. Raises `ValueError` for a number of bins outside 1 to 256.
+    Vermaak et al. (2003), section 5.2. Raises `ValueError` for a number of bins below 1.
     """
 
-    num_bins: int = eqx.field(static=True, default=30)
-
-    def __check_init__(self) -> None:
-        _check_bins(num_bins=self.num_bins)
+    num_bins: Count = eqx.field(static=True, default=30)
 
     @property
     def num_channels(self) -> int:
@@ -61,22 +58,14 @@ class HSVColours(AbstractColours):
     saturation. The hue of any other pixel is unreliable: the pixel is counted in one of N_v bins of
     value. Use it where the light changes, or where one histogram should replace three.
 
-    Raises `ValueError` for a number of bins outside 1 to 256 and thresholds outside [0, 1].
+    Raises `ValueError` for a number of bins below 1 and thresholds outside [0, 1].
     """
 
-    num_hues: int = eqx.field(static=True, default=10)
-    num_saturations: int = eqx.field(static=True, default=10)
-    num_values: int = eqx.field(static=True, default=10)
-    least_saturation: float = eqx.field(static=True, default=0.1)
-    least_value: float = eqx.field(static=True, default=0.2)
-
-    def __check_init__(self) -> None:
-        _check_bins(
-            num_hues=self.num_hues,
-            num_saturations=self.num_saturations,
-            num_values=self.num_values,
-        )
-        check_share(least_saturation=self.least_saturation, least_value=self.least_value)
+    num_hues: Count = eqx.field(static=True, default=10)
+    num_saturations: Count = eqx.field(static=True, default=10)
+    num_values: Count = eqx.field(static=True, default=10)
+    least_saturation: Share = eqx.field(static=True, default=0.1)
+    least_value: Share = eqx.field(static=True, default=0.2)
 
     @property
     def num_channels(self) -> int:
@@ -122,10 +111,3 @@ def hue_saturation_value(
 
 def _bin(share: Float[Array, "h w"], num_bins: int) -> Int[Array, "h w"]:
     return jnp.minimum((share * num_bins).astype(jnp.int32), num_bins - 1)
-
-
-def _check_bins(**numbers: int) -> None:
-    for name, number in numbers.items():
-        check_whole(**{name: number})
-        if number > 256:
-            raise ValueError(f"{name}: {number} is not between 1 and 256")

@@ -204,19 +204,29 @@ def reference_histograms(
     weigh_colours: bool,
 ) -> tuple[Float[Array, "k parts channels bins"], Float[Array, "k parts channels bins"]]:
     """The normalised histograms of the reference boxes, and the weights of their colours."""
-    # NumPy does the rest: single operations of JAX take seconds to be compiled. Only quotients are
-    # JAX's, whose last digits are not NumPy's.
+    # NumPy counts: boxes differ in size, and a program for each would have to be compiled.
     bins, inner, outer = map(np.asarray, _sorted(jnp.asarray(frame), colours, places, num_parts))
-    counts = _counts(bins, inner, colours.num_bins).astype(places.dtype)
-    if not weigh_colours:
-        return jnp.asarray(_shares(counts)), jnp.asarray(np.ones_like(counts))
-    within = _counts(bins, outer, colours.num_bins).astype(places.dtype)
-    ring = within - np.sum(counts, axis=1, keepdims=True)
-    inside, outside = _shares(counts), _shares(ring)
-    share = inside + outside
-    # A colour that is neither in the box nor around it says nothing about the box.
-    weights = np.where(share > 0, _ratio(inside, share), np.full_like(share, 0.5))
-    return jnp.asarray(_shares(counts * weights)), jnp.asarray(weights)
+    counts, within = (
+        jnp.asarray(_counts(bins, edges, colours.num_bins), places.dtype)
+        for edges in (inner, outer)
+    )
+    return _weighed(counts, within, weigh_colours)
+
+
+@eqx.filter_jit
+def _weighed(
+    counts: Float[Array, "k parts channels bins"],
+    within: Float[Array, "k 1 channels bins"],
+    weigh_colours: bool,
+) -> tuple[Float[Array, "k parts channels bins"], Float[Array, "k parts channels bins"]]:
+    """Histograms by the counts in boxes and in their surroundings, and the weights of colours."""
+    weights = jnp.ones_like(counts)
+    if weigh_colours:
+        inside = normalise(counts)
+        share = inside + normalise(within - jnp.sum(counts, axis=1, keepdims=True))
+        # A colour that is neither in the box nor around it says nothing about the box.
+        weights = jnp.where(share > 0, inside / jnp.where(share > 0, share, 1.0), 0.5)
+    return normalise(counts, weights), weights
 
 
 @eqx.filter_jit
@@ -242,31 +252,15 @@ def _counts(
     bins: Int[np.ndarray, "h w channels"], edges: Int[np.ndarray, "k edges"], num_bins: int
 ) -> Int[np.ndarray, "k parts channels bins"]:
     """Pixels of each colour in each band of each box; none in a box without area."""
+
+    def count(pixels: Int[np.ndarray, "rows columns channels"]) -> list[np.ndarray]:
+        each = np.moveaxis(pixels, -1, 0).reshape(pixels.shape[-1], -1)
+        return [np.bincount(channel, minlength=num_bins) for channel in each]
+
     return np.array([
-        [_count(bins[top:bottom, left:right], num_bins) for top, bottom in pairwise(rows)]
+        [count(bins[top:bottom, left:right]) for top, bottom in pairwise(rows)]
         for *rows, left, right in edges.tolist()
     ])  # fmt: skip
-
-
-def _count(
-    bins: Int[np.ndarray, "rows columns channels"], num_bins: int
-) -> Int[np.ndarray, "channels bins"]:
-    channels = np.moveaxis(bins, -1, 0)
-    return np.array([np.bincount(part.ravel(), minlength=num_bins) for part in channels])
-
-
-def _shares(counts: Float[np.ndarray, "... bins"]) -> Float[np.ndarray, "... bins"]:
-    """Counts as shares that sum to one over the bins; all zero where nothing was counted."""
-    counts = np.where(counts >= 0, counts, np.zeros_like(counts))
-    # One number after the other, as in a filter's program.
-    total = np.cumsum(counts, axis=-1)[..., -1:]
-    return np.where(total > 0, _ratio(counts, total), np.zeros_like(counts))
-
-
-def _ratio(
-    values: Float[np.ndarray, "..."], by: Float[np.ndarray, "..."]
-) -> Float[np.ndarray, "..."]:
-    return np.asarray(jnp.divide(values, np.where(by > 0, by, np.ones_like(by))))
 
 
 class SampledBoxes(eqx.Module):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.checks import check_type, check_whole, shown, to_rows
+from mpfjax.checks import shown, to_rows
 
 _COMMENTS = ("#", "%", "//")
 # The names that a header may give to the first seven columns, in lower case and without "_".
@@ -28,7 +28,6 @@ TRACK_COLUMNS = range(7, 11)
 
 def parse_box(text: str, argument: str = "box") -> Float[np.ndarray, "4"]:
     """Read "x,y,w,h" in pixels. Raises `ValueError` naming `argument` for any other text."""
-    check_type(str, "a text x,y,w,h", **{argument: text})
     try:
         box = np.array([float(part) for part in text.split(",")])
     except ValueError:
@@ -40,13 +39,16 @@ def parse_box(text: str, argument: str = "box") -> Float[np.ndarray, "4"]:
 
 def check_boxes(
     boxes: Float[np.ndarray, "k 4"], height: int, width: int, argument: str = "boxes"
-) -> None:
-    """Raise `ValueError` for a box without area, or wholly outside a frame of this size.
+) -> Float[np.ndarray, "k 4"]:
+    """The boxes as rows of numbers, at least one.
 
-    Also for boxes that are not four finite numbers, and a size that is not a whole number.
+    Raises `ValueError` for none, for a box without area or wholly outside a frame of this size, and
+    for what is not four finite numbers.
     """
-    check_whole(height=height, width=width)
-    for x, y, w, h in to_rows(4, argument, boxes).tolist():
+    rows = to_rows(4, argument, boxes)
+    if len(rows) == 0:
+        raise ValueError(f"{argument}: there are none")
+    for x, y, w, h in rows.tolist():
         named = f"{argument}: {x:g},{y:g},{w:g},{h:g}"
         if not np.all(np.isfinite([x, y, w, h])):
             raise ValueError(f"{named} is not finite")
@@ -55,6 +57,7 @@ def check_boxes(
         # With less than a pixel inside, it may hold no pixel's centre, and so no colour to track.
         if not (x + w >= 1 and y + h >= 1 and x <= width - 1 and y <= height - 1):
             raise ValueError(f"{named} lies outside the first frame, {width} x {height}")
+    return rows
 
 
 def centred(boxes: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "k 4"]:
@@ -79,7 +82,6 @@ def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     any box. Warns where the seventh column is that of a ground truth of which some rows do not
     count.
     """
-    check_type((str, Path), "a path", path=path)
     found = read_rows(path, TRACK_FORM, TRACK_COLUMNS)
     for number, row in found.items():
         check_identity(path, number, row)
@@ -104,20 +106,16 @@ def read_detections(path: str | Path) -> Float[np.ndarray, "rows columns"]:
     not finite, lies in a frame before 1, or has a score where other rows have none; and for a file
     without any detection.
     """
-    check_type((str, Path), "a path", path=path)
     form = "frame,id,x,y,w,h,score and up to three more columns"
-    rows = {
-        n: row[:7] for n, row in read_rows(path, form, range(6, 11), holds="detections").items()
-    }
-    width = len(next(iter(rows.values())))
-    for number, row in rows.items():
-        if len(row) != width:
-            raise ValueError(
-                f"{path}, line {number}: has a score, or none, unlike the lines before it"
-            )
+    found = read_rows(path, form, range(6, 11), holds="detections")
+    rows = [row[:7] for row in found.values()]
+    for number, row in zip(found, rows, strict=True):
+        if len(row) != len(rows[0]):
+            said = "has a score, or none, unlike the lines before it"
+            raise ValueError(f"{path}, line {number}: {said}")
         if not np.all(np.isfinite(row)):
             raise ValueError(f"{path}, line {number}: {shown(row)} is not {form}")
-    return np.array(list(rows.values()))
+    return np.array(rows)
 
 
 def write_tracks(path: str | Path, rows: Float[np.ndarray, "rows 6"]) -> None:
@@ -126,7 +124,6 @@ def write_tracks(path: str | Path, rows: Float[np.ndarray, "rows 6"]) -> None:
     Raises `ValueError` for rows that `read_tracks` could not read: rows that are not six finite
     numbers, or with a frame or an id that is not a whole number, from 1 and 0 on.
     """
-    check_type((str, Path), "a path", path=path)
     rows = to_rows(6, "rows", rows)
     for row in rows:
         if not np.all(np.isfinite(row)) or np.any(row[:2] < [1, 0]) or np.any(row[:2] % 1):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from mpfjax.checks import check_positive, check_shape, check_type, check_whole, given
+from mpfjax.checks import Count, Positive, check_shape, checked
 from mpfjax.vision.files.sequences import read_sequence_info
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp")
@@ -24,8 +24,9 @@ _INNER = ("img", "img1")
 _X264 = {"crf": "19", "preset": "veryfast", "x264-params": "rc-lookahead=30:subme=4"}
 
 
+@checked
 def read_frames(
-    path: str | Path, first: int = 1, last: int | None = None
+    path: str | Path, first: Count = 1, last: Count | None = None
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Read frames `first` to `last`, both included and counted from 1, in RGB, one at a time.
 
@@ -36,9 +37,7 @@ def read_frames(
     `FileNotFoundError` if `path` is, and `ValueError` with `path` if it cannot be read, has no
     frames, or has frames of different sizes, and for `first` and `last` that are no range.
     """
-    check_type((str, Path), "a path", path=path)
-    check_whole(first=first, **given(last=last))
-    if first < 1 or (last is not None and last < first):
+    if last is not None and last < first:
         raise ValueError(f"first, last: {first}, {last} is not a range of frames from 1 on")
     path = Path(path)
     if not path.exists():
@@ -75,7 +74,6 @@ def frame_rate(path: str | Path) -> float | None:
     The mean for a video whose rate varies; None where the rate is not given. Raises `ValueError`
     for a file that is no video.
     """
-    check_type((str, Path), "a path", path=path)
     path = Path(path)
     if path.is_dir():
         return read_sequence_info(path, path.parent).frame_rate
@@ -84,17 +82,17 @@ def frame_rate(path: str | Path) -> float | None:
     return float(rate) if rate and 0 < rate < math.inf else None
 
 
+@checked
 def write_video(
-    path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], frames_per_second: float = 10.0
+    path: str | Path,
+    frames: Iterable[UInt8[np.ndarray, "h w 3"]],
+    frames_per_second: Positive = 10.0,
 ) -> None:
     """Write RGB frames to an MP4 or, by the ending of `path`, a GIF that loops.
 
     Raises `ValueError` for another ending, frames that are no images of one size and a rate that is
     not positive, `ImportError` where PyAV is missing for an MP4.
     """
-    check_type((str, Path), "a path", path=path)
-    check_type(Iterable, "frames one after the other", frames=frames)
-    check_positive(frames_per_second=frames_per_second)
     stills = of_one_kind(frames)
     if Path(path).suffix.lower() == ".gif":
         from PIL import Image

@@ -3,12 +3,12 @@
 import configparser
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.checks import check_one_of, check_type, given, shown
+from mpfjax.checks import checked, shown
 from mpfjax.metrics.tracking_scores import IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT
 from mpfjax.vision.files.boxes import (
     TRACK_COLUMNS,
@@ -34,7 +34,7 @@ _LABELS = [
 _CATEGORIES = range(12)
 _KITTI_HEIGHT = 25.0
 _FLAG, _CLASS = 6, 7
-FORMATS = ("motchallenge", "visdrone", "uavdt", "cvat")
+Format = Literal["motchallenge", "visdrone", "uavdt", "cvat"]
 _INFO = "seqinfo.ini"
 
 
@@ -61,7 +61,8 @@ class Truth(NamedTuple):
         return Truth(objects, ignored, self.min_height)
 
 
-def read_truth(path: str | Path, *, format: str | None = None) -> Truth:
+@checked
+def read_truth(path: str | Path, *, format: Format | None = None) -> Truth:
     """Read the ground truth of a sequence, and what its benchmark removes before scoring.
 
     `path` is a file, or a folder with `gt.txt` or `gt/gt.txt`. Rows are frame,id,x,y,w,h,flag and
@@ -90,8 +91,6 @@ def read_truth(path: str | Path, *, format: str | None = None) -> Truth:
     without any row; `FileNotFoundError` where there is none. Use it with `multi_object_scores`. For
     the rows of a tracker use `read_tracks`.
     """
-    check_type((str, Path), "a path", path=path)
-    check_one_of(FORMATS, **given(format=format))
     path = _truth_file(Path(path))
     rows = read_rows(path, TRACK_FORM, TRACK_COLUMNS)
     name = _name_of(path).lower()
@@ -133,7 +132,7 @@ def _truth_file(path: Path) -> Path:
     raise FileNotFoundError(f"{path}: holds neither gt.txt nor gt/gt.txt")
 
 
-def _format_of(path: Path, name: str, table: Float[np.ndarray, "r 10"]) -> str:
+def _format_of(path: Path, name: str, table: Float[np.ndarray, "r 10"]) -> Format:
     """What the files and their columns say that they are."""
     if re.fullmatch(r".*gt_whole|M\d+_gt", path.stem):
         return "uavdt"

@@ -1,8 +1,8 @@
 """What may be given as detections: rows of a file, boxes frame by frame, or a detector to call."""
 
-import abc
+import itertools
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mpfjax.checks import check_finite, check_whole, given, is_series, saying, shown
+from mpfjax.checks import CountOrZero, checked, is_series, saying, shown
 from mpfjax.vision.files.boxes import read_detections
 from mpfjax.vision.tracking.detections import to_masked_rows
 
@@ -18,6 +18,7 @@ from mpfjax.vision.tracking.detections import to_masked_rows
 _BOX, _SCORE = slice(2, 6), 6
 # A tracker that is made for rows of detections has room for at most so many objects.
 LEAST_ROOM, MOST_ROOM = 24, 1024
+_END = object()
 
 
 class DetectedBoxes(NamedTuple):
@@ -30,56 +31,19 @@ class DetectedBoxes(NamedTuple):
     scores: Float[np.ndarray, " k"] | None
 
 
-class AbstractDetector(abc.ABC):
-    """Finds the detections of a frame, given its number and its pixels."""
-
-    @abc.abstractmethod
-    def find(self, number: int, frame: Any) -> DetectedBoxes:
-        """Return the detections of a frame; `frame` is None where there are no pixels.
-
-        Raises `StopIteration` where there are no further frames.
-        """
-
-    def warn_of_the_rest(self, last: int) -> None:
-        """Warn of detections in frames after the last."""
-        del last
-
-    def most_objects(self) -> int:
-        """How many objects there should be room for, as far as is known beforehand."""
-        return LEAST_ROOM
-
-
-def as_detector(detections: Any, first: int = 1) -> AbstractDetector:
-    """Wrap rows, an iterable or a callable as a detector. Frames are numbered from `first` on.
-
-    Raises `ValueError` for anything else, and for rows that are not in MOTChallenge's form.
-    """
-    if isinstance(detections, AbstractDetector):
-        return detections
-    if isinstance(detections, str | Path):
-        detections = read_detections(detections)
-    if isinstance(detections, np.ndarray | jax.Array):
-        return Rows(np.asanyarray(detections), first)
-    if callable(detections) and not isinstance(detections, type):
-        return _Called(detections)
-    if is_series(detections):
-        return _Streamed(iter(detections))
-    raise ValueError(
-        f"detections: {shown(detections)} is neither a detector to call with a frame, nor an array"
-        " or a file of rows frame,id,x,y,w,h,score, nor the boxes of one frame after the other"
-    )
-
-
-class Rows(AbstractDetector):
+class Rows:
     """Rows (frame, id, x, y, w, h, score) as MOTChallenge files have them; the id is not read.
 
     Frames count from 1. Without pixels `last` is the last frame, by default that of the last row.
     """
 
+    @checked
     def __init__(
-        self, rows: Float[np.ndarray, "r columns"], first: int = 1, last: int | None = None
+        self,
+        rows: Float[np.ndarray, "r columns"],
+        first: CountOrZero = 1,
+        last: CountOrZero | None = None,
     ) -> None:
-        check_whole(0, first=first, **given(last=last))
         if rows.ndim != 2 or not (rows.size == 0 or 6 <= rows.shape[1] <= 10):
             raise ValueError(
                 f"detections: shape {rows.shape} is not that of rows frame,id,x,y,w,h and,"
@@ -87,77 +51,85 @@ class Rows(AbstractDetector):
             )
         rows = rows if rows.size else np.zeros((0, 7))
         rows = to_masked_rows(rows.shape[1], "detections", rows)
-        bad = ~np.isfinite(rows[:, : _SCORE + 1]).all(axis=1) | (rows[:, 0] % 1 != 0)
+        bad = ~np.isfinite(rows[:, : _SCORE + 1]).all(axis=1)
+        bad |= (rows[:, 0] % 1 != 0) | (rows[:, 0] < 1)
         for number in np.flatnonzero(bad.filled(False))[:1]:
             raise ValueError(
                 f"detections: row {number}, {shown(rows.data[number])}, is not finite, or its"
-                " frame is no whole number"
-            )
-        for number in np.flatnonzero((rows[:, 0] < 1).filled(False))[:1]:
-            raise ValueError(
-                f"detections: row {number} lies in frame {rows[number, 0]:.0f}, and frames count"
-                " from 1"
+                " frame is no whole number from 1 on"
             )
         rows = rows[~np.ma.getmaskarray(rows)[:, 0]]
+        rows = rows[np.argsort(rows.data[:, 0], kind="stable")]
+        self._rows, self._frames = rows, rows.data[:, 0].astype(int)
         self.first = first
-        self.frames = rows.data[:, 0].astype(int)
-        self.last = int(self.frames.max(initial=0)) if last is None else last
-        order = np.argsort(self.frames, kind="stable")
-        self._rows, self._sorted = rows[order], self.frames[order]
+        self.last = int(self._frames.max(initial=0)) if last is None else last
 
-    def find(self, number: int, frame: Any) -> DetectedBoxes:
-        """The rows of this frame."""
-        if frame is None and number > self.last:
-            raise StopIteration
-        begin, end = np.searchsorted(self._sorted, [number, number + 1])
+    def of_frame(self, number: int) -> DetectedBoxes:
+        """The detections of a frame."""
+        begin, end = np.searchsorted(self._frames, [number, number + 1])
         rows = self._rows[begin:end]
-        scores = rows[:, _SCORE] if rows.shape[1] > _SCORE else None
-        return DetectedBoxes(rows[:, _BOX], scores)
+        return DetectedBoxes(rows[:, _BOX], rows[:, _SCORE] if rows.shape[1] > _SCORE else None)
 
-    def warn_of_the_rest(self, last: int) -> None:
-        """Warn of rows after the last frame."""
-        late = int(np.sum(self.frames > last))
-        if late:
-            _warn(f"detections: {late} lie in frames after the last, {last}, and were left out")
+    def num_after(self, last: int) -> int:
+        """How many rows lie in later frames."""
+        return int(np.sum(self._frames > last))
 
     def most_objects(self) -> int:
         """One and a half times the number of detections in all but the fullest frames."""
-        counts = np.unique(self.frames, return_counts=True)[1]
+        counts = np.unique(self._frames, return_counts=True)[1]
         usual = float(np.quantile(counts, 0.95)) if len(counts) else 0.0
         return int(np.clip(8 * np.ceil(1.5 * usual / 8), LEAST_ROOM, MOST_ROOM))
 
 
-class _Called(AbstractDetector):
-    """A user's function from a frame to its boxes, or to a pair of boxes and scores."""
-
-    def __init__(self, function: Callable[[Any], Any]) -> None:
-        self.function = function
-
-    def find(self, number: int, frame: Any) -> DetectedBoxes:
-        with saying(f"detections: raised by the detector at frame {number}"):
-            found = self.function(frame)
-        return _as_found(found, number)
+Detector = Rows | Callable[[Any], Any] | Iterable[Any]
 
 
-class _Streamed(AbstractDetector):
-    """A user's iterable of boxes, or of pairs of boxes and scores, one item for each frame."""
+def as_detector(detections: Any, first: int = 1) -> Detector:
+    """Files and arrays as rows; a callable and an iterable as they are.
 
-    def __init__(self, stream: Iterator[Any]) -> None:
-        self.stream = stream
+    Frames are numbered from `first` on. Raises `ValueError` for anything else, and for rows that
+    are not in MOTChallenge's form.
+    """
+    if isinstance(detections, str | Path):
+        detections = read_detections(detections)
+    if isinstance(detections, np.ndarray | jax.Array):
+        return Rows(np.asanyarray(detections), first)
+    is_detector = callable(detections) and not isinstance(detections, type)
+    if is_detector or isinstance(detections, Rows) or is_series(detections):
+        return detections
+    raise ValueError(
+        f"detections: {shown(detections)} is neither a detector to call with a frame, nor an array"
+        " or a file of rows frame,id,x,y,w,h,score, nor the boxes of one frame after the other"
+    )
 
-    def find(self, number: int, frame: Any) -> DetectedBoxes:
-        try:
-            found = next(self.stream)
-        except StopIteration:
-            if frame is None:
-                raise
-            raise ValueError(f"detections: end before the frames do, at frame {number}") from None
-        return _as_found(found, number)
 
-    def warn_of_the_rest(self, last: int) -> None:
-        """Warn where there are detections for one more frame."""
-        if next(self.stream, None) is not None:
-            _warn(f"detections: go on after the last frame, {last}, and were left out")
+def observed(
+    stills: Iterator[np.ndarray] | None, detector: Detector, first: int
+) -> Iterator[tuple[int, np.ndarray | None, DetectedBoxes]]:
+    """Number, pixels and detections of each frame; warns of detections after the last."""
+    number, end = first - 1, detector.last + 1 if isinstance(detector, Rows) else None
+    numbers = itertools.count(first) if end is None else range(first, end)
+    frames = zip(numbers, itertools.repeat(None)) if stills is None else enumerate(stills, first)
+    if isinstance(detector, Rows):
+        for number, still in frames:
+            yield number, still, detector.of_frame(number)
+        if late := detector.num_after(number):
+            _warn(f"detections: {late} lie in frames after the last, {number}, and were left out")
+        return
+    coming = iter(()) if callable(detector) else iter(detector)
+    for number, still in frames:
+        if callable(detector):
+            with saying(f"detections: raised by the detector at frame {number}"):
+                found = detector(still)
+        else:
+            found = next(coming, _END)
+        if found is _END and still is None:
+            return
+        if found is _END:
+            raise ValueError(f"detections: end before the frames do, at frame {number}")
+        yield number, still, _as_found(found, number)
+    if next(coming, _END) is not _END:
+        _warn(f"detections: go on after the last frame, {number}, and were left out")
 
 
 class Sieve:
@@ -170,7 +142,6 @@ class Sieve:
     """
 
     def __init__(self, min_score: float | None, frame_size: tuple[int, int] | None = None) -> None:
-        check_finite(**given(min_score=min_score))
         self.min_score, self.frame_size = min_score, frame_size
         self.once = Once()
 
@@ -219,11 +190,7 @@ def _as_found(value: Any, number: int) -> DetectedBoxes:
     named = f"detections: frame {number}"
     if boxes is None:
         raise ValueError(f"{named}: None is no array; [] has no detections")
-    if scores is not None:
-        try:
-            scores = np.asanyarray(scores, float).reshape(-1)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{named}: scores {shown(scores)} are no numbers") from error
+    scores = None if scores is None else np.asanyarray(scores, float).reshape(-1)
     return DetectedBoxes(to_masked_rows(4, named, boxes), scores)
 
 

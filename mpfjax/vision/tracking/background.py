@@ -6,14 +6,7 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from mpfjax.checks import (
-    check_inner_share,
-    check_not_negative,
-    check_positive,
-    check_type,
-    check_whole,
-    given,
-)
+from mpfjax.checks import Count, InnerShare, NotNegative, Positive, checked
 from mpfjax.vision.files.frames import check_frame
 from mpfjax.vision.tracking.optical_flow import opencv
 
@@ -66,26 +59,21 @@ class BackgroundSubtraction:
     Raises `ValueError` for a setting outside its range, `ImportError` where OpenCV is missing.
     """
 
+    @checked
     def __init__(
         self,
         *,
-        history: int = 500,
-        threshold: float = 8.0,
-        background_share: float = 0.6,
-        shadow_brightness: float | None = 0.6,
-        warm_up: int = 1,
+        history: Count = 500,
+        threshold: Positive = 8.0,
+        background_share: InnerShare = 0.6,
+        shadow_brightness: InnerShare | None = 0.6,
+        warm_up: Count = 1,
         area: tuple[float, float] = (0.0015, 0.3),
         aspect: tuple[float, float] | None = None,
-        largest_gap: float = 0.1,
-        cut_aspect: float | None = None,
-        most_pixels: int = 640 * 480,
+        largest_gap: NotNegative = 0.1,
+        cut_aspect: NotNegative | None = None,
+        most_pixels: Count = 640 * 480,
     ) -> None:
-        check_whole(history=history, warm_up=warm_up, most_pixels=most_pixels)
-        check_positive(threshold=threshold)
-        check_not_negative(largest_gap=largest_gap, **given(cut_aspect=cut_aspect))
-        check_inner_share(
-            background_share=background_share, **given(shadow_brightness=shadow_brightness)
-        )
         aspect = (0.0, np.inf) if aspect is None else aspect
         for name, (least, most), limit in (("area", area, 1), ("aspect", aspect, np.inf)):
             if not 0 <= least < most <= limit:
@@ -106,7 +94,6 @@ class BackgroundSubtraction:
         these frames counts as background. Use it where the whole video is at hand. Raises
         `ValueError` where there are no frames, and for frames as `detect` does.
         """
-        check_type(Iterable, "frames one after the other", frames=frames)
         self._forget()
         for number, frame in enumerate(frames, 1):
             self._subtract(frame, rate=1 / number)
@@ -132,9 +119,8 @@ class BackgroundSubtraction:
         boxes = np.array(self._blobs(foreground), float).reshape(-1, 4)
         boxes = boxes[self._fitting(boxes, foreground.size)]
         boxes = boxes[np.lexsort((boxes[:, 1], boxes[:, 0]))]
-        height, width = np.asarray(frame).shape[:2]
-        scale = np.array([width / foreground.shape[1], height / foreground.shape[0]])
-        return boxes * np.concatenate([scale, scale])
+        scale = np.divide(np.shape(frame)[1::-1], foreground.shape[::-1])
+        return boxes * np.tile(scale, 2)
 
     def _forget(self) -> None:
         shadows = self.shadow_brightness is not None
@@ -165,11 +151,11 @@ class BackgroundSubtraction:
         """The frame, or means over squares of its pixels where it has too many."""
         height, width, _ = frame.shape
         factor = int(np.ceil(np.sqrt(height * width / self.most_pixels)))
+        frame = np.ascontiguousarray(frame)
         if factor == 1:
-            return np.ascontiguousarray(frame)
+            return frame
         size = (max(width // factor, 1), max(height // factor, 1))
-        area = self._cv2.INTER_AREA
-        return self._cv2.resize(np.ascontiguousarray(frame), size, interpolation=area)
+        return self._cv2.resize(frame, size, interpolation=self._cv2.INTER_AREA)
 
     def _blobs(self, foreground: np.ndarray) -> list[tuple[int, int, int, int]]:
         known = len(self._heights) >= _ENOUGH
@@ -182,36 +168,38 @@ class BackgroundSubtraction:
         _, labels, found, _ = self._cv2.connectedComponentsWithStats(foreground, connectivity=8)
         boxes = []
         # No part of a blob can be larger than the blob.
-        large = [
-            (label, *place[:4])
-            for label, place in enumerate(found[1:].tolist(), 1)
-            if place[2] * place[3] >= self.area[0] * foreground.size
-        ]
+        least = self.area[0] * foreground.size
+        large = [(n, *place[:4]) for n, place in enumerate(found.tolist()) if n]
+        large = [blob for blob in large if blob[3] * blob[4] >= least]
         # An object that is partly outside the frame does not show its shape.
         bottom, right = foreground.shape
-        whole = [
-            (w, h)
-            for _, x, y, w, h in large
-            if x > 0 and y > 0 and x + w < right and y + h < bottom
-        ]
-        self._aspects.extend(h / w for w, h in whole)
-        self._heights.extend(h for _, h in whole)
+        for _, x, y, w, h in large:
+            if x > 0 and y > 0 and x + w < right and y + h < bottom:
+                self._aspects.append(h / w)
+                self._heights.append(h)
         # A blob lower than this many widths may be several objects; 0 where this is unknown.
         known = len(self._aspects) >= _ENOUGH
         usual = float(np.median(self._aspects)) if known else 0.0
         widest = usual if self.cut_aspect is None else self.cut_aspect
         for label, x, y, w, h in large:
             blob = labels[y : y + h, x : x + w] == label
-            boxes += [(x + i, y + j, *size) for i, j, *size in self._cut(blob, widest)]
+            boxes += self._cut(blob, x, y, widest)
         return boxes
 
-    def _cut(self, blob: Bool[np.ndarray, "h w"], widest: float) -> list[tuple[int, int, int, int]]:
-        """The boxes of the objects that stand side by side in a blob that fills its array."""
+    def _cut(
+        self, blob: Bool[np.ndarray, "h w"], x: int, y: int, widest: float
+    ) -> list[tuple[int, int, int, int]]:
+        """The boxes of the objects side by side in a blob, whose array begins at (x, y)."""
+        rows, columns = (np.flatnonzero(blob.any(axis=axis)) for axis in (1, 0))
+        if len(rows) == 0:
+            return []
+        x, y = x + int(columns[0]), y + int(rows[0])
+        blob = blob[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         height, width = blob.shape
         most = min(self.aspect[1], _NARROWEST * widest)
         narrowest = max(int(np.ceil(height / most)), 1) if most > 0 else width
         if height >= widest * width or width <= 2 * narrowest:
-            return [(0, 0, width, height)]
+            return [(x, y, width, height)]
         # How high the blob reaches in each column. It dips between two heads, but not between
         # the legs of one person.
         outline = np.where(blob.any(axis=0), height - blob.argmax(axis=0), 0)
@@ -221,19 +209,9 @@ class BackgroundSubtraction:
         depths = outline / np.maximum(np.minimum(left, right), 1)
         cut = narrowest + int(np.argmin(depths[narrowest : width - narrowest]))
         if depths[cut] > _CUT_DEPTH:
-            return [(0, 0, width, height)]
-        left_part = self._cut_part(blob[:, :cut], 0, widest)
-        return left_part + self._cut_part(blob[:, cut:], cut, widest)
-
-    def _cut_part(
-        self, part: np.ndarray, start: int, widest: float
-    ) -> list[tuple[int, int, int, int]]:
-        rows, columns = (np.flatnonzero(part.any(axis=axis)) for axis in (1, 0))
-        if len(rows) == 0:
-            return []
-        tight = part[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        x, y = start + int(columns[0]), int(rows[0])
-        return [(x + i, y + j, w, h) for i, j, w, h in self._cut(tight, widest)]
+            return [(x, y, width, height)]
+        parts = (blob[:, :cut], x), (blob[:, cut:], x + cut)
+        return [box for part, left in parts for box in self._cut(part, left, y, widest)]
 
     def _fitting(self, boxes: np.ndarray, pixels: int) -> np.ndarray:
         width, height = boxes[:, 2], boxes[:, 3]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mpfjax.checks import as_numbers, check_whole, shown, to_array, to_rows
+from mpfjax.checks import Count, as_numbers, checked, shown, to_array, to_rows
 from mpfjax.operations.stored import take
 from mpfjax.vision.files.boxes import centred, top_left
 
@@ -37,10 +37,11 @@ class Detections(eqx.Module):
     labels: Int[Array, " d"] = eqx.field(converter=to_array("labels", floating=False), default=0)
 
     @classmethod
+    @checked
     def from_boxes(
         cls,
         boxes: Float[np.ndarray, "k 4"],
-        max_detections: int,
+        max_detections: Count,
         scores: Float[np.ndarray, " k"] | None = None,
         *,
         frame_size: tuple[int, int] | None = None,
@@ -59,7 +60,6 @@ class Detections(eqx.Module):
         finer than float32 where they are; for scores that are masked, or not one finite number for
         each box; and for a size below one.
         """
-        check_whole(max_detections=max_detections)
         rows = to_masked_rows(4, "boxes", boxes)
         # A single box without its axis is more likely a slip than meant.
         if len(rows) > 0 and np.ndim(boxes) != 2:

@@ -3,23 +3,25 @@
 import contextlib
 from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import check_flag, check_key, check_one_of, check_type, check_whole, given
+from mpfjax.checks import Count, Finite, checked
 from mpfjax.operations.compiling import in_little_memory, jit_with
 from mpfjax.vision.files.boxes import centred, top_left
 from mpfjax.vision.files.frames import of_one_kind, read_frames
 from mpfjax.vision.files.threads import read_ahead
 from mpfjax.vision.tracking.adapters import (
-    AbstractDetector,
+    LEAST_ROOM,
     DetectedBoxes,
     Once,
+    Rows,
     Sieve,
     as_detector,
+    observed,
 )
 from mpfjax.vision.tracking.detections import Detections
 from mpfjax.vision.tracking.gaussian import CameraMotion
@@ -31,18 +33,19 @@ from mpfjax.vision.tracking.tracker import ObjectTracker, advanced
 _FEW_OBJECTS = 48
 
 
+@checked
 def track(
     frames: Iterable[UInt8[np.ndarray, "..."]] | str | Path | None,
     detections: Any,
     tracker: ObjectTracker | None = None,
     *,
     key: Key[Array, ""] | None = None,
-    first: int = 1,
-    min_score: float | None = None,
-    max_detections: int | None = None,
+    first: Count = 1,
+    min_score: Finite | None = None,
+    max_detections: Count | None = None,
     use_colours: bool = True,
     frame_size: tuple[int, int] | None = None,
-    camera_motion: str | None = None,
+    camera_motion: Literal["pixels", "detections"] | None = None,
     ahead: bool = False,
 ) -> Generator[Tracks, None, None]:
     """Track what a detector finds in a video: yields the `Tracks` of each frame as it comes.
@@ -62,7 +65,7 @@ def track(
       or an array of rows (frame, id, x, y, w, h, score) whose frames count from 1, or the path of a
       MOTChallenge file of these.
     - `tracker`: None takes `ObjectTracker()`, with more room where a frame has more rows.
-    - `key`: of the random numbers; None takes `jax.random.key(0)`.
+    - `key`: counts for nothing, since nothing is drawn.
     - `first`: the number of the first frame, by which rows are found.
     - `min_score`: detections with a lower score are left out; None leaves out none.
     - `max_detections`: the most detections in a frame; if there are more, the strongest are kept.
@@ -87,42 +90,22 @@ def track(
     """
     if isinstance(frames, str | Path):
         frames = read_frames(frames, first)
-    if frames is not None:
-        check_type(Iterable, "frames one after the other, or None", frames=frames)
-    check_flag(use_colours=use_colours, ahead=ahead)
-    check_whole(first=first, **given(max_detections=max_detections))
-    if frame_size is not None:
-        height, width = frame_size
-        check_whole(**{"frame_size's height": height, "frame_size's width": width})
-    if frames is None and callable(detections):
-        raise ValueError("detections: a detector needs frames, and frames is None")
+    del key
     detector, sieve = as_detector(detections, first), Sieve(min_score, frame_size)
+    if frames is None and callable(detector):
+        raise ValueError("detections: a detector needs frames, and frames is None")
+    if frames is None and camera_motion == "pixels":
+        raise ValueError("camera_motion: 'pixels' needs frames, and frames is None")
     if tracker is None:
-        tracker = ObjectTracker(detector.most_objects())
-    check_type(ObjectTracker, "an ObjectTracker", tracker=tracker)
-    key = jax.random.key(0) if key is None else key
-    check_key(key)
+        of_rows = isinstance(detector, Rows)
+        tracker = ObjectTracker(detector.most_objects() if of_rows else LEAST_ROOM)
     room = 2 * tracker.max_objects if max_detections is None else max_detections
     stills = None if frames is None else of_one_kind(frames, first)
-    flow = _optical_flow(camera_motion, frames is not None, use_colours)
-    observed = _observed(stills, detector, first)
-    seen = _seen(observed, sieve, tracker, room, use_colours, flow)
-    return _tracked(seen, tracker, ahead)
-
-
-def _optical_flow(
-    camera_motion: str | None, has_frames: bool, use_colours: bool
-) -> OpticalFlow | None:
-    """What finds the camera's motion from pixels, None where it is left to the detections."""
-    if camera_motion is None:
-        wanted = has_frames and use_colours and has_opencv()
-        return OpticalFlow() if wanted else None
-    check_one_of(("pixels", "detections"), camera_motion=camera_motion)
-    if camera_motion == "detections":
-        return None
-    if not has_frames:
-        raise ValueError("camera_motion: 'pixels' needs frames, and frames is None")
-    return OpticalFlow()
+    if camera_motion is None and stills is not None and use_colours and has_opencv():
+        camera_motion = "pixels"
+    flow = OpticalFlow() if camera_motion == "pixels" else None
+    found = observed(stills, detector, first)
+    return _tracked(_seen(found, sieve, tracker, room, use_colours, flow), tracker, ahead)
 
 
 class _Seen(NamedTuple):
@@ -137,7 +120,7 @@ class _Seen(NamedTuple):
 
 
 def _seen(
-    observed: Iterator[tuple[int, np.ndarray | None, DetectedBoxes]],
+    frames: Iterator[tuple[int, np.ndarray | None, DetectedBoxes]],
     sieve: Sieve,
     tracker: ObjectTracker,
     room: int,
@@ -146,7 +129,7 @@ def _seen(
 ) -> Iterator[_Seen]:
     """What does not depend on earlier tracks, frame by frame."""
     once, origin = Once(), None
-    for number, still, found in observed:
+    for number, still, found in frames:
         found, kept = sieve(found, number, still)
         if len(found.boxes) > room:
             once.warn(
@@ -188,26 +171,6 @@ def _tracked(
                 boxes=tracks.boxes + np.append(origin, [0, 0]),
                 detections=np.where(taken >= 0, np.append(kept, -1)[taken], -1),
             )
-
-
-def _observed(
-    stills: Iterator[np.ndarray] | None, detector: AbstractDetector, first: int
-) -> Iterator[tuple[int, np.ndarray | None, DetectedBoxes]]:
-    """Number, pixels and detections of each frame."""
-    number = first - 1
-    if stills is not None:
-        for number, still in enumerate(stills, first):
-            yield number, still, detector.find(number, still)
-        detector.warn_of_the_rest(number)
-        return
-    while True:
-        number += 1
-        try:
-            found = detector.find(number, None)
-        except StopIteration:
-            detector.warn_of_the_rest(number - 1)
-            return
-        yield number, None, found
 
 
 # --- tracks as files have them -------------------------------------------------------------

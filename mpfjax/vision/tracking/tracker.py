@@ -1,6 +1,6 @@
 """A tracker of an unknown number of objects, from detections: a Kalman filter for each."""
 
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,14 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
-from mpfjax.checks import (
-    check_finite,
-    check_one_of,
-    check_positive,
-    check_type,
-    check_whole,
-    given,
-)
+from mpfjax.checks import POSITIVE, Checked, Count, Rule, as_numbers, check_finite, checked, one_of
 from mpfjax.vision.colour.bins import HSVColours
 from mpfjax.vision.colour.histograms import SampledBoxes, normalise
 from mpfjax.vision.tracking.associate import (
@@ -57,7 +50,23 @@ _CONTACT = 0.12  # an overlap from which on objects would learn each other's col
 _FIRST = 3  # strong detections of an object after which it teaches the noises
 
 
-class ObjectTracker(eqx.Module):
+def _as_rate(frames_per_second: Any) -> np.ndarray:
+    """An array, so that one program serves all rates."""
+    rate = 25 if frames_per_second is None else frames_per_second
+    return np.asarray(as_numbers("frames_per_second", rate), np.float32)
+
+
+def _check_scores(scores: Any, name: str) -> None:
+    if not isinstance(scores, tuple) or len(scores) != 2:
+        one_of(("learned", "ignore", "(weak, strong)")).check(scores, name)
+        return
+    weak, strong = scores
+    check_finite(**{f"{name}: weak": weak, f"{name}: strong": strong})
+    if weak > strong:
+        raise ValueError(f"{name}: the weak one, {weak}, is above the strong one, {strong}")
+
+
+class ObjectTracker(Checked):
     """Tracks an unknown and changing number of objects, with any detector.
 
     Every object has a Kalman filter for its box. `step` is a function of the state and of what is
@@ -82,35 +91,23 @@ class ObjectTracker(eqx.Module):
       detection counts for nothing.
     - `class_matters`: "always" pairs objects with detections of their own label only, and does not
       take those of another one for doubles. "prefers" is for detectors that mix up classes: another
-      label costs as much as a weak score does. False does not look at labels. The label 0 is none,
-      and goes with all.
+      label costs as much as a weak score does. False does not look at labels, True is "always". The
+      label 0 is none, and goes with all.
 
     Raises `ValueError` for a number of objects that is not whole, or below 1, a rate that is not
     positive, and scores or classes that are none of these.
     """
 
-    max_objects: int = eqx.field(static=True)
-    rate: Float[Array | np.ndarray, ""]
-    scores: str | tuple[float, float] = eqx.field(static=True)
-    class_matters: str | bool = eqx.field(static=True)
-
-    def __init__(
-        self,
-        max_objects: int = 24,
-        *,
-        frames_per_second: float | None = None,
-        scores: str | tuple[float, float] = "learned",
-        class_matters: str | bool = "always",
-    ) -> None:
-        check_whole(max_objects=max_objects)
-        check_positive(**given(frames_per_second=frames_per_second))
-        self.max_objects = max_objects
-        # An array, so that one program serves all rates.
-        self.rate = np.asarray(frames_per_second or 25, np.float32)
-        self.scores = _checked_scores(scores)
-        if class_matters is not False:
-            check_one_of(("always", "prefers"), class_matters=class_matters)
-        self.class_matters = class_matters
+    max_objects: Count = eqx.field(static=True, default=24)
+    frames_per_second: Annotated[Float[Array | np.ndarray, ""], POSITIVE] = eqx.field(
+        converter=_as_rate, default=None, kw_only=True
+    )
+    scores: Annotated[str | tuple[float, float], Rule(_check_scores, "scores")] = eqx.field(
+        static=True, default="learned", kw_only=True
+    )
+    class_matters: Literal["always", "prefers"] | bool = eqx.field(
+        static=True, default="always", kw_only=True
+    )
 
     def init(self) -> TrackerState:
         """The state before the first frame: no objects."""
@@ -122,11 +119,12 @@ class ObjectTracker(eqx.Module):
             doubles=Doubles.initial(m),
             scores=ScoreState.initial(m),
             camera=CameraState.initial(),
-            noise=NoiseState.initial(m, float(self.rate)),
+            noise=NoiseState.initial(m, float(self.frames_per_second)),
             colours=zeros(m, _BANDS * _COLOURS.num_bins),
         )
         return jax.tree.map(jnp.asarray, state)
 
+    @checked
     def step(
         self,
         key: Key[Array, ""] | None,
@@ -144,8 +142,6 @@ class ObjectTracker(eqx.Module):
         `Detections` and a state of `init`.
         """
         del key
-        check_type(Detections, "Detections, as from_boxes makes them", detections=detections)
-        check_type(TrackerState, "a state, as init and step return it", state=state)
         if frame is not None and not isinstance(frame, SampledBoxes):
             frame = self.look(frame, detections)
         return _advanced(self, state, detections, frame, motion)
@@ -156,17 +152,6 @@ class ObjectTracker(eqx.Module):
         Raises `ValueError` for a frame as `step` does.
         """
         return SampledBoxes.of(np.asarray(frame), np.asarray(detections.boxes), _COLOURS)
-
-
-def _checked_scores(scores: Any) -> str | tuple[float, float]:
-    if not isinstance(scores, tuple) or len(scores) != 2:
-        check_one_of(("learned", "ignore", "(weak, strong)"), scores=scores)
-        return scores
-    weak, strong = scores
-    check_finite(**{"scores: weak": weak, "scores: strong": strong})
-    if weak > strong:
-        raise ValueError(f"scores: the weak one, {weak}, is above the strong one, {strong}")
-    return float(weak), float(strong)
 
 
 class _Found(NamedTuple):
@@ -236,7 +221,10 @@ def advanced(
     motion: CameraMotion | None = None,
 ) -> tuple[TrackerState, Tracks]:
     """A step as a pure function, for `jax.lax.scan` and for programs of your own."""
-    found, spans = _Found.of(tracker, detections, seen), Spans.at(jnp.asarray(tracker.rate))
+    found, spans = (
+        _Found.of(tracker, detections, seen),
+        Spans.at(jnp.asarray(tracker.frames_per_second)),
+    )
     unlike = _unlikeness(tracker, state, found)
     predicted, noise, camera, shift = _moved(state, found, unlike, motion)
     scores = state.scores.after(
