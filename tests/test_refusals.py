@@ -19,13 +19,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import mpfjax
-from mpfjax import Filter, KMeans, Merge, Propagate, Resample, checks, smoothing
+from mpfjax import Filter, KMeans, Merge, Propagate, Resample, checks, metrics, smoothing, vision
 from mpfjax.moves.initial import SelectInitial
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.running.islands import IslandInteraction
+from mpfjax.vision.boxes.following import Snapshot
 from tests.user_models import DriftOfOne
 
 pytestmark = pytest.mark.usefixtures("as_installed")
@@ -145,6 +146,35 @@ GOOD = {
     },
 }  # fmt: skip
 RUNNERS = tuple(list(GOOD)[-7:])
+FRAME = np.random.default_rng(0).integers(0, 256, (40, 50, 3), dtype=np.uint8)
+BOXES = np.array([[5.0, 5, 10, 20], [20, 10, 10, 15]])
+ROWS = np.array([[1.0, 1, 2, 2, 5, 5], [2, 1, 2, 2, 5, 5]])
+SETS = {"estimates": np.ones((2, 2)), "truths": np.ones((3, 2)), "cutoff": 3.0}
+TRACKER = vision.ObjectTracker(2)
+# Those that boxes and frames come to, of which only the annotated arguments are tried.
+WITH_BOXES = {
+    vision.ObjectTracker: {},
+    vision.RGBColours: {},
+    vision.HSVColours: {},
+    vision.BackgroundSubtraction: {},
+    vision.ColourModel.from_frame: {"frame": FRAME, "boxes": BOXES},
+    vision.joint_colour_model: {"frame": FRAME, "boxes": BOXES},
+    vision.follow_boxes: {"frames": [FRAME], "boxes": BOXES},
+    vision.track: {"frames": None, "detections": np.zeros((0, 7))},
+    metrics.ospa: SETS,
+    metrics.gospa: SETS,
+    metrics.crps: {"values": np.ones(5), "weights": np.ones(5), "observations": np.ones(())},
+    metrics.modes_represented: {
+        "positions": np.ones(5),
+        "occupied": np.ones(5, bool),
+        "modes": TWO,
+        "radius": 0.3,
+    },
+    metrics.mass_above: {"mixture": MIXTURE, "threshold": 0.5},
+    metrics.log_score: {"model": MODEL, "mixture": MIXTURE, "observation": 1.0},
+    metrics.tracking_quality: {"estimates": np.ones((2, 3, 1, 4)), "truth": np.ones((3, 1, 4))},
+    metrics.multi_object_scores: {"tracks": ROWS, "truth": ROWS},
+}
 # What an argument is called further down.
 ALSO = {"max_components": "num_components", "order": "orders", "object_model": "model"}
 
@@ -190,9 +220,9 @@ def refusals(function):
                 yield name, value
 
 
-@pytest.mark.parametrize("function", GOOD, ids=lambda function: function.__name__)
+@pytest.mark.parametrize("function", GOOD | WITH_BOXES, ids=lambda function: function.__name__)
 def test_what_an_annotation_rules_out_is_refused_by_name(function):
-    good = GOOD[function]
+    good = (GOOD | WITH_BOXES)[function]
     assert function(**good) is not None
     defaults = {parameter.name: parameter.default for parameter in arguments_of(function)}
     for name, value in refusals(function):
@@ -307,6 +337,13 @@ def after(change):
     return run(Filter(MODEL, [Propagate(MODEL), lambda key, m, y: change(m)], 4))
 
 
+DETECTIONS = vision.Detections.from_boxes(BOXES, 2)
+
+
+def tracked(detections, frames=(FRAME, FRAME), **options):
+    return list(vision.track(frames, detections, TRACKER, use_colours=False, **options))
+
+
 # By room: words of the message, and the call.
 REFUSED = (
     # filters and moves
@@ -364,6 +401,80 @@ REFUSED = (
     (r"model: Wrong.log_transition returned shape \(3,\)",
      lambda: run_of(
          wrong(log_transition=lambda self, states, previous: jnp.zeros(3)), gradient="stop")),
+    # scores
+    ("estimate_mask: shape", lambda: metrics.ospa(**SETS, estimate_mask=np.ones(3, bool))),
+    ("weights: shape", lambda: metrics.crps(np.ones((2, 3)), np.ones((2, 4)), TWO)),
+    (r"observations: shape \(3,\) is not \(2,\)",
+     lambda: metrics.crps(np.ones((2, 3)), np.ones((2, 3)), np.ones(3))),
+    ("occupied: shape", lambda: metrics.modes_represented(np.ones(5), np.ones(4, bool), TWO, 0.3)),
+    ("mixture: particles of shapes",
+     lambda: metrics.mass_above(MIXTURE.replace(particles=jnp.ones((4, 2))), 0.5)),
+    ("mixture: particles of shapes", lambda: metrics.uniqueness(MIXTURE)),
+    ("truth: shape",
+     lambda: metrics.tracking_quality(np.ones((2, 3, 1, 4)), np.ones((2, 1, 4)))),
+    ("truth: there are no true boxes", lambda: metrics.multi_object_scores(ROWS, ROWS, (5, 9))),
+    ("frames: 2, the last",
+     lambda: metrics.multi_object_scores(ROWS, ROWS, (3, 2))),
+    ("tracks: id 1 has more than one box in frame 1",
+     lambda: metrics.multi_object_scores(ROWS[[0, 1, 0]], ROWS)),
+    ("truth: holds numbers that are not finite",
+     lambda: metrics.multi_object_scores(ROWS, ROWS + INFINITY)),
+    ("track_states: shape",
+     lambda: metrics.tracking_quality(np.ones((0, 3, 1, 4)), np.ones((3, 1, 4)))),
+    # frames, boxes and detections
+    *(
+        ("boxes: .*" + words, lambda boxes=boxes: vision.ColourModel.from_frame(FRAME, boxes))
+        for words, boxes in (
+            ("there are none", []), ("no area", [[5, 5, 0, 5]]), ("not finite", [[NAN, 5, 9, 9]]),
+            ("outside the first frame, 50 x 40", [[-9, 10, 9, 9]]), ("no rows of 4", [[1, 2, 3]]),
+        )
+    ),
+    *(
+        ("frame: ", lambda frame=frame: vision.ColourModel.from_frame(frame, BOXES))
+        for frame in (None, FRAME[:, :, 0], FRAME[:0], FRAME.astype(float), FRAME[:, :, :1])
+    ),
+    ("deviations: ", lambda: vision.joint_colour_model(FRAME, BOXES, deviations=(0.0, 1, 1, 1))),
+    ("dynamics: parameters for",
+     lambda: vision.ColourModel.from_frame(
+         FRAME, BOXES, dynamics=mpfjax.RandomWalk(np.ones((3, 4))))),
+    ("templates: 2 is none of the 2 objects",
+     lambda: vision.joint_colour_model(FRAME, BOXES, templates={2: (FRAME, BOXES[0])})),
+    ("templates: of object 0",
+     lambda: vision.joint_colour_model(FRAME, BOXES, templates={0: (None, BOXES[0])})),
+    ("detections: ", lambda: TRACKER.step(None, TRACKER.init(), None, BOXES)),
+    ("state: ", lambda: TRACKER.step(None, None, None, DETECTIONS)),
+    ("frame: float", lambda: TRACKER.look(FRAME.astype(float), DETECTIONS)),
+    ("boxes: shape", lambda: vision.Detections.from_boxes(BOXES[0], 2)),
+    ("boxes: .* no area", lambda: vision.Detections.from_boxes(BOXES * 0, 2)),
+    ("boxes: .*float32.*origin", lambda: vision.Detections.from_boxes([[5e6, 5e6, 0.6, 1.8]], 2)),
+    ("scores: shape", lambda: vision.Detections.from_boxes(BOXES, 2, np.ones(3))),
+    ("labels: .*whole numbers from 0",
+     lambda: vision.Detections.from_boxes(BOXES, 2, labels=np.array([-1, 1]))),
+    *(
+        (f"detections: {words}", lambda found=found: tracked(lambda frame: found))
+        for words, found in (
+            ("frame 1: .* not finite", [[1.0, NAN, 3, 4]]), ("frame 1: None is no array", None),
+            ("frame 1: scores .* not finite", (BOXES, [NAN, 1])), ("frame 1: float64", [[1.0, 2]]),
+            ("frame 1: 1 scores for 2", (BOXES, [1.0])), ("frame 1: 'boxes'", "boxes"),
+            ("frame 1: scores .* masked", (BOXES, np.ma.masked_array([1.0, 2], [True, False]))),
+        )
+    ),
+    ("detections: end before the frames do, at frame 2", lambda: tracked([BOXES])),
+    ("detections: row 1, .* is not finite", lambda: tracked(ROWS * [[1], [NAN]])),
+    ("detections: 3 is neither", lambda: tracked(3)),
+    ("detections: shape", lambda: tracked(ROWS[:, :5])),
+    ("a detector needs frames", lambda: vision.track(None, len)),
+    ("min_score: .* no scores", lambda: tracked([BOXES] * 2, min_score=0.5)),
+    ("camera_motion: 'pixels' needs", lambda: vision.track(None, ROWS, camera_motion="pixels")),
+    ("frames: frame 2 is 50 x 30", lambda: tracked([BOXES] * 2, [FRAME, FRAME[:30]])),
+    ("frames: float64 is not uint8", lambda: tracked([BOXES], [FRAME.astype(float)])),
+    ("by_reference: ", lambda: vision.track_rows([Snapshot(0, 0, 0, 0)], by_reference=True)),
+    ("area: .* is not a range", lambda: vision.BackgroundSubtraction(area=(0.2, 0.1))),
+    ("frames: there are none", lambda: vision.BackgroundSubtraction().learn([])),
+    (r"rows: .* is not frame,id", lambda: vision.write_tracks("/nowhere", [[0, 1, 5, 5, 9, 9]])),
+    ("first, last: 4, 2", lambda: vision.read_frames(".", 4, 2)),
+    ("path: .* ends in neither", lambda: vision.write_video("/nowhere/a.avi", [FRAME])),
+    ("format: 'coco'", lambda: vision.read_truth("/nowhere", format="coco")),
     # runs and studies
     ("slots: 3 is no whole number of at least N, 4",
      lambda: mpfjax.monte_carlo(KEY[None], FILTER, TWO, slots=3)),
