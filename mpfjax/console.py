@@ -23,42 +23,28 @@ from mpfjax.operations.compiling import keep_programs
 from mpfjax.running.storage import write_whole
 
 
-def whole(least: int = 1, most: int = 2**31 - 1) -> Callable[[str], int]:
-    """The type of an option that is a whole number in this range, by default a count."""
-
-    def read(text: str) -> int:
-        try:
-            number = int(text)
-        except ValueError:
-            number = least - 1
-        if not least <= number <= most:
-            raise argparse.ArgumentTypeError(
-                f"{text!r} is not a whole number from {least} to {most}"
-            )
-        return number
+def _read_by(
+    kind: Callable[[str], Any], holds: Callable[[Any], bool], what: str
+) -> Callable[[str], Any]:
+    def read(text: str) -> Any:
+        with contextlib.suppress(ValueError):
+            if holds(number := kind(text)):
+                return number
+        raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
 
     return read
 
 
+def whole(least: int = 1, most: int = 2**31 - 1) -> Callable[[str], int]:
+    """The type of an option that is a whole number in this range, by default a count."""
+    what = f"a whole number from {least} to {most}"
+    return _read_by(int, lambda number: least <= number <= most, what)
+
+
 # JAX makes a key of the last 32 bits only: larger seeds would repeat smaller ones.
 seed = whole(0, 2**32 - 1)
-
-
-def positive(text: str) -> float:
-    """The type of an option that is a positive, finite number."""
-    return _number(text, lambda number: 0 < number < math.inf, "a positive, finite number")
-
-
-def finite(text: str) -> float:
-    """The type of an option that is a finite number."""
-    return _number(text, math.isfinite, "a finite number")
-
-
-def _number(text: str, holds: Callable[[float], bool], what: str) -> float:
-    with contextlib.suppress(ValueError):
-        if holds(number := float(text)):
-            return number
-    raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
+positive = _read_by(float, lambda number: 0 < number < math.inf, "a positive, finite number")
+finite = _read_by(float, math.isfinite, "a finite number")
 
 
 def write_figure(path: Path, figure: Any, dpi: int = 150) -> None:

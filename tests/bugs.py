@@ -72,6 +72,49 @@ BUGS = {
         "accepted = accepts(jax.random.key(0), found.log_density - before)",
         "tests/test_exact_answers.py -k chains",
     ),
+    # running
+    "islands forget each other's scale": Bug(
+        "operations/islands.py",
+        "log_total = log_sum_exp(sums + (((scales - common) + largest) - shift))",
+        "log_total = log_sum_exp(sums)",
+        "tests/test_devices.py -k unbiased",
+    ),
+    "threads run the first block again": Bug(
+        "running/devices.py",
+        "return run(_at(inputs, first + np.arange(size)), *arguments)",
+        "return run(_at(inputs, np.arange(size)), *arguments)",
+        "tests/test_devices.py -k one_block",
+    ),
+    "a study's batches share their keys": Bug(
+        "running/studies.py",
+        "batch = study.keys[np.clip(np.arange(start, start + size), 0, num_seeds - 1)]",
+        "batch = study.keys[np.arange(size)]",
+        "tests/test_studies.py -k those_of_monte_carlo",
+    ),
+    "a resumed study runs finished cells again": Bug(
+        "running/studies.py",
+        "pending = [cell for cell in cells if cell.file not in results]",
+        "pending = cells",
+        "tests/test_studies.py -k goes_on",
+    ),
+    "slots beyond N have weight": Bug(
+        "running/run.py",
+        "log_weights=jnp.where(slot < number, filled.log_weights, -jnp.inf),",
+        "log_weights=filled.log_weights,",
+        "tests/test_studies.py -k shared_slots",
+    ),
+    "a checkpoint counts one step too many": Bug(
+        "running/long_runs.py",
+        'notes = {"caller": self.caller, "step": state.step}',
+        'notes = {"caller": self.caller, "step": state.step + 1}',
+        "tests/test_storage.py -k LongRuns",
+    ),
+    "a file is renamed before it is written": Bug(
+        "running/storage.py",
+        'partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")',
+        "partial = path",
+        "tests/test_storage.py -k TestFullDisk",
+    ),
 }
 
 

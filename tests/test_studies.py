@@ -112,7 +112,7 @@ class TestBrokenOff:
             assert "'num_particles': 8, 'noise': 0.55" in caught.value.__notes__[0]
         assert len(read_study(tmp_path)) == 2
         finished = {path: path.stat().st_mtime_ns for path in files_of(tmp_path)}
-        study = small_study(NUM_CELLS, measure=breaking(error, after=NUM_CELLS - 2))
+        study = small_study(NUM_CELLS, measure=breaking(RuntimeError("again"), NUM_CELLS - 2))
         np.testing.assert_equal(run_study(study, tmp_path, resume=True), alone[1])
         assert all(path.stat().st_mtime_ns == time for path, time in finished.items())
 

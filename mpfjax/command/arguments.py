@@ -3,7 +3,6 @@
 import argparse
 import importlib
 import re
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -59,8 +58,7 @@ class Source(NamedTuple):
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """The arguments, checked as far as possible without the frames."""
     parser, track = _parsers()
-    given = sys.argv[1:] if arguments is None else arguments
-    options = parser.parse_args(_with_boxes_joined(given))
+    options = parser.parse_args(arguments)
     _check(track, options)
     return options
 
@@ -78,6 +76,8 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    # A box that reaches beyond the left border is no option, though it begins with a minus sign.
+    track._negative_number_matcher = re.compile(r"-[\d.]")
     track.add_argument("source", type=_existing, metavar="SOURCE", help=SOURCE)
     track.add_argument("--out", type=Path, required=True, metavar="DIR", help="where results go")
     what = track.add_mutually_exclusive_group()
@@ -120,12 +120,10 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
 def _check(track: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """An error of `track` for options that do not go together."""
     if not (options.detections or options.detect or options.box) and _has_pixels(options.source):
-        if _is_text(options.source):
-            track.error(
-                f"argument SOURCE: {options.source} is text, and no video; the name of a file of"
-                " detections ends in .txt or .csv"
-            )
-        track.error("one of the arguments --detections --detect --box is required")
+        track.error(
+            "one of the arguments --detections --detect --box is required, for a file of detections"
+            " alone is .txt or .csv"
+        )
     if options.box is not None:
         for name in ("max_objects", "min_score", "no_colour", "camera_motion", "offline"):
             if getattr(options, name):
@@ -144,29 +142,6 @@ def _existing(text: str) -> Path:
     if not path.exists():
         raise argparse.ArgumentTypeError(f"{path}: no such file or folder")
     return path
-
-
-def _is_text(path: Path) -> bool:
-    """Whether a file begins as no video does, with neither a zero nor a byte of 255."""
-    if path.is_dir():
-        return False
-    with path.open("rb") as file:
-        start = file.read(1024)
-    return bool(start) and b"\0" not in start and b"\xff" not in start
-
-
-def _with_boxes_joined(arguments: list[str]) -> list[str]:
-    """`--box` and its value joined, since argparse takes a box that begins with - for an option.
-
-    Such a box reaches beyond the left border.
-    """
-    joined: list[str] = []
-    for argument in arguments:
-        if joined and joined[-1] == "--box" and re.match(r"-[\d.]", argument):
-            joined[-1] = f"--box={argument}"
-        else:
-            joined.append(argument)
-    return joined
 
 
 def open_source(options: argparse.Namespace) -> Source:
