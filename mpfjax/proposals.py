@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import POSITIVE, Checked, Count, Positive, checked, to_array
-from mpfjax.models.base import has_attribute, model_name, require
+from mpfjax.models.base import has_attribute, model_name
 from mpfjax.operations.matrices import cholesky, solve_lower
 from mpfjax.operations.random import normal
 
@@ -151,14 +151,11 @@ class GaussNewtonProposal(_GaussianProposal):
     inflation: Positive = eqx.field(static=True, default=1.1)
 
     def __check_init__(self) -> None:
-        for method in ("transition_mean", "observation_mean"):
-            require(self.model, method, "GaussNewtonProposal")
-        for matrix in ("transition_covariance", "observation_covariance"):
-            if not has_attribute(self.model, matrix):
-                raise ValueError(
-                    f"model: {model_name(self.model)} has no {matrix},"
-                    " which GaussNewtonProposal needs"
-                )
+        for moment in ("mean", "covariance"):
+            for name in (f"transition_{moment}", f"observation_{moment}"):
+                if not has_attribute(self.model, name):
+                    needed = f"{name}, which GaussNewtonProposal needs"
+                    raise ValueError(f"model: {model_name(self.model)} defines no {needed}")
 
     def propose_from_noise(
         self,

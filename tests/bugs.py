@@ -115,6 +115,61 @@ BUGS = {
         "partial = path",
         "tests/test_storage.py -k TestFullDisk",
     ),
+    # Filters, resampling and regrouping.
+    "residual resampling draws from what is expected in all": Bug(
+        "moves/resampling/ancestors.py",
+        "dealt.line.positions(jnp.maximum(expected - whole, 0.0), left, rest.firsts)",
+        "dealt.line.positions(expected, left, rest.firsts)",
+        "tests/moves/test_contracts.py -k unbiased",
+    ),
+    "SSP keeps the wrong one of a pair": Bug(
+        "moves/resampling/ancestors.py",
+        "left_stays = draw < jnp.where(one_is_up, 1 - left, left)",
+        "left_stays = draw < jnp.where(one_is_up, 1 - right, left)",
+        "tests/moves/test_contracts.py -k unbiased",
+    ),
+    "the threshold of adaptive resampling is one of all particles": Bug(
+        "moves/resampling/resample.py",
+        "least = self.ess_threshold * counts.astype(mixture.log_weights.dtype)",
+        "least = self.ess_threshold * jnp.sum(counts).astype(mixture.log_weights.dtype)",
+        "tests/moves/test_contracts.py -k adaptive",
+    ),
+    "conditional SMC draws from the start of the kept interval": Bug(
+        "moves/resampling/ancestors.py",
+        "kept.point(dealt.before, dealt.kept.shares[0] * dealt.expected[dealt.kept.place])",
+        "kept.point(dealt.before, 0 * dealt.expected[dealt.kept.place])",
+        "tests/moves/test_conditional.py -k systematic",
+    ),
+    "a look-ahead is not divided out again": Bug(
+        "moves/resampling/auxiliary.py",
+        "drawn = drawn.weighed(-take(log_factors, ancestors.particles))",
+        "drawn = drawn.weighed(0 * take(log_factors, ancestors.particles))",
+        "tests/moves/test_auxiliary.py -k expected",
+    ),
+    "regeneration forgets the weights": Bug(
+        "moves/resampling/gaussian.py",
+        "weights = mixture.component_weights.astype(states.dtype)",
+        "weights = mixture.occupied.astype(states.dtype)",
+        "tests/moves/test_gaussian.py -k moments",
+    ),
+    "the share of a half is one of any mass": Bug(
+        "moves/regrouping/split.py",
+        "& (least_mass >= self.min_share * total)",
+        "& (least_mass >= self.min_share)",
+        "tests/moves/test_regrouping.py -k min_share",
+    ),
+    "Gauss-Newton's volume is inverted": Bug(
+        "proposals.py",
+        "log_volume = -jnp.sum(jnp.log(_diagonals(factors)), axis=1)",
+        "log_volume = jnp.sum(jnp.log(_diagonals(factors)), axis=1)",
+        "tests/moves/test_auxiliary.py -k normaliser",
+    ),
+    "a chosen x_0 is weighed by its chance": Bug(
+        "moves/initial.py",
+        "log_weights=-jnp.log(trust * total),",
+        "log_weights=jnp.log(trust / jnp.sum(trust)),",
+        "tests/test_initial.py -k represent",
+    ),
 }
 
 

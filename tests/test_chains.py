@@ -14,24 +14,28 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter
-from tests.marking import quick_of
-from tests.registry import CHAINS, MANY_COMPONENTS, NUM_PARTICLES, QUICK_CHAINS
+from tests.registry import CHAINS, NUM_PARTICLES, QUICK_CHAINS
 from tests.user_models import (
     BLINDED,
     BROKEN,
     DRIFT_AS_LINEAR_GAUSSIAN,
     EXPLODING,
     Drift,
+    DriftOfOne,
     TrickyQuadraticModel,
     nothing_traced,
 )
 
-NUM_RUNS = 2000
+NUM_RUNS = 4000
 OBSERVATIONS = jnp.array([1.5, 1.0, 0.4, 0.9])
 GRID = jnp.linspace(-5.0, 5.0, 1001)
-MODELS = {"quadratic": TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0), "drift": Drift()}
+MODELS = {
+    "quadratic": TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0),
+    "drift": Drift(),
+    "drift of one": mpfjax.per_particle(DriftOfOne()),
+}
 
-over_chains = pytest.mark.parametrize("chain", quick_of(CHAINS, QUICK_CHAINS))
+over_chains = pytest.mark.parametrize("chain", QUICK_CHAINS)
 
 
 def is_exact(chain):
@@ -75,63 +79,51 @@ def chain_filter(chain, model):
     return CHAINS[chain](MODELS[model])
 
 
-# Regrouping is exact whatever the labels are, so that what the state is makes no difference to it:
-# a second model for the chains without, and for one of each kind with it.
-ON_BOTH_MODELS = ("mpf", "mpf rqmc", "guided mpf", "partitioned in clusters")
-EXACT = [
-    (chain, model)
-    for chain in CHAINS
-    if is_exact(chain)
-    for model in MODELS
-    if model == "quadratic"
-    or chain in ON_BOTH_MODELS
-    or chain_filter(chain, model).num_components == 1
+# What the state is makes no difference to regrouping: a second model for a few, and more slots than
+# particles for what deals with them, each in its own way.
+EXACT = [(chain, "quadratic", None) for chain in CHAINS if is_exact(chain)] + [
+    ("guided pf", "drift of one", None),
+    *((chain, "drift", None) for chain in ("guided mpf", "partitioned in clusters", "mpf rqmc")),
+    *((chain, "quadratic", 120) for chain in ("pf ssp", "metropolis", "random labels, residual")),
+    ("pf multinomial", "quadratic", 120),
 ]
 
 
-QUICK = [(chain, model) for chain, model in EXACT if chain in QUICK_CHAINS if model == "quadratic"]
-
-
 @cache
-def runs(chain, model):
+def runs(chain, model="quadratic", slots=None):
     keys = jax.random.split(jax.random.key(3), NUM_RUNS)
-    run = mpfjax.monte_carlo(keys, chain_filter(chain, model), OBSERVATIONS, moments)
+    filter = chain_filter(chain, model)
+    run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, moments, slots=slots)
     return jax.tree.map(np.asarray, run)
 
 
-@pytest.mark.parametrize(("chain", "model"), quick_of(EXACT, QUICK))
-class TestExactness:
-    def test_evidence_and_moments_are_unbiased(self, chain, model):
-        """E[Ẑ/Z] = 1, and E[Ẑ/Z φ̂] = E[φ | y], at every step, within 4 standard errors.
+@pytest.mark.parametrize(("chain", "model", "slots"), EXACT)
+def test_evidence_and_moments_are_unbiased(chain, model, slots):
+    """E[Ẑ/Z] = 1, and E[Ẑ/Z φ̂] = E[φ | y], at every step, within 4 standard errors.
 
-        A particle filter's estimate of E[φ | y] is biased, but times its evidence it is not.
-        """
-        run, exact = runs(chain, model), joint_truth(chain, model)
-        log_evidence = np.cumsum(run.log_likelihood_increments, axis=1)
-        ratios = np.exp(log_evidence - exact.log_evidence)
-        first, second, _ = run.collected
-        # Loose estimates would prove nothing.
-        assert (ratios.std(axis=0) / np.sqrt(NUM_RUNS) < 0.04).all()
-        assert_unbiased(ratios, 1.0)
-        assert_unbiased(ratios[..., None] * first, exact.first)
-        assert_unbiased(ratios[..., None] * second, exact.second)
-
-    def test_increments_add_up(self, chain, model):
-        run = runs(chain, model)
-        total = run.log_likelihood_increments.sum(axis=1)
-        np.testing.assert_allclose(run.log_marginal_likelihood, total, rtol=1e-5, atol=1e-5)
-
-    def test_final_mixture_is_normalised_and_finite(self, chain, model):
-        final, filter = runs(chain, model).final, chain_filter(chain, model)
-        assert not np.isnan(final.log_weights).any()
-        np.testing.assert_allclose(np.exp(final.log_weights).sum(axis=1), 1.0, rtol=1e-5)
-        assert (final.component_indicators >= 0).all()
-        assert (final.component_indicators < filter.num_components).all()
-        ancestors = np.asarray(final.ancestor_indices)
-        if all(move.keeps_parents for move in filter.moves):
-            assert ((ancestors >= 0) & (ancestors < NUM_PARTICLES)).all()
-        else:
-            assert (ancestors == -1).all()
+    A particle filter's estimate of E[φ | y] is biased, but times its evidence it is not.
+    """
+    run, exact = runs(chain, model, slots), joint_truth(chain, model)
+    log_evidence = np.cumsum(run.log_likelihood_increments, axis=1)
+    ratios = np.exp(log_evidence - exact.log_evidence)
+    first, second, _ = run.collected
+    # Loose estimates would prove nothing.
+    assert (ratios.std(axis=0) / np.sqrt(NUM_RUNS) < 0.03).all()
+    assert_unbiased(ratios, 1.0)
+    assert_unbiased(ratios[..., None] * first, exact.first)
+    assert_unbiased(ratios[..., None] * second, exact.second)
+    np.testing.assert_allclose(run.log_marginal_likelihood, log_evidence[:, -1], rtol=1e-4)
+    final, filter = run.final, chain_filter(chain, model)
+    np.testing.assert_allclose(np.exp(final.log_weights).sum(axis=1), 1.0, rtol=1e-5)
+    assert (final.component_indicators >= 0).all()
+    assert (final.component_indicators < filter.num_components).all()
+    filled = final.log_weights > -np.inf
+    assert not filled[:, NUM_PARTICLES:].any()
+    ancestors = final.ancestor_indices[filled]
+    if all(move.keeps_parents for move in filter.moves):
+        assert ((ancestors >= 0) & (ancestors < NUM_PARTICLES)).all()
+    else:
+        assert (ancestors == -1).all()
 
 
 def assert_unbiased(estimates, expected):
@@ -143,17 +135,7 @@ def assert_unbiased(estimates, expected):
 
 def test_what_is_approximate_is_declared():
     declared = {chain for chain in CHAINS if not is_exact(chain)}
-    of_components = {
-        "exclusion", "gaussian mixture", "gaussian mixture rqmc", "predictive Gaussian"
-    }  # fmt: skip
-    of_many = f"predictive Gaussian, M = {MANY_COMPONENTS}"
-    assert declared == {"dps prior", of_many} | of_components
-
-
-def step_keys(key, length):
-    """The keys that `run_filter` gives to `init` and to each step."""
-    key_initial, key_steps = jax.random.split(key)
-    return key_initial, jax.random.split(key_steps, length)
+    assert declared == {"dps prior", "exclusion", "gaussian mixture", "gaussian mixture rqmc"}
 
 
 @over_chains
@@ -161,23 +143,19 @@ class TestOnline:
     """The chain's single step, on the tricky quadratic model."""
 
     def test_step_by_step_equals_the_scan_and_a_loop_equals_vmap(self, chain):
-        run, filter = runs(chain, "quadratic"), chain_filter(chain, "quadratic")
-        # A run in which no particle lies within rounding of the edge between two offspring.
-        for k, key in list(enumerate(jax.random.split(jax.random.key(3), NUM_RUNS)))[6:7]:
-            initial, keys = step_keys(key, len(OBSERVATIONS))
-            mixture = filter.init(initial, OBSERVATIONS[0])
-            for t, observation in enumerate(OBSERVATIONS):
-                mixture, info = filter.step(keys[t], mixture, observation)
-                increment = run.log_likelihood_increments[k, t]
-                np.testing.assert_allclose(info.log_likelihood_increment, increment, rtol=1e-3)
-                np.testing.assert_allclose(
-                    mixture.particles, run.collected[2][k, t], rtol=1e-4, atol=1e-4
-                )
-                np.testing.assert_array_equal(info.resampled, run.resampled[k, t])
-            np.testing.assert_array_equal(
-                mixture.component_indicators, run.final.component_indicators[k]
-            )
-            np.testing.assert_array_equal(mixture.ancestor_indices, run.final.ancestor_indices[k])
+        run, filter = runs(chain), chain_filter(chain, "quadratic")
+        k = 6  # in which no particle lies within rounding of the edge between two offspring
+        key_initial, key_steps = jax.random.split(jax.random.split(jax.random.key(3), NUM_RUNS)[k])
+        mixture = filter.init(key_initial, OBSERVATIONS[0])
+        for t, key in enumerate(jax.random.split(key_steps, len(OBSERVATIONS))):
+            mixture, info = filter.step(key, mixture, OBSERVATIONS[t])
+            increment = run.log_likelihood_increments[k, t]
+            np.testing.assert_allclose(info.log_likelihood_increment, increment, rtol=1e-3)
+            drawn = run.collected[2][k, t]
+            np.testing.assert_allclose(mixture.particles, drawn, rtol=1e-4, atol=1e-4)
+            np.testing.assert_array_equal(info.resampled, run.resampled[k, t])
+        for name in ("component_indicators", "ancestor_indices"):
+            np.testing.assert_array_equal(getattr(mixture, name), getattr(run.final, name)[k])
 
     def test_a_step_of_zero_likelihood_is_flagged_and_the_filter_goes_on(self, chain):
         filter = chain_filter(chain, "quadratic")
@@ -192,7 +170,7 @@ class TestOnline:
         assert not bool(info.degenerate)
         assert np.isfinite(after.mean()).all()
 
-    @pytest.mark.parametrize("constant", [1e3, -1e3, 1e6, -1e6, 1e9, -1e9, 1e30, -1e30])
+    @pytest.mark.parametrize("constant", [1e3, -1e6, 1e9, -1e30])
     def test_a_constant_moves_the_evidence_and_nothing_else(self, chain, constant):
         """Added to every log-likelihood, of any size that the type holds.
 
@@ -225,32 +203,21 @@ class TestOnline:
             labels = mixture.component_indicators, expected.component_indicators
             np.testing.assert_array_equal(*labels)
 
-    def test_a_nan_observation_is_an_error(self, chain):
+    def test_a_number_that_is_not_finite_is_an_error(self, chain):
         filter = chain_filter(chain, "quadratic")
-        with pytest.raises(RuntimeError, match="observation"):
-            filter.step(jax.random.key(6), started(chain), observed(jnp.nan))
+        density = "model: a density was NaN or infinite"
+        for value, words in ((jnp.nan, "observation"), (BROKEN, density), (EXPLODING, density)):
+            with pytest.raises(RuntimeError, match=words):
+                filter.step(jax.random.key(6), started(chain), observed(value))
 
-    def test_a_nan_or_infinite_density_is_an_error(self, chain):
-        filter = chain_filter(chain, "quadratic")
-        for observation in (BROKEN, EXPLODING):
-            with pytest.raises(RuntimeError, match="model: a density was NaN or infinite"):
-                filter.step(jax.random.key(6), started(chain), observed(observation))
-
-    def test_nothing_compiles_again_as_components_come_and_go(self, chain):
-        filter = chain_filter(chain, "quadratic")
+    def test_nothing_compiles_again(self, chain):
+        """Not as components come and go, nor for another filter of the same shape."""
         mixture = started(chain)
-        filter.step(jax.random.key(6), mixture, OBSERVATIONS[0])
-        with nothing_traced():
-            for t, observation in enumerate((2.0, 1.0, 0.0, 0.0, 0.0, 3.0, BLINDED, 1.0)):
-                mixture, _ = filter.step(jax.random.key(t), mixture, observed(observation))
-
-    def test_another_filter_of_the_same_shape_compiles_nothing(self, chain):
-        filter = chain_filter(chain, "quadratic")
-        mixture = started(chain)
-        filter.step(jax.random.key(6), mixture, OBSERVATIONS[0])
         other = CHAINS[chain](TrickyQuadraticModel(0.4, 0.2, -2.0, 2.0))
         with nothing_traced():
-            other.step(jax.random.key(6), mixture, OBSERVATIONS[1])
+            for t, observation in enumerate((2.0, 1.0, 0.0, 0.0, 0.0, 3.0, BLINDED, 1.0)):
+                filter = other if t % 3 == 2 else chain_filter(chain, "quadratic")
+                mixture, _ = filter.step(jax.random.key(t), mixture, observed(observation))
 
 
 def observed(value):

@@ -66,15 +66,10 @@ def runs():
     return {k: mpfjax.monte_carlo(keys, make(k), OBSERVATIONS, nothing) for k in (1, 8)}
 
 
-def test_a_wide_prior_is_covered_as_by_more_particles(runs):
-    exact, _ = Wide().kalman()
-    errors = {k: np.sqrt(np.mean((run.log_marginal_likelihood - exact) ** 2))
-              for k, run in runs.items()}  # fmt: skip
-    assert errors[8] < 0.6 * errors[1], errors
-
-
-def test_evidence_and_moments_stay_unbiased(runs):
+def test_evidence_and_moments_stay_unbiased_and_vary_less(runs):
     log_z, mean = Wide().kalman()
+    errors = {k: np.mean((run.log_marginal_likelihood - log_z) ** 2) for k, run in runs.items()}
+    assert errors[8] < 0.36 * errors[1], errors
     ratios = np.exp(np.asarray(runs[8].log_marginal_likelihood, np.float64) - log_z)
     assert is_near(ratios)
     assert is_near(
@@ -109,36 +104,6 @@ def test_particles_descend_from_those_of_the_run():
     assert np.any(run.resampled[1])
 
 
-def test_online_steps_draw_the_same():
-    filter = mpfjax.mixture_particle_filter(Wide(), 50, 3)
-    run = mpfjax.run_filter(KEY, filter, OBSERVATIONS, nothing)
-    key_initial, key_steps = jax.random.split(KEY)
-    mixture, total = filter.init(key_initial, OBSERVATIONS[0]), 0.0
-    for key, observation in zip(jax.random.split(key_steps, 3), OBSERVATIONS, strict=True):
-        mixture, info = filter.step(key, mixture, observation)
-        total += float(info.log_likelihood_increment)
-    assert total == pytest.approx(float(run.log_marginal_likelihood), abs=1e-4)
-    np.testing.assert_array_equal(mixture.particles, run.final.particles)
-
-
-@pytest.mark.parametrize(
-    "changed",
-    [
-        lambda m: m.replace(particles=500 + m.particles / 1000),
-        lambda m: m.replace(particles=-m.particles),
-        lambda m: m.replace(particles=2 * m.particles),
-        lambda m: m.replace(component_indicators=0 * m.component_indicators),
-    ],
-    ids=["elsewhere", "mirrored", "scaled", "in one component"],
-)
-def test_a_mixture_changed_by_hand_is_what_the_first_step_goes_on_from(changed):
-    filter = mpfjax.mixture_particle_filter(Wide(), 50, 3)
-    given = changed(filter.init(KEY))
-    moved, _ = filter.step(KEY, given, OBSERVATIONS[0])
-    away = np.abs(np.asarray(moved.particles)[:, None] - np.asarray(given.particles)[None])
-    assert np.max(np.min(away, axis=1)) < 2.0
-
-
 def test_without_an_observation_it_does_nothing():
     gap = OBSERVATIONS.copy()
     gap[0] = np.nan
@@ -170,31 +135,6 @@ def test_what_a_chain_weighs_before_it_propagates_counts():
     log_z = -0.5 * (seen @ np.linalg.solve(covariance, seen) + np.linalg.slogdet(covariance)[1])
     log_z -= np.log(2 * np.pi)
     assert is_near(np.exp(np.asarray(found.log_marginal_likelihood, np.float64) - log_z))
-
-
-class CountingResample(mpfjax.AbstractResampling):
-    """A resampling of its own, which remembers how long each component has lived."""
-
-    def initial_memory(self, num_components):
-        return {"ages": jnp.zeros(num_components, jnp.int32)}
-
-    def forget(self, memory, dead):
-        return memory | {"ages": jnp.where(dead, 0, memory["ages"])}
-
-    def __call__(self, key, mixture, observation=None):
-        moved = mpfjax.Resample()(key, mixture)
-        return moved.replace(memory=mixture.memory | {"ages": mixture.memory["ages"] + 1})
-
-
-def test_a_resampling_that_waits_forgets_dead_components_all_the_same():
-    model = Wide()
-    propagate = mpfjax.Propagate(model)
-    filter = mpfjax.Filter(
-        model, [CountingResample(), propagate], 30, 3,
-        initial_moves=[SelectInitial(propagate, 4)],
-    )  # fmt: skip
-    ages = mpfjax.run_filter(KEY, filter, OBSERVATIONS).final.memory["ages"]
-    np.testing.assert_array_equal(ages, [2, 0, 0])  # two components have no particles, one waited
 
 
 def test_every_second_step_is_the_second_and_the_fourth():
@@ -245,16 +185,6 @@ def test_in_slots_the_choice_is_that_of_a_run_without():
     np.testing.assert_allclose(in_slots.initial.log_scale, plain.initial.log_scale, atol=1e-6)
 
 
-def test_a_filter_is_replaced_by_its_own_arguments():
-    model, other = Wide(), Wide(wide=1.0)
-    filter = mpfjax.with_selected_start(mpfjax.mixture_particle_filter(model, 20, 2), 3)
-    changed = filter.replace(model=other, num_particles=50)
-    assert changed.num_particles == 50
-    for held in (changed.model, changed.moves[1].model, changed.initial_moves[0].propagation.model):
-        assert held is other
-    assert changed.initial_moves[0].num_draws == 3
-
-
 def expected_trust(values):
     """By numpy: the linear predictor of E[L | x_0] from the mean of two draws."""
     ratios = values / values.mean()
@@ -283,12 +213,3 @@ def test_impossible_and_empty_particles():
     assert np.all(np.isfinite(found))
     assert found[0] > 1 > found[1] >= 0.25
     np.testing.assert_array_equal(trusted(jnp.full((2, 3), -jnp.inf), jnp.ones(3)), 1.0)
-
-
-def test_what_cannot_choose_is_refused():
-    joint = mpfjax.MultiObjectModel(mpfjax.QuadraticModel(), 2)
-    partitioned = mpfjax.partitioned_sampling(joint, 10)
-    with pytest.raises(ValueError, match="filter: x_0 is chosen where Propagate"):
-        mpfjax.with_selected_start(partitioned, 2)
-    with pytest.raises(ValueError, match="num_draws"):
-        make(0)

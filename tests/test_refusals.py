@@ -362,6 +362,41 @@ REFUSED = (
      lambda: mpfjax.mixture_particle_filter(MODEL, 20, 2, scale=[1.0, 2.0]).init(KEY)),
     ("share_by: groups have no effect",
      lambda: Resample(particles_per_component=2, share_by=nothing)),
+    ("moves: there must be at least one", lambda: mpfjax.Every(2, [])),
+    ("moves: .* is not a list of moves", lambda: mpfjax.Every(2, KMeans())),
+    ("moves: (?s:.*) neither regroups, resamples nor",
+     lambda: mpfjax.Every(2, [KMeans(), Propagate(MODEL)])),
+    ("moves: Every and Every would share one memory",
+     lambda: FILTER.replace(
+         moves=[*FILTER.moves, *(mpfjax.Every(2, [KMeans(k)]) for k in (1, 2))])),
+    *(
+        ("function: it returned", lambda f=function: mpfjax.GroupBy(f)(KEY, MIXTURE))
+        for function in (lambda states: states, lambda states: jnp.zeros(2, jnp.int32), len)
+    ),
+    ("num_sets: 7 is more than num_components",
+     lambda: mpfjax.RandomPartition(7).regroup(KEY, MIXTURE)),
+    *(
+        (words, lambda v=value: mpfjax.AuxiliaryResample(Resample(), lambda y, states: v)(
+            KEY, MIXTURE, 1.0))
+        for words, value in (
+            ("lookahead: it returned 3.0", 3.0), (r"lookahead: .* shape \(2,\)", jnp.zeros(2)))
+    ),
+    ("lookahead: None", lambda: mpfjax.auxiliary_particle_filter(MODEL, 20, None)),
+    ("importance: .* draws from no proposal",
+     lambda: mpfjax.gaussian_particle_filter(
+         MODEL, 5, importance="predictive_gaussian", proposal=mpfjax.GaussNewtonProposal(MODEL))),
+    *(
+        (words, lambda c=change: c(mpfjax.independent_particle_filters(JOINT, 8)))
+        for words, change in (
+            ("filter: none of its moves is a Resample", mpfjax.with_lookahead),
+            ("filter: x_0 is chosen where", lambda f: mpfjax.with_selected_start(f, 2)),
+            ("filter: each particle draws where",
+             lambda f: mpfjax.with_proposals_per_particle(f, 2)),
+            (r"slots: Propagate\w+ fills every slot",
+             lambda f: mpfjax.monte_carlo(KEY[None], f, TWO, slots=60)),
+        )
+    ),
+    (r"slots: 3 is .* N, 4", lambda: mpfjax.monte_carlo(KEY[None], FILTER, TWO, slots=3)),
     ("(?s)moves: .* returned None, no ParticleMixture", lambda: after(lambda m: None)),
     ("(?s)moves: .* in PyTreeDef.*x.*, and was given",
      lambda: after(lambda m: m.replace(particles={"x": m.particles}))),

@@ -4,7 +4,6 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import mpfjax
 from mpfjax import (
@@ -104,16 +103,11 @@ def test_a_look_ahead_and_proposals_are_put_on_and_taken_off():
     chex.assert_trees_all_equal(final(with_selected_start(plain, 1)), final(plain))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda f: with_lookahead(f), "filter: none of its moves is a Resample"),
-        (lambda f: with_selected_start(f, 2), "filter: x_0 is chosen where"),
-        (lambda f: with_proposals_per_particle(f, 2), "filter: each particle draws where"),
-        (lambda f: with_proposals_per_particle(f, 0), "num_draws: 0"),
-    ],
-)
-def test_a_filter_without_the_move_is_refused(change, message):
-    joint = MultiObjectModel(MODEL, 2, shared_observation=True)
-    with pytest.raises(ValueError, match=message):
-        change(mpfjax.independent_particle_filters(joint, 8))
+def test_a_filter_is_replaced_by_its_own_arguments():
+    other = mpfjax.QuadraticModel(0.1, 0.5, -2.0, 2.0)
+    filter = with_selected_start(own_chain(), 3)
+    changed = filter.replace(model=other, num_particles=50)
+    assert changed.num_particles == 50
+    for held in (changed.model, changed.moves[1].model, changed.initial_moves[0].propagation.model):
+        assert held is other
+    assert changed.initial_moves[0].num_draws == 3

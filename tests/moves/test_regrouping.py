@@ -1,4 +1,4 @@
-"""K-means, merging and splitting on clouds made by hand."""
+"""K-means, merging, splitting and the other groups, on mixtures made by hand."""
 
 import equinox as eqx
 import jax
@@ -6,7 +6,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax import Filter, KMeans, Merge, Pool, QuadraticModel, RandomPartition, Split
+import mpfjax
+from mpfjax import (
+    Filter,
+    GroupBy,
+    KMeans,
+    Merge,
+    Pool,
+    Propagate,
+    Prune,
+    QuadraticModel,
+    RandomPartition,
+    Resample,
+    Split,
+)
 from mpfjax.moves.regrouping.features import summarise, summarise_about
 from mpfjax.moves.regrouping.kmeans import farthest_first
 from mpfjax.moves.regrouping.merge import lowest_connected
@@ -32,32 +45,16 @@ def labels_after(move, mixture):
 
 
 class TestKMeans:
-    def test_equals_lloyds_algorithm(self):
-        states = RNG.normal(size=(200, 3))
-        start = RNG.integers(0, 5, 200)
-        mixture = make_mixture(states, RNG.normal(size=200), start, 6)
-        for iterations in (1, 4):
-            expected = lloyd(states, start, 6, iterations)
-            found = labels_after(KMeans(iterations), mixture)
-            np.testing.assert_array_equal(found, expected)
-
-    def test_empty_slots_pull_no_centroid(self):
-        states = np.array([[100.0], [101.0], [1000.0], [110.0], [111.0], [-1000.0]])
-        log_weights = np.array([0, 0, -np.inf, 0, 0, -np.inf])
-        mixture = make_mixture(states, log_weights, [0, 1, 0, 1, 1, 1], 3)
-        found = labels_after(KMeans(5), mixture)
-        np.testing.assert_array_equal(found[[0, 1, 3, 4]], [0, 0, 1, 1])
-
-    def test_a_dead_component_stays_dead(self):
-        mixture = clouds([[0, 0], [9, 9]], [20, 20])
-        moved = eqx.filter_jit(KMeans())(KEY, mixture)
-        np.testing.assert_array_equal(moved.active, [True, True, False, False, False, False])
-
-    def test_weights_play_no_part(self):
-        states, start = RNG.normal(size=(60, 2)), RNG.integers(0, 3, 60)
-        light = make_mixture(states, np.zeros(60), start, 3)
-        heavy = make_mixture(states, 5 * RNG.normal(size=60), start, 3)
-        np.testing.assert_array_equal(labels_after(KMeans(), light), labels_after(KMeans(), heavy))
+    @pytest.mark.parametrize(("living", "m"), [(3, 3), (5, 6), (37, 40)])
+    def test_equals_lloyds_algorithm(self, living, m):
+        """Whatever the weights; empty slots pull no centroid, and the dead stay dead."""
+        states, start = RNG.normal(size=(200, 3)), RNG.integers(0, living, 200)
+        empty = RNG.random(200) < 0.2
+        states[empty] *= 1000
+        log_weights = np.where(empty, -np.inf, 5 * RNG.normal(size=200))
+        mixture = make_mixture(states, log_weights, start, m)
+        expected = lloyd(states[~empty], start[~empty], m, 4)
+        np.testing.assert_array_equal(labels_after(KMeans(4), mixture)[~empty], expected)
 
     def test_reseeding_finds_clouds_that_share_a_label(self):
         mixture = clouds([[0, 0], [20, 0], [0, 20]], [15, 30, 45], num_components=3)
@@ -69,17 +66,11 @@ class TestKMeans:
 
     def test_features_and_scale_decide_what_is_near(self):
         states = np.array([[0.0, 0.0], [0.0, 10.0], [1.0, 0.0], [1.0, 10.0]])
-        mixture = make_mixture(states, np.zeros(4), [0, 0, 1, 1], 2)
-        np.testing.assert_array_equal(labels_after(KMeans(1), mixture), [0, 0, 1, 1])
-        mixture = make_mixture(states, np.zeros(4), [0, 1, 0, 1], 2)
-        apart = KMeans(5, scale=(0.01, 100.0))
-        # In these units the first coordinate is all that matters, though the labels differ in the
-        # second; on the second alone nothing changes.
+        mixture = make_mixture(states, np.zeros(4), [0, 0, 0, 1], 2)
         by_second = KMeans(5, features=lambda states: states[:, 1])
         np.testing.assert_array_equal(labels_after(by_second, mixture), [0, 1, 0, 1])
-        tilted = make_mixture(states, np.zeros(4), [0, 0, 0, 1], 2)
-        assert labels_after(apart, tilted)[2] == 1
-        assert labels_after(apart, tilted)[1] == 0
+        by_first = KMeans(5, scale=(0.01, 100.0))
+        np.testing.assert_array_equal(labels_after(by_first, mixture), [0, 0, 1, 1])
 
     def test_farthest_first_starts_far_out_and_spreads(self):
         points = jnp.array([[0.0], [1.0], [2.0], [10.0], [-50.0]])
@@ -98,43 +89,34 @@ def lloyd(states, labels, num_components, iterations):
     return labels
 
 
+def two_at(gap):
+    return make_mixture(np.array([[0.0, 0.0], [gap, 0.0]]), np.zeros(2), [0, 1], 2)
+
+
+def of_weights(log_weights):
+    return make_mixture(np.array([0.0, 10, 10, 0]), log_weights, [0, 0, 1, 1], 2)
+
+
+BY_DISTANCE = Merge(None, 1.0, scale=(3.0, 1.0))
+MERGED = {
+    "overlap": (Merge(1.0), clouds([[0, 0], [0.2, 0], [10, 0], [10, 8]], [40] * 4), [0, 0, 2, 3]),
+    "chain": (Merge(2.0), clouds([[3.0], [1.5], [0.0], [40.0]], [200] * 4), [0, 0, 0, 3]),
+    "within two deviations": (Merge(2.0), clouds([[0.0], [1.8]], [4000] * 2), [0, 0]),
+    "beyond two deviations": (Merge(2.0), clouds([[0.0], [2.2]], [4000] * 2), [0, 1]),
+    "within a distance": (BY_DISTANCE, two_at(2.7), [0, 0]),
+    "beyond a distance": (BY_DISTANCE, two_at(3.3), [0, 1]),
+    "both conditions": (Merge(2.0, 1.0), clouds([[0.0], [3.0]], [50] * 2, scale=10.0), [0, 1]),
+    "weighted": (Merge(None, 1.0), of_weights(np.log([0.999, 0.001, 0.001, 0.999])), [0, 0]),
+    "weighted apart": (Merge(None, 1.0), of_weights(np.log([0.999, 0.001, 0.999, 0.001])), [0, 1]),
+}
+
+
 class TestMerge:
-    def test_clouds_that_overlap_merge_and_those_apart_do_not(self):
-        mixture = clouds([[0, 0], [0.2, 0], [10, 0], [10, 8]], [40, 40, 40, 40])
-        found = labels_after(Merge(1.0), mixture)
-        np.testing.assert_array_equal(found, np.repeat([0, 0, 2, 3], 40))
-
-    @pytest.mark.parametrize(("gap", "merges"), [(1.8, True), (2.2, False)])
-    def test_the_border_is_max_deviations_pooled_deviations(self, gap, merges):
-        mixture = clouds([[0.0], [gap]], [4000, 4000])
-        assert (labels_after(Merge(2.0), mixture)[-1] == 0) == merges
-
-    @pytest.mark.parametrize(("gap", "merges"), [(0.9, True), (1.1, False)])
-    def test_the_border_is_max_distance_in_units_of_scale(self, gap, merges):
-        states = np.array([[0.0, 0.0], [3.0 * gap, 0.0]])
-        mixture = make_mixture(states, np.zeros(2), [0, 1], 2)
-        merged = Merge(None, 1.0, scale=(3.0, 1.0))
-        assert (labels_after(merged, mixture)[1] == 0) == merges
-
-    def test_both_conditions_must_hold_where_both_are_given(self):
-        mixture = clouds([[0.0], [3.0]], [50, 50], scale=10.0)
-        assert labels_after(Merge(2.0), mixture)[-1] == 0
-        assert labels_after(Merge(2.0, 1.0), mixture)[-1] == 1
-
-    def test_chains_of_overlap_become_one_with_the_lowest_label(self):
-        mixture = clouds([[3.0], [1.5], [0.0], [40.0]], [200] * 4)
-        found = labels_after(Merge(2.0), mixture)
-        np.testing.assert_array_equal(found, np.repeat([0, 0, 0, 3], 200))
-
-    def test_means_are_weighted(self):
-        states = np.array([[0.0], [10.0], [10.0], [0.0]])
-        log_weights = np.log([0.999, 0.001, 0.001, 0.999])
-        mixture = make_mixture(states, log_weights, [0, 0, 1, 1], 2)
-        assert labels_after(Merge(None, 1.0), mixture)[-1] == 0
-
-    def test_dead_components_merge_with_nothing(self):
-        mixture = clouds([[0.0], [30.0]], [20, 20], labels=np.repeat([2, 4], 20))
-        np.testing.assert_array_equal(labels_after(Merge(), mixture), np.repeat([2, 4], 20))
+    @pytest.mark.parametrize("case", MERGED)
+    def test_what_overlaps_becomes_one_with_the_lowest_label(self, case):
+        move, mixture, expected = MERGED[case]
+        found = labels_after(move, mixture).reshape(len(expected), -1)
+        np.testing.assert_array_equal(found, np.tile(expected, (found.shape[1], 1)).T)
 
     def test_patience_counts_steps_in_a_row(self):
         near, far = clouds([[0.0], [0.1]], [30, 30]), clouds([[0.0], [50.0]], [30, 30])
@@ -147,25 +129,6 @@ class TestMerge:
             merged.append(int(moved.component_indicators[-1]) == 0)
         # After a merge both labels start a count of their own.
         assert merged == [False, False, False, False, False, True, False]
-
-    def test_a_label_that_is_taken_again_has_no_past(self):
-        """A label that Merge frees and Split takes in the same step starts its counts anew."""
-        merge = Merge(None, 0.7, patience=3)
-        near = np.linspace(-0.25, 0.75, 40)  # the halves' means are 0.5 apart
-        states = np.concatenate([near, np.full(10, -10), np.full(10, 12)])
-        mixture = make_mixture(states[:, None], np.zeros(60), np.repeat([0, 1, 2], 20), 3)
-        # 0 and 1 overlap for the third time, 1 and 2, whose mean lies at 1, for the second.
-        durations = jnp.array([[0, 2, 0], [2, 0, 1], [0, 1, 0]], jnp.int32)
-        mixture = mixture.replace(memory={"overlap_durations": durations})
-        seen = lambda key, mixture, observation: mixture  # noqa: E731
-        filter = Filter(QuadraticModel(), [merge, Split(), seen], 60, 3)
-        moved, _ = eqx.filter_jit(filter._step)(KEY, mixture, jnp.zeros(()))
-        labels = np.asarray(moved.component_indicators)
-        assert set(labels[:40]) == {0}
-        assert set(labels[40:]) == {1, 2}
-        durations = np.asarray(moved.memory["overlap_durations"])
-        assert (durations[1] == 0).all()
-        assert (durations[:, 1] == 0).all()
 
     def test_connected_components_of_a_graph(self):
         adjacent = np.zeros((7, 7), bool)
@@ -188,23 +151,25 @@ class TestSplit:
         # The lighter part takes the free label.
         np.testing.assert_array_equal(found, np.repeat([0, 1], [70, 30]))
 
-    @pytest.mark.parametrize("seed", range(5))
-    def test_a_gaussian_and_a_uniform_do_not_split(self, seed):
-        rng = np.random.default_rng(seed)
-        for states in (rng.normal(size=(500, 1)), rng.random((500, 1)), rng.normal(size=(500, 3))):
+    def test_a_gaussian_a_uniform_and_a_point_do_not_split(self):
+        for states in (RNG.normal(size=(500, 1)), RNG.random((500, 1)), np.ones((500, 1))):
             assert (labels_after(Split(), self.one(states)) == 0).all()
 
-    def test_the_halves_must_be_min_distance_apart_in_units_of_scale(self):
+    @pytest.mark.parametrize(
+        ("move", "splits"),
+        [
+            (Split(4.0, 2.0, scale=5.0), True),
+            (Split(4.0, 3.0, scale=5.0), False),
+            (Split(min_share=0.05), True),
+            (Split(min_share=0.2), False),
+        ],
+    )
+    def test_the_halves_must_be_min_distance_apart_and_hold_min_share_of_the_mass(
+        self, move, splits
+    ):
         states = np.concatenate([RNG.normal(size=50), 12 + RNG.normal(size=50)])[:, None]
-        assert labels_after(Split(4.0, 2.0, scale=5.0), self.one(states)).max() == 1
-        assert labels_after(Split(4.0, 3.0, scale=5.0), self.one(states)).max() == 0
-
-    def test_the_lighter_half_must_hold_min_share_of_the_mass(self):
-        states = np.concatenate([RNG.normal(size=50), 12 + RNG.normal(size=50)])[:, None]
-        log_weights = np.log(np.repeat([0.9, 0.1], 50))
-        mixture = self.one(states, log_weights=log_weights)
-        assert labels_after(Split(min_share=0.05), mixture).max() == 1
-        assert labels_after(Split(min_share=0.2), mixture).max() == 0
+        mixture = self.one(states, log_weights=np.log(np.repeat([0.9, 0.1], 50) / 50))
+        assert labels_after(move, mixture).max() == splits
 
     def test_there_are_never_more_than_m_components_and_the_clearest_splits(self):
         parts = [RNG.normal(size=40) + centre for centre in (0, 12, 200, 260)]
@@ -215,30 +180,10 @@ class TestSplit:
         assert set(found[80:]) == {1, 2}
         full = mixture.replace(num_components=2)
         np.testing.assert_array_equal(labels_after(Split(), full), np.repeat([0, 1], 80))
-
-    @pytest.mark.thorough
-    def test_more_modes_than_labels_share_them_without_losing_mass(self):
-        """Three clouds and two labels: one is full of two, which `is_diffuse` tells."""
-        modes = np.repeat([0, 1, 1], 40)
-        states = np.repeat([0.0, 20.0, 40.0], 40) + RNG.normal(size=120)
-        mixture = make_mixture(states[:, None], RNG.normal(size=120), modes, 2)
-        found = eqx.filter_jit(Split())(KEY, mixture)
-        np.testing.assert_array_equal(found.log_weights, mixture.log_weights)
-        np.testing.assert_array_equal(found.component_indicators, modes)
-        assert list(np.asarray(Split().is_diffuse(mixture))) == [False, True]
-        # With a label more, the second cloud of the two has one of its own.
-        free = eqx.filter_jit(Split())(KEY, mixture.replace(num_components=3))
-        assert len(np.unique(free.component_indicators)) == 3
-
-    def test_two_splits_at_once_take_different_labels(self):
-        parts = [RNG.normal(size=40) + centre for centre in (0, 12, 200, 260)]
-        mixture = make_mixture(
-            np.concatenate(parts)[:, None], np.zeros(160), np.repeat([1, 3], 80), 6
-        )
-        found = labels_after(Split(), mixture)
-        groups = [set(found[40 * i : 40 * i + 40]) for i in range(4)]
-        assert all(len(group) == 1 for group in groups)
-        assert len(set.union(*groups)) == 4
+        assert list(np.asarray(Split().is_diffuse(full))) == [True, True]
+        free = labels_after(Split(), mixture.replace(num_components=4)).reshape(4, 40)
+        assert (free == free[:, :1]).all()
+        assert len(np.unique(free)) == 4
 
     @pytest.mark.parametrize("room", [None, 3000, 40])
     def test_a_sample_finds_the_halves_that_all_particles_show(self, room):
@@ -270,10 +215,6 @@ class TestSplit:
         mixture = mixture.replace(usable_slots=jnp.asarray(100))
         np.testing.assert_array_equal(labels_after(Split(), mixture)[:100], states[:100] == 9)
 
-    def test_two_points_split_and_one_does_not(self):
-        assert labels_after(Split(), self.one([[0.0], [0.0], [5.0], [5.0]])).max() == 1
-        assert labels_after(Split(), self.one([[5.0]] * 4)).max() == 0
-
     def test_free_labels_go_to_the_highest_priority(self):
         found = free_labels(
             jnp.array([True, False, True, True, False]),
@@ -304,18 +245,90 @@ class TestPoolAndRandomPartition:
         move = RandomPartition(2)
         draw = jax.jit(jax.vmap(lambda key: move(key, self.MIXTURE).component_indicators))
         labels = np.asarray(draw(jax.random.split(KEY, 4000)))
-        share = labels.mean(axis=0)
-        assert np.abs(share - 11 / 23).max() < 4.5 * 0.5 / np.sqrt(4000)
+        assert np.abs(labels.mean(axis=0) - 11 / 23).max() < 4.5 * 0.5 / np.sqrt(4000)
         together = np.mean(labels[:, :1] == labels[:, 1:], axis=0)
         expected = (12 * 11 + 11 * 10) / (23 * 22)
         assert np.abs(together - expected).max() < 4.5 * 0.5 / np.sqrt(4000)
 
-    @pytest.mark.usefixtures("as_installed")
-    def test_bad_input(self):
-        with pytest.raises(ValueError, match="num_sets: 0 is not a whole"):
-            RandomPartition(0)
-        with pytest.raises(ValueError, match="num_sets: 7 is more than num_components, 6"):
-            RandomPartition(7)(KEY, self.MIXTURE)
+
+def side(states):
+    return (states > 0).astype(jnp.int32)
+
+
+MODEL = QuadraticModel(0.3, 0.5, -2.0, 2.0)
+
+
+class TestGroupBy:
+    @pytest.mark.parametrize("label", [-1, 2])
+    def test_a_label_outside_is_a_named_error_unless_its_slot_is_empty(self, label):
+        labels = np.array([0, label, 0], np.int32)
+        group = GroupBy(lambda states: jnp.asarray(labels) + 0 * states.astype(jnp.int32))
+        weightless = make_mixture(np.zeros(3), [0.0, -np.inf, 0.0], [0, 0, 0], 2)
+        assert int(group(KEY, weightless).component_indicators.max()) < 2
+        weighed = make_mixture(np.zeros(3), np.zeros(3), [0, 0, 0], 2)
+        with pytest.raises(RuntimeError, match=r"GroupBy: function gave a label outside \[0, "):
+            jax.block_until_ready(group(KEY, weighed))
+        moves = [Resample(), Propagate(MODEL), GroupBy(lambda states: 2 * side(states))]
+        with pytest.raises(RuntimeError, match="GroupBy"):
+            mpfjax.run_filter(KEY, Filter(MODEL, moves, 20, 2), jnp.ones(3))
+
+    def test_each_label_keeps_its_particles_however_improbable_it_is(self):
+        """Observations of x² say nothing of the sign; a plain filter of 20 loses one."""
+        moves = [Resample(), Propagate(MODEL), GroupBy(side)]
+        kept = Filter(MODEL, moves, 20, 2, initial_moves=[GroupBy(side)])
+        counts = mpfjax.run_filter(KEY, kept, jnp.full(100, 3.0), lambda m: m.component_counts)
+        assert int(counts.collected.min()) == 10
+
+
+@pytest.mark.parametrize("masses", [(0.9, 0.0999, 1e-4), (0.6, 0.1, 0.2, 0.0999, 1e-4, 1e-6), (1,)])
+def test_only_what_is_below_the_share_of_the_heaviest_is_pruned(masses):
+    log_weights = np.repeat(np.log(np.array(masses) / 3), 3)
+    before = make_mixture(np.zeros(len(masses) * 3), log_weights,
+                          np.repeat(np.arange(len(masses)), 3), len(masses))  # fmt: skip
+    after, lives = Prune(1e-3)(KEY, before), np.array(masses) >= 1e-3 * max(masses)
+    np.testing.assert_array_equal(after.active, lives)
+    kept = lives[np.asarray(before.component_indicators)]
+    np.testing.assert_array_equal(after.log_weights[kept], before.log_weights[kept])
+    assert Prune().approximate
+    assert Prune(1e-3).predict(KEY, before) is before
+
+
+class FourAlike(mpfjax.AbstractStateSpaceModel):
+    """x_0 in one of four places, of which only the distance from the nearest is seen."""
+
+    def sample_initial(self, key, num_particles):
+        key_mode, key_place = jax.random.split(key)
+        modes = jax.random.choice(key_mode, jnp.asarray(MODES, jnp.float32), (num_particles,))
+        return modes + jax.random.normal(key_place, (num_particles,))
+
+    def sample_transition(self, key, states):
+        return states + 0.2 * jax.random.normal(key, states.shape)
+
+    def log_likelihood(self, observation, states):
+        return jax.scipy.stats.norm.logpdf(observation, jnp.mod(states, 20.0) - 10.0, 0.3)
+
+
+MODES = np.array([-30.0, -10.0, 10.0, 30.0])
+
+
+def test_modes_that_share_a_label_keep_their_mass():
+    """E[Ẑ π_k] = Z / 4 for each of the four modes, with two labels, which run out."""
+    filter = mpfjax.mixture_particle_filter(FourAlike(), 200, 2)
+
+    def masses(mixture):
+        return [mixture.average(jnp.abs(mixture.particles - mode) < 10) for mode in MODES]
+
+    observations = jnp.array([0.5, -0.5, 0.3, 0.0])
+    runs = mpfjax.monte_carlo(jax.random.split(KEY, 600), filter, observations, masses)
+    log_z, found = np.asarray(runs.log_marginal_likelihood, float), np.stack(runs.collected, -1)
+    gaps = np.exp(log_z - log_z.max())[:, None] * (found[:, -1] - 0.25)
+    errors = gaps.std(axis=0, ddof=1) / np.sqrt(len(gaps))
+    assert np.all(np.abs(gaps.mean(axis=0)) < 4 * errors), gaps.mean(axis=0) / errors
+    assert np.all(found[:, -1].mean(axis=0) > 0.15)
+    final = jax.tree.map(lambda leaf: leaf[0], runs.final)
+    for m, ran_out in ((2, True), (12, False)):
+        wider = filter.replace(num_components=m)
+        assert wider.step(KEY, final.replace(num_components=m), 0.0)[1].labels_ran_out == ran_out
 
 
 @pytest.mark.parametrize("num_groups", [3, 12])

@@ -179,59 +179,45 @@ def ssp(key: Key[Array, ""], dealt: Dealt) -> Int[Array, " p"]:
     the floor or the ceiling of its expected number of offspring. The pairs form a tree over each
     component, and all pairs of a level are settled at once: O(log N) levels.
     """
-    line, expected = dealt.line, dealt.expected
+    line, expected, kept = dealt.line, dealt.expected, dealt.kept
     # Includes particles that are never drawn, so that every place has a rank from 0 on.
     firsts, lasts = line.extents(drawn=False)
-    places = _Stretches(*map(line.of_places, (firsts, lasts - firsts + 1)))
+    firsts, counts = map(line.of_places, (firsts, lasts - firsts + 1))
     whole = _certain(expected)
     uniforms = uniform(key, expected.shape, expected.dtype)
-    is_up = _settle(jnp.maximum(expected - whole, 0.0), uniforms, places, _up(dealt, whole))
+    # The fraction of the kept particle becomes 1, unless its offspring is one of the certain ones.
+    is_due = None if kept is None else kept.shares[0] * expected[kept.place] >= whole[kept.place]
+    rest = jnp.maximum(expected - whole, 0.0)
+    is_up = _settle(rest, uniforms, firsts, counts, kept, is_due)
     offspring = whole.astype(jnp.int32) + is_up.astype(jnp.int32)
     # Relative to the component's first, so that rounding errors stay within the component.
     earlier = jnp.cumsum(offspring) - offspring
-    return earlier - take(earlier, places.firsts) + line.of_places(dealt.slots.firsts)
-
-
-class _Stretches(NamedTuple):
-    """For each place, where its component's places start, and how many these are."""
-
-    firsts: Int[Array, " #p"]
-    counts: Int[Array, " #p"]
-
-
-class _Up(NamedTuple):
-    """A place whose fraction becomes 1, where that `is_due`."""
-
-    kept: Kept
-    is_due: Bool[Array, ""]
-
-
-def _up(dealt: Dealt, whole: Float[Array, " p"]) -> _Up | None:
-    """The kept particle, unless its offspring is one of those that are certain."""
-    kept = dealt.kept
-    if kept is None:
-        return None
-    return _Up(kept, kept.shares[0] * dealt.expected[kept.place] >= whole[kept.place])
+    return earlier - take(earlier, firsts) + line.of_places(dealt.slots.firsts)
 
 
 def _settle(
     fractions: Float[Array, " p"],
     uniforms: Float[Array, " p"],
-    places: _Stretches,
-    up: _Up | None = None,
+    firsts: Int[Array, " #p"],
+    counts: Int[Array, " #p"],
+    kept: Kept | None,
+    is_due: Bool[Array, ""] | None,
 ) -> Bool[Array, " p"]:
-    """Which of the fractions become 1, where those of each component sum to a whole number."""
+    """Which of the fractions become 1, where those of each component sum to a whole number.
+
+    The components' places start at `firsts`, so many for each. The `kept` one is 1 if that is due.
+    """
     p = fractions.shape[0]
-    ranks = jnp.arange(p, dtype=jnp.int32) - places.firsts
+    ranks = jnp.arange(p, dtype=jnp.int32) - firsts
 
     def at(values: Array, rank: Int[Array, " p"]) -> Array:
-        return take(values, jnp.clip(places.firsts + rank, 0, p - 1))
+        return take(values, jnp.clip(firsts + rank, 0, p - 1))
 
     levels = []
     left_over, length = fractions, 1
     while length < p:
         # The pair of the blocks 2r and 2r + 1 of a component stands at its rank r.
-        has_right = (2 * ranks + 1) * length < places.counts
+        has_right = (2 * ranks + 1) * length < counts
         left = at(left_over, 2 * ranks)
         right = jnp.where(has_right, at(left_over, 2 * ranks + 1), 0.0)
         total = left + right
@@ -239,23 +225,23 @@ def _settle(
         # The middle of a pair's interval belongs to no other pair.
         draw = at(uniforms, (2 * ranks + 1) * length) * jnp.where(one_is_up, 2.0 - total, total)
         left_stays = draw < jnp.where(one_is_up, 1 - left, left)
-        if up is not None:
+        if kept is not None and is_due is not None:
             # Its own block becomes 1 at once, or stays with what is left over; but never 0.
-            rank, share = ranks[up.kept.place], up.kept.shares[1 + len(levels)]
+            rank, share = ranks[kept.place], kept.shares[1 + len(levels)]
             is_left = (rank // length) % 2 == 0
             own, other = jnp.where(is_left, left, right), jnp.where(is_left, right, left)
             leaves = one_is_up & (share * own * (2 - total) < 1 - other)
-            pair = up.kept.place - rank + rank // (2 * length)
-            is_pair = up.is_due & (jnp.arange(p, dtype=jnp.int32) == pair)
+            pair = kept.place - rank + rank // (2 * length)
+            is_pair = is_due & (jnp.arange(p, dtype=jnp.int32) == pair)
             left_stays = jnp.where(is_pair, leaves != is_left, left_stays)
-            up = up._replace(is_due=up.is_due & ~leaves[pair])
+            is_due = is_due & ~leaves[pair]
         levels.append((left_stays, one_is_up))
         left_over, length = total - one_is_up.astype(total.dtype), 2 * length
     is_up = left_over > 0.5
     for left_stays, one_is_up in reversed(levels):
         stays = at(left_stays, ranks // 2) == (ranks % 2 == 0)
         is_up = jnp.where(stays, at(is_up, ranks // 2), at(one_is_up, ranks // 2))
-    return is_up & (ranks < places.counts)
+    return is_up & (ranks < counts)
 
 
 def random_points(key: Key[Array, ""], slots: Slots, targets: Int[Array, " m"]) -> Positions:
