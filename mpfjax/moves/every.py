@@ -15,7 +15,8 @@ from mpfjax.operations.random import split
 
 
 def _of_moves(together: Callable[..., bool], name: str) -> Any:
-    return property(lambda self: together(getattr(move, name) for move in self.moves))
+    found = lambda self: together(getattr(move, name) for move in self.moves)  # noqa: E731
+    return property(found, doc=f"Whether it is so of {together.__name__} of the moves.")
 
 
 class Every(AbstractMove):

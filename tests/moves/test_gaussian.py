@@ -35,7 +35,8 @@ def test_draws_have_the_moments_of_their_component(noise):
     np.testing.assert_array_equal(np.bincount(labels, minlength=4), [10, 10, 10, 0])
     draws = np.asarray(after.particles)
     assert (draws[:, labels == 1] == np.float32(STATES[5])).all()
-    means, covariances = MIXTURE.component_means(), MIXTURE.component_covariances()
+    means = np.asarray(MIXTURE.component_means())
+    covariances = np.asarray(MIXTURE.component_covariances())
     # Independent over keys, whatever the noise within a draw; sorted draws have none alone.
     chosen = RNG.integers(0, 10, NUM_DRAWS)
     for m in (0, 2):
