@@ -204,13 +204,16 @@ def _of_jax(name: str, array: Any) -> np.ndarray:
     return held
 
 
-def to_array(name: str, *, floating: bool = True) -> Callable[[Any], Array]:
+def to_array(name: str, *, floating: bool = True, optional: bool = False) -> Callable[[Any], Array]:
     """A converter of the argument of this name to an array, for `eqx.field(converter=...)`.
 
-    With `floating`, whole numbers and booleans become floating point numbers.
+    With `floating`, whole numbers and booleans become floating point numbers; with `optional`, None
+    stays None.
     """
 
     def convert(value: Any) -> Array:
+        if optional and value is None:
+            return value  # pyright: ignore[reportReturnType]
         numbers = as_numbers(name, value, floating=floating)
         return numbers if isinstance(numbers, jax.ShapeDtypeStruct) else jnp.asarray(numbers)  # pyright: ignore[reportReturnType]
 
@@ -394,6 +397,7 @@ Exponent = Annotated[float, number(lambda x: 0 < x <= 1, "a number in (0, 1]")]
 POSITIVE = entries(lambda array: (array > 0) & np.isfinite(array), "positive and finite")
 NOT_NEGATIVE = entries(lambda array: (array >= 0) & np.isfinite(array), "finite and not negative")
 FINITE = entries(np.isfinite, "finite")
+COVARIANCE = Rule(lambda value, name: check_covariance_array(**{name: value}), "a covariance")
 
 
 class Checked(eqx.Module):
@@ -404,6 +408,28 @@ class Checked(eqx.Module):
         for field in dataclasses.fields(self):
             if field.name in rules:
                 rules[field.name].check(getattr(self, field.name), field.name)
+
+
+class Fitting(Checked):
+    """A base of classes whose arrays fit together: each word of their shapes is one length.
+
+    So `Float[Array, "d d"]` beside `Float[Array, " d"]`. The axes of a word with a star, none or
+    several, are the same in all fields.
+    """
+
+    def __check_init__(self) -> None:
+        known: dict[str, Any] = {}
+        for name, choices in _shapes(type(self)).items():
+            shape = getattr(getattr(self, name), "shape", None)
+            if shape is None:
+                continue
+            found = [_lengths(shape, axes) for axes in choices]
+            fitting = [own for own in found if own is not None and _agree(own, known)]
+            if not fitting:
+                shapes = " or ".join(f"({', '.join(axes)})" for axes in choices)
+                raise ValueError(f"{name}: shape {shape} is not {shapes}, where {known}")
+            known |= fitting[0]
+        super().__check_init__()
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
@@ -440,14 +466,49 @@ _CHECKS: dict[type, Callable[[Any, str], None]] = {}
 @functools.cache
 def _rules(owner: Any) -> dict[str, Rule]:
     """By name, the rules for the arguments of a function or the fields of a class."""
+    rules = {name: _rule(hint) for name, hint in _hints(owner).items() if name != "return"}
+    return {name: rule for name, rule in rules.items() if rule is not None}
+
+
+def _hints(owner: Any) -> dict[str, Any]:
     is_class = isinstance(owner, type)
     # A user's subclass says by its annotations what it likes.
     told = [base for base in owner.__mro__[::-1] if _is_ours(base)] if is_class else [owner]
     hints: dict[str, Any] = {}
     for each in told:
         hints |= inspect.get_annotations(each, eval_str=True)
-    rules = {name: _rule(hint) for name, hint in hints.items() if name != "return"}
-    return {name: rule for name, rule in rules.items() if rule is not None}
+    return hints
+
+
+@functools.cache
+def _shapes(owner: type) -> dict[str, list[list[str]]]:
+    """By name, the shapes that an array may have, each as the words of its axes."""
+    shapes = {name: _axes(hint) for name, hint in _hints(owner).items()}
+    return {name: choices for name, choices in shapes.items() if choices}
+
+
+def _axes(hint: Any) -> list[list[str]]:
+    words = getattr(hint, "dim_str", None)
+    if words is not None:
+        return [words.split()]
+    parts = [] if typing.get_origin(hint) is Callable else typing.get_args(hint)
+    return [choice for part in parts for choice in _axes(part)]
+
+
+def _lengths(shape: tuple[int, ...], axes: list[str]) -> dict[str, Any] | None:
+    """What each word stands for; None where the shape is not of these axes."""
+    if axes and axes[0].startswith("*"):
+        split = max(len(shape) - len(axes) + 1, 0)
+        shape = (shape[:split], *shape[split:])  # pyright: ignore[reportAssignmentType]
+    found: dict[str, Any] = {}
+    fits = len(shape) == len(axes) and all(
+        found.setdefault(axis, length) == length for axis, length in zip(axes, shape, strict=True)
+    )
+    return found if fits else None
+
+
+def _agree(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    return all(one[word] == other[word] for word in one.keys() & other.keys())
 
 
 def _is_ours(kind: type) -> bool:

@@ -4,7 +4,7 @@ and second-order autoregression.
 
 import abc
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -13,14 +13,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from mpfjax.checks import (
-    check_finite_array,
-    check_inner_share,
-    check_not_negative_array,
-    check_positive_array,
-    check_rows,
-    check_scalars,
+    FINITE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Fitting,
+    InnerShare,
     check_shape,
-    check_type,
     shown,
     to_array,
 )
@@ -30,7 +28,7 @@ from mpfjax.operations.random import fast_key, normal, split_once
 Rows = Float[Array, "n d"]
 
 
-class AbstractDynamics(eqx.Module):
+class AbstractDynamics(Fitting):
     """D(x_t | x_{t-1}, x_{t-2}) of a vector: a part of a model, not a model itself.
 
     A class defines the `expected` x_t and the law of the step that x_t takes from there. There is
@@ -114,11 +112,9 @@ class RandomWalk(AbstractDynamics):
     it where the last motion says little about the next.
     """
 
-    deviations: Float[Array, "*n d"] = eqx.field(converter=to_array("deviations"))
-
-    def __check_init__(self) -> None:
-        check_positive_array(deviations=self.deviations)
-        check_rows(deviations=self.deviations)
+    deviations: Annotated[Float[Array, "*n d"], POSITIVE] = eqx.field(
+        converter=to_array("deviations")
+    )
 
     @property
     def step_deviations(self) -> Float[Array, "*n d"]:
@@ -154,13 +150,10 @@ class RandomWalkWithJumps(RandomWalk):
     and for a probability outside (0, 1). Use it where objects vanish and come back elsewhere.
     """
 
-    jump_deviations: Float[Array, "*n d"] = eqx.field(converter=to_array("jump_deviations"))
-    jump_probability: float = eqx.field(static=True, default=0.03)
-
-    def __check_init__(self) -> None:
-        check_positive_array(jump_deviations=self.jump_deviations)
-        _check_shape_of_deviations(self.deviations, jump_deviations=self.jump_deviations)
-        check_inner_share(jump_probability=self.jump_probability)
+    jump_deviations: Annotated[Float[Array, "*n d"], POSITIVE] = eqx.field(
+        converter=to_array("jump_deviations")
+    )
+    jump_probability: InnerShare = eqx.field(static=True, default=0.03)
 
     @property
     def noise_dimension(self) -> int:
@@ -231,20 +224,18 @@ class WalkWithVelocity(AbstractDynamics):
 
     walk: RandomWalk
     gain: float | Sequence[float] = eqx.field(static=True, converter=_as_shares, default=0.1)
-    initial_velocity: Float[Array, "*n d"] | None = eqx.field(
-        converter=lambda value: None if value is None else to_array("initial_velocity")(value),
-        default=None,
+    initial_velocity: Annotated[Float[Array, "*n d"], NOT_NEGATIVE] | None = eqx.field(
+        converter=to_array("initial_velocity", optional=True), default=None
     )
 
     def __check_init__(self) -> None:
-        check_type(RandomWalk, "a walk such as RandomWalk(deviations)", walk=self.walk)
-        d, gain = self.walk.deviations.shape[-1], np.asarray(self.gain)
-        if len(gain) not in (1, d) or not ((gain >= 0) & (gain <= 1)).all():
-            raise ValueError(f"gain: {self.gain} is not one or {d} numbers in [0, 1]")
-        if self.initial_velocity is not None:
-            deviations = self.walk.deviations
-            _check_shape_of_deviations(deviations, initial_velocity=self.initial_velocity)
-            check_not_negative_array(initial_velocity=self.initial_velocity)
+        super().__check_init__()
+        shape, gain = self.walk.deviations.shape, np.asarray(self.gain)
+        if len(gain) not in (1, shape[-1]) or not ((gain >= 0) & (gain <= 1)).all():
+            raise ValueError(f"gain: {self.gain} is not one or {shape[-1]} numbers in [0, 1]")
+        start = self.initial_velocity
+        if start is not None and start.shape != shape:
+            raise ValueError(f"initial_velocity: shape {start.shape} is not {shape}, the walk's")
 
     @property
     def noise_dimension(self) -> int:
@@ -256,9 +247,9 @@ class WalkWithVelocity(AbstractDynamics):
         """Those of the walk."""
         return self.walk.step_deviations
 
-    def expected(self, current: Rows, previous: Rows | None = None) -> Rows:
+    def expected(self, current: Rows, previous: Any = None) -> Rows:
         """x_{t-1} + v_{t-1}."""
-        return 2 * current - _given(previous, self)
+        return 2 * current - previous
 
     def step(self, noise: Float[Array, "n k"]) -> Rows:
         """A step of the walk."""
@@ -301,22 +292,10 @@ class Autoregression(AbstractDynamics):
 
     order = 2
 
-    A1: Float[Array, "*n d d"] = eqx.field(converter=to_array("A1"))
-    A2: Float[Array, "*n d d"] = eqx.field(converter=to_array("A2"))
-    B: Float[Array, "*n d d"] = eqx.field(converter=to_array("B"))
-    mean: Float[Array, "*n d"] = eqx.field(converter=to_array("mean"))
-
-    def __check_init__(self) -> None:
-        check_rows(mean=self.mean)
-        check_finite_array(mean=self.mean)
-        expected = (*self.mean.shape, self.mean.shape[-1])
-        for name in ("A1", "A2", "B"):
-            if getattr(self, name).shape != expected:
-                raise ValueError(
-                    f"{name}: shape {getattr(self, name).shape} is not {expected},"
-                    f" for a mean of shape {self.mean.shape}"
-                )
-            check_finite_array(**{name: getattr(self, name)})
+    A1: Annotated[Float[Array, "*n d d"], FINITE] = eqx.field(converter=to_array("A1"))
+    A2: Annotated[Float[Array, "*n d d"], FINITE] = eqx.field(converter=to_array("A2"))
+    B: Annotated[Float[Array, "*n d d"], FINITE] = eqx.field(converter=to_array("B"))
+    mean: Annotated[Float[Array, "*n d"], FINITE] = eqx.field(converter=to_array("mean"))
 
     @classmethod
     def with_momentum(cls, momentum: float, deviations: Float[Array, "*n d"]) -> "Autoregression":
@@ -326,8 +305,6 @@ class Autoregression(AbstractDynamics):
         `deviations` are one row for all, or a row for each particle or box, as in `RandomWalk`.
         """
         kept = to_array("momentum")(momentum)
-        check_scalars(momentum=kept)
-        check_finite_array(momentum=kept)
         deviations = RandomWalk(deviations).deviations
         d = deviations.shape[-1]
         eye = jnp.broadcast_to(jnp.eye(d, dtype=deviations.dtype), (*deviations.shape, d))
@@ -339,9 +316,9 @@ class Autoregression(AbstractDynamics):
         """The roots of the diagonal of B Bᵀ."""
         return jnp.sqrt(jnp.sum(self.B**2, axis=-1))
 
-    def expected(self, current: Rows, previous: Rows | None = None) -> Rows:
+    def expected(self, current: Rows, previous: Any = None) -> Rows:
         """x̄ + A1 (x_{t-1} - x̄) + A2 (x_{t-2} - x̄)."""
-        previous, mean = _given(previous, self), jnp.broadcast_to(self.mean, current.shape)
+        mean = jnp.broadcast_to(self.mean, current.shape)
         return mean + _times(self.A1, current - mean) + _times(self.A2, previous - mean)
 
     def step(self, noise: Float[Array, "n k"]) -> Rows:
@@ -354,22 +331,6 @@ class Autoregression(AbstractDynamics):
         factors = cholesky(jnp.sum(B[:, :, None] * B[:, None], axis=3))
         log_volume = jnp.sum(jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)), axis=1)
         return _log_standard_normal(solve_lower(factors, steps)) - log_volume
-
-
-def _given(previous: Rows | None, dynamics: AbstractDynamics) -> Rows:
-    if previous is None:
-        raise ValueError(
-            f"previous: {type(dynamics).__name__} needs the past that remembered() gives"
-        )
-    return previous
-
-
-def _check_shape_of_deviations(deviations: Array, **arguments: Array) -> None:
-    for name, array in arguments.items():
-        if array.shape != deviations.shape:
-            raise ValueError(
-                f"{name}: shape {array.shape} is not that of the deviations, {deviations.shape}"
-            )
 
 
 def _times(matrices: Float[Array, "*n d d"], vectors: Rows) -> Rows:

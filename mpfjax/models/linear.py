@@ -1,8 +1,7 @@
 """Linear-Gaussian models: one system, and K of them with a Markov chain that chooses one."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -12,9 +11,11 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.checks import (
-    check_covariance_array,
-    check_finite_array,
-    check_not_negative_array,
+    COVARIANCE,
+    FINITE,
+    NOT_NEGATIVE,
+    Fitting,
+    Rule,
     check_shape,
     shown,
     to_array,
@@ -31,12 +32,21 @@ _IN_TIME = ("A", "Q", "H", "R", "B", "inputs")
 _ROUNDING = 1e-4
 
 
-def _if_given(name: str) -> Callable[[Any], Array | None]:
-    """A converter of an argument that may be None."""
-    return lambda value: None if value is None else to_array(name)(value)
+def _check_probabilities(array: Any, name: str) -> None:
+    NOT_NEGATIVE.check(array, name)
+    if isinstance(array, Tracer | jax.ShapeDtypeStruct):
+        return
+    if np.abs(np.sum(np.asarray(array, float), axis=-1) - 1).max() > _ROUNDING:
+        raise ValueError(f"{name}: {shown(array)} has rows that do not sum to one")
 
 
-class LinearGaussianModel(AbstractStateSpaceModel):
+PROBABILITIES = Rule(_check_probabilities, "probabilities along the last axis")
+# One of all regimes, or one for each.
+VectorOfEach = Float[Array, " d"] | Float[Array, "k d"]
+SquareOfEach = Float[Array, "d d"] | Float[Array, "k d d"]
+
+
+class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
     """x_t = A x_{t-1} + B u_t + N(0, Q), y_t = H x_t + N(0, R), x_0 ~ N(m0, P0).
 
     - `A`, `Q`: (d, d); `H`: (p, d); `R`: (p, p); `m0`: (d,); `P0`: (d, d). R is positive definite;
@@ -52,32 +62,18 @@ class LinearGaussianModel(AbstractStateSpaceModel):
     with the Kalman filter, or where the system is linear.
     """
 
-    A: Float[Array, "d d"] = eqx.field(converter=to_array("A"))
-    Q: Float[Array, "d d"] = eqx.field(converter=to_array("Q"))
-    H: Float[Array, "p d"] = eqx.field(converter=to_array("H"))
-    R: Float[Array, "p p"] = eqx.field(converter=to_array("R"))
-    m0: Float[Array, " d"] = eqx.field(converter=to_array("m0"))
-    P0: Float[Array, "d d"] = eqx.field(converter=to_array("P0"))
-    B: Float[Array, "d k"] | None = eqx.field(converter=_if_given("B"), default=None)
-    inputs: Float[Array, " k"] | None = eqx.field(converter=_if_given("inputs"), default=None)
-
-    def __check_init__(self) -> None:
-        d = self.m0.shape[-1] if self.m0.ndim else 0
-        p = self.H.shape[0] if self.H.ndim else 0
-        k = self.B.shape[-1] if self.B is not None and self.B.ndim else 0
-        shapes = {
-            "m0": (d,), "A": (d, d), "Q": (d, d), "P0": (d, d), "H": (p, d), "R": (p, p),
-            "B": (d, k), "inputs": (k,),
-        }  # fmt: skip
-        for name, shape in shapes.items():
-            array = getattr(self, name)
-            if array is not None and array.shape != shape:
-                raise ValueError(
-                    f"{name}: shape {array.shape} is not {shape}, for m0 of shape {self.m0.shape},"
-                    f" H of shape {self.H.shape} and {k} inputs"
-                )
-            if array is not None and name != "inputs":
-                check_finite_array(**{name: array})
+    A: Annotated[Float[Array, "d d"], FINITE] = eqx.field(converter=to_array("A"))
+    Q: Annotated[Float[Array, "d d"], FINITE] = eqx.field(converter=to_array("Q"))
+    H: Annotated[Float[Array, "p d"], FINITE] = eqx.field(converter=to_array("H"))
+    R: Annotated[Float[Array, "p p"], FINITE] = eqx.field(converter=to_array("R"))
+    m0: Annotated[Float[Array, " d"], FINITE] = eqx.field(converter=to_array("m0"))
+    P0: Annotated[Float[Array, "d d"], FINITE] = eqx.field(converter=to_array("P0"))
+    B: Annotated[Float[Array, "d k"], FINITE] | None = eqx.field(
+        converter=to_array("B", optional=True), default=None
+    )
+    inputs: Float[Array, " k"] | None = eqx.field(
+        converter=to_array("inputs", optional=True), default=None
+    )
 
     def with_inputs(self, inputs: PyTree) -> "LinearGaussianModel":
         """The model at step t: u_t, (k,), or a dict of the fields that change in time."""
@@ -167,7 +163,7 @@ class LinearGaussianModel(AbstractStateSpaceModel):
         return self.R
 
 
-class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel):
+class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
     """A Markov chain of K regimes z_t, and a linear-Gaussian system for each of them.
 
         P(z_t = j | z_{t-1} = i) = Π_ij,    x_0 ~ N(m0, P0),
@@ -188,40 +184,28 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel):
     Use it for manoeuvring targets, and for regimes of a time series.
     """
 
-    transition_matrix: Float[Array, "k k"] = eqx.field(converter=to_array("transition_matrix"))
-    F: Float[Array, "*k d d"] = eqx.field(converter=to_array("F"))
-    Q: Float[Array, "*k d d"] = eqx.field(converter=to_array("Q"))
-    H: Float[Array, "*k p d"] = eqx.field(converter=to_array("H"))
-    R: Float[Array, "*k p p"] = eqx.field(converter=to_array("R"))
-    m0: Float[Array, "*k d"] = eqx.field(converter=to_array("m0"))
-    P0: Float[Array, "*k d d"] = eqx.field(converter=to_array("P0"))
-    b: Float[Array, "*k d"] | None = eqx.field(converter=_if_given("b"), default=None)
-    c: Float[Array, "*k p"] | None = eqx.field(converter=_if_given("c"), default=None)
-    initial_probabilities: Float[Array, " k"] | None = eqx.field(
-        converter=_if_given("initial_probabilities"), default=None
+    transition_matrix: Annotated[Float[Array, "k k"], PROBABILITIES] = eqx.field(
+        converter=to_array("transition_matrix")
     )
-
-    def __check_init__(self) -> None:
-        k = self.transition_matrix.shape[-1] if self.transition_matrix.ndim else 0
-        d = self.m0.shape[-1] if self.m0.ndim else 0
-        p = self.H.shape[-2] if self.H.ndim > 1 else 0
-        _check_probabilities((k, k), transition_matrix=self.transition_matrix)
-        shapes = {
-            "F": (d, d), "Q": (d, d), "H": (p, d), "R": (p, p), "m0": (d,), "P0": (d, d),
-            "b": (d,), "c": (p,),
-        }  # fmt: skip
-        for name, shape in shapes.items():
-            array = getattr(self, name)
-            if array is None:
-                continue
-            if array.shape not in (shape, (k, *shape)):
-                raise ValueError(
-                    f"{name}: shape {array.shape} is neither {shape} nor {(k, *shape)}, for"
-                    f" {k} regimes, m0 of shape {self.m0.shape} and H of shape {self.H.shape}"
-                )
-            check = check_covariance_array if name in ("Q", "R", "P0") else check_finite_array
-            check(**{name: array})
-        _check_probabilities((k,), initial_probabilities=self.probabilities_at_start)
+    F: Annotated[SquareOfEach, FINITE] = eqx.field(converter=to_array("F"))
+    Q: Annotated[SquareOfEach, COVARIANCE] = eqx.field(converter=to_array("Q"))
+    H: Annotated[Float[Array, "p d"] | Float[Array, "k p d"], FINITE] = eqx.field(
+        converter=to_array("H")
+    )
+    R: Annotated[Float[Array, "p p"] | Float[Array, "k p p"], COVARIANCE] = eqx.field(
+        converter=to_array("R")
+    )
+    m0: Annotated[VectorOfEach, FINITE] = eqx.field(converter=to_array("m0"))
+    P0: Annotated[SquareOfEach, COVARIANCE] = eqx.field(converter=to_array("P0"))
+    b: Annotated[VectorOfEach, FINITE] | None = eqx.field(
+        converter=to_array("b", optional=True), default=None
+    )
+    c: Annotated[Float[Array, " p"] | Float[Array, "k p"], FINITE] | None = eqx.field(
+        converter=to_array("c", optional=True), default=None
+    )
+    initial_probabilities: Annotated[Float[Array, " k"], PROBABILITIES] | None = eqx.field(
+        converter=to_array("initial_probabilities", optional=True), default=None
+    )
 
     @property
     def num_regimes(self) -> int:
@@ -324,17 +308,6 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel):
         for j in range(self.num_regimes - 1):
             drawn = drawn + (shares >= spread(bounds[:, j], latent)).astype(latent.dtype)
         return drawn
-
-
-def _check_probabilities(shape: tuple[int, ...], **arguments: Array) -> None:
-    """Each argument has this shape, and numbers from 0 on that sum to one along the last axis."""
-    for name, array in arguments.items():
-        check_shape(" ".join(map(str, shape)), **{name: array})
-        check_not_negative_array(**{name: array})
-        if isinstance(array, Tracer | jax.ShapeDtypeStruct):
-            continue
-        if np.abs(np.sum(np.asarray(array, float), axis=-1) - 1).max() > _ROUNDING:
-            raise ValueError(f"{name}: {shown(array)} has rows that do not sum to one")
 
 
 def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:

@@ -1,7 +1,7 @@
 """The joint state of several objects: independent dynamics and likelihoods, and interaction."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -9,23 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import (
-    check_callable,
-    check_flag,
-    check_positive_array,
-    check_scalars,
-    check_type,
-    check_whole,
-    given,
-    to_array,
-)
+from mpfjax.checks import POSITIVE, Count, Fitting, check_type, checked, to_array
 from mpfjax.mixture import flatten_states
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     check_log_density,
     is_made_of_noise,
     replaced,
-    require_model,
     takes_inputs,
     with_inputs,
 )
@@ -73,22 +63,18 @@ class MultiObjectModel(AbstractStateSpaceModel):
     per_object: bool = eqx.field(static=True)
     shared_inputs: bool = eqx.field(static=True)
 
+    @checked
     def __init__(
         self,
         object_model: AbstractStateSpaceModel,
-        num_objects: int,
+        num_objects: Count,
         interaction: Callable[[PyTree, PyTree], Float[Array, " n"]] | None = None,
         shared_observation: bool = False,
         *,
         per_object: bool | None = None,
         shared_inputs: bool = True,
     ) -> None:
-        check_whole(num_objects=num_objects)
-        require_model(object_model, "MultiObjectModel", "object_model")
         refuse_marginalised(object_model, "MultiObjectModel", "give each a filter", "object_model")
-        check_callable("a function of the states of two objects", **given(interaction=interaction))
-        check_flag(shared_observation=shared_observation, shared_inputs=shared_inputs)
-        check_flag(**given(per_object=per_object))
         self.object_model, self.num_objects = object_model, int(num_objects)
         self.interaction, self.shared_inputs = interaction, shared_inputs
         self.shared_observation = shared_observation
@@ -179,9 +165,15 @@ class MultiObjectModel(AbstractStateSpaceModel):
 
     def _drawn(self, method: str, key: Key[Array, ""], states: PyTree) -> PyTree:
         """The draws of every object, by a method of its model."""
-        keys = split(key, self.num_objects)
-        draw = lambda key, states, j: getattr(self.object_at(j), method)(key, states)  # noqa: E731
-        return jax.vmap(draw, in_axes=(0, 1, 0), out_axes=1)(keys, states, self._indices)
+        return self._of_each(method, (0, 1), split(key, self.num_objects), states)
+
+    def _of_each(self, method: str, axes: tuple[int, ...], *arguments: PyTree) -> PyTree:
+        """What a method of each object's model gives, (n, J, ...), from its part of the arguments.
+
+        `axes` are those of the objects.
+        """
+        of_one = lambda j, *own: getattr(self.object_at(j), method)(*own)  # noqa: E731
+        return jax.vmap(of_one, in_axes=(0, *axes), out_axes=1)(self._indices, *arguments)
 
     @property
     def _noise_dimension(self) -> int:
@@ -191,16 +183,11 @@ class MultiObjectModel(AbstractStateSpaceModel):
     def _transition_from_noise(self, noise: Float[Array, "n k"], states: PyTree) -> PyTree:
         """x_t of every object, from its own columns of the noise."""
         noise = noise.reshape(noise.shape[0], self.num_objects, -1)
-
-        def move(noise: Float[Array, "n k"], states: PyTree, j: Int[Array, ""]) -> PyTree:
-            return self.object_at(j).transition_from_noise(noise, states)  # pyright: ignore
-
-        return jax.vmap(move, in_axes=(1, 1, 0), out_axes=1)(noise, states, self._indices)
+        return self._of_each("transition_from_noise", (1, 1), noise, states)
 
     def _log_transition(self, states: PyTree, previous_states: PyTree) -> Float[Array, " n"]:
         """Σ_j log D(x_t^j | x_{t-1}^j)."""
-        weigh = jax.vmap(self.object_log_transition, in_axes=(1, 1, 0))
-        return jnp.sum(weigh(states, previous_states, self._indices), axis=0)
+        return jnp.sum(self._of_each("log_transition", (1, 1), states, previous_states), axis=1)
 
     # One object at a time. `objects` is the same object for all particles, (), or one of its
     # own for each, (n,); `states` are those of that object, leaves (n, ...).
@@ -245,10 +232,8 @@ class MultiObjectModel(AbstractStateSpaceModel):
         if not self.per_object or objects.ndim == 0:
             return self.object_at(objects).sample_transition(key, states)
 
-        def draw(key: Key[Array, ""], state: PyTree, j: Int[Array, ""]) -> PyTree:
-            return _one(self.object_at(j).sample_transition(key, _many(state)))
-
-        return jax.vmap(draw)(split(key, objects.shape[0]), states, objects)
+        draw = lambda states, j, key: self.object_at(j).sample_transition(key, states)  # noqa: E731
+        return _one_by_one(draw, (states,), objects, split(key, objects.shape[0]))
 
     def prepare_observation(self, observation: PyTree) -> PyTree:
         """What the objects' likelihoods look at: y_t, or what the object model makes of it."""
@@ -272,7 +257,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
         if objects.ndim == 0 or (self.shared_observation and not self.per_object):
             values = weigh(states, objects)
         else:
-            values = jax.vmap(lambda state, j: weigh(_many(state), j)[0])(states, objects)
+            values = _one_by_one(weigh, (states,), objects)
         num_particles = jax.tree.leaves(states)[0].shape[0]
         return check_log_density(values, self.object_model, "log_likelihood", num_particles)
 
@@ -287,8 +272,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
 
         if not self.per_object or objects.ndim == 0:
             return weigh(states, previous_states, objects)
-        one = lambda state, previous, j: weigh(_many(state), _many(previous), j)[0]  # noqa: E731
-        return jax.vmap(one)(states, previous_states, objects)
+        return _one_by_one(weigh, (states, previous_states), objects)
 
     def _require_object_axis(self, name: str, tree: PyTree) -> None:
         for leaf in jax.tree.leaves(tree):
@@ -303,7 +287,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
         return jnp.arange(self.num_objects, dtype=jnp.int32)
 
 
-class PairwiseRepulsion(eqx.Module):
+class PairwiseRepulsion(Fitting):
     """log ψ(x_i, x_j) = -strength · k(|p_i - p_j| / radius), p the positions of two objects.
 
     The pairwise Markov random field of Khan, Balch and Dellaert (2004), for objects that cannot
@@ -321,16 +305,10 @@ class PairwiseRepulsion(eqx.Module):
     With the compact form a filter can tell that objects do not touch.
     """
 
-    strength: Float[Array, ""] = eqx.field(converter=to_array("strength"))
-    radius: Float[Array, ""] = eqx.field(converter=to_array("radius"))
+    strength: Annotated[Float[Array, ""], POSITIVE] = eqx.field(converter=to_array("strength"))
+    radius: Annotated[Float[Array, ""], POSITIVE] = eqx.field(converter=to_array("radius"))
     position: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None)
     compact: bool = eqx.field(static=True, default=True)
-
-    def __check_init__(self) -> None:
-        check_positive_array(strength=self.strength, radius=self.radius)
-        check_scalars(strength=self.strength, radius=self.radius)
-        check_callable("a function of the states", **given(position=self.position))
-        check_flag(compact=self.compact)
 
     def __call__(self, states: PyTree, other_states: PyTree) -> Float[Array, " n"]:
         """log ψ of each row of the states with the same row of the other states."""
@@ -352,12 +330,14 @@ def _is_array(leaf: Any) -> bool:
     return isinstance(leaf, jax.Array | np.ndarray)
 
 
-def _many(state: PyTree) -> PyTree:
-    return jax.tree.map(lambda leaf: leaf[None], state)
+def _one_by_one(function: Callable[..., PyTree], states: tuple[PyTree, ...], *own: Any) -> PyTree:
+    """A function of the states of n particles, called for each with what is its own."""
 
+    def of_one(states: tuple[PyTree, ...], *own: Any) -> PyTree:
+        found = function(*jax.tree.map(lambda leaf: leaf[None], states), *own)
+        return jax.tree.map(lambda leaf: leaf[0], found)
 
-def _one(states: PyTree) -> PyTree:
-    return jax.tree.map(lambda leaf: leaf[0], states)
+    return jax.vmap(of_one)(states, *own)
 
 
 def _has_axis(model: Any, num_objects: int) -> bool:

@@ -1,24 +1,21 @@
 """The scalar model with two symmetric modes, Vermaak et al. (2003), section 5.1."""
 
+from typing import Annotated, Literal
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from mpfjax.checks import (
-    check_finite,
-    check_one_of,
-    check_positive_array,
-    check_scalars,
-    check_shape,
-    to_array,
-)
+from mpfjax.checks import POSITIVE, Finite, Fitting, check_shape, to_array
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.noise import stratified_uniform
 from mpfjax.operations.random import normal, uniform
 
+Deviation = Annotated[Float[Array, ""], POSITIVE]
 
-class QuadraticModel(AbstractStateSpaceModel):
+
+class QuadraticModel(AbstractStateSpaceModel, Fitting):
     """A random walk whose square is observed: D = N(x_{t-1}, σ_x²), L = N(y_t; x_t², σ_y²).
 
     Vermaak et al. (2003), section 5.1. The observation does not depend on the sign of x_t. With a
@@ -34,19 +31,18 @@ class QuadraticModel(AbstractStateSpaceModel):
     not positive, an empty range or an unknown draw. Use it to see which filters keep both modes.
     """
 
-    sigma_x: Float[Array, ""] = eqx.field(converter=to_array("sigma_x"), default=0.1)
-    sigma_y: Float[Array, ""] = eqx.field(converter=to_array("sigma_y"), default=0.1)
-    low: float = eqx.field(static=True, default=-2.5)
-    high: float = eqx.field(static=True, default=2.5)
-    initial_draw: str = eqx.field(static=True, default="stratified")
+    sigma_x: Deviation = eqx.field(converter=to_array("sigma_x"), default=0.1)
+    sigma_y: Deviation = eqx.field(converter=to_array("sigma_y"), default=0.1)
+    low: Finite = eqx.field(static=True, default=-2.5)
+    high: Finite = eqx.field(static=True, default=2.5)
+    initial_draw: Literal["stratified", "independent"] = eqx.field(
+        static=True, default="stratified"
+    )
 
     def __check_init__(self) -> None:
-        check_positive_array(sigma_x=self.sigma_x, sigma_y=self.sigma_y)
-        check_scalars(sigma_x=self.sigma_x, sigma_y=self.sigma_y)
-        check_finite(low=self.low, high=self.high)
+        super().__check_init__()
         if not self.low < self.high:
             raise ValueError(f"high: {self.high} is not above low, {self.low}")
-        check_one_of(("stratified", "independent"), initial_draw=self.initial_draw)
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Float[Array, " n"]:
         """x_0, uniform on [low, high]."""
