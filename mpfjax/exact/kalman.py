@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.checks import as_numbers, check_shape, check_type
+from mpfjax.checks import as_numbers, check_shape, checked
 from mpfjax.models.base import with_inputs
 from mpfjax.models.linear import LinearGaussianModel
 from mpfjax.observations import Series, gathered, steps_of_inputs
@@ -55,32 +55,39 @@ class KalmanSmootherRun(eqx.Module):
     log_marginal_likelihood: Float[Array, ""]
 
 
+@checked
 def kalman_filter(
     model: LinearGaussianModel,
     observations: PyTree,
+    *,
+    inputs: PyTree = None,
+    missing: str = "error",
 ) -> KalmanFilterRun:
     """The Kalman filter (Kalman 1960), with the library's convention: y_1 follows x_1, not x_0.
 
     Covariances are updated in Joseph's form, which stays positive in float32. Differentiable, and
     `jax.vmap` maps it over several series.
 
-    - `observations`: an array (t, p), or a `Series` of one. Its inputs are those of the model:
-      controls, or matrices that change in time. `Series.skipping` leaves out each number that is
-      NaN: of two sensors, the one that is there counts. (A particle filter leaves out the whole
-      step, unless its model has `handles_missing`.) Otherwise a NaN is a `ValueError`, as far as
-      the numbers are known.
+    - `observations`: an array (t, p), or a `Series` of one.
+    - `inputs`: those of the model, controls or matrices that change in time; as for `run_filter`.
+    - `missing`: "skip", as `Series.skipping`, leaves out each number that is NaN: of two sensors,
+      the one that is there counts. (A particle filter leaves out the whole step, unless its model
+      has `handles_missing`.) With "error" a NaN is a `ValueError`, as far as the numbers are known.
 
     Raises `ValueError` for another model and observations that are not (t, p). Use it as the
     reference for a linear-Gaussian model.
     """
-    series = _checked(model, observations)
-    filtered, increments = _kalman_filter(model, *series)
+    filtered, increments = _kalman_filter(model, *_checked(model, observations, inputs, missing))
     return KalmanFilterRun(*filtered, increments, jnp.sum(increments))
 
 
+@checked
 def kalman_smoother(
     model: LinearGaussianModel,
     observations: PyTree,
+    *,
+    inputs: PyTree = None,
+    missing: str = "error",
 ) -> KalmanSmootherRun:
     """E and Cov of x_0, ..., x_t given y_1..y_t, by the recursion of Rauch, Tung and Striebel 1965.
 
@@ -94,12 +101,11 @@ def kalman_smoother(
     over several series. Arguments and errors are those of `kalman_filter`. Use it as the reference
     for particle smoothers of a linear-Gaussian model.
     """
-    return _smooth(model, *_checked(model, observations))
+    return _smooth(model, *_checked(model, observations, inputs, missing))
 
 
-def _checked(model: Any, observations: PyTree) -> tuple[Float[Array, "t p"], PyTree]:
-    check_type(LinearGaussianModel, "a LinearGaussianModel", model=model)
-    series = gathered(observations)
+def _checked(model: Any, data: PyTree, inputs: PyTree, missing: str) -> tuple[Array, PyTree]:
+    series = gathered(data, inputs, missing)
     rows = checked_rows(series, model.H.shape[0], model.m0.dtype)
     return rows, steps_of_inputs(series.inputs, rows.shape[0], model)
 
@@ -132,12 +138,10 @@ def _kalman_filter(constant, observations, inputs):
 
 @eqx.filter_jit
 def _smooth(constant, observations, inputs):
-    (means, covariances), increments = _kalman_filter(constant, observations, inputs)
-    moments = (
-        jnp.concatenate([constant.m0[None], means]),
-        jnp.concatenate([constant.P0[None], covariances]),
-    )
-    smoothed, lagged = smoothed_moments(moments, lambda now: _step_of(constant, now), inputs)
+    start, filtered = (constant.m0, constant.P0), _kalman_filter(constant, observations, inputs)
+    moments, increments = filtered
+    step_of = lambda now: _step_of(constant, now)  # noqa: E731
+    smoothed, lagged = smoothed_moments(start, moments, step_of, inputs)
     return KalmanSmootherRun(*smoothed, lagged, jnp.sum(increments))
 
 
@@ -193,11 +197,10 @@ def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
 
 
 def smoothed_moments(
-    filtered: Moments, step_of: StepOf, told: PyTree
+    start: Moments, filtered: Moments, step_of: StepOf, told: PyTree
 ) -> tuple[Moments, Float[Array, "t d d"]]:
-    """Those of x_0, ..., x_t given y_1..y_t, and Cov[x_s, x_{s-1}], from the filter's of x_0 on."""
-    means, covariances = filtered
-    identity = jnp.eye(means.shape[1], dtype=means.dtype)
+    """Those of x_0, ..., x_t given y_1..y_t, and Cov[x_s, x_{s-1}]."""
+    identity = jnp.eye(start[0].shape[0], dtype=start[0].dtype)
 
     def back(later: Moments, earlier: tuple[Array, Array, PyTree]) -> tuple[Moments, Any]:
         (later_mean, later_covariance), (mean, covariance, now) = later, earlier
@@ -209,11 +212,12 @@ def smoothed_moments(
         covariance = left @ covariance @ left.T + gain @ (step.Q + later_covariance) @ gain.T
         return (mean, covariance), (mean, covariance, later_covariance @ gain.T)
 
-    last = means[-1], covariances[-1]
-    earlier = means[:-1], covariances[:-1], told
-    _, (means, covariances, lagged) = jax.lax.scan(back, last, earlier, reverse=True)
+    last = filtered[0][-1], filtered[1][-1]
+    earlier = jax.tree.map(
+        lambda row, rows: jnp.concatenate([row[None], rows[:-1]]), start, filtered
+    )
+    _, (*found, lagged) = jax.lax.scan(back, last, (*earlier, told), reverse=True)
     means, covariances = (
-        jnp.concatenate([rows, row[None]])
-        for rows, row in zip((means, covariances), last, strict=True)
+        jnp.concatenate([rows, row[None]]) for rows, row in zip(found, last, strict=True)
     )
     return (means, covariances), lagged

@@ -1,14 +1,12 @@
 """The sum over all sequences of regimes, for switching models."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mpfjax.checks import check_type
+from mpfjax.checks import checked
 from mpfjax.exact.kalman import (
     LinearStep,
     Moments,
@@ -43,15 +41,17 @@ class SwitchingFilterRun(eqx.Module):
 _MOST_SEQUENCES = 2**20
 
 
-def switching_filter(model: Any, observations: Float[Array, "t ..."]) -> SwitchingFilterRun:
+@checked
+def switching_filter(
+    model: SwitchingLinearGaussianModel, observations: Float[Array, "t ..."]
+) -> SwitchingFilterRun:
     """All K^(t+1) sequences of regimes z_0, ..., z_t, and a Kalman smoother for each.
 
-    `model` is a `SwitchingLinearGaussianModel`. The answer is exact. No recursion gives it, since
+    The answer is exact. No recursion gives it, since
     the number of Gaussians grows K-fold with every step. An entry of the observations that is NaN
     is missing. Differentiable. Raises `ValueError` for another model, for observations that are not
     (t, p), and for more than a million sequences. Use it as the reference for a short series.
     """
-    check_type(SwitchingLinearGaussianModel, "a SwitchingLinearGaussianModel", model=model)
     series = Series.skipping(observations)
     rows = checked_rows(series, model.H.shape[-2], model.m0.dtype)
     length, k = rows.shape[0], model.num_regimes
@@ -73,8 +73,8 @@ def _enumerated(
     log_prior = model.log_initial(sequences[:, 0])
     for s in range(length):
         log_prior = log_prior + model.log_transition(sequences[:, s + 1], sequences[:, s])
-    given = jax.vmap(lambda sequence: _kalman_smoother(model, sequence, observations))(sequences)
-    filtered, smoothed, log_densities = given
+    of_each = jax.vmap(lambda sequence: _kalman_smoother(model, sequence, observations))
+    filtered, smoothed, log_densities = of_each(sequences)
     log_weights = log_prior[:, None] + jnp.cumsum(log_densities, axis=1)
     log_evidence = jax.vmap(log_sum_exp)(log_weights.T)
     weights = jnp.exp(log_weights - log_evidence[None])
@@ -109,24 +109,18 @@ def _kalman_smoother(
     model: SwitchingLinearGaussianModel, sequence: Int[Array, " t1"], observations: Array
 ) -> tuple[Moments, Moments, Float[Array, " t"]]:
     """Filtered and smoothed moments, and log p(y_s | y_1..y_{s-1}), given the regimes."""
+
+    def of(regime: Int[Array, ""], values: Array | None, *shape: int) -> Array:
+        if values is None:
+            return jnp.zeros(shape, observations.dtype)
+        return values if values.ndim == len(shape) else values[regime]
+
+    def step_of(z: Int[Array, ""]) -> LinearStep:
+        dynamics = of(z, model.F, d, d), of(z, model.b, d), of(z, model.Q, d, d)
+        return LinearStep(*dynamics, of(z, model.H, p, d), of(z, model.c, p), of(z, model.R, p, p))
+
     d, p = model.m0.shape[-1], observations.shape[1]
-
-    def own(parts: tuple[Array, ...], *shapes: tuple[int, ...]) -> list[Array]:
-        return [
-            jnp.broadcast_to(part, (1, *shape))[0]
-            for part, shape in zip(parts, shapes, strict=True)
-        ]
-
-    def step_of(regime: Int[Array, ""]) -> LinearStep:
-        z = regime[None]
-        dynamics = own(model.dynamics(z, z), (d, d), (d,), (d, d))
-        return LinearStep(*dynamics, *own(model.emission(z), (p, d), (p,), (p, p)))
-
-    mean, covariance = own(model.initial_moments(sequence[:1]), (d,), (d, d))
-    filtered, increments = filtered_moments((mean, covariance), step_of, sequence[1:], observations)
-    means, covariances = filtered
-    from_start = (
-        jnp.concatenate([mean[None], means]), jnp.concatenate([covariance[None], covariances])
-    )  # fmt: skip
-    smoothed, _ = smoothed_moments(from_start, step_of, sequence[1:])
+    start = of(sequence[0], model.m0, d), of(sequence[0], model.P0, d, d)
+    filtered, increments = filtered_moments(start, step_of, sequence[1:], observations)
+    smoothed, _ = smoothed_moments(start, filtered, step_of, sequence[1:])
     return filtered, smoothed, increments

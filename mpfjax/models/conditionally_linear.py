@@ -269,7 +269,7 @@ def gaussian_of(state: MarginalisedState) -> Gaussian:
 def dynamics_of(model: Any, latent: PyTree, state: MarginalisedState) -> Linear:
     """F, b and Q, checked, the particles last."""
     (n, d), parts = state.mean.shape, model.dynamics(latent, state.latent)
-    return _linear(*_checked(model, "dynamics", parts, n, F=(d, d), b=(d,), Q=(d, d)))
+    return Linear.of(*_checked(model, "dynamics", parts, n, F=(d, d), b=(d,), Q=(d, d)))
 
 
 def emission_of(model: Any, latent: PyTree, state: MarginalisedState) -> Linear | None:
@@ -278,7 +278,7 @@ def emission_of(model: Any, latent: PyTree, state: MarginalisedState) -> Linear 
     if parts is None:
         return None
     (n, d), p = state.mean.shape, _length(parts, 0, -2)
-    return _linear(*_checked(model, "emission", parts, n, H=(p, d), c=(p,), R=(p, p)))
+    return Linear.of(*_checked(model, "emission", parts, n, H=(p, d), c=(p,), R=(p, p)))
 
 
 def latent_dynamics_of(
@@ -290,7 +290,7 @@ def latent_dynamics_of(
     if isinstance(parts, tuple) and len(parts) == 4:
         shapes["S"] = (d, k)
     offset, matrix, noise, *rest = _checked(model, "latent_dynamics", parts, n, **shapes)
-    return _linear(matrix, offset, noise), particles_last(rest[0], 2) if rest else None
+    return Linear.of(matrix, offset, noise), particles_last(rest[0], 2) if rest else None
 
 
 def observation_rows(
@@ -306,10 +306,6 @@ def observation_rows(
             f" {model_name(model)}.emission returned; linear_observation may pick y_t"
         )
     return jnp.reshape(jnp.asarray(found, dtype), (p, 1))
-
-
-def _linear(matrix: Array, offset: Array, noise: Array) -> Linear:
-    return Linear(particles_last(matrix, 2), particles_last(offset, 1), particles_last(noise, 2))
 
 
 def _length(parts: Any, place: int, axis: int) -> int:

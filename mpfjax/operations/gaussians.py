@@ -156,6 +156,11 @@ class Linear(NamedTuple):
     offset: Float[Array, "e n"]
     noise: Float[Array, "e e n"]
 
+    @classmethod
+    def of(cls, matrix: Array, offset: Array, noise: Array) -> "Linear":
+        """From arrays with the particles first, or one for all of them."""
+        return cls(particles_last(matrix, 2), particles_last(offset, 1), particles_last(noise, 2))
+
 
 def predict(state: Gaussian, dynamics: Linear) -> Gaussian:
     """The law of F x + b + N(0, Q)."""
