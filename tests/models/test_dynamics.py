@@ -31,7 +31,9 @@ CASES = {
         [(1.0, B @ B.T)],
     ),
     "momentum": (
-        Autoregression.with_momentum(0.5, jnp.asarray(SHORT)), CURRENT + 0.5 * (CURRENT - PREVIOUS), SMALL,
+        Autoregression.with_momentum(0.5, jnp.asarray(SHORT)),
+        CURRENT + 0.5 * (CURRENT - PREVIOUS),
+        SMALL,
     ),
     "velocity": (WalkWithVelocity(JUMPS, (0.2, 0.0)), 2 * CURRENT - PREVIOUS, BOTH),
 }  # fmt: skip
