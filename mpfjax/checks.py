@@ -30,7 +30,6 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
 
 P = ParamSpec("P")
 R = TypeVar("R")
