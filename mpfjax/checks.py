@@ -254,7 +254,9 @@ def check_covariance_array(**arguments: Any) -> None:
     for name, array in arguments.items():
         if isinstance(array, Tracer | jax.ShapeDtypeStruct):
             continue
-        values = np.asarray(array, float)
+        values = 1.0 * np.asarray(array)
+        if values.ndim < 2 or values.shape[-1] != values.shape[-2]:
+            raise ValueError(f"{name}: shape {values.shape} is not that of square matrices")
         largest = np.abs(values).max()
         mirrored = np.swapaxes(values, -1, -2)
         if np.abs(values - mirrored).max() > _ROUNDING * largest:
@@ -417,6 +419,7 @@ class Fitting(Checked):
     """
 
     def __check_init__(self) -> None:
+        super().__check_init__()
         known: dict[str, Any] = {}
         for name, choices in _shapes(type(self)).items():
             shape = getattr(getattr(self, name), "shape", None)
@@ -428,7 +431,6 @@ class Fitting(Checked):
                 shapes = " or ".join(f"({', '.join(axes)})" for axes in choices)
                 raise ValueError(f"{name}: shape {shape} is not {shapes}, where {known}")
             known |= fitting[0]
-        super().__check_init__()
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:

@@ -436,6 +436,35 @@ REFUSED = (
     (r"model: Wrong.log_transition returned shape \(3,\)",
      lambda: run_of(
          wrong(log_transition=lambda self, states, previous: jnp.zeros(3)), gradient="stop")),
+    # how models' arrays fit together, and exact answers
+    (r"Q: shape \(2, 2\) is not \(d, d\)",
+     lambda: mpfjax.LinearGaussianModel(**LINEAR | {"Q": np.eye(2)})),
+    ("b: shape", lambda: mpfjax.SwitchingLinearGaussianModel(*[EYE] * 5, ZERO, EYE, b=np.ones(2))),
+    ("transition_matrix: .* do not sum to one",
+     lambda: mpfjax.SwitchingLinearGaussianModel(0.6 * EYE, *[EYE] * 4, ZERO, EYE)),
+    *(
+        (f"(?s)Q: .* {what}",
+         lambda Q=Q: mpfjax.SwitchingLinearGaussianModel(
+             EYE, np.eye(2), Q, np.eye(2), np.eye(2), np.zeros(2), np.eye(2)))
+        for Q, what in (
+            ([[1, 0.5], [0, 1]], "not symmetric"), ([[1, 2], [2, 1]], "negative eigenvalue"))
+    ),
+    ("A2: shape", lambda: mpfjax.Autoregression(EYE, np.eye(2), EYE, ZERO)),
+    ("jump_deviations: shape", lambda: mpfjax.RandomWalkWithJumps([1.0], [[5.0]])),
+    ("initial_velocity: shape",
+     lambda: mpfjax.WalkWithVelocity(mpfjax.RandomWalk([1.0]), 0.1, [1.0, 1.0])),
+    ("gain: .* is not one or 1",
+     lambda: mpfjax.WalkWithVelocity(mpfjax.RandomWalk([1.0]), [0.1] * 3)),
+    ("high: 1.0 is not above low", lambda: mpfjax.QuadraticModel(low=1.0, high=1.0)),
+    ("interaction: .* cannot be simulated",
+     lambda: mpfjax.MultiObjectModel(MODEL, 2, difference).simulate(KEY, 2)),
+    (r"observations: shape \(2,\) is not \(t, 1\)",
+     lambda: mpfjax.exact.kalman_filter(mpfjax.LinearGaussianModel(**LINEAR), TWO)),
+    ("model: .* is not a LinearGaussianModel", lambda: mpfjax.exact.kalman_smoother(MODEL, TWO)),
+    ("log_initial: shape",
+     lambda: mpfjax.exact.grid_filter(MODEL, TWO, np.linspace(-1, 1, 9), TWO)),
+    ("model: Switching.* conditionally linear",
+     lambda: mpfjax.exact.grid_filter(SWITCHING, TWO[:, None], np.linspace(-1, 1, 9))),
     # scores
     ("estimate_mask: shape", lambda: metrics.ospa(**SETS, estimate_mask=np.ones(3, bool))),
     ("weights: shape", lambda: metrics.crps(np.ones((2, 3)), np.ones((2, 4)), TWO)),

@@ -36,7 +36,7 @@ def _check_probabilities(array: Any, name: str) -> None:
     NOT_NEGATIVE.check(array, name)
     if isinstance(array, Tracer | jax.ShapeDtypeStruct):
         return
-    if np.abs(np.sum(np.asarray(array, float), axis=-1) - 1).max() > _ROUNDING:
+    if np.abs(np.atleast_1d(array).sum(axis=-1) - 1).max() > _ROUNDING:
         raise ValueError(f"{name}: {shown(array)} has rows that do not sum to one")
 
 
