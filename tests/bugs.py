@@ -169,6 +169,54 @@ BUGS = {
         "log_weights=-jnp.log(trust * total),",
         "log_weights=jnp.log(trust / jnp.sum(trust)),",
         "tests/test_initial.py -k represent",
+    # vision and metrics
+    "histograms count half a pixel off": Bug(
+        "vision/colour/histograms.py",
+        "jnp.ceil(inside - 0.5).astype(jnp.int32)",
+        "jnp.ceil(inside).astype(jnp.int32)",
+        "tests/vision/test_histograms.py -k numpys",
+    ),
+    "OSPA's cutoff cuts at twice of it": Bug(
+        "metrics/set_distances.py",
+        "jnp.pad(jnp.minimum(distances, 1.0), (rows, columns))",
+        "jnp.pad(jnp.minimum(distances, 2.0), (rows, columns))",
+        "tests/metrics/test_set_distances.py -k ospa",
+    ),
+    "GOSPA counts a pair beyond the cutoff once for each": Bug(
+        "metrics/set_distances.py",
+        "shares = jnp.where(pairing.is_pair, 0.5, 1.0 / alpha)",
+        "shares = jnp.where(pairing.is_pair, 1.0, 1.0 / alpha)",
+        "tests/metrics/test_set_distances.py -k gospa",
+    ),
+    "the cost of a pair has no determinant": Bug(
+        "vision/tracking/associate.py",
+        "return tails + jnp.minimum(volumes, _WIDEST)[:, None]",
+        "return tails",
+        "tests/vision/test_association.py -k density",
+    ),
+    "objects end a frame too early": Bug(
+        "vision/tracking/lives.py",
+        "stays = self.alive & inside & (unseen <= most)",
+        "stays = self.alive & inside & (unseen < most)",
+        "tests/vision/test_tracker.py -k outlives",
+    ),
+    "no chain of weak scores is an object's": Bug(
+        "vision/tracking/scores.py",
+        "proved = seen & ((own >= _SURE) | (age >= lasting))",
+        "proved = seen & (own >= _SURE)",
+        "tests/vision/test_learning.py -k chains",
+    ),
+    "objects move against the camera": Bug(
+        "vision/tracking/tracker.py",
+        "return objects.shifted(shift), noise, camera, shift",
+        "return objects.shifted(-shift), noise, camera, shift",
+        "tests/vision/test_tracker.py -k shaking",
+    ),
+    "births do not know the frame rate": Bug(
+        "vision/tracking/noise.py",
+        "start: Any = np.float32(min(25 / frames_per_second, _MOST)) * _SPEED",
+        "start: Any = np.float32(1.0) * _SPEED",
+        "tests/vision/test_tracker.py -k rare",
     ),
 }
 

@@ -2,12 +2,11 @@
 
 import jax
 import numpy as np
-import pytest
 import scipy.stats
 from matplotlib.collections import LineCollection
 
 import mpfjax
-from benchmarks.figures import draw_errors_by_size, draw_overlaps, standard_error
+from benchmarks.figures import standard_error
 from mpfjax.plotting import draw_components
 from tests.switching import MODEL as SWITCHING
 from tests.switching import OBSERVATIONS as SEEN
@@ -18,20 +17,6 @@ RUNS = np.random.default_rng(0).normal(size=(3, 5))
 def test_standard_errors_divide_by_n_minus_one():
     np.testing.assert_allclose(standard_error(RUNS), scipy.stats.sem(RUNS, axis=0))
     assert np.isnan(standard_error(RUNS[:1])).all()
-
-
-def test_bars_and_bands_are_standard_errors():
-    by_size = {100: np.abs(RUNS[:, 0]), 200: np.abs(RUNS[:, 1])}
-    figure = draw_errors_by_size([("errors", {"pf": by_size})], "error")
-    (bars,) = figure.axes[0].containers
-    heights = [segment[1, 1] - segment[0, 1] for segment in bars[2][0].get_segments()]
-    expected = [2 * scipy.stats.sem(by_size[size]) for size in (100, 200)]
-    np.testing.assert_allclose(heights, expected)
-    figure = draw_overlaps([("a", {"kind": RUNS}, 1)])
-    (band,) = figure.axes[0].collections
-    corners = band.get_paths()[0].vertices
-    width = [np.ptp(corners[corners[:, 0] == frame, 1]) for frame in (2, 3, 4)]
-    np.testing.assert_allclose(width, 2 * scipy.stats.sem(RUNS, axis=0)[1:4])
 
 
 def kept_run(model, observations):
@@ -57,11 +42,3 @@ def test_components_stand_where_their_moments_are():
         assert any(np.allclose(bar, expected, rtol=1e-3) for bar in bars)
     living = jax.vmap(lambda mixture: mixture.active)(mixtures)
     assert len(bars) == np.sum(living)
-
-
-def test_mixtures_without_time_and_numbers_that_are_not_there_are_named():
-    mixtures = kept_run(SWITCHING, SEEN)
-    with pytest.raises(ValueError, match="mixtures: log-weights of shape"):
-        draw_components(jax.tree.map(lambda leaf: leaf[0], mixtures))
-    with pytest.raises(ValueError, match="index: 9 of a state of"):
-        draw_components(mixtures, 9)

@@ -1,7 +1,6 @@
-"""OSPA and GOSPA against Stone Soup, and against every pairing where the sets are small."""
+"""OSPA and GOSPA against every pairing of small sets, and GOSPA against Stone Soup."""
 
 import datetime
-import functools
 import itertools
 
 import jax
@@ -20,15 +19,6 @@ def random_sets(seed, num_estimates, num_truths):
     """Close enough together that pairs lie on both sides of the cutoff, and pairings compete."""
     rng = np.random.default_rng(seed)
     return rng.uniform(0, 40, (num_estimates, 2)), rng.uniform(0, 40, (num_truths, 2))
-
-
-def tracked_sets(seed, num_estimates, num_truths):
-    """Objects far apart and estimates near them, so that no two pairings compete."""
-    rng = np.random.default_rng(seed)
-    objects = 100.0 * rng.permutation(max(num_estimates, num_truths))[:, None] + np.zeros(2)
-    errors = rng.uniform(-25, 25, (num_estimates, 2))
-    order = rng.permutation(num_estimates)
-    return objects[:num_estimates][order] + errors, objects[:num_truths]
 
 
 def padded(sets, size):
@@ -58,7 +48,7 @@ def one_frame(metric, **settings):
     return call
 
 
-def stone_soup(name, estimates, truths, **settings):
+def stone_soup(estimates, truths, **settings):
     reference = pytest.importorskip(
         "stonesoup.metricgenerator.ospametric",
         reason="stonesoup, the reference, is not installed",
@@ -67,9 +57,7 @@ def stone_soup(name, estimates, truths, **settings):
 
     time = datetime.datetime(2020, 1, 1)
     x, y = ([State(point[:, None], timestamp=time) for point in set] for set in (estimates, truths))
-    metric = getattr(reference, name)(**settings)
-    if name == "OSPAMetric":
-        return metric.compute_OSPA_distance(x, y).value
+    metric = reference.GOSPAMetric(**settings)
     return metric.compute_gospa_metric(x, y)[0].value
 
 
@@ -88,7 +76,7 @@ def every_pairing(estimates, truths, cutoff, order, cost_alone):
 @pytest.mark.parametrize("order", [1.0, 2.0, 3.5])
 def test_gospa_is_that_of_stone_soup(order):
     pairs = [random_sets(seed, *sizes) for sizes in SIZES if any(sizes) for seed in range(3)]
-    expected = [stone_soup("GOSPAMetric", *pair, c=CUTOFF, p=order) for pair in pairs]
+    expected = [stone_soup(*pair, c=CUTOFF, p=order) for pair in pairs]
     found = masked(gospa, pairs, cutoff=CUTOFF, order=order)
     for name in ("distance", "localisation", "missed", "false"):
         np.testing.assert_allclose(
@@ -97,17 +85,6 @@ def test_gospa_is_that_of_stone_soup(order):
             rtol=2e-5,
             atol=1e-5 * CUTOFF**order,
         )
-
-
-@pytest.mark.parametrize("order", [1.0, 2.0, 3.5])
-def test_ospa_is_that_of_stone_soup(order):
-    """On sets whose pairings compete only at order 1: above it Stone Soup pairs by plain distance,
-    which is not always the least sum of powers, and its value is then too large."""
-    some_sets = random_sets if order == 1 else tracked_sets
-    pairs = [some_sets(seed, *sizes) for sizes in SIZES if any(sizes) for seed in range(3)]
-    expected = [stone_soup("OSPAMetric", *pair, c=CUTOFF, p=order) for pair in pairs]
-    found = masked(ospa, pairs, cutoff=CUTOFF, order=order)
-    np.testing.assert_allclose(found, expected, rtol=2e-5)
 
 
 @pytest.mark.parametrize("order", [1.0, 2.0, 3.5])
@@ -129,17 +106,6 @@ def test_gospa_is_the_least_over_every_pairing(alpha):
     np.testing.assert_allclose(parts, best, rtol=2e-5)
 
 
-def test_parts_by_hand():
-    """An object found 3 pixels off, one missed, one at the cutoff exactly, a false estimate."""
-    truths = jnp.array([[0.0, 0.0], [100.0, 0.0], [200.0, 0.0]])
-    estimates = jnp.array([[3.0, 0.0], [210.0, 0.0], [400.0, 0.0]])
-    found = gospa(estimates, truths, cutoff=10.0, order=2.0)
-    assert found.localisation == pytest.approx(9.0)
-    assert found.missed == pytest.approx(2 * 50.0)
-    assert found.false == pytest.approx(2 * 50.0)
-    assert found.distance == pytest.approx(209.0**0.5)
-
-
 def test_empty_sets():
     none, two = jnp.zeros((0, 2)), jnp.zeros((2, 2))
     assert ospa(none, none, cutoff=7.0) == 0
@@ -150,32 +116,6 @@ def test_empty_sets():
     np.testing.assert_allclose(missed, [7.0, 0, 49.0, 0], rtol=1e-6)
     false = gospa(two, none, cutoff=7.0, order=1.0, alpha=1.0)
     np.testing.assert_allclose(false, [14.0, 0, 0, 14.0], rtol=1e-6)
-
-
-def test_equal_sets_in_any_order_are_at_distance_zero():
-    points = jnp.asarray(random_sets(0, 5, 0)[0])
-    assert ospa(points, points[::-1], cutoff=7.0) == 0
-    assert gospa(points, points[::-1], cutoff=7.0) == (0, 0, 0, 0)
-
-
-@pytest.mark.parametrize("metric", [ospa, gospa])
-def test_vmap_is_a_loop_and_jit_no_jit(metric):
-    """And a mask is the same as an array without what it leaves out."""
-    settings = {"cutoff": CUTOFF, "order": 2.0}
-    pairs = [random_sets(seed, *sizes) for seed, sizes in enumerate([(0, 3), (2, 2), (4, 1)])]
-    call = one_frame(metric, **settings)
-    (x, x_mask), (y, y_mask) = all_padded(pairs)
-    frames = list(zip(x, y, x_mask, y_mask, strict=True))
-    together = masked(metric, pairs, **settings)
-    for each in (
-        [call(*frame) for frame in frames],
-        [jax.jit(call)(*frame) for frame in frames],
-        [metric(jnp.asarray(x), jnp.asarray(y), **settings) for x, y in pairs],
-    ):
-        stacked = jax.tree.map(lambda *values: jnp.stack(values), *each)
-        jax.tree.map(
-            functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-3), together, stacked
-        )
 
 
 def test_large_cutoffs_and_orders_do_not_overflow():

@@ -71,13 +71,6 @@ def test_rates_by_hand():
     np.testing.assert_array_equal(recovery_rate(both), [0.75, 0.25])
 
 
-def test_frames_without_the_object_do_not_count():
-    present = jnp.array([1, 0, 0, 1, 0], bool)
-    assert float(success_rate(STATES, present)) == 0.5
-    assert float(recovery_rate(STATES, present)) == 0.5
-    assert float(recovery_rate(STATES, present, num_last=3)) == 0.5
-
-
 def test_all_measures_of_two_objects():
     """Object 0 is tracked in half, one run only; object 1 is not there in the second frame."""
     truth = jnp.broadcast_to(G, (2, 2, 4)).at[1, 1].set(jnp.nan)
@@ -96,9 +89,3 @@ def test_all_measures_of_two_objects():
         np.testing.assert_allclose(quality.precision, [2.25 / 3, 1.0], rtol=1e-6)
         np.testing.assert_allclose(quality.recall, [2.25 / 3, 1.0], rtol=1e-6)
         np.testing.assert_allclose(quality.tracked, [0.75, 0.5])
-
-
-def test_an_object_that_is_never_tracked_has_zeros():
-    truth, estimates = jnp.broadcast_to(G, (3, 1, 4)), jnp.full((2, 3, 1, 4), 500.0)
-    quality = tracking_quality(estimates, truth)
-    np.testing.assert_array_equal(jnp.stack(quality), 0.0)

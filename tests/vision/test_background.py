@@ -134,16 +134,6 @@ def test_the_shape_of_one_is_learned_from_the_video():
     np.testing.assert_allclose(found, drawn(side_by_side(11)), atol=2)
 
 
-def test_someone_who_strides_is_not_cut():
-    def stride(frame, t):
-        if t >= 10:
-            frame[40:72, 60:72] = (200, 30, 40)
-            frame[66:86, 50:60] = frame[66:86, 72:84] = (200, 30, 40)
-
-    (found,) = detections(street(12, nobody, paint=stride))[-1]
-    np.testing.assert_allclose(found, (50, 40, 34, 46), atol=1)
-
-
 def test_a_gap_in_the_height_of_a_person_is_closed():
     def belt(frame, t):
         frame[60:62] = 120
@@ -151,25 +141,6 @@ def test_a_gap_in_the_height_of_a_person_is_closed():
     frames = street(12, lambda t: [(50, 40)] if t >= 10 else [], paint=belt)
     np.testing.assert_allclose(detections(frames)[-1], drawn([(50, 40)]), atol=1)
     assert len(detections(frames, largest_gap=0.0, aspect=(0.5, 6.0))[-1]) == 2
-
-
-def test_how_large_a_gap_is_closed_is_learned_from_who_walks_by():
-    """A belt that cuts a tall one in two: once tall ones are known, it is one person."""
-    rng = np.random.default_rng(0)
-
-    def tall(t, belt):
-        frame = np.full((96, 160, 3), 120.0)
-        x = 4 + 4 * t
-        frame[20:80, x : x + 24] = (200, 30, 40)
-        if belt:
-            frame[46:50] = 120
-        return np.clip(frame + rng.normal(0, 2, frame.shape), 0, 255).astype(np.uint8)
-
-    empty = [np.full((96, 160, 3), 120, np.uint8)] * 10
-    known = [tall(t, False) for t in range(32)]
-    options = {"area": (0.01, 0.5), "aspect": None}
-    assert len(detections([*empty, *known, tall(10, True)], **options)[-1]) == 1
-    assert len(detections([*empty, tall(10, True)], **options)[-1]) == 2
 
 
 def test_a_shadow_is_no_person():

@@ -171,35 +171,41 @@ def test_rising_is_the_nearest_sequence_that_does_not_fall():
         )
 
 
-def scored(frames, lasting=50, num_chains=8):
+@jax.jit
+def after_all(frames, lasting):
+    stronger, overlaps = jnp.zeros((4, 4), bool), jnp.zeros((4, 4))
+
+    def step(state, found):
+        return state.after(found, stronger, overlaps, jnp.zeros(2), lasting), None
+
+    start = jax.tree.map(jnp.asarray, ScoreState.initial(8))
+    return jax.lax.scan(step, start, frames)[0]
+
+
+def scored(frames, lasting=50):
     """The state after frames of (places of boxes of 10 x 10, scores)."""
-    step = jax.jit(
-        lambda state, found: state.after(
-            found, jnp.zeros((4, 4), bool), jnp.zeros((4, 4)), jnp.zeros(2), jnp.int32(lasting)
-        )
-    )
-    state = jax.tree.map(jnp.asarray, ScoreState.initial(num_chains))
+    found = []
     for places, scores in frames:
-        corners = np.array([[*place, 10, 10] for place in places], float).reshape(-1, 4)
-        state = step(state, Detections.from_boxes(corners, 4, np.asarray(scores, float)))
-    return state
+        corners = np.array([[*place, 10, 10] for place in places], float)
+        found.append(Detections.from_boxes(corners, 4, np.asarray(scores, float)))
+    return after_all(jax.tree.map(lambda *leaves: np.stack(leaves), *found), jnp.int32(lasting))
 
 
 def test_scores_of_chains_that_become_sure_are_strong_and_of_those_that_end_are_not():
     """One that comes nearer, with rising scores; and flashes at ever other places."""
     rng = np.random.default_rng(0)
-    near = [[((5, 5),), [0.3 + 0.7 * (t % 40) / 40]] for t in range(200)]
+    near = [[((5, 5),), [0.3 + 0.7 * (t % 40) / 40]] for t in range(120)]
     assert float(scored(near).strong) < 0.4
-    flashes = [[((5, 5), tuple(rng.uniform(100, 900, 2))), [1.0, 0.7]] for t in range(200)]
+    flashes = [[((5, 5), tuple(rng.uniform(100, 900, 2))), [1.0, 0.7]] for t in range(120)]
     assert float(scored(flashes).strong) > 0.7
-    far = [[((5, 5), (300, 300)), [1.0, 0.3]] for t in range(200)]
+    far = [[((5, 5), (300, 300)), [1.0, 0.3]] for t in range(120)]
     assert float(scored(far, lasting=1000).strong) == pytest.approx(0.5, abs=0.05)
     assert float(scored(far, lasting=50).strong) < 0.35
 
 
 @pytest.mark.parametrize("score", [-2.0, 0.3, 7.0])
 def test_equal_scores_are_all_strong(score):
-    state = scored([[((5, 5), (50, 50)), [score, score]]] * 3)
+    state = scored([[((5, 5), (50, 50)), [score, score]]] * 200)
     assert float(state.strong) <= score
     assert float(state.weak) <= score
 

@@ -1,26 +1,78 @@
-"""The rendered scene: the same for the same key, with boxes that fit what is drawn."""
+"""Rendered scenes: the facts of the paper's section 3.2, and boxes that fit what is drawn."""
 
 import jax
 import numpy as np
 import pytest
 
-from benchmarks.scenes.football import football_scene
+from benchmarks.scenes import distracter_scene, football_scene
 
 
 @pytest.fixture(scope="module")
 def scene():
-    return football_scene(jax.random.key(3), 12)
+    return distracter_scene(jax.random.key(0))
+
+
+def overlap(a, b):
+    low, high = np.maximum(a[:2], b[:2]), np.minimum(a[:2] + a[2:], b[:2] + b[2:])
+    return np.prod(np.maximum(high - low, 0)) / np.prod(a[2:])
 
 
 def test_the_same_key_gives_the_same_scene(scene):
-    again, other = (football_scene(jax.random.key(seed), 12) for seed in (3, 4))
+    again, other = (distracter_scene(jax.random.key(seed)) for seed in (0, 1))
     np.testing.assert_array_equal(scene.frames, again.frames)
-    np.testing.assert_array_equal(scene.tracks, again.tracks)
-    assert not np.array_equal(scene.tracks, other.tracks)
+    np.testing.assert_array_equal(scene.boxes, again.boxes)
+    assert not np.array_equal(scene.boxes, other.boxes)
 
 
-def test_the_kits_are_where_the_boxes_are(scene):
+@pytest.fixture(scope="module")
+def scenes(scene):
+    return [scene, *(distracter_scene(jax.random.key(seed)) for seed in range(1, 12))]
+
+
+def gaps(scene):
+    """How far object 1 is clear of the place of the distracter, in each frame."""
+    offsets = np.abs(scene.boxes[:, 0, :2] - scene.distracter[7, :2])
+    return np.max(offsets - scene.boxes[0, 0, 2:], axis=1)
+
+
+def test_the_distracter_stands_over_object_one_which_walks_away(scenes):
+    for scene in scenes:
+        there = np.isfinite(scene.distracter).all(axis=1)
+        assert (np.flatnonzero(there) + 1).tolist() == [3, 4, 5, 6, 7, 8]
+        for t in np.flatnonzero(there):
+            np.testing.assert_array_equal(scene.distracter[t], scene.boxes[2, 0])
+            assert all(overlap(scene.distracter[t], box) == 0 for box in scene.boxes[t, 1:])
+        # Corners are rounded to whole pixels.
+        assert 3 <= gaps(scene)[7] <= 13
+        assert gaps(scene)[-1] >= 11
+
+
+def test_steps_are_those_of_the_papers_dynamics(scenes):
+    """x_t - x_{t-1} - 0.5 (x_{t-1} - x_{t-2}) has a deviation of 3; boxes are on whole pixels."""
+    paths = np.stack([scene.boxes[:, 1:, :2] for scene in scenes])
+    steps = np.diff(paths, axis=1)
+    noise = steps[:, 1:] - 0.5 * steps[:, :-1]
+    rounding = (1 + 1.5**2 + 0.5**2) / 12
+    np.testing.assert_allclose(noise.std(), np.sqrt(9 + rounding), rtol=0.04)
+    correlation = np.corrcoef(noise[:, 1:].ravel(), noise[:, :-1].ravel())[0, 1]
+    assert abs(correlation) < 0.2
+
+
+def test_the_template_is_the_distracter_over_object_one(scene):
+    frame, box = scene.template
+    np.testing.assert_array_equal(frame, scene.frames[2])
+    np.testing.assert_array_equal(box, scene.boxes[2, 0])
+    x, y, w, h = box.astype(int)
+    covered = frame[y : y + h, x : x + w].astype(int)
+    x, y, w, h = scene.boxes[0, 0].astype(int)
+    own = scene.frames[0, y : y + h, x : x + w].astype(int)
+    change = np.abs(covered - own).mean(axis=(1, 2))
+    assert change[: h // 4].mean() < 25 < change[h // 2 :].mean()
+
+
+def test_the_kits_are_where_the_boxes_are():
     """The upper middle of a box is its player's shirt: red of kit 0, no redder than blue of 1."""
+    scene = football_scene(jax.random.key(3), 1)
     first = scene.tracks[scene.tracks[:, 0] == 1]
     for _, id, x, y, w, h in first:
         middle = scene.frames[0][int(y + 0.3 * h), int(x + w / 2)].astype(int)

@@ -11,7 +11,6 @@ import pytest
 from mpfjax.vision import Detections, ObjectTracker, Tracks, track
 from mpfjax.vision.boxes.following import follow_boxes
 from mpfjax.vision.files.frames import write_image
-from mpfjax.vision.tracking.adapters import LEAST_ROOM, MOST_ROOM, Rows
 from mpfjax.vision.tracking.track import offline_rows, online_rows
 
 SHAPE = (48, 64, 3)
@@ -101,10 +100,6 @@ def write_detections(path):
     path.write_text("".join(",".join(map(str, row)) + "\n" for row in walks()))
 
 
-def test_without_colours_the_pixels_do_not_count(without_pixels):
-    assert_same(tracked(stills(), walks(), use_colours=False), without_pixels)
-
-
 def test_tracks_are_the_same_where_frames_are_looked_at_ahead(with_pixels):
     found = tracked(stills(), detector_of(walks()), ahead=True)
     assert_same(found, with_pixels)
@@ -132,21 +127,6 @@ def test_frames_ahead_end_with_the_tracks_and_errors_come_in_their_place():
     with pytest.raises(OSError, match="unplugged"):
         next(tracks)
     assert threading.active_count() == before
-
-
-def test_a_camera_is_read_one_frame_at_a_time():
-    read = []
-
-    def camera():
-        for number in itertools.count():
-            read.append(number)
-            yield stills(1)[0]
-
-    run = track(camera(), lambda frame: np.zeros((0, 4)), TRACKER)
-    assert read == []
-    for number in range(3):
-        next(run)
-        assert read == list(range(number + 1))
 
 
 def test_weak_detections_are_left_out_where_a_least_score_is_given():
@@ -263,19 +243,6 @@ def test_rows_online_are_of_what_was_known_then_and_offline_of_what_is_known_at_
     offline = offline_rows(kept, 5)
     assert offline[:, :2].tolist() == [[5, 1], [6, 1]]
     assert offline_rows([]).shape == (0, 6)
-
-
-def test_room_is_made_for_what_a_file_holds():
-    rows = np.zeros((0, 7))
-    assert Rows(rows).most_objects() == LEAST_ROOM
-    crowd = np.array(
-        [[frame, -1, 1, 1, 5, 5, 1] for frame in range(1, 101) for _ in range(40)], float
-    )
-    assert Rows(crowd).most_objects() == 64
-    burst = np.concatenate([crowd, np.tile(crowd[:1], (2000, 1))])
-    assert Rows(burst).most_objects() == 64
-    assert Rows(np.tile(crowd, (10, 1))).most_objects() == 600
-    assert Rows(np.tile(crowd, (50, 1))).most_objects() == MOST_ROOM
 
 
 def test_the_second_frame_is_tracked_by_the_program_of_the_first():

@@ -184,6 +184,17 @@ def test_nothing_leaks_over_many_random_frames():
     assert max(ever) == int(state.lives.last_identity) == len(ever)
 
 
+@pytest.mark.parametrize(("rate", "names"), [(8, 1), (25, 6)])
+def test_what_begins_may_move_further_in_a_frame_where_frames_are_rare(rate, names):
+    """By a box from frame to frame: an object at 8 frames a second, and six at 25."""
+    tracker = ObjectTracker(M, frames_per_second=rate)
+    state = tracker.init()
+    for t in range(6):
+        found = Detections.from_boxes(np.array([[20.0 * t, 50, 20, 40]]), ROOM)
+        state, tracks = tracker.step(None, state, None, found)
+    assert tracks.identities.max() == names
+
+
 # --- a function of the state ---------------------------------------------------------------
 
 
@@ -300,15 +311,16 @@ def test_boxes_of_other_classes_are_no_doubles_and_the_likelier_class_is_taken()
 # --- a camera that shakes ------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shake", [4, 6, 10])
+EIGHT = ObjectTracker(8, frames_per_second=25)
+FOLLOW = jax.jit(lambda xs: jax.lax.scan(lambda s, x: advanced(EIGHT, s, x), EIGHT.init(), xs)[1])
+
+
+@pytest.mark.parametrize("shake", [4, 10])
 def test_still_objects_before_a_shaking_camera_are_shown_from_the_second_second_on(shake):
     """Two of them have weaker scores, and must not seem to be none because the camera jolts."""
     shown, most = [], []
     at = np.array([[150, 150], [350, 160], [200, 350], [420, 340]], float)
-    tracker = ObjectTracker(8, frames_per_second=25)
-    start = tracker.init()
-    scan = jax.jit(lambda xs: jax.lax.scan(lambda s, x: advanced(tracker, s, x), start, xs))
-    for seed in range(5):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         frames = []
         for _ in range(80):
@@ -317,7 +329,7 @@ def test_still_objects_before_a_shaking_camera_are_shown_from_the_second_second_
             centres = at + rng.normal(0, shake, 2) + noise[:, :2] * [45, 90]
             boxes = np.concatenate([centres - sizes / 2, sizes], axis=1)
             frames.append(Detections.from_boxes(boxes, 8, np.array([1, 1, 0.6, 0.6])))
-        _, tracks = scan(jax.tree.map(lambda *leaves: jnp.stack(leaves), *frames))
+        tracks = FOLLOW(jax.tree.map(lambda *leaves: np.stack(leaves), *frames))
         shown.append(np.asarray(tracks.shown).sum(axis=1)[50:])
         most.append(int(np.asarray(tracks.identities).max()))
     assert np.array(shown).min() == 4
