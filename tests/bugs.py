@@ -169,6 +169,7 @@ BUGS = {
         "log_weights=-jnp.log(trust * total),",
         "log_weights=jnp.log(trust / jnp.sum(trust)),",
         "tests/test_initial.py -k represent",
+    ),
     # vision and metrics
     "histograms count half a pixel off": Bug(
         "vision/colour/histograms.py",
