@@ -14,50 +14,77 @@ are simulated as for `benchmarks.tracking_by_detection --scene football`. Scores
 --seeds draws of these. Into --out DIR goes camera_motion.json.
 """
 
-import argparse
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.harness import AtLeast2, Count, Folders, Natural, command, data, table
 from benchmarks.tracking_by_detection import football
-from mpfjax.console import exit_status, format_table, whole, write_json
+from benchmarks.tracking_by_detection.__main__ import OF_SCORES, SCORES
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import OpticalFlow, read_frames, read_truth, track
 from mpfjax.vision.tracking.track import online_rows
 
-SCORES = ("HOTA", "MOTA", "IDF1", "id_switches")
+OF_MOTION = {
+    "recording": "{recording}", "moved": "{moved:.3f}", "error": "{error:.3f}",
+    "known": "{known:.2f}", "CPU ms": "{cpu_ms:.1f}",
+}  # fmt: skip
 
 
 class Recording(NamedTuple):
     """Frames with the true boxes, and the true motion of fixed points where it is known."""
 
     name: str
-    frames: Callable[[], Iterator[np.ndarray]]
+    frames: Sequence[np.ndarray] | np.ndarray
     truth: np.ndarray
-    num_frames: int
-    size: tuple[int, int]  # width and height
     landmarks: np.ndarray | None
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        height, width, _ = self.frames[0].shape
+        return width, height
 
-def recordings(folders: list[Path], seed: int, most: int) -> Iterator[Recording]:
+
+@command(frames=4, seeds=1)
+def main(
+    folders: Folders = (),
+    *,
+    seed: Natural = 0,
+    seeds: Count = 3,
+    frames: AtLeast2 = 300,
+    out: Path = Path("results/camera_motion"),
+) -> None:
+    """Both tables, written after each recording.
+
+    - `folders`: img/ and gt.txt.
+    - `seeds`: draws of the detections.
+    - `frames`: the most of a recording.
+    """
+    found: list[dict[str, Any]] = []
+    tracked: list[dict[str, Any]] = []
+    for recording in recordings(folders, seed, frames):
+        found.append(accuracy(recording))
+        for motion in ("detections", "pixels"):
+            tracked.append(scores(recording, motion, range(seed, seed + seeds)))
+        data(out / "camera_motion.json", found=found, tracked=tracked)
+    print(table(OF_MOTION, found))
+    print(table({"recording": "{recording}", "motion from": "{motion}"} | OF_SCORES, tracked))
+    print(f"written to {out}")
+
+
+def recordings(folders: Sequence[Path], seed: int, most: int) -> Iterator[Recording]:
     """The rendered matches, and the folders."""
     for match in football.MATCHES:
-        length = min(most, football.NUM_FRAMES)
-        scene = football.play(match, seed, length)
-        size = match.width, match.height
-        yield Recording(
-            match.name, scene.frames.__iter__, scene.tracks, length, size, scene.landmarks
-        )
+        scene = football.play(match, seed, min(most, football.NUM_FRAMES))
+        yield Recording(match.name, scene.frames, scene.tracks, scene.landmarks)
     for folder in folders:
         truth = read_truth(folder).objects
         frames = [frame for frame, _ in zip(read_frames(folder), range(most), strict=False)]
-        height, width, _ = frames[0].shape
-        truth = truth[truth[:, 0] <= len(frames)]
-        yield Recording(folder.name, frames.__iter__, truth, len(frames), (width, height), None)
+        yield Recording(folder.name, frames, truth[truth[:, 0] <= len(frames)], None)
 
 
 def accuracy(recording: Recording) -> dict[str, Any]:
@@ -68,7 +95,7 @@ def accuracy(recording: Recording) -> dict[str, Any]:
     cv2.setNumThreads(1)
     flow, moved, errors, known, seconds = OpticalFlow(), [], [], [], []
     centre = np.array([recording.size]) / 2
-    for t, frame in enumerate(recording.frames()):
+    for t, frame in enumerate(recording.frames):
         boxes = recording.truth[recording.truth[:, 0] == t + 1, 2:6]
         start = time.process_time()
         motion = flow(frame, boxes)
@@ -89,91 +116,31 @@ def accuracy(recording: Recording) -> dict[str, Any]:
     cv2.setNumThreads(threads)
     return {
         "recording": recording.name,
-        "moved": _root_mean_square(moved),
-        "error": _root_mean_square(errors) if errors else None,
+        "moved": root_mean_square(moved),
+        "error": root_mean_square(errors) if errors else None,
         "known": float(np.mean(known)),
         "cpu_ms": float(1e3 * np.median(seconds[1:])),
     }
 
 
-def _root_mean_square(gaps: list[np.ndarray]) -> float:
+def root_mean_square(gaps: list[np.ndarray]) -> float:
+    """Of the lengths of all gaps."""
     return float(np.sqrt(np.mean(np.sum(np.concatenate(gaps) ** 2, axis=1))))
 
 
 def scores(recording: Recording, motion: str, seeds: range) -> dict[str, Any]:
     """A row of the second table: the tracker's mean scores."""
-    match = football.Match(recording.name, 0, recording.size[1], recording.size[0])
+    width, height = recording.size
     found = []
     for seed in seeds:
+        match = football.Match(recording.name, 0, height, width)
         rows = football.detect(match, recording.truth, seed)
-        tracked = track(recording.frames(), rows, camera_motion=motion)
+        tracked = track(iter(recording.frames), rows, camera_motion=motion)
         kept = np.concatenate([online_rows(t, tracks) for t, tracks in enumerate(tracked, 1)])
-        found.append(multi_object_scores(kept, recording.truth, (1, recording.num_frames)))
+        found.append(multi_object_scores(kept, recording.truth, (1, len(recording.frames))))
     means = {name: float(np.mean([one[name] for one in found])) for name in SCORES}
     return {"recording": recording.name, "motion": motion} | means
 
 
-def run(options: argparse.Namespace) -> None:
-    """Both tables, written after each recording."""
-    options.out.mkdir(parents=True, exist_ok=True)
-    found: list[dict[str, Any]] = []
-    tracked: list[dict[str, Any]] = []
-    for recording in recordings(options.folders, options.seed, options.frames):
-        found.append(accuracy(recording))
-        for motion in ("detections", "pixels"):
-            seeds = range(options.seed, options.seed + options.seeds)
-            tracked.append(scores(recording, motion, seeds))
-        write_json(options.out / "camera_motion.json", {"found": found, "tracked": tracked})
-    print(
-        format_table(
-            ["recording", "moved", "error", "known", "CPU ms"],
-            [
-                [
-                    row["recording"],
-                    f"{row['moved']:.3f}",
-                    "" if row["error"] is None else f"{row['error']:.3f}",
-                    f"{row['known']:.2f}",
-                    f"{row['cpu_ms']:.1f}",
-                ]
-                for row in found
-            ],
-        )
-    )
-    print(
-        format_table(
-            ["recording", "motion from", "HOTA", "MOTA", "IDF1", "switches"],
-            [
-                [
-                    row["recording"],
-                    row["motion"],
-                    *(f"{row[name]:.3f}" for name in SCORES[:3]),
-                    f"{row['id_switches']:.1f}",
-                ]
-                for row in tracked
-            ],
-        )
-    )
-    print(f"written to {options.out}")
-
-
-def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
-    """The arguments."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.camera_motion",
-        description="The camera's motion from pixels: its error, its cost, and its use.",
-    )
-    parser.add_argument("folders", type=Path, nargs="*", metavar="DIR", help="img/ and gt.txt")
-    parser.add_argument("--out", type=Path, default=Path("results/camera_motion"))
-    parser.add_argument("--seed", type=whole(0), default=0)
-    parser.add_argument("--seeds", type=whole(), default=3, help="draws of the detections")
-    parser.add_argument("--frames", type=whole(2), default=300, help="the most of a recording")
-    return parser.parse_args(arguments)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the benchmark; bad input is one line on the error stream and exit status 2."""
-    return exit_status(lambda: run(parse_arguments(arguments)), arguments)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

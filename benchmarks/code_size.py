@@ -8,17 +8,15 @@ its public modules, exports. Arguments of a class are its fields, unless it has 
 """
 
 import ast
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
-from benchmarks.harness import ROOT, command, table
+from benchmarks.harness import ROOT, Folders, command, table
 
 MODULES = ("", "exact", "metrics", "plotting", "smoothing", "tuning", "vision")
 
 
 @command()
-def main(*, checkouts: Annotated[Sequence[Path], "*"] = (ROOT,)) -> None:
+def main(checkouts: Folders = (ROOT,)) -> None:
     """A line for each checkout."""
     rows = []
     for checkout in checkouts:

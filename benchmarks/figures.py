@@ -1,9 +1,9 @@
 """Figures of the papers, and of what the benchmarks measure; no command."""
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -157,11 +157,8 @@ def draw_curves(
     figure = Figure(figsize=(7.0, 3.4), layout="constrained")
     axis = figure.subplots()
     for index, (name, values) in enumerate(curves.items()):
-        frames = first + np.arange(values.shape[1])
-        mean, std = values.mean(axis=0), values.std(axis=0)
-        style = {"color": COLOURS[index], "marker": MARKERS[index], "markevery": (3 * index, 12)}
-        axis.plot(frames, mean, label=name, lw=1.4, ms=5, **style)
-        axis.fill_between(frames, mean - std, mean + std, color=COLOURS[index], alpha=0.15, lw=0)
+        style = {"marker": MARKERS[index], "markevery": (3 * index, 12), "ms": 5}
+        _draw_band(axis, COLOURS[index], name, first, values, values.std(axis=0), **style)
     axis.set(xlabel=xlabel, ylabel=ylabel)
     axis.set_ylim(bottom=0)
     axis.set_title(title, fontsize=10)
@@ -170,43 +167,35 @@ def draw_curves(
     return figure
 
 
+def _draw_band(
+    axis: Axes, colour: str, name: str, first: int, values: np.ndarray, spread: np.ndarray,
+    **style: Any,
+) -> None:  # fmt: skip
+    """The mean over seeds of (seeds, t), and a band about it."""
+    frames, mean = first + np.arange(values.shape[1]), values.mean(axis=0)
+    axis.plot(frames, mean, label=name, lw=1.4, color=colour, **style)
+    axis.fill_between(frames, mean - spread, mean + spread, color=colour, alpha=0.15, lw=0)
+
+
 def draw_errors_by_size(
     panels: Sequence[tuple[str, Mapping[str, Mapping[int, np.ndarray]]]], ylabel: str
 ) -> Figure:
     """Figures 5 and 6 of Lin et al. (2012): errors of several runs against N, two panels a row.
 
-    Each panel has a title and, for each filter by name, the errors of its runs by N. A filter has
-    the same colour in all of them, by its place in the first.
+    Each panel has a title and, for each filter by name, the errors of its runs by N.
     """
-    num_rows = -(-len(panels) // 2)
-    figure = Figure(figsize=(7.8, 2.9 * num_rows + 0.4), layout="constrained")
-    axes = figure.subplots(num_rows, 2, squeeze=False, sharex=True, sharey="row")
-    names = list(panels[0][1])
-    for axis, (title, lines) in zip(axes.ravel(), panels, strict=False):
-        for name, by_size in lines.items():
-            index = names.index(name)
-            sizes = np.array(sorted(by_size))
-            mean = np.array([by_size[size].mean() for size in sizes])
-            error = np.array([standard_error(by_size[size]) for size in sizes])
-            # Shifted a little, so that bars of equal heights do not cover each other.
-            shift = 1 + 0.012 * (index - (len(names) - 1) / 2)
-            axis.errorbar(
-                sizes * shift, mean, error, label=name, color=COLOURS[index],
-                marker=MARKERS[index], ms=5, lw=1.4, capsize=3,
-            )  # fmt: skip
-            axis.set_xticks(sizes)
-        axis.set_yscale("log")
-        axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0)))
-        axis.yaxis.set_major_formatter("{x:g}")
-        axis.yaxis.set_minor_locator(NullLocator())
-        axis.set_title(title, fontsize=10)
-        axis.grid(alpha=0.25)
-    for axis in axes[-1]:
-        axis.set_xlabel("number of particles $N$")
-    for axis in axes[:, 0]:
-        axis.set_ylabel(ylabel)
-    axes[0, -1].legend(fontsize=8)
-    return figure
+
+    def point(size: int, errors: np.ndarray) -> tuple[float, ...]:
+        mean, error = errors.mean(), float(standard_error(errors))
+        return size, mean, mean - error, mean + error
+
+    drawn = [
+        Panel(title, "number of particles $N$", ylabel, {
+            name: [point(*each) for each in by_size.items()] for name, by_size in lines.items()
+        })
+        for title, lines in panels
+    ]  # fmt: skip
+    return draw_panels([drawn[k : k + 2] for k in range(0, len(drawn), 2)], ("linear", "log"))
 
 
 def draw_object_bars(rows: Mapping[str, Sequence[np.ndarray]], titles: Sequence[str]) -> Figure:
@@ -231,35 +220,6 @@ def draw_object_bars(rows: Mapping[str, Sequence[np.ndarray]], titles: Sequence[
         axis.set_title(title, fontsize=9)
     for axis in axes[-1]:
         axis.set_xlabel("object")
-    return figure
-
-
-def draw_rates(
-    lines: Mapping[str, Sequence[tuple[float, float, float, float]]],
-    *,
-    xlabel: str,
-    ylabel: str,
-    title: str,
-) -> Figure:
-    """Named lines of rates, each point (x, rate, low, high) with its interval's ends."""
-    figure = Figure(figsize=(7.0, 3.8), layout="constrained")
-    axis = figure.subplots()
-    places = sorted({point[0] for points in lines.values() for point in points})
-    step = min(np.diff(places), default=1.0)
-    for index, (name, points) in enumerate(lines.items()):
-        x, rate, low, high = np.array(sorted(points)).T
-        # Shifted a little, so that intervals at the same place do not cover each other.
-        x = x + 0.06 * step * (index - (len(lines) - 1) / 2)
-        axis.errorbar(
-            x, rate, np.maximum([rate - low, high - rate], 0), label=name,
-            color=COLOURS[index % len(COLOURS)], marker=MARKERS[index % len(MARKERS)], ms=5,
-            lw=1.2, capsize=3,
-        )  # fmt: skip
-    axis.set_xticks(places)
-    axis.set(xlabel=xlabel, ylabel=ylabel, ylim=(-0.03, 1.03))
-    axis.set_title(title, fontsize=10)
-    axis.grid(alpha=0.25)
-    axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
@@ -313,10 +273,7 @@ def draw_overlaps(panels: Sequence[tuple[str, Mapping[str, np.ndarray], int]]) -
     axes = figure.subplots(len(panels), squeeze=False)[:, 0]
     for axis, (title, curves, first) in zip(axes, panels, strict=True):
         for index, (name, values) in enumerate(curves.items()):
-            frames = first + np.arange(values.shape[1])
-            mean, error = values.mean(axis=0), standard_error(values)
-            axis.plot(frames, mean, label=name, lw=1.4, color=COLOURS[index])
-            axis.fill_between(frames, mean - error, mean + error, color=COLOURS[index], alpha=0.2)
+            _draw_band(axis, COLOURS[index], name, first, values, standard_error(values))
         axis.set(ylabel="overlap", ylim=(0, 1))
         axis.set_title(title, fontsize=10)
         axis.grid(alpha=0.25)
@@ -325,18 +282,38 @@ def draw_overlaps(panels: Sequence[tuple[str, Mapping[str, np.ndarray], int]]) -
     return figure
 
 
-@dataclass(frozen=True)
-class CostPanel:
-    """Named lines of what something costs, each of points (size, cost), on logarithmic axes."""
+class Panel(NamedTuple):
+    """Named lines of points (x, y), or (x, y, low, high) with the ends of an interval.
+
+    - `at`: where a dotted line stands.
+    """
 
     title: str
     xlabel: str
     ylabel: str
-    lines: Mapping[str, Sequence[tuple[float, float]]]
+    lines: Mapping[str, Sequence[Sequence[float]]]
+    ylim: tuple[float, float] | None = None
+    at: float | None = None
 
 
-def draw_costs(rows: Sequence[Sequence[CostPanel]]) -> Figure:
-    """Panels of costs, which share their axis of costs along a row, or else down a column.
+def lines_of(
+    entries: Sequence[Mapping[str, Any]], name: str | Callable[[Any], str], *axes: Any
+) -> dict[str, list[tuple[float, ...]]]:
+    """The lines of a panel: of each name, a point for each entry.
+
+    `name` and `axes`, which are x, y and perhaps low and high, are names of values, or functions.
+    """
+    lines: dict[str, list[tuple[float, ...]]] = {}
+    for entry in entries:
+        line, *point = (each(entry) if callable(each) else entry[each] for each in (name, *axes))
+        lines.setdefault(line, []).append(tuple(point))
+    return lines
+
+
+def draw_panels(
+    rows: Sequence[Sequence[Panel]], scales: tuple[str, str] = ("log", "log")
+) -> Figure:
+    """Panels, which share their second axis along a row, or else down a column.
 
     A name has the same colour and marker in all of them.
     """
@@ -349,8 +326,7 @@ def draw_costs(rows: Sequence[Sequence[CostPanel]]) -> Figure:
         for axis in row_axes[len(row) :]:
             axis.set_axis_off()
         for axis, panel in zip(row_axes, row, strict=False):
-            _draw_cost_panel(axis, panel, names)
-            _set_cost_ticks(axis)
+            _draw_panel(axis, panel, names, scales)
     handles = {
         label: handle
         for axis in axes.ravel()
@@ -365,32 +341,44 @@ def draw_costs(rows: Sequence[Sequence[CostPanel]]) -> Figure:
     return figure
 
 
-def _draw_cost_panel(axis: Axes, panel: CostPanel, names: Sequence[str]) -> None:
-    sizes = set()
+def _draw_panel(axis: Axes, panel: Panel, names: Sequence[str], scales: tuple[str, str]) -> None:
+    ticks = sorted({point[0] for points in panel.lines.values() for point in points})
+    step = min(np.diff(ticks), default=1.0)
+    if panel.at is not None:
+        axis.axvline(panel.at, color="0.6", ls=":", lw=1.2)
     for name, points in panel.lines.items():
         index = names.index(name)
-        x, y = np.array(sorted(points)).T
-        axis.plot(
-            x, y, label=name, lw=1.4, ms=5, color=COLOURS[index % len(COLOURS)],
-            marker=MARKERS[index % len(MARKERS)],
-        )  # fmt: skip
-        sizes |= set(x.tolist())
-    axis.set(xscale="log", yscale="log", xlabel=panel.xlabel, ylabel=panel.ylabel)
+        style: dict[str, Any] = {
+            "label": name, "color": COLOURS[index % len(COLOURS)], "lw": 1.4, "ms": 5,
+            "marker": MARKERS[index % len(MARKERS)],
+        }  # fmt: skip
+        x, y, *ends = np.array(sorted(points)).T
+        if ends:
+            # Shifted a little, so that intervals at the same place do not cover each other.
+            x = x + 0.06 * step * (index - (len(names) - 1) / 2)
+            reach = np.maximum([y - ends[0], ends[1] - y], 0)
+            axis.errorbar(x, y, reach, capsize=3, **style)
+        else:
+            axis.plot(x, y, **style)
+    axis.set(xscale=scales[0], yscale=scales[1], xlabel=panel.xlabel, ylabel=panel.ylabel)
     axis.set_title(panel.title, fontsize=10)
-    ticks = sorted(sizes)
     if len(ticks) <= _MOST_TICKS:
-        labels = [f"{tick:,.0f}".replace(",", "\u2009") for tick in ticks]
+        whole = [f"{tick:,.0f}".replace(",", "\u2009") for tick in ticks]
+        labels = [
+            name if tick == int(tick) else f"{tick:g}"
+            for name, tick in zip(whole, ticks, strict=True)
+        ]
         axis.set_xticks(ticks, labels, fontsize=8)
     else:  # times, of which every point has its own
         axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
         axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_locator(NullLocator())
+    if panel.ylim is not None:
+        axis.set_ylim(panel.ylim)
+    if scales[1] == "log":  # ticks at every decade, and between where there are few of them
+        low, high = axis.get_ylim()
+        subs = (1.0,) if high > 1000 * low else (1.0, 2.0, 5.0)
+        axis.yaxis.set_major_locator(LogLocator(subs=subs))
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_locator(NullLocator())
     axis.grid(alpha=0.25)
-
-
-def _set_cost_ticks(axis: Axes) -> None:
-    """Ticks at every decade, and between where there are few of them."""
-    low, high = axis.get_ylim()
-    axis.yaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 1000 * low else (1.0, 2.0, 5.0)))
-    axis.yaxis.set_major_formatter("{x:g}")
-    axis.yaxis.set_minor_locator(NullLocator())

@@ -24,7 +24,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from functools import wraps
+from functools import partial, wraps
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
@@ -45,6 +45,8 @@ AtLeast2 = Annotated[int, console.whole(2)]
 Natural = Annotated[int, console.whole(0)]
 Seed = Annotated[int, console.seed]
 Positive = Annotated[float, console.positive]
+Form = str | Callable[[Any], str]  # of a cell in a table, from what an entry holds
+Folders = Annotated[Sequence[Path], "*"]
 
 
 class _Help(argparse.RawDescriptionHelpFormatter, argparse.ArgumentDefaultsHelpFormatter):
@@ -58,10 +60,11 @@ def command(**quick: Any) -> Callable[[Callable[..., Any]], Callable[..., int]]:
     """Make a `main` of a function: it reads the options and calls the function with them.
 
     A type may be `Annotated` with what reads its text, such as `Count`, or with the names to choose
-    from. A sequence takes one or more, one annotated with "*" any number, a tuple as many as it
-    has. `quick`: the options that --quick sets; a function with an argument `quick` is told of it
-    as well. `main` returns what the function does, or the status of an error: 2 with one line for a
-    `ValueError` or a missing file, 130 for an interruption.
+    from. A sequence takes one or more, one annotated with "*" any number, one with "append" one for
+    each time that the option is given, a tuple as many as it has. An argument that is not for
+    keywords alone has no flag. `quick`: the options that --quick sets; a function with an argument
+    `quick` is told of it as well. `main` returns what the function does, or the status of an error:
+    2 with one line for a `ValueError` or a missing file, 130 for an interruption.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., int]:
@@ -91,7 +94,8 @@ def _parser(function: Callable[..., Any]) -> argparse.ArgumentParser:
     hints = get_type_hints(function, include_extras=True)
     for name, given in inspect.signature(function).parameters.items():
         if name != "quick":
-            flag = name if name == "checkouts" else f"--{name.replace('_', '-')}"
+            has_flag = given.kind is inspect.Parameter.KEYWORD_ONLY
+            flag = f"--{name.replace('_', '-')}" if has_flag else name
             parser.add_argument(flag, **_option(name, hints[name], given.default, function))
     parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
     return parser
@@ -119,6 +123,8 @@ def _option(name: str, hint: Any, default: Any, function: Callable[..., Any]) ->
     metadata = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
     if "*" in metadata:
         told["nargs"], hint = "*", get_args(hint)[0]
+    if "append" in metadata:
+        return told | {"action": "append", "metavar": "TEXT"}
     if get_origin(hint) in (Sequence, tuple):
         kinds = get_args(hint)
         told.setdefault("nargs", len(kinds) if get_origin(hint) is tuple else "+")
@@ -257,20 +263,36 @@ def table(columns: Mapping[str, Any] | None, entries: Sequence[Mapping[str, Any]
     value stands under its name, numbers with three digits.
     """
 
-    def shown(value: Any) -> str:
-        return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-    def cell(form: str | Callable[[Any], str], entry: Mapping) -> str:
-        try:
-            return form(entry) if callable(form) else form.format_map(entry)
-        except (KeyError, TypeError):
-            return "-"
-
-    columns = columns or {
-        name: lambda entry, name=name: shown(entry[name]) for name in dict.fromkeys(entries[0])
-    }
-    rows = [[cell(form, entry) for form in columns.values()] for entry in entries]
+    columns = columns or {name: partial(_shown, name) for name in dict.fromkeys(entries[0])}
+    rows = [[_cell(form, entry) for form in columns.values()] for entry in entries]
     return format_table(list(columns), rows)
+
+
+def pivot(
+    title: str, entries: Sequence[Mapping[str, Any]], row: Form, column: Form, cell: Form
+) -> str:
+    """A table with a line for each `row` of the entries, and a column for each of their `column`.
+
+    All three are as the columns of `table`; where there is no such entry, there is a dash.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for entry in entries:
+        found.setdefault(_cell(row, entry), {})[_cell(column, entry)] = _cell(cell, entry)
+    names = dict.fromkeys(name for cells in found.values() for name in cells)
+    rows = [[name, *(cells.get(each, "-") for each in names)] for name, cells in found.items()]
+    return format_table([title, *names], rows)
+
+
+def _shown(name: str, entry: Mapping[str, Any]) -> str:
+    value = entry[name]
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _cell(form: Form, entry: Mapping[str, Any]) -> str:
+    try:
+        return form(entry) if callable(form) else form.format_map(entry)
+    except (KeyError, TypeError):
+        return "-"
 
 
 def settings_of(options: Mapping[str, Any], **more: Any) -> dict[str, Any]:

@@ -37,7 +37,7 @@ from benchmarks.harness import (
     table,
     turns,
 )  # fmt: skip
-from benchmarks.peers.worker import Worker, stop_all
+from benchmarks.peers.worker import Worker, library_at_work, stop_all
 from mpfjax.operations.compiling import cpu_options
 from mpfjax.running.islands import IslandInteraction
 
@@ -282,17 +282,14 @@ def draw(results: list[dict[str, Any]]) -> Any:
     """A column for each axis, time above memory, a line for each filter."""
 
     def panel(axis: str, label: str, cost: Callable[[dict[str, Any]], float]) -> Any:
-        lines: dict[str, list[tuple[float, float]]] = {}
-        for entry in results:
-            if entry["axis"] == axis:
-                points = lines.setdefault(FILTERS[entry["filter"]], [])
-                points.append((entry[axis], cost(entry)))
-        return plotting.CostPanel("", AXES[axis], label, lines)
+        own = [entry for entry in results if entry["axis"] == axis]
+        lines = plotting.lines_of(own, lambda e: FILTERS[e["filter"]], axis, cost)
+        return plotting.Panel("", AXES[axis], label, lines)
 
     axes = list(dict.fromkeys(entry["axis"] for entry in results))
     times = [panel(axis, "time of all runs [ms]", lambda e: 1000 * e["median"]) for axis in axes]
     memory = [panel(axis, "memory [MB]", lambda e: e["bytes"] / 1e6) for axis in axes]
-    return plotting.draw_costs([times, memory])
+    return plotting.draw_panels([times, memory])
 
 
 # --- a mixture's price --------------------------------------------------------------------------
@@ -406,11 +403,14 @@ def spread_over(
 def start_group(kind: str, number: int) -> list[Worker]:
     """One process with so many devices, or so many processes with one device each."""
     if kind == "devices":
-        return [Worker("mpfjax", "quadratic", number)]
+        return [Worker(library_at_work, "mpfjax", "quadratic", number)]
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         address = f"localhost:{probe.getsockname()[1]}"
-    return [Worker("mpfjax", "quadratic", 1, (address, number, index)) for index in range(number)]
+    return [
+        Worker(library_at_work, "mpfjax", "quadratic", 1, (address, number, index))
+        for index in range(number)
+    ]
 
 
 def _answers(workers: list[Worker]) -> list[dict[str, Any]]:

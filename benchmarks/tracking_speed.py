@@ -10,31 +10,29 @@ not; nothing is written. The first round compiles and is not counted. `frames/s`
 round. Into --out DIR goes tracking_speed.json.
 """
 
-import argparse
-import multiprocessing
-import os
-import platform
-import sys
+import itertools
 import warnings
-from collections.abc import Callable, Iterator
-from multiprocessing.connection import Connection
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-import mpfjax
-from mpfjax.console import Clock, exit_status, format_table, peak_memory, whole, write_json
+from benchmarks.harness import Count, command, data, settings_of, table
+from benchmarks.peers.worker import Worker, stop_all
+from mpfjax.console import Clock, peak_memory
+from mpfjax.vision import BackgroundSubtraction, ObjectTracker, track
 from mpfjax.vision.tracking.adapters import LEAST_ROOM
-from mpfjax.vision.tracking.background import BackgroundSubtraction
-from mpfjax.vision.tracking.track import track
-from mpfjax.vision.tracking.tracker import ObjectTracker
 
 FEW, MORE, CROWD = (3, 8), (6, 10), (10, 15)  # rows and columns of objects
 BOX = 100 / 240, 250 / 360  # as shares of an object's field
 LARGE, SMALL = (1080, 1920), (288, 384)
 ERROR = 0.02  # of a detection, in boxes
+COLUMNS = {
+    "": "{way}", "detect [ms]": "{detect_ms:.2f}", "track [ms]": "{track_ms:.2f}",
+    "frames/s": "{frames_per_second:.0f}", "median": "{median_frames_per_second:.0f}",
+    "x small": "{times_small:.2f}", "objects": "{objects}", "MB": "{peak_memory_mb:.0f}",
+}  # fmt: skip
 
 
 class Way(NamedTuple):
@@ -69,6 +67,22 @@ WAYS = (
 )
 
 
+@command(frames=1, rounds=1)
+def main(
+    *, frames: Count = 20, rounds: Count = 30, out: Path = Path("results/tracking_speed")
+) -> None:
+    """Round after round of each way; then the table.
+
+    - `frames`: in a round.
+    - `rounds`: of each way, in turns.
+    """
+    settings, found = settings_of(locals()), in_turns(WAYS, frames, rounds)
+    rows = [summary(way, found[way], found[WAYS[1]]) for way in WAYS]
+    print(table(COLUMNS, rows))
+    data(out / "tracking_speed.json", settings=settings, rows=rows)
+    print(f"results: {out}/")
+
+
 class Street:
     """A video of so many objects, each of which walks to and fro in a field of its own."""
 
@@ -84,9 +98,8 @@ class Street:
         blocks = generator.integers(90, 130, (height // 12 + 1, width // 12 + 1, 3))
         self.background = blocks.repeat(12, 0).repeat(12, 1)[:height, :width].astype(np.uint8)
         # Dark or bright clothes before a middling background, from head to foot.
-        self.clothes = generator.choice([10, 40, 200, 240], (len(self.centres), 6, 3)).astype(
-            np.uint8
-        )
+        colours = generator.choice([10, 40, 200, 240], (len(self.centres), 6, 3))
+        self.clothes = colours.astype(np.uint8)
 
     def boxes(self, t: int) -> np.ndarray:
         """(x, y, w, h) of each object, whole pixels."""
@@ -117,11 +130,11 @@ class Timed:
         street = Street(*(way.size or LARGE), way.fields)
         frames = None
         if way.size is not None:
-            frames = self.clock.over("read", map(street.frame, _count()))
+            frames = self.clock.over("read", map(street.frame, itertools.count()))
         if way.detect:
             detections: Any = self._detecting(BackgroundSubtraction())
         else:
-            detections = self.clock.over("read", map(street.detected, _count()))
+            detections = self.clock.over("read", map(street.detected, itertools.count()))
         tracker = ObjectTracker(way.room)
         tracked = track(frames, detections, tracker, camera_motion=way.motion)
         self.tracked = self.clock.over("track", tracked)
@@ -147,138 +160,54 @@ class Timed:
         }
 
 
-def _count() -> Iterator[int]:
-    t = 0
-    while True:
-        yield t
-        t += 1
-
-
-def serve(way: Way, pipe: Connection) -> None:
-    """A process's end: a round for each number of frames that is asked for, until None."""
+def at_work(way: Way) -> tuple[dict[str, Any], Callable[..., dict[str, Any]]]:
+    """What a process does: a round for each number of frames that is asked for."""
     # Background subtraction finds parts of objects as well, more than there is room for.
     warnings.simplefilter("ignore", RuntimeWarning)
-    timed = Timed(way)
-    while (num_frames := pipe.recv()) is not None:
-        pipe.send(timed.round(num_frames))
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Time every way, print a table, and write the results."""
-    options = parse(arguments)
-    return exit_status(lambda: run(options), arguments)
-
-
-def parse(arguments: list[str] | None) -> argparse.Namespace:
-    """The options, or a message that names the one that cannot be run."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.tracking_speed")
-    parser.add_argument("--frames", type=whole(), default=20, help="frames in a round")
-    parser.add_argument("--rounds", type=whole(), default=30, help="rounds of each way, in turns")
-    parser.add_argument("--out", default="results/tracking_speed", metavar="DIR")
-    return parser.parse_args(arguments)
-
-
-def run(options: argparse.Namespace) -> None:
-    """Round after round of each way; then the table."""
-    rounds = in_turns(WAYS, options.frames, options.rounds)
-    results = [summary(way, rounds[way], rounds[WAYS[1]]) for way in WAYS]
-    print(table(results))
-    out = Path(options.out)
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "tracking_speed.json", {"settings": settings_of(options), "rows": results})
-    print(f"results: {out}/")
+    return {}, Timed(way).round
 
 
 def in_turns(
-    ways: tuple[Way, ...], num_frames: int, num_rounds: int
+    ways: Sequence[Way], num_frames: int, num_rounds: int
 ) -> dict[Way, list[dict[str, Any]]]:
     """What each round of each way took, the first of them left out."""
-    context = multiprocessing.get_context("spawn")
-    pipes: dict[Way, Any] = {}
-    processes = []
-    for way in ways:
-        pipes[way], end = context.Pipe()
-        processes.append(context.Process(target=serve, args=(way, end), daemon=True))
-        processes[-1].start()
-        end.close()  # or nobody would hear of it where the process ends
+    workers = {way: Worker(at_work, way) for way in ways}
     rounds: dict[Way, list[dict[str, Any]]] = {way: [] for way in ways}
     try:
-        for number in range(1 + num_rounds):
-            for way, pipe in pipes.items():
-                pipe.send(num_frames)
-                found = _answer(pipe, way)
-                if number > 0:
+        for number in range(2 + num_rounds):  # to say that they are there, to compile, and those
+            for way, worker in workers.items():
+                found = worker.run(num_frames=num_frames) if number else worker.answer()
+                if "error" in found:
+                    raise ValueError(f"{way.name}: {found['error']}")
+                if number > 1:
                     rounds[way].append(found)
-        for pipe in pipes.values():
-            pipe.send(None)
     finally:
-        for process in processes:
-            process.join(timeout=10)
-            process.kill()
+        stop_all(workers.values())
     return rounds
-
-
-def _answer(pipe: Connection, way: Way) -> dict[str, Any]:
-    try:
-        return pipe.recv()
-    except (EOFError, ConnectionError) as error:
-        raise ValueError(f"{way.name}: its process ended before its time") from error
 
 
 def summary(
     way: Way, rounds: list[dict[str, Any]], rounds_of_small: list[dict[str, Any]]
 ) -> dict[str, Any]:
     """The best round, the memory, and the time as a multiple of that in small frames."""
-    best = min(rounds, key=_milliseconds)
-    ratio = _milliseconds(best) / min(map(_milliseconds, rounds_of_small))
+    best = min(rounds, key=milliseconds)
+    ratio = milliseconds(best) / min(map(milliseconds, rounds_of_small))
     return {
         "way": way.name,
         "detect_ms": round(best["detect_ms"], 3),
         "track_ms": round(best["track_ms"], 3),
-        "frames_per_second": round(1e3 / _milliseconds(best), 1),
-        "median_frames_per_second": round(1e3 / np.median([*map(_milliseconds, rounds)]), 1),
+        "frames_per_second": round(1e3 / milliseconds(best), 1),
+        "median_frames_per_second": round(1e3 / np.median([*map(milliseconds, rounds)]), 1),
         "times_small": round(ratio, 3),
         "objects": rounds[-1]["objects"],
         "peak_memory_mb": round(max(found["peak_memory_mb"] for found in rounds), 1),
     }
 
 
-def _milliseconds(found: dict[str, Any]) -> float:
+def milliseconds(found: dict[str, Any]) -> float:
+    """Of a frame in a round."""
     return found["detect_ms"] + found["track_ms"]
 
 
-def table(results: list[dict[str, Any]]) -> str:
-    """The results as text."""
-    header = ["", "detect [ms]", "track [ms]", "frames/s", "median", "x small", "objects", "MB"]
-    return format_table(
-        header,
-        [
-            [
-                row["way"],
-                f"{row['detect_ms']:.2f}",
-                f"{row['track_ms']:.2f}",
-                f"{row['frames_per_second']:.0f}",
-                f"{row['median_frames_per_second']:.0f}",
-                f"{row['times_small']:.2f}",
-                str(row["objects"]),
-                f"{row['peak_memory_mb']:.0f}",
-            ]
-            for row in results
-        ],
-    )
-
-
-def settings_of(options: argparse.Namespace) -> dict[str, Any]:
-    """What a second run needs to be the same, and the machine."""
-    return {
-        "frames": options.frames,
-        "rounds": options.rounds,
-        "jax": jax.__version__,
-        "mpfjax": mpfjax.__version__,
-        "machine": platform.machine(),
-        "processors": os.cpu_count(),
-    }
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

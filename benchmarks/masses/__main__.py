@@ -223,16 +223,15 @@ def summary(found: Found, known: Known, region: int) -> dict[str, float]:
 def picture(rows: list[dict[str, Any]]) -> Any:
     """For each scene the error of masses, and of log Ẑ beside it, against the time of a step."""
 
-    def panel(scene: str, what: str, label: str) -> Any:
-        lines: dict[str, list[tuple[float, float]]] = {}
-        for row in rows:
-            if row["scene"] == scene and row["filter"] not in _IN_THE_TABLE_ONLY:
-                lines.setdefault(row["filter"], []).append((row["ms"], row[what]))
-        return plotting.CostPanel(scene, "milliseconds a step", label, lines)
+    def panel(scene: str, what: str, label: str) -> plotting.Panel:
+        own = [row for row in rows if row["scene"] == scene]
+        shown = [row for row in own if row["filter"] not in _IN_THE_TABLE_ONLY]
+        lines = plotting.lines_of(shown, "filter", "ms", what)
+        return plotting.Panel(scene, "milliseconds a step", label, lines)
 
     measures = {"mass_rmse": "RMS error of masses", "log_z_sd": "sd of log Ẑ"}
     scenes = dict.fromkeys(row["scene"] for row in rows)
-    return plotting.draw_costs(
+    return plotting.draw_panels(
         [[panel(scene, what, label) for what, label in measures.items()] for scene in scenes]
     )
 

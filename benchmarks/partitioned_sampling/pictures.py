@@ -69,18 +69,16 @@ def draw_recovery(content: dict[str, Any]) -> Any:
     """The hard object's recovery rate by every filter against λ, means over scenes."""
     (table,) = [name for name in content["means"] if name != "1"]
     ends: dict[str | None, str] = {None: "", "mean": ", mean of orders", "worst": ", worst order"}
-    lines: dict[str, list[tuple[float, float, float, float]]] = {}
-    for entry in content["means"][table]:
-        if entry["order"] in ends:
-            name = str(TITLES.get(entry["method"], entry["method"])) + ends[entry["order"]]
-            point = (entry["lambda"], entry["recovery"], *entry["recovery_interval"])
-            lines.setdefault(name, []).append(point)
+    lines = plotting.lines_of(
+        [entry for entry in content["means"][table] if entry["order"] in ends],
+        lambda entry: str(TITLES.get(entry["method"], entry["method"])) + ends[entry["order"]],
+        "lambda", "recovery", *(lambda e, i=i: e["recovery_interval"][i] for i in (0, 1)),
+    )  # fmt: skip
     num = len(content["scenes"])
     what = f"mean of {num} scenes" if num > 1 else content["scenes"][0]["source"]
-    return plotting.draw_rates(
-        lines, xlabel=r"$\lambda$", ylabel="recovery rate",
-        title=f"the distracted or hidden object, {what}, 95% intervals",
-    )  # fmt: skip
+    title = f"the distracted or hidden object, {what}, 95% intervals"
+    panel = plotting.Panel(title, r"$\lambda$", "recovery rate", lines, (-0.03, 1.03))
+    return plotting.draw_panels([[panel]], ("linear", "linear"))
 
 
 def pair_of_runs(

@@ -1,11 +1,9 @@
 """What tables 1 and 2 hang on: the size of objects, the distracter's speed, the momentum."""
 
 from collections.abc import Sequence
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks import figures as plotting
@@ -120,34 +118,17 @@ def draw_sensitivity(entries: Sequence[dict[str, Any]], chosen: dict[str, Any]) 
     `entries` hold `axis`, `value`, `filter` and the rates with intervals; `chosen` is the value
     of each axis in the tables, at the dotted line.
     """
-    shown = [name for name in chosen if any(entry["axis"] == name for entry in entries)]
-    panels = (
+    rows = (
         ("recovery", "recovery of object 1", (-0.03, 1.03)),
         ("precision", "precision of objects 2-7", (0.5, 1.0)),
     )
-    figure = Figure(figsize=(3.4 * len(shown), 5.4), layout="constrained")
-    axes = figure.subplots(len(panels), len(shown), squeeze=False, sharex="col", sharey="row")
-    for (column, name), (row, (rate, label, limits)) in product(
-        enumerate(shown), enumerate(panels)
-    ):
-        axis, own = axes[row, column], [entry for entry in entries if entry["axis"] == name]
-        places = sorted({entry["value"] for entry in own})
-        step = min(np.diff(places), default=1.0)
-        axis.axvline(chosen[name], color="0.6", ls=":", lw=1.2)
-        for index, filter in enumerate(FILTERS.values()):
-            points = [
-                (e["value"], e[rate], *e[f"{rate}_interval"]) for e in own if e["filter"] == filter
-            ]
-            x, y, low, high = np.array(sorted(points)).reshape(-1, 4).T
-            axis.errorbar(
-                x + 0.06 * step * (index - 1), y, np.maximum([y - low, high - y], 0), label=filter,
-                color=plotting.COLOURS[index], marker=plotting.MARKERS[index], ms=5, lw=1.3,
-                capsize=3,
-            )  # fmt: skip
-        axis.set(
-            xticks=places, ylim=limits, xlabel=name if row else "", ylabel="" if column else label
-        )
-        axis.grid(alpha=0.25)
-    handles, names = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=len(names), fontsize=9)
-    return figure
+
+    def panel(name: str, rate: str, label: str, limits: tuple[float, float]) -> plotting.Panel:
+        own = [entry for entry in entries if entry["axis"] == name]
+        ends = (lambda e, i=i: e[f"{rate}_interval"][i] for i in (0, 1))
+        lines = plotting.lines_of(own, "filter", "value", rate, *ends)
+        return plotting.Panel("", name, label, lines, limits, chosen[name])
+
+    shown = [name for name in chosen if any(entry["axis"] == name for entry in entries)]
+    panels = [[panel(name, *row) for name in shown] for row in rows]
+    return plotting.draw_panels(panels, ("linear", "linear"))

@@ -33,7 +33,7 @@ from benchmarks.harness import (
 )  # fmt: skip
 from benchmarks.peers.jobs import JOBS, Job, Quadratic
 from benchmarks.peers.libraries import LIBRARIES, model_of
-from benchmarks.peers.worker import Worker, stop_all
+from benchmarks.peers.worker import Worker, library_at_work, stop_all
 from mpfjax.console import whole
 from mpfjax.exact import grid_filter, kalman_filter
 
@@ -116,8 +116,8 @@ def chosen_libraries(skip: Sequence[str], num_devices: int) -> list[str]:
 def start(name: str, job: str, num_devices: int) -> Worker:
     """The process of a library; those of all start side by side."""
     if name == ON_DEVICES:
-        return Worker("mpfjax", job, num_devices)
-    return Worker(name, job, num_devices=1 if name == "mpfjax" else None)
+        return Worker(library_at_work, "mpfjax", job, num_devices)
+    return Worker(library_at_work, name, job, 1 if name == "mpfjax" else None)
 
 
 def exact_log_likelihood(job: Job) -> float:
@@ -254,26 +254,20 @@ def _start(entry: Mapping[str, Any]) -> str:
 def draw(results: list[dict[str, Any]], labels: Mapping[str, str]) -> Any:
     """Time against N, a panel for each job and a line for each library; particles' faster mode."""
     panels = []
-    for job_name in dict.fromkeys(entry["job"] for entry in results):
+    for name in dict.fromkeys(entry["job"] for entry in results):
         lines: dict[str, dict[float, float]] = {}
         for entry in results:
-            if entry["job"] != job_name or entry["median"] is None:
-                continue
-            # The two modes have one line.
-            name = entry["library"]
-            label = "particles" if name.startswith("particles") else labels[name]
-            line, size = lines.setdefault(label, {}), entry["particles"]
-            line[size] = min(1000 * entry["median"], line.get(size, np.inf))
-        job = JOBS[job_name]
-        panels.append(
-            plotting.CostPanel(
-                f"{job.title}, {job.num_steps} steps",
-                "number of particles $N$",
-                "time of all runs [ms]",
-                {label: list(line.items()) for label, line in lines.items()},
-            )
-        )
-    return plotting.draw_costs([panels])
+            if entry["job"] == name and entry["median"] is not None:
+                # The two modes have one line.
+                library = entry["library"].removesuffix("_2")
+                label = "particles" if library == "particles" else labels[library]
+                line, size = lines.setdefault(label, {}), entry["particles"]
+                line[size] = min(1000 * entry["median"], line.get(size, np.inf))
+        title = f"{JOBS[name].title}, {JOBS[name].num_steps} steps"
+        points = {label: list(line.items()) for label, line in lines.items()}
+        axes = "number of particles $N$", "time of all runs [ms]"
+        panels.append(plotting.Panel(title, *axes, points))
+    return plotting.draw_panels([panels])
 
 
 if __name__ == "__main__":

@@ -1,89 +1,68 @@
-"""A library at work in a process of its own: asked and answering in lines of JSON.
+"""Work in a process of its own: so that its peak memory is its own, a device count can be chosen,
+and what breaks one library leaves the others alone.
 
-So a library's peak memory is its own, a device count can be chosen, and what breaks one library
-leaves the others alone. `Worker` is the parent's end; run as a module, this is the child's.
+`Worker` is the parent's end. The other end is a function of the arguments that says what there is,
+and hands over the function that does what it is asked for.
 """
 
-import argparse
 import contextlib
-import json
+import multiprocessing
 import os
-import select
-import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from benchmarks.peers.jobs import JOBS
 
-ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 10.0
+Made = tuple[dict[str, Any], Callable[..., dict[str, Any]]]
 
 
 class Worker:
-    """A process that runs one library on one job, whenever it is asked to.
+    """A process in which `make(*arguments)` works; its first answer is what `make` says of it."""
 
-    `num_devices` host devices where it is given; `processes` is (address of process 0, how many
-    processes, which one this is) where several work together.
-    """
-
-    def __init__(
-        self,
-        library: str,
-        job: str,
-        num_devices: int | None = None,
-        processes: tuple[str, int, int] | None = None,
-    ) -> None:
-        command = [sys.executable, "-m", "benchmarks.peers.worker", library, job]
-        if num_devices is not None:
-            command += ["--devices", str(num_devices)]
-        if processes is not None:
-            command += ["--processes", *map(str, processes)]
-        paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-        self._process: Any = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
-        )  # fmt: skip
+    def __init__(self, make: Callable[..., Made], *arguments: Any) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, end = context.Pipe()
+        self._process = context.Process(target=_serve, args=(end, make, arguments))
+        self._process.start()
+        end.close()  # or nobody would hear of it where the process ends
 
     def ask(self, **request: Any) -> None:
-        """Have it run the job once with these `particles`, `seeds` and `seed`."""
-        with contextlib.suppress(BrokenPipeError):  # what is wrong with it, `answer` finds out
-            self._process.stdin.write(json.dumps(request) + "\n")
-            self._process.stdin.flush()
+        """Have it work once on this."""
+        with contextlib.suppress(OSError):  # what is wrong with it, `answer` finds out
+            self._pipe.send(request)
 
-    def answer(self, time_limit: float) -> dict[str, Any]:
+    def answer(self, time_limit: float | None = None) -> dict[str, Any]:
         """What it found, or {"error": why it did not}; after an error it has ended."""
-        pipe = self._process.stdout
-        if not select.select([pipe], [], [], time_limit)[0]:
-            self.stop()
-            return {"error": f"no answer within {time_limit:g} s"}
-        line = pipe.readline()
-        if not line:
-            return {"error": f"its process ended with status {self._process.wait()}"}
-        return json.loads(line)
+        try:
+            if self._pipe.poll(time_limit):
+                return self._pipe.recv()
+        except (EOFError, OSError):
+            self._process.join(PATIENCE)
+            return {"error": f"its process ended with status {self._process.exitcode}"}
+        self.stop()
+        return {"error": f"no answer within {time_limit:g} s"}
 
-    def run(self, time_limit: float, **request: Any) -> dict[str, Any]:
+    def run(self, time_limit: float | None = None, **request: Any) -> dict[str, Any]:
         """Ask, and wait for the answer."""
         self.ask(**request)
         return self.answer(time_limit)
 
     def dismiss(self) -> None:
         """Tell it that there is no more to do; it may wait for others to be told as well."""
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.close()
+        with contextlib.suppress(OSError):
+            self._pipe.send(None)
 
     def stop(self, patience: float = 0.0) -> None:
         """End the process, whatever it is at, if it has not ended on its own by then."""
         self.dismiss()
-        try:
-            self._process.wait(patience)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._process.stdout.close()
+        self._process.join(patience)
+        self._process.kill()
+        self._process.join()
 
 
 def stop_all(workers: Iterable[Worker]) -> None:
@@ -95,71 +74,64 @@ def stop_all(workers: Iterable[Worker]) -> None:
         worker.stop(PATIENCE)
 
 
-def main() -> None:
-    """Say what there is, then run what is asked for until no more is."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.peers.worker")
-    parser.add_argument("library")
-    parser.add_argument("job", choices=list(JOBS))
-    parser.add_argument("--devices", type=int)
-    parser.add_argument("--processes", nargs=3, metavar=("ADDRESS", "NUMBER", "INDEX"))
-    options = parser.parse_args()
-    # Answers go out on a descriptor of their own: what libraries print is no answer.
-    channel = os.fdopen(os.dup(1), "w")
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-
-    def reply(content: dict[str, Any]) -> None:
-        channel.write(json.dumps(content) + "\n")
-        channel.flush()
-
-    reply(introduce(options))
-    before = peak_memory()
-    prepared: dict[tuple[int, int], Any] = {}
-    for line in sys.stdin:
-        request = json.loads(line)
-        try:
-            reply(answer(options, request, prepared) | {"memory": peak_memory() - before})
-        except Exception as error:
-            reply({"error": f"{type(error).__name__}: {error}"})
-            return
+def _serve(pipe: Any, make: Callable[..., Made], arguments: tuple[Any, ...]) -> None:
+    """The process's end: what is asked for, until no more is."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # libraries print what nobody wants to read
+    try:
+        told, work = make(*arguments)
+        pipe.send(told)
+        while (request := pipe.recv()) is not None:
+            pipe.send(work(**request))
+    except Exception as error:
+        pipe.send({"error": f"{type(error).__name__}: {error}"})
 
 
-def introduce(options: argparse.Namespace) -> dict[str, Any]:
-    """Versions and devices; imports what the library needs, so that jobs are not charged for it."""
+def library_at_work(
+    library: str,
+    job: str,
+    num_devices: int | None = None,
+    processes: tuple[str, int, int] | None = None,
+) -> Made:
+    """A library on one job: versions and devices, and what runs the job.
+
+    `processes`: (address of process 0, how many processes, which one this is), where several work
+    together. Imports what the library needs, so that jobs are not charged for it.
+    """
     from benchmarks.peers import libraries
 
-    name = options.library.removesuffix("_2")
-    found: dict[str, Any] = {"version": metadata.version(name)}
+    name = library.removesuffix("_2")
+    told: dict[str, Any] = {"version": metadata.version(name)}
     if name != "particles":
         import jax
 
-        if options.devices is not None:
-            jax.config.update("jax_num_cpu_devices", options.devices)
-        if options.processes is not None:
-            address, number, index = options.processes
-            jax.distributed.initialize(address, int(number), int(index))
-        found["devices"] = [device.device_kind for device in jax.devices()]
-    libraries.prepare(options.library, JOBS[options.job], 2, 2)
-    return found
+        if num_devices is not None:
+            jax.config.update("jax_num_cpu_devices", num_devices)
+        if processes is not None:
+            jax.distributed.initialize(*processes)
+        told["devices"] = [device.device_kind for device in jax.devices()]
+    libraries.prepare(library, JOBS[job], 2, 2)
+    before = peak_memory()
+    prepared: dict[tuple[int, int], Any] = {}
+
+    def work(particles: int, seeds: int, seed: int) -> dict[str, Any]:
+        size = particles, seeds
+        if size not in prepared:
+            prepared[size] = libraries.prepare(library, JOBS[job], *size)
+        return timed(prepared[size], JOBS[job], seeds, seed) | {"memory": peak_memory() - before}
+
+    return told, work
 
 
-def answer(
-    options: argparse.Namespace, request: dict[str, Any], prepared: dict[tuple[int, int], Any]
-) -> dict[str, Any]:
+def timed(prepared: Any, job: Any, num_seeds: int, seed: int) -> dict[str, Any]:
     """Seconds of one run of the job, and what came out of it for each seed."""
     import numpy as np
 
-    from benchmarks.peers import libraries
-
-    job = JOBS[options.job]
-    size = request["particles"], request["seeds"]
-    if size not in prepared:
-        prepared[size] = libraries.prepare(options.library, job, *size)
-    given = prepared[size].make_input(request["seed"])
+    given = prepared.make_input(seed)
     start = time.perf_counter()
-    result = prepared[size].run(given)
+    result = prepared.run(given)
     seconds = time.perf_counter() - start
     means, sizes, log_likelihoods = (np.asarray(value, float) for value in result)
-    expected = (request["seeds"], job.num_steps)
+    expected = (num_seeds, job.num_steps)
     shapes = (means.shape, sizes.shape, log_likelihoods.shape)
     if shapes != ((*expected, *job.state_shape), expected, expected[:1]):
         raise ValueError(f"results of shapes {shapes}")
@@ -183,7 +155,3 @@ def peak_memory() -> int:
 
         unit = 1 if sys.platform == "darwin" else 1024
         return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
-if __name__ == "__main__":
-    main()

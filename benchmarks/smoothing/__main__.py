@@ -232,15 +232,15 @@ def accuracy(job: Job, sizes: Sequence[int], runs: int, seed: int) -> list[dict[
 def draw_accuracy(found: dict[str, list[dict[str, Any]]]) -> Any:
     """Errors above, seconds below, against N."""
 
-    def panel(job: str, what: str, label: str) -> Any:
-        lines: dict[str, list[tuple[float, float]]] = {}
-        for entry in found[job]:
-            name = entry["method"].replace("backward sampling", "backward")  # to fit
-            lines.setdefault(name, []).append((entry["particles"], entry[what]))
-        return plotting.CostPanel(job, "particles N", label, lines)
+    def panel(job: str, what: str, label: str) -> plotting.Panel:
+        short = lambda e: e["method"].replace("backward sampling", "backward")  # noqa: E731
+        lines = plotting.lines_of(found[job], short, "particles", what)
+        return plotting.Panel(job, "particles N", label, lines)
 
     rows = (("rms_error", "RMS error"), ("seconds", "seconds a run"))
-    return plotting.draw_costs([[panel(job, what, label) for job in found] for what, label in rows])
+    return plotting.draw_panels(
+        [[panel(job, what, label) for job in found] for what, label in rows]
+    )
 
 
 # --- (b) two modes of equal mass, smoothed: which methods keep both, at every time ----------------

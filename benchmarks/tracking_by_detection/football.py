@@ -34,16 +34,13 @@ MATCHES = (Match("football", 4, 288, 512), Match("football_20", 10, 1080, 1920))
 
 def play(match: Match, seed: int, num_frames: int = NUM_FRAMES) -> Scene:
     """The rendered video, with the true boxes of those whose centre is in the picture."""
+    _, players, height, width = match
     scene = football_scene(
-        jax.random.key(seed),
-        num_frames,
-        num_players=match.players_of_a_team,
-        num_opponents=match.players_of_a_team,
-        height=match.height,
-        width=match.width,
-    )
+        jax.random.key(seed), num_frames, num_players=players, num_opponents=players,
+        height=height, width=width,
+    )  # fmt: skip
     centres = scene.tracks[:, 2:4] + scene.tracks[:, 4:] / 2
-    inside = ((centres >= 0) & (centres < [match.width, match.height])).all(axis=1)
+    inside = ((centres >= 0) & (centres < [width, height])).all(axis=1)
     return scene._replace(tracks=scene.tracks[inside])
 
 

@@ -9,6 +9,7 @@ boxes and scores alone, without camera motion.
 import sys
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,19 +66,14 @@ TRACKERS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     ),
 }  # fmt: skip
 # norfair has no default distance; that of its demonstrations on boxes, and of MOTChallenge's.
-NORFAIR = {
+NORFAIR: dict[str, dict[str, Any]] = {
     "defaults": {"distance_function": "iou", "distance_threshold": 0.7},
-    "advised": {
-        "distance_function": "iou",
-        "distance_threshold": 0.9,
-        "detection_threshold": 0.5,
-        "pointwise_hit_counter_max": 3,
-        "hit_counter_max": 8,
-    },
-}
+    "advised": {"distance_function": "iou", "distance_threshold": 0.9, "detection_threshold": 0.5,
+                "pointwise_hit_counter_max": 3, "hit_counter_max": 8},
+}  # fmt: skip
 
 
-def peers() -> list[Peer]:
+def installed() -> list[Peer]:
     """Those that are installed; what is missing is said on the error stream."""
     found: list[Peer] = []
     for bring, hint in (
@@ -101,59 +97,56 @@ def _of_trackers() -> list[Peer]:
         kind = getattr(trackers, name, None)
         if kind is not None:
             for setting, options in (("defaults", {}), ("advised", advised)):
-                found.append(Peer(title, setting, _maker(kind, always | options, supervision)))
+                make = partial(_through_trackers, kind, always | options, supervision)
+                found.append(Peer(title, setting, make))
     return found
 
 
-def _maker(kind: Any, options: dict[str, Any], supervision: Any) -> Callable[[float | None], Step]:
-    def make(frames_per_second: float | None) -> Step:
-        rate = {} if frames_per_second is None else {"frame_rate": frames_per_second}
-        tracker = kind(**options | rate)
+def _through_trackers(
+    kind: Any, options: dict[str, Any], supervision: Any, frames_per_second: float | None
+) -> Step:
+    rate = {} if frames_per_second is None else {"frame_rate": frames_per_second}
+    tracker = kind(**options | rate)
 
-        def step(boxes: np.ndarray, scores: np.ndarray) -> np.ndarray:
-            corners = np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
-            found = supervision.Detections(
-                xyxy=corners.reshape(-1, 4).astype(np.float32),
-                confidence=scores.astype(np.float32),
-                class_id=np.zeros(len(boxes), int),
-            )
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                tracked = tracker.update(found)
-            ids = np.asarray(tracked.tracker_id if tracked.tracker_id is not None else [], int)
-            kept = np.flatnonzero(ids >= 0)
-            sides = np.asarray(tracked.xyxy, float)[kept]
-            # Ids of files count from 1.
-            return np.column_stack([ids[kept] + 1, sides[:, :2], sides[:, 2:] - sides[:, :2]])
+    def step(boxes: np.ndarray, scores: np.ndarray) -> np.ndarray:
+        corners = np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
+        found = supervision.Detections(
+            xyxy=corners.reshape(-1, 4).astype(np.float32),
+            confidence=scores.astype(np.float32),
+            class_id=np.zeros(len(boxes), int),
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            tracked = tracker.update(found)
+        ids = np.asarray(tracked.tracker_id if tracked.tracker_id is not None else [], int)
+        kept = np.flatnonzero(ids >= 0)
+        sides = np.asarray(tracked.xyxy, float)[kept]
+        # Ids of files count from 1.
+        return np.column_stack([ids[kept] + 1, sides[:, :2], sides[:, 2:] - sides[:, :2]])
 
-        return step
-
-    return make
+    return step
 
 
 def _of_norfair() -> list[Peer]:
     import norfair  # pyright: ignore[reportMissingImports]
 
-    def maker(options: dict[str, Any]) -> Callable[[float | None], Step]:
-        def make(frames_per_second: float | None) -> Step:
-            del frames_per_second
-            tracker = norfair.Tracker(**options)
+    def make(frames_per_second: float | None, options: dict[str, Any]) -> Step:
+        del frames_per_second
+        tracker = norfair.Tracker(**options)
 
-            def step(boxes: np.ndarray, scores: np.ndarray) -> np.ndarray:
-                corners = np.stack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
-                found = [
-                    norfair.Detection(points, scores=np.full(2, score))
-                    for points, score in zip(corners, scores, strict=True)
-                ]
-                tracked = tracker.update(detections=found)
-                rows = [
-                    [one.id, *one.estimate[0], *(one.estimate[1] - one.estimate[0])]
-                    for one in tracked
-                ]
-                return np.array(rows, float).reshape(-1, 5)
+        def step(boxes: np.ndarray, scores: np.ndarray) -> np.ndarray:
+            corners = np.stack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
+            found = [
+                norfair.Detection(points, scores=np.full(2, score))
+                for points, score in zip(corners, scores, strict=True)
+            ]
+            tracked = [(one.id, one.estimate) for one in tracker.update(detections=found)]
+            rows = [[id, *low, *(high - low)] for id, (low, high) in tracked]
+            return np.array(rows, float).reshape(-1, 5)
 
-            return step
+        return step
 
-        return make
-
-    return [Peer("norfair", setting, maker(options)) for setting, options in NORFAIR.items()]
+    return [
+        Peer("norfair", setting, partial(make, options=options))
+        for setting, options in NORFAIR.items()
+    ]

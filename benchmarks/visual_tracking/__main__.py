@@ -14,12 +14,10 @@ first frame that has any, and in the MPF and the GM-MPF a component is born for 
 dies when its object is gone (Lin et al. 2012, section 5).
 """
 
-import argparse
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -27,127 +25,155 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 import mpfjax
+from benchmarks.harness import Count, Natural, Seed, command, data, table
 from benchmarks.visual_tracking.detected import detect_all, make_mixtures, track_detected
 from benchmarks.visual_tracking.pictures import NAMES, write_contact_sheet, write_video
-from benchmarks.visual_tracking.scores import score, table, tracking_scores
-from benchmarks.visual_tracking.source import Source, open_source
-from mpfjax.console import exit_status, seed, whole, write_json
+from benchmarks.visual_tracking.scores import COLUMNS, OF_TRACKING, score, tracking_scores
+from benchmarks.visual_tracking.source import Asked, Source, read_source, rendered_source
+from mpfjax.console import refuse_overwriting
+from mpfjax.vision import write_tracks
+from mpfjax.vision.boxes import recipes
 from mpfjax.vision.boxes.following import Snapshot, follow, track_rows
-from mpfjax.vision.boxes.recipes import (
-    MAX_COMPONENTS,
-    PARTICLES_PER_COMPONENT,
-    PARTICLES_PER_HYPOTHESIS,
-    PRESETS,
-    most_components,
-)
-from mpfjax.vision.files import boxes as box_files
+from mpfjax.vision.files.frames import parse_range
 
 
-def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
-    """The arguments, each checked as far as it can be without the frames."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.visual_tracking",
-        description="Track several objects with the PF and the MPF (Vermaak et al. 2003, 5.2).",
-    )
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--sequence", type=Path, metavar="DIR", help="img/ and, if any, gt.txt")
-    where.add_argument("--video", type=Path, metavar="FILE", help="a video file")
-    what = parser.add_mutually_exclusive_group()
-    what.add_argument("--box", action="append", metavar="x,y,w,h", help="an object, in frame A")
-    what.add_argument("--ids", type=whole(0), nargs="+", metavar="ID", help="objects of gt.txt")
-    what.add_argument("--detect", action="store_true", help="find what moves; a still camera")
-    parser.add_argument("--frames", metavar="A:B", help="frames A to B, counted from 1, both in")
-    parser.add_argument("--preset", choices=sorted(PRESETS), default="default")
-    parser.add_argument("--out", type=Path, default=Path("results/visual_tracking"))
-    parser.add_argument("--seed", type=seed, default=0)
-    parser.add_argument("--seeds", type=whole(), default=1, help="runs; scores are their means")
-    parser.add_argument("--gif", action="store_true", help="an animated GIF in place of an MP4")
-    options = parser.parse_args(arguments)
-    if options.box is not None and options.sequence is None and options.video is None:
-        parser.error(
-            "argument --box: without --video FILE or --sequence DIR there is no frame to draw it"
-            " in; add one, or leave --box out for the rendered scene"
-        )
-    return options
+class Runs(NamedTuple):
+    """What yields the frames of a filter's runs with their seconds, and what makes tracks of them.
+
+    - `by_object`: tracks with objects for ids, where components keep to their first box.
+    """
+
+    frames: Callable[[tqdm], Iterator[tuple[Snapshot, float]]]
+    rows: Callable[[list[Snapshot]], list[np.ndarray]]
+    by_object: Callable[[list[Snapshot]], list[np.ndarray]] | None = None
 
 
-def run(options: argparse.Namespace) -> None:
-    """Track with every filter, writing each one's results as soon as it has finished."""
-    source = open_source(options)
-    keys = jax.random.split(jax.random.key(options.seed), options.seeds)
-    options.out.mkdir(parents=True, exist_ok=True)
-    runs, source = (_detected_runs if options.detect else _drawn_runs)(options, source, keys)
+@command(frames="1:4")
+def main(
+    *,
+    sequence: Path | None = None,
+    video: Path | None = None,
+    box: Annotated[Sequence[str], "append"] = (),
+    ids: Sequence[Natural] | None = None,
+    detect: bool = False,
+    frames: str | None = None,
+    preset: Annotated[str, (*sorted(recipes.PRESETS),)] = "default",
+    seed: Seed = 0,
+    seeds: Count = 1,
+    gif: bool = False,
+    out: Path = Path("results/visual_tracking"),
+) -> None:
+    """Track with every filter, writing each one's results as soon as it has finished.
+
+    - `sequence`: img/ and, if any, gt.txt.
+    - `video`: a video file, in place of a sequence.
+    - `box`: x,y,w,h, an object, in frame A.
+    - `ids`: objects of gt.txt.
+    - `detect`: find what moves; a still camera.
+    - `frames`: A:B, frames A to B, counted from 1, both in.
+    - `seeds`: runs; scores are their means.
+    - `gif`: an animated GIF in place of an MP4.
+    """
+    if sum(map(bool, (box, ids, detect))) > 1 or (sequence and video):
+        raise ValueError("one of --sequence and --video, and of --box, --ids and --detect")
+    span, asked = parse_range(frames, "--frames"), Asked(box, ids, detect)
+    paths = {"--sequence": sequence, "--video": video}
+    source = None
+    for name, path in paths.items():
+        if path is not None:
+            if not (path.is_dir() if name == "--sequence" else path.is_file()):
+                kind = "folder" if name == "--sequence" else "file"
+                raise ValueError(f"{name}: {path} is not a {kind}")
+            refuse_overwriting(out, ["tracking.mp4", "tracking.gif"], {name: path})
+            source = read_source(path, name, span, asked)
+    if source is None:
+        if box:
+            raise ValueError(
+                "--box: without --video FILE or --sequence DIR there is no frame to draw it in;"
+                " add one, or leave --box out for the rendered scene"
+            )
+        source = rendered_source(span, seed, asked)
+    keys = jax.random.split(jax.random.key(seed), seeds)
+    runs, source = (detected_runs if detect else drawn_runs)(preset, source, keys)
+    settings = {
+        "source": source.name, "preset": preset, "detect": detect, "seed": seed, "seeds": seeds
+    }  # fmt: skip
+    settings |= sizes(preset if not detect else "detect", source)
     tracked: dict[str, list[Snapshot]] = {}
     results: list[dict[str, Any]] = []
-    for name, (frames_of_run, rows_of_run) in runs.items():
+    for name, own in runs.items():
         tracked[name], seconds = [], []
         try:
             with tqdm(total=source.num_frames, desc=NAMES[name], unit="frame", disable=None) as bar:
-                for snapshot, elapsed in frames_of_run(bar):
+                for snapshot, elapsed in own.frames(bar):
                     tracked[name].append(snapshot)
                     seconds.append(elapsed)
         finally:
             # Also on the way out of an interrupted run.
-            if tracked[name]:
-                tracks = rows_of_run(tracked[name])
-                result = score(
-                    name,
-                    tracks,
-                    len(tracked[name]),
-                    seconds,
-                    source,
-                    _by_object(name, options, tracked[name], source),
-                )
-                if options.detect:
-                    result |= tracking_scores(tracks, source, len(tracked[name]))
-                results.append(result)
-                box_files.write_tracks(options.out / f"tracks_{name}.txt", tracks[0])
-                _write_scores(options, source, len(tracked[name]), results)
-    write_contact_sheet(options.out / "contact_sheet.png", source, tracked)
-    write_video(options.out / f"tracking.{'gif' if options.gif else 'mp4'}", source, tracked)
-    print(table(results))
-    print(f"written to {options.out}")
+            if number := len(tracked[name]):
+                tracks = own.rows(tracked[name])
+                by_object = None if own.by_object is None else own.by_object(tracked[name])
+                results.append(score(name, tracks, number, seconds, source, by_object))
+                if detect:
+                    results[-1] |= tracking_scores(tracks, source, number)
+                out.mkdir(parents=True, exist_ok=True)
+                write_tracks(out / f"tracks_{name}.txt", tracks[0])
+                settings["frames"] = [source.first, source.first + number - 1]
+                data(out / "visual_tracking.json", settings=settings, results=results)
+    write_contact_sheet(out / "contact_sheet.png", source, tracked)
+    write_video(out / f"tracking.{'gif' if gif else 'mp4'}", source, tracked)
+    more = OF_TRACKING if detect else ()
+    print(table(COLUMNS | {each: f"{{{each}:.3g}}" for each in more}, results))
+    print(f"written to {out}")
 
 
-def _drawn_runs(options, source: Source, keys: Array) -> tuple[dict[str, Any], Source]:
+def sizes(preset: str, source: Source) -> dict[str, Any]:
+    """What the settings say of the objects and the particles."""
+    components, particles = recipes.MAX_COMPONENTS, recipes.PARTICLES_PER_COMPONENT
+    if preset == "objects":
+        components = recipes.most_components(len(source.boxes))
+        particles = recipes.PARTICLES_PER_HYPOTHESIS
+    ids = None if source.truth is None else np.unique(source.truth[:, 1]).astype(int)
+    return {
+        "boxes": source.boxes, "ids": ids, "num_particles": particles * components,
+        "max_components": components, "particles_per_component": particles,
+    }  # fmt: skip
+
+
+def drawn_runs(preset: str, source: Source, keys: Array) -> tuple[dict[str, Runs], Source]:
     """The filters of the preset, started at the given boxes."""
-    first_frame = next(iter(source.read()))
-    filters = PRESETS[options.preset](first_frame, source.boxes)
-    return {name: _plain_run(filter, source, keys) for name, filter in filters.items()}, source
+    filters = recipes.PRESETS[preset](next(iter(source.read())), source.boxes)
+    runs = {name: plain_runs(filter, source, keys) for name, filter in filters.items()}
+    if preset == "objects":
+        by_object = lambda shots: rows_of(shots, source, keys, by_reference=True)  # noqa: E731
+        runs["mpf"] = runs["mpf"]._replace(by_object=by_object)
+    return runs, source
 
 
-def _plain_run(filter: mpfjax.Filter, source: Source, keys: Array) -> tuple[Callable, Callable]:
-    """What yields the frames of a filter's runs, and what makes tracks of them."""
-    return (
-        lambda bar: track(filter, keys, source, bar),
-        lambda snapshots: [track_rows(snapshots, run, source.first) for run in range(len(keys))],
+def plain_runs(filter: mpfjax.Filter, source: Source, keys: Array) -> Runs:
+    """Those of a filter of boxes."""
+    return Runs(
+        lambda bar: track(filter, keys, source, bar), lambda shots: rows_of(shots, source, keys)
     )
 
 
-def _by_object(
-    name: str, options: argparse.Namespace, snapshots: list[Snapshot], source: Source
-) -> list[np.ndarray] | None:
-    """Each run's tracks with objects for ids, where components keep to their first box."""
-    if name != "mpf" or options.preset != "objects" or options.detect:
-        return None
-    return [
-        track_rows(snapshots, run, source.first, by_reference=True) for run in range(options.seeds)
-    ]
+def rows_of(shots: list[Snapshot], source: Source, keys: Array, **how: bool) -> list[np.ndarray]:
+    """The tracks of each run."""
+    return [track_rows(shots, run, source.first, **how) for run in range(len(keys))]
 
 
-def _detected_runs(options, source: Source, keys: Array) -> tuple[dict[str, Any], Source]:
+def detected_runs(preset: str, source: Source, keys: Array) -> tuple[dict[str, Runs], Source]:
     """The PF of the preset, started at the first detections, and the two mixtures."""
     detected = detect_all(source)
     first = next((t for t, boxes in enumerate(detected.boxes) if len(boxes)), None)
     if first is None:
         raise ValueError("--detect: nothing moves before a still camera in these frames")
-    boxes = detected.boxes[first][:MAX_COMPONENTS]
+    boxes = detected.boxes[first][: recipes.MAX_COMPONENTS]
     source = source._replace(boxes=boxes, num_frames=len(detected.boxes))
     still = next(frame for t, frame in enumerate(source.read()) if t == first)
-    filter = PRESETS[options.preset](still, boxes)["pf"]
-    runs: dict[str, Any] = {"pf": _plain_run(filter, source, keys)}
+    runs = {"pf": plain_runs(recipes.PRESETS[preset](still, boxes)["pf"], source, keys)}
     for name, component in make_mixtures().items():
-        runs[name] = track_detected(component, keys, source, detected)
+        runs[name] = Runs(*track_detected(component, keys, source, detected))
     return runs, source
 
 
@@ -167,30 +193,5 @@ def track(
         yield snapshot, time.perf_counter() - handed_over[0]
 
 
-def _write_scores(options, source: Source, num_frames: int, results) -> None:
-    components, particles = MAX_COMPONENTS, PARTICLES_PER_COMPONENT
-    if options.preset == "objects" and not options.detect:
-        components, particles = most_components(len(source.boxes)), PARTICLES_PER_HYPOTHESIS
-    settings = {
-        "source": source.name,
-        "preset": options.preset,
-        "detect": options.detect,
-        "frames": [source.first, source.first + num_frames - 1],
-        "boxes": source.boxes.tolist(),
-        "ids": None if source.truth is None else np.unique(source.truth[:, 1]).astype(int).tolist(),
-        "seed": options.seed,
-        "seeds": options.seeds,
-        "num_particles": particles * components,
-        "max_components": components,
-        "particles_per_component": particles,
-    }
-    write_json(options.out / "visual_tracking.json", {"settings": settings, "results": results})
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the benchmark; bad input is one line on the error stream and exit status 2."""
-    return exit_status(lambda: run(parse_arguments(arguments)), arguments)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())
