@@ -124,7 +124,7 @@ def _option(name: str, hint: Any, default: Any, function: Callable[..., Any]) ->
     if "*" in metadata:
         told["nargs"], hint = "*", get_args(hint)[0]
     if "append" in metadata:
-        return told | {"action": "append", "metavar": "TEXT"}
+        return told | {"action": "append", "metavar": "TEXT", "default": list(default)}
     if get_origin(hint) in (Sequence, tuple):
         kinds = get_args(hint)
         told.setdefault("nargs", len(kinds) if get_origin(hint) is tuple else "+")

@@ -1,30 +1,28 @@
-"""Every command runs with --quick and writes its files, and what they compute is right."""
+"""Every command runs with --quick and writes its files; the harness does what it says."""
 
 import importlib
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
 
-import mpfjax
-from benchmarks import harness
-from benchmarks.interacting_objects.partitions import adaptive_partitions, independent_partitions
-from benchmarks.masses.models import Bearings, MarginalisedBearings
-from benchmarks.masses.scenes import SCENES
-from benchmarks.partitioned_sampling.posterior import Window, distance_maps
+from benchmarks import harness, tracking_speed
+from benchmarks.coverage import coverage
 from benchmarks.peers.__main__ import disagreement
-from benchmarks.smoothing.jobs import Linear, Quadratic
-from tests.examples import stack, walker
-from tests.marking import thorough
-from tests.smoothing.exact_smoothers import gaussian_smoother, grid_smoother
+from benchmarks.scenes import football_scene
+from benchmarks.visual_tracking import __main__ as visual_tracking
+from mpfjax.vision import read_tracks, write_tracks
+from mpfjax.vision.files.frames import write_image
 
-# The files that each writes.
+# The files that each writes; options beside --quick follow the name.
+OF_VIDEO = "visual_tracking.json contact_sheet.png tracking.mp4 tracks_pf.txt tracks_mpf.txt"
 COMMANDS = {
+    "camera_motion": "camera_motion.json",
     "code_size": "",
     "first_result": "first_result.json",
     "gm_mpf": "gm_mpf.json particle_migration.png effective_sample_size.png rmse.png",
@@ -39,8 +37,12 @@ COMMANDS = {
     "scaling": "scaling.json scaling.png",
     "score_vs_particles": "score_vs_particles.json score_vs_particles.png typical_run.png",
     "smoothing": "smoothing.json accuracy.png modes.png posteriors.png",
+    "tracking_by_detection": "tracking_by_detection.json",
+    "tracking_speed": "tracking_speed.json",
+    "visual_tracking": OF_VIDEO,
+    "visual_tracking --preset objects": OF_VIDEO,
+    "visual_tracking --detect --frames 1:12": f"{OF_VIDEO} tracks_gm_mpf.txt",
 }
-QUICKEST = ["code_size"]
 
 
 def main_of(name):
@@ -51,12 +53,14 @@ def main_of(name):
     return module.main
 
 
-@pytest.mark.parametrize("name", [*QUICKEST, *thorough(sorted(COMMANDS.keys() - QUICKEST))])
-def test_a_command_runs_and_writes_its_files(name, tmp_path, capsys):
-    out = ["--out", str(tmp_path)] if COMMANDS[name] else []
-    assert main_of(name)(["--quick", *out]) == 0
+@pytest.mark.weekly
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_runs_and_writes_its_files(command, tmp_path, capsys):
+    name, *options = command.split()
+    out = ["--out", str(tmp_path)] if COMMANDS[command] else []
+    assert main_of(name)(["--quick", *options, *out]) == 0
     assert capsys.readouterr().out
-    for file in COMMANDS[name].split():
+    for file in COMMANDS[command].split():
         assert (tmp_path / file).stat().st_size > 50, file
 
 
@@ -65,10 +69,12 @@ def test_a_command_runs_and_writes_its_files(name, tmp_path, capsys):
 
 @harness.command(sizes=[2])
 def example(
+    places: harness.Folders = (),
     *,
     sizes: Sequence[harness.AtLeast2] = (10, 20),
     pair: tuple[harness.Natural, harness.Natural] | None = None,
     kinds: Annotated[Sequence[Annotated[str, ("one", "two")]], "*"] = ("one",),
+    box: Annotated[Sequence[str], "append"] = (),
     weigh: bool = True,
     out: Path = Path("results"),
 ) -> int:
@@ -77,7 +83,7 @@ def example(
     - `sizes`: N, of
       all.
     """
-    print(sizes, pair, kinds, weigh, out)
+    print(*places, sizes, pair, kinds, box, weigh, out)
     return sum(sizes)
 
 
@@ -85,9 +91,9 @@ def test_options_are_those_of_the_signature(capsys):
     assert example([]) == 30
     assert example(["--quick"]) == 2
     assert example(["--quick", "--sizes", "3", "4"]) == 7
-    given = ["--pair", "0", "1", "--kinds", "--no-weigh", "--out", "there"]
+    given = ["here", "--pair", "0", "1", "--kinds", "--no-weigh", "--out", "there", "--box", "1"]
     assert example(given) == 30
-    assert capsys.readouterr().out.splitlines()[-1] == "(10, 20) [0, 1] [] False there"
+    assert capsys.readouterr().out.splitlines()[-1] == "here (10, 20) [0, 1] [] ['1'] False there"
     for wrong, word in (
         (["--sizes", "1"], "from 2"),
         (["--pair", "1"], "expected 2"),
@@ -124,79 +130,9 @@ def test_turns_are_timed_but_for_the_first_and_tables_have_dashes():
     columns = {"n": "{n}", "x": "{x:.1f}"}
     lines = harness.table(columns, [{"n": 1, "x": 0.25}, {"n": 2, "x": None}]).splitlines()
     assert [line.split() for line in lines[2:]] == [["1", "0.2"], ["2", "-"]]
-
-
-# --- what commands compute ----------------------------------------------------------------------
-
-
-def test_smoothed_truths_are_those_of_one_large_gaussian_and_of_another_grid():
-    job = Linear(6, 1)
-    model = type("Model", (), {
-        "A": [[job.a]], "Q": [[job.q**2]], "H": [[1.0]], "R": [[job.r**2]], "m0": [0.0],
-        "P0": [[job.p**2]],
-    })  # fmt: skip
-    means, covariance = gaussian_smoother(model, job.observations[:, None])
-    x = means[:, 0]
-    assert job.exact == pytest.approx(np.mean(np.diagonal(covariance, 1) + x[:-1] * x[1:]))
-    job, grid = Quadratic(6, 1), np.linspace(-4, 4, 701)
-    log_initial = np.where(np.abs(grid) <= job.width, 0.0, -np.inf)
-    log_transition = -0.5 * ((grid[None] - grid[:, None]) / job.sigma_x) ** 2
-    log_likelihoods = -0.5 * ((job.observations[:, None] - grid**2) / job.sigma_y) ** 2
-    _, pairs = grid_smoother(log_initial, log_transition, log_likelihoods)
-    expected = np.mean(np.einsum("sij,i,j->s", pairs, grid, grid))
-    assert job.exact == pytest.approx(expected, rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    "name", ["bearings", *thorough(["corridor", "mirror", "terrain", "jumps"])]
-)
-def test_noise_and_draws_have_one_law(name):
-    """Of x_0 and of a step: the draws of the model and those from noise, by their moments."""
-    model, n = SCENES[name][0](2, 0).model, 20_000
-    keys = jax.random.split(jax.random.key(0), 4)
-    start = model.sample_initial(keys[0], n)
-    noise = jax.random.normal(keys[1], (n, model.initial_noise_dimension))
-    step_noise = jax.random.normal(keys[3], (n, model.noise_dimension))
-    drawn = start, model.sample_transition(keys[2], start)
-    made = model.initial_from_noise(noise), model.transition_from_noise(step_noise, start)
-    for one, other in zip(jax.tree.leaves(drawn), jax.tree.leaves(made), strict=True):
-        one, other = np.asarray(one, float), np.asarray(other, float)
-        error = np.sqrt((one.var(axis=0) + other.var(axis=0)) / n)
-        assert (np.abs(one.mean(axis=0) - other.mean(axis=0)) <= 4 * error + 1e-9).all()
-        np.testing.assert_allclose(one.std(axis=0), other.std(axis=0), rtol=0.05, atol=1e-9)
-
-
-def test_the_velocity_of_the_bearings_is_marginalised_exactly():
-    """Both filters, one with drawn velocities, have the same evidence."""
-    keys = jax.random.split(jax.random.key(0), 200)
-    observations = Bearings().simulated(4, 0)
-    one, other = (
-        np.exp(np.asarray(mpfjax.monte_carlo(
-            keys, mpfjax.particle_filter(model, 500), observations, harness.nothing
-        ).log_marginal_likelihood))
-        for model in (Bearings(), MarginalisedBearings())
-    )  # fmt: skip
-    error = np.hypot(one.std(), other.std()) / np.sqrt(len(keys))
-    assert error < 0.1 * one.mean()
-    assert abs(one.mean() - other.mean()) < 4 * error
-
-
-def test_maps_are_counted_pixel_by_pixel():
-    """Σ over the bands of 1 - Σ_b sqrt(h_b h_ref,b), of boxes inside the frame and not."""
-    rng = np.random.default_rng(0)
-    bins, sides = rng.integers(0, 4, (9, 11)), (3, 4)
-    references = rng.dirichlet(np.ones(4), size=(1, 2))
-    window = Window.whole(bins, sides)
-    found = distance_maps(bins, references, sides, window)[0]
-    for top, left in ((2, 5), (-1, -2), (7, 9), (-4, 0)):
-        expected = 0.0
-        for part in range(2):
-            rows = slice(max(top + 2 * part, 0), max(top + 2 * part + 2, 0))
-            pixels = bins[rows, max(left, 0) : max(left + 3, 0)].ravel()
-            shares = np.bincount(pixels, minlength=4) / max(len(pixels), 1)
-            expected += 1 - np.sqrt(shares * references[0, part]).sum()
-        place = found[top - window.top, left - window.left]
-        assert place == pytest.approx(expected, abs=1e-5)
+    entries = [{"a": a, "b": b} for a, b in ((1, 5), (2, 6), (1, 6))]
+    lines = harness.pivot("", entries, "{a}", "b = {b}", lambda e: str(e["a"] * e["b"])).split("\n")
+    assert [line.split() for line in lines[2:]] == [["1", "5", "6"], ["2", "-", "12"]]
 
 
 def made_up(log_likelihood=-10.0, size=50.0, spread=0.3):
@@ -209,31 +145,76 @@ def made_up(log_likelihood=-10.0, size=50.0, spread=0.3):
     }
 
 
+def test_a_library_with_other_numbers_is_refused():
+    ours, low = made_up(), made_up(log_likelihood=-11)
+    for found, reference, reason in (
+        (low, ours, "mean log likelihoods -11"),
+        (made_up(size=53), ours, "mean effective sample sizes 53, not 50"),
+        (low, low, "exactly -10"),
+        (made_up(log_likelihood=np.nan), ours, "not finite"),
+    ):
+        assert reason in disagreement(found, reference, exact=-10.0)
+    assert disagreement(made_up(-10.1, 50.2), ours, exact=-10.0) is None
+
+
+@pytest.mark.weekly
+def test_a_process_that_ends_is_named():
+    broken = tracking_speed.Way("no frame", (0, 0))
+    with pytest.raises(ValueError, match="no frame: "):
+        tracking_speed.in_turns((broken,), 1, 1)
+
+
+# --- drawn boxes --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    """Small frames of the rendered scene as a folder with img/ and gt.txt."""
+    folder = tmp_path_factory.mktemp("sequence")
+    scene = football_scene(jax.random.key(1), 6, height=96, width=160)
+    (folder / "img").mkdir()
+    for i, frame in enumerate(scene.frames, 1):
+        write_image(folder / "img" / f"{i:06d}.png", frame)
+    write_tracks(folder / "gt.txt", scene.tracks)
+    return folder
+
+
+def tracked(*arguments):
+    return visual_tracking.main([str(argument) for argument in arguments])
+
+
+@pytest.mark.weekly
+def test_the_scores_are_those_of_the_tracks(sequence, tmp_path):
+    pytest.importorskip("av", reason="writing frames needs the extra 'video'")
+    given = ["--sequence", sequence, "--ids", 1, 2, 3, "--frames", "3:6", "--preset", "objects"]
+    assert tracked(*given, "--out", tmp_path) == 0
+    truth = read_tracks(sequence / "gt.txt")
+    truth = truth[truth[:, 0] >= 3]
+    is_started = np.isin(truth[:, 1], [1, 2, 3])
+    truth, others = truth[is_started], truth[~is_started]
+    for result in json.loads((tmp_path / "visual_tracking.json").read_text())["results"]:
+        rows = read_tracks(tmp_path / f"tracks_{result['filter']}.txt")
+        expected = coverage(rows, truth, others)
+        for name in ("all_covered", "on_object", "on_other", "id_swaps"):
+            assert result[name] == pytest.approx(getattr(expected, name))
+        assert (result["object_swaps"] is None) == (result["filter"] == "pf")
+
+
 @pytest.mark.parametrize(
-    ("found", "reference", "reason"),
+    ("message", "arguments"),
     [
-        (made_up(log_likelihood=-11), made_up(), "mean log likelihoods -11"),
-        (made_up(size=53), made_up(), "mean effective sample sizes 53, not 50"),
-        (made_up(log_likelihood=-11), made_up(log_likelihood=-11), "exactly -10"),
-        (made_up(log_likelihood=np.nan), made_up(), "not finite"),
+        ("--box: '1,2,3' is not four numbers", ["--box", "1,2,3"]),
+        ("--box: 900,10,9,9 lies outside", ["--box", "900,10,9,9"]),
+        ("--ids: gt.txt has no box of [77] in frame 1", ["--ids", "1", "77"]),
+        ("--frames: '5:4' is not A:B", ["--frames", "5:4"]),
+        ("frame 40 is not among them", ["--frames", "40:50"]),
+        ("--detect: nothing moves", ["--detect", "--frames", "1:1"]),
     ],
 )
-def test_a_library_with_other_numbers_is_refused(found, reference, reason):
-    assert reason in disagreement(found, reference, exact=-10.0)
-    assert disagreement(made_up(-10.1, 50.2), made_up(), exact=-10.0) is None
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("make", [independent_partitions, adaptive_partitions])
-def test_objects_that_never_meet_are_proposed_exactly(make):
-    """Beside the exact evidence of two walkers."""
-    path = jnp.array([[0.2, 1.6], [0.9, 1.4], [1.2, 1.2]])[:, :, None]
-    model = mpfjax.MultiObjectModel(stack([walker(0.0), walker(2.0)]), 2)
-    keys = jax.random.split(jax.random.key(0), 400)
-    runs = mpfjax.monte_carlo(keys, make(model, 50), path, harness.nothing)
-    exact = sum(
-        mpfjax.exact.kalman_filter(walker(start), path[:, k]).log_marginal_likelihood
-        for k, start in enumerate((0.0, 2.0))
-    )
-    ratios = np.exp(np.asarray(runs.log_marginal_likelihood) - float(exact))
-    assert abs(ratios.mean() - 1) < 4 * ratios.std() / np.sqrt(len(ratios)) < 0.1
+def test_bad_input_is_named_before_anything_compiles(
+    sequence, tmp_path, capsys, monkeypatch, message, arguments
+):
+    monkeypatch.setattr(visual_tracking, "track", lambda *_: pytest.fail("it went on to track"))
+    assert tracked("--sequence", sequence, "--out", tmp_path / "out", *arguments) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,205 @@
+"""What commands compute beside filters: against exact answers, and counted by hand."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+import mpfjax
+from benchmarks import harness
+from benchmarks.coverage import coverage, covers
+from benchmarks.interacting_objects.partitions import adaptive_partitions, independent_partitions
+from benchmarks.likelihood_tuning.labelled_boxes import labelled_states
+from benchmarks.likelihood_tuning.soft_colours import SoftColourModel, soft_histograms
+from benchmarks.masses.models import Bearings, MarginalisedBearings
+from benchmarks.masses.scenes import SCENES
+from benchmarks.partitioned_sampling.posterior import Window, distance_maps
+from benchmarks.smoothing.jobs import Linear, Quadratic
+from benchmarks.tracking_by_detection import __main__ as by_detection
+from benchmarks.tracking_by_detection import football
+from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
+from mpfjax.vision.colour.bins import RGBColours
+from mpfjax.vision.colour.histograms import integral_histogram
+from tests.examples import stack, walker
+from tests.marking import exactness
+from tests.precision import float64
+from tests.smoothing.exact_smoothers import gaussian_smoother, grid_smoother
+
+NOISE = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
+
+
+def test_smoothed_truths_are_those_of_one_large_gaussian_and_of_another_grid():
+    job = Linear(6, 1)
+    model = type("Model", (), {
+        "A": [[job.a]], "Q": [[job.q**2]], "H": [[1.0]], "R": [[job.r**2]], "m0": [0.0],
+        "P0": [[job.p**2]],
+    })  # fmt: skip
+    means, covariance = gaussian_smoother(model, job.observations[:, None])
+    x = means[:, 0]
+    assert job.exact == pytest.approx(np.mean(np.diagonal(covariance, 1) + x[:-1] * x[1:]))
+    job, grid = Quadratic(6, 1), np.linspace(-4, 4, 701)
+    log_initial = np.where(np.abs(grid) <= job.width, 0.0, -np.inf)
+    log_transition = -0.5 * ((grid[None] - grid[:, None]) / job.sigma_x) ** 2
+    log_likelihoods = -0.5 * ((job.observations[:, None] - grid**2) / job.sigma_y) ** 2
+    _, pairs = grid_smoother(log_initial, log_transition, log_likelihoods)
+    expected = np.mean(np.einsum("sij,i,j->s", pairs, grid, grid))
+    assert job.exact == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "name", ["terrain", *exactness(["bearings", "corridor", "mirror", "jumps"])]
+)
+def test_noise_and_draws_have_one_law(name):
+    """Of x_0 and of a step: the draws of the model and those from noise, by their moments."""
+    model, n = SCENES[name][0](2, 0).model, 20_000
+    keys = jax.random.split(jax.random.key(0), 4)
+    start = model.sample_initial(keys[0], n)
+    noise = jax.random.normal(keys[1], (n, model.initial_noise_dimension))
+    step_noise = jax.random.normal(keys[3], (n, model.noise_dimension))
+    drawn = start, model.sample_transition(keys[2], start)
+    made = model.initial_from_noise(noise), model.transition_from_noise(step_noise, start)
+    for one, other in zip(jax.tree.leaves(drawn), jax.tree.leaves(made), strict=True):
+        one, other = np.asarray(one, float), np.asarray(other, float)
+        error = np.sqrt((one.var(axis=0) + other.var(axis=0)) / n)
+        assert (np.abs(one.mean(axis=0) - other.mean(axis=0)) <= 4 * error + 1e-9).all()
+        np.testing.assert_allclose(one.std(axis=0), other.std(axis=0), rtol=0.05, atol=1e-9)
+
+
+@pytest.mark.exactness
+def test_the_velocity_of_the_bearings_is_marginalised_exactly():
+    """Both filters, one with drawn velocities, have the same evidence."""
+    keys = jax.random.split(jax.random.key(0), 200)
+    observations = Bearings().simulated(4, 0)
+    one, other = (
+        np.exp(np.asarray(mpfjax.monte_carlo(
+            keys, mpfjax.particle_filter(model, 500), observations, harness.nothing
+        ).log_marginal_likelihood))
+        for model in (Bearings(), MarginalisedBearings())
+    )  # fmt: skip
+    error = np.hypot(one.std(), other.std()) / np.sqrt(len(keys))
+    assert error < 0.1 * one.mean()
+    assert abs(one.mean() - other.mean()) < 4 * error
+
+
+def test_maps_are_counted_pixel_by_pixel():
+    """Σ over the bands of 1 - Σ_b sqrt(h_b h_ref,b), of boxes inside the frame and not."""
+    rng = np.random.default_rng(0)
+    bins, sides = rng.integers(0, 4, (9, 11)), (3, 4)
+    references = rng.dirichlet(np.ones(4), size=(1, 2))
+    window = Window.whole(bins, sides)
+    found = distance_maps(bins, references, sides, window)[0]
+    for top, left in ((2, 5), (-1, -2), (7, 9), (-4, 0)):
+        expected = 0.0
+        for part in range(2):
+            rows = slice(max(top + 2 * part, 0), max(top + 2 * part + 2, 0))
+            pixels = bins[rows, max(left, 0) : max(left + 3, 0)].ravel()
+            shares = np.bincount(pixels, minlength=4) / max(len(pixels), 1)
+            expected += 1 - np.sqrt(shares * references[0, part]).sum()
+        place = found[top - window.top, left - window.left]
+        assert place == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.exactness
+@pytest.mark.parametrize("make", [independent_partitions, adaptive_partitions])
+def test_objects_that_never_meet_are_proposed_exactly(make):
+    """Beside the exact evidence of two walkers."""
+    path = jnp.array([[0.2, 1.6], [0.9, 1.4], [1.2, 1.2]])[:, :, None]
+    model = mpfjax.MultiObjectModel(stack([walker(0.0), walker(2.0)]), 2)
+    keys = jax.random.split(jax.random.key(0), 400)
+    runs = mpfjax.monte_carlo(keys, make(model, 50), path, harness.nothing)
+    exact = sum(
+        mpfjax.exact.kalman_filter(walker(start), path[:, k]).log_marginal_likelihood
+        for k, start in enumerate((0.0, 2.0))
+    )
+    ratios = np.exp(np.asarray(runs.log_marginal_likelihood) - float(exact))
+    assert abs(ratios.mean() - 1) < 4 * ratios.std() / np.sqrt(len(ratios)) < 0.1
+
+
+# --- colours and boxes --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("num_bins", "num_parts"), [(16, 1), (30, 4)])
+def test_the_limit_of_soft_histograms_is_the_hard_one(num_bins, num_parts):
+    """With a point on every pixel, on noise, where no blur would go unseen."""
+    boxes = jnp.array([[20.0, 20, 12, 12], [31, 15, 12, 12], [54, 34, 12, 12]])
+    hard = integral_histogram(jnp.asarray(NOISE), RGBColours(num_bins)).counts(boxes, num_parts)
+    sharp = jnp.array(1e-3)
+    soft = soft_histograms(jnp.asarray(NOISE), boxes, num_bins, sharp, 12, num_parts)
+    np.testing.assert_allclose(soft * 144 / num_parts, hard, atol=1e-3)
+
+
+def test_derivatives_of_the_soft_model_are_those_of_differences():
+    boxes = np.array([[10.0, 8, 12, 16], [35, 12, 12, 20]])
+    model = SoftColourModel.from_frame(NOISE, boxes, num_bins=8, num_points=4, num_parts=2)
+    box = jnp.array([[17.3, 16.6, 1.1, 0.9], [39.1, 21.2, 0.9, 1.0]])
+
+    @jax.jit
+    def total(logits, lambda_, bandwidth, box):
+        names = lambda m: (m.reference_logits, m.lambda_, m.bandwidth)  # noqa: E731
+        changed = eqx.tree_at(names, model, (logits, lambda_, bandwidth))
+        state = BoxState(box, jnp.arange(2, dtype=jnp.int32))
+        return jnp.sum(changed.log_likelihood(jnp.asarray(NOISE), state))
+
+    with float64(), jax.numpy_dtype_promotion("standard"):
+        model = jax.tree.map(lambda leaf: leaf.astype(float), model)
+        logits = model.reference_logits
+        logits = logits + 0.3 * jax.random.normal(jax.random.key(1), logits.shape)
+        given = (logits, model.lambda_, model.bandwidth, box.astype(float))
+        check_grads(total, given, order=1, modes=["rev"], eps=1e-6, rtol=1e-3)
+
+
+def test_labels_with_a_velocity_remember_it_over_all_frames():
+    boxes = np.array([[10.0, 8, 12, 16], [35, 12, 12, 20]])
+    track = boxes + np.array([0.0, 1, 3])[:, None, None] * np.array([[1.0, 2, 3, 4]])
+    dynamics = mpfjax.WalkWithVelocity(mpfjax.RandomWalk(np.ones(4)), 0.25)
+    states = labelled_states(ColourModel.from_frame(NOISE, boxes, dynamics=dynamics), track)
+    velocity = np.zeros_like(states.box[0])
+    for t in range(1, 3):
+        velocity += 0.25 * np.asarray(states.box[t] - states.box[t - 1] - velocity)
+        np.testing.assert_allclose(states.box[t] - states.previous[t], velocity, atol=1e-5)
+
+
+# --- scores of tracks, and detections -----------------------------------------------------------
+
+
+def row(frame, id, x, y=0.0):
+    return [frame, id, x, y, 10.0, 20.0]
+
+
+def test_coverage_strays_and_swaps_by_hand():
+    objects = np.array([row(t, id, 100 * id) for t in (1, 2, 3, 4) for id in (1, 2)])
+    places = ((1, 7, 100), (1, 8, 200), (2, 7, 100), (2, 8, 500), (3, 8, 200), (4, 9, 200))
+    tracks, others = np.array([row(*place) for place in places]), np.array([row(2, 3, 504)])
+    result = coverage(tracks, objects, others)
+    assert (result.all_covered, result.on_object, result.on_other) == (0.25, 5 / 6, 1 / 6)
+    assert result.per_object == {1: 0.5, 2: 0.75}
+    assert result.id_swaps == 1
+    # |dx| < 0.75 w and |dy| < 0.5 h of the object, strictly, whatever the track's own size.
+    centres = [(5 + 7.4, 10), (5 + 7.5, 10), (5, 10 + 9.9), (5, 10 + 10), (5 - 7.4, 10 - 9.9)]
+    boxes = np.array([(x - 2, y - 3, 4, 6) for x, y in centres])
+    reached = covers(boxes, np.array([[0.0, 0, 10, 20]]))[:, 0]
+    assert reached.tolist() == [True, False, True, False, True]
+
+
+def test_the_threshold_parts_two_groups_of_scores():
+    random = np.random.default_rng(0)
+    scores = np.concatenate([random.normal(0.2, 0.05, 300), random.normal(0.8, 0.05, 100)])
+    threshold = by_detection.otsu(random.permutation(scores))
+    assert np.mean((scores >= threshold) == (np.arange(400) >= 300)) > 0.99
+
+
+def test_the_simulated_detector_errs_as_it_says():
+    match = football.MATCHES[0]
+    # So far apart that nobody hides another, but for the second of each frame.
+    corners = np.array([[10, 10], [102, 5], [100, 10], [200, 10], [300, 10]])
+    rows = [[t, i, *corner, 20, 50] for t in range(1, 1001) for i, corner in enumerate(corners, 1)]
+    found = football.detect(match, np.array(rows, float), 0)
+    gaps = np.abs(found[:, None, 2:6] - np.concatenate([corners, np.tile([20, 50], (5, 1))], 1))
+    near = np.all(gaps <= 6 * football.ERROR * np.array([20, 50, 20, 50]), axis=2)
+    hits = near.sum(axis=0) / 1000
+    assert hits[[0, 3, 4]] == pytest.approx(1 - football.MISSES, abs=0.04)
+    offsets = found[near[:, 0], 2] - 10
+    assert offsets.std() == pytest.approx(football.ERROR * 20, rel=0.1)
+    assert len(found) / 1000 == pytest.approx(4 * 0.9 + football.FALSE_ONES, abs=0.1)
