@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.harness import AtLeast2, Count, Folders, Natural, command, data, table
 from benchmarks.tracking_by_detection import football
-from benchmarks.tracking_by_detection.__main__ import OF_SCORES, SCORES
+from benchmarks.tracking_by_detection.__main__ import OF_SCORES, SCORES, Motion
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import OpticalFlow, read_frames, read_truth, track
 from mpfjax.vision.tracking.track import online_rows
@@ -68,8 +68,8 @@ def main(
     tracked: list[dict[str, Any]] = []
     for recording in recordings(folders, seed, frames):
         found.append(accuracy(recording))
-        for motion in ("detections", "pixels"):
-            tracked.append(scores(recording, motion, range(seed, seed + seeds)))
+        own = range(seed, seed + seeds)
+        tracked += [scores(recording, "detections", own), scores(recording, "pixels", own)]
         data(out / "camera_motion.json", found=found, tracked=tracked)
     print(table(OF_MOTION, found))
     print(table({"recording": "{recording}", "motion from": "{motion}"} | OF_SCORES, tracked))
@@ -128,7 +128,7 @@ def root_mean_square(gaps: list[np.ndarray]) -> float:
     return float(np.sqrt(np.mean(np.sum(np.concatenate(gaps) ** 2, axis=1))))
 
 
-def scores(recording: Recording, motion: str, seeds: range) -> dict[str, Any]:
+def scores(recording: Recording, motion: Motion, seeds: range) -> dict[str, Any]:
     """A row of the second table: the tracker's mean scores."""
     width, height = recording.size
     found = []

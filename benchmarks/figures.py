@@ -80,50 +80,34 @@ def _draw_history(axis: Axes, history: ParticleHistory, truth: np.ndarray) -> No
 
 def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str]) -> Figure:
     """Figure 2 of Vermaak et al. (2003), and the error of the modes' mass beside it."""
-    figure = Figure(figsize=(10.5, 3.7), layout="constrained")
-    score, weight, mass = figure.subplots(1, 3)
-    names = [name for name in labels if any(entry["filter"] == name for entry in results)]
-    for index, name in enumerate(names):
-        entries = sorted(
-            (entry for entry in results if entry["filter"] == name),
-            key=lambda entry: entry["particles"],
-        )
-        style = {"color": COLOURS[index], "marker": MARKERS[index], "ms": 4, "label": labels[name]}
-        sizes = np.array([entry["particles"] for entry in entries])
-        means = np.array([np.mean(entry["scores"]) for entry in entries])
-        stds = np.array([np.std(entry["scores"]) for entry in entries])
-        # A score lies in [0, 1]: the bars end there too.
-        bars = np.minimum(stds, [means, 1 - means])
-        # Shifted by a few per cent, so that bars at the same N do not cover each other.
-        score.errorbar(sizes * 1.04 ** (index - 1), means, yerr=bars, capsize=2, **style)
-        mass.plot(sizes, [entry["mode_mass_error"] for entry in entries], **style)
-        if name != "pf":
-            mean = np.array([entry["weight_mean"] for entry in entries])
-            std = np.array([entry["weight_std"] for entry in entries])
-            weight.plot(sizes, mean, **style)
-            for sign in (1, -1):
-                weight.plot(sizes, mean + sign * std, ls="--", lw=1, color=COLOURS[index])
-    all_sizes = sorted({entry["particles"] for entry in results})
-    for axis in (score, weight, mass):
-        axis.set_xscale("log")
-        axis.set_xticks(all_sizes, [str(size) for size in all_sizes])
-        axis.minorticks_off()
-        axis.set_xlabel("number of particles $N$")
-        axis.grid(alpha=0.25)
-    num_seeds = len(results[0]["scores"])
-    score.set_ylabel("share of steps with both modes")
-    score.set_title(f"score, mean ± std of {num_seeds} runs", fontsize=10)
-    score.set_ylim(-0.03, 1.06)
-    weight.set_ylabel(r"mixture weight $\pi_1$")
-    weight.set_title("weight of component one, mean ± std", fontsize=10)
-    weight.set_ylim(-0.03, 1.06)
-    mass.set_ylabel(r"error of $P(x_t > 0 \mid y_1 \ldots y_t)$")
-    mass.set_title("RMS error of the upper mode's mass", fontsize=10)
-    mass.set_ylim(bottom=0)
-    # Above the axes: in the first panel every corner holds bars, at some N.
-    handles, texts = mass.get_legend_handles_labels()
-    figure.legend(handles, texts, loc="outside upper center", ncols=len(names), fontsize=8)
-    return figure
+    entries: list[dict[str, Any]] = []
+    for entry in sorted(results, key=lambda entry: list(labels).index(entry["filter"])):
+        mean, std = np.mean(entry["scores"]), np.std(entry["scores"])
+        weight, spread = entry["weight_mean"], entry["weight_std"]
+        entries.append({
+            "label": labels[entry["filter"]], **entry, "weight_low": weight - spread,
+            "weight_high": weight + spread,
+            # A score lies in [0, 1]: the bars end there too.
+            "score": mean, "low": max(mean - std, 0), "high": min(mean + std, 1),
+        })  # fmt: skip
+    mixtures = [entry for entry in entries if entry["filter"] != "pf"]
+    at, x, limits = ("label", "particles"), "number of particles $N$", (-0.03, 1.06)
+    panels = [
+        Panel(
+            f"score, mean ± std of {len(results[0]['scores'])} runs", x,
+            "share of steps with both modes",
+            lines_of(entries, *at, "score", "low", "high"), limits,
+        ),
+        Panel(
+            "weight of component one, mean ± std", x, r"mixture weight $\pi_1$",
+            lines_of(mixtures, *at, "weight_mean", "weight_low", "weight_high"), limits,
+        ),
+        Panel(
+            "RMS error of the upper mode's mass", x,
+            r"error of $P(x_t > 0 \mid y_1 \ldots y_t)$", lines_of(entries, *at, "mode_mass_error"),
+        ),
+    ]  # fmt: skip
+    return draw_panels([panels], ("log", "linear"))
 
 
 def draw_contact_sheet(
@@ -291,7 +275,7 @@ class Panel(NamedTuple):
     title: str
     xlabel: str
     ylabel: str
-    lines: Mapping[str, Sequence[Sequence[float]]]
+    lines: Mapping[str, Sequence[tuple[float, ...]]]
     ylim: tuple[float, float] | None = None
     at: float | None = None
 
@@ -305,8 +289,8 @@ def lines_of(
     """
     lines: dict[str, list[tuple[float, ...]]] = {}
     for entry in entries:
-        line, *point = (each(entry) if callable(each) else entry[each] for each in (name, *axes))
-        lines.setdefault(line, []).append(tuple(point))
+        read: list[Any] = [e(entry) if callable(e) else entry[e] for e in (name, *axes)]
+        lines.setdefault(read[0], []).append(tuple(read[1:]))
     return lines
 
 
@@ -355,7 +339,8 @@ def _draw_panel(axis: Axes, panel: Panel, names: Sequence[str], scales: tuple[st
         x, y, *ends = np.array(sorted(points)).T
         if ends:
             # Shifted a little, so that intervals at the same place do not cover each other.
-            x = x + 0.06 * step * (index - (len(names) - 1) / 2)
+            shift = index - (len(names) - 1) / 2
+            x = x * 1.04**shift if scales[0] == "log" else x + 0.06 * step * shift
             reach = np.maximum([y - ends[0], ends[1] - y], 0)
             axis.errorbar(x, y, reach, capsize=3, **style)
         else:

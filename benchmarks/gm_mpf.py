@@ -27,7 +27,7 @@ from benchmarks import figures as plotting
 from benchmarks import harness
 from benchmarks.coverage import REACH
 from benchmarks.harness import AtLeast2, Count, Natural, Seed, command
-from benchmarks.scenes import football_scene
+from benchmarks.scenes import boxes_over_time, football_scene
 from mpfjax.vision import read_truth
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
 from mpfjax.vision.colour.bins import HSVColours
@@ -94,40 +94,35 @@ def main(
     found = study(targets, particles, seeds, seed, names)
     mixtures = [name for name in names if name in ("mpf", "gm_mpf")]
     references = reference_estimates(targets, seed, mixtures)
-    least = particles[0]
+    fewest = {name: steps[particles[0]] for name, steps in found.items()}
     by_size = {name: errors_by_size(steps, targets.truth) for name, steps in found.items()}
+    own = {name: errors_by_size(found[name], truth) for name, truth in references.items()}
     content |= {
         "rmse": _of_each(by_size, lambda errors: errors.mean(axis=0)),
         "rmse_std": _of_each(by_size, lambda errors: errors.std(axis=0)),
-        "monte_carlo_error": {
-            name: _of_each({name: errors_by_size(found[name], truth)}, lambda e: e.mean(axis=0))[
-                name
-            ]
-            for name, truth in references.items()
-        },
-        "n_eff": {
-            name: steps[least].effective_sample_size.mean(axis=0) for name, steps in found.items()
-        },
-        "both_held": {
-            name: held(steps[least], targets.truth).mean() for name, steps in found.items()
-        },
+        "monte_carlo_error": _of_each(own, lambda errors: errors.mean(axis=0)),
+        "n_eff": {name: step.effective_sample_size.mean(axis=0) for name, step in fewest.items()},
+        "both_held": {name: held(step, targets.truth).mean() for name, step in fewest.items()},
     }
     harness.data(out / "gm_mpf.json", **content)
     print(f"\ntwo targets of {targets.name}, {seeds} seeds")
-    print(study_table(found, targets, references))
-    curves = {NAMES[name]: steps[least].effective_sample_size for name, steps in found.items()}
+    print(study_table(found, by_size, own, targets))
+    curves = {NAMES[name]: step.effective_sample_size for name, step in fewest.items()}
     harness.figures(
-        out, dpi=130, particle_migration=draw_migration(found, least, targets),
+        out, dpi=130, particle_migration=draw_migration(fewest, targets),
         effective_sample_size=plotting.draw_curves(  # figures 3 and 4
             curves, targets.first, xlabel="frame", ylabel=r"effective sample size $N_{eff}$",
-            title=f"eq. 14, N = {least}, mean ± std over seeds",
+            title=f"eq. 14, N = {particles[0]}, mean ± std over seeds",
         ),
-        rmse=draw_errors(found, targets, references),
+        rmse=draw_errors(by_size, own),
     )  # fmt: skip
     print(f"written to {out}")
 
 
-def _of_each(values: dict[str, dict[int, Any]], measure: Callable[[Any], Any]) -> dict[str, Any]:
+BySize = dict[str, dict[int, np.ndarray]]  # of each filter and number of particles
+
+
+def _of_each(values: BySize, measure: Callable[[Any], Any]) -> dict[str, Any]:
     """A measure of every filter and number of particles."""
     return {
         name: {str(size): measure(value) for size, value in by_size.items()}
@@ -180,13 +175,10 @@ def _rendered(ids: Sequence[int] | None, span: str | None, seed: int) -> Targets
 def _with_truth(
     name: str, stills: np.ndarray, first: int, rows: np.ndarray, ids: Sequence[int]
 ) -> Targets:
-    truth = np.zeros((len(stills), 2, 4))
-    for target, id in enumerate(ids):
-        own = {int(row[0]): row[2:] for row in rows[rows[:, 1] == id]}
-        for t in range(len(stills)):
-            if first + t not in own:
-                raise ValueError(f"--ids: object {id} has no box in frame {first + t}")
-            truth[t, target] = box_files.centred(own[first + t][None])[0]
+    boxes = boxes_over_time(rows, ids, first, len(stills))
+    for t, target in np.argwhere(np.isnan(boxes).any(axis=2)):
+        raise ValueError(f"--ids: object {ids[target]} has no box in frame {first + t}")
+    truth = box_files.centred(boxes.reshape(-1, 4)).reshape(boxes.shape)
     return Targets(name, stills, first, truth)
 
 
@@ -197,16 +189,11 @@ def make_model(targets: Targets) -> ColourModel:
         [boxes[:, 2:], np.ones_like(boxes[:, 2:])], axis=1
     )
     each = [mpfjax.Autoregression.with_momentum(MOMENTUM, jnp.asarray(row)) for row in deviations]
+    dynamics = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
     return ColourModel.from_frame(
-        still,
-        boxes,
-        colours=HSVColours(),
-        sigma=SIGMA,
-        num_parts=NUM_PARTS,
-        weigh_colours=True,
-        deviations=deviations,
-        dynamics=jax.tree.map(lambda *leaves: jnp.stack(leaves), *each),
-    )
+        still, boxes, colours=HSVColours(), sigma=SIGMA, num_parts=NUM_PARTS, weigh_colours=True,
+        deviations=deviations, dynamics=dynamics,
+    )  # fmt: skip
 
 
 def make_filter(name: str, model: ColourModel, num_particles: int) -> mpfjax.Filter:
@@ -364,20 +351,14 @@ def profile(targets: Targets, seed: int) -> dict[str, float]:
     key, states = jax.random.key(seed + 1), mixture.particles
     redraw = mpfjax.GaussianRegeneration(where=motion)
     parts: dict[str, tuple[Callable[..., Any], Any, Any]] = {
-        "integral histogram of the frame": (
-            eqx.filter_jit(integral_histogram),
-            still,
-            model.colours,
-        ),
-        "likelihood of all boxes": (eqx.filter_jit(model.log_likelihood), table, states),
-        "dynamics": (eqx.filter_jit(model.sample_transition), key, states),
-        "resampling, two components": (eqx.filter_jit(mpfjax.Resample()), key, mixture),
-        "Gaussian regeneration, two components": (eqx.filter_jit(redraw), key, mixture),
+        "integral histogram of the frame": (integral_histogram, still, model.colours),
+        "likelihood of all boxes": (model.log_likelihood, table, states),
+        "dynamics": (model.sample_transition, key, states),
+        "resampling, two components": (mpfjax.Resample(), key, mixture),
+        "Gaussian regeneration, two components": (redraw, key, mixture),
     }
-    runs = {
-        name: lambda _, part=part, given=given: part(*given)
-        for name, (part, *given) in parts.items()
-    }
+    programs = {name: eqx.filter_jit(part) for name, (part, *_) in parts.items()}
+    runs = {name: lambda _, name=name: programs[name](*parts[name][1:]) for name in parts}
     return {name: float(np.median(times)) for name, times in _milliseconds(runs).items()}
 
 
@@ -412,20 +393,20 @@ def timing_table(elapsed: dict[str, np.ndarray], paper: bool) -> str:
 
 
 def study_table(
-    found: dict[str, dict[int, Step]], targets: Targets, references: dict[str, np.ndarray]
+    found: dict[str, dict[int, Step]], by_size: BySize, own: BySize, targets: Targets
 ) -> str:
     """RMSE of each target and what of it is Monte Carlo error, who holds both, and mean N_eff."""
     rows = []
     for name, steps in found.items():
         for size, step in steps.items():
-            by_seed = errors(step.estimates, targets.truth).mean(axis=1)
+            error = by_size[name][size]
             row: dict[str, Any] = {
-                "filter": f"{NAMES[name]}, N = {size}", "mean": by_seed.mean(axis=0),
-                "std": by_seed.std(axis=0), "held": held(step, targets.truth).mean(),
+                "filter": f"{NAMES[name]}, N = {size}", "mean": error.mean(axis=0),
+                "std": error.std(axis=0), "held": held(step, targets.truth).mean(),
                 "n_eff": step.effective_sample_size.mean(),
             }  # fmt: skip
-            if name in references:
-                row["own"] = errors(step.estimates, references[name]).mean((0, 1))
+            if name in own:
+                row["own"] = own[name][size].mean(axis=0)
             rows.append(row)
     columns = {"filter": "{filter}"}
     columns |= {f"RMSE {k + 1} [px]": f"{{mean[{k}]:.2f}} ± {{std[{k}]:.2f}}" for k in (0, 1)}
@@ -433,7 +414,7 @@ def study_table(
     return harness.table(columns | {"both held": "{held:.2f}", "N_eff": "{n_eff:.1f}"}, rows)
 
 
-def draw_migration(found: dict[str, dict[int, Step]], size: int, targets: Targets) -> Any:
+def draw_migration(fewest: dict[str, Step], targets: Targets) -> Any:
     """Figures 1 and 2: where the particles of one run are, coloured by the target they stand for.
 
     Four frames, among them the first, the one in which the targets are closest, and the last,
@@ -444,26 +425,21 @@ def draw_migration(found: dict[str, dict[int, Step]], size: int, targets: Target
     middle = closest // 2 if 2 * closest > last else (closest + last) // 2
     chosen = sorted({0, middle, closest, last})
     crop = _region(targets)
-    height = crop[0].stop - crop[0].start
-    zoom = max(1, round(360 / height))
-    rows = []
-    for name in (name for name in ("pf", "mpf", "gm_mpf") if name in found):
-        step = found[name][size]
-        pictures = [
-            _annotated(targets.stills[t], step.centres[0, t], step.target[0, t], zoom, crop)
-            for t in chosen
-        ]
-        rows.append((NAMES[name], pictures))
+    rows = [
+        (NAMES[name], [_annotated(targets.stills[t], step, t, crop) for t in chosen])
+        for name, step in fewest.items()
+        if name != "gpf"
+    ]
     titles = [f"frame {targets.first + t}" for t in chosen]
     return plotting.draw_contact_sheet(rows, titles)
 
 
-def _annotated(
-    still: np.ndarray, centres: np.ndarray, target: np.ndarray, zoom: int, crop: tuple
-) -> np.ndarray:
+def _annotated(still: np.ndarray, step: Step, t: int, crop: tuple[slice, slice]) -> np.ndarray:
+    zoom = max(1, round(360 / (crop[0].stop - crop[0].start)))
     canvas = still[crop].repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
     corner = np.array([crop[1].start, crop[0].start], float)
-    drawing.draw_points(canvas, zoom * (centres - corner), drawing.PALETTE[target], 0.9 * zoom)
+    places, colours = zoom * (step.centres[0, t] - corner), drawing.PALETTE[step.target[0, t]]
+    drawing.draw_points(canvas, places, colours, 0.9 * zoom)
     return np.clip(canvas, 0, 255).astype(np.uint8)
 
 
@@ -476,25 +452,21 @@ def _region(targets: Targets) -> tuple[slice, slice]:
     return slice(low[1], min(high[1], height)), slice(low[0], min(high[0], width))
 
 
-def draw_errors(
-    found: dict[str, dict[int, Step]], targets: Targets, references: dict[str, np.ndarray]
-) -> Any:
+def draw_errors(by_size: BySize, own: BySize) -> Any:
     """Figures 5 and 6: each target's error against the number of particles.
 
     Below, what of it is the Monte Carlo error of the mixtures.
     """
-    lines = {name: errors_by_size(by_size, targets.truth) for name, by_size in found.items()}
-    own = {name: errors_by_size(found[name], truth) for name, truth in references.items()}
     panels = [
         (
             f"target {target + 1}, from {what}",
             {
-                NAMES[name]: {size: error[:, target] for size, error in by_size.items()}
-                for name, by_size in those.items()
+                NAMES[name]: {size: error[:, target] for size, error in sizes.items()}
+                for name, sizes in errors.items()
             },
         )
-        for what, those in (
-            ("the true box", lines),
+        for what, errors in (
+            ("the true box", by_size),
             (f"the estimate with N = {REFERENCE_PARTICLES}", own),
         )
         for target in (0, 1)

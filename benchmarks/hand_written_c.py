@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
-from benchmarks.harness import AtLeast2, Count, command, data, ratio, settings_of, table
+from benchmarks.harness import AtLeast2, Count, command, data, ratio, settings_of, table, turns
 from benchmarks.peers.__main__ import disagreement, exact_log_likelihood
 from benchmarks.peers.jobs import Quadratic
 from benchmarks.peers.libraries import model_of, through_mpfjax
@@ -163,11 +163,11 @@ def compare(
     their answers differ.
     """
     ours = through_parts(job, by_hand.num_particles)
-    keys = [jax.random.split(jax.random.key(turn), num_seeds) for turn in range(repeats)]
-    for part in ours.values():
-        part(keys[0])
+    # The first turn compiles; what it is given says whether both agree.
+    keys = [jax.random.split(jax.random.key(turn), num_seeds) for turn in range(1 + repeats)]
+    given = [by_hand.prepared(turn) for turn in range(1 + repeats)]
     _, sizes, log_likelihoods = ours[ALL](keys[0])
-    found = by_hand.run(by_hand.prepared(0))
+    found = by_hand.run(given[0])
     reason = disagreement(
         {"log_likelihoods": found[..., 2].sum(1), "effective_sample_sizes": found[..., 1].mean(1)},
         {"log_likelihoods": log_likelihoods, "effective_sample_sizes": np.mean(sizes, axis=1)},
@@ -175,20 +175,12 @@ def compare(
     )
     if reason is not None:
         raise ValueError(f"N = {by_hand.num_particles}: the C program's {reason}")
-    taken: dict[tuple[str, int], list[tuple[float, float]]] = {}
-    for turn, key in enumerate(keys):
-        runs = by_hand.prepared(turn)
-        for part, one in ours.items():
-            taken.setdefault(("mpfjax", part), []).append(timed(one, key))
-            taken.setdefault(("C", part), []).append(timed(by_hand.run, runs, part))
-    return {name: np.array(seconds) for name, seconds in taken.items()}
-
-
-def timed(run: Callable[..., Any], *arguments: Any) -> tuple[float, float]:
-    """Seconds of processor time, and by the clock."""
-    processor, clock = time.process_time(), time.perf_counter()
-    run(*arguments)
-    return time.process_time() - processor, time.perf_counter() - clock
+    runs: dict[tuple[str, int], Callable[[int], Any]] = {}
+    for part, one in ours.items():
+        runs["mpfjax", part] = lambda turn, one=one: one(keys[turn])
+        runs["C", part] = lambda turn, part=part: by_hand.run(given[turn], part)
+    both: Any = lambda: np.array([time.process_time(), time.perf_counter()])  # noqa: E731
+    return turns(runs, repeats, clock=both)
 
 
 def as_rows(seconds: dict[tuple[str, int], np.ndarray], number: int) -> list[dict[str, Any]]:
@@ -198,15 +190,8 @@ def as_rows(seconds: dict[tuple[str, int], np.ndarray], number: int) -> list[dic
         draw, weigh, whole = (
             1e9 * np.median(seconds[who, part][:, 0]) / number for part in (DRAW, WEIGH, ALL)
         )
-        rows.append(
-            {
-                "who": who,
-                "draw": draw,
-                "weigh": weigh - draw,
-                "resample": whole - weigh,
-                "all": whole,
-            }
-        )
+        parts = {"draw": draw, "weigh": weigh - draw, "resample": whole - weigh, "all": whole}
+        rows.append({"who": who, **parts})
     ours, theirs = seconds["mpfjax", ALL], seconds["C", ALL]
     rows[1] |= {
         "ratio": ratio(ours[:, 0], theirs[:, 0]), "by_the_clock": ratio(ours[:, 1], theirs[:, 1])

@@ -27,7 +27,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial, wraps
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import jax
 import numpy as np
@@ -129,6 +129,8 @@ def _option(name: str, hint: Any, default: Any, function: Callable[..., Any]) ->
         kinds = get_args(hint)
         told.setdefault("nargs", len(kinds) if get_origin(hint) is tuple else "+")
         hint = kinds[0]
+    if get_origin(hint) is Literal:
+        return told | {"choices": get_args(hint)}
     told["type"] = hint
     if get_origin(hint) is Annotated:
         told["type"], how = get_args(hint)
@@ -165,7 +167,7 @@ def turns(
     for turn in range(warm_up + repeats):
         for index in order.permutation(len(names)).tolist():
             name = names[index]
-            if sum(taken[name]) > budget and len(taken[name]) >= 3:
+            if np.sum(taken[name]) > budget and len(taken[name]) >= 3:
                 continue
             start = clock()
             jax.block_until_ready(runs[name](turn))

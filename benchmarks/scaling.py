@@ -26,17 +26,8 @@ from jax.experimental.compilation_cache import compilation_cache
 
 import mpfjax
 from benchmarks import figures as plotting
-from benchmarks.harness import (
-    Count,
-    command,
-    data,
-    figures,
-    nothing,
-    ratio,
-    settings_of,
-    table,
-    turns,
-)  # fmt: skip
+from benchmarks import harness
+from benchmarks.harness import Count, command, data, nothing, pivot, table, turns
 from benchmarks.peers.worker import Worker, library_at_work, stop_all
 from mpfjax.operations.compiling import cpu_options
 from mpfjax.running.islands import IslandInteraction
@@ -134,7 +125,7 @@ def main(
         raise ValueError(f"--islands: {uneven[0]} is not a positive multiple of {NUM_ISLANDS**2}")
     sizes = TINY if quick else FULL
     content: dict[str, Any] = {
-        "settings": settings_of(locals() | sizes._asdict(), sizes=None), "results": [],
+        "settings": harness.settings_of(locals() | sizes._asdict(), sizes=None), "results": [],
         "slopes": [], "spread": [], "price": [], "first_calls": [], "islands": [],
     }  # fmt: skip
     programs: dict[Cell, Any] = {}
@@ -160,7 +151,7 @@ def main(
         print(table(ISLAND_COLUMNS, content["islands"]), end="\n\n")
     data(out / "scaling.json", **content)
     if content["results"]:
-        figures(out, scaling=draw(content["results"]))
+        harness.figures(out, scaling=draw(content["results"]))
     print(f"results: {out}/")
 
 
@@ -258,24 +249,27 @@ def slopes_of(axis: str, entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def as_tables(axis: str, entries: list[dict[str, Any]], slopes: list[dict[str, Any]]) -> str:
     """Times with their ratios to the PF's of the same size, memory, and the slopes of both."""
-    cells = {(entry["filter"], entry[axis]): entry for entry in entries}
-    rows = [slope for slope in slopes if slope["axis"] == axis]
+    plain = {entry[axis]: entry["median"] for entry in entries if entry["filter"] == "pf"}
+    own = [slope for slope in slopes if slope["axis"] == axis]
+    cells = sorted(entries, key=lambda entry: entry[axis])
 
     def time_of(entry: dict[str, Any]) -> str:
-        pf = cells.get(("pf", 1 if axis == "components" else entry[axis]))
-        over = "" if pf is None else f" {entry['median'] / pf['median']:6.2f}"
+        pf = plain.get(1 if axis == "components" else entry[axis])
+        over = "" if pf is None else f" {entry['median'] / pf:6.2f}"
         return f"{1000 * entry['median']:.4g}{over}"
 
-    def one(title: str, form: Callable[[dict[str, Any]], str], ends: dict[str, Any]) -> str:
-        columns: dict[str, Any] = {title: lambda row: FILTERS[row["filter"]]}
-        for value in sorted({entry[axis] for entry in entries}):
-            columns[f"{axis} {value}"] = lambda row, v=value: form(cells[row["filter"], v])
-        return table(columns | ends, rows)
+    def one(title: str, form: Callable[[dict[str, Any]], str], ends: dict[str, str]) -> str:
+        lines = [each | {"at": f"{axis} {each[axis]}", "text": form(each)} for each in cells]
+        for end, name in ends.items():
+            lines += [
+                slope | {"at": end, "text": "-" if slope[name] is None else f"{slope[name]:.2f}"}
+                for slope in own
+            ]
+        return pivot(title, lines, lambda line: FILTERS[line["filter"]], "{at}", "{text}")
 
-    of_time = {"slope": "{time:.2f}", "slope at the end": "{time_last:.2f}"}
-    times = one("median [ms], ratio to PF", time_of, of_time)
-    memory = one("memory [MB]", lambda e: f"{e['bytes'] / 1e6:.3g}", {"slope": "{memory:.2f}"})
-    return f"{times}\n\n{memory}"
+    times = {"slope": "time", "slope at the end": "time_last"}
+    memory = one("memory [MB]", lambda e: f"{e['bytes'] / 1e6:.3g}", {"slope": "memory"})
+    return f"{one('median [ms], ratio to PF', time_of, times)}\n\n{memory}"
 
 
 def draw(results: list[dict[str, Any]]) -> Any:
@@ -308,7 +302,8 @@ def price_of(sizes: Sizes, repeats: int) -> list[dict[str, Any]]:
         calls = {cell: lambda _, run=run, keys=keys: run(keys) for cell, run in runs.items()}
         taken = turns(calls, repeats, budget=BUDGET)
         entries += [
-            cell._asdict() | {"seconds": taken[cell], "ratio": ratio(taken[cell], taken[plain])}
+            cell._asdict()
+            | {"seconds": taken[cell], "ratio": harness.ratio(taken[cell], taken[plain])}
             for cell in mixtures
         ]
     return entries
@@ -350,26 +345,19 @@ def _nothing_kept() -> Iterator[None]:
 
 def price_table(entries: list[dict[str, Any]], calls: list[dict[str, Any]]) -> str:
     """A line for each filter and N, with the slope in N, and one for each filter's first call."""
-    numbers = sorted({entry["particles"] for entry in entries})
-    found = {(e["filter"], e["particles"], e["components"]): e for e in entries}
-    first = {(call["filter"], call["components"]): call["first_call"] for call in calls}
-
-    def slope(name: str, m: int) -> str:
-        times = [float(np.median(found[name, n, m]["seconds"])) for n in numbers]
-        fitted = fit_slope(numbers, times)
-        return "-" if fitted is None else f"{fitted:.2f}"
-
-    titles = "time over the plain filter's", f"(its first call: {first['pf', 1]:.1f} s)"
-    sizes = sorted({entry["components"] for entry in entries})
-    rows: list[dict[str, Any]] = []
-    for name, title in PRICED.items():
-        lines = {f"N = {n}": [f"{found[name, n, m]['ratio']:.2f}" for m in sizes] for n in numbers}
-        lines["slope in N"] = [slope(name, m) for m in sizes]
-        lines["first call [s]"] = [f"{first[name, m]:.1f}" for m in sizes]
-        for what, cells in lines.items():
-            values = zip((f"M = {m}" for m in sizes), cells, strict=True)
-            rows.append({titles[0]: title, titles[1]: what, **dict(values)})
-    return table(None, rows)
+    lines = [e | {"what": f"N = {e['particles']}", "text": f"{e['ratio']:.2f}"} for e in entries]
+    for cell in dict.fromkeys((e["filter"], e["components"]) for e in entries):
+        own = [e for e in entries if (e["filter"], e["components"]) == cell]
+        times = [float(np.median(e["seconds"])) for e in own]
+        slope = fit_slope([e["particles"] for e in own], times)
+        text = "-" if slope is None else f"{slope:.2f}"
+        lines.append(own[0] | {"what": "slope in N", "text": text})
+    plain, *mixtures = calls
+    lines += [e | {"what": "first call [s]", "text": f"{e['first_call']:.1f}"} for e in mixtures]
+    lines.sort(key=lambda line: list(PRICED).index(line["filter"]))
+    title = f"time over the plain filter's (its first call: {plain['first_call']:.1f} s)"
+    name = lambda line: f"{PRICED[line['filter']]}: {line['what']}"  # noqa: E731
+    return pivot(title, lines, name, "M = {components}", "{text}")
 
 
 # --- devices, processes and islands -------------------------------------------------------------

@@ -131,10 +131,7 @@ def simulate(seed: int) -> tuple[Float[Array, " t"], Float[Array, " t"]]:
 
 
 def build(
-    name: str,
-    model: mpfjax.QuadraticModel,
-    mixture: dict[str, Any],
-    num_particles: int,
+    name: str, model: mpfjax.QuadraticModel, mixture: dict[str, Any], num_particles: int
 ) -> mpfjax.Filter:
     """The filter of that name; `mixture` are the options of those that are mixtures.
 

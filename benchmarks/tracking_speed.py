@@ -14,7 +14,7 @@ import itertools
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -42,7 +42,7 @@ class Way(NamedTuple):
     size: tuple[int, int] | None
     detect: bool = False
     fields: tuple[int, int] = FEW
-    motion: str = "detections"  # what the camera's motion is found from
+    motion: Literal["detections", "pixels"] = "detections"  # what the camera's motion is found from
 
     @property
     def num_objects(self) -> int:

@@ -21,17 +21,9 @@ from matplotlib.figure import Figure
 import mpfjax
 from benchmarks import harness
 from benchmarks.harness import Count, command
+from benchmarks.interacting_objects import scenes as made
 from benchmarks.interacting_objects.partitions import adaptive_partitions, independent_partitions
-from benchmarks.interacting_objects.scenes import (
-    BOX,
-    NUM_FRAMES,
-    SCENES,
-    SHARPNESS,
-    Blob,
-    Scene,
-    Setting,
-    place_of,
-)
+from benchmarks.interacting_objects.scenes import BOX, NUM_FRAMES, SCENES, SHARPNESS, Scene
 from mpfjax.metrics.tracking_quality import recovery_rate, track_state
 
 REPULSION = 2 * SHARPNESS  # so that sharing a place never pays; none from a box's side on
@@ -126,8 +118,8 @@ def run_all(
     def run(inputs: tuple) -> dict[str, Float[Array, "t objects 2"]]:
         key, scene, order = inputs
         num_objects = scene.places.shape[1]
-        blobs = Blob(scene.places[0], 2 * scene.places[0] - scene.places[1])
-        repulsion = mpfjax.PairwiseRepulsion(REPULSION, BOX, place_of)
+        blobs = made.Blob(scene.places[0], 2 * scene.places[0] - scene.places[1])
+        repulsion = mpfjax.PairwiseRepulsion(REPULSION, BOX, made.place_of)
         model = mpfjax.MultiObjectModel(blobs, num_objects, repulsion, per_object=True)
         filter = make(model, num_particles) if order is None else make(model, num_particles, order)
         seen = jax.tree.map(lambda leaf: leaf[1:], scene.seen)
@@ -147,7 +139,9 @@ def estimates(mixture: mpfjax.ParticleMixture) -> dict[str, Float[Array, "object
     return {"mean": mixture.average(places), "median": median}
 
 
-def run_method(method: str, setting: Setting, num_runs: int, seed: int) -> dict[str, np.ndarray]:
+def run_method(
+    method: str, setting: made.Setting, num_runs: int, seed: int
+) -> dict[str, np.ndarray]:
     """Whether each object is tracked, by each estimate: (orders, runs, t, objects)."""
     key_scenes, key_runs = jax.random.split(jax.random.key(seed))
     scenes = jax.vmap(setting.make)(jax.random.split(key_scenes, num_runs))
@@ -211,18 +205,12 @@ def entries(
 
 def as_table(results: list[dict[str, Any]], estimate: str) -> str:
     """Methods by scenes, each rate with its interval."""
-    cells = {(line["label"], line["scene"]): line["recovery"][estimate] for line in results}
 
-    def text(label: str, scene: str) -> str:
-        low, high = cells[label, scene]["interval"]
-        return f"{cells[label, scene]['rate']:.3f} [{low:.2f}, {high:.2f}]"
+    def cell(line: dict[str, Any]) -> str:
+        low, high = line["recovery"][estimate]["interval"]
+        return f"{line['recovery'][estimate]['rate']:.3f} [{low:.2f}, {high:.2f}]"
 
-    scenes = dict.fromkeys(line["scene"] for line in results)
-    rows = [
-        {f"recovery, {estimate}": label} | {scene: text(label, scene) for scene in scenes}
-        for label in dict.fromkeys(line["label"] for line in results)
-    ]
-    return harness.table(None, rows)
+    return harness.pivot(f"recovery, {estimate}", results, "{label}", "{scene}", cell)
 
 
 def draw(results: list[dict[str, Any]]) -> Figure:

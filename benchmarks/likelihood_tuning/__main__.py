@@ -282,41 +282,28 @@ def optimisation(key: Array, start: np.ndarray, num_steps: int) -> TuningRun:
     """The guided mixture particle filter's likelihood, climbed from one start."""
     model = mpfjax.QuadraticModel(float(start[0]), float(start[1]), LOW, HIGH)
     filter = mpfjax.mixture_particle_filter(
-        model,
-        TUNED_PARTICLES,
-        max_components=2,
-        proposal=mpfjax.GaussNewtonProposal(model),
-        noise="rqmc",
+        model, TUNED_PARTICLES, 2, proposal=mpfjax.GaussNewtonProposal(model), noise="rqmc",
         gradient="stop",
-    )
+    )  # fmt: skip
+    optimiser = optax.adam(optax.cosine_decay_schedule(RATE, num_steps))
     return fit(
-        key,
-        filter,
-        jnp.asarray(OBSERVATIONS),
-        optax.adam(optax.cosine_decay_schedule(RATE, num_steps)),
-        num_steps,
+        key, filter, jnp.asarray(OBSERVATIONS), optimiser, num_steps,
         parameters={"sigma_x": lambda f: f.model.sigma_x, "sigma_y": lambda f: f.model.sigma_y},
         transforms={"sigma_x": Positive(), "sigma_y": Positive()},
-        num_seeds=TUNED_SEEDS,
-        curvature_seeds=CURVATURE_SEEDS,
-        progress=False,
-    )
+        num_seeds=TUNED_SEEDS, curvature_seeds=CURVATURE_SEEDS, progress=False,
+    )  # fmt: skip
 
 
 def compare(start: np.ndarray, run: TuningRun, maximum: Maximum) -> dict[str, Any]:
     """Where an optimisation ended, and its standard errors, relative to the exact ones."""
-    end = np.array([run.parameters["sigma_x"], run.parameters["sigma_y"]], float)
-    errors = None
+    both = lambda of: np.array([of["sigma_x"], of["sigma_y"]], float)  # noqa: E731
+    end, errors = both(run.parameters), None
     if run.standard_errors is not None:
-        found = np.array([run.standard_errors["sigma_x"], run.standard_errors["sigma_y"]], float)
-        errors = (found / end / maximum.errors).tolist()
+        errors = both(run.standard_errors) / end / maximum.errors
     return {
-        "start": start.tolist(),
-        "end": end.tolist(),
-        "relative_error": (end / np.exp(maximum.point) - 1).tolist(),
-        "standard_errors_over_exact": errors,
-        "stopped": run.stopped,
-    }
+        "start": start, "end": end, "relative_error": end / np.exp(maximum.point) - 1,
+        "standard_errors_over_exact": errors, "stopped": run.stopped,
+    }  # fmt: skip
 
 
 def surface() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,17 +1,18 @@
 """Labelled boxes as states of a model, and boxes around them."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from mpfjax.checks import check_finite, check_key, check_positive, check_type, check_whole, shown
+from mpfjax.checks import Count, Positive, checked, number
 from mpfjax.vision.boxes.colour_model import AbstractBoxModel, BoxState
 from mpfjax.vision.files.boxes import centred
 
 
+@checked
 def labelled_states(model: AbstractBoxModel, boxes: Float[np.ndarray, "t k 4"]) -> BoxState:
     """The states of k labelled objects in t consecutive frames: leaves (t, k, ...).
 
@@ -19,11 +20,7 @@ def labelled_states(model: AbstractBoxModel, boxes: Float[np.ndarray, "t k 4"]) 
     dynamics of second order, the objects have no speed in the first frame. Raises `ValueError`
     for another number of boxes than of references, and for a box that is not finite or has no area.
     """
-    check_type(AbstractBoxModel, "a model of boxes, such as a ColourModel", model=model)
-    try:
-        boxes = np.asarray(boxes, float)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"boxes: {shown(boxes)} are no numbers") from error
+    boxes = np.asarray(boxes, float)
     k = model.reference_boxes.shape[0]
     if boxes.ndim != 3 or boxes.shape[1:] != (k, 4):
         raise ValueError(f"boxes: shape {boxes.shape} is not (t, {k}, 4), for {k} references")
@@ -46,13 +43,14 @@ def labelled_states(model: AbstractBoxModel, boxes: Float[np.ndarray, "t k 4"]) 
     return BoxState(box, reference, jnp.concatenate([box[:1], pasts]))
 
 
+@checked
 def boxes_around(
     key: Key[Array, ""],
     model: AbstractBoxModel,
     states: BoxState,
-    num_boxes: int,
-    reach: float = 2.0,
-    stretch: float = 1.5,
+    num_boxes: Count,
+    reach: Positive = 2.0,
+    stretch: Annotated[float, number(lambda x: 1 <= x < np.inf, "at least 1")] = 1.5,
 ) -> BoxState:
     """Boxes spread evenly over the neighbourhood of each: leaves (..., n, ...).
 
@@ -62,14 +60,6 @@ def boxes_around(
     include boxes of wrong sizes, without which the likelihood does not learn about size. Raises
     `ValueError` for fewer than one box, a reach that is not positive, and a stretch below one.
     """
-    check_key(key)
-    check_type(AbstractBoxModel, "a model of boxes, such as a ColourModel", model=model)
-    check_type(BoxState, "a BoxState", states=states)
-    check_whole(num_boxes=num_boxes)
-    check_positive(reach=reach)
-    check_finite(stretch=stretch)
-    if stretch < 1:
-        raise ValueError(f"stretch: {stretch} is less than 1")
 
     def each(leaf: Array) -> Array:
         lead = states.reference.shape

@@ -19,7 +19,7 @@ from benchmarks import harness
 from benchmarks.coverage import covers
 from benchmarks.likelihood_tuning.labelled_boxes import boxes_around, labelled_states
 from benchmarks.likelihood_tuning.soft_colours import SoftColourModel
-from benchmarks.scenes import football_scene
+from benchmarks.scenes import boxes_over_time, football_scene
 from mpfjax.metrics.tracking_quality import intersection_area
 from mpfjax.tuning import LabelLikelihood, Positive, maximise
 from mpfjax.tuning.labels import transition_candidates
@@ -62,10 +62,8 @@ def read_labelled(name: str, seed: int) -> Labelled:
             raise FileNotFoundError(f"{folder}: no such sequence")
         frames = np.stack(list(read_frames(folder, 1, last)))
         rows = read_truth(folder / "gt.txt").objects
-        ids = sorted(set(rows[rows[:, 0] <= last, 1]))
-    boxes = [[rows[(rows[:, 0] == t) & (rows[:, 1] == id)][0, 2:] for id in ids]
-             for t in range(1, last + 1)]  # fmt: skip
-    return Labelled(frames, np.array(boxes))
+        ids = sorted({int(id) for id in rows[rows[:, 0] <= last, 1]})
+    return Labelled(frames, boxes_over_time(rows, ids, 1, last))
 
 
 def untuned_model(labelled: Labelled, template: int) -> SoftColourModel:
@@ -74,13 +72,9 @@ def untuned_model(labelled: Labelled, template: int) -> SoftColourModel:
     def learn(frame: np.ndarray, boxes: np.ndarray) -> SoftColourModel:
         size = np.concatenate([boxes[:, 2:], np.ones_like(boxes[:, 2:])], axis=1)
         return SoftColourModel.from_frame(
-            frame,
-            boxes,
-            num_bins=NUM_BINS,
-            num_points=NUM_POINTS,
-            num_parts=NUM_PARTS,
+            frame, boxes, num_bins=NUM_BINS, num_points=NUM_POINTS, num_parts=NUM_PARTS,
             deviations=size * np.array(STEPS),
-        )
+        )  # fmt: skip
 
     looks = learn(labelled.frames[template], labelled.boxes[template]).reference_logits
     model = learn(labelled.frames[-1], labelled.boxes[-1])
@@ -100,20 +94,16 @@ def tune(key: Array, model: SoftColourModel, labelled: Labelled, num_steps: int)
     )
     frames = jnp.asarray(labelled.frames[1:])
     objective = LabelLikelihood(frames, present, rivals, min(FRAMES_A_STEP, len(frames)))
+    parameters = {
+        "lambda": lambda m: m.lambda_,
+        "bandwidth": lambda m: m.bandwidth,
+        "references": lambda m: m.reference_logits,
+    }
     return maximise(
-        key_refined,
-        objective,
-        model,
-        optax.adam(optax.cosine_decay_schedule(RATE, num_steps)),
-        num_steps,
-        parameters={
-            "lambda": lambda m: m.lambda_,
-            "bandwidth": lambda m: m.bandwidth,
-            "references": lambda m: m.reference_logits,
-        },
-        transforms={"lambda": Positive(), "bandwidth": Positive()},
-        progress=False,
-    )
+        key_refined, objective, model, optax.adam(optax.cosine_decay_schedule(RATE, num_steps)),
+        num_steps, parameters=parameters,
+        transforms={"lambda": Positive(), "bandwidth": Positive()}, progress=False,
+    )  # fmt: skip
 
 
 def filters_of(size: np.ndarray) -> dict[str, Callable[[SoftColourModel], mpfjax.Filter]]:

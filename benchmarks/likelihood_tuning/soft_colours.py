@@ -2,6 +2,7 @@
 
 import math
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,12 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num, UInt8
 
-from mpfjax.checks import check_inner_share, check_positive, check_shape, check_whole
+from mpfjax.checks import InnerShare, Positive, checked
 from mpfjax.models.dynamics import AbstractDynamics
 from mpfjax.vision.boxes.colour_model import AbstractBoxModel, BoxState, ColourModel
 from mpfjax.vision.colour.bins import RGBColours
 from mpfjax.vision.colour.histograms import bhattacharyya, normalise
-from mpfjax.vision.files.frames import check_frame
 
 
 class SoftColourModel(AbstractBoxModel):
@@ -53,41 +53,28 @@ class SoftColourModel(AbstractBoxModel):
     switch_probability: float = eqx.field(static=True, default=0.0)
 
     @classmethod
+    @checked
     def from_frame(
         cls,
         frame: UInt8[np.ndarray, "h w 3"],
         boxes: Float[np.ndarray, "k 4"],
         *,
         num_bins: int = 16,
-        sigma: float = 0.15,
-        bandwidth: float = 0.5,
+        bandwidth: Positive = 0.5,
         num_points: int = 10,
-        floor: float = 1e-3,
-        deviations: Float[np.ndarray, "..."] | None = None,
-        dynamics: AbstractDynamics | None = None,
+        floor: InnerShare = 1e-3,
         num_parts: int = 1,
-        switch_probability: float = 0.0,
+        **options: Any,
     ) -> "SoftColourModel":
         """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
 
         - `num_bins`: of each of red, green and blue.
-        - `sigma`: σ, with λ = 1 / 2σ².
         - `bandwidth`, `num_points`, `floor`: see the class.
-        - The other arguments and the errors are those of `ColourModel.from_frame`.
+        - The other arguments and the errors are those of `ColourModel.from_frame`, but for σ, which
+          is 0.15 and says λ = 1 / 2σ².
         """
-        check_positive(bandwidth=bandwidth)
-        check_inner_share(floor=floor)
-        _check_points(num_points, num_parts)
-        hard = ColourModel.from_frame(
-            frame,
-            boxes,
-            colours=RGBColours(num_bins),
-            sigma=sigma,
-            deviations=deviations,
-            dynamics=dynamics,
-            num_parts=num_parts,
-            switch_probability=switch_probability,
-        )
+        options = {"sigma": 0.15, "num_parts": num_parts} | options
+        hard = ColourModel.from_frame(frame, boxes, colours=RGBColours(num_bins), **options)
         width = jnp.asarray(bandwidth, hard.sigma.dtype)
         counts = soft_histograms(
             jnp.asarray(frame), hard.reference_boxes, num_bins, width, num_points, num_parts
@@ -101,7 +88,7 @@ class SoftColourModel(AbstractBoxModel):
             bandwidth=width,
             num_points=num_points,
             floor=floor,
-            switch_probability=switch_probability,
+            switch_probability=hard.switch_probability,
         )
 
     @property
@@ -130,6 +117,7 @@ class SoftColourModel(AbstractBoxModel):
         return jnp.mean(jnp.sum(jnp.where(empty, 1.0, distances), axis=2), axis=1)
 
 
+@partial(jax.jit, static_argnames=("num_bins", "num_points", "num_parts"))
 def soft_histograms(
     frame: Num[Array, "h w 3"],
     boxes: Float[Array, "n 4"],
@@ -149,26 +137,10 @@ def soft_histograms(
 
     Boxes are (x, y, w, h) about their centre, in pixels. Points outside the frame do not count, and
     those within half a pixel of its edge count in part. Bands run from top to bottom. A box that is
-    not finite has zero counts. Raises `ValueError` for K that is no multiple of `num_parts`, a
-    number of bins outside 1 to 256, a frame that is not (h, w, 3), and arrays of other shapes.
+    not finite has zero counts. Raises `ValueError` for K that is no multiple of `num_parts`.
     """
-    _check_points(num_points, num_parts)
-    RGBColours(num_bins)
-    check_frame(frame, eight_bits=False)
-    check_shape("n 4", boxes=boxes)
-    check_shape("", bandwidth=bandwidth)
-    return _soft_histograms(frame, boxes, num_bins, bandwidth, num_points, num_parts)
-
-
-@partial(jax.jit, static_argnames=("num_bins", "num_points", "num_parts"))
-def _soft_histograms(
-    frame: Num[Array, "h w 3"],
-    boxes: Float[Array, "n 4"],
-    num_bins: int,
-    bandwidth: Float[Array, ""],
-    num_points: int,
-    num_parts: int,
-) -> Float[Array, "n parts 3 bins"]:
+    if num_points % num_parts:
+        raise ValueError(f"num_points: {num_points} is no multiple of num_parts, {num_parts}")
     finite = jnp.all(jnp.isfinite(boxes), axis=1, keepdims=True)
     boxes = jnp.where(finite, boxes, -1e6)
     steps = (jnp.arange(num_points, dtype=boxes.dtype)[None] + 0.5) / num_points - 0.5
@@ -234,9 +206,3 @@ def _soft_bins(
 
 def _mixed(histograms: Float[Array, "*batch bins"], floor: float) -> Float[Array, "*batch bins"]:
     return (1 - floor) * histograms + floor / histograms.shape[-1]
-
-
-def _check_points(num_points: int, num_parts: int) -> None:
-    check_whole(num_points=num_points, num_parts=num_parts)
-    if num_points % num_parts:
-        raise ValueError(f"num_points: {num_points} is no multiple of num_parts, {num_parts}")

@@ -27,16 +27,11 @@ from tqdm import tqdm
 
 from benchmarks.harness import Count, Natural, Positive, Seed, command, data, settings_of
 from benchmarks.partitioned_sampling import scenes as scene_files
+from benchmarks.partitioned_sampling import tables
 from benchmarks.partitioned_sampling.pictures import write_pictures
 from benchmarks.partitioned_sampling.scenes import MOST_TRIED, Event, Scene, find_events
 from benchmarks.partitioned_sampling.sensitivity import CASES, run_sensitivity
-from benchmarks.partitioned_sampling.study import METHODS, filters, num_rows, study
-from benchmarks.partitioned_sampling.tables import (
-    Measured,
-    content_of,
-    measure_row,
-    print_tables,
-)
+from benchmarks.partitioned_sampling.study import METHODS, filters, study
 from mpfjax.console import seed as read_seed
 from mpfjax.vision.files.frames import parse_range
 
@@ -117,7 +112,7 @@ def run(
     cycles = synthetic and "ps" in methods
     size, lambdas = settings["num_particles"], settings["lambdas"]
     scenes: list[Scene] = []
-    measured: list[Measured] = []
+    measured: list[tables.Measured] = []
     passed_over: list[Any] = []
     started = time.perf_counter()
     for number, (name, scene) in enumerate(found):
@@ -127,20 +122,19 @@ def run(
         # Numbers that do not fit come to light here, before anything compiles.
         filters(scene, lambdas[0], size, methods)
         scenes.append(scene)
-        total = num_rows(scene, lambdas, methods, cycles)
         made = study(
             scene, number, lambdas, size, methods, settings["runs"], settings["seed"],
             cycles=cycles,
         )  # fmt: skip
-        for row in tqdm(made, desc=scene.name, total=total, unit="row", disable=None):
-            measured.append(measure_row(scene, row, synthetic))
+        for row in tqdm(made, desc=scene.name, unit="row", disable=None):
+            measured.append(tables.measure_row(scene, row, synthetic))
         settings["seconds"] = round(time.perf_counter() - started, 1)
         settings["passed_over"] = passed_over
-        content = content_of(scenes, measured)
+        content = tables.content_of(scenes, measured)
         data(out / "partitioned_sampling.json", settings=settings, **content)
     if not scenes:
         raise ValueError("--keys: the posterior keeps the scene of none of them")
-    print_tables(content)
+    tables.print_tables(content)
     write_pictures(out, scenes, [row for row, _ in measured], content)
     if passed_over:
         print(f"\n{len(passed_over)} keys were passed over: {passed_over}")

@@ -132,18 +132,11 @@ def distance_maps(
         raise ValueError(f"sides: {num_parts} bands of a height of {height} end within pixels")
     band = height // num_parts
     rows, columns = window.bottom - window.top, window.right - window.left
-    seen = np.full((rows + height - 1, columns + width - 1), -1)
-    inside = [
-        slice(max(start, 0), min(start + size, limit))
-        for start, size, limit in zip(
-            (window.top, window.left), seen.shape, bins.shape, strict=True
-        )
-    ]
-    places = [
-        slice(part.start - start, max(part.stop, part.start) - start)
-        for part, start in zip(inside, (window.top, window.left), strict=True)
-    ]
-    seen[tuple(places)] = bins[tuple(inside)]
+    # The pixels that the boxes hold, -1 outside the frame.
+    bottom, right = window.bottom + height - 1, window.right + width - 1
+    edge = max(0, -window.top, -window.left, bottom - len(bins), right - bins.shape[1])
+    seen = np.pad(bins, edge, constant_values=-1)
+    seen = seen[window.top + edge : bottom + edge, window.left + edge : right + edge]
     roots = np.sqrt(references).astype(np.float32)
     alike = np.zeros((num_objects, num_parts, len(seen) - band + 1, columns), np.float32)
     for colour in np.flatnonzero(roots.any(axis=(0, 1))):

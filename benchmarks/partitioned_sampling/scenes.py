@@ -10,7 +10,7 @@ that it went in with. The rule says nothing of looks, and no filter has run.
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,17 +18,10 @@ import numpy as np
 from jaxtyping import Float
 
 import mpfjax
+from benchmarks.partitioned_sampling import posterior
 from benchmarks.partitioned_sampling.effective_dynamics import effective_dynamics
-from benchmarks.partitioned_sampling.posterior import (
-    Verdict,
-    Window,
-    distance_maps,
-    judge,
-    mapped_model,
-    particle_means,
-    posterior_means,
-)
-from benchmarks.scenes import NoPath, distracter_scene
+from benchmarks.partitioned_sampling.posterior import Verdict, Window, judge
+from benchmarks.scenes import NoPath, boxes_over_time, distracter_scene
 from mpfjax import vision
 from mpfjax.metrics import uniqueness
 from mpfjax.vision.boxes.joint_colour import PAPER_DEVIATIONS, object_boxes
@@ -76,7 +69,7 @@ class Setting(NamedTuple):
     size: tuple[int, int] = (24, 24)
     speed: float = 0.0
     deviation: float = 4.0
-    noise: str = "grey"
+    noise: Literal["grey", "colour"] = "grey"
     momentum: float = 0.5
 
 
@@ -128,18 +121,22 @@ def synthetic_scene(
     whole = Window.whole(bins[0], sides)
 
     def maps_of(objects: slice) -> np.ndarray:
-        return np.stack([distance_maps(one, references[objects], sides, whole) for one in bins])
+        return np.stack(
+            [posterior.distance_maps(one, references[objects], sides, whole) for one in bins]
+        )
 
     first, steps = maps_of(slice(0, 1)), PAPER_DEVIATIONS[:2]
-    means = particle_means(first[:, 0], starts[0], sides, steps)
+    means = posterior.particle_means(first[:, 0], starts[0], sides, steps)
     verdict = judge(means, drawn.boxes[:, 0])
     if only_if_kept and not verdict.keeps:
         return None
-    exact = judge(posterior_means(bins, references[0], starts[0], sides), drawn.boxes[:, 0])
+    exact = judge(
+        posterior.posterior_means(bins, references[0], starts[0], sides), drawn.boxes[:, 0]
+    )
     maps = np.concatenate([first, maps_of(slice(1, None))], axis=1)
     return Scene(
         key, f"synthetic sequence of key {key}", drawn.frames, 1, drawn.boxes, 0, jnp.asarray(maps),
-        lambda lambda_: mapped_model(starts, sides, lambda_, setting.momentum, steps),
+        lambda lambda_: posterior.mapped_model(starts, sides, lambda_, setting.momentum, steps),
         lambda everything: _place_collector(sides, everything), np.array(steps), verdict, exact,
     )  # fmt: skip
 
@@ -195,7 +192,9 @@ def find_events(folder: Path) -> list[Event]:
     """
     if not folder.is_dir():
         raise ValueError(f"--sequence: {folder} is not a folder")
-    ids, boxes = tracks(read_truth(folder / "gt.txt").objects)
+    rows = vision.read_truth(folder / "gt.txt").objects
+    ids = sorted({int(id) for id in rows[:, 1]})
+    boxes = boxes_over_time(rows, ids, 0, int(rows[:, 0].max()) + 1)
     events = [event for j in range(len(ids)) for event in _events_of(j, ids, boxes)]
     if not events:
         raise ValueError(
@@ -203,17 +202,6 @@ def find_events(folder: Path) -> list[Event]:
             " out elsewhere; give --ids and --frames"
         )
     return events
-
-
-def tracks(
-    rows: Float[np.ndarray, "rows 6"],
-) -> tuple[list[int], Float[np.ndarray, "frames objects 4"]]:
-    """The ids, and each object's box in frames 0, 1, ..., NaN where it has none."""
-    ids = sorted({int(row[1]) for row in rows})
-    boxes = np.full((int(rows[:, 0].max()) + 1, len(ids), 4), np.nan)
-    for frame, id, *box in rows:
-        boxes[int(frame), ids.index(int(id))] = box
-    return ids, boxes
 
 
 def cover(
@@ -272,11 +260,7 @@ def real_scene(folder: Path, event: Event) -> Scene:
     missing = [id for id in ids if id not in started]
     if missing or not ids:
         raise ValueError(f"--ids: gt.txt has no box of {missing or 'any object'} in frame {first}")
-    truth = np.full((len(stills), len(ids), 4), np.nan)
-    for t in range(len(stills)):
-        own = box_files.boxes_of_frame(rows, first + t)
-        for j, id in enumerate(ids):
-            truth[t, j] = own.get(id, np.nan)
+    truth = boxes_over_time(rows, ids, first, len(stills))
     deviations = np.array(PAPER_DEVIATIONS)
     deviations[:2] *= stills.shape[2] / PAPER_WIDTH
     steps = tuple(deviations.tolist())

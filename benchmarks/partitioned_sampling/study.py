@@ -101,12 +101,6 @@ def study(
             yield _reduced(Row(scene.key, lambda_, method, order, kept, {}), scene)
 
 
-def num_rows(scene: Scene, lambdas: Sequence[float], methods: Sequence[str], cycles: bool) -> int:
-    """How many rows `study` makes."""
-    orders = sum(scene.num_objects if name in ORDERED else 1 for name in methods)
-    return orders * len(lambdas) + cycles * len(other_cycles(scene.num_objects))
-
-
 def row_keys(seed: int, scene: int, lambda_: float, place: int, num_runs: int) -> Array:
     """Keys of one row's runs: no two rows have any in common, whatever other λ there are."""
     key = jax.random.fold_in(jax.random.key(seed), scene)

@@ -7,14 +7,8 @@ import numpy as np
 from scipy import stats
 
 from benchmarks import harness
-from benchmarks.partitioned_sampling.rates import (
-    RATES,
-    Rates,
-    least_and_greatest,
-    measure,
-    over_scenes,
-    pool,
-)
+from benchmarks.partitioned_sampling import rates as of_runs
+from benchmarks.partitioned_sampling.rates import RATES, Rates, least_and_greatest
 from benchmarks.partitioned_sampling.scenes import Scene
 from benchmarks.partitioned_sampling.study import CYCLE, ORDERED, Order, Row
 
@@ -33,7 +27,7 @@ def measure_row(scene: Scene, row: Row, synthetic: bool) -> Measured:
         objects = {"1": [j for j in range(scene.num_objects) if j != scene.hard]}
         objects["2"] = [scene.hard]
     rates = {
-        table: measure(row.kept.boxes[:, :, chosen], scene.truth[:, chosen])
+        table: of_runs.measure(row.kept.boxes[:, :, chosen], scene.truth[:, chosen])
         for table, chosen in objects.items()
     }
     return Measured(row, rates)
@@ -89,7 +83,9 @@ def _over_orders(scene: Scene, measured: list[tuple[Row, Rates]]) -> list[dict[s
     for lambda_ in dict.fromkeys(row.lambda_ for row, _ in own):
         pairs = [(row, found) for row, found in own if row.lambda_ == lambda_]
         head = {"scene": scene.key, "lambda": lambda_, "method": pairs[0][0].method}
-        entries.append(head | {"order": "mean"} | pool([found for _, found in pairs]).as_dict())
+        entries.append(
+            head | {"order": "mean"} | of_runs.pool([found for _, found in pairs]).as_dict()
+        )
         row, found = min(pairs, key=lambda p: (p[1].recovered.mean(), p[1].success.mean()))
         worst = [j + 1 for j in row.order or ()]
         entries.append(head | {"order": "worst", "worst": worst} | found.as_dict())
@@ -108,7 +104,7 @@ def _means(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
             key = (entry["lambda"], entry["method"], entry["order"])
             grouped.setdefault(key, []).append(entry)
     return [
-        {"lambda": lambda_, "method": method, "order": order} | over_scenes(group)
+        {"lambda": lambda_, "method": method, "order": order} | of_runs.over_scenes(group)
         for (lambda_, method, order), group in sorted(grouped.items(), key=lambda item: item[0][0])
     ]
 

@@ -21,16 +21,8 @@ import numpy as np
 from scipy import stats
 
 from benchmarks import figures as plotting
-from benchmarks.harness import (
-    AtLeast2,
-    Count,
-    Positive,
-    command,
-    data,
-    figures,
-    settings_of,
-    table,
-)  # fmt: skip
+from benchmarks import harness
+from benchmarks.harness import AtLeast2, Count, Positive, command
 from benchmarks.peers.jobs import JOBS, Job, Quadratic
 from benchmarks.peers.libraries import LIBRARIES, model_of
 from benchmarks.peers.worker import Worker, library_at_work, stop_all
@@ -73,7 +65,7 @@ def main(
     - `devices`: mpfjax on so many, beside on one.
     - `time_limit`: seconds, of one run.
     """
-    settings = settings_of(locals())
+    settings = harness.settings_of(locals())
     results: list[dict[str, Any]] = []
     found: dict[str, Any] = {}
     for job in jobs:
@@ -89,13 +81,15 @@ def main(
                     request = {"particles": size, "seeds": seeds}
                     cell = time_cell(workers, request, exact, repeats, time_limit)
                     results += [{"job": job, "particles": size} | entry for entry in cell]
-                data(out / "peers.json", settings=settings, libraries=found, results=results)
+                harness.data(
+                    out / "peers.json", settings=settings, libraries=found, results=results
+                )
         finally:
             stop_all(workers.values())
     labels = LIBRARIES | {ON_DEVICES: f"mpfjax, {devices} devices"}
     for job in jobs:
         print(as_tables(job, results, labels), end="\n\n")
-    figures(out, peers=draw(results, labels))
+    harness.figures(out, peers=draw(results, labels))
     print(f"results and figure: {out}/")
     return int(any(entry["refused"] for entry in results))
 
@@ -218,35 +212,22 @@ def disagreement(
 
 def as_tables(job: str, results: list[dict[str, Any]], labels: Mapping[str, str]) -> str:
     """Times with their ratios to mpfjax's, and below them starts and memory."""
-    own = [entry for entry in results if entry["job"] == job]
-    entries = {(entry["library"], entry["particles"]): entry for entry in own}
-    sizes = sorted({size for _, size in entries})
-    names = dict.fromkeys(name for name, _ in entries)
-
-    def one(title: str, form: Any) -> str:
-        rows = [
-            {title: labels[name]}
-            | {f"N = {n}": form(entries[name, n]) if (name, n) in entries else "-" for n in sizes}
-            for name in names
-        ]
-        return table(None, rows)
-
-    titles = one("median [ms], ratio", _time), one("start [s], memory [MB]", _start)
-    return "\n\n".join([JOBS[job].title, *titles])
+    own = [entry | {"label": labels[entry["library"]]} for entry in results if entry["job"] == job]
+    forms = {"median [ms], ratio": _time, "start [s], memory [MB]": _start}
+    tables = [
+        harness.pivot(title, own, "{label}", "N = {particles}", form)
+        for title, form in forms.items()
+    ]
+    return "\n\n".join([JOBS[job].title, *tables])
 
 
 def _time(entry: Mapping[str, Any]) -> str:
-    if entry.get("refused"):
+    if entry["refused"]:
         return "refused"
-    if entry["median"] is None:
-        return "-"
-    ratio = "" if entry["ratio"] is None else f" {entry['ratio']:6.2f}"
-    return f"{1000 * entry['median']:.4g}{ratio}"
+    return f"{1000 * entry['median']:.4g} {entry['ratio']:6.2f}"
 
 
 def _start(entry: Mapping[str, Any]) -> str:
-    if entry["start"] is None:
-        return "-"
     memory = "-" if entry["memory"] is None else f"{entry['memory'] / 1e6:.0f}"
     return f"{entry['start']:.1f} {memory:>5}"
 

@@ -4,25 +4,30 @@
 """
 # ruff: noqa: NPY002
 
+from dataclasses import dataclass
+
 import numpy as np
 
 LOG_2_PI = float(np.log(2 * np.pi))
 
 
+@dataclass(frozen=True)
 class Quadratic:
     """x_t = x_{t-1} + N(0, σ_x²), y_t = x_t² + N(0, σ_y²), x_0 uniform; the true state a sinusoid.
 
     Vermaak et al. (2003), section 5.1. States are scalars.
     """
 
-    title, num_steps, state_shape = "quadratic model, 1 dimension", 100, ()
+    num_steps: int = 100
+    seed: int = 0
+    title, state_shape = "quadratic model, 1 dimension", ()
     sigma_x, sigma_y, low, high = 0.1, 0.1, -2.5, 2.5
 
     @property
     def observations(self) -> np.ndarray:
         """y_1..y_t, (t,)."""
         truth = 2 * np.sin(2 * np.pi * np.arange(1, self.num_steps + 1) / 100)
-        noise = np.random.default_rng(0).standard_normal(self.num_steps)
+        noise = np.random.default_rng(self.seed).standard_normal(self.num_steps)
         return (truth**2 + self.sigma_y * noise).astype(np.float32)
 
     def initial(self, number: int) -> np.ndarray:

@@ -1,7 +1,23 @@
 """Rendered scenes with true boxes: football, and objects led away by a distracter. No command."""
 
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
 from benchmarks.scenes.distracter import DistracterScene as DistracterScene
 from benchmarks.scenes.distracter import NoPath as NoPath
 from benchmarks.scenes.distracter import distracter_scene as distracter_scene
 from benchmarks.scenes.football import Scene as Scene
 from benchmarks.scenes.football import football_scene as football_scene
+
+
+def boxes_over_time(
+    rows: Float[np.ndarray, "rows 6"], ids: Sequence[int], first: int, num_frames: int
+) -> Float[np.ndarray, "t objects 4"]:
+    """The true boxes of these objects in frames from `first` on; NaN where one has none."""
+    boxes = np.full((num_frames, len(ids), 4), np.nan)
+    for frame, id, *box in rows:
+        if int(id) in ids and 0 <= int(frame) - first < num_frames:
+            boxes[int(frame) - first, list(ids).index(int(id))] = box
+    return boxes

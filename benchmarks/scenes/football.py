@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import check_flag, check_key, check_whole
+from mpfjax.checks import Count, CountOrZero, checked
 from mpfjax.vision.files.drawing import blend, draw_stroke, window
 
 _PITCH_DEPTH = (22.0, 52.0)
@@ -77,14 +77,15 @@ class _Camera(NamedTuple):
         return right, forward, up
 
 
+@checked
 def football_scene(
     key: Key[Array, ""],
-    num_frames: int = 120,
+    num_frames: Count = 120,
     *,
-    num_players: int = 4,
-    num_opponents: int = 4,
-    height: int = 288,
-    width: int = 512,
+    num_players: Count = 4,
+    num_opponents: CountOrZero = 4,
+    height: Count = 288,
+    width: Count = 512,
     still_camera: bool = False,
 ) -> Scene:
     """Render players of two teams on a pitch, seen by a camera that pans with the play.
@@ -97,10 +98,6 @@ def football_scene(
     Raises `ValueError` for no frames, no pixels, fewer than one player or a negative number of
     opponents.
     """
-    check_key(key)
-    check_whole(num_frames=num_frames, num_players=num_players, height=height, width=width)
-    check_whole(0, num_opponents=num_opponents)
-    check_flag(still_camera=still_camera)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
     kits = [0] * num_players + [1] * num_opponents
     paths = np.concatenate(
@@ -229,15 +226,9 @@ def _draw_players(
 
 
 def _draw_player(
-    frame: np.ndarray,
-    foot: np.ndarray,
-    scale: float,
-    kit: int,
-    who: int,
-    phase: float,
-    gait: float,
-    heading: float,
-) -> None:
+    frame: np.ndarray, foot: np.ndarray, scale: float, kit: int, who: int, phase: float,
+    gait: float, heading: float,
+) -> None:  # fmt: skip
     shirt, shorts, socks = (np.array(colour, float) for colour in _KITS[kit])
     skin, hair = np.array(_SKIN[who % 4], float), np.array(_HAIR[who % 4], float)
 
@@ -272,12 +263,9 @@ def _draw_player(
 
 
 def _draw_ellipse(
-    frame: Float[np.ndarray, "h w 3"],
-    centre: tuple[float, float],
-    radii: tuple[float, float],
-    colour: Float[np.ndarray, "3"],
+    frame: np.ndarray, centre: tuple[float, float], radii: tuple[float, float], colour: np.ndarray,
     opacity: float = 1.0,
-) -> None:
+) -> None:  # fmt: skip
     """Draw a filled ellipse along the axes."""
     (cx, cy), (rx, ry) = centre, radii
     found = window(frame, cx - rx - 1, cy - ry - 1, cx + rx + 1, cy + ry + 1)

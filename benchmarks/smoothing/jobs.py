@@ -11,12 +11,15 @@ a grid.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 import mpfjax
+from benchmarks.peers import jobs
+from benchmarks.peers.jobs import LOG_2_PI
+from mpfjax.exact import kalman_smoother
 
-LOG_2_PI = np.log(2 * np.pi)
 GRID = np.linspace(-5.0, 5.0, 1001)
 
 
@@ -44,21 +47,10 @@ class Linear:
     @cached_property
     def exact(self) -> float:
         """The smoothed mean of the products, by Rauch, Tung and Striebel."""
-        means, variances = [0.0], [self.p**2]
-        for y in self.observations:
-            mean, variance = self.a * means[-1], self.a**2 * variances[-1] + self.q**2
-            gain = variance / (variance + self.r**2)
-            means.append(mean + gain * (y - mean))
-            variances.append((1 - gain) * variance)
-        mean, variance, products = means[-1], variances[-1], 0.0
-        for t in range(self.num_steps - 1, -1, -1):
-            predicted = self.a**2 * variances[t] + self.q**2
-            gain = self.a * variances[t] / predicted
-            earlier = means[t] + gain * (mean - self.a * means[t])
-            products += gain * variance + earlier * mean
-            variance = variances[t] + gain**2 * (variance - predicted)
-            mean = earlier
-        return products / self.num_steps
+        model: Any = self.model()
+        found = kalman_smoother(model, self.seen)
+        means, pairs = np.asarray(found.means)[:, 0], np.asarray(found.lagged_covariances)[:, 0, 0]
+        return float(np.mean(pairs + means[:-1] * means[1:]))
 
     def initial(self, number: int) -> np.ndarray:
         """x_0, for particles."""
@@ -84,22 +76,8 @@ class Linear:
         return self.observations.astype(np.float32)[:, None]
 
 
-@dataclass(frozen=True)
-class Quadratic:
-    """x_t = x_{t-1} + N(0, σ_x²), y_t = x_t² + N(0, σ_y²), x_0 uniform on [-width, width]."""
-
-    num_steps: int
-    seed: int
-    sigma_x: float = 0.1
-    sigma_y: float = 0.1
-    width: float = 2.5
-
-    @cached_property
-    def observations(self) -> np.ndarray:
-        """y_1..y_T of Vermaak et al. (2003), section 5.1: the two modes meet at zero, at t = 50."""
-        rng = np.random.default_rng(self.seed)
-        truth = 2 * np.sin(2 * np.pi * np.arange(1, self.num_steps + 1) / 100)
-        return truth**2 + self.sigma_y * rng.normal(size=self.num_steps)
+class Quadratic(jobs.Quadratic):
+    """That of `benchmarks.peers`, of any length: the two modes meet at zero, at t = 50."""
 
     @cached_property
     def exact(self) -> float:
@@ -107,9 +85,9 @@ class Quadratic:
         steps = (GRID[None] - GRID[:, None]) / self.sigma_x
         kernel = np.exp(-0.5 * steps**2)
         kernel /= kernel.sum(axis=1, keepdims=True)
-        noise = (self.observations[:, None] - GRID[None] ** 2) / self.sigma_y
+        noise = (self.observations[:, None].astype(float) - GRID[None] ** 2) / self.sigma_y
         likelihoods = np.exp(-0.5 * (noise**2 - (noise**2).min(axis=1, keepdims=True)))
-        forward = [(np.abs(GRID) <= self.width).astype(float)]
+        forward = [(np.abs(GRID) <= self.high).astype(float)]
         for likelihood in likelihoods:
             joint = (forward[-1] @ kernel) * likelihood
             forward.append(joint / joint.sum())
@@ -122,28 +100,19 @@ class Quadratic:
             backward /= backward.sum()
         return products / self.num_steps
 
-    def initial(self, number: int) -> np.ndarray:
-        """x_0, for particles."""
-        return np.random.uniform(-self.width, self.width, number)
-
     def of_step(self) -> tuple[float, float]:
         """The factor and the deviation of a step."""
         return 1.0, self.sigma_x
 
-    def log_likelihood(self, y: float, states: np.ndarray) -> np.ndarray:
-        """log L(y_t | x_t)."""
-        scale = self.sigma_y
-        return -0.5 * ((y - states**2) / scale) ** 2 - np.log(scale) - 0.5 * LOG_2_PI
-
     def model(self, independent: bool = False) -> mpfjax.AbstractStateSpaceModel:
         """The model of the job; with `independent` draws of x_0 or stratified ones."""
         draw = "independent" if independent else "stratified"
-        return mpfjax.QuadraticModel(self.sigma_x, self.sigma_y, -self.width, self.width, draw)
+        return mpfjax.QuadraticModel(self.sigma_x, self.sigma_y, self.low, self.high, draw)
 
     @property
     def seen(self) -> np.ndarray:
         """y_1..y_T as the model takes them."""
-        return self.observations.astype(np.float32)
+        return self.observations
 
 
 Job = Linear | Quadratic

@@ -62,7 +62,7 @@ def exact(job: Quadratic) -> dict[str, np.ndarray]:
 
     @jax.jit
     def log_joint(pair: Any) -> Any:
-        model = mpfjax.QuadraticModel(pair[0], pair[1], -job.width, job.width)
+        model = mpfjax.QuadraticModel(pair[0], pair[1], job.low, job.high)
         parameters = dict(zip(NAMES, pair, strict=True))
         evidence = grid_filter(model, observations, states).log_marginal_likelihood
         return evidence + log_prior(parameters)

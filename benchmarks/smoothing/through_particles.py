@@ -11,7 +11,8 @@ import particles
 from particles.collectors import Online_smooth_ON2, Paris
 
 from benchmarks.peers import through_particles
-from benchmarks.smoothing.jobs import LOG_2_PI, Job
+from benchmarks.peers.jobs import LOG_2_PI
+from benchmarks.smoothing.jobs import Job
 
 ONLINE = {"online": Online_smooth_ON2, "paris": Paris}
 

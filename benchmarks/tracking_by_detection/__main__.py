@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -34,6 +34,7 @@ from mpfjax.vision.files import sequences
 from mpfjax.vision.tracking.adapters import Rows
 from mpfjax.vision.tracking.track import online_rows
 
+Motion = Literal["pixels", "detections"]  # what the camera's motion is found from
 OURS = "mpfjax"
 SCORES = ("HOTA", "MOTA", "IDF1", "id_switches")
 OF_SCORES = {name: f"{{{name}:.3f}}" for name in SCORES[:3]} | {"switches": "{id_switches:.1f}"}
@@ -88,7 +89,7 @@ def main(
     min_score: Annotated[float, finite] | None = None,
     peers: bool = True,
     colour: bool = True,
-    camera_motion: Annotated[str, ("pixels", "detections")] | None = None,
+    camera_motion: Motion | None = None,
     out: Path = Path("results/tracking_by_detection"),
 ) -> None:
     """Run every tracker on every sequence, writing the table after each.
@@ -179,7 +180,7 @@ def runs_of(
 
 
 def ours(
-    sequence: Sequence, least: float | None, *, use_colours: bool, camera_motion: str | None
+    sequence: Sequence, least: float | None, *, use_colours: bool, camera_motion: Motion | None
 ) -> Run:
     """One run; the camera's motion is that of the options where there are pixels."""
     rows = Rows(sequence.rows, sequence.first, sequence.last)

@@ -38,9 +38,10 @@ def test_smoothed_truths_are_those_of_one_large_gaussian_and_of_another_grid():
     })  # fmt: skip
     means, covariance = gaussian_smoother(model, job.observations[:, None])
     x = means[:, 0]
-    assert job.exact == pytest.approx(np.mean(np.diagonal(covariance, 1) + x[:-1] * x[1:]))
+    expected = np.mean(np.diagonal(covariance, 1) + x[:-1] * x[1:])
+    assert job.exact == pytest.approx(expected, rel=1e-5)
     job, grid = Quadratic(6, 1), np.linspace(-4, 4, 701)
-    log_initial = np.where(np.abs(grid) <= job.width, 0.0, -np.inf)
+    log_initial = np.where(np.abs(grid) <= job.high, 0.0, -np.inf)
     log_transition = -0.5 * ((grid[None] - grid[:, None]) / job.sigma_x) ** 2
     log_likelihoods = -0.5 * ((job.observations[:, None] - grid**2) / job.sigma_y) ** 2
     _, pairs = grid_smoother(log_initial, log_transition, log_likelihoods)
