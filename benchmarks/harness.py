@@ -280,7 +280,7 @@ def pivot(
     found: dict[str, dict[str, str]] = {}
     for entry in entries:
         found.setdefault(_cell(row, entry), {})[_cell(column, entry)] = _cell(cell, entry)
-    names = dict.fromkeys(name for cells in found.values() for name in cells)
+    names = dict.fromkeys(_cell(column, entry) for entry in entries)
     rows = [[name, *(cells.get(each, "-") for each in names)] for name, cells in found.items()]
     return format_table([title, *names], rows)
 
