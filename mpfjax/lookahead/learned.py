@@ -1,25 +1,20 @@
 """Twisted particle filters: a look-ahead to all observations, learned from earlier runs."""
 
 import dataclasses
+import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.checks import check_callable, check_key, check_type, check_whole, given
+from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter
 from mpfjax.lookahead.quadratics import neutral
 from mpfjax.lookahead.regression import fit_lookahead
-from mpfjax.lookahead.twisted import (
-    PropagateTwisted,
-    RegroupTwisted,
-    Twist,
-    TwistInitial,
-    features_of,
-)
+from mpfjax.lookahead.twisted import PropagateTwisted, RegroupTwisted, Twist, TwistInitial
+from mpfjax.mixture import flatten_states
 from mpfjax.models.base import mapped, require_noise, starts_from_noise
 from mpfjax.models.conditionally_linear import is_mixed, with_moments
 from mpfjax.models.noise import noise_dtype
@@ -32,13 +27,14 @@ from mpfjax.running.run import run_filter
 _LEARNERS = 16
 
 
+@checked
 def learn_lookahead(
     key: Key[Array, ""],
     filter: Filter,
     observations: PyTree,
-    num_passes: int = 5,
+    num_passes: Count = 5,
     *,
-    num_particles: int | None = None,
+    num_particles: Count | None = None,
     features: Callable[[PyTree], Array] | None = None,
 ) -> Filter:
     """Learn a filter that looks ahead to all later observations, when it resamples and when it
@@ -84,15 +80,11 @@ def learn_lookahead(
     observations are known from the start: for log Ẑ in `metropolis_hastings` and `smc2`, to compare
     models, and for the masses of modes at the end.
     """
-    check_key(key)
-    check_type(Filter, "a Filter", filter=filter)
-    check_whole(num_passes=num_passes, **given(num_particles=num_particles))
-    check_callable("features of the states", **given(features=features))
     model: Any = filter.model
     if not is_mixed(model):
         require_noise(model, "learn_lookahead")
     series = as_series(observations, model)
-    twist = _knowing_nothing(key, filter, series.length, mapped(model, features))
+    twist = _knowing_nothing(key, filter, series.length, mapped(model, features) or flatten_states)
     learners = num_particles or _LEARNERS * filter.num_particles
     for pass_key in jax.random.split(key, num_passes):
         run_key, fit_key = jax.random.split(pass_key)
@@ -103,13 +95,13 @@ def learn_lookahead(
 
 
 def _knowing_nothing(
-    key: Key[Array, ""], filter: Filter, length: int, features: Callable[[PyTree], Array] | None
+    key: Key[Array, ""], filter: Filter, length: int, features: Callable[[PyTree], Array]
 ) -> Twist:
     """ψ = 1 at every step."""
     model: Any = filter.model
     start = lambda key: with_moments(model, model.sample_initial(key, 2))  # noqa: E731
     states = jax.eval_shape(start, key)
-    num_features = jax.eval_shape(partial(features_of, features), states).shape[1]
+    num_features = math.prod(jax.eval_shape(features, states).shape[1:])
     size, dtype = filter.num_components, noise_dtype(states)
     noise = jax.eval_shape(lambda states: jnp.zeros(noise_dimension(model, states)), states)
     one = neutral(size, num_features, noise.shape[0], dtype)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from mpfjax.filter import Filter
-from mpfjax.lookahead.quadratics import LocalQuadratics, neutral
+from mpfjax.lookahead.quadratics import LocalQuadratics
 from mpfjax.lookahead.twisted import Twist
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.conditionally_linear import with_moments
@@ -46,7 +46,7 @@ def fit_lookahead(
         points = _draw_points(key, model, twist, used, after, mixture, now)
         fitted = _fit_step(points, used)
         fitted = _scaled(fitted, mixture, twist.features_of(mixture.particles))
-        fitted = _numbers_or_neutral(fitted)
+        fitted = _if_finite(fitted, used)
         return fitted, fitted
 
     keys = jax.random.split(key_steps, series.length)
@@ -54,7 +54,7 @@ def fit_lookahead(
     whole = jax.tree.map(lambda some, end: jnp.concatenate([some, end[None]]), fitted, last)
     initial = twist.initial
     if initial is not None:
-        initial = _numbers_or_neutral(_fit_initial(key_initial, filter, twist, initial, first))
+        initial = _if_finite(_fit_initial(key_initial, filter, twist, initial, first), initial)
     return Twist(whole, initial, twist.features)
 
 
@@ -127,7 +127,8 @@ def _fit_step(points: _Points, used: LocalQuadratics) -> LocalQuadratics:
     weights = weights / jnp.maximum(jnp.sum(weights, axis=0), 1e-30)[None]
 
     def fit(of_expert: tuple[Array, Array]) -> tuple[dict[str, Array], Array]:
-        return _integrated(*_regressed(*of_expert, points.noise, points.targets))
+        quadratic, missed = _regressed(*of_expert, points.noise, points.targets)
+        return _integrated(*quadratic, points.noise.shape[1]), missed
 
     whitened = jnp.swapaxes(located.whitened(points.features), 1, 2)
     experts, missed = jax.lax.map(fit, (weights.T, whitened))
@@ -216,12 +217,15 @@ def _tempered(
 
     low, high = jnp.zeros_like(most), jnp.ones_like(most)
     goal = jnp.minimum(needed, 0.5 * size(low))
-    full = size(high) >= goal
-    for _ in range(_HALVINGS):
+
+    def halved(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bounds
         middle = 0.5 * (low + high)
         enough = size(middle) >= goal
-        low, high = jnp.where(enough, middle, low), jnp.where(enough, high, middle)
-    return members * jnp.exp(jnp.where(full, 1.0, low)[None] * logs)
+        return jnp.where(enough, middle, low), jnp.where(enough, high, middle)
+
+    tempered, _ = jax.lax.fori_loop(0, _HALVINGS, halved, (low, high))
+    return members * jnp.exp(jnp.where(size(high) >= goal, 1.0, tempered)[None] * logs)
 
 
 def _moments(
@@ -247,8 +251,11 @@ def _regressed(
     whitened: Float[Array, "n d"],
     noise: Float[Array, "n j"],
     targets: Float[Array, " n"],
-) -> tuple[Array, Array, Array, Array, int]:
-    """a, b and H of the quadratic a + bᵀz + zᵀHz / 2 in z = (features, ε), H not positive."""
+) -> tuple[tuple[Array, Array, Array], Array]:
+    """a, b and H of the quadratic a + bᵀz + zᵀHz / 2 in z = (features, ε), H not positive.
+
+    Also the mean square error of its fit.
+    """
     values = jnp.concatenate([whitened, noise], axis=1)
     size, dtype = values.shape[1], values.dtype
     mean = weights @ values
@@ -282,21 +289,17 @@ def _regressed(
     missed = weights @ residuals**2 - (weights @ residuals) ** 2
     hessian, slope = inverse.T @ hessian @ inverse, inverse.T @ slope
     constant = constant - slope @ mean + 0.5 * mean @ hessian @ mean
-    return constant, slope - hessian @ mean, hessian, missed, whitened.shape[1]
+    return (constant, slope - hessian @ mean, hessian), missed
 
 
 def _integrated(
     constant: Float[Array, ""],
     slope: Float[Array, " z"],
     hessian: Float[Array, "z z"],
-    missed: Float[Array, ""],
-    num_features: int,
-) -> tuple[dict[str, Array], Float[Array, ""]]:
-    """The quadratic in features and noise, with N(ε; 0, I) and integrated over ε.
-
-    The fields of an expert, and the mean square error of its fit.
-    """
-    d = num_features
+    num_noises: int,
+) -> dict[str, Array]:
+    """The fields of an expert: the quadratic with N(ε; 0, I), and integrated over ε."""
+    d = len(slope) - num_noises
     of_noise, mixed = hessian[d:, d:], hessian[:d, d:]
     precision = jnp.eye(len(of_noise), dtype=hessian.dtype) - of_noise
     values, vectors = jnp.linalg.eigh(precision)
@@ -304,7 +307,7 @@ def _integrated(
     values = jnp.maximum(values, 1.0)
     covariance = (vectors / values[None]) @ vectors.T
     mean, gain = covariance @ slope[d:], covariance @ mixed.T
-    expert = {
+    return {
         "constants": constant + 0.5 * slope[d:] @ mean - 0.5 * jnp.sum(jnp.log(values)),
         "slopes": slope[:d] + mixed @ mean,
         "curvatures": hessian[:d, :d] + mixed @ gain,
@@ -312,15 +315,12 @@ def _integrated(
         "noise_slopes": gain,
         "noise_factors": jnp.linalg.cholesky(covariance),
     }
-    return expert, missed
 
 
-def _numbers_or_neutral(psi: LocalQuadratics) -> LocalQuadratics:
-    """ψ, or ψ = 1 where a fit is not finite."""
-    num_experts, num_noises, num_features = psi.noise_slopes.shape
-    nothing = neutral(num_experts, num_features, num_noises, psi.slopes.dtype)
+def _if_finite(psi: LocalQuadratics, before: LocalQuadratics) -> LocalQuadratics:
+    """ψ, or that of before where the fit has a NaN."""
     broken = jnp.any(jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(psi)]))
-    return jax.tree.map(lambda own, other: jnp.where(broken, other, own), psi, nothing)
+    return jax.tree.map(lambda own, other: jnp.where(broken, other, own), psi, before)
 
 
 def _num_coefficients(dimension: int) -> int:

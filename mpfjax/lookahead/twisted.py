@@ -28,12 +28,12 @@ class Twist(eqx.Module):
 
     - `steps`: ψ of each step, and one more, ψ = 1, for steps after the last.
     - `initial`: of x_0, which is made of noise alone; None where the model draws it otherwise.
-    - `features`: φ, the features of a state that ψ depends on, (n, d); None is the flattened state.
+    - `features`: φ, the features of a state that ψ depends on, (n, d).
     """
 
     steps: LocalQuadratics
     initial: LocalQuadratics | None
-    features: Callable[[PyTree], Array] | None = None
+    features: Callable[[PyTree], Array] = flatten_states
 
     reads = frozenset({STEP})
 
@@ -43,21 +43,14 @@ class Twist(eqx.Module):
         return jax.tree.map(lambda leaf: leaf[place], self.steps)
 
     def features_of(self, states: PyTree) -> Float[Array, "n d"]:
-        """φ(x) of each particle."""
-        return features_of(self.features, states)
+        """φ(x) of each particle, a row for each."""
+        found = jnp.asarray(self.features(states))
+        return found.reshape(found.shape[0], -1).astype(noise_dtype(states))
 
     def at_step_of(self, mixture: ParticleMixture) -> Callable[[PyTree, PyTree], Array]:
         """log ν of the next step, as a function of y_t, which it does not use, and the states."""
         psi = self.next(mixture)
         return lambda observation, states: psi.log_normaliser(self.features_of(states))
-
-
-def features_of(features: Callable[[PyTree], Array] | None, states: PyTree) -> Float[Array, "n d"]:
-    """φ(x) of each particle, a row for each; without features the flattened state."""
-    if features is None:
-        return flatten_states(states)
-    found = jnp.asarray(features(states))
-    return found.reshape(found.shape[0], -1).astype(noise_dtype(states))
 
 
 class TwistInitial(AbstractMove):

@@ -124,14 +124,6 @@ def refuse_marginalised(
         )
 
 
-def require_marginalised(model: Any, needed_by: str) -> None:
-    """Raise a `ValueError` for a model that is not conditionally linear."""
-    if not is_marginalised(model):
-        raise ValueError(
-            f"model: {shown(model)} is no AbstractConditionallyLinearModel, which {needed_by} needs"
-        )
-
-
 def is_mixed(model: Any) -> bool:
     """Whether z_t depends on x_{t-1}."""
     return callable(getattr(model, "latent_dynamics", None))

@@ -9,14 +9,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_exponent, check_inner_share, check_one_of, check_whole
+from mpfjax.checks import Count, Exponent, InnerShare
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, require, require_model
+from mpfjax.models.base import AbstractStateSpaceModel, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.steps import likelihoods, log_transition
-from mpfjax.moves.base import AbstractMarkovMove
+from mpfjax.moves.base import AbstractMarkovMove, Gradient
+from mpfjax.moves.propagation.tempered import accepted
 from mpfjax.operations.logarithms import add_gradient, without_gradient
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.random import normal, split, uniform
@@ -65,20 +66,14 @@ class AbstractMetropolis(AbstractMarkovMove):
     """
 
     model: AbstractStateSpaceModel
-    num_steps: int = eqx.field(static=True, default=1)
-    least_step: float = eqx.field(static=True, default=0.02)
-    exponent: float = eqx.field(static=True, default=1.0)
-    gradient: str = eqx.field(static=True, default="none")
+    num_steps: Count = eqx.field(static=True, default=1)
+    least_step: InnerShare = eqx.field(static=True, default=0.02)
+    exponent: Exponent = eqx.field(static=True, default=1.0)
+    gradient: Gradient = eqx.field(static=True, default="none")
 
     def __check_init__(self) -> None:
-        who = type(self).__name__
-        require_model(self.model, who)
-        refuse_marginalised(self.model, who)
-        require(self.model, "log_transition", who)
-        check_whole(num_steps=self.num_steps)
-        check_inner_share(least_step=self.least_step)
-        check_exponent(exponent=self.exponent)
-        check_one_of(("none", "stop"), gradient=self.gradient)
+        refuse_marginalised(self.model, type(self).__name__)
+        require(self.model, "log_transition", type(self).__name__)
 
     needs_parents = True
     """the target of x_t is given x_{t-1}."""
@@ -98,20 +93,19 @@ class AbstractMetropolis(AbstractMarkovMove):
                 f"moves: {type(self).__name__} comes before any propagation: there is no x_t yet"
             )
         target = _Target(self.model, mixture.parents, observation, self.exponent)
-        states, n = mixture.particles, mixture.num_particles
+        states = mixture.particles
         if self.gradient == "stop":
             states = without_gradient(states)
         first = densities = target(states)
         dtype = densities[1].dtype
         for step_key in split(key, self.num_steps):
             key_length, key_proposal, key_taken = split(step_key, 3)
-            length = self.least_step ** uniform(key_length, (n,), dtype)
+            length = self.least_step ** uniform(key_length, (mixture.num_particles,), dtype)
             proposed, log_ratio = self.propose(key_proposal, length, states, target)
             those = target(proposed)
             log_ratio += target.ratio(those, densities)
-            taken = jnp.log(uniform(key_taken, (n,), dtype)) < log_ratio  # a NaN is rejected
-            states = _where(taken, proposed, states)
-            densities = _where(taken, those, densities)
+            new, old = (proposed, those), (states, densities)
+            states, densities = accepted(key_taken, log_ratio, new, old)
         log_weights = mixture.log_weights
         if self.gradient == "stop":
             states = without_gradient(states)
@@ -137,8 +131,8 @@ class RandomWalkMetropolis(AbstractMetropolis):
     ) -> tuple[PyTree, Float[Array, " n"]]:
         """x + s (a - b) / √2, whose reverse step has the same density."""
         rows, back = _as_rows(states)
-        first, second = _two_draws(key, self.model, target.parents)
-        step = length.astype(rows.dtype)[:, None] * (first - second) / math.sqrt(2)
+        gaps = _gaps(key, self.model, target.parents)
+        step = length.astype(rows.dtype)[:, None] * gaps / math.sqrt(2)
         return back(rows + step), jnp.zeros_like(length)
 
 
@@ -157,8 +151,8 @@ class MetropolisAdjustedLangevin(AbstractMetropolis):
         """A step of the Langevin diffusion, and the reverse step's log density relative to it."""
         rows, back = _as_rows(states)
         key_spread, key_noise = split(key, 2)
-        first, second = _two_draws(key_spread, self.model, target.parents)
-        deviations = jnp.sqrt(0.5 * jnp.mean((first - second) ** 2, axis=0))
+        gaps = _gaps(key_spread, self.model, target.parents)
+        deviations = jnp.sqrt(0.5 * jnp.mean(gaps**2, axis=0))
         unit = length.astype(rows.dtype)[:, None] * deviations[None]
 
         def drift(rows: Float[Array, "n d"]) -> Float[Array, "n d"]:
@@ -186,13 +180,7 @@ def _as_rows(states: PyTree) -> tuple[Float[Array, "n d"], Callable[[Array], PyT
     return rows, lambda rows: eqx.combine(jax.vmap(unravel)(rows), rest)
 
 
-def _two_draws(key: Key[Array, ""], model: Any, parents: PyTree) -> tuple[Array, Array]:
-    """Two draws of x_t from each parent, as rows."""
-    draw = lambda key: without_gradient(model.sample_transition(key, parents))  # noqa: E731
-    first, second = (_as_rows(draw(own))[0] for own in split(key, 2))
-    return first, second
-
-
-def _where(taken: Bool[Array, " n"], new: PyTree, old: PyTree) -> PyTree:
-    rows = lambda leaf: taken.reshape(-1, *[1] * (leaf.ndim - 1))  # noqa: E731
-    return jax.tree.map(lambda a, b: jnp.where(rows(a), a, b), new, old)
+def _gaps(key: Key[Array, ""], model: Any, parents: PyTree) -> Float[Array, "n d"]:
+    """The difference of two draws of x_t from each parent, as rows."""
+    first, second = (_as_rows(model.sample_transition(own, parents))[0] for own in split(key, 2))
+    return without_gradient(first - second)

@@ -1,11 +1,13 @@
 """Clusters of objects: particle filters of their own that merge where objects meet."""
 
+from typing import Literal
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_one_of, check_whole, given
+from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture, no_ancestors
 from mpfjax.models.base import require
 from mpfjax.moves.objects.coupling import coupled, recombined, rotated, scores, together
@@ -20,8 +22,6 @@ from mpfjax.moves.resampling.allocation import require_equal_rows
 from mpfjax.operations.logarithms import default_float, finite_max
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
-
-STARTS = ("apart", "together")
 
 
 class PropagateInClusters(AbstractPropagationByObject):
@@ -84,13 +84,11 @@ class PropagateInClusters(AbstractPropagationByObject):
     `split_after` below 1.
     """
 
-    start: str = eqx.field(static=True, default="apart")
-    split_after: int | None = eqx.field(static=True, default=None)
+    start: Literal["apart", "together"] = eqx.field(static=True, default="apart")
+    split_after: Count | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
         super().__check_init__()
-        check_one_of(STARTS, start=self.start)
-        check_whole(**given(split_after=self.split_after))
         if self._may_be_joint:
             require(self.model.object_model, "log_transition", "PropagateInClusters")
 

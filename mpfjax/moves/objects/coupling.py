@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from mpfjax.models.multi_object import MultiObjectModel
-from mpfjax.operations.logarithms import default_float, finite_or_zero, log_or_nothing
+from mpfjax.operations.logarithms import default_float, log_sum_exp, scaled_exp
 from mpfjax.operations.matrices import draw_columns
 from mpfjax.operations.random import split, uniform
 
@@ -91,9 +91,9 @@ def scores(
             log_f = over_pairs(lambda parent, point: object_model.log_transition(point, parent))
             table = log_f(model.object_states(particles, j), model.object_states(points, j))
             table = table.astype(default_float())
-            log_totals = _log_sums(table.T)
+            log_totals = jax.vmap(log_sum_exp)(table.T)
             log_b = table + (log_likelihoods[j] - log_totals)[None]
-            return log_totals, _log_sums(log_b)
+            return log_totals, jax.vmap(log_sum_exp)(log_b)
 
         def own() -> tuple[Float[Array, " n"], Float[Array, " n"]]:
             return jnp.zeros_like(log_likelihoods[j]), log_likelihoods[j]
@@ -202,18 +202,8 @@ def _draw_columns(
     strides = _GOLDEN * np.arange(log_table.shape[0])
     shift = uniform(key, (), log_table.dtype)
     quantiles = (jnp.asarray(strides % 1, log_table.dtype) + shift) % 1
-    weights = jnp.exp(jax.lax.stop_gradient(log_table) - _finite_max(log_table)[:, None])
-    return draw_columns(quantiles, weights), _log_sums(log_table)
-
-
-def _log_sums(log_table: Float[Array, "k n"]) -> Float[Array, " k"]:
-    """log Σ exp of every line, -inf where all of it is, with a finite gradient there."""
-    shift = _finite_max(log_table)
-    return log_or_nothing(jnp.sum(jnp.exp(log_table - shift[:, None]), axis=1)) + shift
-
-
-def _finite_max(log_table: Float[Array, "k n"]) -> Float[Array, " k"]:
-    return finite_or_zero(jnp.max(jax.lax.stop_gradient(log_table), axis=1))
+    weights, _ = jax.vmap(scaled_exp)(jax.lax.stop_gradient(log_table))
+    return draw_columns(quantiles, weights), jax.vmap(log_sum_exp)(log_table)
 
 
 def rotated(key: Key[Array, ""], indices: Int[Array, " k"]) -> Int[Array, " k"]:

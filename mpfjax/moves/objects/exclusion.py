@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_positive
+from mpfjax.checks import Positive
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.regrouping.features import ByFeatures, summarise
@@ -50,11 +50,8 @@ class Exclusion(AbstractExclusion, ByFeatures):
     Raises `ValueError` for a strength or radius that is not positive.
     """
 
-    strength: float = eqx.field(static=True, default=10.0)
-    radius: float = eqx.field(static=True, default=0.5)
-
-    def __check_init__(self) -> None:
-        check_positive(strength=self.strength, radius=self.radius)
+    strength: Positive = eqx.field(static=True, default=10.0)
+    radius: Positive = eqx.field(static=True, default=0.5)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree

@@ -5,13 +5,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_one_of
 from mpfjax.mixture import ParticleMixture, no_ancestors, single_component
-from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
+from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.resampling.allocation import require_equal_rows
-from mpfjax.moves.resampling.ancestors import SCHEMES
-from mpfjax.moves.resampling.resample import Resample
+from mpfjax.moves.resampling.resample import Resample, Scheme
 from mpfjax.operations.logarithms import default_float
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
@@ -21,14 +19,10 @@ class AbstractPropagationByObject(AbstractPropagation):
     """A propagation in which every object of a particle has a parent of its own."""
 
     model: MultiObjectModel
-    scheme: str = eqx.field(static=True, default="systematic", kw_only=True)
+    scheme: Scheme = eqx.field(static=True, default="systematic", kw_only=True)
 
     keeps_parents = False
     biases_score = True
-
-    def __check_init__(self) -> None:
-        require_multi_object(self.model, type(self).__name__)
-        check_one_of(SCHEMES, scheme=self.scheme)
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """Draw x_t ~ D(. | x_{t-1}) of all objects, and leave all else."""

@@ -1,7 +1,7 @@
 """Partitioned sampling: one object after the other, with weighted resampling in between."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -10,10 +10,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_one_of, check_type, given, shown
+from mpfjax.checks import checked, shown, to_rows
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
-from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
+from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.resample import Resample
@@ -23,7 +23,7 @@ from mpfjax.operations.random import split
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
 
-REASSEMBLIES = ("evidence", "prior")
+Reassembly = Literal["evidence", "prior"]
 
 
 class Partitioned(AbstractPropagation):
@@ -62,28 +62,25 @@ class Partitioned(AbstractPropagation):
     orders: Int[Array, "orders objects"] | None
     rule: str | None = eqx.field(static=True)
     resample: Resample
-    reassembly: str = eqx.field(static=True)
+    reassembly: Reassembly = eqx.field(static=True)
 
+    @checked
     def __init__(
         self,
         model: MultiObjectModel,
         orders: str | Sequence[int] | Sequence[Sequence[int]] | Array | np.ndarray | None = None,
         *,
         resample: Resample | None = None,
-        reassembly: str = "evidence",
+        reassembly: Reassembly = "evidence",
     ) -> None:
-        check_one_of(REASSEMBLIES, reassembly=reassembly)
-        require_multi_object(model, "Partitioned")
         if isinstance(orders, str):
             if orders not in ("circular", "random"):
                 raise ValueError(f"orders: {orders!r} is neither 'circular' nor 'random'")
             self.rule, self.orders = orders, None
         else:
             self.rule, self.orders = None, check_orders(orders, model.num_objects)
-        self.model = model
-        check_type(Resample, "a Resample", **given(resample=resample))
+        self.model, self.reassembly = model, reassembly
         self.resample = Resample(allocation="equal") if resample is None else resample
-        self.reassembly = reassembly
 
     @property
     def approximate(self) -> bool:
@@ -209,17 +206,11 @@ def circular_orders(num_orders: int, num_objects: int) -> Int[np.ndarray, "order
 
 def check_orders(orders: Any, num_objects: int, name: str = "orders") -> Int[Array, "c objects"]:
     """One order a row; raises `ValueError` for one that is no permutation of the objects."""
-    if orders is None:
-        orders = range(num_objects)
     if isinstance(orders, Tracer):
         return jnp.atleast_2d(orders).astype(jnp.int32)
-    try:
-        table = np.atleast_2d(np.asarray(orders))
-        expected = np.broadcast_to(np.arange(num_objects), (len(table), num_objects))
-        is_order = np.array_equal(np.sort(table, axis=1), expected)
-    except (TypeError, ValueError):  # rows of different lengths, or no numbers
-        is_order = False
-    if not is_order:
+    table = to_rows(num_objects, name, range(num_objects) if orders is None else orders)
+    is_order = np.sort(table, axis=1) == np.arange(num_objects)[None]
+    if not is_order.size or not is_order.all():
         raise ValueError(
             f"{name}: {shown(orders)} is no permutation of the objects 0 to {num_objects - 1}"
         )

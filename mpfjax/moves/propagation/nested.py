@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_numbered, check_type, check_whole
+from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.noise import draw_family_noise, noise_dtype
@@ -37,15 +37,13 @@ class PropagateNested(AbstractPropagation):
     """
 
     propagate: Propagate
-    num_draws: int = eqx.field(static=True, default=4)
+    num_draws: Count = eqx.field(static=True, default=4)
 
     draws_each = True
     """each particle moves without a look at the others."""
 
     def __check_init__(self) -> None:
-        check_type(Propagate, "a Propagate", propagate=self.propagate)
-        check_whole(num_draws=self.num_draws)
-        if self.propagate.gradient == "stop":
+        if getattr(self.propagate, "gradient", None) == "stop":
             raise ValueError("propagate: gradient 'stop' does not see which draw is kept")
 
     @property
@@ -58,7 +56,6 @@ class PropagateNested(AbstractPropagation):
     ) -> ParticleMixture:
         """Propagate every particle and weigh it by y_t."""
         n, k = mixture.num_particles, self.num_draws
-        check_numbered("draws up to", n * k, num_particles=n, num_draws=k)
         families, shares = self._drawn(key, mixture, observation)
         log_weights = families.log_weights.reshape(n, k)
         largest = jnp.max(log_weights, axis=1, keepdims=True)

@@ -6,18 +6,21 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_exponent, check_one_of, check_type
+from mpfjax.checks import Exponent
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     check_moved,
     is_made_of_noise,
     require,
-    require_model,
     require_noise,
 )
-from mpfjax.models.conditionally_linear import is_mixed, refuse_marginalised, require_marginalised
-from mpfjax.models.noise import NOISES, draw_noise, noise_dtype
+from mpfjax.models.conditionally_linear import (
+    AbstractConditionallyLinearModel,
+    is_mixed,
+    refuse_marginalised,
+)
+from mpfjax.models.noise import Noise, draw_noise, noise_dtype
 from mpfjax.models.steps import (
     completed,
     drawn,
@@ -28,7 +31,7 @@ from mpfjax.models.steps import (
     noise_dimension,
     seen,
 )
-from mpfjax.moves.base import AbstractPropagation
+from mpfjax.moves.base import AbstractPropagation, Gradient
 from mpfjax.moves.conditional import ConditionalPropagation, Reference
 from mpfjax.operations.logarithms import add_gradient, finite_max, without_gradient
 from mpfjax.proposals import AbstractProposal
@@ -64,14 +67,24 @@ class Propagate(AbstractPropagation):
 
     model: AbstractStateSpaceModel
     proposal: AbstractProposal | None = None
-    gradient: str = eqx.field(static=True, default="none")
-    noise: str = eqx.field(static=True, default="independent")
+    gradient: Gradient = eqx.field(static=True, default="none")
+    noise: Noise = eqx.field(static=True, default="independent")
 
     draws_each = True
     """each particle moves without a look at the others."""
 
     def __check_init__(self) -> None:
-        _check_draws(self, self.proposal)
+        model, proposal, needs_noise = self.model, self.proposal, self.noise != "independent"
+        # The mixed form has the law of z_t and its noise whatever the model's methods are.
+        has_law = is_mixed(model)
+        if not has_law and self.gradient == "stop":
+            require(model, "log_transition", "gradient='stop'")
+        if not has_law and proposal is not None:
+            require(model, "log_transition", f"proposal {type(proposal).__name__}")
+        if needs_noise and proposal is not None:
+            require(proposal, "propose_from_noise", f"noise={self.noise!r}", "proposal")
+        elif needs_noise and not has_law:
+            require_noise(model, f"noise={self.noise!r}")
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -81,7 +94,7 @@ class Propagate(AbstractPropagation):
             noise = noise_of_slots(self.noise, key, self.noise_dimension(mixture), mixture)
             return self.from_noise(noise, mixture, observation)
         if self.proposal is None:
-            return _weighed(self.model, self.predict(key, mixture), observation)
+            return self.weighed(self.predict(key, mixture), observation)
         draws = self.proposal.propose(key, observation, mixture.particles)
         return self._proposed(draws, mixture, observation)
 
@@ -91,8 +104,7 @@ class Propagate(AbstractPropagation):
         """The same with x_t made of this noise, a row for each slot."""
         if self.proposal is None:
             draws = made_of(self.model, noise, mixture.particles)
-            moved = _moved(draws, self.model, mixture, self.gradient)
-            return _weighed(self.model, moved, observation)
+            return self.weighed(_moved(draws, self.model, mixture, self.gradient), observation)
         proposal: Any = self.proposal
         draws = proposal.propose_from_noise(noise, observation, mixture.particles)
         return self._proposed(draws, mixture, observation)
@@ -130,11 +142,18 @@ class Propagate(AbstractPropagation):
         log_density: Float[Array, " n"] | None = None,
     ) -> ParticleMixture:
         """The weights of x_t times L, and D / q where each has been drawn with a log q."""
-        if log_density is None:
-            return _weighed(self.model, mixture, observation)
         draws = drawn_part(self.model, mixture.particles)
-        log_ratio = log_transition(self.model, draws, previous) - log_density
-        return _weighed(self.model, mixture, observation, log_ratio)
+        mixture, log_factors = self._seen(mixture, observation)
+        if log_density is not None:
+            log_factors.append(log_transition(self.model, draws, previous) - log_density)
+        return mixture.weighed(*log_factors)
+
+    def _seen(
+        self, mixture: ParticleMixture, observation: PyTree
+    ) -> tuple[ParticleMixture, list[Array]]:
+        """The particles updated by y_t, and log L as its factors."""
+        states, log_factors = seen(self.model, observation, mixture.particles)
+        return mixture.replace(particles=states), log_factors
 
     def around(self, reference: Reference) -> ConditionalPropagation:
         """The same around the trajectory, where noise and proposal allow it."""
@@ -165,50 +184,29 @@ class PropagateMarginalised(Propagate):
     `mixture_particle_filter` and `auxiliary_particle_filter` use it for such a model.
     """
 
-    def __check_init__(self) -> None:
-        require_marginalised(self.model, "PropagateMarginalised")
+    model: AbstractConditionallyLinearModel
 
 
-class Predict(AbstractPropagation):
-    """Draw x_t ~ D(. | x_{t-1}) and leave the weights: the first half of a bootstrap `Propagate`.
+class Predict(Propagate):
+    """Draw x_t and multiply the weights by D / q alone: the first half of a `Propagate`.
 
     `Reweight` is the second half. Use the two in a chain that does something in between, such as
-    redrawing the prediction from its Gaussian (Lin et al. 2012, section 4, step 3). `gradient`,
-    `noise` and the errors are those of `Propagate`.
+    redrawing the prediction from its Gaussian (Lin et al. 2012, section 4, step 3). The arguments
+    and errors are those of `Propagate`; without a proposal the weights stay as they are.
     """
 
-    model: AbstractStateSpaceModel
-    gradient: str = eqx.field(static=True, default="none")
-    noise: str = eqx.field(static=True, default="independent")
-
     weighs = False
-    """the observation changes no weight."""
+    """the likelihood of the observation changes no weight."""
 
-    def __check_init__(self) -> None:
-        _check_draws(self)
+    draws_each = False
+    """what is drawn is not weighed yet, so that no draw is better than another."""
 
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
-        """Propagate every particle; the observation plays no part."""
+    def _seen(
+        self, mixture: ParticleMixture, observation: PyTree
+    ) -> tuple[ParticleMixture, list[Array]]:
+        """The particles as they are, and nothing of L."""
         del observation
-        return self.predict(key, mixture)
-
-    def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
-        """The same without an observation."""
-        return predict(key, self.model, mixture, self.gradient, self.noise)
-
-    proposal = None
-    """x_t is drawn by the dynamics."""
-
-    def weighed(self, mixture: ParticleMixture, observation: PyTree) -> ParticleMixture:
-        """The mixture as it is."""
-        del observation
-        return mixture
-
-    def around(self, reference: Reference) -> ConditionalPropagation:
-        """The same around the trajectory, where the noise allows it."""
-        return ConditionalPropagation(self, reference)
+        return mixture, []
 
 
 class Reweight(AbstractPropagation):
@@ -220,11 +218,9 @@ class Reweight(AbstractPropagation):
     """
 
     model: AbstractStateSpaceModel
-    exponent: float = eqx.field(static=True, default=1.0)
+    exponent: Exponent = eqx.field(static=True, default=1.0)
 
     def __check_init__(self) -> None:
-        require_model(self.model, "Reweight")
-        check_exponent(exponent=self.exponent)
         if self.exponent != 1:
             refuse_marginalised(self.model, "a part of the likelihood", "take exponent 1")
 
@@ -234,7 +230,8 @@ class Reweight(AbstractPropagation):
         """Reweight every particle by y_t."""
         del key
         if self.exponent == 1:
-            return _weighed(self.model, mixture, observation)
+            states, log_factors = seen(self.model, observation, mixture.particles)
+            return mixture.replace(particles=states).weighed(*log_factors)
         log_factors = likelihoods(self.model, observation, mixture.particles)
         # Differences would be lost to rounding beside a large common constant.
         common = finite_max(jnp.where(mixture.occupied, log_factors, -jnp.inf))
@@ -244,27 +241,6 @@ class Reweight(AbstractPropagation):
         """The move itself, which weighs the trajectory as any other."""
         del reference
         return self
-
-
-def _check_draws(move: Any, proposal: Any = None) -> None:
-    """Raise a `ValueError` for a gradient, noise or proposal that the model cannot have."""
-    model = move.model
-    require_model(model, type(move).__name__)
-    check_one_of(("none", "stop"), gradient=move.gradient)
-    check_one_of(NOISES, noise=move.noise)
-    # The mixed form has the law of z_t and its noise whatever the model's methods are.
-    has_law, needs_noise = is_mixed(model), move.noise != "independent"
-    if move.gradient == "stop" and not has_law:
-        require(model, "log_transition", "gradient='stop'")
-    if proposal is not None:
-        what = "a proposal, such as GaussNewtonProposal(model) or RegimeProposal(model)"
-        check_type(AbstractProposal, what, proposal=proposal)
-        if not has_law:
-            require(model, "log_transition", f"proposal {type(proposal).__name__}")
-        for method in ("propose_from_noise", "noise_dimension") if needs_noise else ():
-            require(proposal, method, f"noise={move.noise!r}", "proposal")
-    elif needs_noise and not has_law:
-        require_noise(model, f"noise={move.noise!r}")
 
 
 def noise_of_slots(
@@ -305,14 +281,3 @@ def _moved(
         log_density = log_transition(model, draws, previous).astype(log_weights.dtype)
         log_weights = add_gradient(log_weights, jnp.where(mixture.occupied, log_density, 0.0))
     return mixture.replace(particles=completed(model, draws, previous), log_weights=log_weights)
-
-
-def _weighed(
-    model: AbstractStateSpaceModel,
-    mixture: ParticleMixture,
-    observation: PyTree,
-    *log_ratio: Float[Array, " n"],
-) -> ParticleMixture:
-    """The particles updated by y_t, their weights times L, and D / q where that is the ratio."""
-    states, log_factors = seen(model, observation, mixture.particles)
-    return mixture.replace(particles=states).weighed(*log_factors, *log_ratio)

@@ -7,13 +7,11 @@ import jax.numpy as jnp
 from jax.scipy.special import logsumexp, ndtr
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_type, given
 from mpfjax.mixture import MarginalisedState, ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.models.conditionally_linear import (
     AbstractConditionallyLinearModel,
     predicted,
-    require_marginalised,
     updated,
 )
 from mpfjax.models.steps import log_predictive
@@ -46,7 +44,7 @@ class RegimeProposal(AbstractProposal):
     model: AbstractConditionallyLinearModel
 
     def __check_init__(self) -> None:
-        require_finite(self.model, "RegimeProposal")
+        require(self.model, "all_transitions", "RegimeProposal")
         require(self.model, "log_transition", "RegimeProposal")
 
     def propose(
@@ -119,8 +117,7 @@ class PropagateRegimes(AbstractPropagation):
     """it resamples without a memory of first ancestors."""
 
     def __check_init__(self) -> None:
-        require_finite(self.model, "PropagateRegimes")
-        check_type(GroupBy, "a GroupBy", **given(group=self.group))
+        require(self.model, "all_transitions", "PropagateRegimes")
 
     def would_resample(
         self, mixture: ParticleMixture, observation: PyTree = None
@@ -225,12 +222,6 @@ def _threshold(line: Line, targets: Int[Array, " m"]) -> Float[Array, " m"]:
         is_falling, lambda pair: (pair[1], lowered(pair[1])), (first, lowered(first))
     )
     return threshold
-
-
-def require_finite(model: Any, needed_by: str) -> None:
-    """Raise a `ValueError` for a model that does not list what may follow its latent."""
-    require_marginalised(model, needed_by)
-    require(model, "all_transitions", needed_by)
 
 
 def _row(table: Array, rows: Int[Array, " n"]) -> Array:

@@ -1,16 +1,16 @@
 """Tempered propagation: the likelihood enters by powers, and particles move in between."""
 
-import itertools
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_inner_share, check_type, check_whole, shown
+from mpfjax.checks import Count, InnerShare, shown
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import AbstractStateSpaceModel, require_model, require_noise
+from mpfjax.models.base import AbstractStateSpaceModel, require_noise
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.noise import noise_dtype
 from mpfjax.models.steps import likelihoods, made_of
@@ -27,14 +27,6 @@ class TemperedParticles(NamedTuple):
     states: PyTree
     noise: Float[Array, "n d"]
     log_likelihoods: Float[Array, " n"]
-
-
-def _numbers(exponents: Any) -> Any:
-    """The exponents as a tuple of numbers; what is none stays, and is refused by its name."""
-    try:
-        return tuple(float(number) for number in exponents)
-    except (TypeError, ValueError):
-        return exponents
 
 
 class PropagateTempered(AbstractPropagation):
@@ -66,24 +58,21 @@ class PropagateTempered(AbstractPropagation):
     model: AbstractStateSpaceModel
     resample: Resample = eqx.field(default_factory=Resample)
     exponents: tuple[float, ...] = eqx.field(
-        converter=_numbers, static=True, default=(1 / 64, 1 / 16, 1 / 4, 1.0)
+        converter=lambda numbers: tuple(np.ravel(numbers).tolist()),
+        static=True,
+        default=(1 / 64, 1 / 16, 1 / 4, 1.0),
     )
-    num_moves: int = eqx.field(static=True, default=1)
-    least_step: float = eqx.field(static=True, default=0.02)
+    num_moves: Count = eqx.field(static=True, default=1)
+    least_step: InnerShare = eqx.field(static=True, default=0.02)
 
     def __check_init__(self) -> None:
-        require_model(self.model, "PropagateTempered")
         refuse_marginalised(self.model, "PropagateTempered")
         require_noise(self.model, "PropagateTempered")
-        check_type(Resample, "a Resample", resample=self.resample)
-        if self.resample.sort_by is not None:
+        if getattr(self.resample, "sort_by", None) is not None:
             raise ValueError("resample: sort_by has no use between the stages")
-        numbers = self.exponents if isinstance(self.exponents, tuple) else ()
-        rises = all(a < b for a, b in itertools.pairwise((0.0, *numbers)))
-        if not rises or numbers[-1:] != (1.0,):
+        rises = np.all(np.diff([0.0, *self.exponents]) > 0)
+        if not rises or self.exponents[-1:] != (1.0,):
             raise ValueError(f"exponents: {shown(self.exponents)} do not rise from above 0 to 1")
-        check_whole(num_moves=self.num_moves)
-        check_inner_share(least_step=self.least_step)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
@@ -137,16 +126,26 @@ class PropagateTempered(AbstractPropagation):
         """Each particle after one Metropolis step in its noise, with the same parent."""
         now = mixture.particles
         key_step, key_noise, key_taken = split(key, 3)
-        n, dtype = mixture.num_particles, now.noise.dtype
-        step = jnp.asarray(self.least_step, dtype) ** uniform(key_step, (n, 1), dtype)
+        shape, dtype = (mixture.num_particles, 1), now.noise.dtype
+        step = jnp.asarray(self.least_step, dtype) ** uniform(key_step, shape, dtype)
         noise = jnp.sqrt(1 - step**2) * now.noise + step * normal(key_noise, now.noise.shape, dtype)
         states = made_of(self.model, noise, mixture.parents)
         log_likelihoods = likelihoods(self.model, observation, states) - common
         log_ratio = exponent * log_likelihoods - exponent * now.log_likelihoods
-        taken = jnp.log(uniform(key_taken, (n,), dtype)) < log_ratio
         proposed = TemperedParticles(states, noise, log_likelihoods)
+        return mixture.replace(particles=accepted(key_taken, log_ratio, proposed, now))
 
-        def pick(new: Array, old: Array) -> Array:
-            return jnp.where(taken.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
-        return mixture.replace(particles=jax.tree.map(pick, proposed, now))
+def accepted(
+    key: Key[Array, ""], log_ratio: Float[Array, " n"], new: PyTree, old: PyTree
+) -> PyTree:
+    """The new of each particle with the probability min(1, exp log_ratio), else the old.
+
+    A ratio that is NaN is rejected.
+    """
+    taken = jnp.log(uniform(key, log_ratio.shape, log_ratio.dtype)) < log_ratio
+
+    def pick(new: Array, old: Array) -> Array:
+        return jnp.where(taken.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    return jax.tree.map(pick, new, old)
