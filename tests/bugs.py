@@ -32,26 +32,26 @@ class Bug(NamedTuple):
 BUGS = {
     "the proposal's density has the wrong sign": Bug(
         "moves/propagation/propagate.py",
-        "log_ratio = log_transition(self.model, states, previous) - log_density",
-        "log_ratio = log_transition(self.model, states, previous) + log_density",
+        "log_factors.append(log_transition(self.model, draws, previous) - log_density)",
+        "log_factors.append(log_transition(self.model, draws, previous) + log_density)",
         "tests/test_exact_answers.py -k guided",
     ),
     "nested propagation sums over proposals": Bug(
         "moves/propagation/nested.py",
-        "log_weights=repeat(mixture.log_weights) - math.log(num_draws),",
-        "log_weights=repeat(mixture.log_weights),",
+        "log_weights=repeated.log_weights - math.log(k)",
+        "log_weights=repeated.log_weights",
         "tests/test_exact_answers.py -k proposals",
     ),
     "MALA forgets its step back": Bug(
         "moves/metropolis.py",
-        "lambda a, b, xi: 0.5 * (xi**2 - (a + b + xi) ** 2), forth, back, noise",
-        "lambda a, b, xi: 0.5 * (xi**2 - (a + a + xi) ** 2), forth, back, noise",
+        "reverse = forth + drift(proposed) + noise",
+        "reverse = forth + forth + noise",
         "tests/test_exact_answers.py -k Langevin",
     ),
     "densities are stale after an accepted step": Bug(
         "moves/metropolis.py",
-        "densities = _where(taken, those, densities)",
-        "densities = densities",
+        "states, densities = accepted(key_taken, log_ratio, new, old)",
+        "states, _ = accepted(key_taken, log_ratio, new, old)",
         "tests/test_exact_answers.py -k RandomWalk",
     ),
     "prior masses of DPS count the dead": Bug(
@@ -218,6 +218,49 @@ BUGS = {
         "start: Any = np.float32(min(25 / frames_per_second, _MOST)) * _SPEED",
         "start: Any = np.float32(1.0) * _SPEED",
         "tests/vision/test_tracker.py -k rare",
+    ),
+    # Propagation, several objects, look-aheads.
+    "tempered moves draw everything by one key": Bug(
+        "moves/propagation/tempered.py",
+        "key_step, key_noise, key_taken = split(key, 3)",
+        "key_step, key_noise, key_taken = key, key, key",
+        "tests/moves/test_tempered.py",
+    ),
+    "moments are not updated by what is seen": Bug(
+        "moves/propagation/propagate.py",
+        "return mixture.replace(particles=states), log_factors",
+        "return mixture, log_factors",
+        "tests/moves/test_marginalised.py -k kalman",
+    ),
+    "regimes follow each other by the transposed matrix": Bug(
+        "models/linear.py",
+        "(jnp.full_like(latent, j), spread(log_matrix[:, j], latent))",
+        "(jnp.full_like(latent, j), spread(log_matrix[j], latent))",
+        "tests/moves/test_marginalised.py -k kept_twice",
+    ),
+    "an object does not meet the one that moved just before": Bug(
+        "moves/objects/partitioned.py",
+        "has_moved = ranks < rank",
+        "has_moved = ranks < rank - 1",
+        "tests/moves/test_partitioned.py -k joint_state",
+    ),
+    "components move their objects in one order": Bug(
+        "moves/objects/partitioned.py",
+        "return take(objects, mixture.component_indicators)",
+        "return objects[0]",
+        "tests/moves/test_partitioned.py -k moved_last",
+    ),
+    "a point set is not shifted": Bug(
+        "models/noise.py",
+        "points = sobol_points(ranks, directions) ^ shifts",
+        "points = sobol_points(ranks, directions)",
+        "tests/test_point_sets.py -k exactly_normal",
+    ),
+    "a twisted draw's density lacks its volume": Bug(
+        "lookahead/quadratics.py",
+        "return 0.5 * (norm - inner(residuals, residuals)) + log_volume",
+        "return 0.5 * (norm - inner(residuals, residuals))",
+        "tests/lookahead/test_learned.py",
     ),
 }
 

@@ -27,7 +27,7 @@ from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.running.islands import IslandInteraction
 from mpfjax.vision.boxes.following import Snapshot
-from tests.user_models import DriftOfOne
+from tests.user_models import Drift, DriftOfOne
 
 pytestmark = pytest.mark.usefixtures("as_installed")
 
@@ -328,8 +328,69 @@ def run(filter, observations=TWO, **options):
     return mpfjax.run_filter(KEY, filter, observations, **options)
 
 
-def run_of(model, **options):
-    return run(mpfjax.particle_filter(model, 10, **options))
+def run_of(model, observations=TWO, **options):
+    return run(mpfjax.particle_filter(model, 10, **options), observations)
+
+
+class Plain(mpfjax.AbstractProposal):
+    """A proposal that is not made of noise."""
+
+    def propose(self, key, observation, previous_states):
+        return previous_states, jnp.zeros(len(previous_states))
+
+
+class Nothing(mpfjax.AbstractStateSpaceModel):
+    """A model that cannot move its states."""
+
+    def sample_initial(self, key, num_particles):
+        return jnp.zeros(num_particles)
+
+    def log_likelihood(self, observation, states):
+        return -states
+
+
+class Nine(Drift):
+    """Nine coordinates are more than a Hilbert curve goes through."""
+
+    def sample_initial(self, key, num_particles):
+        return jnp.zeros((num_particles, 9))
+
+
+class Parts(mpfjax.AbstractConditionallyLinearModel):
+    """One of its parts may be wrong; its latent has no density, and is not made of noise."""
+
+    F: np.ndarray = eqx.field(default_factory=lambda: EYE)
+    b: np.ndarray = eqx.field(default_factory=lambda: ZERO)
+    R: np.ndarray = eqx.field(default_factory=lambda: EYE)
+    P0: np.ndarray = eqx.field(default_factory=lambda: EYE)
+
+    def sample_initial(self, key, num_particles):
+        return jnp.zeros(num_particles)
+
+    def sample_transition(self, key, latent):
+        return latent
+
+    def initial_moments(self, latent):
+        return jnp.zeros(1), self.P0
+
+    def dynamics(self, latent, previous_latent):
+        return self.F, self.b, EYE
+
+    def emission(self, latent):
+        return EYE, ZERO, self.R
+
+
+def changed(kind, name, value=lambda self, key, states: states):
+    """A model of this kind, of which a subclass of the user's has another attribute."""
+    return type("Changed", (kind,), {name: value})()
+
+
+def odd(dimension):
+    return changed(Drift, "noise_dimension", dimension)
+
+
+def conditional(filter):
+    return smoothing.conditional_filter(KEY, filter, TWO, np.ones(3, np.float32))
 
 
 def after(change):
@@ -551,6 +612,96 @@ REFUSED = (
             ("num_particles: 8.5 is not a whole number", {"num_particles": [8.5]}),
             ("settings: 'filter' is a name", {"settings": {"filter": [1]}}),
             ("noise: .* no number or string; name it", {"settings": {"noise": [ZERO]}}),
+        )
+    ),
+    # propagation, several objects, look-ahead
+    *(
+        (words, lambda model=model, options=options: Propagate(model, **options))
+        for model, options, words in (
+            (wrong(), {"gradient": "stop"}, "Wrong defines no log_transition, which gradient="),
+            (wrong(), {"noise": "rqmc"}, "model: Wrong defines no transition_from_noise"),
+            (wrong(), {"proposal": Plain()}, "Wrong defines no log_transition, which proposal"),
+            (MODEL, {"proposal": Plain(), "noise": "rqmc"}, "Plain defines no propose_from_noise"),
+            *((odd(d), {"noise": "rqmc"}, "noise_dimension") for d in (0, 2.0, 65, None)),
+        )
+    ),
+    ("inherits its transition_from_noise, which noise='rqmc' needs",
+     lambda: Propagate(changed(mpfjax.QuadraticModel, "sample_transition"), noise="rqmc")),
+    ("model: Nothing defines no sample_transition, nor transition_from_noise",
+     lambda: mpfjax.particle_filter(Nothing(), 8)),
+    ("sort_by: 9 coordinates", lambda: run(mpfjax.particle_filter(Nine(), 8, noise="rqmc"))),
+    ("model: Wrong defines no transition_mean", lambda: mpfjax.GaussNewtonProposal(wrong())),
+    ("propagate: gradient 'stop'",
+     lambda: mpfjax.PropagateNested(Propagate(MODEL, gradient="stop"))),
+    ("filter: PropagateNested cannot keep a trajectory",
+     lambda: conditional(mpfjax.with_proposals_per_particle(FILTER, 2))),
+    ("filter: .* not noise='rqmc'", lambda: conditional(mpfjax.with_point_sets(FILTER))),
+    *(
+        ("exponents: .* do not rise", lambda e=e: mpfjax.PropagateTempered(MODEL, exponents=e))
+        for e in ((0.5, 0.2, 1.0), (0.1, 0.5), (), (NAN, 1.0), (0.0, 1.0))
+    ),
+    ("resample: sort_by", lambda: mpfjax.PropagateTempered(MODEL, Resample(sort_by="hilbert"))),
+    ("transition_from_noise, which PropagateTempered", lambda: mpfjax.PropagateTempered(wrong())),
+    ("comes before any propagation: there is no x_t yet",
+     lambda: run(Filter(MODEL, [mpfjax.RandomWalkMetropolis(MODEL), Propagate(MODEL)], 4))),
+    *(
+        (f"{type(between).__name__} leaves no particle one parent", lambda between=between: Filter(
+            MODEL, [Propagate(MODEL), mpfjax.Every(2, [between]),
+                    mpfjax.RandomWalkMetropolis(MODEL)], 4))
+        for between in (IslandInteraction(), mpfjax.GaussianRegeneration())
+    ),
+    *(
+        ("model: .* is conditionally linear", lambda make=make: make(SWITCHING))
+        for make in (
+            mpfjax.PropagateTempered, lambda model: Reweight(model, 0.5),
+            lambda model: mpfjax.MultiObjectModel(model, 2),
+            lambda model: mpfjax.gaussian_particle_filter(model, 10),
+        )
+    ),
+    ("Parts defines no all_transitions", lambda: mpfjax.PropagateRegimes(Parts())),
+    ("Parts defines no log_transition",
+     lambda: mpfjax.PropagateMarginalised(Parts(), gradient="stop")),
+    (r"observation: shape \(2,\)", lambda: run_of(Parts(), observations=np.ones((2, 2)))),
+    *(
+        (f"model: Parts.{method} returned", lambda own=own: run_of(Parts(**own)))
+        for method, own in (
+            ("dynamics", {"F": EYE[0]}), ("dynamics", {"b": np.zeros(2)}),
+            ("emission", {"R": ZERO}),
+            ("initial_moments", {"P0": np.ones((1, 2))}),
+        )
+    ),
+    *(
+        ("order: ", lambda order=order: mpfjax.partitioned_sampling(JOINT, 10, order))
+        for order in ((0, 0), (0,), (1, 2), (0.5, 1.0), (), "circular", [(0, 1), (1, 0)])
+    ),
+    *(
+        ("orders: ", lambda o=o: mpfjax.distributed_partitioned_sampling(JOINT, 10, o))
+        for o in ([(0, 1), (1, 1)], [(0, 1), (1,)], "alphabetic")
+    ),
+    ("orders: 2 of them, for 1 components",
+     lambda: run(Filter(JOINT, [mpfjax.Partitioned(JOINT, [(0, 1), (1, 0)])], 4))),
+    ("num_particles: 1 is less than num_components, 2",
+     lambda: mpfjax.distributed_partitioned_sampling(JOINT, 1)),
+    *(
+        ("mixture: 2 components, not one",
+         lambda move=move: run(Filter(JOINT, [move(JOINT)], 4, 2)))
+        for move in (PropagateInClusters, PropagateIndependently)
+    ),
+    ("Wrong defines no log_transition, which PropagateInClusters",
+     lambda: mpfjax.clustered_particle_filter(
+         mpfjax.MultiObjectModel(wrong(), 2, mpfjax.PairwiseRepulsion(1.0, 1.0)), 4)),
+    ("Wrong defines no log_transition, which gradient=",
+     lambda: run(mpfjax.with_score_gradient(mpfjax.partitioned_sampling(
+         mpfjax.MultiObjectModel(wrong(), 2, shared_observation=True), 4)))),
+    ("transition_from_noise, which PilotLookahead needs",
+     lambda: mpfjax.with_lookahead(mpfjax.particle_filter(wrong(), 4))),
+    *(
+        (f"filter: .*{words}", lambda moves=moves: smoothing.learn_lookahead(
+            KEY, Filter(MODEL, moves, 4), TWO))
+        for words, moves in (
+            ("cannot look ahead", [mpfjax.GaussianRegeneration(), Propagate(MODEL)]),
+            ("cannot look ahead", [Resample(), Predict(MODEL), Reweight(MODEL)]),
+            ("its moves need one Resample", [Propagate(MODEL)]),
         )
     ),
 )  # fmt: skip

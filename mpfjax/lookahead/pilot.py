@@ -43,20 +43,18 @@ class PilotLookahead(eqx.Module):
 
     def at_step_of(self, mixture: ParticleMixture) -> Callable[[PyTree, PyTree], Array]:
         """(y_t, states) -> log ν, by the weights of the mixture."""
-        weights = mixture.weights
-        return lambda observation, states: self._log_factors(observation, states, weights)
-
-    def _log_factors(
-        self, observation: PyTree, states: PyTree, weights: Float[Array, " n"]
-    ) -> Float[Array, " n"]:
         model: Any = self.model
-        ones = jnp.ones((weights.shape[0], model.noise_dimension), noise_dtype(states))
-        seen = [
-            likelihoods(self.model, observation, model.transition_from_noise(noise, states))
-            for noise in (ones, -ones)
-        ]
-        # Any ν is exact, so that its derivative is not needed.
-        return jax.lax.stop_gradient(jnp.log(trusted(jnp.stack(seen), weights)))
+
+        def look(observation: PyTree, states: PyTree) -> Float[Array, " n"]:
+            ones = jnp.ones((mixture.num_particles, model.noise_dimension), noise_dtype(states))
+            seen = [
+                likelihoods(model, observation, model.transition_from_noise(noise, states))
+                for noise in (ones, -ones)
+            ]
+            # Any ν is exact, so that its derivative is not needed.
+            return jax.lax.stop_gradient(jnp.log(trusted(jnp.stack(seen), mixture.weights)))
+
+        return look
 
 
 Lookahead = AbstractProposal | PilotLookahead | Callable[[PyTree, PyTree], Array]

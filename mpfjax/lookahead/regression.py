@@ -218,7 +218,7 @@ def _tempered(
     low, high = jnp.zeros_like(most), jnp.ones_like(most)
     goal = jnp.minimum(needed, 0.5 * size(low))
 
-    def halved(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halved(_: Any, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bounds
         middle = 0.5 * (low + high)
         enough = size(middle) >= goal

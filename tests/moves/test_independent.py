@@ -3,11 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import mpfjax
 from mpfjax import MultiObjectModel
-from mpfjax.moves.objects.independent import PropagateIndependently
 
 KEY = jax.random.key(0)
 
@@ -19,40 +17,24 @@ class Lamp(mpfjax.QuadraticModel):
         return jnp.where((states > 0) & (observation > 0), -states, -jnp.inf)
 
 
-MODEL = MultiObjectModel(Lamp(0.1, 0.1, -1.0, 1.0), 3)
-FILTER = mpfjax.independent_particle_filters(MODEL, 20)
-
-
-def test_an_object_that_is_lost_does_not_take_the_others_along():
-    mixture = FILTER.init(KEY)
-    after, info = FILTER.step(KEY, mixture, jnp.array([1.0, -1.0, 1.0]))
+def test_each_object_is_resampled_by_its_own_likelihood_alone():
+    """A lost object does not take the others along, and log Ẑ is the sum over the objects."""
+    filter = mpfjax.independent_particle_filters(MultiObjectModel(Lamp(0.1, 0.1, -1.0, 1.0), 3), 20)
+    before = filter.init(KEY)
+    same = jnp.broadcast_to(jnp.linspace(-1.0, 1.0, 20)[:, None], (20, 3))
+    after, info = filter.step(KEY, before.replace(particles=same), jnp.ones(3))
+    assert (np.asarray(after.particles) > 0).all()
+    # Of each object about half of the particles is seen, with a mean likelihood of 1 - 1 / e.
+    np.testing.assert_allclose(info.log_likelihood_increment, 3 * np.log(0.316), atol=0.45)
+    after, info = filter.step(KEY, before, jnp.array([1.0, -1.0, 1.0]))
     assert bool(info.degenerate)
     assert (np.asarray(after.particles)[:, [0, 2]] > 0).all()
-    np.testing.assert_allclose(after.particles[:, 1], mixture.particles[:, 1], atol=0.6)
+    np.testing.assert_allclose(after.particles[:, 1], before.particles[:, 1], atol=0.6)
     np.testing.assert_allclose(after.weights, np.full(20, 0.05), rtol=1e-5)
 
 
-def test_each_object_is_resampled_by_its_own_likelihood_alone():
-    """So rows are parted: two objects that move together would stay together in a joint filter."""
-    mixture = FILTER.init(KEY)
-    same = jnp.linspace(-1.0, 1.0, 20)[:, None]
-    mixture = mixture.replace(particles=jnp.broadcast_to(same, (20, 3)))
-    after, info = FILTER.step(KEY, mixture, jnp.ones(3))
-    assert (np.asarray(after.particles) > 0).all()
-    assert np.isfinite(info.log_likelihood_increment)
-    single = mpfjax.particle_filter(MultiObjectModel(MODEL.object_model, 1), 20)
-    alone = single.init(KEY).replace(particles=same)
-    # A third of the log evidence, up to the noise of three draws.
-    _, one = single.step(KEY, alone, jnp.ones(1))
-    ratio = float(info.log_likelihood_increment) / float(one.log_likelihood_increment)
-    assert 2.4 < ratio < 3.6
-
-
-@pytest.mark.usefixtures("as_installed")
-def test_bad_input():
-    with pytest.raises(ValueError, match="scheme: 'optimal'"):
-        mpfjax.independent_particle_filters(MODEL, 20, scheme="optimal")
-    move = PropagateIndependently(MODEL)
-    mixture = mpfjax.distributed_partitioned_sampling(MODEL, 20).init(KEY)
-    with pytest.raises(ValueError, match="mixture: 3 components, not one"):
-        move(KEY, mixture, jnp.ones(3))
+def test_an_interaction_is_ignored_and_that_is_said():
+    for interaction in (None, mpfjax.PairwiseRepulsion(1.0, 1.0)):
+        joint = MultiObjectModel(Lamp(), 2, interaction)
+        filter = mpfjax.independent_particle_filters(joint, 8)
+        assert filter.approximate == (interaction is not None)

@@ -7,7 +7,8 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
-from tests.marking import thorough
+from tests.marking import exactness
+from tests.moves.test_marginalised import assert_unbiased
 
 # The whole state (z, x) is linear: z_t = f z + A x + v, x_t = F x + B z + w.
 SLOPE, COUPLING = 0.7, np.array([[0.5, -0.3]])
@@ -60,7 +61,7 @@ def moments(mixture):
 
 @pytest.mark.parametrize(
     ("is_correlated", "noise"),
-    [(True, "independent"), *thorough([(False, "independent"), (True, "rqmc")])],
+    [(True, "independent"), *exactness([(False, "independent"), (True, "rqmc")])],
 )
 def test_evidence_and_moments_are_those_of_the_kalman_filter(is_correlated, noise):
     filter = mpfjax.particle_filter(Mixed(is_correlated), NUM_PARTICLES, noise=noise)
@@ -73,34 +74,6 @@ def test_evidence_and_moments_are_those_of_the_kalman_filter(is_correlated, nois
     second = covariances + means[..., 1:, None] * means[..., None, 1:]
     mean = np.asarray(exact.means)
     expected = np.asarray(exact.covariances)[:, 1:, 1:] + mean[:, 1:, None] * mean[:, None, 1:]
-    for found, truth in (
-        (ratios, np.ones(len(OBSERVATIONS))),
-        (ratios[..., None] * means, mean),
-        (ratios[..., None, None] * second, expected),
-    ):
-        error = found.std(axis=0) / np.sqrt(NUM_RUNS)
-        assert (error < 0.05).all()
-        z = (found.mean(axis=0) - truth) / error
-        assert np.abs(z).max() < 4, f"standard errors away: {z}"
-
-
-class WithoutS(Mixed):
-    def latent_dynamics(self, previous_latent):
-        return SLOPE * previous_latent, jnp.array(COUPLING)
-
-
-class Whole(Mixed):
-    def sample_initial(self, key, num_particles):
-        return jnp.zeros(num_particles, jnp.int32)
-
-
-@pytest.mark.parametrize(
-    ("model", "message"),
-    [
-        (WithoutS(), "latent_dynamics returned"),
-        (Whole(), "has latent_dynamics, so that its latent must be one array"),
-    ],
-)
-def test_other_parts_are_named(model, message):
-    with pytest.raises(ValueError, match=message):
-        mpfjax.run_filter(jax.random.key(0), mpfjax.particle_filter(model, 4), OBSERVATIONS)
+    assert_unbiased(ratios, 1.0)
+    assert_unbiased(ratios[..., None] * means, mean)
+    assert_unbiased(ratios[..., None, None] * second, expected)

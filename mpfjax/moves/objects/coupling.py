@@ -9,7 +9,6 @@ own quantities, since they are drawn with the same key.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,9 +39,8 @@ def coupled(
         i, j = pair
 
         def look() -> Bool[Array, ""]:
-            log_psi = over_pairs(interaction)(
-                model.object_states(points, i), model.object_states(points, j)
-            )
+            over_pairs = jax.vmap(of_one(interaction), in_axes=(0, None))
+            log_psi = over_pairs(*(model.object_states(points, k) for k in pair))
             return jnp.any(log_psi != 0)
 
         if may_split:
@@ -60,17 +58,16 @@ def together(labels: Int[Array, " objects"]) -> Bool[Array, "objects objects"]:
     return labels[:, None] == labels[None]
 
 
-def alike(state: PyTree, others: PyTree) -> PyTree:
-    """The same state repeated beside each of the other object's states."""
-    return jax.tree.map(lambda a, b: jnp.broadcast_to(a[None], b.shape), state, others)
-
-
-def over_pairs(
+def of_one(
     function: Callable[[PyTree, PyTree], Float[Array, " n"]],
-) -> Callable[[PyTree, PyTree], Float[Array, "n n"]]:
-    """Turn a function of the states of equal rows into one of all pairs of rows."""
-    of_one = lambda state, others: function(alike(state, others), others)  # noqa: E731
-    return jax.vmap(of_one, in_axes=(0, None))
+) -> Callable[[PyTree, PyTree], Float[Array, " n"]]:
+    """Turn a function of the states of equal rows into one of one state and many others."""
+
+    def with_each(state: PyTree, others: PyTree) -> Float[Array, " n"]:
+        repeated = jax.tree.map(lambda a, b: jnp.broadcast_to(a[None], b.shape), state, others)
+        return function(repeated, others)
+
+    return with_each
 
 
 def scores(
@@ -87,10 +84,8 @@ def scores(
 
     def score(carry: None, j: Int[Array, ""]) -> tuple[None, tuple]:
         def shared() -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-            object_model: Any = model.object_at(j)
-            log_f = over_pairs(lambda parent, point: object_model.log_transition(point, parent))
+            log_f = jax.vmap(partial(_log_kernels, model, j), in_axes=(0, None))
             table = log_f(model.object_states(particles, j), model.object_states(points, j))
-            table = table.astype(default_float())
             log_totals = jax.vmap(log_sum_exp)(table.T)
             log_b = table + (log_likelihoods[j] - log_totals)[None]
             return log_totals, jax.vmap(log_sum_exp)(log_b)
@@ -157,8 +152,8 @@ def _log_kernels(
     model: MultiObjectModel, j: Int[Array, ""], parent: PyTree, points: PyTree
 ) -> Float[Array, " n"]:
     """log f_j of the points of one object given one parent."""
-    object_model: Any = model.object_at(j)
-    return object_model.log_transition(points, alike(parent, points)).astype(default_float())
+    log_f = of_one(lambda parent, points: model.object_log_transition(points, parent, j))
+    return log_f(parent, points).astype(default_float())
 
 
 def _with_history(
@@ -180,7 +175,7 @@ def _log_potentials(
     total = jnp.zeros((num, num), default_float())
     if interaction is None:
         return total
-    of_row = jax.vmap(lambda state, points: interaction(alike(state, points), points))
+    of_row = jax.vmap(of_one(interaction))
 
     def add(total: Float[Array, "n n"], inputs: tuple) -> tuple[Float[Array, "n n"], None]:
         i, meets = inputs

@@ -43,7 +43,8 @@ class PropagateNested(AbstractPropagation):
     """each particle moves without a look at the others."""
 
     def __check_init__(self) -> None:
-        if getattr(self.propagate, "gradient", None) == "stop":
+        super().__check_init__()
+        if self.propagate.gradient == "stop":
             raise ValueError("propagate: gradient 'stop' does not see which draw is kept")
 
     @property

@@ -74,6 +74,7 @@ class Propagate(AbstractPropagation):
     """each particle moves without a look at the others."""
 
     def __check_init__(self) -> None:
+        super().__check_init__()
         model, proposal, needs_noise = self.model, self.proposal, self.noise != "independent"
         # The mixed form has the law of z_t and its noise whatever the model's methods are.
         has_law = is_mixed(model)
@@ -221,6 +222,7 @@ class Reweight(AbstractPropagation):
     exponent: Exponent = eqx.field(static=True, default=1.0)
 
     def __check_init__(self) -> None:
+        super().__check_init__()
         if self.exponent != 1:
             refuse_marginalised(self.model, "a part of the likelihood", "take exponent 1")
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Count, InnerShare, shown
+from mpfjax.checks import Count, InnerShare, as_numbers, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, require_noise
 from mpfjax.models.conditionally_linear import refuse_marginalised
@@ -27,6 +27,10 @@ class TemperedParticles(NamedTuple):
     states: PyTree
     noise: Float[Array, "n d"]
     log_likelihoods: Float[Array, " n"]
+
+
+def _as_exponents(numbers: Any) -> tuple[float, ...]:
+    return tuple(np.ravel(as_numbers("exponents", numbers, floating=True)).tolist())
 
 
 class PropagateTempered(AbstractPropagation):
@@ -58,17 +62,16 @@ class PropagateTempered(AbstractPropagation):
     model: AbstractStateSpaceModel
     resample: Resample = eqx.field(default_factory=Resample)
     exponents: tuple[float, ...] = eqx.field(
-        converter=lambda numbers: tuple(np.ravel(numbers).tolist()),
-        static=True,
-        default=(1 / 64, 1 / 16, 1 / 4, 1.0),
+        converter=_as_exponents, static=True, default=(1 / 64, 1 / 16, 1 / 4, 1.0)
     )
     num_moves: Count = eqx.field(static=True, default=1)
     least_step: InnerShare = eqx.field(static=True, default=0.02)
 
     def __check_init__(self) -> None:
+        super().__check_init__()
         refuse_marginalised(self.model, "PropagateTempered")
         require_noise(self.model, "PropagateTempered")
-        if getattr(self.resample, "sort_by", None) is not None:
+        if self.resample.sort_by is not None:
             raise ValueError("resample: sort_by has no use between the stages")
         rises = np.all(np.diff([0.0, *self.exponents]) > 0)
         if not rises or self.exponents[-1:] != (1.0,):
