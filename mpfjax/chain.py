@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import shown
+from mpfjax.checks import kinds, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, saying_that_none_were_given, with_inputs
 from mpfjax.moves.base import AbstractMove, Moves, name_of, with_inner, without_dead
@@ -181,16 +181,10 @@ def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> Pa
     if not isinstance(moved, ParticleMixture):
         raise ValueError(f"{who} {shown(moved)}, no ParticleMixture")
     for name in ("particles", "log_weights", "component_indicators"):
-        own, given = (_kinds(getattr(each, name)) for each in (moved, mixture))
+        own, given = (kinds(getattr(each, name)) for each in (moved, mixture))
         if own != given:
             raise ValueError(f"{who} {name} of {own}, and was given {given}")
     return moved
-
-
-def _kinds(tree: PyTree) -> str:
-    leaves, structure = jax.tree.flatten(tree)
-    kinds = [f"{jnp.result_type(leaf)}{list(jnp.shape(leaf))}" for leaf in leaves]
-    return f"{', '.join(kinds)} in {structure}"
 
 
 def normalised(

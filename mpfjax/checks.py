@@ -312,6 +312,24 @@ def _has_numbers(array: Any) -> bool:
     return dtype is not None and not is_duration and any(jnp.issubdtype(dtype, k) for k in kinds)
 
 
+def kinds(tree: Any) -> str:
+    """The types and shapes of a tree's arrays, and its structure, to be compared and shown."""
+    leaves, structure = jax.tree.flatten(tree)
+    each = [f"{jnp.result_type(leaf)}{list(jnp.shape(leaf))}" for leaf in leaves]
+    return f"{', '.join(each)} in {structure}"
+
+
+def check_one_each(num_particles: int, /, **results: Any) -> None:
+    """What the user's function of this name returned has arrays with an entry for each particle."""
+    for name, values in results.items():
+        leaves = jax.tree.leaves(values)
+        if not leaves or any(jnp.shape(leaf)[:1] != (num_particles,) for leaf in leaves):
+            raise ValueError(
+                f"{name}: it returned {shown(jax.tree.map(jnp.shape, values))}, no arrays whose"
+                f" leading axis is that of the {num_particles} particles"
+            )
+
+
 def check_scalars(**arguments: Any) -> None:
     """Each array is a single number."""
     for name, array in arguments.items():

@@ -9,13 +9,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
-from mpfjax.checks import as_numbers, check_flag, check_key, check_type, shown
+from mpfjax.checks import checked, kinds
 from mpfjax.filter import Filter
 from mpfjax.models.base import AbstractStateSpaceModel, model_name, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.moves.conditional import REFERENCE, ConditionalPropagation, Reference, at, put
 from mpfjax.moves.initial import sample_initial
-from mpfjax.observations import Series, as_series
+from mpfjax.observations import Series, as_arrays, as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.random import split, uniform
 from mpfjax.running.scan import FilterRun, initial_keys, scan, sound
@@ -42,6 +42,7 @@ class ConditionalRun(eqx.Module):
     possible: Bool[Array, " t"]
 
 
+@checked
 def conditional_filter(
     key: Key[Array, ""],
     filter: Filter,
@@ -87,9 +88,6 @@ def conditional_filter(
     model's states, or of density zero (RuntimeError within jit). Use it in a Gibbs sampler of your
     own; `mpfjax.tuning.particle_gibbs` is one for parameters.
     """
-    check_key(key)
-    check_type(Filter, "a Filter", filter=filter)
-    check_flag(backward=backward)
     check_conditional(filter, backward, "conditional_filter")
     series = as_series(observations, filter.model)
     trajectory = _as_states(trajectory, filter.model, series.length + 1)
@@ -177,7 +175,7 @@ def draw_trajectory(
     """One trajectory of a run, by backward sampling or the genealogy: leaves (t + 1, ...)."""
     mixtures = mixtures_of(run)
     if backward:
-        drawn = draw_trajectories(key, model, mixtures, inputs, 1, checked=checked)
+        drawn, _ = draw_trajectories(key, model, mixtures, inputs, 1, checked=checked)
     else:
         end = draw(key, (1,), mixtures.log_weights[-1])
         drawn = paths_through(mixtures, ancestors_of(end, mixtures))
@@ -211,24 +209,26 @@ def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
         )
 
 
+def shape_of_trajectory(model: Any, length: int) -> PyTree:
+    """The shapes and types of x_0, ..., x_t of a model, t + 1 being the length."""
+    states = jax.eval_shape(lambda key: sample_initial(key, model, 1), jax.random.key(0))
+    in_time = lambda leaf: jax.ShapeDtypeStruct((length, *leaf.shape[1:]), leaf.dtype)  # noqa: E731
+    return jax.tree.map(in_time, states)
+
+
 def _as_states(trajectory: Any, model: AbstractStateSpaceModel, length: int) -> PyTree:
     """The trajectory as arrays of the states' types; a `ValueError` for one of other shapes."""
-    like = jax.eval_shape(lambda key: sample_initial(key, model, 1), jax.random.key(0))
-    own, expected = jax.tree.structure(trajectory), jax.tree.structure(like)
-    of_states = f"of the states of {model_name(model)}"
-    if own != expected:
+    like, own = shape_of_trajectory(model, length), as_arrays(trajectory, "trajectory")
+
+    def convert(leaf: Any, state: jax.ShapeDtypeStruct) -> Any:
+        may_be = np.can_cast(jnp.result_type(leaf), state.dtype, "same_kind")
+        return jnp.asarray(leaf, state.dtype) if may_be else leaf
+
+    if jax.tree.structure(own) == jax.tree.structure(like):
+        own = jax.tree.map(convert, own, like)
+    if kinds(own) != kinds(like):
         raise ValueError(
-            f"trajectory: {shown(trajectory)} has not the structure {of_states}, {expected}"
+            f"trajectory: {kinds(own)} is not {kinds(like)}, x_0 and one state for each of the"
+            f" observations, of the states of {model_name(model)}"
         )
-
-    def convert(leaf: Any, state: jax.ShapeDtypeStruct) -> Array:
-        leaf, shape = as_numbers("trajectory", leaf), (length, *state.shape[1:])
-        own, dtype = jnp.shape(leaf), jnp.result_type(leaf)
-        if own != shape or not np.can_cast(dtype, state.dtype, "same_kind"):
-            raise ValueError(
-                f"trajectory: {dtype}{list(own)} is not {state.dtype}{list(shape)}, x_0 and one"
-                f" state for each of the observations, {of_states}"
-            )
-        return jnp.asarray(leaf, state.dtype)
-
-    return jax.tree.map(convert, trajectory, like)
+    return own

@@ -5,11 +5,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
 from mpfjax.chain import give_inputs
-from mpfjax.checks import check_callable, check_key, check_type, check_whole, given, saying, shown
+from mpfjax.checks import Count, check_one_each, checked, saying
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped
@@ -30,11 +29,12 @@ class Forecast(eqx.Module):
     observations: PyTree = None
 
 
+@checked
 def forecast(
     key: Key[Array, ""],
     filter: Filter,
     mixture: ParticleMixture,
-    num_steps: int,
+    num_steps: Count,
     *,
     simulate_observation: Callable[[Key[Array, ""], PyTree], PyTree] | None = None,
     inputs: PyTree = None,
@@ -57,13 +57,6 @@ def forecast(
     without an observation, and for simulated observations that are not one a particle. Use it for
     forecasts with intervals, and to score a filter by its forecasts.
     """
-    check_key(key)
-    check_type(Filter, "a Filter", filter=filter)
-    check_type(ParticleMixture, "a mixture, as init and step return it", mixture=mixture)
-    check_whole(num_steps=num_steps)
-    check_callable(
-        "a function of a key and states", **given(simulate_observation=simulate_observation)
-    )
     simulate = mapped(filter.model, simulate_observation, draws=True)
     inputs = steps_of_inputs(inputs, num_steps, filter.model, "forecast")
     options = (num_steps, simulate)
@@ -87,19 +80,9 @@ def _forecast(key, filter, mixture, inputs, options):
             simulate = give_inputs(simulate_observation, filter.model, now)
             with saying("in simulate_observation, which is called with a key and the particles"):
                 observations = simulate(key_observation, mixture.particles)
-            _check_simulated(observations, mixture.num_particles)
+            check_one_each(mixture.num_particles, simulate_observation=observations)
         return mixture, (mixture, observations)
 
     steps = (jax.random.split(key, num_steps), inputs)
     _, (mixtures, observations) = jax.lax.scan(advance, mixture, steps)
     return Forecast(mixtures, observations)
-
-
-def _check_simulated(observations: PyTree, num_particles: int) -> None:
-    """Raise a `ValueError` unless there is one observation for each particle."""
-    leaves = jax.tree.leaves(observations)
-    if not leaves or any(jnp.shape(leaf)[:1] != (num_particles,) for leaf in leaves):
-        raise ValueError(
-            f"simulate_observation: it returned {shown(jax.tree.map(jnp.shape, observations))}, no"
-            f" arrays whose leading axis is that of the {num_particles} particles"
-        )

@@ -8,34 +8,29 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PyTree
 
-from mpfjax.checks import check_numbered, shown
+from mpfjax.checks import check_numbered, checked
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.stored import count_places, take
 from mpfjax.running.scan import FilterRun
 
-_NEEDED = "a FilterRun of run_filter(..., collect=None), or the mixtures that it collected"
 
-
-def mixtures_of(run: Any) -> ParticleMixture:
+def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
     """The stacked mixtures of a run; with those of a whole `FilterRun` x_0 comes first.
 
     Raises `ValueError` for anything but a stack of mixtures, and for a stack of several runs.
     """
-    initial, mixtures = None, run
-    if isinstance(run, FilterRun):
-        initial, mixtures = run.initial, run.collected
-    if not isinstance(mixtures, ParticleMixture):
-        raise ValueError(f"mixtures: {shown(mixtures)} is not {_NEEDED}")
-    if mixtures.log_weights.ndim != 2:
+    is_run = isinstance(run, FilterRun)
+    mixtures: Any = run.collected if is_run else run
+    if not isinstance(mixtures, ParticleMixture) or mixtures.log_weights.ndim != 2:
         raise ValueError(
-            f"mixtures: weights of shape {mixtures.log_weights.shape} are not those of one run, "
-            "(t, n); jax.vmap over the leading axis of several runs"
+            "mixtures: these are not all the mixtures of one run, as run_filter(..., collect=None)"
+            " keeps them; jax.vmap over the leading axis of several runs"
         )
     # Smoothing does not use the moves' memory, whose leaves may not stack.
     mixtures = jax.vmap(lambda mixture: mixture.replace(memory={}))(mixtures)
-    if initial is None:
+    if not is_run:
         return mixtures
-    initial = initial.replace(memory={})
+    initial = run.initial.replace(memory={})
     return jax.tree.map(
         lambda first, rest: jnp.concatenate([first[None].astype(rest.dtype), rest]),
         initial,
@@ -92,6 +87,7 @@ class Genealogy(eqx.Module):
     share_apart: Float[Array, "m t"]
 
 
+@checked
 def trace_ancestors(mixtures: FilterRun | ParticleMixture) -> Genealogy:
     """Follow the ancestor indices of a run back from its end.
 

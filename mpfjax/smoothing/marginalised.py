@@ -67,10 +67,8 @@ def check_marginalised(
     model: Any, mixtures: ParticleMixture, observations: Any, method: str
 ) -> None:
     """Raise a `ValueError` for data that backward sampling of latents cannot use."""
-    if not is_marginalised(model):
-        raise ValueError("observations: only a conditionally linear model needs them")
-    if observations is None:
-        raise ValueError("observations: there are none, and a conditionally linear model needs y")
+    if not is_marginalised(model) or observations is None:
+        raise ValueError("observations: a conditionally linear model needs y, and it alone")
     if method != "exact":
         raise ValueError(f"method: {method!r} is not there for a conditionally linear model")
     lengths = {jnp.shape(leaf)[0] for leaf in jax.tree.leaves(observations)}
@@ -86,11 +84,12 @@ def check_marginalised(
 def sample_marginalised(key, model, mixtures, observations, inputs, num_trajectories, component):
     """Latents z_0, ..., z_t given y_1..y_t, and the moments of x_0, ..., x_t given both.
 
-    `mixtures` are those of x_0, ..., x_t; `inputs` are those of the steps between them.
+    Also the indices of their particles, (t + 1, k). `mixtures` are those of x_0, ..., x_t; `inputs`
+    are those of the steps between them.
     """
     key_last, key_steps = split(key, 2)
     length = mixtures.log_weights.shape[0] - 1
-    _, end = draw_ends(key_last, mixtures, num_trajectories, component)
+    last, end = draw_ends(key_last, mixtures, num_trajectories, component)
 
     def back(carry: tuple[PyTree, Information], step: Any) -> tuple[Any, Any]:
         latent, future = carry
@@ -99,7 +98,7 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
         indices = _indices(step_key, moved_by, observation, latent, future, earlier)
         before = jax.tree.map(lambda leaf: take(leaf, indices), earlier.particles)
         future = _before(moved_by, observation, latent, before, future)
-        return (before.latent, future), (before.latent, future)
+        return (before.latent, future), (before.latent, future, indices)
 
     def forth(state: MarginalisedState, step: Any) -> tuple[Any, Any]:
         latent, observation, now = step
@@ -110,15 +109,15 @@ def sample_marginalised(key, model, mixtures, observations, inputs, num_trajecto
     nothing = _nothing(end.mean)
     earlier = jax.tree.map(lambda leaf: leaf[:-1], mixtures)
     steps = (jax.random.split(key_steps, length), earlier, observations, inputs)
-    _, (latents, futures) = jax.lax.scan(back, (end.latent, nothing), steps, reverse=True)
+    _, past = jax.lax.scan(back, (end.latent, nothing), steps, reverse=True)
     ended = lambda rows, row: jnp.concatenate([rows, row[None]])  # noqa: E731
-    latents = jax.tree.map(ended, latents, end.latent)
+    latents, futures, indices = jax.tree.map(ended, past, (end.latent, nothing, last))
     following = jax.tree.map(lambda leaf: leaf[1:], latents)
     start = with_moments(model, jax.tree.map(lambda leaf: leaf[0], latents))
     _, later = jax.lax.scan(forth, start, (following, observations, inputs))
     filtered = jax.tree.map(lambda row, rows: jnp.concatenate([row[None], rows]), start, later)
-    found = jax.vmap(_smoothed)(filtered, jax.tree.map(ended, futures, nothing))
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), found)
+    found = jax.vmap(_smoothed)(filtered, futures)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), found), indices
 
 
 def _nothing(mean: Float[Array, "n d"]) -> Information:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -11,15 +11,7 @@ import numpy as np
 from jaxtyping import Array, Int, Key, PyTree
 
 from mpfjax.chain import check_keep_parents
-from mpfjax.checks import (
-    check_callable,
-    check_key,
-    check_one_of,
-    check_type,
-    check_whole,
-    saying,
-    shown,
-)
+from mpfjax.checks import Count, CountOrZero, check_one_each, checked, saying
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped, require, with_inputs
@@ -55,15 +47,16 @@ class SmoothedSums(eqx.Module):
     run: FilterRun
 
 
+@checked
 def smoothed_sums(
     key: Key[Array, ""],
     filter: Filter,
     observations: PyTree,
     function: Callable[[PyTree, PyTree], PyTree],
     *,
-    lag: int | None = None,
-    method: str = "exact",
-    num_draws: int = 2,
+    lag: CountOrZero | None = None,
+    method: Literal["exact", "mcmc"] = "exact",
+    num_draws: Count = 2,
 ) -> SmoothedSums:
     """E[Σ_t h(x_{t-1}, x_t) | y], online: PaRIS, in memory that does not grow with t.
 
@@ -91,17 +84,10 @@ def smoothed_sums(
     series too long to keep. `sample_trajectories` needs the mixtures of all steps, and serves every
     function at once.
     """
-    check_key(key)
-    check_type(Filter, "a Filter", filter=filter)
     refuse_marginalised(filter.model, "smoothed_sums", "take sample_trajectories")
     require(filter.model, "log_transition", "smoothed_sums")
-    check_callable("a function of two states", function=function)
-    if lag is not None:
-        check_whole(0, lag=lag)
-    check_one_of(("exact", "mcmc"), method=method)
     if method == "mcmc":
         check_keep_parents("filter", filter.moves, "smoothed_sums with method 'mcmc'")
-    check_whole(num_draws=num_draws)
     series = as_series(observations, filter.model)
     if lag is not None:
         lag = min(lag, series.length - 1)
@@ -196,10 +182,5 @@ def _of_states(
     """h of these states; a `ValueError` unless it is one value a particle."""
     with saying("in function, which is called with x_{t-1} and x_t of all particles"):
         values = function(previous, states)
-    n, leaves = jax.tree.leaves(states)[0].shape[0], jax.tree.leaves(values)
-    if not leaves or any(jnp.shape(leaf)[:1] != (n,) for leaf in leaves):
-        raise ValueError(
-            f"function: it returned {shown(jax.tree.map(jnp.shape, values))}, no arrays whose"
-            f" leading axis is that of the {n} particles"
-        )
+    check_one_each(jax.tree.leaves(states)[0].shape[0], function=values)
     return jax.tree.map(as_inexact, values)

@@ -1,20 +1,19 @@
 """Backward sampling: whole trajectories from their distribution given all observations."""
 
 import warnings
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_key, check_one_of, check_whole, given
+from mpfjax.checks import Count, CountOrZero, checked
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     require,
-    require_model,
     saying_that_none_were_given,
     with_inputs,
 )
@@ -32,15 +31,16 @@ from mpfjax.smoothing.marginalised import check_marginalised, sample_marginalise
 _SMALL_SHARE = 0.1
 
 
+@checked
 def sample_trajectories(
     key: Key[Array, ""],
     model: AbstractStateSpaceModel,
     mixtures: FilterRun | ParticleMixture,
-    num_trajectories: int,
+    num_trajectories: Count,
     *,
-    component: int | None = None,
-    method: str = "exact",
-    num_steps: int | None = None,
+    component: CountOrZero | None = None,
+    method: Literal["exact", "mcmc"] = "exact",
+    num_steps: Count | None = None,
     inputs: PyTree = None,
     observations: PyTree = None,
 ) -> PyTree:
@@ -75,38 +75,27 @@ def sample_trajectories(
     of the past. The genealogy of the particles (`trace_ancestors`) is exact as well, but has few
     distinct states at early times.
     """
-    check_key(key)
-    require_model(model, "sample_trajectories")
     if not is_mixed(model):
         require(model, "log_transition", "sample_trajectories")
-    check_whole(num_trajectories=num_trajectories)
-    check_one_of(("exact", "mcmc"), method=method)
-    check_whole(**given(num_steps=num_steps))
     if method == "exact" and num_steps is not None:
         raise ValueError(f"num_steps: {num_steps} does nothing with method 'exact'")
     stacked = mixtures_of(mixtures)
     inputs = _inputs_between(inputs, model, stacked, isinstance(mixtures, FilterRun))
     if component is not None:
-        check_whole(0, component=component)
         _check_component(stacked, component)
     if is_marginalised(model) or observations is not None:
         observations = as_arrays(gathered(observations).observations)
         check_marginalised(model, stacked, observations, method)
-        drawn = sample_marginalised(
+        drawn, indices = sample_marginalised(
             key, model, stacked, observations, inputs, num_trajectories, component
         )
-        latents = stacked.particles.latent
-        _warn_of_few(drawn.latent, latents, stacked.log_weights)
-        return drawn
-    if method == "exact":
-        num_steps = 0
     else:
-        stacked = with_parents(stacked, "sample_trajectories with method 'mcmc'")
-        num_steps = 1 if num_steps is None else num_steps
-    options = (num_trajectories, component, num_steps)
-    with saying_that_none_were_given(model):
-        drawn = draw_trajectories(key, model, stacked, inputs, *options)
-    _warn_of_few(drawn, stacked.particles, stacked.log_weights)
+        if method == "mcmc":
+            stacked = with_parents(stacked, "sample_trajectories with method 'mcmc'")
+        options = (num_trajectories, component, 0 if method == "exact" else num_steps or 1)
+        with saying_that_none_were_given(model):
+            drawn, indices = draw_trajectories(key, model, stacked, inputs, *options)
+    _warn_of_few(indices, stacked.log_weights)
     return drawn
 
 
@@ -135,9 +124,9 @@ def _check_component(mixtures: ParticleMixture, component: int) -> None:
 def draw_trajectories(
     key, model, mixtures, inputs, num_trajectories, component=None, num_steps=0, checked=True
 ):
-    """`sample_trajectories` without its checks of arguments; `checked` as for `draw_exactly`.
+    """`sample_trajectories` without its checks of arguments, and the particles' indices, (t, k).
 
-    `inputs` are those of the steps between mixtures.
+    `inputs` are those of the steps between mixtures; `checked` as for `draw_exactly`.
     """
     key_final, key_steps, key_proposed = split_keys(key, 3)
     last, states = draw_ends(key_final, mixtures, num_trajectories, component)
@@ -154,7 +143,7 @@ def draw_trajectories(
             start = take(ancestors, next_indices)
             indices = walk(step_key, moved_by, next_states, earlier, start, proposed)[-1]
         states = jax.tree.map(lambda leaf: take(leaf, indices), earlier.particles)
-        return (states, indices), states
+        return (states, indices), (states, indices)
 
     num_earlier = mixtures.log_weights.shape[0] - 1
     earlier = jax.tree.map(lambda leaf: leaf[:-1], mixtures)
@@ -167,40 +156,33 @@ def draw_trajectories(
     keys = jax.random.split(key_steps, num_earlier)
     steps = (keys, earlier, ancestors, proposed, inputs)
     _, past = jax.lax.scan(back, (states, last), steps, reverse=True)
-    return jax.tree.map(
-        lambda before, end: jnp.concatenate([jnp.moveaxis(before, 0, 1), end[:, None]], axis=1),
-        past,
-        states,
+    states, indices = jax.tree.map(
+        lambda before, end: jnp.concatenate([before, end[None]]), past, (states, last)
     )
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), states), indices
 
 
-def _warn_of_few(trajectories: PyTree, particles: PyTree, log_weights: Float[Array, "t n"]) -> None:
+def _warn_of_few(indices: Int[Array, "t k"], log_weights: Float[Array, "t n"]) -> None:
     """A RuntimeWarning where few trajectories are distinct because backward weights degenerate.
 
-    The share at a time is the number of distinct states over the largest possible number: that of
-    the trajectories, or of the distinct particles of positive weight where these are fewer. It may
-    be small where few particles fit, although each of these has many pasts, and so counts only
-    where trajectories that share a state nearly always share the state before as well. States are
-    compared by their floating point numbers; for a state without any, and within the caller's own
-    jit, there is no warning.
+    The share at a time is the number of distinct particles over the largest possible number: that
+    of the trajectories, or of the particles of positive weight where these are fewer. It may be
+    small where few particles fit, although each of these has many pasts, and so counts only where
+    trajectories that share a particle nearly always share the one before as well. Within the
+    caller's own jit there is no warning.
     """
-    leaves = jax.tree.leaves((trajectories, particles, log_weights))
-    if any(isinstance(leaf, Tracer) or not leaf.is_fully_addressable for leaf in leaves):
+    is_known = lambda leaf: not isinstance(leaf, Tracer) and leaf.is_fully_addressable  # noqa: E731
+    if not (is_known(indices) and is_known(log_weights)):
         return
-    drawn = _fingerprints(trajectories, slice(log_weights.shape[1]))
-    if drawn is None or drawn.shape[1] < 2:
+    num_particles = log_weights.shape[1]
+    drawn = np.asarray(indices, np.int64)[:, :num_particles]
+    num_drawn, counts = drawn.shape[1], _num_distinct(drawn)
+    few = np.flatnonzero(counts[:-1] < _SMALL_SHARE * num_drawn)
+    shared = (num_drawn - counts[1:]).sum()
+    own_pasts = _num_distinct(drawn[:-1] * num_particles + drawn[1:]) - counts[1:]
+    if few.size == 0 or own_pasts.sum() > _SMALL_SHARE * shared:
         return
-    before, after = drawn[:, :-1].T, drawn[:, 1:].T
-    num_drawn, counts = drawn.shape[0], _num_distinct(before)
-    few = np.flatnonzero(counts < _SMALL_SHARE * num_drawn)
-    num_after, pairs = _num_distinct(after), before * np.uint64(0x9E3779B97F4A7C15) + after
-    own_pasts = (_num_distinct(pairs) - num_after).sum() / max((num_drawn - num_after).sum(), 1)
-    if few.size == 0 or own_pasts > _SMALL_SHARE:
-        return
-    there, weights = _fingerprints(particles, few), np.asarray(log_weights)[few]
-    # The likeliest particle stands for those without weight.
-    likeliest = np.take_along_axis(there, np.argmax(weights, axis=1)[:, None], axis=1)
-    possible = _num_distinct(np.where(weights > -np.inf, there, likeliest))
+    possible = (np.asarray(log_weights)[few] > -np.inf).sum(axis=1)
     shares = counts[few] / np.minimum(num_drawn, possible)
     worst = int(np.argmin(shares))
     if shares[worst] < _SMALL_SHARE:
@@ -210,24 +192,11 @@ def _warn_of_few(trajectories: PyTree, particles: PyTree, log_weights: Float[Arr
             " weights degenerate: log_transition leaves a state next to no particle to have come"
             " from but one. docs/smoothing.md says what to do",
             RuntimeWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 
-def _fingerprints(states: PyTree, rows: Any) -> Any:
-    """A whole number for each state, leaves (n, m, ...), that equal states share; or None."""
-    leaves = [leaf for leaf in jax.tree.leaves(states) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    if not leaves:
-        return None
-    parts = [np.asarray(np.asarray(leaf)[rows], float) for leaf in leaves]
-    numbers = np.concatenate([part.reshape(*part.shape[:2], -1) for part in parts], axis=2)
-    # Random weights modulo 2^64 give distinct rows distinct sums, almost surely; -0 equals 0.
-    bits = (numbers + 0.0).view(np.uint64)
-    weights = np.random.default_rng(0).integers(2**63, size=bits.shape[2], dtype=np.uint64)
-    return (bits * (2 * weights + np.uint64(1))).sum(axis=2)
-
-
-def _num_distinct(fingerprints: np.ndarray) -> np.ndarray:
-    """How many of each row differ."""
-    rows = np.sort(fingerprints, axis=1)
+def _num_distinct(rows: np.ndarray) -> np.ndarray:
+    """How many numbers of each row differ."""
+    rows = np.sort(rows, axis=1)
     return 1 + np.count_nonzero(rows[:, 1:] != rows[:, :-1], axis=1)

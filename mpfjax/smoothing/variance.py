@@ -1,7 +1,7 @@
 """Standard errors of log Ẑ, masses and means: from one run by first ancestors, or from a batch."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.chain import check_keep_parents
-from mpfjax.checks import check_callable, check_type, shown
+from mpfjax.checks import checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, with_inner
@@ -25,11 +25,7 @@ from mpfjax.running.scan import FilterRun
 # Standard errors from fewer runs are not reliable.
 FEWEST_RUNS = 4
 # What the estimates hold for. Draws that are more even vary less than they say, or more.
-_INDEPENDENT = {
-    "scheme": "multinomial",
-    "noise": "independent",
-    "initial_noise": "independent",
-}
+_INDEPENDENT = {"scheme": "multinomial", "noise": "independent", "initial_noise": "independent"}
 
 
 class _KeepFirstAncestors(AbstractMove):
@@ -46,6 +42,7 @@ class _KeepFirstAncestors(AbstractMove):
         return with_new_eve_indices(mixture)
 
 
+@checked
 def with_first_ancestors(filter: Filter) -> Filter:
     """The same filter, which also remembers the first ancestor of each particle.
 
@@ -57,7 +54,6 @@ def with_first_ancestors(filter: Filter) -> Filter:
     `PropagateIndependently`, `PropagateInClusters` or `IslandInteraction`), and for draws that are
     not independent: a scheme other than "multinomial", or a noise other than "independent".
     """
-    check_type(Filter, "a Filter", filter=filter)
     check_keep_parents("filter", filter.moves, "with_first_ancestors")
     for move in with_inner(filter.moves):
         if move.approximate or not move.keeps_families:
@@ -65,15 +61,7 @@ def with_first_ancestors(filter: Filter) -> Filter:
                 f"filter: {type(move).__name__}, one of its moves, is approximate or draws in a way"
                 " of its own; the variance of log Ẑ is not known from one run"
             )
-    _require_independent_draws(filter)
-    if any(isinstance(move, _KeepFirstAncestors) for move in filter.initial_moves):
-        return filter
-    kept = [move for move in filter.initial_moves if not move.weighs]
-    return filter.replace(initial_moves=[*kept, _KeepFirstAncestors()])
-
-
-def _require_independent_draws(filter: Filter) -> None:
-    """Raise a `ValueError` for draws that are more even than what the formulae are made of."""
+    # Draws that are more even than independent ones are not what the formulae are made of.
     draws = lambda node: hasattr(node, "scheme") or hasattr(node, "noise")  # noqa: E731
     for part in [filter, *jax.tree.leaves(filter.moves, is_leaf=draws)]:
         for option, known in _INDEPENDENT.items():
@@ -83,8 +71,13 @@ def _require_independent_draws(filter: Filter) -> None:
                     f"filter: {option} of {type(part).__name__} is {chosen!r}; the variance of"
                     f" log Ẑ is known from one run for {known!r} alone"
                 )
+    if any(isinstance(move, _KeepFirstAncestors) for move in filter.initial_moves):
+        return filter
+    kept = [move for move in filter.initial_moves if not move.weighs]
+    return filter.replace(initial_moves=[*kept, _KeepFirstAncestors()])
 
 
+@checked
 def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[Array, ""]:
     """An estimate of the variance of log Ẑ, from one run of `with_first_ancestors(filter)`.
 
@@ -133,6 +126,7 @@ def log_marginal_likelihood_variance(run: FilterRun | ParticleMixture) -> Float[
     return jnp.where(jnp.any(degenerate), jnp.inf, _evidence_variance(mixture))
 
 
+@checked
 def mixture_weight_errors(run: FilterRun | ParticleMixture) -> Float[Array, " m"]:
     """The standard error of each mixture weight π_m, from a run of `with_first_ancestors(filter)`.
 
@@ -165,20 +159,15 @@ _evidence_variance = eqx.filter_jit(evidence_variance)
 _mass_variances = eqx.filter_jit(mass_variances)
 
 
-def _with_lineage(run: Any) -> ParticleMixture:
+def _with_lineage(run: FilterRun | ParticleMixture) -> ParticleMixture:
     """The last mixture of a run; a `ValueError` unless it has first ancestors in common."""
-    mixture: Any = run.final if isinstance(run, FilterRun) else run
-    if not isinstance(mixture, ParticleMixture):
-        raise ValueError(f"run: {shown(run)} is no FilterRun, nor a mixture")
+    mixture = run.final if isinstance(run, FilterRun) else run
     if EVE_INDICES not in mixture.memory:
         raise ValueError("run: its filter keeps no first ancestors; run with_first_ancestors of it")
-    if mixture.log_weights.ndim != 1:
-        raise ValueError(
-            f"run: weights of shape {mixture.log_weights.shape} are not those of one run, (n,);"
-            " jax.vmap over the leading axis of several runs"
-        )
     if mixture.memory[EVE_INDICES].indices.ndim != 1:
-        raise ValueError("run: islands have no first ancestors in common")
+        raise ValueError(
+            "run: islands have no first ancestors in common; of several runs, jax.vmap over them"
+        )
     return mixture
 
 
@@ -195,6 +184,7 @@ class BatchEstimate(NamedTuple):
     """(Σ Ẑ)² / Σ Ẑ²: below about a third of the runs, errors are too small themselves."""
 
 
+@checked
 def batch_estimate(
     runs: FilterRun, quantity: Callable[[ParticleMixture], Float[Array, " *shape"]]
 ) -> BatchEstimate:
@@ -221,13 +211,12 @@ def batch_estimate(
     Runs of zero likelihood have no weight. Raises `ValueError` for fewer runs, and for anything but
     a stack of runs. Use it to see whether a mass can be trusted.
     """
-    check_callable("a function of a mixture", quantity=quantity)
-    if not isinstance(runs, FilterRun) or runs.log_marginal_likelihood.ndim != 1:
-        what = "one run" if isinstance(runs, FilterRun) else shown(runs)
-        raise ValueError(f"runs: {what} is not what monte_carlo returns for several keys")
-    number = len(runs.log_marginal_likelihood)
-    if number < FEWEST_RUNS:
-        raise ValueError(f"runs: {number}; a standard error asks for {FEWEST_RUNS} at least")
+    number = runs.log_marginal_likelihood.size
+    if runs.log_marginal_likelihood.ndim != 1 or number < FEWEST_RUNS:
+        raise ValueError(
+            f"runs: {number}; a standard error asks for {FEWEST_RUNS} at least, as monte_carlo"
+            " returns them for several keys"
+        )
     logs = runs.log_marginal_likelihood
     values = jax.vmap(quantity)(runs.final)
     # Each run is left out in turn; a difference of sums would be lost to rounding.
