@@ -5,7 +5,6 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple, TypedDict
 
 import equinox as eqx
@@ -15,10 +14,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_type, check_whole, given
+from mpfjax.checks import Checked, Count, CountOrZero
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.running.long_runs import Checkpoint, LongRun, State, identity_of
-from mpfjax.tuning.densities import LogPrior, Prior, SamplePrior, checked_prior, chosen, drawn
+from mpfjax.tuning.densities import SamplePrior, chosen, drawn
 from mpfjax.tuning.problem import Problem, Reals
 from mpfjax.tuning.walks import RandomWalk, random_walk
 
@@ -70,38 +69,6 @@ class ChainOptions(TypedDict, total=False):
     progress: bool
 
 
-@dataclass(frozen=True)
-class Plan:
-    """How many chains there are, where they start, and which of their steps are kept."""
-
-    num_steps: int
-    num_chains: int = 1
-    sample_prior: SamplePrior | None = None
-    burn_in: int = 0
-    thinning: int = 1
-    checkpoint: Checkpoint | None = None
-    progress: bool = True
-
-    def __post_init__(self) -> None:
-        check_whole(num_chains=self.num_chains, num_steps=self.num_steps, thinning=self.thinning)
-        check_whole(0, burn_in=self.burn_in)
-        check_type(Checkpoint, "a Checkpoint", **given(checkpoint=self.checkpoint))
-        if self.thinning > self.num_steps:
-            raise ValueError(
-                f"thinning: {self.thinning} is more than num_steps, {self.num_steps}: no step"
-                " would be kept"
-            )
-
-    @property
-    def last(self) -> int:
-        """The number of steps, of burn-in and after, up to the last one that is kept."""
-        return self.burn_in + self.num_steps // self.thinning * self.thinning
-
-    def num_draws(self, step: int) -> int:
-        """How many draws there are after some steps."""
-        return max(step - self.burn_in, 0) // self.thinning
-
-
 class Chains(eqx.Module):
     """The present state of all chains."""
 
@@ -110,15 +77,7 @@ class Chains(eqx.Module):
     num_invalid: dict[str, Int[Array, " chains"]]
 
 
-class Outcome(NamedTuple):
-    """What chains give: their draws, leaves (chains, draws, ...), and the fields of a posterior."""
-
-    draws: PyTree
-    fields: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Sampling:
+class Sampling(Checked):
     """Chains on the parameters of a problem, for the public function `caller`."""
 
     caller: str
@@ -126,94 +85,95 @@ class Sampling:
     problem: Problem
     deviations: Reals
     """of the random walk at first."""
-    plan: Plan
+    num_steps: Count
+    num_chains: Count = 1
+    sample_prior: SamplePrior | None = None
+    burn_in: CountOrZero = 0
+    thinning: Count = 1
+    checkpoint: Checkpoint | None = None
+    progress: bool = True
 
-    def prior(self, log_prior: LogPrior) -> Prior:
-        """The prior; a `ValueError` for one that is no number where chains start."""
-        sample_prior = self.plan.sample_prior
-        if sample_prior is None:
-            return checked_prior(log_prior, self.problem, self.problem.start(), "at the start")
-        draws = drawn(self._keys[0], self.problem, sample_prior, 1)
-        first = jax.tree.map(lambda u: u[0], draws)
-        return checked_prior(log_prior, self.problem, first, "at a draw of sample_prior")
+    def __check_init__(self) -> None:
+        if self.thinning > self.num_steps:
+            raise ValueError(
+                f"thinning: {self.thinning} is more than num_steps, {self.num_steps}: no step"
+                " would be kept"
+            )
 
     def run(
         self, kernel: AbstractKernel, settings: dict[str, Any], functions: dict[str, Any]
-    ) -> Outcome:
-        """All steps; the last two arguments are those of `identity_of`."""
-        plan, caller = self.plan, self.caller
+    ) -> tuple[PyTree, dict[str, Any]]:
+        """The draws, leaves (chains, draws, ...), and further fields of a posterior.
+
+        The last two arguments are those of `identity_of`.
+        """
         settings = self.problem.settings | settings | {
-            "proposal_deviations": self.deviations, "key": self.key, "burn_in": plan.burn_in,
-            "num_chains": plan.num_chains, "thinning": plan.thinning,
+            "proposal_deviations": self.deviations, "key": self.key, "burn_in": self.burn_in,
+            "num_chains": self.num_chains, "thinning": self.thinning,
         }  # fmt: skip
-        identity = identity_of(plan.checkpoint, settings, functions)
-        run = LongRun(caller, plan.last, plan.checkpoint, plan.progress, lambda step: identity)
-        at = eqx.filter_eval_shape(self._chains_at, kernel, self.key, self._own_start())
-        report = eqx.filter_eval_shape(_one_step, kernel, self.key, at[0], 0).report
+        identity = identity_of(self.checkpoint, settings, functions)
+        num_draws = self.num_steps // self.thinning
+        last = self.burn_in + num_draws * self.thinning
+        run = LongRun(self.caller, last, self.checkpoint, self.progress, lambda step: identity)
+        key_starts, key_steps = jax.random.split(self.key)
+        starts = self._starts(key_starts)
+        at = eqx.filter_eval_shape(self._chains_at, kernel, key_starts, starts)
+        report = eqx.filter_eval_shape(_one_step, kernel, key_steps, at[0], 0).report
         none = jax.tree.map(lambda leaf: np.empty((0, *leaf.shape), leaf.dtype), report)
-        start = lambda: State(0, self._started(kernel), none)  # noqa: E731
-        state, stopped = run.go(State(0, at[0], none), start, self._advance(kernel, report))
-        num_draws = plan.num_draws(plan.last)
+        start = lambda: State(0, self._started(kernel, key_starts, starts), none)  # noqa: E731
+        advance = self._advance(kernel, key_steps, report)
+        state, stopped = run.go(State(0, at[0], none), start, advance)
         draws = jax.tree.map(lambda rows: np.moveaxis(rows[:num_draws], 0, 1), state.rows)
         num_invalid = jax.tree.map(np.asarray, state.carry.num_invalid)
-        warn_of_invalid(caller, num_invalid, stacklevel=4)
+        warn_of_invalid(self.caller, num_invalid, stacklevel=5)
         factor = np.asarray(state.carry.walk.factor)
-        return Outcome(
-            draws,
-            {
-                "num_invalid": num_invalid, "stopped": stopped,
-                "proposal_covariance": factor @ factor.T,
-            },
-        )  # fmt: skip
+        fields = {"num_invalid": num_invalid, "stopped": stopped}
+        return draws, fields | {"proposal_covariance": factor @ factor.T}
 
-    @property
-    def _keys(self) -> Key[Array, " 2"]:
-        """For the starts and for the steps."""
-        return jax.random.split(self.key)
-
-    def _own_start(self) -> Reals:
-        """The filter's own parameters, for each chain."""
-        num = self.plan.num_chains
-        return jax.tree.map(lambda u: jnp.broadcast_to(u, (num, *u.shape)), self.problem.start())
+    def _starts(self, key: Key[Array, ""]) -> Reals:
+        """Where each chain starts: the filter's own parameters, or a draw of the prior."""
+        if self.sample_prior is not None:
+            return drawn(key, self.problem, self.sample_prior, self.num_chains)
+        repeat = lambda u: jnp.broadcast_to(u, (self.num_chains, *u.shape))  # noqa: E731
+        return jax.tree.map(repeat, self.problem.start())
 
     def _chains_at(
         self, kernel: AbstractKernel, key: Key[Array, ""], reals: Reals
-    ) -> tuple[Chains, Array]:
+    ) -> tuple[Chains, Bool[Array, " chains"]]:
         """All chains at some parameters, and which can start there."""
-        keys = jax.random.split(key, self.plan.num_chains)
+        keys = jax.random.split(key, self.num_chains)
         return _start_all(kernel, keys, reals, random_walk(self.deviations, reals))
 
-    def _started(self, kernel: AbstractKernel) -> Chains:
+    def _started(self, kernel: AbstractKernel, key: Key[Array, ""], reals: Reals) -> Chains:
         """All chains at their starts.
 
         A draw of the prior at which a chain cannot start is drawn again.
         """
-        key, sample_prior, num = self._keys[0], self.plan.sample_prior, self.plan.num_chains
-        if sample_prior is None:
-            chains, fine = self._chains_at(kernel, key, self._own_start())
-        else:
-            again = jax.random.fold_in(key, 0)
-            reals = drawn(again, self.problem, sample_prior, num)
-            chains, fine = self._chains_at(kernel, key, reals)
-            for attempt in range(1, _MOST_DRAWS_OF_A_START):
-                if np.all(fine):
-                    break
-                again = jax.random.fold_in(key, attempt)
-                reals = drawn(again, self.problem, sample_prior, num)
-                new, now_fine = self._chains_at(kernel, again, reals)
-                states = jax.vmap(chosen)(fine, chains.states, new.states)
-                walk = random_walk(self.deviations, states.reals)
-                chains, fine = Chains(states, walk, chains.num_invalid), fine | now_fine
+        chains, fine = self._chains_at(kernel, key, reals)
+        where = "the start" if self.sample_prior is None else "any draw of sample_prior"
+        for attempt in range(1, _MOST_DRAWS_OF_A_START if self.sample_prior else 1):
+            if np.all(fine):
+                break
+            again = jax.random.fold_in(key, attempt)
+            new, now_fine = self._chains_at(kernel, again, self._starts(again))
+            states = jax.vmap(chosen)(fine, chains.states, new.states)
+            walk = random_walk(self.deviations, states.reals)
+            chains, fine = Chains(states, walk, chains.num_invalid), fine | now_fine
         if not np.all(fine):
-            where = "the start" if sample_prior is None else "any draw of sample_prior"
             raise RuntimeError(
                 f"{self.caller}: the log prior or log marginal likelihood was NaN or inf at {where}"
             )
         return chains
 
-    def _advance(self, kernel: AbstractKernel, report: PyTree) -> Callable[..., Any]:
+    def _num_draws(self, step: int) -> int:
+        """How many draws there are after some steps."""
+        return max(step - self.burn_in, 0) // self.thinning
+
+    def _advance(
+        self, kernel: AbstractKernel, key: Key[Array, ""], report: PyTree
+    ) -> Callable[..., Any]:
         """Some steps of all chains, about as many as take half a second."""
-        plan, key, length = self.plan, self._keys[1], 1
+        length = 1
         size = 8 * sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(report))
         capacity = max(2, min(_MOST_DRAWS_AT_ONCE, _MOST_BYTES_AT_ONCE // max(size, 1)))
 
@@ -221,14 +181,14 @@ class Sampling:
             nonlocal length
             last = min(step + length, last)
             began = time.monotonic()
-            numbers = jnp.array([step, last, plan.burn_in, plan.thinning], jnp.int32)
+            numbers = jnp.array([step, last, self.burn_in, self.thinning], jnp.int32)
             chains, buffers = _steps(kernel, key, chains, numbers, capacity)
-            new = plan.num_draws(last) - plan.num_draws(step)
+            new = self._num_draws(last) - self._num_draws(step)
             # Waits for the program, so that an interruption comes before anything is taken over.
             rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:new], buffers)
             seconds = time.monotonic() - began
             if seconds < _SECONDS_BETWEEN / 2:
-                length = min(2 * length, (capacity - 1) * plan.thinning)
+                length = min(2 * length, (capacity - 1) * self.thinning)
             elif seconds > 2 * _SECONDS_BETWEEN:
                 length = max(1, length // 2)
             return last, chains, rows

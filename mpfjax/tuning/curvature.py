@@ -9,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_key, check_whole
+from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter
 from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
 from mpfjax.tuning.problem import Parameters, Problem, Reals, score_of_each
@@ -29,6 +29,7 @@ _NUM_HALVINGS = 32
 _MOST_APART = 0.25
 
 
+@checked
 def standard_errors(
     key: Key[Array, ""],
     filter: Filter,
@@ -36,7 +37,7 @@ def standard_errors(
     *,
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
-    num_seeds: int = 100,
+    num_seeds: Count = 100,
 ) -> dict[str, np.ndarray] | None:
     """Standard errors of a filter's parameters where they maximise the likelihood.
 
@@ -57,8 +58,6 @@ def standard_errors(
     direction that the data do not determine, or with too few seeds. Raises `ValueError` for what
     `fit` does, fewer than one seed, and more than fifty numbers.
     """
-    check_key(key)
-    check_whole(1, num_seeds=num_seeds)
     problem = pose_evidence(filter, observations, parameters, transforms)
     warn_of_bias("standard_errors", problem)
     batches = [jax.random.split(key, num_seeds)]
@@ -90,11 +89,16 @@ def errors_at(
         warnings.warn(
             "standard_errors: the log marginal likelihood has no maximum here, or too few seeds"
             " to see it",
-            stacklevel=3,
+            stacklevel=4,
         )
         return None
     _warn_of_noise(informations, of_seeds)
-    return _on_their_own_scale(problem, reals, covariance)
+    # By the Jacobian of the parameters on their own scale, laid out in the same order.
+    _, shaped = ravel_pytree(problem.constrain(reals))
+    constrain = lambda flat: ravel_pytree(problem.constrain(unravel(flat)))[0]  # noqa: E731
+    jacobian = np.asarray(jax.jacfwd(constrain)(point), float)
+    variances = np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian)
+    return jax.tree.map(np.asarray, shaped(jnp.asarray(np.sqrt(variances), point.dtype)))
 
 
 def _informations(
@@ -198,22 +202,5 @@ def _warn_of_noise(informations: Float[np.ndarray, "seeds d d"], of_seeds: str) 
     warnings.warn(
         f"standard_errors: {num_seeds} seeds leave them uncertain, and rather too large: those of"
         f" one half of the seeds and of the other half {found}; raise {of_seeds}",
-        stacklevel=4,
+        stacklevel=5,
     )
-
-
-def _on_their_own_scale(
-    problem: Problem, reals: Reals, covariance: Float[np.ndarray, "d d"]
-) -> dict[str, np.ndarray]:
-    errors, first = {}, 0
-    # In the order in which `ravel_pytree` lays a dictionary out.
-    for name in sorted(reals):
-        size = reals[name].size
-        block = covariance[first : first + size, first : first + size]
-        jacobian = np.asarray(jax.jacfwd(problem.transforms[name].constrain)(reals[name]))
-        value_shape = jacobian.shape[: jacobian.ndim - reals[name].ndim]
-        jacobian = jacobian.reshape(-1, size)
-        variances = np.einsum("ij,jk,ik->i", jacobian, block, jacobian)
-        errors[name] = np.sqrt(variances).reshape(value_shape)
-        first += size
-    return errors

@@ -1,7 +1,7 @@
 """The log density of parameters in unconstrained numbers, for samplers: our own and others'."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import check_callable, shown
+from mpfjax.checks import checked, shown
 from mpfjax.filter import Filter
 from mpfjax.tuning.evidence import check_exact, pose_evidence
 from mpfjax.tuning.problem import Parameters, Problem, Reals
@@ -35,33 +35,35 @@ class Prior(eqx.Module):
         return density
 
 
-class Evaluated(NamedTuple):
-    """The log density at one point, in its two parts."""
+class Point(eqx.Module):
+    """Parameters, and their log density in its two parts."""
 
-    log_prior: Float[Array, "*chains"]
+    reals: Reals
+    log_prior: Float[Array, "*n"]
     """with the Jacobian; -inf where it is zero or no number."""
-    log_likelihood: Float[Array, "*chains"]
+    log_likelihood: Float[Array, "*n"]
     """-inf where it is zero, no number, or where the prior is zero."""
-    invalid: dict[str, Bool[Array, "*chains"]]
-    """which of the two was NaN or +inf."""
+    mixture: Any = None
+    """where their filter stands, for samplers that go on with it."""
 
     @property
-    def log_density(self) -> Float[Array, "*chains"]:
+    def log_density(self) -> Float[Array, "*n"]:
         """Their sum."""
         return self.log_prior + self.log_likelihood
 
 
 def evaluated(
+    reals: Reals,
     log_prior: Float[Array, ""],
     log_likelihood: Float[Array, ""],
     name: str = "log_marginal_likelihood",
-) -> Evaluated:
-    """The two parts as numbers or -inf, and which of them was not a number, by name."""
+) -> tuple[Point, dict[str, Bool[Array, ""]]]:
+    """The point with these log densities, and which of them was NaN or +inf, by name."""
     has_prior = (log_prior > -jnp.inf) & (log_prior < jnp.inf)
     # Where the prior is zero, the likelihood may not even be defined.
     invalid = {"log_prior": is_invalid(log_prior), name: has_prior & is_invalid(log_likelihood)}
     log_likelihood = jnp.where(has_prior, number_or_zero(log_likelihood), -jnp.inf)
-    return Evaluated(number_or_zero(log_prior), log_likelihood, invalid)
+    return Point(reals, number_or_zero(log_prior), log_likelihood), invalid
 
 
 class LogDensity(eqx.Module):
@@ -76,11 +78,13 @@ class LogDensity(eqx.Module):
 
     def __call__(self, reals: Reals, key: Key[Array, ""]) -> Float[Array, ""]:
         """The log density up to a constant; -inf where a part of it is NaN or +inf."""
-        return self.evaluated(reals, key).log_density
+        return self.evaluated(key, reals)[0].log_density
 
-    def evaluated(self, reals: Reals, key: Key[Array, ""]) -> Evaluated:
-        """Its two parts, and whether they are numbers."""
-        return evaluated(self.prior(reals), self.problem.value(reals, key))
+    def evaluated(
+        self, key: Key[Array, ""], reals: Reals
+    ) -> tuple[Point, dict[str, Bool[Array, ""]]]:
+        """Its two parts, and which of them are no numbers."""
+        return evaluated(reals, self.prior(reals), self.problem.value(reals, key))
 
     @property
     def start(self) -> Reals:
@@ -100,6 +104,7 @@ class LogDensity(eqx.Module):
         return self.problem.at(reals)
 
 
+@checked
 def log_density(
     filter: Filter,
     observations: PyTree,
@@ -127,26 +132,32 @@ def log_density(
     """
     check_exact(filter, "likelihood")
     problem = pose_evidence(filter, observations, parameters, transforms)
-    return LogDensity(problem, checked_prior(log_prior, problem, problem.start(), "at the start"))
+    return LogDensity(problem, checked_prior(log_prior, problem))
 
 
-def checked_prior(log_prior: Any, problem: Problem, at: Reals, where: str) -> Prior:
-    """The prior; a `ValueError` for one that is no finite number at some point."""
-    check_callable("a function of the parameters by name", log_prior=log_prior)
+def checked_prior(
+    log_prior: LogPrior,
+    problem: Problem,
+    key: Key[Array, ""] | None = None,
+    sample_prior: SamplePrior | None = None,
+) -> Prior:
+    """The prior; a `ValueError` for one that is no finite number where its parameters start."""
+    at, where = problem.start(), "the start"
+    if sample_prior is not None:
+        draws = drawn(cast(Any, key), problem, sample_prior, 1)
+        at, where = jax.tree.map(lambda u: u[0], draws), "a draw of sample_prior"
     density = log_prior(problem.constrain(at))
-    is_number = eqx.is_array_like(density) and jnp.ndim(density) == 0
-    if not is_number or not jnp.issubdtype(jnp.result_type(density), jnp.floating):
-        raise ValueError(f"log_prior: {shown(density)} {where} is no floating point number")
+    if getattr(density, "shape", None) != () or not jnp.issubdtype(density.dtype, jnp.floating):
+        raise ValueError(f"log_prior: {shown(density)} at {where} is no floating point number")
     prior = Prior(log_prior, problem.transforms)
     value = float(prior(at))
     if not np.isfinite(value):
-        raise ValueError(f"log_prior: {value} {where}")
+        raise ValueError(f"log_prior: {value} at {where}")
     return prior
 
 
 def drawn(key: Key[Array, ""], problem: Problem, sample_prior: SamplePrior, num: int) -> Reals:
     """Draws of the prior in unconstrained numbers, leaves (num, ...)."""
-    check_callable("a function of a key", sample_prior=sample_prior)
     keys = jax.random.split(key, num)
     # By the way, the names and shapes are checked.
     problem.unconstrain(sample_prior(keys[0]), "sample_prior")

@@ -7,9 +7,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_type
+from mpfjax.checks import kinds
 from mpfjax.filter import Filter
 from mpfjax.moves.base import AbstractMove
 from mpfjax.observations import Series, as_series, gathered
@@ -42,16 +43,13 @@ def pose_evidence(
     transforms: Mapping[str, AbstractTransform] | None,
 ) -> Problem:
     """The problem of the log marginal likelihood; without `parameters`, in those of the model."""
-    check_type(Filter, "a filter", filter=filter)
     sequences = observations if isinstance(observations, list) else [observations]
     if not sequences:
         raise ValueError("observations: there are no sequences")
     groups: dict[str, list[Series]] = {}
     for sequence in sequences:
         series = as_series(sequence, filter.model)
-        kind = lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf).name)  # noqa: E731
-        shapes = jax.tree.map(kind, (series.observations, series.inputs))
-        groups.setdefault(str(shapes), []).append(series)
+        groups.setdefault(kinds((series.observations, series.inputs)), []).append(series)
     objective = LogEvidence([_stacked(group) for group in groups.values()])
     return pose(filter, objective, parameters, transforms)
 
@@ -68,7 +66,6 @@ def one_sequence(observations: PyTree, model: Any) -> Series:
 
 def check_exact(filter: Filter, what: str) -> None:
     """Raise a `ValueError` for a filter whose estimates of the likelihood are biased."""
-    check_type(Filter, "a filter", filter=filter)
     if filter.approximate:
         raise ValueError(
             f"filter: an approximate one has no unbiased likelihood, and so no exact {what}"
@@ -94,7 +91,7 @@ def warn_of_bias(caller: str, problem: Problem) -> None:
             f"{caller}: the resampling of {type(moves[0]).__name__} has no gradient, so that the"
             f" score of {', '.join(names)} is biased, however many particles there are; build the"
             ' filter with gradient="stop", if need be of other moves',
-            stacklevel=3,
+            stacklevel=4,
         )
 
 
@@ -111,13 +108,15 @@ def _nodes(tree: PyTree, kind: type) -> list[Any]:
 def _stacked(group: list[Series]) -> Series:
     """Sequences of one shape in one `Series`, whose leaves have a leading axis of them."""
     if any(series.present is not None for series in group):
-        full = jnp.ones(group[0].length, bool)
-        present = [full if series.present is None else series.present for series in group]
-        group = [
-            Series(series.observations, series.inputs, there)
-            for series, there in zip(group, present, strict=True)
-        ]
+        group = [with_present(series) for series in group]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *group)
+
+
+def with_present(series: Series) -> Series:
+    """The series that says of each step whether its observation is there."""
+    if series.present is not None:
+        return series
+    return Series(series.observations, series.inputs, np.ones(series.length, bool))
 
 
 def _nothing(mixture: Any) -> None:

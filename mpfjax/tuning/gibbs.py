@@ -10,21 +10,34 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import check_callable, check_key, check_type, given, saying, shown
+from mpfjax.checks import checked, saying, shown
 from mpfjax.filter import Filter
 from mpfjax.models.base import require, with_inputs
 from mpfjax.models.steps import likelihoods
-from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import Series
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.backward import log_transitions
-from mpfjax.smoothing.conditional import check_conditional, draw_trajectory, possible_times, renew
-from mpfjax.tuning.chains import AbstractKernel, ChainOptions, Plan, Sampling, Step
-from mpfjax.tuning.densities import LogPrior, Prior, chosen, evaluated, is_invalid
+from mpfjax.smoothing.conditional import (
+    check_conditional,
+    draw_trajectory,
+    possible_times,
+    renew,
+    shape_of_trajectory,
+)
+from mpfjax.tuning.chains import AbstractKernel, ChainOptions, Sampling, Step
+from mpfjax.tuning.densities import (
+    LogPrior,
+    Point,
+    Prior,
+    checked_prior,
+    chosen,
+    evaluated,
+    is_invalid,
+)
 from mpfjax.tuning.evidence import one_sequence
 from mpfjax.tuning.problem import Parameters, Problem, Reals, pose
 from mpfjax.tuning.transforms import AbstractTransform
-from mpfjax.tuning.walks import RandomWalk, accepts, checked_deviations
+from mpfjax.tuning.walks import RandomWalk, checked_deviations, metropolis_step
 
 _NUM_METROPOLIS_STEPS = 5  # for one new trajectory; they cost little
 
@@ -62,6 +75,7 @@ class GibbsPosterior:
         return self.renewed.mean(axis=(0, 1))
 
 
+@checked
 def particle_gibbs(
     key: Key[Array, ""],
     filter: Filter,
@@ -117,13 +131,6 @@ def particle_gibbs(
     `metropolis_hastings` reject nearly all. If θ and the trajectory fix each other, as a small
     noise of the dynamics does, steps are short and `metropolis_hastings` is better.
     """
-    check_key(key)
-    check_type(Filter, "a filter", filter=filter)
-    plan = Plan(num_steps, **options)
-    check_callable("a function of a trajectory", **given(collect=collect))
-    what = "a function of a key, a trajectory, observations and a model"
-    check_callable(what, **given(draw=draw))
-    check_callable("a function of the parameters by name", **given(log_prior=log_prior))
     if (draw is None) == (log_prior is None):
         raise ValueError(
             f"draw, log_prior: {shown(draw)} and {shown(log_prior)}; exactly one must be given"
@@ -133,14 +140,15 @@ def particle_gibbs(
     joint = LogJoint(one_sequence(observations, filter.model))
     problem = pose(filter, joint, parameters, transforms)
     deviations = checked_deviations(proposal_deviations, problem.start())
-    sampling = Sampling("particle_gibbs", key, problem, deviations, plan)
+    sampling = Sampling("particle_gibbs", key, problem, deviations, num_steps, **options)
     prior = None
     if log_prior is not None:
         for density in ("log_transition", "log_initial"):
             require(filter.model, density, "particle_gibbs with log_prior")
-        prior = sampling.prior(log_prior)
+        prior = checked_prior(log_prior, problem, key, sampling.sample_prior)
     kernel = _Kernel(problem, joint, prior, draw, collect, backward)
-    start, trajectory = problem.start(), _shape_of_trajectory(joint, filter.model)
+    start = problem.start()
+    trajectory = shape_of_trajectory(filter.model, joint.series.length + 1)
     if draw is not None:  # Names and shapes are checked before anything compiles.
         jax.eval_shape(kernel.drawn, key, start, trajectory)
     functions = {
@@ -265,31 +273,16 @@ class _Kernel(AbstractKernel):
         """Steps of the random walk on the parameters given the trajectory."""
         prior = cast(Prior, self.prior)
 
-        def log_density(reals: Reals) -> tuple[Array, dict[str, Array]]:
+        def evaluate(key: Key[Array, ""], reals: Reals) -> tuple[Point, dict[str, Array]]:
+            del key
             log_joint = self.joint(trajectory, self.problem.at(reals))
-            found = evaluated(prior(reals), log_joint, "log_joint")
-            return found.log_density, found.invalid
+            return evaluated(reals, prior(reals), log_joint, "log_joint")
 
-        def move(place: tuple[Reals, Array], key: Key[Array, ""]) -> tuple[tuple, tuple]:
-            reals, current = place
-            key_walk, key_accept = jax.random.split(key)
-            proposed = walk.propose(key_walk, reals)
-            new, invalid = log_density(proposed)
-            accepted = accepts(key_accept, new - current)
-            return chosen(accepted, (proposed, new), place), (accepted, invalid)
+        def move(point: Point, key: Key[Array, ""]) -> tuple[Point, Any]:
+            point, *report = metropolis_step(key, walk.factor, point, evaluate)
+            return point, report
 
         keys = jax.random.split(key, _NUM_METROPOLIS_STEPS)
-        place = (reals, log_density(reals)[0])
-        (reals, _), (accepted, invalid) = jax.lax.scan(move, place, keys)
+        point, (accepted, invalid) = jax.lax.scan(move, evaluate(key, reals)[0], keys)
         counts = jax.tree.map(lambda some: jnp.sum(some, dtype=jnp.int32), invalid)
-        return reals, jnp.mean(accepted.astype(jnp.result_type(float))), counts
-
-
-def _shape_of_trajectory(joint: LogJoint, model: Any) -> PyTree:
-    states = jax.eval_shape(lambda key: sample_initial(key, model, 1), jax.random.key(0))
-    return jax.tree.map(
-        lambda state: jax.ShapeDtypeStruct(
-            (joint.series.length + 1, *state.shape[1:]), state.dtype
-        ),
-        states,
-    )
+        return point.reals, jnp.mean(accepted.astype(jnp.result_type(float))), counts

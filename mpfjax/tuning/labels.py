@@ -6,12 +6,12 @@ import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_key, check_whole, given, shown
-from mpfjax.models.base import AbstractStateSpaceModel, require
+from mpfjax.checks import Checked, Count, checked, shown
+from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.steps import likelihoods, moved
 
 
-class LabelLikelihood(eqx.Module):
+class LabelLikelihood(Checked):
     """The conditional log likelihood of labels given their observations, for `maximise`.
 
     It is the mean over labels of `label_log_posteriors`, in each step over `num_frames` frames that
@@ -31,11 +31,10 @@ class LabelLikelihood(eqx.Module):
     observations: PyTree
     labels: PyTree
     candidates: PyTree
-    num_frames: int | None = eqx.field(static=True, default=None)
+    num_frames: Count | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
         t = _check(self.observations, self.labels, self.candidates)
-        check_whole(1, **given(num_frames=self.num_frames))
         if self.num_frames is not None and self.num_frames > t:
             raise ValueError(f"num_frames: {self.num_frames} is not between 1 and the {t} frames")
 
@@ -49,6 +48,7 @@ class LabelLikelihood(eqx.Module):
         return jnp.mean(label_log_posteriors(model, *data))
 
 
+@checked
 def label_log_posteriors(
     model: AbstractStateSpaceModel, observations: PyTree, labels: PyTree, candidates: PyTree
 ) -> Float[Array, "t k"]:
@@ -68,7 +68,6 @@ def label_log_posteriors(
     Shapes are as in `LabelLikelihood`. Frames are taken one after the other and computed again for
     the derivative. So in memory only the data grow with t.
     """
-    require(model, "log_likelihood", "label_log_posteriors")
     _check(observations, labels, candidates)
 
     @jax.checkpoint
@@ -83,8 +82,9 @@ def label_log_posteriors(
     return jax.lax.map(of_frame, (observations, labels, candidates))
 
 
+@checked
 def transition_candidates(
-    key: Key[Array, ""], model: AbstractStateSpaceModel, labels: PyTree, num_candidates: int
+    key: Key[Array, ""], model: AbstractStateSpaceModel, labels: PyTree, num_candidates: Count
 ) -> PyTree:
     """Draws from D(. | the label one frame before), for every frame but the first.
 
@@ -92,9 +92,6 @@ def transition_candidates(
     them. Raises `ValueError` for fewer than one candidate, fewer than two frames, and labels that
     are no arrays.
     """
-    check_key(key)
-    require(model, "sample_transition", "transition_candidates")
-    check_whole(1, num_candidates=num_candidates)
     t, k = _leading_axes("labels", labels, 2)
     if t < 2:
         raise ValueError(f"labels: {t} frames leave none with a label one frame before")
@@ -113,9 +110,7 @@ def _check(observations: PyTree, labels: PyTree, candidates: PyTree) -> int:
     for name, tree, count in (("observations", observations, 1), ("labels", labels, 2)):
         own = _leading_axes(name, tree, count)
         if own != lead[:count]:
-            raise ValueError(
-                f"{name}: leading axes {own} are not {lead[:count]}, as of the candidates"
-            )
+            raise ValueError(f"{name}: {own} leads, and not {lead[:count]}, as of the candidates")
     return lead[0]
 
 

@@ -4,20 +4,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Unpack
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import check_key
+from mpfjax.checks import checked
 from mpfjax.filter import Filter
-from mpfjax.tuning.chains import AbstractKernel, ChainOptions, Plan, Sampling, Step
-from mpfjax.tuning.densities import LogDensity, LogPrior, chosen
+from mpfjax.tuning.chains import AbstractKernel, ChainOptions, Sampling, Step
+from mpfjax.tuning.densities import LogDensity, LogPrior, Point, checked_prior
 from mpfjax.tuning.evidence import check_exact, pose_evidence
 from mpfjax.tuning.problem import Parameters, Reals
 from mpfjax.tuning.transforms import AbstractTransform
-from mpfjax.tuning.walks import RandomWalk, accepts, checked_deviations
+from mpfjax.tuning.walks import RandomWalk, checked_deviations, metropolis_step
 
 
 @dataclass(frozen=True)
@@ -44,6 +42,7 @@ class Posterior:
         return float(self.accepted.mean())
 
 
+@checked
 def metropolis_hastings(
     key: Key[Array, ""],
     filter: Filter,
@@ -104,25 +103,16 @@ def metropolis_hastings(
     prior without one, a checkpoint of other chains, and what `fit` does; `RuntimeError` where the
     start, or a hundred draws of the prior, have no likelihood.
     """
-    check_key(key)
     check_exact(filter, "chain")
-    plan = Plan(num_steps, **options)
     problem = pose_evidence(filter, observations, parameters, transforms)
     deviations = checked_deviations(proposal_deviations, problem.start())
-    sampling = Sampling("metropolis_hastings", key, problem, deviations, plan)
-    density = LogDensity(problem, sampling.prior(log_prior))
+    sampling = Sampling("metropolis_hastings", key, problem, deviations, num_steps, **options)
+    prior = checked_prior(log_prior, problem, key, sampling.sample_prior)
+    density = LogDensity(problem, prior)
     data = {"observations": problem.objective}
-    functions = {"log_prior": (density.prior, problem.start())}
+    functions = {"log_prior": (prior, problem.start())}
     (reals, log_evidence, accepted), fields = sampling.run(_Kernel(density), data, functions)
     return Posterior(problem.constrained_rows(reals), log_evidence, accepted, **fields)
-
-
-class _Point(eqx.Module):
-    """The present state of a chain, and the log density there."""
-
-    reals: Reals
-    log_prior: Float[Array, "*chains"]
-    log_marginal_likelihood: Float[Array, "*chains"]
 
 
 class _Kernel(AbstractKernel):
@@ -135,21 +125,14 @@ class _Kernel(AbstractKernel):
         """False: noise in log Ẑ rejects steps of any length, whatever the scale."""
         return False
 
-    def start(self, key: Key[Array, ""], reals: Reals) -> tuple[_Point, Bool[Array, ""]]:
+    def start(self, key: Key[Array, ""], reals: Reals) -> tuple[Point, Bool[Array, ""]]:
         """The pair, and whether its density is positive."""
-        found = self.density.evaluated(reals, key)
-        point = _Point(reals, found.log_prior, found.log_likelihood)
-        return point, found.log_density > -jnp.inf
+        point, _ = self.density.evaluated(key, reals)
+        return point, point.log_density > -jnp.inf
 
-    def step(self, key: Key[Array, ""], state: _Point, walk: RandomWalk) -> Step:
+    def step(self, key: Key[Array, ""], state: Point, walk: RandomWalk) -> Step:
         """A Gaussian step in u with a fresh key, accepted or not."""
-        key_propose, key_accept = jax.random.split(key)
-        key_walk, key_fresh = jax.random.split(key_propose)
-        reals = walk.propose(key_walk, state.reals)
-        found = self.density.evaluated(reals, key_fresh)
-        proposed = _Point(reals, found.log_prior, found.log_likelihood)
-        before = state.log_prior + state.log_marginal_likelihood
-        accepted = accepts(key_accept, found.log_density - before)
-        state = chosen(accepted, proposed, state)
-        report = (state.reals, state.log_marginal_likelihood, accepted)
-        return Step(state, report, accepted.astype(before.dtype), found.invalid)
+        evaluate = self.density.evaluated
+        point, accepted, invalid = metropolis_step(key, walk.factor, state, evaluate)
+        report = (point.reals, point.log_likelihood, accepted)
+        return Step(point, report, accepted.astype(point.log_prior.dtype), invalid)

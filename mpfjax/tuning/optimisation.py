@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -12,13 +12,23 @@ import numpy as np
 import optax
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.checks import check_callable, check_key, check_type, check_whole, given, shown
+from mpfjax.checks import Count, CountOrZero, Rule, checked, shown
 from mpfjax.filter import Filter
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.curvature import errors_at
 from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
 from mpfjax.tuning.problem import Objective, Parameters, Problem, Reals, pose, scores
 from mpfjax.tuning.transforms import AbstractTransform
+
+
+def _check_optimizer(optimizer: Any, name: str) -> None:
+    if isinstance(optimizer, type) or not callable(getattr(optimizer, "update", None)):
+        raise ValueError(
+            f"{name}: {shown(optimizer)} has no update; take one of optax, as optax.adam(0.05)"
+        )
+
+
+Optimizer = Annotated[optax.GradientTransformation, Rule(_check_optimizer, "an optimiser")]
 
 
 @dataclass(frozen=True)
@@ -51,17 +61,18 @@ class TuningRun:
         return self.value
 
 
+@checked
 def fit(
     key: Key[Array, ""],
     filter: Filter,
     observations: PyTree,
-    optimizer: optax.GradientTransformation,
-    num_steps: int,
+    optimizer: Optimizer,
+    num_steps: Count,
     *,
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
-    num_seeds: int = 8,
-    curvature_seeds: int = 0,
+    num_seeds: Count = 8,
+    curvature_seeds: CountOrZero = 0,
     checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> TuningRun:
@@ -94,7 +105,6 @@ def fit(
     differs, for one that is cut off or lacks an array, and where `run_filter` does. Raises
     `RuntimeError` if the start itself is not finite.
     """
-    check_whole(0, curvature_seeds=curvature_seeds)
     problem = pose_evidence(filter, observations, parameters, transforms)
     warn_of_bias("fit", problem)
     ascent = _Ascent("fit", "log_marginal_likelihood", key, problem, optimizer, num_seeds)
@@ -109,16 +119,17 @@ def fit(
     return TuningRun(*run, standard_errors=errors)
 
 
+@checked
 def maximise(
     key: Key[Array, ""],
     objective: Objective,
     model: Any,
-    optimizer: optax.GradientTransformation,
-    num_steps: int,
+    optimizer: Optimizer,
+    num_steps: Count,
     *,
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
-    num_seeds: int = 1,
+    num_seeds: Count = 1,
     checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> TuningRun:
@@ -137,7 +148,6 @@ def maximise(
     Raises what `fit` does for the same arguments, and `ValueError` for an objective that is not a
     floating point scalar. For a `checkpoint` the objective must also be the same.
     """
-    check_callable("a function of a key and a model", objective=objective)
     problem = pose(model, objective, parameters, transforms)
     ascent = _Ascent("maximise", "value", key, problem, optimizer, num_seeds)
     found = eqx.filter_eval_shape(problem.value, problem.start(), key)
@@ -161,17 +171,6 @@ class _Ascent:
     optimizer: optax.GradientTransformation
     num_seeds: int
 
-    def __post_init__(self) -> None:
-        check_key(self.key)
-        check_whole(num_seeds=self.num_seeds)
-        for method in ("init", "update"):
-            is_class = isinstance(self.optimizer, type)
-            if is_class or not callable(getattr(self.optimizer, method, None)):
-                raise ValueError(
-                    f"optimizer: {shown(self.optimizer)} has no {method}; take one of optax, such"
-                    " as optax.adam(0.05)"
-                )
-
     def climb(
         self,
         num_steps: int,
@@ -181,8 +180,6 @@ class _Ascent:
         functions: dict[str, Any],
     ) -> tuple[Reals, tuple]:
         """The parameters at the end, and the first fields of a `TuningRun`."""
-        check_whole(num_steps=num_steps)
-        check_type(Checkpoint, "a Checkpoint", **given(checkpoint=checkpoint))
         reals = self.problem.start()
         optimizer = self.optimizer.init(reals)
         no_path = jax.tree.map(lambda u: np.empty((0, *u.shape), u.dtype), reals)

@@ -16,24 +16,9 @@ from mpfjax.observations import Series
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.logarithms import log_sum_exp
 from mpfjax.running.scan import first_mixture, step_or_predict
-from mpfjax.tuning.densities import (
-    Evaluated,
-    Prior,
-    chosen,
-    evaluated,
-    is_invalid,
-    number_or_zero,
-)
+from mpfjax.tuning.densities import Point, Prior, evaluated, is_invalid, number_or_zero
 from mpfjax.tuning.problem import Problem, Reals
-from mpfjax.tuning.walks import accepts, factor_of
-
-
-class Sample(eqx.Module):
-    """A θ with its filter, up to the present observation."""
-
-    reals: Reals
-    mixture: ParticleMixture
-    log_evidence: Float[Array, "*n"]
+from mpfjax.tuning.walks import factor_of, metropolis_step
 
 
 class FilterOf(eqx.Module):
@@ -71,7 +56,7 @@ class FilterOf(eqx.Module):
 
 
 class Sampler(eqx.Module):
-    """The problem that the samples belong to, and their moves."""
+    """The problem that the samples belong to, and their moves; a sample is a θ with its filter."""
 
     problem: Problem
     run: FilterOf
@@ -96,44 +81,28 @@ class Sampler(eqx.Module):
         problem = self.problem.with_structure(jax.tree.structure(resized))
         return dataclasses.replace(self, problem=problem)
 
-    def start(self, key: Key[Array, ""], reals: Reals) -> Sample:
+    def start(self, key: Key[Array, ""], reals: Reals) -> Point:
         """A θ with the mixture of x_0."""
         mixture = self.run.start(key, self.problem.at(reals))
-        return Sample(reals, mixture, jnp.zeros((), mixture.log_weights.dtype))
+        nothing = jnp.zeros((), mixture.log_weights.dtype)
+        return Point(reals, number_or_zero(self.prior(reals)), nothing, mixture)
 
     def extend(
-        self, key: Key[Array, ""], sample: Sample, t: Int[Array, ""]
-    ) -> tuple[Sample, Float[Array, ""]]:
+        self, key: Key[Array, ""], sample: Point, t: Int[Array, ""]
+    ) -> tuple[Point, Float[Array, ""]]:
         """The sample after one more observation, and its increment."""
         filter = self.problem.at(sample.reals)
         mixture, increment = self.run.step(key, filter, sample.mixture, t)
-        log_evidence = sample.log_evidence + number_or_zero(increment)
-        return Sample(sample.reals, mixture, log_evidence), increment
+        log_likelihood = sample.log_likelihood + number_or_zero(increment)
+        return Point(sample.reals, sample.log_prior, log_likelihood, mixture), increment
 
     def run_again(
         self, key: Key[Array, ""], reals: Reals, num_steps: Int[Array, ""]
-    ) -> tuple[Sample, Evaluated]:
-        """A θ with a new filter over all observations so far."""
+    ) -> tuple[Point, dict[str, Bool[Array, ""]]]:
+        """A θ with a new filter over all observations so far, and what was no number."""
         mixture, log_evidence = self.run(key, self.problem.at(reals), num_steps)
-        found = evaluated(self.prior(reals), log_evidence)
-        return Sample(reals, mixture, found.log_likelihood), found
-
-    def move(
-        self,
-        key: Key[Array, ""],
-        sample: Sample,
-        factor: Float[Array, "d d"],
-        num_steps: Int[Array, ""],
-    ) -> tuple[Sample, Bool[Array, ""], dict[str, Bool[Array, ""]]]:
-        """One step of particle marginal Metropolis-Hastings, and whether it moved."""
-        key_walk, key_filter, key_accept = jax.random.split(key, 3)
-        u, unravel = ravel_pytree(sample.reals)
-        noise = jax.random.normal(key_walk, u.shape, u.dtype)
-        reals = unravel(u + jnp.matmul(factor, noise, precision="highest"))
-        proposed, found = self.run_again(key_filter, reals, num_steps)
-        before = number_or_zero(self.prior(sample.reals)) + sample.log_evidence
-        accepted = accepts(key_accept, found.log_density - before)
-        return chosen(accepted, proposed, sample), accepted, found.invalid
+        point, invalid = evaluated(reals, self.prior(reals), log_evidence)
+        return dataclasses.replace(point, mixture=mixture), invalid
 
 
 class Extended(NamedTuple):
@@ -147,12 +116,19 @@ class Extended(NamedTuple):
     """how many θs were dropped, since their likelihood was NaN or +inf."""
 
 
-class Rejuvenated(NamedTuple):
-    """Samples of equal weight."""
-
-    samples: ParticleMixture
-    acceptance_rate: Float[Array, ""]
-    invalid: dict[str, Int[Array, ""]]
+def _weighed(
+    samples: ParticleMixture,
+    points: Point,
+    log_factors: Float[Array, " n"],
+    invalid: Bool[Array, " n"],
+) -> Extended:
+    """The points with the samples' weights times these factors; zero stays zero."""
+    alive = samples.log_weights > -jnp.inf
+    log_weights = jnp.where(alive, samples.log_weights + log_factors, -jnp.inf)
+    total = log_sum_exp(log_weights)
+    samples = samples.replace(particles=points, log_weights=log_weights - total)
+    num_invalid = jnp.sum(alive & invalid, dtype=jnp.int32)
+    return Extended(samples, total, samples.effective_sample_size, num_invalid)
 
 
 @jit_on_wide_vectors
@@ -168,21 +144,17 @@ def extended(sampler, key, samples, t):
     A θ whose likelihood is no number gets the weight zero, and keeps it.
     """
     keys = jax.random.split(key, sampler.num_samples)
-    particles, increments = jax.vmap(sampler.extend, in_axes=(0, 0, None))(
-        keys, samples.particles, t
-    )
-    alive = samples.log_weights > -jnp.inf
-    increments = jnp.where(alive, increments, -jnp.inf)
-    log_weights = samples.log_weights + number_or_zero(increments)
-    total = log_sum_exp(log_weights)
-    samples = samples.replace(particles=particles, log_weights=log_weights - total)
-    invalid = jnp.sum(is_invalid(increments), dtype=jnp.int32)
-    return Extended(samples, total, samples.effective_sample_size, invalid)
+    extend = jax.vmap(sampler.extend, in_axes=(0, 0, None))
+    points, increments = extend(keys, samples.particles, t)
+    return _weighed(samples, points, number_or_zero(increments), is_invalid(increments))
 
 
 @jit_on_wide_vectors
 def rejuvenated(sampler, key, samples, num_steps):
-    """Samples of equal weight, from chains that start at resampled ones."""
+    """Samples of equal weight, from chains that start at resampled ones.
+
+    Also the share of accepted steps, and how often a density was no number, by name.
+    """
     key_resample, key_moves = jax.random.split(key)
     points = jax.vmap(lambda reals: ravel_pytree(reals)[0])(samples.particles.reals)
     centred = points - samples.average(points)[None]
@@ -192,10 +164,12 @@ def rejuvenated(sampler, key, samples, num_steps):
     resampled = Resample(particles_per_component=num_chains)(key_resample, samples)
     starts = jax.tree.map(lambda leaf: leaf[:num_chains], resampled.particles)
 
-    def chain(key: Key[Array, ""], sample: Sample) -> tuple[Sample, Any]:
-        def advance(sample: Sample, key: Key[Array, ""]) -> tuple[Sample, Any]:
-            sample, accepted, invalid = sampler.move(key, sample, factor, num_steps)
-            return sample, (sample, accepted, invalid)
+    evaluate = lambda key, reals: sampler.run_again(key, reals, num_steps)  # noqa: E731
+
+    def chain(key: Key[Array, ""], sample: Point) -> tuple[Point, Any]:
+        def advance(sample: Point, key: Key[Array, ""]) -> tuple[Point, Any]:
+            moved = metropolis_step(key, factor, sample, evaluate)
+            return moved[0], moved
 
         return jax.lax.scan(advance, sample, jax.random.split(key, num_moves))
 
@@ -207,7 +181,7 @@ def rejuvenated(sampler, key, samples, num_steps):
     )
     rate = jnp.mean(accepted.astype(samples.log_weights.dtype))
     counts = jax.tree.map(lambda some: jnp.sum(some, dtype=jnp.int32), invalid)
-    return Rejuvenated(single_component(everywhere), rate, counts)
+    return single_component(everywhere), rate, counts
 
 
 @jit_on_wide_vectors
@@ -219,12 +193,7 @@ def exchanged(sampler, key, samples, num_steps):
     new Ẑ over the old one. Also the log of the mean of these ratios.
     """
     keys = jax.random.split(key, sampler.num_samples)
-    particles, found = jax.vmap(sampler.run_again, in_axes=(0, 0, None))(
-        keys, samples.particles.reals, num_steps
-    )
-    ratios = found.log_likelihood - samples.particles.log_evidence
-    log_weights = jnp.where(samples.log_weights > -jnp.inf, samples.log_weights + ratios, -jnp.inf)
-    total = log_sum_exp(log_weights)
-    samples = samples.replace(particles=particles, log_weights=log_weights - total)
-    invalid = jnp.sum(found.invalid["log_marginal_likelihood"], dtype=jnp.int32)
-    return Extended(samples, total, samples.effective_sample_size, invalid)
+    run_again = jax.vmap(sampler.run_again, in_axes=(0, 0, None))
+    points, invalid = run_again(keys, samples.particles.reals, num_steps)
+    ratios = points.log_likelihood - samples.particles.log_likelihood
+    return _weighed(samples, points, ratios, invalid["log_marginal_likelihood"])

@@ -144,16 +144,18 @@ def pose(
     leaves, structure = jax.tree.flatten(tree)
     tuned = _tuned(tree, parameters)
     if not tuned:
-        raise ValueError(f"parameters: there is nothing to tune{_what_there_is(tree)}")
+        raise ValueError(
+            "parameters: there is nothing to tune; Python floats are tuned where `parameters` names"
+            f" them, or where their fields are declared {_DECLARED}"
+        )
     for name, index in tuned.items():
         leaves[index] = _as_array(name, leaves[index])
     transforms = {} if transforms is None else transforms
     check_type(Mapping, "a mapping from names to transforms", transforms=transforms)
     for name, transform in transforms.items():
         check_type(AbstractTransform, "a transform", **{f"transforms[{name!r}]": transform})
-    unknown = sorted(set(transforms) - set(tuned))
-    if unknown:
-        raise ValueError(f"transforms: {unknown} are not among the parameters, {sorted(tuned)}")
+        if name not in tuned:
+            raise ValueError(f"transforms: {name} is not among the parameters, {sorted(tuned)}")
     return Problem(
         leaves=leaves,
         transforms={name: transforms.get(name, Unconstrained()) for name in tuned},
@@ -178,47 +180,22 @@ def placed(tree: PyTree) -> PyTree:
 
 def _as_array(name: str, value: Any) -> Array:
     """A parameter as an array; raises `ValueError` for one without a derivative."""
-    is_array = isinstance(value, jax.Array | np.ndarray | np.generic)
-    if is_array and jnp.issubdtype(value.dtype, jnp.floating):
-        return jnp.asarray(value)
-    if isinstance(value, float):
-        return jnp.asarray(value, float)
-    use = ""
-    if isinstance(value, int) and not isinstance(value, bool):
-        use = f"; give the model {float(value)}, or declare it {_DECLARED}"
-    raise ValueError(f"parameters: {name} is {shown(value)}, no floating point number{use}")
-
-
-def _what_there_is(tree: PyTree) -> str:
-    """A hint at numbers that are not arrays, which can only be tuned by name."""
-    leaves = jax.tree_util.tree_leaves_with_path(_model_of(tree))
-    numbers = [_named("", path) for path, leaf in leaves if isinstance(leaf, float)]
-    if not numbers:
-        return ""
-    return (
-        f"; {', '.join(numbers)} are Python floats, which are tuned where `parameters` names"
-        f" them, or where their fields are declared {_DECLARED}"
+    if isinstance(value, float | jax.Array | np.ndarray | np.generic):
+        array = jnp.asarray(value, float if isinstance(value, float) else None)
+        if jnp.issubdtype(array.dtype, jnp.floating):
+            return array
+    raise ValueError(
+        f"parameters: {name} is {shown(value)}, no floating point number; give the model one, or"
+        f" declare it {_DECLARED}"
     )
-
-
-def _model_of(tree: PyTree) -> PyTree:
-    return getattr(tree, "model", tree)
-
-
-def _named(name: str, path: Any) -> str:
-    """What a leaf of a parameter is called."""
-    return (name + jax.tree_util.keystr(path)).removeprefix(".")
 
 
 def _tuned(tree: PyTree, parameters: Parameters) -> dict[str, int]:
     """Each parameter's name, and its place among the tree's leaves."""
     if parameters is None:
-        parameters = {"": _model_of}
-    if not isinstance(parameters, Mapping):
-        raise ValueError(
-            f"parameters: {shown(parameters)} is no mapping from names to functions, such as"
-            ' {"r": lambda filter: filter.model.r}'
-        )
+        parameters = {"": lambda tree: getattr(tree, "model", tree)}
+    example = 'a mapping from names to functions, as {"r": lambda filter: filter.model.r}'
+    check_type(Mapping, example, parameters=parameters)
     leaves, places = jax.tree.leaves(tree), placed(tree)
     tuned: dict[str, int] = {}
     for name, where in parameters.items():
@@ -233,8 +210,6 @@ def _tuned(tree: PyTree, parameters: Parameters) -> dict[str, int]:
 
 def _picked(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[str, int]:
     """The leaves that one entry of the mapping selects: a leaf, or the arrays of a node."""
-    if not callable(where):
-        raise ValueError(f"parameters: {name} is {shown(where)}, no function that picks from it")
     try:
         picked = where(places)
     except (AttributeError, IndexError, KeyError, TypeError) as error:
@@ -253,4 +228,5 @@ def _picked(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[st
         ]
     if not found and name:
         raise ValueError(f"parameters: {name} picks no array")
-    return {_named(name, path): place.index for path, place in found}
+    called = lambda path: (name + jax.tree_util.keystr(path)).removeprefix(".")  # noqa: E731
+    return {called(path): place.index for path, place in found}

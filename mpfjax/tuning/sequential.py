@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import check_key, check_type, check_whole, given
+from mpfjax.checks import Count, checked, kinds
 from mpfjax.filter import Filter
 from mpfjax.observations import Series
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.chains import warn_of_invalid
 from mpfjax.tuning.densities import LogPrior, SamplePrior, checked_prior, drawn
-from mpfjax.tuning.evidence import check_exact, one_sequence
+from mpfjax.tuning.evidence import check_exact, one_sequence, with_present
 from mpfjax.tuning.parameter_particles import (
     FilterOf,
     Sampler,
@@ -87,16 +87,17 @@ class SequentialPosterior:
         return run.followed_by(state.step, observations, progress).posterior(state)
 
 
+@checked
 def smc2(
     key: Key[Array, ""],
     filter: Filter,
     observations: PyTree,
-    num_samples: int,
+    num_samples: Count,
     *,
     sample_prior: SamplePrior,
     log_prior: LogPrior,
-    num_moves: int = 5,
-    max_particles: int | None = None,
+    num_moves: Count = 5,
+    max_particles: Count | None = None,
     parameters: Parameters = None,
     transforms: Mapping[str, AbstractTransform] | None = None,
     checkpoint: Checkpoint | None = None,
@@ -141,10 +142,7 @@ def smc2(
     for posteriors with several modes, and to compare models; `metropolis_hastings` is simpler where
     only the last posterior is wanted.
     """
-    check_key(key)
     check_exact(filter, "SMC²")
-    check_whole(num_samples=num_samples, num_moves=num_moves, **given(max_particles=max_particles))
-    check_type(Checkpoint, "a Checkpoint", **given(checkpoint=checkpoint))
     if num_samples % (num_moves + 1):
         raise ValueError(
             f"num_samples: {num_samples} is no multiple of num_moves + 1, {num_moves + 1}"
@@ -155,7 +153,7 @@ def smc2(
     key_prior, key_filters, key_steps = jax.random.split(key, 3)
     reals = drawn(key_prior, problem, sample_prior, num_samples)
     first = jax.tree.map(lambda u: u[0], reals)
-    prior = checked_prior(log_prior, problem, first, "at a draw of sample_prior")
+    prior = checked_prior(log_prior, problem, key_prior, sample_prior)
     sampler = Sampler(problem, runs, prior, int(num_moves), int(num_samples))
     settings = problem.settings | {
         "key": key, "num_samples": int(num_samples), "num_moves": int(num_moves),
@@ -189,10 +187,11 @@ class _Run:
             np.asarray, one_sequence(observations, self.sampler.problem.tree.model)
         )
         if (before.present is None) != (after.present is None):
-            before, after = _with_present(before), _with_present(after)
-        if _kind(before) != _kind(after):
+            before, after = with_present(before), with_present(after)
+        one_step = lambda series: kinds(jax.tree.map(lambda leaf: leaf[-1], series))  # noqa: E731
+        if one_step(before) != one_step(after):
             raise ValueError(
-                f"observations: {_kind(after)} are not like those before, {_kind(before)}"
+                f"observations: {one_step(after)} is not like those before, {one_step(before)}"
             )
         series = jax.tree.map(lambda *leaves: np.concatenate(leaves), before, after)
         held = self.sampler.run.series.length
@@ -208,8 +207,9 @@ class _Run:
 
         def identity(step: int) -> dict[str, str]:
             seen = jax.tree.map(lambda leaf: leaf[:step], self.series)
-            seen = _with_present(seen)
-            return self.identity | identity_of(self.checkpoint, {"observations": seen}, {})
+            return self.identity | identity_of(
+                self.checkpoint, {"observations": with_present(seen)}, {}
+            )
 
         def start() -> State:
             return like._replace(carry=(started(self.sampler, keys, reals), *like.carry[1:]))
@@ -250,10 +250,9 @@ class _Run:
         samples = found.samples
         if size < _ESS_THRESHOLD * sampler.num_samples:
             so_far = jnp.asarray(step + 1, jnp.int32)
-            moved = rejuvenated(sampler, keys[1], samples, so_far)
-            samples, rate = moved.samples, float(moved.acceptance_rate)
-            for name, count in moved.invalid.items():
-                counts[name] += int(count)
+            samples, accepted, of_moves = rejuvenated(sampler, keys[1], samples, so_far)
+            rate = float(accepted)
+            counts = {name: count + int(of_moves[name]) for name, count in counts.items()}
             may_double = self.max_particles is not None and 2 * num_particles <= self.max_particles
             if may_double and rate < _ACCEPTANCE_THRESHOLD:
                 larger = self.sampler.with_particles(2 * num_particles)
@@ -271,19 +270,3 @@ def _padded(series: Series, capacity: int) -> FilterOf:
     """Runs over the data, in arrays with room for this many steps."""
     pad = lambda leaf: jnp.asarray(np.resize(leaf, (capacity, *leaf.shape[1:])))  # noqa: E731
     return FilterOf(jax.tree.map(pad, series))
-
-
-def _with_present(series: Series) -> Series:
-    if series.present is not None:
-        return series
-    return Series(series.observations, series.inputs, np.ones(series.length, bool))
-
-
-def _kind(series: Series) -> str:
-    """The structure, shapes and types of one step of a series."""
-    return str(
-        [
-            f"{jax.tree_util.keystr(place)} {leaf.dtype}{list(leaf.shape[1:])}"
-            for place, leaf in jax.tree_util.tree_leaves_with_path(series)
-        ]
-    )

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mpfjax.checks import check_finite
+from mpfjax.checks import Checked, Finite
 
 
-class AbstractTransform(eqx.Module):
+class AbstractTransform(Checked):
     """A smooth bijection between the domain of a parameter and all real numbers."""
 
     @abc.abstractmethod
@@ -83,11 +83,10 @@ class Interval(AbstractTransform):
     Raises `ValueError` for an empty interval, and for ends that are not finite numbers.
     """
 
-    low: float = eqx.field(static=True)
-    high: float = eqx.field(static=True)
+    low: Finite = eqx.field(static=True)
+    high: Finite = eqx.field(static=True)
 
     def __check_init__(self) -> None:
-        check_finite(low=self.low, high=self.high)
         if not self.low < self.high:
             raise ValueError(f"high: {self.high} is not above low, {self.low}")
 

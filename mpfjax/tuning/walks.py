@@ -1,7 +1,7 @@
-"""Gaussian random walks in unconstrained numbers, and how they learn their covariance."""
+"""Metropolis steps of Gaussian random walks, and how these learn their covariance."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from mpfjax.checks import check_positive_array, shown
 from mpfjax.operations.matrices import cholesky
+from mpfjax.tuning.densities import Point, chosen
 from mpfjax.tuning.problem import Reals
 
 # The best scale of a random walk in d dimensions is this over sqrt(d), times the target's own
@@ -30,16 +31,6 @@ class RandomWalk(eqx.Module):
     mean: Float[Array, " d"]
     covariance: Float[Array, "d d"]
     log_scale: Float[Array, ""]
-
-    def propose(self, key: Key[Array, ""], reals: Reals) -> Reals:
-        """A Gaussian step from u."""
-        names = sorted(reals)
-        noise = {
-            name: jax.random.normal(key, reals[name].shape, reals[name].dtype)
-            for name, key in zip(names, jax.random.split(key, len(names)), strict=True)
-        }
-        u, unravel = ravel_pytree(reals)
-        return unravel(u + jnp.matmul(self.factor, ravel_pytree(noise)[0], precision="highest"))
 
     def adapted(
         self,
@@ -84,9 +75,25 @@ def best_acceptance(dimension: int) -> float:
     return 0.44 if dimension == 1 else 0.234
 
 
-def accepts(key: Key[Array, ""], gain: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether a Metropolis step with this gain in log density is accepted; a NaN is rejected."""
-    return jnp.log(jax.random.uniform(key, (), gain.dtype)) < gain
+def metropolis_step(
+    key: Key[Array, ""],
+    factor: Float[Array, "d d"],
+    point: Point,
+    evaluate: Callable[[Key[Array, ""], Reals], tuple[Point, dict[str, Array]]],
+) -> tuple[Point, Bool[Array, ""], dict[str, Array]]:
+    """A step of the walk u + F z, accepted or not: the point, whether it moved, what was no number.
+
+    `evaluate` gives the point at other parameters by a key that is always new, and which of its
+    densities were no numbers.
+    """
+    key_walk, key_fresh, key_accept = jax.random.split(key, 3)
+    u, unravel = ravel_pytree(point.reals)
+    noise = jax.random.normal(key_walk, u.shape, u.dtype)
+    reals = unravel(u + jnp.matmul(factor, noise, precision="highest"))
+    proposed, invalid = evaluate(key_fresh, reals)
+    gain = proposed.log_density - point.log_density  # where it is NaN, the step is rejected
+    accepted = jnp.log(jax.random.uniform(key_accept, (), gain.dtype)) < gain
+    return chosen(accepted, proposed, point), accepted, invalid
 
 
 def checked_deviations(given: float | Mapping[str, Any], start: Reals) -> Reals:
