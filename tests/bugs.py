@@ -262,6 +262,68 @@ BUGS = {
         "return 0.5 * (norm - inner(residuals, residuals))",
         "tests/lookahead/test_learned.py",
     ),
+    # smoothing
+    "backward sampling forgets the next state": Bug(
+        "smoothing/backward.py",
+        "log_weights = mixture.log_weights + log_density(future)",
+        "log_weights = mixture.log_weights + 0 * log_density(future)",
+        "tests/smoothing/test_contracts.py -k backward",
+    ),
+    "the smoother's inputs are one step off": Bug(
+        "smoothing/trajectories.py",
+        "steps = (keys, earlier, ancestors, proposed, inputs)",
+        "steps = (keys, earlier, ancestors, proposed, jax.tree.map(lambda u: u[::-1], inputs))",
+        "tests/smoothing/test_contracts.py -k backward",
+    ),
+    "PaRIS leaves sums where they were": Bug(
+        "smoothing/sums.py",
+        "kept = jax.tree.map(of_pasts, kept)",
+        "kept = kept",
+        "tests/smoothing/test_contracts.py -k PaRIS",
+    ),
+    "a fixed lag keeps the term that is overwritten": Bug(
+        "smoothing/sums.py",
+        "own[(t + 1) % num_kept], averages)",
+        "own[t % num_kept], averages)",
+        "tests/smoothing/test_contracts.py -k lag",
+    ),
+    "the variance of log Ẑ counts pairs for less": Bug(
+        "moves/eve_indices.py",
+        "grown = jnp.where(due & (k > 1), -jnp.log1p(-1 / jnp.maximum(k, 2)), 0.0)",
+        "grown = jnp.where(due & (k > 1), jnp.log1p(-1 / jnp.maximum(k, 2)), 0.0)",
+        "tests/smoothing/test_variance.py",
+    ),
+    "conditional SMC loses its reference": Bug(
+        "moves/conditional.py",
+        "particles = jax.tree.map(lambda leaf, own: put(leaf, own, slot), mixture.particles, now)",
+        "particles = mixture.particles",
+        "tests/smoothing/test_conditional.py",
+    ),
+    # tuning
+    "SMC² does not normalise its weights": Bug(
+        "tuning/parameter_particles.py",
+        "samples = samples.replace(particles=points, log_weights=log_weights - total)",
+        "samples = samples.replace(particles=points, log_weights=log_weights)",
+        "tests/test_exact_answers.py -k smc2",
+    ),
+    "posteriors leave out the prior": Bug(
+        "tuning/densities.py",
+        "return self.log_prior + self.log_likelihood",
+        "return self.log_likelihood",
+        "tests/tuning/test_densities.py",
+    ),
+    "posteriors leave out the Jacobian": Bug(
+        "tuning/densities.py",
+        "density += self.transforms[name].log_jacobian(u)",
+        "density += 0 * self.transforms[name].log_jacobian(u)",
+        "tests/tuning/test_posteriors.py -k metropolis",
+    ),
+    "a Metropolis step is accepted by the walk's key": Bug(
+        "tuning/walks.py",
+        "jnp.log(jax.random.uniform(key_accept, (), gain.dtype)) < gain",
+        "jnp.log(jax.random.uniform(key_walk, (), gain.dtype)) < gain",
+        "tests/test_exact_answers.py -k chains",
+    ),
 }
 
 

@@ -14,20 +14,34 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import mpfjax
-from mpfjax import Filter, KMeans, Merge, Propagate, Resample, checks, metrics, smoothing, vision
+from mpfjax import (
+    Filter,
+    KMeans,
+    Merge,
+    Propagate,
+    Resample,
+    checks,
+    metrics,
+    smoothing,
+    tuning,
+    vision,
+)
 from mpfjax.moves.initial import SelectInitial
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.objects.independent import PropagateIndependently
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from mpfjax.running.islands import IslandInteraction
+from mpfjax.smoothing.variance import batch_estimate, log_marginal_likelihood_variance
+from mpfjax.tuning.labels import transition_candidates
 from mpfjax.vision.boxes.following import Snapshot
-from tests.user_models import Drift, DriftOfOne
+from tests.user_models import Batched, Drift, DriftOfOne, ScalarLinear
 
 pytestmark = pytest.mark.usefixtures("as_installed")
 
@@ -36,7 +50,7 @@ MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
 JOINT = mpfjax.MultiObjectModel(MODEL, 2, shared_observation=True)
 FILTER = mpfjax.particle_filter(MODEL, 4)
 MIXTURE = FILTER.init(KEY)
-TWO = np.ones(2, np.float32)
+TWO, THREE = np.ones(2, np.float32), np.ones(3, np.float32)
 HISTORY = mpfjax.run_filter(KEY, FILTER, TWO)
 EYE, ZERO = np.eye(1), np.zeros(1)
 LINEAR = {"A": EYE, "Q": EYE, "H": EYE, "R": EYE, "m0": ZERO, "P0": EYE}
@@ -705,6 +719,186 @@ REFUSED = (
         )
     ),
 )  # fmt: skip
+
+
+SCALAR = ScalarLinear()
+OF_SCALAR = mpfjax.particle_filter(SCALAR, 4)
+GAUSSIAN = mpfjax.gaussian_particle_filter(SCALAR, 4)
+ONE_OF_TWO = mpfjax.run_filter(KEY, Filter(MODEL, [Propagate(MODEL)], 4, 2), TWO)
+OF_SWITCHING = mpfjax.particle_filter(SWITCHING, 4)
+RUN_OF_SWITCHING = mpfjax.run_filter(KEY, OF_SWITCHING, TWO[:, None])
+
+
+def paths(run=HISTORY, model=MODEL, **options):
+    return smoothing.sample_trajectories(KEY, model, run, 2, **options)
+
+
+def around(filter=FILTER, trajectory=THREE, observations=TWO):
+    return smoothing.conditional_filter(KEY, filter, observations, trajectory)
+
+
+def sums(function=difference, filter=FILTER, observations=TWO):
+    return smoothing.smoothed_sums(KEY, filter, observations, function)
+
+
+REFUSED += (
+    # smoothing
+    ("observations: a conditionally linear", lambda: paths(RUN_OF_SWITCHING, SWITCHING)),
+    ("observations: a conditionally linear", lambda: paths(observations=TWO)),
+    ("observations: .3. steps",
+     lambda: paths(RUN_OF_SWITCHING, SWITCHING, observations=np.ones((3, 1), np.float32))),
+    ("component: 2 is not one of 2", lambda: paths(ONE_OF_TWO, component=2)),
+    ("component: 1 is dead", lambda: paths(ONE_OF_TWO, component=1)),
+    ("num_steps: 3 does nothing", lambda: paths(num_steps=3)),
+    ("Batched defines no log_transition", lambda: paths(model=Batched())),
+    ("mixtures: these are not all", lambda: paths(HISTORY.final)),
+    ("mixtures: these are not all",
+     lambda: smoothing.trace_ancestors(run(FILTER, collect=lambda mixture: mixture.mean()))),
+    (r"trajectory: float32\[4\] .* is not float32\[3\]", lambda: around(trajectory=np.ones(4))),
+    ("trajectory: .* is not", lambda: around(trajectory={"x": np.ones(3)})),
+    ("trajectory: complex128 is complex", lambda: around(trajectory=np.ones(3, complex))),
+    ("Batched defines no log_transition", lambda: around(mpfjax.particle_filter(Batched(), 4))),
+    ("filter: .*not noise='rqmc'",
+     lambda: around(Filter(SCALAR, [Resample(), Propagate(SCALAR, noise="rqmc")], 4))),
+    ("filter: .*one Propagate or Predict", lambda: around(Filter(MODEL, [Reweight(MODEL)], 4))),
+    ("filter: Partitioned cannot keep", lambda: around(mpfjax.partitioned_sampling(JOINT, 4))),
+    ("filter: GaussianRegeneration cannot keep", lambda: around(GAUSSIAN)),
+    ("conditionally linear, and conditional_filter", lambda: around(OF_SWITCHING)),
+    ("conditionally linear, and smoothed_sums", lambda: sums(filter=OF_SWITCHING)),
+    ("conditionally linear, and particle_gibbs",
+     lambda: tuning.particle_gibbs(KEY, OF_SWITCHING, TWO[:, None], 2, log_prior=flat)),
+    *(
+        ("filter: .* is approximate or draws in a way of its own",
+         lambda filter=filter: smoothing.with_first_ancestors(filter))
+        for filter in (
+            mpfjax.distributed_partitioned_sampling(JOINT, 4),
+            Filter(MODEL, [Propagate(MODEL), lambda key, mixture, y: mixture], 4),
+        )
+    ),
+    *(
+        (r"filter: (scheme|noise|initial_noise) of \w+ is '",
+         lambda filter=filter: smoothing.with_first_ancestors(filter))
+        for filter in (
+            OF_SCALAR, mpfjax.particle_filter(SCALAR, 4, scheme="multinomial", noise="rqmc"),
+            Filter(SCALAR, [mpfjax.Every(2, [Resample("stratified")]), Propagate(SCALAR)], 4),
+        )
+    ),
+    ("run: its filter keeps no first ancestors",
+     lambda: log_marginal_likelihood_variance(HISTORY)),
+    ("runs: 1; a standard error asks for 4", lambda: batch_estimate(HISTORY, nothing)),
+    *(
+        ("function: it returned", lambda function=function: sums(function))
+        for function in (lambda x, y: x[:3], lambda x, y: y.sum(), lambda x, y: ())
+    ),
+    ("simulate_observation: it returned",
+     lambda: mpfjax.forecast(KEY, FILTER, MIXTURE, 2, simulate_observation=lambda k, x: x[:3])),
+)  # fmt: skip
+
+
+ASCENT = optax.sgd(0.1)
+
+
+class Bare(eqx.Module):
+    a: float = 0.5
+
+
+def flat(parameters):
+    return sum(0.0 * value for value in parameters.values())
+
+
+def draw_one(key, trajectory, observations, model):
+    return {"a": 1.0}
+
+
+OF_A = {"parameters": {"a": lambda filter: filter.model.a}, "progress": False}
+LABELS = (TWO, TWO[:, None], TWO[:, None, None])
+
+
+def chain(filter=OF_SCALAR, **options):
+    options = {"log_prior": flat} | OF_A | options
+    return tuning.metropolis_hastings(KEY, filter, TWO, 4, **options)
+
+
+def gibbs(draw=draw_one, observations=TWO, **options):
+    return tuning.particle_gibbs(KEY, OF_SCALAR, observations, 4, draw=draw, **OF_A | options)
+
+
+def cloud(drawn=0.5, num_samples=6, filter=OF_SCALAR, **options):
+    options = {"log_prior": flat, "sample_prior": lambda key: {"a": drawn}} | OF_A | options
+    return tuning.smc2(KEY, filter, TWO, num_samples, **options)
+
+
+def climb(optimizer=ASCENT, observations=TWO, **options):
+    filter = mpfjax.particle_filter(SCALAR, 4, gradient="stop")
+    return tuning.fit(KEY, filter, observations, optimizer, 2, **OF_A | options)
+
+
+def maximised(objective, model=SCALAR):
+    return tuning.maximise(KEY, objective, model, ASCENT, 2)
+
+
+REFUSED += (
+    # tuning
+    *(
+        ("filter: an approximate one", lambda call=call: call(filter=GAUSSIAN))
+        for call in (chain, cloud)
+    ),
+    ("filter: an approximate one", lambda: tuning.log_density(GAUSSIAN, TWO, log_prior=flat)),
+    ("thinning: 9 is more than num_steps, 4", lambda: chain(thinning=9)),
+    ("burn_in: -1", lambda: chain(burn_in=-1)),
+    ("checkpoint: 'fit.npz' is not a Checkpoint", lambda: chain(checkpoint="fit.npz")),
+    ("proposal_deviations: a: 0.0", lambda: chain(proposal_deviations=0.0)),
+    (r"proposal_deviations: those of \['b'\]", lambda: chain(proposal_deviations={"b": 1.0})),
+    ("log_prior: -inf at the start", lambda: chain(log_prior=lambda p: 0 * p["a"] - jnp.inf)),
+    ("log_prior: nan at a draw of sample_prior",
+     lambda: cloud(log_prior=lambda p: p["a"] * jnp.nan)),
+    ("log_prior: None at the start", lambda: chain(log_prior=lambda p: None)),
+    ("log_prior: .* is no floating", lambda: chain(log_prior=lambda p: jnp.ones(2) * p["a"])),
+    (r"sample_prior: it gave \['b'\]", lambda: cloud(sample_prior=lambda key: {"b": 1.0})),
+    (r"sample_prior: a of shape \(2,\)", lambda: cloud(jnp.zeros(2))),
+    ("sample_prior: a, .* is outside Positive",
+     lambda: cloud(-1.0, transforms={"a": tuning.Positive()})),
+    (r"num_samples: 10 is no multiple of num_moves \+ 1, 6", lambda: cloud(num_samples=10)),
+    ("draw, log_prior: .*exactly one", lambda: gibbs(log_prior=flat)),
+    ("ScalarLinear defines no log_initial", lambda: gibbs(None, log_prior=flat)),
+    (r"draw: it gave \['b'\], no values by", lambda: gibbs(lambda *given: {"b": 1.0})),
+    (r"draw: a of shape \(2,\)", lambda: gibbs(lambda *given: {"a": jnp.zeros(2)})),
+    ("observations: a list is several", lambda: gibbs(observations=[1.0, 2.0])),
+    ("observations: there are no sequences", lambda: climb(observations=[])),
+    ("optimizer: 0.1 has no update", lambda: climb(0.1)),
+    ("optimizer: ", lambda: climb(optax.adam)),
+    ("objective: it returns None", lambda: maximised(lambda key, model: None)),
+    ("does not depend on idle", lambda: maximised(lambda key, model: model.a, Idle())),
+    ("transforms: b is not among", lambda: climb(transforms={"b": tuning.Positive()})),
+    (r"transforms\['a'\]: .*write Positive\(\.\.\.\)",
+     lambda: climb(transforms={"a": tuning.Positive})),
+    ("parameters: a, 0.9, is outside Interval",
+     lambda: climb(transforms={"a": tuning.Interval(2.0, 3.0)})),
+    ("high: 1.0 is not above low", lambda: tuning.Interval(2.0, 1.0)),
+    ("parameters: .* is not a mapping", lambda: climb(parameters=lambda filter: filter.model.a)),
+    ("parameters: there is nothing", lambda: climb(parameters={})),
+    ("parameters: there is nothing", lambda: maximised(lambda key, model: model.a, Bare())),
+    ("parameters: x cannot be picked", lambda: climb(parameters={"x": lambda f: f.model.rho})),
+    ("parameters: x picks 4, which is no leaf",
+     lambda: climb(parameters={"x": lambda f: f.num_particles})),
+    ("parameters: x and y pick the same",
+     lambda: climb(parameters=dict.fromkeys("xy", lambda f: f.model.a))),
+    ("parameters: order is 3, no floating",
+     lambda: tuning.maximise(
+         KEY, lambda key, model: model.a, Idle(), ASCENT, 2,
+         parameters={"order": lambda model: model.order})),
+    ("(?s)labels: .* has no leading axes", lambda: tuning.LabelLikelihood(TWO, TWO, TWO)),
+    ("observations: ", lambda: tuning.LabelLikelihood(TWO, np.ones((3, 1)), LABELS[2])),
+    ("num_frames: 5 is not between", lambda: tuning.LabelLikelihood(*LABELS, 5)),
+    ("labels: 1 frames leave none",
+     lambda: transition_candidates(KEY, MODEL, TWO[:1, None], 2)),
+)  # fmt: skip
+
+
+class Idle(eqx.Module):
+    a: jax.Array = eqx.field(converter=jnp.asarray, default=0.5)
+    idle: jax.Array = eqx.field(converter=jnp.asarray, default=1.0)
+    order: int = 3
 
 
 @pytest.mark.parametrize(("words", "call"), REFUSED, ids=lambda part: str(part)[:40])

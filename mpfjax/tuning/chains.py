@@ -94,6 +94,7 @@ class Sampling(Checked):
     progress: bool = True
 
     def __check_init__(self) -> None:
+        super().__check_init__()
         if self.thinning > self.num_steps:
             raise ValueError(
                 f"thinning: {self.thinning} is more than num_steps, {self.num_steps}: no step"

@@ -158,17 +158,9 @@ def checked_prior(
 
 def drawn(key: Key[Array, ""], problem: Problem, sample_prior: SamplePrior, num: int) -> Reals:
     """Draws of the prior in unconstrained numbers, leaves (num, ...)."""
-    keys = jax.random.split(key, num)
-    # By the way, the names and shapes are checked.
-    problem.unconstrain(sample_prior(keys[0]), "sample_prior")
-    draws, reals = jax.vmap(sample_prior)(keys), {}
-    for name, index in problem.tuned:
-        values, transform = jnp.asarray(draws[name]), problem.transforms[name]
-        if not transform.contains(np.asarray(values)):
-            kind = type(transform).__name__
-            raise ValueError(f"sample_prior: a draw of {name} is outside {kind}'s domain")
-        values = values.astype(problem.leaves[index].dtype)
-        reals[name] = jax.vmap(transform.unconstrain)(values)
+    draws: Any = jax.vmap(sample_prior)(jax.random.split(key, num))
+    reals = jax.vmap(lambda draw: problem.unconstrain(draw, "sample_prior"))(draws)
+    problem.require_inside(draws, "sample_prior")
     return reals
 
 

@@ -97,11 +97,13 @@ def warn_of_bias(caller: str, problem: Problem) -> None:
 
 def _nodes(tree: PyTree, kind: type) -> list[Any]:
     """The nodes of a kind, anywhere in a pytree, also within one another."""
-    found = []
-    is_inner = lambda node: node is not tree and isinstance(node, kind)  # noqa: E731
-    for node in jax.tree.leaves(tree, is_leaf=is_inner):
-        if is_inner(node):
-            found += [node, *_nodes(node, kind)]
+    found: list[Any] = []
+
+    def looked_at(node: Any) -> bool:
+        found.extend([node] if isinstance(node, kind) else [])
+        return False
+
+    jax.tree.leaves(tree, is_leaf=looked_at)
     return found
 
 

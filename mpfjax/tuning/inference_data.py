@@ -63,8 +63,6 @@ def to_inference_data(result: Chains | PyTree) -> Any:
                 f"result: {shown(result)} is not what metropolis_hastings, particle_gibbs or smc2"
                 " returns, nor trajectories, leaves (trajectories, times, ...)"
             )
-    for name in set(states) & set(parameters):
-        raise ValueError(f"result: a parameter is called {name}, as are the states")
     length = stats["renewed"].shape[2] if "renewed" in stats else None
     dims, coords = {}, {}
     for name, leaf in (states | stats).items():

@@ -34,6 +34,7 @@ class LabelLikelihood(Checked):
     num_frames: Count | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
+        super().__check_init__()
         t = _check(self.observations, self.labels, self.candidates)
         if self.num_frames is not None and self.num_frames > t:
             raise ValueError(f"num_frames: {self.num_frames} is not between 1 and the {t} frames")
@@ -68,7 +69,6 @@ def label_log_posteriors(
     Shapes are as in `LabelLikelihood`. Frames are taken one after the other and computed again for
     the derivative. So in memory only the data grow with t.
     """
-    _check(observations, labels, candidates)
 
     @jax.checkpoint
     def of_frame(data: tuple[PyTree, PyTree, PyTree]) -> Float[Array, " k"]:
@@ -106,12 +106,12 @@ def transition_candidates(
 
 def _check(observations: PyTree, labels: PyTree, candidates: PyTree) -> int:
     """The number of frames, or a `ValueError` for leading axes that do not agree."""
-    lead = _leading_axes("candidates", candidates, 3)
-    for name, tree, count in (("observations", observations, 1), ("labels", labels, 2)):
-        own = _leading_axes(name, tree, count)
-        if own != lead[:count]:
-            raise ValueError(f"{name}: {own} leads, and not {lead[:count]}, as of the candidates")
-    return lead[0]
+    of_labels = _leading_axes("labels", labels, 2)
+    for name, tree in (("observations", observations), ("candidates", candidates)):
+        own = _leading_axes(name, tree, 1 if name == "observations" else 3)
+        if own[:2] != of_labels[: len(own)]:
+            raise ValueError(f"{name}: {own} leads, and of the labels {of_labels}")
+    return of_labels[0]
 
 
 def _leading_axes(name: str, tree: PyTree, count: int) -> tuple[int, ...]:

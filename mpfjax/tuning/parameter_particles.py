@@ -69,10 +69,6 @@ class Sampler(eqx.Module):
         """N of each θ's filter."""
         return self.problem.tree.num_particles
 
-    def with_observations(self, run: FilterOf) -> "Sampler":
-        """The same over other observations."""
-        return dataclasses.replace(self, run=run)
-
     def with_particles(self, num_particles: int) -> "Sampler":
         """The same with filters of another number of particles."""
         if num_particles == self.num_particles:

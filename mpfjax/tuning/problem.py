@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
@@ -50,18 +51,9 @@ class Problem(eqx.Module):
         return Problem(self.leaves, self.transforms, self.objective, self.tuned, structure)
 
     def start(self) -> Reals:
-        """The present parameters; raises `ValueError` for one that cannot be tuned."""
-        reals = {}
-        for name, index in self.tuned:
-            value, transform = self.leaves[index], self.transforms[name]
-            if not transform.contains(np.asarray(value)):
-                kind = type(transform).__name__
-                raise ValueError(
-                    f"parameters: {name} starts at {shown(value)}, outside {kind}'s domain"
-                )
-            # A strong type: an optimiser makes a weak one strong, and it would compile again.
-            reals[name] = jax.lax.convert_element_type(transform.unconstrain(value), value.dtype)
-        return reals
+        """The present parameters; raises `ValueError` for one outside its domain."""
+        present = {name: self.leaves[index] for name, index in self.tuned}
+        return self.unconstrain(present, "parameters")
 
     def constrain(self, reals: Reals) -> dict[str, Array]:
         """The parameters on their own scale."""
@@ -70,7 +62,7 @@ class Problem(eqx.Module):
     def unconstrain(self, values: Any, whose: str) -> Reals:
         """u of values by name, which `whose` gave; a `ValueError` for others than the parameters.
 
-        The values may be traced, so that their domains are not checked.
+        It is one as well for values outside their domains, unless they are traced.
         """
         if not isinstance(values, Mapping) or set(values) != set(self.transforms):
             names = sorted(values) if isinstance(values, Mapping) else shown(values)
@@ -85,8 +77,19 @@ class Problem(eqx.Module):
                     f"{whose}: {name} of shape {value.shape}, where the parameter's is"
                     f" {jnp.shape(present)}"
                 )
-            reals[name] = self.transforms[name].unconstrain(value.astype(present.dtype))
+            # A strong type: an optimiser makes a weak one strong, and it would compile again.
+            value = jax.lax.convert_element_type(value, present.dtype)
+            reals[name] = self.transforms[name].unconstrain(value)
+        self.require_inside(values, whose)
         return reals
+
+    def require_inside(self, values: Mapping[str, Any], whose: str) -> None:
+        """Raise a `ValueError` for values, or stacks of them, outside their domains."""
+        for name, transform in self.transforms.items():
+            value = values[name]
+            if not isinstance(value, Tracer) and not transform.contains(np.asarray(value)):
+                kind = type(transform).__name__
+                raise ValueError(f"{whose}: {name}, {shown(value)}, is outside {kind}'s domain")
 
     def constrained_rows(self, reals: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Stacks of parameters, of any leading axes, on their own scale."""
@@ -199,7 +202,6 @@ def _tuned(tree: PyTree, parameters: Parameters) -> dict[str, int]:
     leaves, places = jax.tree.leaves(tree), placed(tree)
     tuned: dict[str, int] = {}
     for name, where in parameters.items():
-        check_type(str, "a name", parameters=name)
         for inner, index in _picked(name, where, places, leaves).items():
             if index in tuned.values():
                 twice = next(other for other in tuned if tuned[other] == index)

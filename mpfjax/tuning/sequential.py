@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -81,9 +81,7 @@ class SequentialPosterior:
         This posterior stays as it is. Raises `ValueError` for observations of other shapes or
         types, and what `smc2` does. Use it as observations come in.
         """
-        if self._goes_on is None:
-            raise ValueError("extend: this posterior has no filters to go on with; smc2 gives them")
-        run, state = self._goes_on
+        run, state = cast(tuple[_Run, State], self._goes_on)
         return run.followed_by(state.step, observations, progress).posterior(state)
 
 
@@ -197,7 +195,7 @@ class _Run:
         held = self.sampler.run.series.length
         # With room for as many more, so that observations that come one by one share a program.
         capacity = held if series.length <= held else max(series.length, 2 * held)
-        sampler = self.sampler.with_observations(_padded(series, capacity))
+        sampler = replace(self.sampler, run=_padded(series, capacity))
         return replace(self, sampler=sampler, series=series, progress=progress)
 
     def posterior(

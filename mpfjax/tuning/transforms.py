@@ -87,6 +87,7 @@ class Interval(AbstractTransform):
     high: Finite = eqx.field(static=True)
 
     def __check_init__(self) -> None:
+        super().__check_init__()
         if not self.low < self.high:
             raise ValueError(f"high: {self.high} is not above low, {self.low}")
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mpfjax.checks import check_positive_array, shown
+from mpfjax.checks import check_positive_array, saying
 from mpfjax.operations.matrices import cholesky
 from mpfjax.tuning.densities import Point, chosen
 from mpfjax.tuning.problem import Reals
@@ -51,7 +51,9 @@ class RandomWalk(eqx.Module):
         covariance = self.covariance + gain * (spread - self.covariance)
         log_scale = self.log_scale
         if acceptance is not None:
-            log_scale = log_scale + gain * (acceptance - best_acceptance(points.shape[1]))
+            # The share of steps that the best random walk accepts.
+            best = 0.44 if points.shape[1] == 1 else 0.234
+            log_scale = log_scale + gain * (acceptance - best)
         factor = jnp.exp(log_scale) * factor_of(covariance)
         return RandomWalk(factor, mean, covariance, log_scale)
 
@@ -68,11 +70,6 @@ def random_walk(deviations: Reals, starts: Reals) -> RandomWalk:
 def factor_of(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """F of the best random walk on a target of this covariance."""
     return cholesky(covariance[None])[0] * math.sqrt(_squared_scale(len(covariance)))
-
-
-def best_acceptance(dimension: int) -> float:
-    """The share of steps that the best random walk accepts: .44 in one dimension, .234 in many."""
-    return 0.44 if dimension == 1 else 0.234
 
 
 def metropolis_step(
@@ -103,13 +100,8 @@ def checked_deviations(given: float | Mapping[str, Any], start: Reals) -> Reals:
         raise ValueError(f"proposal_deviations: those of {sorted(by_name)}, not of {sorted(start)}")
     deviations = {}
     for name, u in start.items():
-        value = by_name[name]
-        try:
-            deviations[name] = jnp.broadcast_to(jnp.asarray(value, u.dtype), u.shape)
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"proposal_deviations: {shown(value)} of {name} is no number, nor {u.shape} numbers"
-            ) from error
+        with saying(f"in proposal_deviations, of {name}"):
+            deviations[name] = jnp.broadcast_to(jnp.asarray(by_name[name], u.dtype), u.shape)
         check_positive_array(**{f"proposal_deviations: {name}": deviations[name]})
     return deviations
 

@@ -3,12 +3,13 @@
 import numpy as np
 
 
-def gaussian_smoother(model, observations):
+def gaussian_smoother(model, observations, inputs=None):
     """Mean (t + 1, d) and covariance ((t + 1) d, (t + 1) d) of x_0, ..., x_t given y.
 
     All states are one Gaussian vector, of which the observations are linear functions. A row of
-    NaN is missing.
+    NaN is missing. `inputs` are u_t of B u_t, where there are any.
     """
+    drifts = np.zeros((len(observations), 1)) if inputs is None else inputs @ np.asarray(model.B).T
     a, q, h, r, mean, covariance = (
         np.asarray(value, float)
         for value in (model.A, model.Q, model.H, model.R, model.m0, model.P0)
@@ -18,7 +19,7 @@ def gaussian_smoother(model, observations):
     blocks = np.zeros((length + 1, d, length + 1, d))
     blocks[0, :, 0] = covariance
     for t in range(1, length + 1):
-        means.append(a @ means[-1])
+        means.append(a @ means[-1] + drifts[t - 1])
         for s in range(t):
             blocks[t, :, s] = a @ blocks[t - 1, :, s]
             blocks[s, :, t] = blocks[t, :, s].T

@@ -48,40 +48,41 @@ def _of_paths(model, paths, weights):
     return jnp.sum(weights[:, None, None] * each, axis=0)
 
 
-def _genealogy(key, model, run):
+def _genealogy(key, model, run, inputs=None):
     return _of_paths(model, trace_ancestors(run).trajectories, run.final.weights)
 
 
 def _backward(**options):
-    def smooth(key, model, run):
-        paths = sample_trajectories(key, model, run, NUM_TRAJECTORIES, **options)
+    def smooth(key, model, run, inputs=None):
+        paths = sample_trajectories(key, model, run, NUM_TRAJECTORIES, inputs=inputs, **options)
         return _of_paths(model, paths, jnp.full(NUM_TRAJECTORIES, 1 / NUM_TRAJECTORIES))
 
     return smooth
 
 
 def _online(**options):
-    def smooth(key, filter, observations):
-        function = statistics_for(filter.model)
-        found = smoothed_sums(key, filter, Series.skipping(observations), function, **options)
+    def smooth(key, filter, observations, inputs=None):
+        series, function = Series.skipping(observations, inputs), statistics_for(filter.model)
+        found = smoothed_sums(key, filter, series, function, **options)
         rows = found.sums if found.terms is None else found.terms
         return found.run.log_likelihood_increments, rows
 
     return smooth
 
 
-def _conditional(key, filter, observations, trajectory):
-    found = conditional_filter(key, filter, Series.skipping(observations), trajectory)
-    return _of_paths(filter.model, found.trajectory[None], jnp.ones(1))
+def _conditional(key, filter, observations, trajectory, inputs=None):
+    series = Series.skipping(observations, inputs)
+    found = conditional_filter(key, filter, series, trajectory).trajectory
+    return _of_paths(filter.model, found[None], jnp.ones(1))
 
 
 class Smoother(NamedTuple):
     """A smoother in one of three forms, and what its rows are estimates of.
 
-    - `of_run`: (key, model, run) -> (t, s).
-    - `online`: (key, filter, observations) -> the increments of log Ẑ, and (t, s).
-    - `kernel`: (key, filter, observations, trajectory) -> (t, s), of another trajectory with the
-      law of the given one.
+    - `of_run`: (key, model, run, inputs) -> (t, s).
+    - `online`: (key, filter, observations, inputs) -> the increments of log Ẑ, and (t, s).
+    - `kernel`: (key, filter, observations, trajectory, inputs) -> (t, s), of another trajectory
+      with the law of the given one.
 
     Row r is the term r given all observations; with a `lag`, given those up to r + lag; with
     `summed`, the sum of the terms up to r given the observations up to r.
@@ -105,9 +106,11 @@ SMOOTHERS = {
     "conditional filter": Smoother(kernel=_conditional),
 }
 
-ONE = mpfjax.LinearGaussianModel(A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.4]], m0=[0.5], P0=[[1.0]])
+ONE = mpfjax.LinearGaussianModel(
+    A=[[0.9]], Q=[[0.3]], H=[[1.0]], R=[[0.4]], m0=[0.5], P0=[[1.0]], B=[[1.0]]
+)
 FOUR = mpfjax.LinearGaussianModel(
-    A=0.9 * np.eye(4) + 0.1 * np.eye(4, k=1), Q=0.2 * np.eye(4) + 0.1,
+    A=0.9 * np.eye(4) + 0.1 * np.eye(4, k=1), Q=0.2 * np.eye(4) + 0.1, B=np.eye(4, 1),
     H=np.eye(2, 4), R=0.5 * np.eye(2), m0=np.full(4, 0.3), P0=np.eye(4),
 )  # fmt: skip
 QUADRATIC = mpfjax.QuadraticModel(0.3, 0.4, -2.0, 2.0)
@@ -119,6 +122,12 @@ MODELS = {
     ),
     "two modes": (QUADRATIC, np.array([1.2, 0.8, NAN, 1.5, 1.0], np.float32)),
 }  # fmt: skip
+# u_t, each unlike the others, so that one of another step is seen.
+INPUTS = {
+    "one dimension": np.array([[0.5], [-0.4], [0.3], [-0.9], [0.7]], np.float32),
+    "four dimensions": np.array([[0.6], [-0.5], [0.9], [-0.2]], np.float32),
+    "two modes": None,
+}
 
 # One of each kind of filter that knows its own evidence, for the smoothers of a run.
 SMOOTHED_CHAINS = (
@@ -149,5 +158,7 @@ QUICK_CASES = [
     *((smoother, chain, model)
       for smoother in SMOOTHERS if SMOOTHERS[smoother].of_run
       for chain, model in (("pf", "four dimensions"), ("mpf", "two modes"))),
+    ("PaRIS", "mpf", "two modes"),
     ("fixed lag, MCMC", "mpf", "one dimension"),
+    ("conditional filter", "mpf", "one dimension"),
 ]  # fmt: skip

@@ -1,7 +1,7 @@
 """Posteriors of one parameter on a grid, by filters that are exact, and the cases they are of."""
 
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +13,46 @@ from mpfjax import Filter, KMeans, Merge, Propagate, Resample, Split
 from mpfjax.exact import grid_filter
 from tests.user_models import ScalarLinear
 
-# The coefficient a of a linear model, with a missing observation.
+# The coefficient a of a linear model, with known inputs and a missing observation.
 OBSERVATIONS = jnp.array([1.5, 0.2, jnp.nan, 0.8, 1.9, 1.1, 0.3, -0.9])
+INPUTS = jnp.array([0.6, -0.7, 0.2, 0.9, -0.3, 0.5, -0.8, 0.1])
+SERIES = mpfjax.Series.skipping(OBSERVATIONS, INPUTS)
 MEAN_OF_A, DEVIATION_OF_A = 0.3, 0.5
 A = {"a": lambda filter: filter.model.a}
 # The noise σ of the quadratic model's observations.
 SQUARES = jnp.array([1.2, 0.3, 0.8, 1.6, 1.0])
 SIGMA = {"sigma_y": lambda filter: filter.model.sigma_y}
 MEAN_OF_LOG_SIGMA, DEVIATION_OF_LOG_SIGMA = -0.5, 0.7
+
+
+class Pushed(ScalarLinear):
+    """x_t = a x_{t-1} + u_t + N(0, q²)."""
+
+    inputs: Any = None
+
+    def transition_mean(self, states):
+        return self.a * states + self.inputs
+
+    def transition_from_noise(self, noise, states):
+        return self.transition_mean(states) + self.q * noise[:, 0]
+
+    def log_transition(self, states, previous_states):
+        return norm.logpdf(states, self.transition_mean(previous_states), self.q)
+
+    def log_initial(self, states):
+        return norm.logpdf(states, self.m, self.p)
+
+
+def sample_a(key):
+    return {"a": MEAN_OF_A + DEVIATION_OF_A * jax.random.normal(key)}
+
+
+def draw_a(key, trajectory, observations, model):
+    """a is normal given the trajectory: a regression of each state on the one before."""
+    before, after = trajectory[:-1], trajectory[1:] - INPUTS
+    precision = DEVIATION_OF_A**-2 + jnp.sum(before**2) / model.q**2
+    mean = (MEAN_OF_A / DEVIATION_OF_A**2 + jnp.sum(before * after) / model.q**2) / precision
+    return {"a": mean + jax.random.normal(key) / jnp.sqrt(precision)}
 
 
 def log_prior_of_a(parameters):
@@ -58,14 +90,14 @@ def _summary(grid, log_densities):
 
 
 @cache
-def posterior_of_a():
-    """By a scalar Kalman filter, in which a missing observation is none."""
+def posterior_of_a(low=-1.7, high=2.3):
+    """By a scalar Kalman filter, in which a missing observation is none; of a in an interval."""
 
     def log_density(a):
         model = ScalarLinear(a=a)
         mean, variance, total = model.m, model.p**2, log_prior_of_a({"a": a})
-        for y in np.asarray(OBSERVATIONS):
-            mean, variance = a * mean, a**2 * variance + model.q**2
+        for y, u in zip(np.asarray(OBSERVATIONS), np.asarray(INPUTS), strict=True):
+            mean, variance = a * mean + u, a**2 * variance + model.q**2
             if np.isfinite(y):
                 innovation = variance + model.r**2
                 total += norm.logpdf(y, mean, jnp.sqrt(innovation))
@@ -73,7 +105,7 @@ def posterior_of_a():
                 mean, variance = mean + gain * (y - mean), (1 - gain) * variance
         return total
 
-    grid = jnp.linspace(-1.7, 2.3, 201)
+    grid = jnp.linspace(low, high, 402)[1::2]
     return _summary(grid, jax.jit(jax.vmap(log_density))(grid))
 
 

@@ -7,7 +7,6 @@ import pytest
 from jax.scipy.stats import norm
 
 import mpfjax
-from mpfjax.exact import kalman_filter
 from mpfjax.tuning import Positive, log_density
 from tests.user_models import ScalarLinear
 
@@ -44,27 +43,3 @@ def test_it_is_prior_jacobian_and_likelihood():
     assert float(density.constrain(density.start)["r"]) == pytest.approx(0.5)
     assert float(density.unconstrain({"r": 2.0})["r"]) == pytest.approx(np.log(2.0))
     assert float(density.filter_at({"r": values[1]}).model.r) == pytest.approx(1.7)
-
-
-@pytest.mark.thorough
-def test_its_likelihood_is_that_of_the_kalman_filter():
-    density = density_of(mpfjax.particle_filter(ScalarLinear(), 4000))
-    u = {"r": jnp.log(jnp.asarray(0.8))}
-    exact = kalman_filter(ScalarLinear(r=0.8).in_matrices(), OBSERVATIONS[:, None])
-    expected = exact.log_marginal_likelihood + log_prior({"r": 0.8}) + u["r"]
-    assert float(density(u, jax.random.key(1))) == pytest.approx(float(expected), abs=0.1)
-
-
-@pytest.mark.parametrize(
-    ("filter", "options", "named"),
-    [
-        (3, {}, "filter: 3"),
-        (mpfjax.gaussian_particle_filter(ScalarLinear(), 9), {}, "filter: an approximate one"),
-        (mpfjax.particle_filter(ScalarLinear(), 9), {"log_prior": 3}, "log_prior: 3"),
-        (mpfjax.particle_filter(ScalarLinear(r=4.0), 9), {}, "log_prior: -inf at the start"),
-    ],
-)
-@pytest.mark.usefixtures("as_installed")
-def test_bad_arguments_are_refused_by_name(filter, options, named):
-    with pytest.raises(ValueError, match=named):
-        density_of(filter, **options)

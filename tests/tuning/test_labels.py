@@ -91,8 +91,6 @@ def test_of_a_conditionally_linear_model_labels_carry_moments():
     z = np.ravel(rivals.latent)
     np.testing.assert_allclose(rivals.mean[0, 0], F[z] @ places[0, 0] + b[z], atol=1e-5)
     np.testing.assert_allclose(rivals.covariance[0, 0], Q[z], atol=1e-6)
-    with pytest.raises(ValueError, match="MarginalisedState"):
-        label_log_posteriors(model, y[1:], last.mean, rivals.mean)
 
 
 def test_the_scale_has_a_best_value_and_a_factor_of_y_none():
@@ -123,115 +121,41 @@ def test_frames_are_drawn_anew_at_every_step():
     assert abs(values.mean() - float(everything.mean())) < 4 * error
 
 
-class TestMaximise:
-    """What `fit` has not shown already."""
+def parabola(key, model):
+    return -((model.lambda_ - 3.0) ** 2)
 
-    def parabola(self, key, model):
-        return -((model.lambda_ - 3.0) ** 2)
 
-    def optimisation(self, num_steps=60, **options):
-        options = {"parameters": {"lambda": lambda m: m.lambda_}, "progress": False} | options
-        return maximise(
-            jax.random.key(0), self.parabola, Unnormalised(), optax.sgd(0.1), num_steps, **options
-        )
+LAMBDA = {"parameters": {"lambda": lambda m: m.lambda_}, "progress": False}
 
-    def test_a_function_is_an_objective(self):
-        run = self.optimisation()
-        assert run.parameters["lambda"] == pytest.approx(3.0, abs=1e-3)
-        np.testing.assert_allclose(run.history["lambda"][:2], [1.0, 1.4], rtol=1e-5)
-        assert run.value == pytest.approx(0.0, abs=1e-4)
 
-    def test_it_goes_on_from_a_checkpoint(self, tmp_path):
-        whole = self.optimisation(6)
-        self.optimisation(3, checkpoint=mpfjax.Checkpoint(tmp_path / "optimisation.npz"))
-        resumed = self.optimisation(6, checkpoint=mpfjax.Checkpoint(tmp_path / "optimisation.npz"))
-        assert resumed.parameters["lambda"] == whole.parameters["lambda"]
+def ascent(objective=parabola, num_steps=60, **options):
+    arguments = (jax.random.key(0), objective, Unnormalised(), optax.sgd(0.1), num_steps)
+    return maximise(*arguments, **LAMBDA | options)
 
-    @pytest.mark.parametrize("wrap", [lambda function: function, eqx.filter_jit])
-    def test_a_checkpoint_of_another_objective_is_refused(self, tmp_path, wrap):
-        def optimisation(num_steps, aim, **options):
-            data = jnp.array([aim, 0.0])
-            return maximise(
-                jax.random.key(0), wrap(lambda key, model: -((model.lambda_ - data[0]) ** 2)),
-                Unnormalised(), optax.sgd(0.1), num_steps,
-                parameters={"lambda": lambda m: m.lambda_}, progress=False,
-                checkpoint=mpfjax.Checkpoint(tmp_path / "optimisation.npz"), **options,
-            )  # fmt: skip
 
-        optimisation(2, 3.0)
-        assert optimisation(3, 3.0).history["lambda"].shape == (3,)
-        with pytest.raises(ValueError, match=r"is of another maximise: objective.* is"):
-            optimisation(3, 4.0)
+def test_a_function_is_an_objective():
+    run = ascent()
+    assert run.parameters["lambda"] == pytest.approx(3.0, abs=1e-3)
+    np.testing.assert_allclose(run.history["lambda"][:2], [1.0, 1.4], rtol=1e-5)
+    assert run.value == pytest.approx(0.0, abs=1e-4)
 
-    @pytest.mark.parametrize(
-        ("objective", "named"),
-        [
-            (None, "objective: None is not a function"),
-            (lambda key, model: model.lambda_ * jnp.ones(2), "objective: it returns"),
-            (lambda key, model: None, "objective: it returns None"),
-            (lambda key, model: jnp.zeros((), int), "objective: it returns"),
-        ],
+
+@pytest.mark.parametrize("wrap", [lambda function: function, eqx.filter_jit])
+def test_it_goes_on_from_a_checkpoint_of_the_same_objective(tmp_path, wrap):
+    def part(num_steps, aim):
+        data = jnp.array([aim, 0.0])
+        objective = wrap(lambda key, model: -((model.lambda_ - data[0]) ** 2))
+        checkpoint = mpfjax.Checkpoint(tmp_path / "ascent.npz")
+        return ascent(objective, num_steps, checkpoint=checkpoint)
+
+    part(3, 3.0)
+    np.testing.assert_array_equal(
+        part(6, 3.0).parameters["lambda"], ascent(num_steps=6).parameters["lambda"]
     )
-    @pytest.mark.usefixtures("as_installed")
-    def test_what_is_no_objective_is_refused(self, objective, named):
-        with pytest.raises(ValueError, match=named):
-            maximise(
-                jax.random.key(0), objective, Unnormalised(), optax.sgd(0.1), 2,
-                parameters={"lambda": lambda m: m.lambda_}, progress=False,
-            )  # fmt: skip
-
-    def test_a_parameter_without_effect_is_named(self):
-        with pytest.raises(ValueError, match="value does not depend on c"):
-            self.optimisation(parameters=None)
-
-    def test_a_break_is_said_to_be_its_own(self):
-        with pytest.raises(RuntimeError, match="maximise: the value was nan at the start"):
-            maximise(
-                jax.random.key(0), lambda key, model: model.lambda_ * jnp.nan, Unnormalised(),
-                optax.sgd(0.1), 2, parameters={"lambda": lambda m: m.lambda_}, progress=False,
-            )  # fmt: skip
+    with pytest.raises(ValueError, match=r"is of another maximise: objective.* is"):
+        part(7, 4.0)
 
 
-def test_bad_input_is_refused_by_name():
-    observations, labels, rivals = data(4, 3)
-    present = labels[1:]
-    for arguments, named in (
-        ((observations[:3], present, rivals), "observations: "),
-        ((observations, labels, rivals), "labels: "),
-        ((observations, present, rivals[:, 0]), "candidates: "),
-        ((observations, present, rivals[:, :, :0]), "candidates: "),
-        ((observations, present, rivals, 5), "num_frames: 5"),
-        ((observations, present, rivals, 0), "num_frames: 0"),
-    ):
-        with pytest.raises(ValueError, match=named):
-            LabelLikelihood(*arguments)
-    with pytest.raises(ValueError, match="num_candidates: 0"):
-        transition_candidates(jax.random.key(0), Unnormalised(), labels, 0)
-    with pytest.raises(ValueError, match="labels: 1 frames"):
-        transition_candidates(jax.random.key(0), Unnormalised(), labels[:1], 2)
-
-
-@pytest.mark.usefixtures("as_installed")
-def test_wrong_types_are_refused_by_name():
-    observations, labels, rivals = data(4, 3)
-    key, present = jax.random.key(0), labels[1:]
-    for arguments, named in (
-        ((None, present, rivals), "observations: None"),
-        ((observations, "labels", rivals), "labels: 'labels'"),
-        ((observations, present, None), "candidates: None"),
-        ((observations, present, rivals, 2.0), "num_frames: 2.0 is not a whole number"),
-        ((observations, present, rivals, True), "num_frames: True"),
-    ):
-        with pytest.raises(ValueError, match=named):
-            LabelLikelihood(*arguments)
-    with pytest.raises(ValueError, match="model: None defines no log_likelihood"):
-        label_log_posteriors(None, observations, present, rivals)
-    for arguments, named in (
-        ((0, Unnormalised(), labels, 2), "key: 0"),
-        ((key, None, labels, 2), "model: None"),
-        ((key, Unnormalised(), None, 2), "labels: None"),
-        ((key, Unnormalised(), labels[:, 0], 2), "(?s)labels: .* has no leading axes"),
-        ((key, Unnormalised(), labels, 2.5), "num_candidates: 2.5"),
-    ):
-        with pytest.raises(ValueError, match=named):
-            transition_candidates(*arguments)
+def test_a_break_is_said_to_be_its_own():
+    with pytest.raises(RuntimeError, match="maximise: the value was nan at the start"):
+        ascent(lambda key, model: model.lambda_ * jnp.nan)

@@ -94,23 +94,3 @@ def test_the_jacobian_is_that_of_automatic_differentiation(name):
 )
 def test_what_lies_outside_is_known(transform, value):
     assert not transform.contains(np.array(value))
-
-
-def test_an_empty_interval_is_refused():
-    with pytest.raises(ValueError, match=r"high: 1\.0"):
-        Interval(2.0, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("ends", "named"),
-    [
-        ((None, 1.0), "low: None is not a finite number"),
-        ((0.0, "1"), "high: '1'"),
-        ((0.0, np.inf), "high: inf"),
-        ((np.nan, 1.0), "low: nan"),
-    ],
-)
-@pytest.mark.usefixtures("as_installed")
-def test_ends_that_are_no_numbers_are_refused(ends, named):
-    with pytest.raises(ValueError, match=named):
-        Interval(*ends)
