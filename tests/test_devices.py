@@ -252,8 +252,7 @@ class TestExchange:
         ("threshold", "log_masses"), [(0.5, [0.0, 0.5, 0.0, 0.5]), (0.0, [0.0, -9.0, -9.0, -9.0])]
     )
     def test_does_nothing_while_masses_are_even_enough(self, threshold, log_masses):
-        before, after = self.exchanged(threshold, log_masses)
-        chex.assert_trees_all_equal(before, after)
+        chex.assert_trees_all_equal(*self.exchanged(threshold, log_masses))
 
 
 # --- threads -------------------------------------------------------------------------------------
@@ -301,13 +300,6 @@ class TestThreads:
 
         np.testing.assert_allclose(jax.grad(total)(2.0), total(1.0), rtol=1e-5)
         np.testing.assert_allclose(jax.jit(total)(2.0), total(2.0), rtol=1e-5)
-
-    def test_an_error_is_raised_here(self):
-        def fail(keys):
-            raise ValueError(f"{keys.shape[0]} of them")
-
-        with pytest.raises(ValueError, match="2 of them"):
-            over_threads(fail, jax.random.split(jax.random.key(6), 4), (), 2)
 
     def noted(self, used, name, program, *arguments):
         used.append(name)
@@ -382,18 +374,12 @@ SUMS = SUMS if jax.__version_info__ >= (0, 10) else {}
 
 def test_an_option_is_left_to_a_flag_that_sets_it(monkeypatch, optimised):
     assert cpu_options() == {"xla_cpu_prefer_vector_width": 512} | SUMS
-    assert cpu_options(soon=True) == cpu_options() | {"xla_backend_optimization_level": 1}
-    passes = {"xla_disable_hlo_passes": ",".join([*SUMS.values(), "cpu-parallel-task-assigner"])}
-    assert cpu_options(one_thread=True) == cpu_options() | passes
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=128")
     assert cpu_options() == SUMS
-    monkeypatch.setenv("XLA_FLAGS", "--xla_disable_hlo_passes=dce")
-    assert cpu_options() == {"xla_cpu_prefer_vector_width": 512}
 
 
 def test_little_memory_is_an_option_that_this_compiler_has_or_is_left_out(monkeypatch, optimised):
     compiling._older_emitters.cache_clear()
-    assert set(in_little_memory()) <= {"xla_cpu_use_fusion_emitters", *SUMS}
     assert jax.jit(lambda x: 3 * x, compiler_options=in_little_memory(soon=True))(3.0) == 9
     compiling._older_emitters.cache_clear()
     monkeypatch.setattr(compiling, "_FUSION_EMITTERS", "xla_cpu_has_no_such_option")

@@ -80,11 +80,9 @@ class TestResults:
             np.testing.assert_allclose(entry["evidence"], run.log_marginal_likelihood, rtol=1e-5)
             np.testing.assert_allclose(entry["means"], run.collected, rtol=1e-4)
         np.testing.assert_equal(read_study(tmp_path), results)
-
-    def test_are_log_likelihoods_where_nothing_is_asked_for(self, alone, tmp_path):
-        study = mpfjax.Study({"pf": build}, [8], small_study().keys, OBSERVATIONS, {"noise": [0.1]})
-        (entry,) = run_study(study, tmp_path)
-        np.testing.assert_allclose(entry["log_marginal_likelihood"], alone[1][0]["evidence"], 1e-5)
+        plain = mpfjax.Study({"pf": build}, [8], study.keys, OBSERVATIONS, {"noise": [0.1]})
+        (entry,) = run_study(plain, tmp_path / "plain", **options)
+        np.testing.assert_allclose(entry["log_marginal_likelihood"], results[0]["evidence"], 1e-5)
 
     def test_of_one_shape_or_within_shared_slots_compile_once(self, tmp_path):
         def one(sizes, num_cells=1):
@@ -175,7 +173,7 @@ def test_of_several_processes_the_first_writes_and_all_have_the_results(
 ):
     """Each runs the cells one by one, in one order."""
     monkeypatch.setattr(jax, "process_index", lambda: 1)
-    monkeypatch.setattr(studies, "ThreadPoolExecutor", None)
+    monkeypatch.setattr(studies.ThreadPoolExecutor, "map", None)
 
     def in_one_process(*arguments, **options):
         with monkeypatch.context() as patch:
@@ -238,9 +236,7 @@ class TestOtherFiles:
         again = [path for path, time in times.items() if path.stat().st_mtime_ns != time]
         assert again == [cut, foreign]
 
-    @pytest.mark.parametrize(
-        "content", ["", '{"axes"', "[]", "{}", "null", '"cells"', "[" * 200_000, '{"axes": null}']
-    )
+    @pytest.mark.parametrize("content", ["", "[]", "{}", "null", "[" * 200_000, '{"axes": null}'])
     def test_a_description_that_is_none_is_named(self, copy, content):
         (copy / "study.json").write_text(content)
         for use in (
@@ -264,16 +260,10 @@ def test_bad_input_to_one_cell_is_an_error_before_any_is_run(tmp_path, changes, 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("measured", "named"),
-    [
-        (lambda run: {"noise": run.log_marginal_likelihood}, "measure: 'noise'"),
-        (lambda run: {"mean": np.ones(3)}, r"measure: mean's shape, \(3,\)"),
-    ],
-)
-def test_bad_input_from_measure_is_named(tmp_path, measured, named):
-    with pytest.raises(ValueError, match=named):
-        run_study(small_study(1, measure=measured), tmp_path)
+def test_bad_input_from_measure_is_named(tmp_path):
+    study = small_study(1, measure=lambda run: {"mean": np.ones(3)})
+    with pytest.raises(ValueError, match=r"measure: mean's shape, \(3,\)"):
+        run_study(study, tmp_path)
 
 
 def test_progress_is_shown_on_a_terminal_alone(tmp_path, monkeypatch, capsys):

@@ -3,7 +3,6 @@
 import math
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -88,32 +87,20 @@ def first_mixture(key: Key[Array, "*keys"], filter: Filter, series: Series) -> P
     return mixture.replace(log_scale=mixture.log_scale - log_islands)
 
 
-class StepReport(NamedTuple):
-    """The part of a `StepInfo` that a run keeps of each step."""
-
-    log_likelihood_increment: Float[Array, "*t"]
-    resampled: Bool[Array, "*t m"]
-    degenerate: Bool[Array, "*t"]
+Report = tuple[Float[Array, "*t"], Bool[Array, "*t m"], Bool[Array, "*t"]]
+"""What a run keeps of a step's report, or of those of all steps."""
 
 
-def report_of(info: StepInfo) -> StepReport:
+def report_of(info: StepInfo) -> Report:
     """The part of a step's report that a run keeps."""
-    return StepReport(info.log_likelihood_increment, info.resampled, info.degenerate)
+    return info.log_likelihood_increment, info.resampled, info.degenerate
 
 
 def run_of(
-    initial: ParticleMixture, final: ParticleMixture, collected: PyTree, reports: StepReport
+    initial: ParticleMixture, final: ParticleMixture, collected: PyTree, reports: Report
 ) -> FilterRun:
     """The `FilterRun` of these steps, whose reports are stacked."""
-    return FilterRun(
-        log_marginal_likelihood=jnp.sum(reports.log_likelihood_increment),
-        log_likelihood_increments=reports.log_likelihood_increment,
-        collected=collected,
-        initial=initial,
-        final=final,
-        resampled=reports.resampled,
-        degenerate=reports.degenerate,
-    )
+    return FilterRun(jnp.sum(reports[0]), reports[0], collected, initial, final, *reports[1:])
 
 
 def step_or_predict(

@@ -7,7 +7,7 @@ import itertools
 import json
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import field
 from pathlib import Path
@@ -151,9 +151,15 @@ def run_study(
             write_arrays(directory / cell.file, measured | mark)
         results[cell.file] = cell.description | measured
 
-    with tqdm(total=len(cells), initial=len(results), unit="cell", disable=None) as bar:
-        for _ in _in_turn(finish, pending, cells_at_once):
-            bar.update()
+    bar = tqdm(total=len(cells), initial=len(results), unit="cell", disable=None)
+    with bar, ThreadPoolExecutor(cells_at_once) as pool:
+        # One at once runs in this thread, which has the caller's settings of JAX.
+        in_turn = map if cells_at_once == 1 else pool.map
+        try:
+            for _ in in_turn(finish, pending):
+                bar.update()
+        finally:  # an error ends it after the cells that are running
+            pool.shutdown(cancel_futures=True)
     return [results[cell.file] for cell in cells]
 
 
@@ -200,8 +206,8 @@ def _cells(study: Study) -> list[_Cell]:
 def _axes(study: Study) -> dict[str, list[Any]]:
     """The values along each axis of the grid, the filters' names first, as JSON can hold them."""
     axes = {"num_particles": study.num_particles, **study.settings}
-    named = {name: _listed(name, values) for name, values in axes.items()}
-    return {"filter": _listed("filters", list(study.filters)), **named}
+    others = {name: _listed(name, values) for name, values in axes.items()}
+    return {"filter": _listed("filters", list(study.filters))} | others
 
 
 def _listed(name: str, values: Any) -> list[Any]:
@@ -209,7 +215,8 @@ def _listed(name: str, values: Any) -> list[Any]:
     values = values.tolist() if isinstance(values, np.ndarray | jax.Array) else values
     if isinstance(values, str) or not isinstance(values, Sequence):
         raise ValueError(f"{name}: {shown(values)} are no values, [value, ...]")
-    plain = [value.item() if isinstance(value, np.generic) else value for value in values]
+    is_scalar = lambda value: isinstance(value, np.generic | jax.Array) and value.ndim == 0  # noqa: E731
+    plain = [value.item() if is_scalar(value) else value for value in values]
     for value in plain:
         if not isinstance(value, str | int | float | None):
             raise ValueError(
@@ -225,14 +232,13 @@ def _manifest(study: Study) -> dict[str, Any]:
     """All that identifies the study of a directory, in a form that JSON can hold."""
     package = importlib.import_module(__name__.partition(".")[0])
     versions = [f"mpfjax {package.__version__}", f"jax {jax.__version__}"]
-    manifest = {
+    return {
         "axes": _axes(study),
         **described(keys=study.keys, observations=study.observations),
         "measure": named(study.measure),
         "collect": named(study.collect),
         "versions": [*versions, str(default_float())],
     }
-    return json.loads(json.dumps(manifest))
 
 
 def _digest(manifest: dict[str, Any]) -> str:
@@ -323,16 +329,3 @@ def _measure(
                 raise ValueError(f"measure: {name}'s shape, {array.shape}, has no axis of seeds")
         parts.append(measured)
     return {name: np.concatenate([part[name] for part in parts])[:num_seeds] for name in parts[0]}
-
-
-def _in_turn(finish: Callable[[_Cell], None], cells: list[_Cell], at_once: int) -> Iterator[None]:
-    """Finish the cells, several at once; an error ends it after the cells that are running."""
-    if at_once == 1:  # in this thread, which has the caller's settings of JAX
-        yield from map(finish, cells)
-        return
-    with ThreadPoolExecutor(at_once) as pool:
-        try:
-            yield from pool.map(finish, cells)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
