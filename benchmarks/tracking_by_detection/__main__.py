@@ -183,7 +183,7 @@ def ours(
     sequence: Sequence, least: float | None, *, use_colours: bool, camera_motion: Motion | None
 ) -> Run:
     """One run; the camera's motion is that of the options where there are pixels."""
-    rows = Rows(sequence.rows, sequence.first, sequence.last)
+    rows = Rows(sequence.rows, last=sequence.last)
     tracker = vision.ObjectTracker(
         rows.most_objects(), frames_per_second=sequence.frames_per_second
     )

@@ -120,7 +120,7 @@ def _start(results: Results, still: np.ndarray | None) -> Start:
     if options.box is not None and still is not None:
         boxes = results.drawn = read_boxes(options, still)
         return lambda stills: follow_boxes(stills or (), boxes, key=key)
-    rows = None if source.rows is None else Rows(source.rows, source.first, source.last)
+    rows = None if source.rows is None else Rows(source.rows, last=source.last)
     room = LEAST_ROOM if rows is None else rows.most_objects()
     rate = source.frames_per_second
     tracker = ObjectTracker(options.max_objects or room, frames_per_second=rate)

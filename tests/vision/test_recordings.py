@@ -17,7 +17,7 @@ def scores_of(folder):
     rows, truth = read_detections(folder / "det.txt"), read_truth(folder / "gt.txt")
     info = read_sequence_info(folder)
     last = last_frame(info, rows, truth.objects)
-    found = Rows(rows, 1, last)
+    found = Rows(rows, last=last)
     tracker = ObjectTracker(found.most_objects(), frames_per_second=info.frame_rate)
     tracked = track(None, found, tracker, frame_size=info.size)
     rows = np.concatenate([online_rows(frame, tracks) for frame, tracks in enumerate(tracked, 1)])

@@ -111,7 +111,5 @@ def object_boxes(model: MultiObjectModel, states: BoxState) -> Float[Array, "n o
 
 def _one_each(model: ColourModel) -> ColourModel:
     """k models with one reference each, stacked, made of one model with k references."""
-    num_objects = model.reference_boxes.shape[0]
-    sigma = jnp.broadcast_to(model.sigma, (num_objects,))
-    split = jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[:, None], model)
-    return eqx.tree_at(lambda m: m.sigma, split, sigma)
+    k = model.reference_boxes.shape[0]
+    return jax.tree.map(lambda x: x[:, None] if x.ndim else jnp.broadcast_to(x, (k,)), model)

@@ -39,10 +39,7 @@ class Rows:
 
     @checked
     def __init__(
-        self,
-        rows: Float[np.ndarray, "r columns"],
-        first: CountOrZero = 1,
-        last: CountOrZero | None = None,
+        self, rows: Float[np.ndarray, "r columns"], *, last: CountOrZero | None = None
     ) -> None:
         if rows.ndim != 2 or not (rows.size == 0 or 6 <= rows.shape[1] <= 10):
             raise ValueError(
@@ -61,7 +58,6 @@ class Rows:
         rows = rows[~np.ma.getmaskarray(rows)[:, 0]]
         rows = rows[np.argsort(rows.data[:, 0], kind="stable")]
         self._rows, self._frames = rows, rows.data[:, 0].astype(int)
-        self.first = first
         self.last = int(self._frames.max(initial=0)) if last is None else last
 
     def of_frame(self, number: int) -> DetectedBoxes:
@@ -84,16 +80,15 @@ class Rows:
 Detector = Rows | Callable[[Any], Any] | Iterable[Any]
 
 
-def as_detector(detections: Any, first: int = 1) -> Detector:
+def as_detector(detections: Any) -> Detector:
     """Files and arrays as rows; a callable and an iterable as they are.
 
-    Frames are numbered from `first` on. Raises `ValueError` for anything else, and for rows that
-    are not in MOTChallenge's form.
+    Raises `ValueError` for anything else, and for rows that are not in MOTChallenge's form.
     """
     if isinstance(detections, str | Path):
         detections = read_detections(detections)
     if isinstance(detections, np.ndarray | jax.Array):
-        return Rows(np.asanyarray(detections), first)
+        return Rows(np.asanyarray(detections))
     is_detector = callable(detections) and not isinstance(detections, type)
     if is_detector or isinstance(detections, Rows) or is_series(detections):
         return detections

@@ -3,13 +3,13 @@
 import contextlib
 from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from mpfjax.checks import Count, Finite, checked
+from mpfjax.checks import Count, Finite, checked, one_of
 from mpfjax.operations.compiling import in_little_memory, jit_with
 from mpfjax.vision.files.boxes import centred, top_left
 from mpfjax.vision.files.frames import of_one_kind, read_frames
@@ -45,7 +45,7 @@ def track(
     max_detections: Count | None = None,
     use_colours: bool = True,
     frame_size: tuple[int, int] | None = None,
-    camera_motion: Literal["pixels", "detections"] | None = None,
+    camera_motion: Annotated[str, one_of(("pixels", "detections"))] | None = None,
     ahead: bool = False,
 ) -> Generator[Tracks, None, None]:
     """Track what a detector finds in a video: yields the `Tracks` of each frame as it comes.
@@ -91,7 +91,7 @@ def track(
     if isinstance(frames, str | Path):
         frames = read_frames(frames, first)
     del key
-    detector, sieve = as_detector(detections, first), Sieve(min_score, frame_size)
+    detector, sieve = as_detector(detections), Sieve(min_score, frame_size)
     if frames is None and callable(detector):
         raise ValueError("detections: a detector needs frames, and frames is None")
     if frames is None and camera_motion == "pixels":
