@@ -1,9 +1,11 @@
 """Tracks made of what is kept of each frame."""
 
+import jax
 import numpy as np
 import pytest
 
-from mpfjax.vision.boxes.following import Snapshot, annotate, track_rows
+from mpfjax.vision.boxes.following import Snapshot, annotate, follow, track_rows
+from mpfjax.vision.boxes.recipes import PRESETS
 from mpfjax.vision.files.drawing import PALETTE, with_tracks
 
 
@@ -70,3 +72,21 @@ def test_every_id_can_be_read_on_dark():
         drawn = with_tracks(dark, np.array([[1.0, id, 20, 25, 20, 20]]))
         assert drawn[:24].max() > 120
         assert drawn[26:].max() > 120
+
+
+@pytest.mark.parametrize("name", ["default", "paper"])
+def test_the_recipes_keep_to_objects_that_stand_still(name):
+    """A red and a blue box on grey: a component is on each, and in all three frames."""
+    still, boxes = (
+        np.full((48, 64, 3), 110, np.uint8),
+        np.array([[8.0, 10, 8, 14], [40, 24, 8, 14]]),
+    )
+    for (x, y, w, h), colour in zip(boxes.astype(int), [(220, 10, 10), (10, 10, 220)], strict=True):
+        still[y : y + h, x : x + w] = colour
+    keys = jax.random.split(jax.random.key(0), 1)
+    snapshots = list(follow(PRESETS[name](still, boxes)["mpf"], keys, [still] * 3))
+    assert len(snapshots) == 3
+    for snapshot in snapshots:
+        means = snapshot.means[0][snapshot.active[0]]
+        gaps = np.abs(means[:, None, :2] - boxes[None, :, :2] - [4, 7]).max(axis=2)
+        assert (gaps.min(axis=0) < 3).all()

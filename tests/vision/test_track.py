@@ -100,6 +100,11 @@ def write_detections(path):
     path.write_text("".join(",".join(map(str, row)) + "\n" for row in walks()))
 
 
+def test_grey_frames_are_frames():
+    grey = stills()[..., :1]
+    assert_same(tracked(grey, walks()), tracked(np.repeat(grey, 3, axis=3), walks()))
+
+
 def test_tracks_are_the_same_where_frames_are_looked_at_ahead(with_pixels):
     found = tracked(stills(), detector_of(walks()), ahead=True)
     assert_same(found, with_pixels)
