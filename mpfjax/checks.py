@@ -456,7 +456,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     signature = inspect.signature(function)
 
     @functools.wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+    def call(*args: Any, **kwargs: Any) -> R:
         values = signature.bind(*args, **kwargs).arguments
         for name, rule in _rules(function).items():
             if name in values:
