@@ -3,7 +3,6 @@
 import errno
 import io
 import os
-import struct
 import time
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
@@ -117,7 +116,7 @@ class TestRoundTrip:
 
 
 class TestFiles:
-    def test_whichever_bit_flips_and_wherever_it_is_cut_off_there_is_no_other_error(self, path):
+    def test_a_file_that_is_cut_off_or_has_a_flipped_bit_loads_as_it_was_or_not_at_all(self, path):
         write_arrays(path, {"x": np.arange(3.0)})
         stored = path.read_bytes()
         np.savez_compressed(path, x=np.arange(3.0))
@@ -131,19 +130,11 @@ class TestFiles:
             for content in spoilt:
                 path.write_bytes(content)
                 try:
-                    load_arrays(path)
+                    np.testing.assert_equal(load_arrays(path), {"x": np.arange(3.0)})
                 except ValueError as error:
                     faults.append(str(error))
         assert len(faults) > 100
         assert all("checkpoint.npz: cut off, damaged" in fault for fault in faults)
-
-    def test_a_flipped_bit_of_an_array_is_noticed(self, path):
-        write_arrays(path, {"x": np.full(100, 7.0)})
-        content = bytearray(path.read_bytes())
-        content[content.index(np.float64(7.0).tobytes()) + 3] ^= 1
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match="cut off, damaged"):
-            load_arrays(path)
 
     def test_several_writers_of_one_path_leave_a_whole_file(self, path):
         """And whoever reads it meanwhile finds one that is whole."""
@@ -185,27 +176,13 @@ class TestFiles:
             load_arrays(tmp_path / "code.npz")
         assert not trace.exists()
 
-    @pytest.mark.parametrize(
-        "content",
-        [
-            ((10**12,), "<f8", b""),
-            ((2, 10**30), "<f8", bytes(16)),
-            ((3,), "<f8", bytes(16)),
-            ((1,), "|O", bytes(8)),
-            b"\x93NUMPY\x01\x00" + struct.pack("<H", 9000) + b"-" * 8999 + b"1",
-            b"",
-        ],
-        ids=range(6),
-    )
-    def test_headers_that_lie_are_errors_that_name_the_file(self, tmp_path, content):
-        if isinstance(content, tuple):
-            shape, dtype, values = content
-            file = io.BytesIO()
-            header = {"descr": dtype, "fortran_order": False, "shape": shape}
-            np.lib.format.write_array_header_1_0(file, header)
-            content = file.getvalue() + values
+    @pytest.mark.parametrize("shape", [(10**12,), (2, 10**30), (3,), (-1, -2)])
+    def test_headers_that_lie_are_errors_that_name_the_file(self, tmp_path, shape):
+        file = io.BytesIO()
+        header = {"descr": "<f8", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)
         with zipfile.ZipFile(tmp_path / "lies.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("x.npy", content)
+            archive.writestr("x.npy", file.getvalue() + bytes(16))
         with pytest.raises(ValueError, match=r"lies.npz: cut off, damaged"):
             load_arrays(tmp_path / "lies.npz")
 
