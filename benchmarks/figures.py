@@ -104,7 +104,8 @@ def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str])
         ),
         Panel(
             "RMS error of the upper mode's mass", x,
-            r"error of $P(x_t > 0 \mid y_1 \ldots y_t)$", lines_of(entries, *at, "mode_mass_error"),
+            r"error of $P(x_t > 0 \mid y_1 \ldots y_t)$",
+            lines_of(entries, *at, "mode_mass_error"), (0, None),
         ),
     ]  # fmt: skip
     return draw_panels([panels], ("log", "linear"))
@@ -276,7 +277,7 @@ class Panel(NamedTuple):
     xlabel: str
     ylabel: str
     lines: Mapping[str, Sequence[tuple[float, ...]]]
-    ylim: tuple[float, float] | None = None
+    ylim: tuple[float, float | None] | None = None
     at: float | None = None
 
 
@@ -346,7 +347,7 @@ def _draw_panel(axis: Axes, panel: Panel, names: Sequence[str], scales: tuple[st
         else:
             axis.plot(x, y, **style)
     axis.set(xscale=scales[0], yscale=scales[1], xlabel=panel.xlabel, ylabel=panel.ylabel)
-    axis.set_title(panel.title, fontsize=10)
+    axis.set_title(textwrap.fill(panel.title, 50), fontsize=10)
     if len(ticks) <= _MOST_TICKS:
         whole = [f"{tick:,.0f}".replace(",", "\u2009") for tick in ticks]
         labels = [
