@@ -236,13 +236,6 @@ def check_positive_array(**arguments: Any) -> None:
     _check_entries(lambda array: (array > 0) & np.isfinite(array), "positive and finite", arguments)
 
 
-def check_not_negative_array(**arguments: Any) -> None:
-    """Each array has numbers, all finite and none negative, where their values are known."""
-    _check_entries(
-        lambda array: (array >= 0) & np.isfinite(array), "finite and not negative", arguments
-    )
-
-
 def check_finite_array(**arguments: Any) -> None:
     """Each array has numbers, all of them finite, where their values are known."""
     _check_entries(np.isfinite, "finite", arguments)
@@ -328,20 +321,6 @@ def check_one_each(num_particles: int, /, **results: Any) -> None:
                 f"{name}: it returned {shown(jax.tree.map(jnp.shape, values))}, no arrays whose"
                 f" leading axis is that of the {num_particles} particles"
             )
-
-
-def check_scalars(**arguments: Any) -> None:
-    """Each array is a single number."""
-    for name, array in arguments.items():
-        if np.shape(array) != ():
-            raise ValueError(f"{name}: shape {np.shape(array)} is not that of one number, ()")
-
-
-def check_rows(**arguments: Any) -> None:
-    """Each array has one axis at least, and numbers along it."""
-    for name, array in arguments.items():
-        if np.ndim(array) < 1 or 0 in np.shape(array):
-            raise ValueError(f"{name}: shape {np.shape(array)} is not (d,), nor (n, d)")
 
 
 def _check_entries(holds: Callable[..., Any], what: str, arguments: dict[str, Any]) -> None:

@@ -323,6 +323,67 @@ BUGS = {
         "jnp.log(jax.random.uniform(key_accept, (), gain.dtype)) < gain",
         "jnp.log(jax.random.uniform(key_walk, (), gain.dtype)) < gain",
         "tests/test_exact_answers.py -k chains",
+    # Models, exact answers and inputs.
+    "A of a linear model is transposed": Bug(
+        "models/linear.py",
+        "mean = states @ self.A.T",
+        "mean = states @ self.A",
+        "tests/models/test_models.py -k linear",
+    ),
+    "an autoregression forgets the volume of its noise": Bug(
+        "models/dynamics.py",
+        "return _log_standard_normal(solve_lower(factors, steps)) - log_volume",
+        "return _log_standard_normal(solve_lower(factors, steps))",
+        "tests/models/test_dynamics.py -k density",
+    ),
+    "a velocity learns twice what it should": Bug(
+        "models/dynamics.py",
+        "return following - (expected - current) - gain * (following - expected)",
+        "return following - (expected - current) - 2 * gain * (following - expected)",
+        "tests/models/test_dynamics.py -k path",
+    ),
+    "regimes follow each other backwards": Bug(
+        "exact/switching.py",
+        "log_prior = log_prior + model.log_transition(sequences[:, s + 1], sequences[:, s])",
+        "log_prior = log_prior + model.log_transition(sequences[:, s], sequences[:, s + 1])",
+        "tests/models/test_switching.py -k joint",
+    ),
+    "pairs of objects interact twice": Bug(
+        "models/multi_object.py",
+        "for of in np.triu_indices(self.num_objects, 1)",
+        "for of in np.nonzero(~np.eye(self.num_objects, dtype=bool))",
+        "tests/models/test_multi_object.py -k pairs",
+    ),
+    "the grid's kernel has no width of a cell": Bug(
+        "exact/grid.py",
+        "return cell * jnp.exp(jax.vmap(row)(states))",
+        "return jnp.exp(jax.vmap(row)(states))",
+        "tests/test_exact.py -k grid",
+    ),
+    "a grid's cell counts to one side of the threshold alone": Bug(
+        "exact/grid.py",
+        "jnp.clip((self.grid - threshold) / cell + 0.5, 0.0, 1.0)",
+        "jnp.clip((self.grid - threshold) / cell, 0.0, 1.0)",
+        "tests/test_exact.py -k modes",
+    ),
+    "the smoother goes back by the filter's covariance": Bug(
+        "exact/kalman.py",
+        "gain @ (step.Q + later_covariance) @ gain.T",
+        "gain @ (step.Q + covariance) @ gain.T",
+        "tests/test_exact.py -k joint",
+    ),
+    "inputs of trajectories are one step off": Bug(
+        "smoothing/trajectories.py",
+        "steps = (keys, earlier, ancestors, proposed, inputs)",
+        "off = jax.tree.map(lambda u: jnp.roll(u, 1), inputs)\n"
+        "    steps = (keys, earlier, ancestors, proposed, off)",
+        "tests/test_inputs.py -k smoothed",
+    ),
+    "a step of zero likelihood keeps no weights": Bug(
+        "chain.py",
+        "log_weights = jnp.where(keep, shares, previous.log_weights)",
+        "log_weights = shares",
+        "tests/test_filters.py -k impossible",
     ),
 }
 

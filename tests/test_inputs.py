@@ -367,29 +367,3 @@ def test_an_error_where_none_were_given_says_so():
         with pytest.raises(TypeError) as caught:
             call()
         assert "inputs: there are none, so Driven" in "".join(caught.value.__notes__)
-
-
-def test_gradients_with_respect_to_inputs_and_parameters():
-    """The score of the plain filter, averaged over seeds, against the Kalman filter's."""
-    keys = jax.random.split(jax.random.key(1), 100)
-    filter = mpfjax.particle_filter(Driven(), 300, gradient="stop")
-
-    def log_z(gain, u, key):
-        own = eqx.tree_at(lambda f: f.model.gain, filter, gain)
-        given = {"dt": jnp.asarray(INPUTS["dt"]), "u": u}
-        run = mpfjax.run_filter(key, own, OBSERVATIONS, nothing, inputs=given)
-        return run.log_marginal_likelihood
-
-    def exact(gain, u):
-        model, inputs = in_matrices(gain)
-        given = inputs | {"inputs": u[:, None]}
-        return kalman_filter(model, OBSERVATIONS[:, None], inputs=given).log_marginal_likelihood
-
-    at = jnp.asarray(GAIN), jnp.asarray(INPUTS["u"])
-    expected = jax.grad(exact, argnums=(0, 1))(*at)
-    score = jax.vmap(jax.grad(log_z, argnums=(0, 1)), (None, None, 0))
-    found = jax.jit(score)(*at, keys)
-    for value, truth in zip(found, expected, strict=True):
-        error = np.std(value, axis=0) / np.sqrt(len(keys))
-        assert (error < 0.15).all()
-        np.testing.assert_array_less(np.abs(np.mean(value, axis=0) - truth), 4 * error + 0.02)

@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import as_numbers, check_key, check_whole, shown
+from mpfjax.checks import Count, as_numbers, checked, shown
 from mpfjax.models.base import (
+    AbstractStateSpaceModel,
     check_log_density,
     check_moved,
     check_states,
     is_made_of_noise,
     model_name,
     require,
-    require_model,
     require_noise,
     saying_that_none_were_given,
     takes_inputs,
@@ -37,8 +37,13 @@ _FAMILIES, _SIBLINGS = 8, 128  # of those that log_transition must know
 _MOST_RATIO, _MOST_ERRORS = 4.0, 5.0
 
 
+@checked
 def check_model(
-    key: Key[Array, ""], model: Any, observation: PyTree, *, inputs: PyTree = None
+    key: Key[Array, ""],
+    model: AbstractStateSpaceModel,
+    observation: PyTree,
+    *,
+    inputs: PyTree = None,
 ) -> None:
     """Try a model out on one observation, y_1; a `ValueError` names the first fault found.
 
@@ -56,8 +61,6 @@ def check_model(
     The last two look at a few thousand random draws, of x_0 and of the first two steps: they accept
     a right model, and may accept one that is wrong by a few percent. `inputs` are u_1.
     """
-    check_key(key)
-    require_model(model, "check_model")
     inputs = _as_inputs(inputs, model)
     if not jax.tree.leaves(observation):
         raise ValueError(f"observation: {shown(observation)} holds no array")
@@ -207,12 +210,11 @@ def _check_transition(key: Key[Array, ""], model: Any, states: PyTree) -> None:
             )
 
 
+@checked
 def simulate(
-    key: Key[Array, ""], model: Any, num_steps: int, inputs: PyTree = None
+    key: Key[Array, ""], model: Any, num_steps: Count, inputs: PyTree = None
 ) -> tuple[PyTree, PyTree]:
     """`AbstractStateSpaceModel.simulate`."""
-    check_key(key)
-    check_whole(num_steps=num_steps)
     require(model, "sample_observation", "simulate")
     inputs = _as_inputs(inputs, model)
     for leaf in jax.tree.leaves(inputs):

@@ -67,25 +67,13 @@ def cholesky(matrix: Float[Array, "d d #n"], floor: bool = False) -> Float[Array
     A direction without variance, but for rounding, gets a column of zeros; with `floor` the root of
     the rounding on the diagonal, so that L can be divided by.
     """
-    d = matrix.shape[0]
-    eps = jnp.finfo(matrix.dtype).eps
-    tiny = jnp.finfo(matrix.dtype).tiny
-    zero = jnp.zeros_like(matrix[0, 0])
-    rows: list[list[Array]] = [[zero] * d for _ in range(d)]
-    for j in range(d):
-        rest = matrix[j, j]
-        for k in range(j):
-            rest = rest - rows[j][k] ** 2
-        least = _ROUNDINGS * d * eps * jnp.abs(matrix[j, j]) + tiny
-        is_positive = rest > least
-        pivot = jnp.sqrt(jnp.where(is_positive, rest, least))
-        rows[j][j] = pivot if floor else jnp.where(is_positive, pivot, 0.0)
-        for i in range(j + 1, d):
-            entry = matrix[i, j]
-            for k in range(j):
-                entry = entry - rows[i][k] * rows[j][k]
-            rows[i][j] = entry / pivot if floor else jnp.where(is_positive, entry / pivot, 0.0)
-    return jnp.stack([jnp.stack(row) for row in rows])
+    factor, variances = without_correlations(matrix)
+    eps, tiny = jnp.finfo(matrix.dtype).eps, jnp.finfo(matrix.dtype).tiny
+    own = jnp.stack([jnp.abs(row[j]) for j, row in enumerate(matrix)])
+    least = _ROUNDINGS * len(own) * eps * own + tiny
+    # Chosen before the root, which has no derivative at zero.
+    roots = jnp.sqrt(jnp.where(variances > 0, variances, least))
+    return factor * (roots if floor else jnp.where(variances > 0, roots, 0.0))[None]
 
 
 def solve_lower(
@@ -105,14 +93,8 @@ def solve_upper(
     factor: Float[Array, "d d #n"], right: Float[Array, "d e #n"]
 ) -> Float[Array, "d e n"]:
     """L⁻ᵀ B of the lower triangular L, by backward substitution."""
-    d = factor.shape[0]
-    rows: list[Array] = []
-    for i in reversed(range(d)):
-        rest = right[i]
-        for k in range(i + 1, d):
-            rest = rest - factor[k, i][None] * rows[d - 1 - k]
-        rows.append(rest / factor[i, i][None])
-    return jnp.stack(rows[::-1])
+    # Mirrored, the upper triangle is a lower one.
+    return solve_lower(transposed(factor)[::-1, ::-1], right[::-1])[::-1]
 
 
 def without_correlations(
