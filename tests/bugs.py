@@ -323,6 +323,7 @@ BUGS = {
         "jnp.log(jax.random.uniform(key_accept, (), gain.dtype)) < gain",
         "jnp.log(jax.random.uniform(key_walk, (), gain.dtype)) < gain",
         "tests/test_exact_answers.py -k chains",
+    ),
     # Models, exact answers and inputs.
     "A of a linear model is transposed": Bug(
         "models/linear.py",
