@@ -86,40 +86,21 @@ def check_chain(moves: Moves, num_particles: int, num_components: int) -> None:
                 f"particles_per_component: {per_component} for each of {num_components}"
                 f" components needs more than num_particles, {num_particles}"
             )
-    if not moves:
-        raise ValueError("moves: a filter needs at least one")
+    names = ", ".join(map(name_of, moves))
     if not any(move.weighs for move in moves):
         raise ValueError(
-            f"moves: {', '.join(map(name_of, moves))} never weigh the particles by what is"
-            " observed, and log Ẑ would be 0; Propagate does, or Reweight after Predict"
+            f"moves: {names or 'none'} never weigh the particles by what is observed, and log Ẑ"
+            " would be 0; Propagate does, or Reweight after Predict"
         )
-    _check_memory(moves)
-    _check_parents(moves)
-
-
-def _check_memory(moves: Moves) -> None:
-    """Each memory has one keeper, and each that is read has one."""
-    keepers: dict[str, str] = {}
-    for move in with_inner(moves):
-        for name in move.own_memory:
-            if name in keepers:
-                raise ValueError(
-                    f"moves: {keepers[name]} and {name_of(move)} would share one memory, {name!r}"
-                )
-            keepers[name] = name_of(move)
-    for move in with_inner(moves):
-        for name in sorted(move.reads - set(keepers)):
-            raise ValueError(
-                f"moves: {name_of(move)} reads the memory {name!r}, which none of them keeps"
-            )
-
-
-def _check_parents(moves: Moves) -> None:
-    """Where a move needs x_{t-1} of the particles, no move loses it after the propagation."""
-    if not any(move.needs_parents for move in moves):
-        return
-    first = next((t for t, move in enumerate(moves) if move.propagates), 0)
-    check_keep_parents("moves", moves[first:], "another move")
+    kept = [name for move in with_inner(moves) for name in move.own_memory]
+    read = {name for move in with_inner(moves) for name in move.reads}
+    for name in sorted(read | set(kept)):
+        if kept.count(name) != 1:
+            number = f"{kept.count(name) or 'none'} of {names}"
+            raise ValueError(f"moves: the memory {name!r} is kept by {number}, and not by one")
+    if any(move.needs_parents for move in moves):
+        first = next((t for t, move in enumerate(moves) if move.propagates), 0)
+        check_keep_parents("moves", moves[first:], "another move")
 
 
 def check_keep_parents(argument: str, moves: Iterable[AbstractMove], needed_by: str) -> None:

@@ -14,6 +14,7 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter
+from tests.marking import exactness
 from tests.registry import CHAINS, NUM_PARTICLES, QUICK_CHAINS
 from tests.user_models import (
     BLINDED,
@@ -81,11 +82,15 @@ def chain_filter(chain, model):
 
 # What the state is makes no difference to regrouping: a second model for a few, and more slots than
 # particles for what deals with them, each in its own way.
-EXACT = [(chain, "quadratic", None) for chain in CHAINS if is_exact(chain)] + [
+IN_SLOTS = ("pf ssp", "pf multinomial", "metropolis", "mpf", "random labels, residual")
+OTHERWISE = [
     ("guided pf", "drift of one", None),
     *((chain, "drift", None) for chain in ("guided mpf", "partitioned in clusters", "mpf rqmc")),
-    *((chain, "quadratic", 120) for chain in ("pf ssp", "metropolis", "random labels, residual")),
-    ("pf multinomial", "quadratic", 120),
+    *((chain, "quadratic", 120) for chain in IN_SLOTS),
+]
+EXACT = [
+    *((chain, "quadratic", None) for chain in CHAINS if is_exact(chain)),
+    *exactness(OTHERWISE),
 ]
 
 

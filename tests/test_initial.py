@@ -110,8 +110,6 @@ def test_without_an_observation_it_does_nothing():
     run, plain = (mpfjax.run_filter(KEY, make(k), gap, missing="skip") for k in (4, 1))
     np.testing.assert_array_equal(run.initial.log_weights, plain.initial.log_weights)
     assert run.initial.log_scale == 0
-    mixture = make(4).init(KEY)
-    assert not np.any(np.asarray(mixture.log_weights) + np.log(100) > 1e-6)
 
 
 def test_what_a_chain_weighs_before_it_propagates_counts():
@@ -137,32 +135,12 @@ def test_what_a_chain_weighs_before_it_propagates_counts():
     assert is_near(np.exp(np.asarray(found.log_marginal_likelihood, np.float64) - log_z))
 
 
-def test_every_second_step_is_the_second_and_the_fourth():
-    model = Wide()
-    propagate = mpfjax.Propagate(model)
-    filter = mpfjax.Filter(
-        model, [mpfjax.Every(2, [mpfjax.Resample()]), propagate], 100,
-        initial_moves=[SelectInitial(propagate, 4)],
-    )  # fmt: skip
-    run = mpfjax.run_filter(KEY, filter, np.full(5, 3.0, np.float32))
-    np.testing.assert_array_equal(run.resampled[:, 0], [False, True, False, True, False])
-
-
 def test_on_islands_the_masses_of_their_choices_count():
-    log_z, _ = Wide().kalman()
-    keys = jax.random.split(KEY, 300)
+    def run(key):
+        return mpfjax.run_islands(key, make(8, 50), OBSERVATIONS, nothing, num_islands=2)
 
-    def log_evidence(num_draws):
-        def run(key):
-            return mpfjax.run_islands(
-                key, make(num_draws, 50), OBSERVATIONS, nothing, num_islands=2
-            )
-
-        return np.asarray(jax.jit(jax.vmap(run))(keys).log_marginal_likelihood, np.float64) - log_z
-
-    chosen, plain = log_evidence(8), log_evidence(1)
-    assert is_near(np.exp(chosen))
-    assert np.sqrt(np.mean(chosen**2)) < 0.6 * np.sqrt(np.mean(plain**2))
+    found = jax.jit(jax.vmap(run))(jax.random.split(KEY, 300)).log_marginal_likelihood
+    assert is_near(np.exp(np.asarray(found, np.float64) - Wide().kalman()[0]))
 
 
 def test_where_x_0_must_be_a_plain_draw_it_is_one():
@@ -172,17 +150,6 @@ def test_where_x_0_must_be_a_plain_draw_it_is_one():
     np.testing.assert_array_equal(found.trajectory, same.trajectory)
     chosen = make(8, scheme="multinomial")
     assert not with_first_ancestors(chosen).looks_at_first
-
-
-def test_in_slots_the_choice_is_that_of_a_run_without():
-    keys = jax.random.split(KEY, 2)
-    filter = mpfjax.mixture_particle_filter(mpfjax.QuadraticModel(), 30, 2)
-    plain = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, nothing)
-    in_slots = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, nothing, slots=48)
-    np.testing.assert_allclose(
-        in_slots.initial.particles[:, :30], plain.initial.particles, rtol=1e-5
-    )
-    np.testing.assert_allclose(in_slots.initial.log_scale, plain.initial.log_scale, atol=1e-6)
 
 
 def expected_trust(values):

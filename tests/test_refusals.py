@@ -441,7 +441,7 @@ REFUSED = (
     ("moves: .* is not a list of moves", lambda: mpfjax.Every(2, KMeans())),
     ("moves: (?s:.*) neither regroups, resamples nor",
      lambda: mpfjax.Every(2, [KMeans(), Propagate(MODEL)])),
-    ("moves: Every and Every would share one memory",
+    ("moves: the memory 'every 2: KMeans' is kept by 2",
      lambda: FILTER.replace(
          moves=[*FILTER.moves, *(mpfjax.Every(2, [KMeans(k)]) for k in (1, 2))])),
     *(
