@@ -199,7 +199,7 @@ class _Ascent:
             if stopped is None:
                 stopped = f"{fault} at step {state.step}"
                 warnings.warn(
-                    f"{self.caller}: {stopped}; its result is of the step before", stacklevel=3
+                    f"{self.caller}: {stopped}; its result is of the step before", stacklevel=4
                 )
             reals, value = jax.tree.map(lambda rows: jnp.asarray(rows[-1]), path), float(values[-1])
         history = {self.objective: values, "deviation": deviations}

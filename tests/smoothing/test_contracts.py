@@ -133,7 +133,7 @@ ONLINE = [name for name, smoother in SMOOTHERS.items() if smoother.online]
 
 
 @pytest.mark.parametrize("observations", ODD.values(), ids=ODD)
-@pytest.mark.parametrize("name", quick_of(["of a run", *ONLINE], ["of a run", "fixed lag, MCMC"]))
+@pytest.mark.parametrize("name", quick_of(["of a run", *ONLINE], ["of a run"]))
 def test_rows_are_finite(name, observations):
     model, _ = MODELS["two modes"]
     filter = mpfjax.particle_filter(model, 20)

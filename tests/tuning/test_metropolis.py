@@ -8,11 +8,12 @@ from jax.scipy.stats import norm
 
 import mpfjax
 from mpfjax.tuning import Interval, metropolis_hastings
-from tests.user_models import ScalarLinear, nothing_traced
+from tests.user_models import ScalarLinear
 
 OBSERVATIONS = jnp.array([1.5, 0.2, -0.4, 0.8, 1.9, 1.1, 0.3, -0.9, 0.4, 1.2])
 A = {"a": lambda filter: filter.model.a}
 INSIDE = Interval(-1.0, 1.0)
+TRACED = []
 
 
 def log_prior(parameters):
@@ -29,12 +30,24 @@ def sample(num_steps=5, *, filter=None, key=None, **options):
     return metropolis_hastings(key, filter, OBSERVATIONS, num_steps, **options)
 
 
-def test_the_likelihoods_are_those_of_the_states():
-    """They change when, and only when, a step moves."""
-    run = sample(30, num_chains=3)
+class Counted(ScalarLinear):
+    """Knows how often it was traced."""
+
+    def log_likelihood(self, observation, states):
+        TRACED.append(None)
+        return super().log_likelihood(observation, states)
+
+
+def test_likelihoods_are_those_of_the_states_and_calls_share_a_program():
+    """They change when, and only when, a step moves; of any length, burn-in and thinning."""
+    filter = mpfjax.particle_filter(Counted(), 12)
+    run = sample(30, num_chains=3, filter=filter)
     moved = np.diff(run.log_marginal_likelihoods, axis=1) != 0
     np.testing.assert_array_equal(np.diff(run.parameters["a"], axis=1) != 0, moved)
     np.testing.assert_array_equal(run.accepted[:, 1:], moved)
+    before = len(TRACED)
+    sample(40, num_chains=3, filter=filter, burn_in=7, thinning=3, key=jax.random.key(5))
+    assert len(TRACED) == before > 0
 
 
 class Fragile(ScalarLinear):
@@ -68,25 +81,6 @@ def test_a_prior_that_is_nan_outside_its_support_is_zero_there():
     assert not run.num_invalid["log_marginal_likelihood"].any()
 
 
-def test_what_the_prior_rules_out_is_never_reached():
-    """Not even a likelihood that is NaN there."""
-
-    def low(parameters):
-        return jnp.where(parameters["a"] > 0.9, -jnp.inf, 0.0)
-
-    filter = mpfjax.particle_filter(Fragile(a=0.5), 12)
-    run = sample(60, filter=filter, num_chains=4, log_prior=low)
-    assert run.stopped is None
-    assert (run.parameters["a"] <= 0.9).all()
-
-
 def test_a_start_that_breaks_is_an_error():
     with pytest.raises(RuntimeError, match="was NaN or inf"):
-        sample(filter=mpfjax.particle_filter(Fragile(a=0.95), 12))
-
-
-def test_calls_share_one_program():
-    """Of any length, burn-in and thinning."""
-    sample(3)
-    with nothing_traced():
-        sample(40, burn_in=7, thinning=3, key=jax.random.key(5))
+        sample(filter=mpfjax.particle_filter(Fragile(a=0.95), 12), num_chains=4)
