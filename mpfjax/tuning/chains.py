@@ -44,10 +44,8 @@ class Step(NamedTuple):
 class AbstractKernel(eqx.Module):
     """A Markov kernel on parameters, and on whatever a chain carries with them."""
 
-    @property
-    @abc.abstractmethod
-    def learns_scale(self) -> bool:
-        """Whether the scale of its random walk follows the acceptance."""
+    learns_scale = False
+    """whether the scale of its random walk follows the acceptance."""
 
     @abc.abstractmethod
     def start(self, key: Key[Array, ""], reals: Reals) -> tuple[Any, Bool[Array, ""]]:

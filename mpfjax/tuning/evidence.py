@@ -31,7 +31,7 @@ class LogEvidence(eqx.Module):
         total = 0.0
         for g, group in enumerate(self.groups):
             keys = jax.random.split(jax.random.fold_in(key, g), group.length)
-            run = lambda key, series: scan(key, filter, series, _nothing)  # noqa: E731
+            run = lambda key, series: scan(key, filter, series, lambda mixture: None)  # noqa: E731
             total += jnp.sum(jax.vmap(run)(keys, group).log_marginal_likelihood)
         return jnp.asarray(total)
 
@@ -119,7 +119,3 @@ def with_present(series: Series) -> Series:
     if series.present is not None:
         return series
     return Series(series.observations, series.inputs, np.ones(series.length, bool))
-
-
-def _nothing(mixture: Any) -> None:
-    del mixture

@@ -116,14 +116,12 @@ def metropolis_hastings(
 
 
 class _Kernel(AbstractKernel):
-    """Random-walk Metropolis-Hastings on pairs of unconstrained numbers and a key."""
+    """Random-walk Metropolis-Hastings on pairs of unconstrained numbers and a key.
+
+    It learns no scale: noise in log Ẑ rejects steps of any length.
+    """
 
     density: LogDensity
-
-    @property
-    def learns_scale(self) -> bool:
-        """False: noise in log Ẑ rejects steps of any length, whatever the scale."""
-        return False
 
     def start(self, key: Key[Array, ""], reals: Reals) -> tuple[Point, Bool[Array, ""]]:
         """The pair, and whether its density is positive."""
