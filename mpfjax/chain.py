@@ -14,8 +14,12 @@ from mpfjax.models.base import AbstractStateSpaceModel, saying_that_none_were_gi
 from mpfjax.moves.base import AbstractMove, Moves, name_of, with_inner, without_dead
 from mpfjax.moves.eve_indices import EVE_INDICES, evidence_variance, mass_variances
 from mpfjax.observations import Fault, faults_of
-from mpfjax.operations.islands import excess_over_islands, island_index, num_islands
-from mpfjax.operations.logarithms import scaled_log_sum_exp
+from mpfjax.operations.logarithms import (
+    excess_over_islands,
+    island_index,
+    num_islands,
+    scaled_log_sum_exp,
+)
 
 BROKEN_DENSITY = "model: a density was NaN or infinite for some particle"
 

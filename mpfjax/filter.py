@@ -30,8 +30,8 @@ from mpfjax.moves.base import AbstractMove, as_moves, initial_memory
 from mpfjax.moves.initial import sample_initial
 from mpfjax.observations import one_input, one_observation, raise_faults
 from mpfjax.operations.compiling import jit_with_floats_traced
-from mpfjax.operations.islands import drawn_once
 from mpfjax.operations.random import split, split_keys
+from mpfjax.operations.stored import drawn_once
 
 
 class Filter(eqx.Module):

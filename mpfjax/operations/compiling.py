@@ -15,13 +15,8 @@ from jax.core import Tracer
 from jax.experimental.compilation_cache import compilation_cache
 from jaxtyping import PyTree
 
-_VECTOR_WIDTH = "xla_cpu_prefer_vector_width"
-_WITHOUT_PASSES = "xla_disable_hlo_passes"
-_TREE_SUMS = "tree_reduction_rewriter"
-_THREADS_OF_ITS_OWN = "cpu-parallel-task-assigner"
 # Since this version XLA sums on vectors, and long rows by a library, in any order.
 _SUMS_ON_VECTORS = (0, 10)
-_OPTIMISATION = "xla_backend_optimization_level"
 _FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
 _settings: Any = jax.config  # whose attributes no type checker knows
 
@@ -43,13 +38,14 @@ def cpu_options(
     if jax.default_backend() != "cpu":
         return {}
     optimised = not jax.config.read("jax_disable_most_optimizations")
-    options = _older_emitters() if older_emitters else {_VECTOR_WIDTH: 512}
+    options = _older_emitters() if older_emitters else {"xla_cpu_prefer_vector_width": 512}
     in_one_piece = optimised and jax.__version_info__[:2] >= _SUMS_ON_VECTORS
-    without = [_TREE_SUMS] * in_one_piece + [_THREADS_OF_ITS_OWN] * one_thread
-    if without:
-        options = options | {_WITHOUT_PASSES: ",".join(without)}
+    passes = ["tree_reduction_rewriter"] * in_one_piece
+    passes += ["cpu-parallel-task-assigner"] * one_thread
+    if passes:
+        options = options | {"xla_disable_hlo_passes": ",".join(passes)}
     if soon and optimised:
-        options = options | {_OPTIMISATION: 1}
+        options = options | {"xla_backend_optimization_level": 1}
     flags = os.environ.get("XLA_FLAGS", "")
     return {name: value for name, value in options.items() if name not in flags}
 
@@ -71,7 +67,6 @@ def jit_on_wide_vectors(
     to its own `jax.jit(..., compiler_options=...)`, or in XLA_FLAGS.
     """
     plain = eqx.filter_jit(function)
-
     one_at_a_time = threading.Lock()
 
     @functools.cache

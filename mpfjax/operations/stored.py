@@ -1,19 +1,25 @@
-"""What XLA computes once and keeps, and gathers and scatters of it.
+"""What XLA computes once and keeps, branches that runs take together, gathers and scatters.
 
 In numpy: `values.copy()`, `values.astype(int)`, `values[indices]` and `np.bincount(places)`. XLA
 fuses a computation into everything that uses its result, and then repeats it for every use. It does
 not fuse across the call of a function that it must not inline, and a call that does nothing takes
-no time. An operation has one form for CPUs and another for all other platforms.
+no time. Nor does it fuse across a condition. Under `vmap`, `jax.lax.cond` becomes a `where` as soon
+as its condition differs from run to run, and both branches run. Where the expensive branch gives
+the right result for every run, the runs can choose together: if one needs it, all take it.
+
+An operation has one form for CPUs and another for all other platforms.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float, Int, PyTree, Shaped, UInt32
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped, UInt32
 
 _only_the_default_forms = False  # set by tests, which try them without a GPU
 VECTOR = 32
@@ -112,3 +118,50 @@ def inverse_permutation(places: Int[Array, " n"]) -> Int[Array, " n"]:
     index = jnp.arange(places.shape[0], dtype=jnp.int32)
     found = jnp.zeros_like(index).at[from_the_start(stored(places))]
     return found.set(index, mode="promise_in_bounds", unique_indices=True)
+
+
+def cond_if_any(
+    is_needed: Bool[Array, ""], dear: Callable[[], PyTree], cheap: Callable[[], PyTree]
+) -> PyTree:
+    """`dear()` if any run of the caller's `vmap` needs it, `cheap()` otherwise.
+
+    For a run that does not need it, `dear()` must give the result of `cheap()`.
+    """
+    return jax.lax.cond(any_run(is_needed), dear, cheap)
+
+
+def drawn_once(key: Key[Array, "*num"], draw: Callable[..., PyTree]) -> PyTree:
+    """`draw(key)`, computed once, where XLA would draw again in each operation that uses it.
+
+    It is a branch that is always taken, which XLA cannot know: no word of a key has more bits than
+    32. Unlike `stored`, this takes numbers of any kind, and NaN. Use it where draws are made once
+    in a program and many operations use them: each would take part of a second to compile. Outside
+    of a program it is `draw(key)` itself.
+    """
+    if not isinstance(key, Tracer):
+        return draw(key)
+    function = partial(draw, key)
+    holds = any_run(jnp.all(jax.lax.population_count(jax.random.key_data(key)) <= 32))
+    shapes = jax.eval_shape(function)
+    nothing = lambda: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)  # noqa: E731
+    return jax.lax.cond(holds, function, nothing)
+
+
+@jax.custom_batching.custom_vmap
+def most_of_runs(number: Int[Array, ""]) -> Int[Array, ""]:
+    """The largest of the numbers of the caller's `vmap`, the same for all its runs."""
+    return number
+
+
+@most_of_runs.def_vmap
+def _most_of_many_runs(
+    axis_size: int, in_batched: list[bool], numbers: Int[Array, " b"]
+) -> tuple[Int[Array, ""], bool]:
+    del axis_size, in_batched
+    # A `vmap` around this one combines its own runs.
+    return most_of_runs(jnp.max(numbers)), False
+
+
+def any_run(is_needed: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Whether it is needed in any run of the caller's `vmap`, the same for all of them."""
+    return most_of_runs(is_needed.astype(jnp.int32)) > 0

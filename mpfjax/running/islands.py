@@ -17,14 +17,14 @@ from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove
 from mpfjax.observations import as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
-from mpfjax.operations.islands import (
+from mpfjax.operations.logarithms import (
     DEVICE_AXIS,
     ISLAND_AXIS,
     deal_to_islands,
     num_islands,
     over_islands,
+    softmax,
 )
-from mpfjax.operations.logarithms import softmax
 from mpfjax.running.devices import choose_devices, over_devices
 from mpfjax.running.scan import FilterRun, scan, sound
 

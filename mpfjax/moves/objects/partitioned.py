@@ -17,11 +17,10 @@ from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.propagation.propagate import predict
 from mpfjax.moves.resampling.resample import Resample
-from mpfjax.operations.islands import cond_if_any
 from mpfjax.operations.logarithms import add_gradient, log_sum_exp
 from mpfjax.operations.random import split
 from mpfjax.operations.segments import spread
-from mpfjax.operations.stored import take
+from mpfjax.operations.stored import cond_if_any, take
 
 Reassembly = Literal["evidence", "prior"]
 

@@ -9,9 +9,9 @@ from mpfjax.checks import Count
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractRegrouping, Regrouped
 from mpfjax.moves.regrouping.features import ByFeatures
-from mpfjax.operations.islands import most_of_runs
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.segments import segment_argmax, segment_counts, segment_sum
+from mpfjax.operations.stored import most_of_runs
 
 # Centroids in one pass over the particles. A program of all 64 takes seconds to compile.
 _AT_ONCE = 16

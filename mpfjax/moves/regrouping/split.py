@@ -17,12 +17,11 @@ from mpfjax.moves.regrouping.features import (
     summarise_about,
     weighted_means,
 )
-from mpfjax.operations.islands import cond_if_any
 from mpfjax.operations.logarithms import without_gradient
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.prefix_sums import few_upto
 from mpfjax.operations.segments import segment_argmax, spread_stored
-from mpfjax.operations.stored import VECTOR, stored, take
+from mpfjax.operations.stored import VECTOR, cond_if_any, stored, take
 
 
 class Split(AbstractRegrouping, ByFeatures):

@@ -17,7 +17,6 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped, UInt32
 
 from mpfjax.checks import saying, shown
 from mpfjax.mixture import ParticleMixture, points
-from mpfjax.operations.islands import cond_if_any
 from mpfjax.operations.logarithms import as_inexact, exp, finite_or_zero, log_or_nothing
 from mpfjax.operations.prefix_sums import (
     Positions,
@@ -38,7 +37,7 @@ from mpfjax.operations.sorting import (
     order_by_segment,
     sortable_bits,
 )
-from mpfjax.operations.stored import stored, take
+from mpfjax.operations.stored import cond_if_any, stored, take
 
 HILBERT = "hilbert"
 SortBy = Callable[[PyTree], Array] | Literal["hilbert"]
