@@ -23,8 +23,7 @@ from mpfjax.moves.resampling.ancestors import draw_ancestors
 from mpfjax.moves.resampling.line import HILBERT, Line, sorted_order
 from mpfjax.operations.logarithms import default_float, exp, finite_or_zero, largest
 from mpfjax.operations.random import split
-from mpfjax.operations.segments import whole
-from mpfjax.operations.stored import stored, take
+from mpfjax.operations.stored import stored, take, whole
 
 # A particle that the first observation tells nothing of keeps a quarter of its chance, so that no
 # weight is more than four times the mean.

@@ -27,6 +27,7 @@ from mpfjax.operations.stored import (
     stored,
     take,
     to_int,
+    whole,
     whole_blocks,
 )
 
@@ -67,7 +68,7 @@ def _blocked_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"],
     if n <= _ONE_BLOCK:
         sums = (values[None] @ _ones_before(n, whole_blocks(n + 1), values.dtype))[0]
         return sums[:n], sums[n]
-    blocks = _in_blocks(values)
+    blocks = whole(values, 0.0).reshape(-1, block_size(n))
     size = blocks.shape[1]
     # Columns are summed in the same order, so the sum does not change where the value is zero.
     within = blocks @ _ones_before(size, size, values.dtype)
@@ -80,11 +81,6 @@ def _blocked_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"],
     # The order of summing changes between blocks: zeros at a block's end belong to the next.
     sums = jnp.where(within == totals[:, None], upto, jnp.minimum(before[:-1, None] + within, upto))
     return sums.reshape(-1)[:n], before[-1]
-
-
-def _in_blocks(values: Float[Array, " n"]) -> Float[Array, "blocks size"]:
-    n = values.shape[0]
-    return jnp.pad(values, (0, whole_blocks(n) - n)).reshape(-1, block_size(n))
 
 
 def _ones_before(num_rows: int, num_columns: int, dtype: jnp.dtype) -> Float[Array, "rows columns"]:
@@ -105,7 +101,7 @@ def count_upto(values: Shaped[Array, " n"], bound: int) -> Int[Array, " n"]:
 
 def _blocked_count_upto(values: Shaped[Array, " n"]) -> Int[Array, " n"]:
     n = values.shape[0]
-    blocks = _in_blocks(values.astype(jnp.float32))
+    blocks = whole(values.astype(jnp.float32), 0.0).reshape(-1, block_size(n))
     before, _ = _blocked_sum_before(jnp.sum(blocks, axis=1))
     size = blocks.shape[1]
     # Whole numbers add up exactly in any order: a block's first entry takes the sum before it.

@@ -108,54 +108,15 @@ def split_keys(key: Key[Array, "*keys"], num: int) -> list[Key[Array, ""]]:
 def split_for_run(
     key: Key[Array, ""], num_initial: int, num_steps: int, num_moves: int
 ) -> tuple[Key[Array, " i"], Key[Array, "t m"]]:
-    """The keys of a run's start and of the moves of each step, as by `split` again and again.
+    """The keys of a run's start and of the moves of each step.
 
     `split(key, 2)` gives a key for the start, which is split into `num_initial`, and one for the
-    steps, which is split into `num_steps`, and each of these into `num_moves`. On a CPU, one loop
-    over the three generations makes all of them: each `split` compiles a hash of its own.
+    steps, which is split into `num_steps`, and each of these into `num_moves`.
     """
-    by_splits = partial(_generations_split, sizes=(num_initial, num_steps, num_moves))
-    if fast_key(key) is key:
-        return by_splits(key)
-    by_loop = partial(_generations_hashed, sizes=(num_initial, num_steps, num_moves))
-    return on_platform(key, cpu=by_loop, default=by_splits)
-
-
-def _generations_split(
-    key: Key[Array, ""], sizes: tuple[int, int, int]
-) -> tuple[Key[Array, " i"], Key[Array, "t m"]]:
-    num_initial, num_steps, num_moves = sizes
     key_initial, key_steps = split(key, 2)
     # Not by `vmap`, under which keys of some generators are split differently.
     moves = jax.lax.map(lambda key: split(key, num_moves), split(key_steps, num_steps))
     return split(key_initial, num_initial), moves
-
-
-def _generations_hashed(
-    key: Key[Array, ""], sizes: tuple[int, int, int]
-) -> tuple[Key[Array, " i"], Key[Array, "t m"]]:
-    num_initial, num_steps, num_moves = sizes
-    size = num_initial + num_steps * num_moves
-
-    def next_generation(number: Any, words: UInt32[Array, "e 2"]) -> UInt32[Array, "e 2"]:
-        # Counted from the loop's own number: XLA would move what does not depend on it out of the
-        # loop, into kernels of their own.
-        count = jnp.asarray(number, jnp.uint32)
-        index = jax.lax.iota(jnp.uint32, size) + count
-        is_move, place = index >= count + num_initial, index - (count + num_initial)
-        step = place // num_moves
-        step = jnp.where(number == 1, step, place - step * num_moves)
-        low = jnp.where(number == 0, is_move.astype(jnp.uint32), step)
-        low = jnp.where(is_move | (number == 0), low, index - count)
-        hashed = _both_halves((words[:, :1], words[:, 1:]), low)
-        # A start has no third generation.
-        is_last = (number == 2) & ~is_move
-        return jnp.where(is_last[:, None], words, hashed)
-
-    first = jnp.broadcast_to(jax.random.key_data(key), (size, 2))
-    words = jax.lax.fori_loop(0, 3, next_generation, first)
-    keys = jax.random.wrap_key_data(words, impl=jax.random.key_impl(key))
-    return keys[:num_initial], keys[num_initial:].reshape(num_steps, num_moves)
 
 
 def uniform(

@@ -7,10 +7,8 @@ long sums stay small. Where segments stand side by side (`Runs`), values are tak
 sums run on vectors.
 """
 
-import functools
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,11 +26,9 @@ from mpfjax.operations.logarithms import (
 from mpfjax.operations.prefix_sums import count_starts
 from mpfjax.operations.stored import (
     EXACT_IN_FLOAT32,
-    block_size,
     from_the_start,
     stored,
     take,
-    whole_blocks,
 )
 
 # Up to this many segments, a sum has a mask for each; with more, up to this many masked entries.
@@ -52,7 +48,6 @@ _LONGEST_SUM = 2**10
 # The segments that occur are kept in the bits of at most this many words.
 _WORD, _MOST_WORDS = 32, 8
 _WORD_BITS = 5  # a word has 2^5 bits
-_COMBINED = {"add": jnp.add, "max": jnp.maximum, "min": jnp.minimum}
 
 
 @jax.jit
@@ -61,12 +56,12 @@ def spread(
 ) -> Shaped[Array, "n *rest"]:
     """values[segments], each entry its segment's value; a label out of range gets some value.
 
-    With up to 16 segments it is a choice between them, with more a gather: on a CPU, nothing that
-    is fused with a gather runs on vectors.
+    With up to 16 segments it is a choice between them, with more a gather of values that are stored
+    for it: on a CPU, nothing that is fused with a gather runs on vectors.
     """
     num_segments = values.shape[0]
     if num_segments > FEW_CHOICES:
-        return take(values, segments)
+        return take(stored(values), segments)
     shape = (*segments.shape, *values.shape[1:])
     cases = [
         jnp.broadcast_to(jax.lax.slice_in_dim(values, m, m + 1), shape) for m in range(num_segments)
@@ -77,49 +72,30 @@ def spread(
     return jax.lax.select_n(which, *cases)
 
 
-def spread_stored(
-    values: Shaped[Array, "m *rest"], segments: Int[Array, " n"]
-) -> Shaped[Array, "n *rest"]:
-    """`spread` of values that are computed once, not again for every entry.
-
-    A choice between few values runs on vectors anyway.
-    """
-    if values.shape[0] <= FEW_CHOICES:
-        return spread(values, segments)
-    return spread(stored(values), segments)
-
-
 @partial(jax.jit, static_argnames="num_segments")
 def segment_sum(
     values: Float[Array, "n *rest"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, "num_segments *rest"]:
     """The sum of the values in each segment; a label outside [0, num_segments) is left out."""
     columns = values.reshape(values.shape[0], -1).T
-    if num_segments > FEW_SEGMENTS or len(columns) <= _FEW_COLUMNS:
-        sums = column_sums(columns, segments, num_segments)
-        return sums.reshape(num_segments, *values.shape[1:])
-    member = _members(segments, num_segments, values.ndim - 1)
-    return jnp.sum(jnp.where(member, values[None], jnp.zeros((), values.dtype)), axis=1)
+    sums = column_sums(columns, segments, num_segments)
+    return sums.reshape(num_segments, *values.shape[1:])
 
 
 def column_sums(
     columns: Float[Array, "c n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, "num_segments c"]:
     """`segment_sum` of values that lie column by column, each entry beside the next."""
+
+    def sums(column: Float[Array, " n"]) -> Float[Array, " num_segments"]:
+        if not are_masked(len(column), num_segments):
+            return _scattered_sum(column, segments, num_segments)
+        return segment_reduce("add", column, segments, num_segments, 0)
+
     if len(columns) <= _FEW_COLUMNS:
         # A sum of several columns at once would be of columns that are chosen number by number.
-        few = are_masked(columns.shape[1], num_segments)
-        sums = _masked_sum if few else _scattered_sum
-        return jnp.stack([sums(column, segments, num_segments) for column in columns], 1)
-    sums = _masked_sum if num_segments <= FEW_SEGMENTS else _scattered_sum
-    return jax.vmap(lambda column: sums(column, segments, num_segments))(columns).T
-
-
-def _masked_sum(
-    column: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
-) -> Float[Array, " num_segments"]:
-    member = _members(segments, num_segments)
-    return jnp.sum(jnp.where(member, column[None], jnp.zeros((), column.dtype)), axis=1)
+        return jnp.stack([sums(column) for column in columns], 1)
+    return jax.vmap(sums)(columns).T
 
 
 def are_masked(n: int, num_segments: int) -> bool:
@@ -205,7 +181,7 @@ def _scattered(
     Segments of many values are shared by lanes.
     """
     n = values.shape[0]
-    num_lanes = _num_lanes(n, num_segments)
+    num_lanes = _num_lanes(n)
     padding = (0, -n % num_lanes)
     # One more, for values that are in no segment.
     labels = jnp.where((segments >= 0) & (segments < num_segments), segments, num_segments)
@@ -220,15 +196,8 @@ def _scattered(
     return REDUCTIONS[how](lines, axis=1).astype(values.dtype)
 
 
-def _num_lanes(n: int, num_segments: int) -> int:
-    """A power of two: enough lanes that the rounding error of each lane's sum stays small.
-
-    Half of them for segments of few values, and one for hardly any.
-    """
-    if n < _LANES * num_segments:
-        return _LANES // 2 if n >= _LANES // 2 * num_segments else 1
-    if n % _LANES and n % (_LANES // 2) == 0 and n // (_LANES // 2) <= _LONGEST_SUM:
-        return _LANES // 2  # rather than to fill up the last row
+def _num_lanes(n: int) -> int:
+    """A power of two: enough lanes that the rounding error of each lane's sum stays small."""
     return max(_LANES, 1 << max(-(-n // _LONGEST_SUM) - 1, 0).bit_length())
 
 
@@ -240,7 +209,7 @@ def segment_log_sum_exp(
 ) -> Float[Array, " num_segments"]:
     """log Σ exp in each segment, -inf in one that is empty or holds nothing but -inf."""
     shift = finite_or_zero(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
-    total = segment_sum(exp(log_values - spread_stored(shift, segments)), segments, num_segments)
+    total = segment_sum(exp(log_values - spread(shift, segments)), segments, num_segments)
     return log_or_nothing(total) + shift
 
 
@@ -250,9 +219,9 @@ def segment_softmax(
 ) -> Float[Array, " n"]:
     """exp of the values as shares of their segment's sum, zero where that sum is zero."""
     shift = finite_or_zero(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
-    values = exp(log_values - spread_stored(shift, segments))
+    values = exp(log_values - spread(shift, segments))
     totals = segment_sum(values, segments, num_segments)
-    shares = values / spread_stored(jnp.where(totals == 0, 1.0, totals), segments)
+    shares = values / spread(jnp.where(totals == 0, 1.0, totals), segments)
     if not are_masked(len(values), num_segments):
         # Otherwise XLA takes the totals by a scatter, one particle after the other.
         shares = stored(shares)
@@ -268,7 +237,7 @@ def segment_argmax(
     limits = jnp.finfo(values.dtype)
     values = jnp.clip(values, limits.min, limits.max)
     largest = jnp.maximum(segment_max(values, segments, num_segments), limits.min)
-    is_largest = values >= spread_stored(largest, segments)
+    is_largest = values >= spread(largest, segments)
     index = jnp.where(is_largest, jnp.arange(n, dtype=jnp.int32), n - 1)
     if not are_masked(n, num_segments):
         index = stored(index)
@@ -296,74 +265,6 @@ def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, "
     return segments
 
 
-def _members(
-    segments: Int[Array, " n"], num_segments: int, trailing: int = 0
-) -> Bool[Array, "num_segments n ..."]:
+def _members(segments: Int[Array, " n"], num_segments: int) -> Bool[Array, "num_segments n"]:
     """A mask of the entries of each segment; XLA fuses it into a sum and never stores it."""
-    labels = jnp.arange(num_segments, dtype=segments.dtype)
-    member = segments[None] == labels[:, None]
-    return member.reshape(member.shape + (1,) * trailing)
-
-
-class Runs(NamedTuple):
-    """The places of segments, in blocks; the segments together fill whole blocks."""
-
-    labels: Int[Array, "blocks size"]
-    first_blocks: Int[Array, " m"]
-    last_blocks: Int[Array, " m"]
-
-    def sums(self, values: Float[Array, " p"]) -> Float[Array, " m"]:
-        """The sum of each segment's values."""
-        return self._reduced("add", values, 0.0)
-
-    def maxima(self, values: Float[Array, " p"]) -> Float[Array, " m"]:
-        """The largest value of each segment, -inf for an empty one."""
-        return self._reduced("max", values, -jnp.inf)
-
-    def extents(self, mask: Bool[Array, " p"]) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
-        """The first and the last masked place of each segment; any place where there is none."""
-        places = jnp.arange(mask.shape[0], dtype=jnp.int32)
-        last = mask.shape[0] - 1
-        # The last place is the least of the negative ones: one minimum finds both.
-        signed = jnp.where(mask[None], jnp.stack([places, -places]), last)
-        firsts, lasts = jax.vmap(lambda row: self._reduced("min", row, last))(signed)
-        return firsts, jnp.maximum(-lasts, 0)
-
-    def _reduced(
-        self, how: str, values: Shaped[Array, " p"], nothing: float
-    ) -> Shaped[Array, " m"]:
-        m, blocks = self.first_blocks.shape[0], values.reshape(self.labels.shape)
-        is_whole = self.labels[:, 0] == self.labels[:, -1]
-        reduce = REDUCTIONS[how]
-        found = segment_reduce(
-            how, reduce(blocks, axis=1), jnp.where(is_whole, self.labels[:, 0], m), m, nothing
-        )
-
-        # Of the first and the last block of each segment, unless it is whole, its own entries.
-        ends = jnp.concatenate([self.first_blocks, self.last_blocks])
-        labels = take(self.labels, ends)
-        is_last = np.arange(2 * m) >= m
-        counts = (labels[:, 0] != labels[:, -1]) & (
-            ~is_last | jnp.tile(self.last_blocks > self.first_blocks, 2)
-        )
-        is_own = labels == np.tile(np.arange(m, dtype=labels.dtype), 2)[:, None]
-        own = jnp.where(is_own & counts[:, None], take(blocks, ends), nothing)
-        of_ends = reduce(own.astype(values.dtype), axis=1)
-        return functools.reduce(_COMBINED[how], (found, of_ends[:m], of_ends[m:]))
-
-
-def runs_of(labels: Int[Array, " p"], num_segments: int) -> Runs:
-    """The runs of labels in ascending order, whole blocks of them."""
-    blocks = labels.reshape(-1, block_size(labels.shape[0]))
-    label = jnp.arange(num_segments, dtype=labels.dtype)[None]
-    last = blocks.shape[0] - 1
-    before = jnp.sum((blocks[:, -1:] < label).astype(jnp.int32), axis=0)
-    after = jnp.sum((blocks[:, :1] > label).astype(jnp.int32), axis=0)
-    ends = jnp.stack([jnp.minimum(before, last), jnp.maximum(last - after, 0)])
-    return Runs(blocks, *stored(ends))
-
-
-def whole(values: Array, fill: float) -> Array:
-    """The values, filled up to whole blocks."""
-    n = values.shape[0]
-    return jnp.pad(values, (0, whole_blocks(n) - n), constant_values=fill)
+    return segments[None] == jnp.arange(num_segments, dtype=segments.dtype)[:, None]

@@ -52,6 +52,12 @@ def block_size(n: int) -> int:
     return next(whole, VECTOR)
 
 
+def whole(values: Shaped[Array, " n"], fill: float) -> Shaped[Array, " p"]:
+    """The values, filled up to whole blocks."""
+    n = values.shape[0]
+    return jnp.pad(values, (0, whole_blocks(n) - n), constant_values=fill)
+
+
 @jax.custom_jvp
 def stored(values: Shaped[Array, "*rest n"]) -> Shaped[Array, "*rest n"]:
     """The same numbers, computed once and kept, where XLA on a CPU would not keep them.

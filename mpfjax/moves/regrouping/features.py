@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from mpfjax.checks import POSITIVE, Checked, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations.logarithms import as_inexact, exp, finite_or_zero
-from mpfjax.operations.segments import are_masked, column_sums, segment_max, spread_stored
+from mpfjax.operations.segments import are_masked, column_sums, segment_max, spread
 from mpfjax.operations.stored import stored
 
 # Up to this many features are multiplied one by one, which runs on vectors.
@@ -83,7 +83,7 @@ def relative_weights(mixture: ParticleMixture) -> Float[Array, " n"]:
     """The weights within each component, in units of its largest; a dead one's are zero."""
     log_weights, labels = mixture.log_weights, mixture.component_indicators
     largest = finite_or_zero(segment_max(log_weights, labels, mixture.num_components))
-    weights = exp(log_weights - spread_stored(largest, labels))
+    weights = exp(log_weights - spread(largest, labels))
     # Otherwise XLA takes the maximum by a scatter, one particle after the other.
     is_kept = are_masked(mixture.num_particles, mixture.num_components)
     return weights if is_kept else stored(weights)
@@ -109,7 +109,7 @@ def summarise(
 ) -> Groups:
     """Weighted mass, mean and covariance of the particles under each label."""
     masses, means = weighted_means(features, weights, labels, num_groups)
-    products, entries = _products(features - spread_stored(means, labels), weights)
+    products, entries = _products(features - spread(means, labels), weights)
     covariances = column_sums(products, labels, num_groups) / _or_one(masses)[:, None]
     return Groups(masses, means, covariances[:, entries])
 

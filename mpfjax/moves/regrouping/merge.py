@@ -9,7 +9,7 @@ from mpfjax.checks import Count, InnerShare, Positive
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, Regrouped
 from mpfjax.moves.regrouping.features import ByFeatures, relative_weights, separation, summarise
-from mpfjax.operations.segments import spread, spread_stored
+from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
 
 
@@ -56,7 +56,7 @@ class Merge(AbstractRegrouping, ByFeatures):
             overlap = durations >= self.patience
             memory = memory | {"overlap_durations": durations}
         labels = lowest_connected(overlap)
-        return spread_stored(labels, mixture.component_indicators), memory
+        return spread(labels, mixture.component_indicators), memory
 
     def forget(self, memory: dict[str, PyTree], dead: Bool[Array, " m"]) -> dict[str, PyTree]:
         """Reset the counts of pairs with a dead component."""

@@ -20,7 +20,7 @@ from mpfjax.moves.regrouping.features import (
 from mpfjax.operations.logarithms import without_gradient
 from mpfjax.operations.matrices import row_sums
 from mpfjax.operations.prefix_sums import few_upto
-from mpfjax.operations.segments import segment_argmax, spread_stored
+from mpfjax.operations.segments import segment_argmax, spread
 from mpfjax.operations.stored import VECTOR, cond_if_any, stored, take
 
 
@@ -61,8 +61,8 @@ class Split(AbstractRegrouping, ByFeatures):
         def split() -> Int[Array, " n"]:
             side, lighter, deviations, splits = self._halves(mixture, features)
             labels = free_labels(splits, deviations, active)
-            moves = (side == spread_stored(lighter, parent)) & mixture.occupied
-            return jnp.where(moves, spread_stored(labels, parent), parent)
+            moves = (side == spread(lighter, parent)) & mixture.occupied
+            return jnp.where(moves, spread(labels, parent), parent)
 
         return cond_if_any(jnp.any(~active), split, lambda: parent), mixture.memory
 
@@ -163,8 +163,8 @@ def _nearer(
 ) -> tuple[Int[Array, " n"], Float[Array, "n k"]]:
     """Which of its own component's two centres each particle is nearer to, and how far from it."""
     m = centres.shape[0] // 2
-    to_first = features - spread_stored(centres[:m], parent)
-    to_second = features - spread_stored(centres[m:], parent)
+    to_first = features - spread(centres[:m], parent)
+    to_second = features - spread(centres[m:], parent)
     is_second = row_sums(to_second**2) < row_sums(to_first**2)
     is_second = stored(is_second)
     # Column by column: XLA would choose numbers of rows of one number one after the other.
@@ -176,6 +176,6 @@ def _farthest_members(
     sample: _Particles, points: Float[Array, "m k"], num_components: int
 ) -> Float[Array, "m k"]:
     """In each component, the particle farthest from the component's point."""
-    distance = row_sums((sample.features - spread_stored(points, sample.parent)) ** 2)
+    distance = row_sums((sample.features - spread(points, sample.parent)) ** 2)
     distance = jnp.where(sample.occupied, distance, -1.0)
     return take(sample.features, segment_argmax(distance, sample.parent, num_components))

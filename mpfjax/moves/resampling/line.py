@@ -29,7 +29,14 @@ from mpfjax.operations.prefix_sums import (
     sum_before,
     unit_shift,
 )
-from mpfjax.operations.segments import Runs, column_sums, runs_of, segment_counts, spread, whole
+from mpfjax.operations.segments import (
+    column_sums,
+    segment_counts,
+    segment_max,
+    segment_reduce,
+    segment_sum,
+    spread,
+)
 from mpfjax.operations.sorting import (
     bits_per_dimension,
     hilbert_index,
@@ -37,7 +44,7 @@ from mpfjax.operations.sorting import (
     order_by_segment,
     sortable_bits,
 )
-from mpfjax.operations.stored import cond_if_any, stored, take
+from mpfjax.operations.stored import cond_if_any, stored, take, whole
 
 HILBERT = "hilbert"
 SortBy = Callable[[PyTree], Array] | Literal["hilbert"]
@@ -48,7 +55,7 @@ class Line(NamedTuple):
     """The particles in a line of p places, those of a component side by side.
 
     p is a multiple of the block length of the prefix sums. The particles of a single component
-    that nothing sorts stand where they are: `order`, `components` and `runs` are then None.
+    that nothing sorts stand where they are: `order`, `components` and `labels` are then None.
     """
 
     num_particles: int
@@ -58,7 +65,7 @@ class Line(NamedTuple):
     is_drawn: Bool[Array, " p"]  # at which places a particle may be drawn, or stays as it is
     order: Int[Array, " p"] | None = None  # which particle stands at each place
     components: Int[Array, " p"] | None = None
-    runs: Runs | None = None
+    labels: Int[Array, " p"] | None = None  # as `components`, but M at an empty place
 
     @property
     def counts(self) -> Int[Array, " m"]:
@@ -80,19 +87,25 @@ class Line(NamedTuple):
 
     def sums(self, values: Float[Array, " p"]) -> Float[Array, " m"]:
         """The sum over each component's places."""
-        return jnp.sum(values, keepdims=True) if self.runs is None else self.runs.sums(values)
+        if self.labels is None:
+            return jnp.sum(values, keepdims=True)
+        return segment_sum(values, self.labels, self.totals.shape[0])
 
     def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, " #p"]:
         """The value of the component at each place."""
-        return values if self.components is None else spread(stored(values), self.components)
+        return values if self.components is None else spread(values, self.components)
 
     def extents(self, drawn: bool) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
         """The first and the last place of each component: of those `drawn` from, or of all."""
-        if self.runs is None:
+        if self.labels is None:
             return jnp.zeros(1, jnp.int32), jnp.full(1, self.weights.shape[0] - 1, jnp.int32)
-        mask = self.is_drawn if drawn else jnp.ones_like(self.is_drawn)
-        firsts, lasts = stored(jnp.stack(self.runs.extents(mask)))
-        return firsts, lasts
+        m, last = self.totals.shape[0], self.weights.shape[0] - 1
+        labels = jnp.where(self.is_drawn, self.labels, m) if drawn else self.labels
+        places = jnp.arange(last + 1, dtype=jnp.int32)
+        # The last place is the least of the negative ones: one minimum finds both.
+        least = lambda row: segment_reduce("min", row, labels, m, last)  # noqa: E731
+        firsts, lasts = stored(jax.vmap(least)(jnp.stack([places, -places])))
+        return firsts, jnp.maximum(-lasts, 0)
 
     def expected(self, targets: Int[Array, " m"]) -> Float[Array, " p"]:
         """The expected number of offspring of each particle."""
@@ -191,15 +204,14 @@ def in_line(
     else:
         order = sorted_order(mixture, labels[:n], sort_by)
         order, log_weights, labels = in_order(whole(order, labels.shape[0] - 1))
-    runs = runs_of(labels, m)
-    labels = jnp.minimum(labels, m - 1)
-    log_largest = finite_or_zero(runs.maxima(log_weights))
-    relative = exp(log_weights - spread(stored(log_largest), labels))
+    log_largest = finite_or_zero(segment_max(log_weights, labels, m))
+    components = jnp.minimum(labels, m - 1)
+    relative = exp(log_weights - spread(log_largest, components))
     is_drawn = relative > 0
     if stays is not None:
         is_drawn |= (log_weights > -jnp.inf) & take(whole(stays, False), order)
-    totals = runs.sums(relative)
-    return Line(n, relative, totals, log_largest, is_drawn, order, labels, runs)
+    totals = segment_sum(relative, labels, m)
+    return Line(n, relative, totals, log_largest, is_drawn, order, components, labels)
 
 
 def sorted_order(
