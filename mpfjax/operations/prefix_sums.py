@@ -55,12 +55,9 @@ def _scanned_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"],
     upto = jnp.cumsum(values)
     total = upto[-1]
     # Each zero takes the sum of the next value that is not zero.
-    starts = jnp.where(values == 0, total, jnp.minimum(_shifted(upto), total))
+    before = jnp.minimum(jnp.pad(upto[:-1], (1, 0)), total)
+    starts = jnp.where(values == 0, total, before)
     return jax.lax.cummin(starts, reverse=True), total
-
-
-def _shifted(values: Shaped[Array, " n"]) -> Shaped[Array, " n"]:
-    return jnp.concatenate([jnp.zeros(1, values.dtype), values[:-1]])
 
 
 def _blocked_sum_before(values: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:

@@ -3,8 +3,7 @@
 In numpy: `[values[labels == m].sum() for m in range(M)]` and `per_component[labels]`. For few
 components or particles there are M masks, which XLA fuses into its loops. For many there is one
 scatter, shared by lanes, so that neighbours need not wait for each other and rounding errors of
-long sums stay small. Where segments stand side by side (`Runs`), values are taken in blocks, whose
-sums run on vectors.
+long sums stay small.
 """
 
 from collections.abc import Callable
@@ -48,6 +47,7 @@ _LONGEST_SUM = 2**10
 # The segments that occur are kept in the bits of at most this many words.
 _WORD, _MOST_WORDS = 32, 8
 _WORD_BITS = 5  # a word has 2^5 bits
+_REDUCTIONS: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": largest, "min": jnp.min}
 
 
 @jax.jit
@@ -141,7 +141,7 @@ def segment_reduce(
     if not are_masked(len(values), num_segments):
         return _scattered(how, values, segments, num_segments, nothing)
     own = jnp.where(_members(segments, num_segments), values[None], nothing)
-    return REDUCTIONS[how](own.astype(values.dtype), axis=1)
+    return _REDUCTIONS[how](own.astype(values.dtype), axis=1)
 
 
 @partial(jax.jit, static_argnames="num_segments")
@@ -176,12 +176,10 @@ def _scattered(
     num_segments: int,
     initial: float,
 ) -> Shaped[Array, " num_segments"]:
-    """The sum of each segment's values, or their "max" or "min", starting from `initial`.
-
-    Segments of many values are shared by lanes.
-    """
+    """The sum of each segment's values, or their "max" or "min", starting from `initial`."""
     n = values.shape[0]
-    num_lanes = _num_lanes(n)
+    # A power of two: enough that the rounding error of each lane's sum stays small.
+    num_lanes = max(_LANES, 1 << max(-(-n // _LONGEST_SUM) - 1, 0).bit_length())
     padding = (0, -n % num_lanes)
     # One more, for values that are in no segment.
     labels = jnp.where((segments >= 0) & (segments < num_segments), segments, num_segments)
@@ -193,24 +191,23 @@ def _scattered(
     combine = getattr(line.at[from_the_start(places.reshape(-1))], how)
     lines = combine(jnp.pad(jax.lax.stop_gradient(values), padding), mode="promise_in_bounds")
     lines = lines.reshape(-1, num_lanes)[:num_segments]
-    return REDUCTIONS[how](lines, axis=1).astype(values.dtype)
-
-
-def _num_lanes(n: int) -> int:
-    """A power of two: enough lanes that the rounding error of each lane's sum stays small."""
-    return max(_LANES, 1 << max(-(-n // _LONGEST_SUM) - 1, 0).bit_length())
-
-
-REDUCTIONS: dict[str, Callable[..., Array]] = {"add": jnp.sum, "max": largest, "min": jnp.min}
+    return _REDUCTIONS[how](lines, axis=1).astype(values.dtype)
 
 
 def segment_log_sum_exp(
     log_values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " num_segments"]:
     """log Σ exp in each segment, -inf in one that is empty or holds nothing but -inf."""
+    values, shift = _relative(log_values, segments, num_segments)
+    return log_or_nothing(segment_sum(values, segments, num_segments)) + shift
+
+
+def _relative(
+    log_values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
+) -> tuple[Float[Array, " n"], Float[Array, " num_segments"]]:
+    """exp of the values divided by their segment's largest, and the logarithm of that."""
     shift = finite_or_zero(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
-    total = segment_sum(exp(log_values - spread(shift, segments)), segments, num_segments)
-    return log_or_nothing(total) + shift
+    return exp(log_values - spread(shift, segments)), shift
 
 
 @partial(jax.jit, static_argnames="num_segments")
@@ -218,8 +215,7 @@ def segment_softmax(
     log_values: Float[Array, " n"], segments: Int[Array, " n"], num_segments: int
 ) -> Float[Array, " n"]:
     """exp of the values as shares of their segment's sum, zero where that sum is zero."""
-    shift = finite_or_zero(segment_max(jax.lax.stop_gradient(log_values), segments, num_segments))
-    values = exp(log_values - spread(shift, segments))
+    values, _ = _relative(log_values, segments, num_segments)
     totals = segment_sum(values, segments, num_segments)
     shares = values / spread(jnp.where(totals == 0, 1.0, totals), segments)
     if not are_masked(len(values), num_segments):
