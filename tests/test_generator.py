@@ -91,9 +91,9 @@ class TestNormal:
     def test_draws_what_jax_draws(self, shape):
         keys = jax.random.split(KEY, 3)
         expected = jax.vmap(lambda key: jax.random.normal(key, shape))(keys)
-        np.testing.assert_allclose(normal(keys[0], shape), expected[0], rtol=2e-6, atol=1e-7)
+        np.testing.assert_allclose(normal(keys[0], shape), expected[0], rtol=5e-6, atol=1e-7)
         drawn = jax.jit(jax.vmap(lambda key: normal(fast_key(key), shape)))(keys)
-        np.testing.assert_allclose(drawn, expected, rtol=2e-6, atol=1e-7)
+        np.testing.assert_allclose(drawn, expected, rtol=5e-6, atol=1e-7)
 
     def test_other_precisions_and_generators_are_those_of_jax(self):
         other = jax.random.key(0, impl="rbg")
