@@ -27,6 +27,3 @@ def quick_of(cases: Iterable[Any], always: Iterable[Any]) -> list[Any]:
     """All the cases, those that are not among `always` marked as `exactness`."""
     always = list(always)
     return [case if case in always else exactness([case])[0] for case in cases]
-
-
-thorough = exactness
