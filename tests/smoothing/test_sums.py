@@ -1,7 +1,6 @@
 """Smoothed sums online: their run, no lag and a long one, and functions."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import mpfjax
@@ -30,24 +29,3 @@ def test_a_long_lag_is_none():
     )
     np.testing.assert_allclose(whole.sums, lagged.sums, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(lagged.terms.sum(), whole.sums[-1], rtol=1e-4)
-
-
-def test_a_model_of_one_particle_takes_a_function_of_one():
-    class Walk:
-        def sample_initial(self, key):
-            return jax.random.normal(key)
-
-        def sample_transition(self, key, state):
-            return state + jax.random.normal(key)
-
-        def log_likelihood(self, observation, state):
-            return -((observation - state) ** 2)
-
-        def log_transition(self, state, previous_state):
-            return -0.5 * (state - previous_state) ** 2
-
-    filter = mpfjax.particle_filter(mpfjax.per_particle(Walk()), 20)
-    found = smoothed_sums(
-        jax.random.key(0), filter, np.ones(3), lambda before, after: jnp.where(after > before, 1, 0)
-    )
-    assert 0 < float(found.sums[-1]) < 3

@@ -46,17 +46,6 @@ def data(num_frames, num_candidates, num_labels=1):
     return observations, labels, rivals
 
 
-def test_they_are_log_posterior_over_prior():
-    """With the dynamics as prior: of two Gaussians, in closed form."""
-    observations, labels, rivals = data(6, 40_000)
-    found = label_log_posteriors(Unnormalised(lambda_=2.0), observations, labels[1:], rivals)
-    before, here = labels[:-1, 0], labels[1:, 0]
-    variance = 1 / (1 + 1 / SIGMA**2)
-    mean = variance * (before + observations / SIGMA**2)
-    expected = norm.logpdf(here, mean, jnp.sqrt(variance)) - norm.logpdf(here, before, 1.0)
-    np.testing.assert_allclose(found[:, 0], expected, atol=0.05)
-
-
 def test_each_label_has_its_own_candidates():
     observations, labels, rivals = data(3, 5, num_labels=2)
     model = Unnormalised(lambda_=0.7)

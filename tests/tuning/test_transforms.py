@@ -23,13 +23,7 @@ def test_there_and_back(name):
     reals = transform.unconstrain(jnp.array(values))
     assert np.isfinite(reals).all()
     np.testing.assert_allclose(transform.constrain(reals), values, rtol=1e-5)
-
-
-@pytest.mark.parametrize("name", INSIDE)
-def test_every_real_number_is_a_parameter_inside(name):
-    transform, values = INSIDE[name]
-    reals = transform.unconstrain(jnp.array(values))
-    for shift in (-3.0, 0.0, 3.0):
+    for shift in (-3.0, 3.0):
         assert transform.contains(np.asarray(transform.constrain(reals + shift)))
 
 
