@@ -20,7 +20,7 @@ import inspect
 import math
 import types
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, ParamSpec, TypeGuard, TypeVar
 
@@ -41,24 +41,6 @@ _MOST = 2**31 - 1
 _ROUNDING = 1e-4
 
 
-def given(**arguments: Any) -> dict[str, Any]:
-    """The arguments that are not None."""
-    return {name: value for name, value in arguments.items() if value is not None}
-
-
-def check_whole(least: int = 1, /, **arguments: Any) -> None:
-    """Each argument is a whole number (a Python or numpy integer, no boolean) from `least` on.
-
-    It fits into 32 bits, which indices have.
-    """
-    for name, value in arguments.items():
-        is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        if not is_whole or value < least:
-            raise ValueError(f"{name}: {shown(value)} is not a whole number of at least {least}")
-        if value > _MOST:
-            raise ValueError(f"{name}: {shown(value)} is more than {_MOST}, the most there can be")
-
-
 def check_numbered(what: str, number: int, /, **arguments: Any) -> None:
     """Each of the counted things gets a 32-bit index; the arguments are their counts."""
     if number > _MOST:
@@ -68,77 +50,10 @@ def check_numbered(what: str, number: int, /, **arguments: Any) -> None:
         )
 
 
-def check_positive(**arguments: Any) -> None:
-    """Each argument is a finite number above zero."""
-    _check_numbers_are(lambda value: 0 < value < math.inf, "a positive, finite number", arguments)
-
-
-def check_not_negative(**arguments: Any) -> None:
-    """Each argument is a finite number of at least zero."""
-    _check_numbers_are(
-        lambda value: 0 <= value < math.inf, "a finite number of at least 0", arguments
-    )
-
-
-def check_finite(**arguments: Any) -> None:
-    """Each argument is a finite number."""
-    _check_numbers_are(math.isfinite, "a finite number", arguments)
-
-
-def check_share(most: float = 1.0, /, **arguments: Any) -> None:
-    """Each argument is a number in [0, most]."""
-    _check_numbers_are(lambda value: 0 <= value <= most, f"a number in [0, {most:g}]", arguments)
-
-
-def check_inner_share(**arguments: Any) -> None:
-    """Each argument is a number in (0, 1)."""
-    _check_numbers_are(lambda value: 0 < value < 1, "a number in (0, 1)", arguments)
-
-
-def check_exponent(**arguments: Any) -> None:
-    """Each argument is a number in (0, 1], as the power of a likelihood that comes in by stages."""
-    _check_numbers_are(lambda value: 0 < value <= 1, "a number in (0, 1]", arguments)
-
-
-def _check_numbers_are(holds: Callable[[Any], bool], what: str, arguments: dict[str, Any]) -> None:
-    for name, value in arguments.items():
-        if not (_is_number(value) and holds(value)):
-            raise ValueError(f"{name}: {shown(value)} is not {what}")
-
-
-def check_one_of(choices: Collection[str], /, **arguments: Any) -> None:
-    """Each argument is one of some strings."""
-    for name, value in arguments.items():
-        if not isinstance(value, str) or value not in choices:
-            raise ValueError(f"{name}: {shown(value)} is not one of {sorted(choices)}")
-
-
-def check_flag(**arguments: Any) -> None:
-    """Each argument is True or False."""
-    for name, value in arguments.items():
-        if not isinstance(value, bool | np.bool_):
-            raise ValueError(f"{name}: {shown(value)} is neither True nor False")
-
-
-def check_callable(what: str, /, **arguments: Any) -> None:
-    """Each argument can be called; `what` says in words what it should be."""
-    for name, value in arguments.items():
-        if isinstance(value, type) or not callable(value):
-            raise ValueError(f"{name}: {shown(value)} is not {what}")
-
-
 def is_series(value: Any) -> TypeGuard[Iterable[Any]]:
     """Whether it is an iterable of several things: no text, no mapping, no array."""
     single = str | bytes | dict | np.ndarray | jax.Array
     return isinstance(value, Iterable) and not isinstance(value, single)
-
-
-def check_type(kind: type | tuple[type, ...], what: str, /, **arguments: Any) -> None:
-    """Each argument is an instance of a class; `what` says in words what it should be."""
-    for name, value in arguments.items():
-        if not isinstance(value, kind):
-            hint = f"; write {value.__name__}(...)" if isinstance(value, type) else ""
-            raise ValueError(f"{name}: {shown(value)} is not {what}{hint}")
 
 
 def check_key(key: Any, name: str = "key", *, batch: bool = False) -> None:
@@ -231,35 +146,6 @@ def real_arrays(shape: str, /, **arguments: Any) -> Any:
     return arrays if len(arrays) > 1 else arrays[0]
 
 
-def check_positive_array(**arguments: Any) -> None:
-    """Each array has numbers, all of them positive and finite, where their values are known."""
-    _check_entries(lambda array: (array > 0) & np.isfinite(array), "positive and finite", arguments)
-
-
-def check_finite_array(**arguments: Any) -> None:
-    """Each array has numbers, all of them finite, where their values are known."""
-    _check_entries(np.isfinite, "finite", arguments)
-
-
-def check_covariance_array(**arguments: Any) -> None:
-    """Each array (..., d, d) is symmetric and positive semidefinite, where its values are known."""
-    check_finite_array(**arguments)
-    for name, array in arguments.items():
-        if isinstance(array, Tracer | jax.ShapeDtypeStruct):
-            continue
-        values = 1.0 * np.asarray(array)
-        if values.ndim < 2 or values.shape[-1] != values.shape[-2]:
-            raise ValueError(f"{name}: shape {values.shape} is not that of square matrices")
-        largest = np.abs(values).max()
-        mirrored = np.swapaxes(values, -1, -2)
-        if np.abs(values - mirrored).max() > _ROUNDING * largest:
-            raise ValueError(f"{name}: {shown(array)} is not symmetric")
-        if np.linalg.eigvalsh(0.5 * (values + mirrored)).min() < -_ROUNDING * largest:
-            raise ValueError(
-                f"{name}: {shown(array)} is no covariance: it has a negative eigenvalue"
-            )
-
-
 def check_shape(shape: str, /, **arguments: Any) -> None:
     """Each argument is an array of this shape, as "n 4" or "... bins".
 
@@ -323,18 +209,6 @@ def check_one_each(num_particles: int, /, **results: Any) -> None:
             )
 
 
-def _check_entries(holds: Callable[..., Any], what: str, arguments: dict[str, Any]) -> None:
-    for name, array in arguments.items():
-        if isinstance(array, Tracer | jax.ShapeDtypeStruct):
-            continue
-        if np.size(array) == 0:
-            raise ValueError(f"{name}: shape {np.shape(array)} holds no number")
-        if not _has_numbers(array if hasattr(array, "dtype") else np.asarray(array)):
-            raise ValueError(f"{name}: {shown(array)} is no array of numbers")
-        if not np.all(holds(np.asarray(array))):
-            raise ValueError(f"{name}: {shown(array)} is not {what} throughout")
-
-
 @dataclass(frozen=True)
 class Rule:
     """What an argument must be, beside its type: `Annotated[float, Rule(isfinite, "finite")]`.
@@ -348,22 +222,38 @@ class Rule:
     def __repr__(self) -> str:
         return self.what
 
+    def holds(self, value: Any) -> bool:
+        """Whether the value is what it must be."""
+        with contextlib.suppress(ValueError):
+            self.check(value, "")
+            return True
+        return False
 
-def number(holds: Callable[[Any], bool], what: str) -> Rule:
-    """The rule for a number of which this holds; `what` says so in words."""
+
+def of(holds: Callable[[Any], Any], what: str) -> Rule:
+    """The rule for a value of which this holds; `what` says so in words."""
 
     def check(value: Any, name: str) -> None:
-        if not (_is_number(value) and holds(value)):
+        if not holds(value):
             raise ValueError(f"{name}: {shown(value)} is not {what}")
 
     return Rule(check, what)
 
 
+def number(holds: Callable[[Any], Any], what: str) -> Rule:
+    """The rule for a number of which this holds."""
+    kinds = int | float | np.integer | np.floating
+    return of(
+        lambda value: isinstance(value, kinds) and not isinstance(value, bool) and holds(value),
+        what,
+    )
+
+
 def whole(least: int) -> Rule:
-    """The rule for a whole number from `least` on."""
-    return Rule(
-        lambda value, name: check_whole(least, **{name: value}),
-        f"a whole number of at least {least}",
+    """The rule for a whole number (a Python or numpy integer) from `least` on, in 32 bits."""
+    return number(
+        lambda value: isinstance(value, int | np.integer) and least <= value <= _MOST,
+        f"a whole number of at least {least}, and at most {_MOST}",
     )
 
 
@@ -372,15 +262,41 @@ def share(most: float = 1.0) -> Rule:
     return number(lambda value: 0 <= value <= most, f"a number in [0, {most:g}]")
 
 
-def entries(holds: Callable[[np.ndarray], Any], what: str) -> Rule:
-    """The rule for an array with this in all its entries, where its values are known."""
-    return Rule(lambda value, name: _check_entries(holds, what, {name: value}), what)
-
-
 def one_of(choices: Iterable[str]) -> Rule:
     """The rule for one of some strings, where they are not written out as a `Literal`."""
-    names = tuple(choices)
-    return Rule(lambda value, name: check_one_of(names, **{name: value}), f"one of {sorted(names)}")
+    names = sorted(choices)
+    return of(lambda value: isinstance(value, str) and value in names, f"one of {names}")
+
+
+def entries(holds: Callable[[np.ndarray], Any], what: str) -> Rule:
+    """The rule for an array with this in all its entries, where its values are known."""
+
+    def check(array: Any, name: str) -> None:
+        if isinstance(array, Tracer | jax.ShapeDtypeStruct):
+            return
+        if np.size(array) == 0:
+            raise ValueError(f"{name}: shape {np.shape(array)} holds no number")
+        if not _has_numbers(array if hasattr(array, "dtype") else np.asarray(array)):
+            raise ValueError(f"{name}: {shown(array)} is no array of numbers")
+        if not np.all(holds(np.asarray(array))):
+            raise ValueError(f"{name}: {shown(array)} is not {what} throughout")
+
+    return Rule(check, what)
+
+
+def _check_covariance(array: Any, name: str) -> None:
+    FINITE.check(array, name)
+    if isinstance(array, Tracer | jax.ShapeDtypeStruct):
+        return
+    values = 1.0 * np.asarray(array)
+    if values.ndim < 2 or values.shape[-1] != values.shape[-2]:
+        raise ValueError(f"{name}: shape {values.shape} is not that of square matrices")
+    largest = np.abs(values).max()
+    mirrored = np.swapaxes(values, -1, -2)
+    if np.abs(values - mirrored).max() > _ROUNDING * largest:
+        raise ValueError(f"{name}: {shown(array)} is not symmetric")
+    if np.linalg.eigvalsh(0.5 * (values + mirrored)).min() < -_ROUNDING * largest:
+        raise ValueError(f"{name}: {shown(array)} is no covariance: it has a negative eigenvalue")
 
 
 Count = Annotated[int, whole(1)]
@@ -395,7 +311,18 @@ Exponent = Annotated[float, number(lambda x: 0 < x <= 1, "a number in (0, 1]")]
 POSITIVE = entries(lambda array: (array > 0) & np.isfinite(array), "positive and finite")
 NOT_NEGATIVE = entries(lambda array: (array >= 0) & np.isfinite(array), "finite and not negative")
 FINITE = entries(np.isfinite, "finite")
-COVARIANCE = Rule(lambda value, name: check_covariance_array(**{name: value}), "a covariance")
+COVARIANCE = Rule(_check_covariance, "a covariance")
+_FUNCTION = of(lambda value: callable(value) and not isinstance(value, type), "a function")
+_FLAG = of(lambda value: isinstance(value, bool | np.bool_), "True or False")
+
+
+def check(hint: Any, what: str = "", /, **arguments: Any) -> None:
+    """Check each argument by an annotation; `what` says in words what it should be."""
+    for name, value in arguments.items():
+        rule = _rule(hint) or _instance(hint)
+        if what:
+            rule = of(rule.holds, what)
+        rule.check(value, name)
 
 
 class Checked(eqx.Module):
@@ -523,17 +450,26 @@ def _rule(hint: Any) -> Rule | None:
     if origin is Literal:
         return one_of(choices)
     if origin is Callable:
-        return Rule(lambda value, name: check_callable("a function", **{name: value}), "a function")
+        return _FUNCTION
     if hint is bool:
-        return Rule(lambda value, name: check_flag(**{name: value}), "True or False")
+        return _FLAG
     if getattr(hint, "dtype", None) is jaxtyping.Key and hint.index_variadic is None:
         is_batch = len(hint.dims) > 0
         return Rule(lambda value, name: check_key(value, name, batch=is_batch), "typed keys")
-    if isinstance(hint, type) and _is_ours(hint):
-        what = f"{'an' if hint.__name__[0] in 'AEIO' else 'a'} {hint.__name__}"
-        is_one = lambda value, name: check_type(hint, what, **{name: value})  # noqa: E731
-        return Rule(_CHECKS.get(hint, is_one), what)
-    return None
+    if hint in _CHECKS:
+        return Rule(_CHECKS[hint], hint.__name__)
+    return _instance(hint) if isinstance(hint, type) and _is_ours(hint) else None
+
+
+def _instance(kind: type) -> Rule:
+    what = f"{'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
+
+    def check(value: Any, name: str) -> None:
+        if not isinstance(value, kind):
+            hint = f"; write {value.__name__}(...)" if isinstance(value, type) else ""
+            raise ValueError(f"{name}: {shown(value)} is not {what}{hint}")
+
+    return Rule(check, what)
 
 
 def _any_of(rules: list[Rule | None]) -> Rule | None:
@@ -546,14 +482,8 @@ def _any_of(rules: list[Rule | None]) -> Rule | None:
     def check(value: Any, name: str) -> None:
         if value is None:
             return
-        if len(known) == 1:
-            known[0].check(value, name)
-            return
-        for rule in known:
-            with contextlib.suppress(ValueError):
-                rule.check(value, name)
-                return
-        raise ValueError(f"{name}: {shown(value)} is not {what}")
+        rule = known[0] if len(known) == 1 else of(lambda v: any(r.holds(v) for r in known), what)
+        rule.check(value, name)
 
     return Rule(check, what)
 
@@ -572,8 +502,3 @@ def shown(value: Any) -> str:
     """The value as it is printed, cut where it is long."""
     text = str(value) if isinstance(value, jax.Array | np.ndarray) else repr(value)
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
-
-
-def _is_number(value: Any) -> bool:
-    numbers = (int, float, np.integer, np.floating)
-    return isinstance(value, numbers) and not isinstance(value, bool)

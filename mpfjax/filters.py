@@ -16,7 +16,7 @@ from mpfjax.moves.base import AbstractMove, Gradient, as_moves
 from mpfjax.moves.every import Every
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
-from mpfjax.moves.objects.partitioned import Partitioned, check_orders
+from mpfjax.moves.objects.partitioned import Partitioned, Reassembly, check_orders
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
 from mpfjax.moves.regrouping.features import Scale
 from mpfjax.moves.regrouping.kmeans import KMeans
@@ -236,7 +236,7 @@ def distributed_partitioned_sampling(
     model: MultiObjectModel,
     num_particles: Count,
     orders: str | Sequence[Sequence[int]] | Array | None = None,
-    reassembly: str = "prior",
+    reassembly: Reassembly = "prior",
     *,
     scheme: Scheme = "systematic",
     ess_threshold: Share = 1.0,
@@ -290,7 +290,7 @@ def clustered_particle_filter(
     model: MultiObjectModel,
     num_particles: Count,
     *,
-    start: str = "apart",
+    start: Literal["apart", "together"] = "apart",
     split_after: int | None = None,
     scheme: Scheme = "systematic",
 ) -> Filter:

@@ -1,6 +1,6 @@
 """The data of each step: observations, which of them are missing, and known inputs."""
 
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree
 
-from mpfjax.checks import as_numbers, check_one_of, check_shape
+from mpfjax.checks import as_numbers, check, check_shape
 from mpfjax.models.base import model_name, takes_inputs
 
 
@@ -60,7 +60,7 @@ def as_series(data: PyTree, model: Any, inputs: PyTree = None, missing: str = "e
 
 def gathered(data: PyTree, inputs: PyTree = None, missing: str = "error") -> Series:
     """The data as a `Series`, unchecked."""
-    check_one_of(("error", "skip"), missing=missing)
+    check(Literal["error", "skip"], missing=missing)
     if not isinstance(data, Series):
         return Series(data, inputs, skips_missing=missing == "skip")
     if inputs is not None or missing != "error":

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_whole, checked_by, shown
+from mpfjax.checks import Count, check, checked_by, shown
 from mpfjax.models.noise import noise_dtype
 from mpfjax.operations.random import direction_numbers, normal, split
 
@@ -190,7 +190,7 @@ def require_noise(model: Any, needed_by: str) -> None:
             f"model: {model_name(model)} defines a sample_transition, but inherits its"
             f" transition_from_noise, which {needed_by} needs; it must define both"
         )
-    check_whole(noise_dimension=model.noise_dimension)
+    check(Count, noise_dimension=model.noise_dimension)
     direction_numbers(model.noise_dimension)
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_type, saying
+from mpfjax.checks import check, saying
 from mpfjax.mixture import MarginalisedState
 from mpfjax.models.base import check_log_density, check_moved, model_name
 from mpfjax.models.conditionally_linear import (
@@ -135,5 +135,5 @@ def log_predictive(
 
 def _with_moments(model: AbstractConditionallyLinearModel, states: PyTree) -> MarginalisedState:
     what = f"a MarginalisedState, as {model_name(model)} has, which is conditionally linear"
-    check_type(MarginalisedState, what, states=states)
+    check(MarginalisedState, what, states=states)
     return cast(MarginalisedState, states)

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
-from mpfjax.checks import Checked, check_callable, is_series, one_of, shown
+from mpfjax.checks import Checked, check, is_series, one_of, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.logarithms import without_gradient
 
@@ -147,7 +147,7 @@ def as_moves(moves: Any, name: str) -> Moves:
         raise ValueError(f"{name}: {shown(moves)} is not a list of moves")
     moves = tuple(moves)
     for move in moves:
-        check_callable("a move, (key, mixture, observation) -> mixture", **{name: move})
+        check(Callable[..., Any], "a move, (key, mixture, observation) -> mixture", **{name: move})
     return tuple(m if isinstance(m, AbstractMove) else FunctionMove(m) for m in moves)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Key, PyTree
 from tqdm import tqdm
 
-from mpfjax.checks import Checked, Count, check_callable, check_type, check_whole, checked, shown
+from mpfjax.checks import Checked, Count, check, checked, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.observations import as_series, check_series
@@ -78,14 +78,16 @@ class Study(Checked):
 
     def __check_init__(self) -> None:
         what = "a dictionary, {name: value}"
-        check_type(Mapping, what, filters=self.filters, settings=self.settings)
+        check(Mapping, what, filters=self.filters, settings=self.settings)
         for name, build in self.filters.items():
-            check_callable("a function that builds a filter", **{f"filters: {name}": build})
+            check(
+                Callable[..., Any], "a function that builds a filter", **{f"filters: {name}": build}
+            )
         for name in self.settings:
             if name in _TAKEN:
                 raise ValueError(f"settings: {name!r} is a name that a cell has already")
         for number in _axes(self)["num_particles"]:
-            check_whole(num_particles=number)
+            check(Count, num_particles=number)
         check_series(self.observations)
 
 

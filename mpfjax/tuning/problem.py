@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check_type, shown
+from mpfjax.checks import check, shown
 from mpfjax.tuning.transforms import AbstractTransform, Unconstrained
 
 _DECLARED = "eqx.field(converter=jnp.asarray)"
@@ -154,9 +154,9 @@ def pose(
     for name, index in tuned.items():
         leaves[index] = _as_array(name, leaves[index])
     transforms = {} if transforms is None else transforms
-    check_type(Mapping, "a mapping from names to transforms", transforms=transforms)
+    check(Mapping, "a mapping from names to transforms", transforms=transforms)
     for name, transform in transforms.items():
-        check_type(AbstractTransform, "a transform", **{f"transforms[{name!r}]": transform})
+        check(AbstractTransform, "a transform", **{f"transforms[{name!r}]": transform})
         if name not in tuned:
             raise ValueError(f"transforms: {name} is not among the parameters, {sorted(tuned)}")
     return Problem(
@@ -198,7 +198,7 @@ def _tuned(tree: PyTree, parameters: Parameters) -> dict[str, int]:
     if parameters is None:
         parameters = {"": lambda tree: getattr(tree, "model", tree)}
     example = 'a mapping from names to functions, as {"r": lambda filter: filter.model.r}'
-    check_type(Mapping, example, parameters=parameters)
+    check(Mapping, example, parameters=parameters)
     leaves, places = jax.tree.leaves(tree), placed(tree)
     tuned: dict[str, int] = {}
     for name, where in parameters.items():

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mpfjax.checks import check_positive_array, saying
+from mpfjax.checks import POSITIVE, saying
 from mpfjax.operations.matrices import cholesky
 from mpfjax.tuning.densities import Point, chosen
 from mpfjax.tuning.problem import Reals
@@ -102,7 +102,7 @@ def checked_deviations(given: float | Mapping[str, Any], start: Reals) -> Reals:
     for name, u in start.items():
         with saying(f"in proposal_deviations, of {name}"):
             deviations[name] = jnp.broadcast_to(jnp.asarray(by_name[name], u.dtype), u.shape)
-        check_positive_array(**{f"proposal_deviations: {name}": deviations[name]})
+        POSITIVE.check(deviations[name], f"proposal_deviations: {name}")
     return deviations
 
 

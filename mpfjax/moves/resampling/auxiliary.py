@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import check_callable, saying, shown
+from mpfjax.checks import check, saying, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import require
 from mpfjax.moves.base import AbstractMove
@@ -48,7 +48,7 @@ class AuxiliaryResample(AbstractMove):
             require(self.lookahead, "log_normaliser", "AuxiliaryResample", "lookahead")
         elif not hasattr(self.lookahead, "at_step_of"):
             what = "a function of an observation and states, nor a proposal"
-            check_callable(what, lookahead=self.lookahead)
+            check(Callable[..., Any], what, lookahead=self.lookahead)
 
     def map_inner(self, change: Callable[[Any], Any]) -> "AuxiliaryResample":
         """The same with another `Resample`."""

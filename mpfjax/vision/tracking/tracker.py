@@ -8,7 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
-from mpfjax.checks import POSITIVE, Checked, Count, Rule, as_numbers, check_finite, checked, one_of
+from mpfjax.checks import (
+    POSITIVE,
+    Checked,
+    Count,
+    Finite,
+    Rule,
+    as_numbers,
+    check,
+    checked,
+    one_of,
+)
 from mpfjax.vision.colour.bins import HSVColours
 from mpfjax.vision.colour.histograms import SampledBoxes, normalise
 from mpfjax.vision.tracking.associate import (
@@ -61,7 +71,7 @@ def _check_scores(scores: Any, name: str) -> None:
         one_of(("learned", "ignore", "(weak, strong)")).check(scores, name)
         return
     weak, strong = scores
-    check_finite(**{f"{name}: weak": weak, f"{name}: strong": strong})
+    check(Finite, **{f"{name}: weak": weak, f"{name}: strong": strong})
     if weak > strong:
         raise ValueError(f"{name}: the weak one, {weak}, is above the strong one, {strong}")
 
