@@ -3,8 +3,9 @@
     python -m benchmarks.code_size [CHECKOUT ...]
 
 reads the source of one checkout or several, without importing it, and prints a table. Lines of code
-are those beside docstrings, comments and blank ones. A public name is one that `mpfjax`, or one of
-its public modules, exports. Arguments of a class are its fields, unless it has an `__init__`.
+of the library, the tests and the benchmarks are those beside docstrings, comments and blank ones. A
+public name is one that `mpfjax`, or one of its public modules, exports. Arguments of a class are
+its fields, unless it has an `__init__`.
 """
 
 import ast
@@ -23,16 +24,21 @@ def main(checkouts: Folders = (ROOT,)) -> None:
         package = checkout / "mpfjax"
         if not package.is_dir():
             raise FileNotFoundError(f"CHECKOUT: {checkout} holds no mpfjax")
-        texts = {path: path.read_text(encoding="utf-8") for path in sorted(package.rglob("*.py"))}
-        trees = {path: ast.parse(text) for path, text in texts.items()}
+        trees = {path: ast.parse(path.read_text("utf-8")) for path in sorted(package.rglob("*.py"))}
         names = public_names(package, trees)
         name, most = most_arguments(trees, names)
         rows.append({
             "checkout": checkout, "files": len(trees),
-            "lines of code": sum(lines_of_code(texts[path], trees[path]) for path in trees),
+            **{folder: lines_in(checkout / folder) for folder in ("mpfjax", "tests", "benchmarks")},
             "public names": len(names), "most arguments of a call": f"{most} ({name})",
         })  # fmt: skip
     print(table(None, rows))
+
+
+def lines_in(folder: Path) -> int:
+    """Lines of code of all files in a folder."""
+    texts = (path.read_text(encoding="utf-8") for path in folder.rglob("*.py"))
+    return sum(lines_of_code(text, ast.parse(text)) for text in texts)
 
 
 def lines_of_code(text: str, tree: ast.Module) -> int:
