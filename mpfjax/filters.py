@@ -291,7 +291,7 @@ def clustered_particle_filter(
     num_particles: Count,
     *,
     start: Literal["apart", "together"] = "apart",
-    split_after: int | None = None,
+    split_after: Count | None = None,
     scheme: Scheme = "systematic",
 ) -> Filter:
     """A joint filter of clusters of objects; clusters merge where objects meet.

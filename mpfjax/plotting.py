@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from mpfjax.checks import CountOrZero, checked, shown
+from mpfjax.checks import CountOrZero, Share, checked, shown
 from mpfjax.mixture import ParticleMixture, flatten_states
 
 # Okabe and Ito's palette (2008), which people with colour blindness can tell apart.
@@ -24,7 +24,7 @@ def draw_components(
     index: CountOrZero = 0,
     *,
     truth: np.ndarray | None = None,
-    least_mass: float = 0.01,
+    least_mass: Share = 0.01,
 ) -> Figure:
     """Each component's mean and two standard deviations over time, the darker the heavier.
 

@@ -1,6 +1,6 @@
 """The grid filter, for scalar models."""
 
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -51,7 +51,7 @@ def grid_filter(
     *,
     state_shape: tuple[int, ...] = (),
     inputs: PyTree = None,
-    missing: str = "error",
+    missing: Literal["error", "skip"] = "error",
 ) -> GridFilterRun:
     """The recursion of Vermaak et al. (2003), eqs. 1 and 2, by quadrature on an even grid.
 

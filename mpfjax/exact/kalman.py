@@ -1,7 +1,7 @@
 """The Kalman filter and smoother, for linear-Gaussian models."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -61,7 +61,7 @@ def kalman_filter(
     observations: PyTree,
     *,
     inputs: PyTree = None,
-    missing: str = "error",
+    missing: Literal["error", "skip"] = "error",
 ) -> KalmanFilterRun:
     """The Kalman filter (Kalman 1960), with the library's convention: y_1 follows x_1, not x_0.
 
@@ -87,7 +87,7 @@ def kalman_smoother(
     observations: PyTree,
     *,
     inputs: PyTree = None,
-    missing: str = "error",
+    missing: Literal["error", "skip"] = "error",
 ) -> KalmanSmootherRun:
     """E and Cov of x_0, ..., x_t given y_1..y_t, by the recursion of Rauch, Tung and Striebel 1965.
 

@@ -95,7 +95,7 @@ def modes_represented(
 
 
 @checked
-def mass_above(mixture: ParticleMixture, threshold: float) -> Float[Array, ""]:
+def mass_above(mixture: ParticleMixture, threshold: float | Float[Array, ""]) -> Float[Array, ""]:
     """P(x_t > threshold | y_1..y_t) of a scalar state; a particle at the threshold counts half.
 
     The particles' estimate of `GridFilterRun.mass_above`. With a threshold between two modes it is

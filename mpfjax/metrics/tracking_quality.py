@@ -98,7 +98,7 @@ def tracking_quality(
     estimates: Float[Array, "runs t objects 4"],
     truth: Float[Array, "t objects 4"],
     *,
-    num_last: int = 1,
+    num_last: Count = 1,
 ) -> TrackingQuality:
     """All measures of section 3.1 for each object, over runs.
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import checked, saying, shown
+from mpfjax.checks import Count, checked, saying, shown
 from mpfjax.filter import Filter
 from mpfjax.models.base import require, with_inputs
 from mpfjax.models.steps import likelihoods
@@ -80,7 +80,7 @@ def particle_gibbs(
     key: Key[Array, ""],
     filter: Filter,
     observations: PyTree,
-    num_steps: int,
+    num_steps: Count,
     *,
     draw: Draw | None = None,
     log_prior: LogPrior | None = None,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import checked
+from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter
 from mpfjax.tuning.chains import AbstractKernel, ChainOptions, Sampling, Step
 from mpfjax.tuning.densities import LogDensity, LogPrior, Point, checked_prior
@@ -47,7 +47,7 @@ def metropolis_hastings(
     key: Key[Array, ""],
     filter: Filter,
     observations: PyTree,
-    num_steps: int,
+    num_steps: Count,
     *,
     log_prior: LogPrior,
     proposal_deviations: float | Mapping[str, Any] = 0.1,

@@ -182,8 +182,8 @@ class ColourModel(AbstractBoxModel):
     initial_deviations: Float[Array, "k 4"]
     sigma: Float[Array, ""]
     colours: AbstractColours
-    switch_probability: float = eqx.field(static=True, default=0.0)
-    contrast: float = eqx.field(static=True, default=0.0)
+    switch_probability: Share = eqx.field(static=True, default=0.0)
+    contrast: NotNegative = eqx.field(static=True, default=0.0)
     wide_counts: bool = eqx.field(static=True, default=False)
 
     @classmethod
