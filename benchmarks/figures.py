@@ -135,6 +135,14 @@ def draw_contact_sheet(
     return figure
 
 
+def region(points: np.ndarray, sizes: np.ndarray, shape: Sequence[int]) -> tuple[slice, slice]:
+    """The rows and columns of a frame that hold points, with room for boxes of these sizes."""
+    margin = 1.2 * sizes.max(axis=0)
+    left, top = (points.min(axis=0) - margin).astype(int)
+    right, bottom = (points.max(axis=0) + margin).astype(int)
+    return slice(max(top, 0), min(bottom, shape[0])), slice(max(left, 0), min(right, shape[1]))
+
+
 def draw_curves(
     curves: Mapping[str, np.ndarray], first: int, *, xlabel: str, ylabel: str, title: str
 ) -> Figure:
@@ -160,27 +168,6 @@ def _draw_band(
     frames, mean = first + np.arange(values.shape[1]), values.mean(axis=0)
     axis.plot(frames, mean, label=name, lw=1.4, color=colour, **style)
     axis.fill_between(frames, mean - spread, mean + spread, color=colour, alpha=0.15, lw=0)
-
-
-def draw_errors_by_size(
-    panels: Sequence[tuple[str, Mapping[str, Mapping[int, np.ndarray]]]], ylabel: str
-) -> Figure:
-    """Figures 5 and 6 of Lin et al. (2012): errors of several runs against N, two panels a row.
-
-    Each panel has a title and, for each filter by name, the errors of its runs by N.
-    """
-
-    def point(size: int, errors: np.ndarray) -> tuple[float, ...]:
-        mean, error = errors.mean(), float(standard_error(errors))
-        return size, mean, mean - error, mean + error
-
-    drawn = [
-        Panel(title, "number of particles $N$", ylabel, {
-            name: [point(*each) for each in by_size.items()] for name, by_size in lines.items()
-        })
-        for title, lines in panels
-    ]  # fmt: skip
-    return draw_panels([drawn[k : k + 2] for k in range(0, len(drawn), 2)], ("linear", "log"))
 
 
 def draw_object_bars(rows: Mapping[str, Sequence[np.ndarray]], titles: Sequence[str]) -> Figure:

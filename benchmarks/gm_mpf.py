@@ -12,7 +12,8 @@ Into --out DIR go gm_mpf.json and the figures.
 """
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -36,20 +37,23 @@ from mpfjax.vision.files import boxes as box_files
 from mpfjax.vision.files import drawing, frames
 
 NAMES = {"pf": "PF", "gpf": "GPF", "mpf": "MPF", "gm_mpf": "GM-MPF"}
-MOMENTUM = 0.5
-STEP_DEVIATIONS = (0.12, 0.04, 0.01, 0.01)  # a frame, in widths, heights, and shares of the size
-SIGMA, NUM_PARTS = 0.1, 3
-DEFAULT_IDS, DEFAULT_FRAMES = (11, 13), "129:199"
-TIMED_PARTICLES, TIMED_FRAMES, WARM_UP = 1000, 50, 5
-# Of the filter that errors are measured from.
-REFERENCE_PARTICLES, REFERENCE_RUNS = 5000, 4
-LAST_FRAMES, LEAST_SHARE = 10, 0.1
-PAPER_MILLISECONDS = {
-    "pf": (1.68, 0.046), "gpf": (1.52, 0.028), "mpf": (1.82, 0.034), "gm_mpf": (1.75, 0.019)
+TIMED_PARTICLES, WARM_UP = 1000, 5
+TIMES = {
+    "filter": "{name}", "ms a frame": "{mean:.3f} ± {std:.3f}",
+    "ratio of means": "{of_means:.3f}", "of medians": "{of_medians:.3f}",
 }  # fmt: skip
+COLUMNS = {
+    "filter": "{name}, N = {particles}",
+    "RMSE 1 [px]": "{rmse[0]:.2f} ± {rmse_std[0]:.2f}",
+    "RMSE 2 [px]": "{rmse[1]:.2f} ± {rmse_std[1]:.2f}",
+    "1 from the reference": "{monte_carlo_error[0]:.2f}",
+    "2 from the reference": "{monte_carlo_error[1]:.2f}",
+    "both held": "{both_held:.2f}",
+    "N_eff": "{n_eff:.1f}",
+}
 
 
-@command(frames="129:140", particles=[20], seeds=2)
+@command(frames="129:140", particles=[20], seeds=2, timed=5, reference=200)
 def main(
     *,
     sequence: Path | None = None,
@@ -58,6 +62,8 @@ def main(
     filters: Sequence[Annotated[str, (*NAMES,)]] = (*NAMES,),
     particles: Sequence[AtLeast2] = (100, 200, 300),
     seeds: Count = 20,
+    timed: Count = 50,
+    reference: AtLeast2 = 5000,
     seed: Seed = 0,
     out: Path = Path("results/gm_mpf"),
 ) -> None:
@@ -66,68 +72,60 @@ def main(
     - `sequence`: a folder with img/ and gt.txt.
     - `ids`: two objects of gt.txt.
     - `frames`: A:B, frames A to B, counted from 1, both in.
+    - `timed`: steps of each filter, and of each part of a step.
+    - `reference`: particles, in four runs, of the filter that errors are measured from.
     """
     targets = open_targets(sequence, ids, frames, seed)
     # In the order of the table, the PF first: the others are measured against it.
     names = [name for name in NAMES if name in filters]
-    timing, cheap = time_filters(targets, seed, names), time_quadratic(seed, names)
-    parts = profile(targets, seed)
+    last = targets.first + len(targets.stills) - 1
+    settings = harness.settings_of(
+        {"source": targets.name, "seeds": seeds, "seed": seed, "frames": [targets.first, last]}
+    )
+    timing = times_of(filters_in_turns(targets, seed, names, timed), timed)
+    profile = times_of(parts_of_a_step(targets, seed), timed)
     print(f"time with colour histograms, {TIMED_PARTICLES} particles (table 1)")
-    print(timing_table(timing, paper=True))
-    print(f"\ntime on the quadratic model, {TIMED_PARTICLES} particles")
-    print(timing_table(cheap, paper=False))
+    print(harness.table(TIMES, timing))
     print("\nwhere the time of one frame goes")
-    columns = {"part": "{part}", "ms": "{ms:.3f}"}
-    print(harness.table(columns, [{"part": k, "ms": v} for k, v in parts.items()]))
-    content: dict[str, Any] = {
-        "settings": harness.settings_of({
-            "source": targets.name, "seeds": seeds, "seed": seed,
-            "frames": [targets.first, targets.first + len(targets.stills) - 1],
-            "timed_particles": TIMED_PARTICLES, "timed_frames": TIMED_FRAMES,
-        }),
-        "timing": {name: times.mean() for name, times in timing.items()},
-        "timing_std": {name: times.std() for name, times in timing.items()},
-        "timing_quadratic": {name: times.mean() for name, times in cheap.items()},
-        "profile": parts,
-    }  # fmt: skip
-    harness.data(out / "gm_mpf.json", **content)
-    found = study(targets, particles, seeds, seed, names)
-    mixtures = [name for name in names if name in ("mpf", "gm_mpf")]
-    references = reference_estimates(targets, seed, mixtures)
-    fewest = {name: steps[particles[0]] for name, steps in found.items()}
-    by_size = {name: errors_by_size(steps, targets.truth) for name, steps in found.items()}
-    own = {name: errors_by_size(found[name], truth) for name, truth in references.items()}
-    content |= {
-        "rmse": _of_each(by_size, lambda errors: errors.mean(axis=0)),
-        "rmse_std": _of_each(by_size, lambda errors: errors.std(axis=0)),
-        "monte_carlo_error": _of_each(own, lambda errors: errors.mean(axis=0)),
-        "n_eff": {name: step.effective_sample_size.mean(axis=0) for name, step in fewest.items()},
-        "both_held": {name: held(step, targets.truth).mean() for name, step in fewest.items()},
-    }
-    harness.data(out / "gm_mpf.json", **content)
-    print(f"\ntwo targets of {targets.name}, {seeds} seeds")
-    print(study_table(found, by_size, own, targets))
-    curves = {NAMES[name]: step.effective_sample_size for name, step in fewest.items()}
+    print(harness.table({"part": "{name}", "ms": "{median:.3f}"}, profile))
+    # What each mixture has with a great many particles, E(x_t | y_1..y_t), (t, 2 targets, 2): the
+    # distance from it is what more particles can mend, and the rest of the distance from the true
+    # box is the model's, or the annotation's.
+    own = {name: run_filter(name, reference, targets, seed + 1, 4).estimates.mean(axis=0)
+           for name in names if name in ("mpf", "gm_mpf")}  # fmt: skip
+    results: list[dict[str, Any]] = []
+    steps: dict[str, Step] = {}
+    for name, size in harness.grid("study", names, particles):
+        step = run_filter(name, size, targets, seed, seeds)
+        steps.setdefault(name, step)
+        # Section 5: the mean over frames of the distance between the estimate and the target.
+        errors = errors_of(step.estimates, targets.truth[:, :, :2])
+        results.append({
+            "filter": name, "name": NAMES[name], "particles": size, "rmse": errors.mean(axis=0),
+            "rmse_std": errors.std(axis=0), "rmse_error": plotting.standard_error(errors),
+            "both_held": held(step, targets.truth).mean(),
+            "n_eff": step.effective_sample_size.mean(),
+        })  # fmt: skip
+        if name in own:
+            errors = errors_of(step.estimates, own[name])
+            results[-1] |= {
+                "monte_carlo_error": errors.mean(axis=0),
+                "monte_carlo_error_error": plotting.standard_error(errors),
+            }
+        content = {"timing": timing, "profile": profile, "results": results}
+        harness.data(out / "gm_mpf.json", settings=settings, **content)
+    print(f"\ntwo targets of {targets.name}, {seeds} seeds; the reference has N = {reference}")
+    print(harness.table(COLUMNS, results))
+    curves = {NAMES[name]: step.effective_sample_size for name, step in steps.items()}
     harness.figures(
-        out, dpi=130, particle_migration=draw_migration(fewest, targets),
+        out, dpi=130, particle_migration=draw_migration(steps, targets),
         effective_sample_size=plotting.draw_curves(  # figures 3 and 4
             curves, targets.first, xlabel="frame", ylabel=r"effective sample size $N_{eff}$",
             title=f"eq. 14, N = {particles[0]}, mean ± std over seeds",
         ),
-        rmse=draw_errors(by_size, own),
+        rmse=draw_errors(results),
     )  # fmt: skip
     print(f"written to {out}")
-
-
-BySize = dict[str, dict[int, np.ndarray]]  # of each filter and number of particles
-
-
-def _of_each(values: BySize, measure: Callable[[Any], Any]) -> dict[str, Any]:
-    """A measure of every filter and number of particles."""
-    return {
-        name: {str(size): measure(value) for size, value in by_size.items()}
-        for name, by_size in values.items()
-    }
 
 
 # --- targets, models and filters ----------------------------------------------------------------
@@ -147,34 +145,20 @@ def open_targets(
 ) -> Targets:
     """The sequence asked for, or pets09_s2l1, or a rendered scene where there is no data.
 
-    The folder of sequences is the one that MPFJAX_DATA names, or ../shared/data.
+    The folder of sequences is the one that MPFJAX_DATA names, or ../shared/data. In the rendered
+    scene two players of a team change places before a camera that stands still.
     """
+    data = Path(os.environ.get("MPFJAX_DATA", "../shared/data")) / "pets09_s2l1"
+    if sequence is None and data.is_dir():
+        sequence, ids, span = data, ids or (11, 13), span or "129:199"
+    first, last = frames.parse_range(span, "--frames")
     if sequence is None:
-        data = Path(os.environ.get("MPFJAX_DATA", "../shared/data")) / "pets09_s2l1"
-        if not data.is_dir():
-            return _rendered(ids, span, seed)
-        sequence = data
-        ids = DEFAULT_IDS if ids is None else ids
-        span = DEFAULT_FRAMES if span is None else span
-    first, last = frames.parse_range(span, "--frames")
-    rows = read_truth(sequence / "gt.txt").objects
-    if ids is None:
-        ids = sorted(box_files.boxes_of_frame(rows, first))[:2]
-    stills = np.stack(list(frames.read_frames(sequence, first, last)))
-    return _with_truth(str(sequence.name), stills, first, rows, ids)
-
-
-def _rendered(ids: Sequence[int] | None, span: str | None, seed: int) -> Targets:
-    """Two players of one team, who change places before a camera that stands still."""
-    first, last = frames.parse_range(span, "--frames")
-    scene = football_scene(jax.random.key(seed), last or 80, num_players=2, still_camera=True)
-    stills = scene.frames[first - 1 :]
-    return _with_truth("rendered scene", stills, first, scene.tracks, ids or (1, 2))
-
-
-def _with_truth(
-    name: str, stills: np.ndarray, first: int, rows: np.ndarray, ids: Sequence[int]
-) -> Targets:
+        scene = football_scene(jax.random.key(seed), last or 80, num_players=2, still_camera=True)
+        name, rows, stills = "rendered scene", scene.tracks, scene.frames[first - 1 :]
+    else:
+        name, rows = sequence.name, read_truth(sequence / "gt.txt").objects
+        stills = np.stack(list(frames.read_frames(sequence, first, last)))
+    ids = ids or sorted(box_files.boxes_of_frame(rows, first))[:2]
     boxes = boxes_over_time(rows, ids, first, len(stills))
     for t, target in np.argwhere(np.isnan(boxes).any(axis=2)):
         raise ValueError(f"--ids: object {ids[target]} has no box in frame {first + t}")
@@ -183,15 +167,18 @@ def _with_truth(
 
 
 def make_model(targets: Targets) -> ColourModel:
-    """HSV histograms and second-order dynamics for the two boxes of the first frame."""
+    """HSV histograms and second-order dynamics for the two boxes of the first frame.
+
+    A step deviates by shares of the boxes' widths and heights, and of the sizes' scales.
+    """
     still, boxes = targets.stills[0], box_files.top_left(targets.truth[0])
-    deviations = np.array(STEP_DEVIATIONS)[None] * np.concatenate(
+    deviations = np.array([[0.12, 0.04, 0.01, 0.01]]) * np.concatenate(
         [boxes[:, 2:], np.ones_like(boxes[:, 2:])], axis=1
     )
-    each = [mpfjax.Autoregression.with_momentum(MOMENTUM, jnp.asarray(row)) for row in deviations]
+    each = [mpfjax.Autoregression.with_momentum(0.5, jnp.asarray(row)) for row in deviations]
     dynamics = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
     return ColourModel.from_frame(
-        still, boxes, colours=HSVColours(), sigma=SIGMA, num_parts=NUM_PARTS, weigh_colours=True,
+        still, boxes, colours=HSVColours(), sigma=0.1, num_parts=3, weigh_colours=True,
         deviations=deviations, dynamics=dynamics,
     )  # fmt: skip
 
@@ -251,100 +238,53 @@ class Collect(eqx.Module):
         )
 
 
-def errors(estimates: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """The distance in pixels of each estimate (..., t, 2 targets, 2) from its target's centre."""
-    return np.linalg.norm(estimates - truth[:, :, :2], axis=-1)
+def errors_of(estimates: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """The mean distance in pixels of each run's estimates (runs, t, 2, 2) from (t, 2, 2)."""
+    return np.linalg.norm(estimates - truth, axis=-1).mean(axis=1)
 
 
 def held(step: Step, truth: np.ndarray) -> np.ndarray:
-    """Whether each run keeps both targets: in all of the last frames the particles that stand for
-    a target and lie on it are at least `LEAST_SHARE` of its equal share, which is half of all.
+    """Whether each run keeps both targets: in each of the last ten frames the particles that stand
+    for a target and lie on it are at least a tenth of its equal share, which is half of all.
     """
     gaps = np.abs(step.centres[:, :, None] - truth[None, :, :, None, :2])
     near = (gaps < np.array(REACH) * truth[None, :, :, None, 2:]).all(axis=-1)
     own = step.target[:, :, None] == np.arange(2)[None, None, :, None]
     shares = 2 * (near & own).mean(axis=-1)
-    return (shares[:, -LAST_FRAMES:] >= LEAST_SHARE).all(axis=(1, 2))
+    return (shares[:, -10:] >= 0.1).all(axis=(1, 2))
 
 
-def study(
-    targets: Targets, sizes: Sequence[int], num_seeds: int, seed: int, names: Iterable[str]
-) -> dict[str, dict[int, Step]]:
-    """Every filter at every number of particles, `num_seeds` runs of each under one vmap."""
-    model = make_model(targets)
-    keys = jax.random.split(jax.random.key(seed), num_seeds)
-    stills = jnp.asarray(targets.stills)
-    found: dict[str, dict[int, Step]] = {}
-    for name, size in harness.grid("study", names, sizes):
-        run = mpfjax.monte_carlo(keys, make_filter(name, model, size), stills, Collect(model))
-        found.setdefault(name, {})[size] = jax.tree.map(np.asarray, run.collected)
-    return found
-
-
-def reference_estimates(targets: Targets, seed: int, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """E(x_t | y_1..y_t) as each filter has it with a great many particles, (t, 2 targets, 2).
-
-    The distance from it is what more particles can mend; what is left of the distance from the
-    true box is the model's, or the annotation's.
-    """
-    found = study(targets, [REFERENCE_PARTICLES], REFERENCE_RUNS, seed + 1, names)
-    return {name: steps[REFERENCE_PARTICLES].estimates.mean(0) for name, steps in found.items()}
-
-
-def errors_by_size(by_size: dict[int, Step], truth: np.ndarray) -> dict[int, np.ndarray]:
-    """Each target's RMSE in each run, (seeds, 2), as section 5 defines it: the mean over frames of
-    the distance between the estimate and the target.
-    """
-    return {size: errors(step.estimates, truth).mean(axis=1) for size, step in by_size.items()}
+def run_filter(name: str, size: int, targets: Targets, seed: int, num_seeds: int) -> Step:
+    """What is kept of the runs of a filter, all under one vmap."""
+    model, keys = make_model(targets), jax.random.split(jax.random.key(seed), num_seeds)
+    filter, stills = make_filter(name, model, size), jnp.asarray(targets.stills)
+    run = mpfjax.monte_carlo(keys, filter, stills, Collect(model))
+    return jax.tree.map(np.asarray, run.collected)
 
 
 # --- times: the filters in turns, and the parts of a step on their own --------------------------
 
 
-def time_filters(targets: Targets, seed: int, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Milliseconds of each of 50 frames with 1000 particles."""
+def filters_in_turns(
+    targets: Targets, seed: int, names: Sequence[str], timed: int
+) -> dict[str, Callable[[int], Any]]:
+    """A step of each filter with 1000 particles, on the next frame in each turn."""
     model, key = make_model(targets), jax.random.key(seed)
-    filters = {name: make_filter(name, model, TIMED_PARTICLES) for name in names}
+    filters = {NAMES[name]: make_filter(name, model, TIMED_PARTICLES) for name in names}
     stills = [jnp.asarray(still) for still in targets.stills]
     mixtures = {name: filter.init(key) for name, filter in filters.items()}
-    keys = jax.block_until_ready(jax.random.split(key, WARM_UP + TIMED_FRAMES))
+    keys = jax.block_until_ready(jax.random.split(key, WARM_UP + timed))
 
     def advance(name: str, turn: int) -> Any:
         still = stills[turn % len(stills)]
         mixtures[name], _ = filters[name].step(keys[turn], mixtures[name], still)
         return mixtures[name]
 
-    return _milliseconds({name: lambda turn, n=name: advance(n, turn) for name in names})
+    return {name: partial(advance, name) for name in filters}
 
 
-def time_quadratic(seed: int, names: Iterable[str], num_steps: int = 200) -> dict[str, np.ndarray]:
-    """Milliseconds a step where the likelihood costs next to nothing: the cost of the mixture.
-
-    The filters of the literature as they are, with all their regrouping at every step; each of 50
-    runs of `num_steps` steps is one scan, so that no time goes into calling it.
-    """
-    model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
-    observations = (2 * jnp.sin(2 * jnp.pi * jnp.arange(1.0, num_steps + 1) / 100)) ** 2
-    n = TIMED_PARTICLES
-    grouping = [mpfjax.Merge(), mpfjax.Split(), mpfjax.KMeans()]
-    every = {
-        "pf": mpfjax.particle_filter(model, n),
-        "gpf": mpfjax.gaussian_particle_filter(model, n),
-        "mpf": mpfjax.mixture_particle_filter(model, n, 2, regroup=grouping, regroup_every=1),
-        "gm_mpf": mpfjax.gaussian_mixture_particle_filter(model, n, 2),
-    }
-
-    def run(filter: mpfjax.Filter, turn: int) -> Array:
-        key = jax.random.key(seed + turn)
-        found = mpfjax.run_filter(key, filter, observations, harness.nothing)
-        return found.log_marginal_likelihood
-
-    taken = _milliseconds({name: lambda turn, f=every[name]: run(f, turn) for name in names})
-    return {name: times / num_steps for name, times in taken.items()}
-
-
-def profile(targets: Targets, seed: int) -> dict[str, float]:
-    """Median milliseconds of each part of a step on its own, with 1000 particles."""
+def parts_of_a_step(targets: Targets, seed: int) -> dict[str, Callable[[int], Any]]:
+    """Each part of a step on its own, with 1000 particles."""
     model, still = make_model(targets), jnp.asarray(targets.stills[0])
     table = integral_histogram(still, model.colours)
     mixture = make_filter("mpf", model, TIMED_PARTICLES).init(jax.random.key(seed))
@@ -358,60 +298,24 @@ def profile(targets: Targets, seed: int) -> dict[str, float]:
         "Gaussian regeneration, two components": (redraw, key, mixture),
     }
     programs = {name: eqx.filter_jit(part) for name, (part, *_) in parts.items()}
-    runs = {name: lambda _, name=name: programs[name](*parts[name][1:]) for name in parts}
-    return {name: float(np.median(times)) for name, times in _milliseconds(runs).items()}
+    return {name: lambda _, name=name: programs[name](*parts[name][1:]) for name in parts}
 
 
-def _milliseconds(runs: dict[str, Callable[[int], Any]]) -> dict[str, np.ndarray]:
-    taken = harness.turns(runs, TIMED_FRAMES, warm_up=WARM_UP)
-    return {name: 1000 * seconds for name, seconds in taken.items()}
-
-
-# --- tables and figures -------------------------------------------------------------------------
-
-
-def timing_table(elapsed: dict[str, np.ndarray], paper: bool) -> str:
-    """Mean and standard deviation of each filter, and its ratio to the first, the PF."""
-    first = next(iter(elapsed))
-    rows = [
+def times_of(runs: dict[str, Callable[[int], Any]], timed: int) -> list[dict[str, Any]]:
+    """Milliseconds of each run, taken in turns, and ratios to the first."""
+    taken = harness.turns(runs, timed, warm_up=WARM_UP)
+    first = next(iter(taken.values()))
+    return [
         {
-            "filter": NAMES[name], "mean": times.mean(), "std": times.std(),
-            "of_means": times.mean() / elapsed[first].mean(),
-            "of_medians": np.median(times) / np.median(elapsed[first]),
-            "paper": "{:.2f} ± {:.3f}".format(*PAPER_MILLISECONDS[name]),
-            "of_paper": PAPER_MILLISECONDS[name][0] / PAPER_MILLISECONDS[first][0],
+            "name": name, "mean": 1000 * times.mean(), "std": 1000 * times.std(),
+            "median": 1000 * float(np.median(times)), "of_means": times.mean() / first.mean(),
+            "of_medians": np.median(times) / np.median(first),
         }
-        for name, times in elapsed.items()
+        for name, times in taken.items()
     ]  # fmt: skip
-    columns = {
-        "filter": "{filter}", "ms a frame": "{mean:.3f} ± {std:.3f}",
-        "ratio of means": "{of_means:.3f}", "of medians": "{of_medians:.3f}",
-    }  # fmt: skip
-    if paper:
-        columns |= {"paper's ms": "{paper}", "paper's ratio": "{of_paper:.3f}"}
-    return harness.table(columns, rows)
 
 
-def study_table(
-    found: dict[str, dict[int, Step]], by_size: BySize, own: BySize, targets: Targets
-) -> str:
-    """RMSE of each target and what of it is Monte Carlo error, who holds both, and mean N_eff."""
-    rows = []
-    for name, steps in found.items():
-        for size, step in steps.items():
-            error = by_size[name][size]
-            row: dict[str, Any] = {
-                "filter": f"{NAMES[name]}, N = {size}", "mean": error.mean(axis=0),
-                "std": error.std(axis=0), "held": held(step, targets.truth).mean(),
-                "n_eff": step.effective_sample_size.mean(),
-            }  # fmt: skip
-            if name in own:
-                row["own"] = own[name][size].mean(axis=0)
-            rows.append(row)
-    columns = {"filter": "{filter}"}
-    columns |= {f"RMSE {k + 1} [px]": f"{{mean[{k}]:.2f}} ± {{std[{k}]:.2f}}" for k in (0, 1)}
-    columns |= {f"{k + 1} from N = {REFERENCE_PARTICLES}": f"{{own[{k}]:.2f}}" for k in (0, 1)}
-    return harness.table(columns | {"both held": "{held:.2f}", "N_eff": "{n_eff:.1f}"}, rows)
+# --- figures ------------------------------------------------------------------------------------
 
 
 def draw_migration(fewest: dict[str, Step], targets: Targets) -> Any:
@@ -424,7 +328,8 @@ def draw_migration(fewest: dict[str, Step], targets: Targets) -> Any:
     closest, last = int(np.argmin(gaps)), len(gaps) - 1
     middle = closest // 2 if 2 * closest > last else (closest + last) // 2
     chosen = sorted({0, middle, closest, last})
-    crop = _region(targets)
+    boxes = targets.truth.reshape(-1, 4)
+    crop = plotting.region(boxes[:, :2], boxes[:, 2:], targets.stills.shape[1:])
     rows = [
         (NAMES[name], [_annotated(targets.stills[t], step, t, crop) for t in chosen])
         for name, step in fewest.items()
@@ -443,35 +348,28 @@ def _annotated(still: np.ndarray, step: Step, t: int, crop: tuple[slice, slice])
     return np.clip(canvas, 0, 255).astype(np.uint8)
 
 
-def _region(targets: Targets) -> tuple[slice, slice]:
-    """The rows and columns that the targets pass through, with a box's room around."""
-    centres, size = targets.truth[:, :, :2], targets.truth[:, :, 2:].max(axis=(0, 1))
-    low = np.maximum(centres.min(axis=(0, 1)) - 1.2 * size, 0).astype(int)
-    high = (centres.max(axis=(0, 1)) + 1.2 * size).astype(int)
-    height, width = targets.stills.shape[1:3]
-    return slice(low[1], min(high[1], height)), slice(low[0], min(high[0], width))
-
-
-def draw_errors(by_size: BySize, own: BySize) -> Any:
+def draw_errors(results: list[dict[str, Any]]) -> Any:
     """Figures 5 and 6: each target's error against the number of particles.
 
     Below, what of it is the Monte Carlo error of the mixtures.
     """
-    panels = [
-        (
-            f"target {target + 1}, from {what}",
-            {
-                NAMES[name]: {size: error[:, target] for size, error in sizes.items()}
-                for name, sizes in errors.items()
-            },
+
+    def panel(what: str, measure: str, target: int) -> plotting.Panel:
+        entries = [entry for entry in results if measure in entry]
+        axes = (
+            lambda e, k=k: e[measure][target] + k * e[f"{measure}_error"][target]
+            for k in (0, -1, 1)
         )
-        for what, errors in (
-            ("the true box", by_size),
-            (f"the estimate with N = {REFERENCE_PARTICLES}", own),
-        )
-        for target in (0, 1)
-    ]
-    return plotting.draw_errors_by_size(panels, "RMSE [pixels], mean ± s.e.")
+        lines = plotting.lines_of(entries, "name", "particles", *axes)
+        label = "RMSE [pixels], mean ± s.e."
+        title = f"target {target + 1}, from {what}"
+        return plotting.Panel(title, "number of particles $N$", label, lines)
+
+    rows = {"the true box": "rmse"}
+    if any("monte_carlo_error" in entry for entry in results):
+        rows["the estimate of the reference"] = "monte_carlo_error"
+    panels = [[panel(what, measure, k) for k in (0, 1)] for what, measure in rows.items()]
+    return plotting.draw_panels(panels, ("linear", "log"))
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ lists the options.
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from textwrap import fill
 from typing import Annotated, Any
@@ -28,43 +28,25 @@ from mpfjax.metrics.tracking_quality import recovery_rate, track_state
 
 REPULSION = 2 * SHARPNESS  # so that sharing a place never pays; none from a box's side on
 RUNS_AT_ONCE = 20
+NUM_LAST = 3  # frames at the end in which who has recovered is tracked
 
-
-def dps(reassembly: str) -> Callable[..., mpfjax.Filter]:
-    return lambda model, n: mpfjax.distributed_partitioned_sampling(model, n, None, reassembly)
-
-
-def crossing(model: mpfjax.MultiObjectModel, num_particles: int) -> mpfjax.Filter:
-    """Shared-proposal crossing of all objects in one cluster."""
-    return mpfjax.clustered_particle_filter(model, num_particles, start="together")
-
-
-def splitting(model: mpfjax.MultiObjectModel, num_particles: int) -> mpfjax.Filter:
-    """Clusters that part after five steps without contact, an approximation."""
-    return mpfjax.clustered_particle_filter(model, num_particles, split_after=5)
-
-
-def adaptive_with_draws(model: mpfjax.MultiObjectModel, num_particles: int) -> mpfjax.Filter:
-    """Adaptive partitions with five points in each row, so up to five times the likelihoods."""
-    return adaptive_partitions(model, num_particles, num_draws=5)
-
-
+clusters, dps = mpfjax.clustered_particle_filter, mpfjax.distributed_partitioned_sampling
 METHODS: dict[str, tuple[str, Callable[..., mpfjax.Filter]]] = {
     "joint": ("joint PF", mpfjax.particle_filter),
     "ps": ("PS", mpfjax.partitioned_sampling),
-    "dps_prior": ("DPS, prior", dps("prior")),
-    "dps_evidence": ("DPS, evidence", dps("evidence")),
+    "dps_prior": ("DPS, prior", partial(dps, reassembly="prior")),
+    "dps_evidence": ("DPS, evidence", partial(dps, reassembly="evidence")),
     "independent": ("independent", mpfjax.independent_particle_filters),
     "independent_partitions": ("independent partitions", independent_partitions),
     "adaptive": ("adaptive partitions", adaptive_partitions),
-    "adaptive_draws": ("adaptive partitions, K = 5", adaptive_with_draws),
-    "crossing": ("one cluster", crossing),
-    "clusters": ("clusters", mpfjax.clustered_particle_filter),
-    "splitting": ("clusters that split", splitting),
+    # Five points in each row, so up to five times the likelihoods.
+    "adaptive_draws": ("adaptive partitions, K = 5", partial(adaptive_partitions, num_draws=5)),
+    "crossing": ("one cluster", partial(clusters, start="together")),
+    "clusters": ("clusters", clusters),
+    # Clusters that part after five steps without contact, an approximation.
+    "splitting": ("clusters that split", partial(clusters, split_after=5)),
 }
 ONE_BY_ONE = ("crossing", "clusters", "splitting")
-ESTIMATES = ("median", "mean")
-NUM_LAST = 3  # frames at the end in which who has recovered is tracked
 
 
 @command(runs=2, scenes=["e"], methods=["ps", "independent"])
@@ -76,28 +58,18 @@ def main(
     methods: Sequence[Annotated[str, (*METHODS,)]] = (*METHODS,),
     out: Path = Path("results/interacting_objects"),
 ) -> None:
-    """Run the study, print its tables, and write its results and figure.
+    """Run the study, print its table, and write its results and figure.
 
     - `runs`: random scenes, one run in each.
     - `seed`: of the scenes and the runs.
     """
     settings = harness.settings_of(locals())
     results: list[dict[str, Any]] = []
-    with ThreadPoolExecutor(max_workers=2) as pool:  # one compiles while another runs
-        futures = {
-            (scene, method): pool.submit(run_method, method, SCENES[scene], runs, seed)
-            for scene in scenes
-            for method in methods
-        }
-        try:
-            for scene, method in harness.grid("cell", scenes, methods):
-                results += entries(scene, method, futures[scene, method].result(), runs)
-                harness.data(out / "interacting_objects.json", settings=settings, results=results)
-        except KeyboardInterrupt:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    for estimate in ESTIMATES:
-        print(as_table(results, estimate), end="\n\n")
+    for scene, method in harness.grid("cell", scenes, methods):
+        results += entries(scene, method, run_method(method, SCENES[scene], runs, seed))
+        harness.data(out / "interacting_objects.json", settings=settings, results=results)
+    cell = "{rate:.3f} [{interval[0]:.2f}, {interval[1]:.2f}]"
+    print(harness.pivot("recovery, median", results, "{label}", "{scene}", cell), end="\n\n")
     for scene in scenes:
         print(f"{scene}: {SCENES[scene].title}; N = {SCENES[scene].num_particles}")
     harness.figures(out, interacting_objects=draw(results))
@@ -112,10 +84,10 @@ def run_all(
     scenes: Scene,
     orders: Array | None,
     runs_at_once: int | None,
-) -> dict[str, Float[Array, "runs t objects 2"]]:
-    """The estimates of one run of the filter in each scene."""
+) -> Float[Array, "runs t objects 2"]:
+    """The medians of one run of the filter in each scene."""
 
-    def run(inputs: tuple) -> dict[str, Float[Array, "t objects 2"]]:
+    def run(inputs: tuple) -> Float[Array, "t objects 2"]:
         key, scene, order = inputs
         num_objects = scene.places.shape[1]
         blobs = made.Blob(scene.places[0], 2 * scene.places[0] - scene.places[1])
@@ -123,26 +95,23 @@ def run_all(
         model = mpfjax.MultiObjectModel(blobs, num_objects, repulsion, per_object=True)
         filter = make(model, num_particles) if order is None else make(model, num_particles, order)
         seen = jax.tree.map(lambda leaf: leaf[1:], scene.seen)
-        return mpfjax.run_filter(key, filter, seen, estimates).collected
+        return mpfjax.run_filter(key, filter, seen, median).collected
 
     return jax.lax.map(run, (keys, scenes, orders), batch_size=runs_at_once)
 
 
-def estimates(mixture: mpfjax.ParticleMixture) -> dict[str, Float[Array, "objects 2"]]:
-    """The mean and the component-wise median of the particles."""
+def median(mixture: mpfjax.ParticleMixture) -> Float[Array, "objects 2"]:
+    """The component-wise median of the particles."""
     places = mixture.particles["now"]
     order = jnp.argsort(places, axis=0)
     upto = jnp.cumsum(mixture.weights[order], axis=0)
     middle = jnp.sum(upto < 0.5, axis=0, keepdims=True)
     ranked = jnp.take_along_axis(places, order, axis=0)
-    median = jnp.take_along_axis(ranked, jnp.minimum(middle, len(places) - 1), axis=0)[0]
-    return {"mean": mixture.average(places), "median": median}
+    return jnp.take_along_axis(ranked, jnp.minimum(middle, len(places) - 1), axis=0)[0]
 
 
-def run_method(
-    method: str, setting: made.Setting, num_runs: int, seed: int
-) -> dict[str, np.ndarray]:
-    """Whether each object is tracked, by each estimate: (orders, runs, t, objects)."""
+def run_method(method: str, setting: made.Setting, num_runs: int, seed: int) -> np.ndarray:
+    """Whether the median of each object is on it: (orders, runs, t, objects)."""
     key_scenes, key_runs = jax.random.split(jax.random.key(seed))
     scenes = jax.vmap(setting.make)(jax.random.split(key_scenes, num_runs))
     keys = jax.random.split(key_runs, num_runs)
@@ -157,12 +126,8 @@ def run_method(
     runs_at_once = None if method in ONE_BY_ONE else RUNS_AT_ONCE
     make = METHODS[method][1]
     found = run_all(make, setting.num_particles, keys, scenes, orders, runs_at_once)
-    truth = boxes(scenes.places[:, 1:])
-    shape = (num_orders, num_runs, NUM_FRAMES - 1, setting.num_objects)
-    return {
-        name: np.asarray(track_state(boxes(found[name]), truth)).reshape(shape)
-        for name in ESTIMATES
-    }
+    tracked = track_state(boxes(found), boxes(scenes.places[:, 1:]))
+    return np.asarray(tracked).reshape(num_orders, num_runs, NUM_FRAMES - 1, setting.num_objects)
 
 
 def boxes(centres: Float[Array, "*batch 2"]) -> Float[Array, "*batch 4"]:
@@ -173,71 +138,44 @@ def boxes(centres: Float[Array, "*batch 2"]) -> Float[Array, "*batch 4"]:
 # --- recovery rates with their intervals ---------------------------------------------------------
 
 
-def entries(
-    scene: str, method: str, tracked: dict[str, np.ndarray], num_runs: int
-) -> list[dict[str, Any]]:
+def entries(scene: str, method: str, tracked: np.ndarray) -> list[dict[str, Any]]:
     """The lines of the results that a method makes of a scene; PS its best and its mean order.
 
     A line has the recovery rate of the objects in question, all at once.
     """
-    setting, label = SCENES[scene], METHODS[method][0]
-    by_order = {}
-    for name in ESTIMATES:  # of orders, runs, t, objects
-        together = jnp.asarray(tracked[name][..., list(setting.hard)].all(axis=-1))
-        by_order[name] = [float(recovery_rate(states, num_last=NUM_LAST)) for states in together]
+    together = jnp.asarray(tracked[..., list(SCENES[scene].hard)].all(axis=-1))
+    by_order = [float(recovery_rate(states, num_last=NUM_LAST)) for states in together]
+    num_orders, num_runs = together.shape[:2]
 
-    def line(method: str, label: str, summary: Callable, num: int) -> dict[str, Any]:
-        recovery = {
-            name: {"rate": float(summary(rates)), "by_order": rates,
-                   "interval": harness.wilson(float(summary(rates)), num, z=1.96)}
-            for name, rates in by_order.items()
+    def line(name: str, label: str, rate: float, num: int) -> dict[str, Any]:
+        interval = harness.wilson(rate, num, z=1.96)
+        return {
+            "scene": scene, "method": name, "label": label, "runs": num_runs, "rate": rate,
+            "interval": interval, "by_order": by_order,
         }  # fmt: skip
-        head = {"scene": scene, "method": method, "label": label, "runs": num}
-        return head | {"recovery": recovery}
 
     if method != "ps":
-        return [line(method, label, max, num_runs)]
+        return [line(method, METHODS[method][0], by_order[0], num_runs)]
     return [
-        line("ps_best", "PS, best order", max, num_runs),
-        line("ps_mean", "PS, mean of orders", np.mean, setting.num_objects * num_runs),
+        line("ps_best", "PS, best order", max(by_order), num_runs),
+        line("ps_mean", "PS, mean of orders", float(np.mean(by_order)), num_orders * num_runs),
     ]
 
 
-def as_table(results: list[dict[str, Any]], estimate: str) -> str:
-    """Methods by scenes, each rate with its interval."""
-
-    def cell(line: dict[str, Any]) -> str:
-        low, high = line["recovery"][estimate]["interval"]
-        return f"{line['recovery'][estimate]['rate']:.3f} [{low:.2f}, {high:.2f}]"
-
-    return harness.pivot(f"recovery, {estimate}", results, "{label}", "{scene}", cell)
-
-
 def draw(results: list[dict[str, Any]]) -> Figure:
-    """A panel for each scene: every method's rate and interval, by both estimates."""
+    """A panel for each scene: every method's rate and interval."""
     scenes = list(dict.fromkeys(line["scene"] for line in results))
-    columns = min(len(scenes), 3)
-    num_rows = -(-len(scenes) // columns)
-    figure = Figure(figsize=(2.3 * columns + 1.8, 3.7 * num_rows), layout="constrained")
-    panels = figure.subplots(num_rows, columns, sharey=True, squeeze=False).ravel()
-    for panel in panels[len(scenes) :]:
-        panel.set_axis_off()
-    for panel, scene in zip(panels, scenes, strict=False):
+    figure = Figure(figsize=(2.3 * len(scenes) + 1.8, 3.7), layout="constrained")
+    panels = figure.subplots(1, len(scenes), sharey=True, squeeze=False)[0]
+    for panel, scene in zip(panels, scenes, strict=True):
         lines = [line for line in results if line["scene"] == scene]
-        for estimate, shift, colour in (("median", -0.13, "C0"), ("mean", 0.13, "C1")):
-            cells = [line["recovery"][estimate] for line in lines]
-            rates = np.array([cell["rate"] for cell in cells])
-            ends = np.array([cell["interval"] for cell in cells])
-            at = np.arange(len(lines)) + shift
-            panel.hlines(at, ends[:, 0], ends[:, 1], colors=colour, linewidth=2)
-            panel.plot(rates, at, "o", color=colour, markersize=4, label=estimate)
+        rates, labels = [line["rate"] for line in lines], [line["label"] for line in lines]
+        panel.hlines(labels, *np.array([line["interval"] for line in lines]).T, linewidth=2)
+        panel.plot(rates, labels, "o", markersize=4)
         panel.set_title(fill(f"{scene}: {SCENES[scene].title}", 28), fontsize=9)
-        panel.set_xlim(-0.03, 1.03)
+        panel.set(xlim=(-0.03, 1.03), xlabel="recovery rate")
         panel.grid(axis="x", alpha=0.3)
-        panel.set_yticks(range(len(lines)), [line["label"] for line in lines])
-        panel.set_xlabel("recovery rate")
     panels[0].invert_yaxis()
-    panels[0].legend(fontsize=8, loc="lower left")
     return figure
 
 

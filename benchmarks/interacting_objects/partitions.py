@@ -1,5 +1,7 @@
 """Independent and adaptive partitions, proposals of one joint filter that are close to clusters."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,10 +30,7 @@ class ProposeInPartitions(mpfjax.AbstractPropagation):
     model: mpfjax.MultiObjectModel
     num_draws: int | None = eqx.field(static=True, default=1)
 
-    @property
-    def approximate(self) -> bool:
-        """True: objects far apart need not be independent."""
-        return True
+    approximate = True  # objects far apart need not be independent
 
     def __call__(
         self, key: Key[Array, ""], mixture: mpfjax.ParticleMixture, observation: PyTree
@@ -65,7 +64,8 @@ class ProposeInPartitions(mpfjax.AbstractPropagation):
         particles = jax.tree.map(lambda leaf: gather(leaf, places), points)
         log_factors = jnp.sum(log_factors, axis=0)
         for i, j in self._pairs():
-            log_factors += self._log_psi(*_states_of(particles, i, j))
+            states = _states_of(particles, i, j)
+            log_factors += self.model.interaction(*states)  # pyright: ignore
         return mixture.replace(particles=particles).weighed(log_factors)
 
     def predict(
@@ -79,10 +79,6 @@ class ProposeInPartitions(mpfjax.AbstractPropagation):
         num_objects = self.model.num_objects if self.model.interaction is not None else 0
         return [(i, j) for j in range(num_objects) for i in range(j)]
 
-    def _log_psi(self, states: PyTree, others: PyTree) -> Float[Array, " n"]:
-        assert self.model.interaction is not None
-        return self.model.interaction(states, others)
-
     def _near(self, points: PyTree) -> Bool[Array, " objects"]:
         """Which objects have a point that interacts with any point of another object."""
         near = jnp.zeros(self.model.num_objects, bool)
@@ -91,7 +87,8 @@ class ProposeInPartitions(mpfjax.AbstractPropagation):
 
             def meets(state: PyTree, others: PyTree = others) -> Bool[Array, ""]:
                 repeat = lambda own, other: jnp.broadcast_to(own[None], other.shape)  # noqa: E731
-                return jnp.any(self._log_psi(jax.tree.map(repeat, state, others), others) != 0)
+                states = jax.tree.map(repeat, state, others)
+                return jnp.any(self.model.interaction(states, others) != 0)  # pyright: ignore
 
             near = near.at[jnp.array([i, j])].max(jnp.any(jax.vmap(meets)(states)))
         return near
@@ -107,11 +104,9 @@ def _from_any_row(
 ) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
     """Points resampled from the first of every row, and log of the mean weight for all."""
     num_rows, num_draws = table.shape
-    log_weights = table[:, 0]
-    weights = jax.nn.softmax(log_weights)
-    rows = jax.random.choice(key, num_rows, (num_rows,), p=weights)
-    log_mean = jax.nn.logsumexp(log_weights) - jnp.log(num_rows)
-    return rows * num_draws, jnp.full_like(log_weights, log_mean)
+    first = table[:, 0]
+    rows = jax.random.choice(key, num_rows, (num_rows,), p=jax.nn.softmax(first))
+    return rows * num_draws, jnp.full_like(first, jax.nn.logsumexp(first) - jnp.log(num_rows))
 
 
 def _from_own_row(
@@ -124,15 +119,13 @@ def _from_own_row(
     return jnp.arange(num_rows, dtype=drawn.dtype) * num_draws + drawn, log_means
 
 
-def independent_partitions(model: mpfjax.MultiObjectModel, num_particles: int) -> mpfjax.Filter:
-    """Every object drawn on its own; the rows weighed by ψ."""
-    moves = [mpfjax.Resample(), ProposeInPartitions(model, None)]
-    return mpfjax.Filter(model, moves=moves, num_particles=num_particles)
-
-
 def adaptive_partitions(
-    model: mpfjax.MultiObjectModel, num_particles: int, num_draws: int = 1
+    model: mpfjax.MultiObjectModel, num_particles: int, num_draws: int | None = 1
 ) -> mpfjax.Filter:
     """Objects near another one drawn in their rows, the others each on its own."""
     moves = [mpfjax.Resample(), ProposeInPartitions(model, num_draws)]
     return mpfjax.Filter(model, moves=moves, num_particles=num_particles)
+
+
+# Every object drawn on its own; the rows weighed by ψ.
+independent_partitions = partial(adaptive_partitions, num_draws=None)

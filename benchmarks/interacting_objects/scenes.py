@@ -103,37 +103,41 @@ def wander(key: Key[Array, ""], starts: Float[Array, "objects 2"]) -> Float[Arra
     return jax.lax.scan(move, (starts, starts), noise)[1]
 
 
+def times() -> Float[Array, " t"]:
+    """The frames, counted from 0."""
+    return jnp.arange(float(NUM_FRAMES))
+
+
 def grid(num_objects: int, spacing: float) -> Float[Array, "objects 2"]:
     """Places in rows of four."""
     index = np.arange(num_objects)
     return jnp.asarray(spacing * np.stack([index % 4, index // 4], axis=1), jnp.float32)
 
 
+def direction(key: Key[Array, ""]) -> Float[Array, "2"]:
+    """Any direction."""
+    angle = jax.random.uniform(key, (), maxval=2 * jnp.pi)
+    return jnp.array([jnp.cos(angle), jnp.sin(angle)])
+
+
 def jump(key: Key[Array, ""], path: Float[Array, "t 2"]) -> Float[Array, "t 2"]:
     """The path of an object that is displaced, in any direction, while nobody sees it."""
-    angle = jax.random.uniform(key, (), maxval=2 * jnp.pi)
-    away = JUMP * jnp.array([jnp.cos(angle), jnp.sin(angle)])
+    away = JUMP * direction(key)
     last, back = LOST.start - 1, LOST.stop
-    share = jnp.clip((jnp.arange(float(NUM_FRAMES)) - last) / (back - last), 0.0, 1.0)
+    share = jnp.clip((times() - last) / (back - last), 0.0, 1.0)
     hidden = path[last][None] + share[:, None] * away[None]
     after = path[last] + away - path[back]
-    moved = jnp.where((jnp.arange(float(NUM_FRAMES)) >= back)[:, None], path + after[None], hidden)
-    return jnp.where((jnp.arange(float(NUM_FRAMES)) <= last)[:, None], path, moved)
+    moved = jnp.where((times() >= back)[:, None], path + after[None], hidden)
+    return jnp.where((times() <= last)[:, None], path, moved)
 
 
 def cross(key: Key[Array, ""], centre: Float[Array, "2"]) -> Float[Array, "t 2 2"]:
     """Two objects that come from two sides, linger side by side, and pass each other."""
     key_angle, key_noise = jax.random.split(key)
-    angle = jax.random.uniform(key_angle, (), maxval=2 * jnp.pi)
-    u = (jnp.arange(float(NUM_FRAMES)) - (NUM_FRAMES - 1) / 2) / ((NUM_FRAMES - 1) / 2)
+    cos, sin = direction(key_angle)
+    u = (times() - (NUM_FRAMES - 1) / 2) / ((NUM_FRAMES - 1) / 2)
     along, aside = PASSING[0] * u**3, jnp.full(NUM_FRAMES, PASSING[1])
-    turned = jnp.stack(
-        [
-            jnp.cos(angle) * along - jnp.sin(angle) * aside,
-            jnp.sin(angle) * along + jnp.cos(angle) * aside,
-        ],
-        axis=1,
-    )
+    turned = jnp.stack([cos * along - sin * aside, sin * along + cos * aside], axis=1)
     noise = 0.5 * jax.random.normal(key_noise, (NUM_FRAMES, 2, 2))
     return centre[None, None] + jnp.stack([turned, -turned], axis=1) + noise
 
@@ -167,31 +171,25 @@ def kinds(*groups: int) -> Float[np.ndarray, "objects objects"]:
     return np.where(labels[:, None] == labels[None], 1.0, UNLIKE)
 
 
-def everything_visible(num_objects: int) -> Bool[Array, "t objects"]:
-    return jnp.ones((NUM_FRAMES, num_objects), bool)
-
-
 def missed(key: Key[Array, ""], num_objects: int) -> Bool[Array, "t objects"]:
     """Who is seen when, with detections that fail now and then, but for the first frames."""
     visible = jax.random.bernoulli(key, 1 - MISSED, (NUM_FRAMES, num_objects))
-    return visible | (jnp.arange(float(NUM_FRAMES)) < 3)[:, None]
+    return visible | (times() < 3)[:, None]
 
 
 def lost_object(key: Key[Array, ""]) -> Scene:
     key_paths, key_jump = jax.random.split(key)
     places = wander(key_paths, grid(4, 120.0))
     places = places.at[:, 3].set(jump(key_jump, places[:, 3]))
-    return look(places, everything_visible(4).at[LOST, 3].set(False), kinds(1, 1, 1, 1))
+    return look(places, jnp.ones((NUM_FRAMES, 4), bool).at[LOST, 3].set(False), kinds(1, 1, 1, 1))
 
 
 def distracted_object(key: Key[Array, ""]) -> Scene:
     key_paths, key_angle = jax.random.split(key)
     places = wander(key_paths, grid(7, 120.0))
-    angle = jax.random.uniform(key_angle, (), maxval=2 * jnp.pi)
-    away = LEAD * (jnp.arange(float(NUM_FRAMES)) - DISTRACTED.start)
-    direction = jnp.array([jnp.cos(angle), jnp.sin(angle)])
-    distracter = places[DISTRACTED.start, 0][None] + away[:, None] * direction[None]
-    visible = everything_visible(7).at[DISTRACTED.start, 0].set(False)
+    away = LEAD * (times() - DISTRACTED.start)[:, None] * direction(key_angle)[None]
+    distracter = places[DISTRACTED.start, 0][None] + away
+    visible = jnp.ones((NUM_FRAMES, 7), bool).at[DISTRACTED.start, 0].set(False)
     return look(places, visible, kinds(*[1] * 7), distracter)
 
 

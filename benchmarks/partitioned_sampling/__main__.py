@@ -5,35 +5,29 @@
     python -m benchmarks.partitioned_sampling --keys 100:107   # of the scenes among these keys
     python -m benchmarks.partitioned_sampling --sensitivity    # what both tables hang on
     python -m benchmarks.partitioned_sampling --sequence DIR [DIR ...]     # tables 3 and 4
-    python -m benchmarks.partitioned_sampling --sequence DIR --ids 4 3 5 --frames 1:63
 
 A joint particle filter ("Non-PS"), partitioned sampling in every circular order and in a sample of
 others, distributed partitioned sampling with both reassemblies, independent filters and clusters,
 all with the same model and the same number of likelihoods a frame, 50 runs each. Synthetic scenes
 are rendered from the keys 0, 1, 2, ..., and kept where the posterior of object 1, by 20 000
 particles on it alone, leaves it and is back at frame 11 or later. In folders with img/ and gt.txt,
-the events are those in which an object is hidden by another and comes out elsewhere; or the first
-of --ids is the hidden one. Into --out DIR go partitioned_sampling.json, the figures, and an
-animation of a PS run that fails beside a DPS run that recovers. Objects are counted from 1.
+the events are those in which an object is hidden by another and comes out elsewhere. Into --out DIR
+go partitioned_sampling.json and figure 4 or 8. Objects are counted from 1.
 """
 
 import time
 from argparse import ArgumentTypeError
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from tqdm import tqdm
-
-from benchmarks.harness import Count, Natural, Positive, Seed, command, data, settings_of
+from benchmarks.harness import Count, Positive, Seed, command, data, figures, settings_of
 from benchmarks.partitioned_sampling import scenes as scene_files
 from benchmarks.partitioned_sampling import tables
-from benchmarks.partitioned_sampling.pictures import write_pictures
-from benchmarks.partitioned_sampling.scenes import MOST_TRIED, Event, Scene, find_events
-from benchmarks.partitioned_sampling.sensitivity import CASES, run_sensitivity
-from benchmarks.partitioned_sampling.study import METHODS, filters, study
+from benchmarks.partitioned_sampling.scenes import DEFAULT, MOST_TRIED
+from benchmarks.partitioned_sampling.sensitivity import run_sensitivity
+from benchmarks.partitioned_sampling.study import METHODS, study
 from mpfjax.console import seed as read_seed
-from mpfjax.vision.files.frames import parse_range
 
 
 def key_range(text: str) -> range:
@@ -53,9 +47,6 @@ def main(
     keys: Annotated[range, key_range] | None = None,
     sensitivity: bool = False,
     sequence: Sequence[Path] = (),
-    event: Count | None = None,
-    ids: Sequence[Natural] = (),
-    frames: str | None = None,
     runs: Count = 50,
     particles: Count | None = None,
     lambdas: Sequence[Positive] = (),
@@ -70,9 +61,6 @@ def main(
     - `keys`: A:B, the scenes among the keys A to B.
     - `sensitivity`: size, speed and momentum; at λ = 20.
     - `sequence`: folders with img/ and gt.txt.
-    - `event`: only so many-th of the sequences.
-    - `ids`: of gt.txt, the hidden one first.
-    - `frames`: A:B, frames A to B, counted from 1, both in.
     - `runs`: of each filter and scene.
     - `particles`: 300 on synthetic scenes, or 200.
     - `lambdas`: 20 30 40 50 on synthetic scenes, or 20.
@@ -83,79 +71,43 @@ def main(
              if value is not None]  # fmt: skip
     if len(given) > 1:
         raise ValueError(f"{given[0]}: not with {given[1]}")
-    if (ids or frames) and len(sequence) != 1:
-        raise ValueError("--ids, --frames: of one --sequence")
     size = particles or (200 if sequence else 300)
     if sensitivity:
-        run_sensitivity(out, CASES, range(MOST_TRIED), scenes, size, runs, seed)
+        run_sensitivity(out, range(MOST_TRIED), scenes, size, runs, seed)
         return
     if sequence:
-        found = _real_scenes(sequence, event, ids, frames)
+        found = scene_files.real_scenes(sequence)
     elif scene is not None:
-        found = [(scene, scene_files.synthetic_scene(scene))]
+        found = [(scene, scene_files.synthetic_scene(scene, **DEFAULT))]
     else:
         among, most = (range(MOST_TRIED), scenes) if keys is None else (keys, None)
         found = scene_files.synthetic_scenes(among, most)
     lambdas = list(dict.fromkeys(lambdas or ((20.0,) if sequence else (20.0, 30.0, 40.0, 50.0))))
+    methods = list(dict.fromkeys(methods))
     settings = settings_of({
         "orders": "objects in the order in which they move, counted from 1", "runs": runs,
         "num_particles": size, "seed": seed, "lambdas": lambdas,
     })  # fmt: skip
-    run(found, settings, list(dict.fromkeys(methods)), not sequence, out)
-
-
-def run(
-    found: Iterable[tuple[Any, Scene | None]], settings: dict[str, Any], methods: list[str],
-    synthetic: bool, out: Path,
-) -> None:  # fmt: skip
-    """Every filter on every scene; those that are None were not kept."""
-    cycles = synthetic and "ps" in methods
-    size, lambdas = settings["num_particles"], settings["lambdas"]
-    scenes: list[Scene] = []
-    measured: list[tables.Measured] = []
-    passed_over: list[Any] = []
-    started = time.perf_counter()
-    for number, (name, scene) in enumerate(found):
-        if scene is None:
+    kept, rows, passed_over, started = [], [], [], time.perf_counter()
+    cycles = not sequence and "ps" in methods
+    for number, (name, one) in enumerate(found):
+        if one is None:
             passed_over.append(name)
             continue
-        # Numbers that do not fit come to light here, before anything compiles.
-        filters(scene, lambdas[0], size, methods)
-        scenes.append(scene)
-        made = study(
-            scene, number, lambdas, size, methods, settings["runs"], settings["seed"],
-            cycles=cycles,
-        )  # fmt: skip
-        for row in tqdm(made, desc=scene.name, unit="row", disable=None):
-            measured.append(tables.measure_row(scene, row, synthetic))
-        settings["seconds"] = round(time.perf_counter() - started, 1)
-        settings["passed_over"] = passed_over
-        content = tables.content_of(scenes, measured)
+        kept.append(one)
+        rows += study(one, number, lambdas, size, methods, runs, seed, cycles=cycles)
+        seconds = round(time.perf_counter() - started, 1)
+        content = tables.content_of(kept, rows)
+        settings |= {"seconds": seconds, "passed_over": passed_over}
         data(out / "partitioned_sampling.json", settings=settings, **content)
-    if not scenes:
+    if not kept:
         raise ValueError("--keys: the posterior keeps the scene of none of them")
     tables.print_tables(content)
-    write_pictures(out, scenes, [row for row, _ in measured], content)
+    if content["figure_4"]:
+        figures(out, dpi=110, uniqueness=tables.draw_impoverishment(content["figure_4"]))
     if passed_over:
         print(f"\n{len(passed_over)} keys were passed over: {passed_over}")
-    print(f"{settings['seconds']} s; written to {out}")
-
-
-def _real_scenes(
-    folders: Sequence[Path], event: int | None, ids: Sequence[int], span: str | None
-) -> Iterator[tuple[str, Scene]]:
-    if ids or span:
-        frames = parse_range(span, "--frames")
-        events = [(folders[0], Event(tuple(dict.fromkeys(ids)), frames))]
-    else:
-        events = [(folder, found) for folder in folders for found in find_events(folder)]
-    if event is not None:
-        if event > len(events):
-            raise ValueError(f"--event: {event} of {len(events)}")
-        events = [events[event - 1]]
-    for folder, found in events:
-        scene = scene_files.real_scene(folder, found)
-        yield scene.name, scene
+    print(f"{seconds} s; written to {out}")
 
 
 if __name__ == "__main__":

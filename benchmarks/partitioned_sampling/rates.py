@@ -1,7 +1,7 @@
 """The measures of section 3.1 over the runs of a scene, and their means over scenes."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,73 +20,53 @@ from mpfjax.metrics.tracking_quality import (
 # Recovered is who is tracked in each of the last frames: one alone may be a brush in passing.
 NUM_LAST = 3
 RATES = ("success", "recovery", "precision", "recall")
+Outcomes = dict[str, np.ndarray]
 
 
-class Rates(NamedTuple):
-    """What the runs of one filter, or of several, came to, for one or more objects."""
+def measure(estimates: np.ndarray, truth: np.ndarray) -> Outcomes:
+    """What each run came to, from boxes (runs, t, objects, 4) and (t, objects, 4).
 
-    success: np.ndarray  # (runs, objects), tracked in every frame
-    recovered: np.ndarray  # (runs, objects), tracked in the last frames
-    precision: np.ndarray  # (runs,), sums over the objects' frames with T = 1
-    recall: np.ndarray  # (runs,)
-    count: np.ndarray  # (runs,), how many such frames
-
-    def as_dict(self) -> dict[str, Any]:
-        """Shares in [0, 1], each with a 95% interval.
-
-        Success and recovery have Wilson's, with as many trials as runs: the objects of one run
-        share its particles, and are no trials of their own. Precision and recall, which are
-        ratios of sums over runs, have the normal one.
-        """
-        rates: dict[str, Any] = {}
-        intervals: dict[str, Any] = {}
-        num_runs = len(self.count)
-        for name, outcomes in (("success", self.success), ("recovery", self.recovered)):
-            rates[name] = float(outcomes.mean())
-            intervals[f"{name}_interval"] = wilson(rates[name], num_runs)
-        for name, sums in (("precision", self.precision), ("recall", self.recall)):
-            rates[name], intervals[f"{name}_interval"] = ratio(sums, self.count)
-        return rates | {"runs": num_runs} | intervals
-
-
-def measure(estimates: np.ndarray, truth: np.ndarray) -> Rates:
-    """The measures of section 3.1 from boxes (runs, t, objects, 4) and (t, objects, 4)."""
+    Success and recovery are of each object; precision and recall are sums over the frames in which
+    an object is tracked, `count` of them.
+    """
     truth = np.asarray(truth, estimates.dtype)
-    return Rates(*map(np.asarray, _measure(jnp.asarray(estimates), jnp.asarray(truth))))
+    return jax.tree.map(np.asarray, _measure(jnp.asarray(estimates), jnp.asarray(truth)))
 
 
 @jax.jit
-def _measure(estimates, truth) -> tuple:
+def _measure(estimates, truth) -> dict:
     present = jnp.all(jnp.isfinite(truth), axis=-1)
     states = track_state(estimates, truth[None])
-
-    def outcomes(states):
-        recovery = recovery_rate(states[None], present, num_last=NUM_LAST)
-        return success_rate(states[None], present) > 0.5, recovery > 0.5
-
-    success, recovered = jax.vmap(outcomes)(states)
-    inside, covered = (
-        jnp.sum(share(estimates, truth[None]), axis=(1, 2)) for share in (precision, recall)
-    )
-    return success, recovered, inside, covered, jnp.sum(states, axis=(1, 2))
+    one = states[:, None]
+    return {
+        "success": jax.vmap(lambda run: success_rate(run, present))(one) > 0.5,
+        "recovery": jax.vmap(lambda run: recovery_rate(run, present, num_last=NUM_LAST))(one) > 0.5,
+        "precision": jnp.sum(precision(estimates, truth[None]), axis=(1, 2)),
+        "recall": jnp.sum(recall(estimates, truth[None]), axis=(1, 2)),
+        "count": jnp.sum(states, axis=(1, 2)),
+    }
 
 
-def pool(rates: Sequence[Rates]) -> Rates:
-    """All runs of several filters."""
-    return Rates(*(np.concatenate(parts) for parts in zip(*rates, strict=True)))
+def shares_of(*outcomes: Outcomes) -> dict[str, Any]:
+    """Shares in [0, 1] over all runs of these filters, each with a 95% interval.
 
-
-def ratio(sums: np.ndarray, counts: np.ndarray) -> tuple[float, list[float]]:
-    """Σ s_r / Σ c_r over runs r and its 95% interval; 0, and all of [0, 1], for no counts."""
-    num_runs, total = len(counts), counts.sum()
-    if total == 0:
-        return 0.0, [0.0, 1.0]
-    value = float(sums.sum() / total)
-    if num_runs == 1:
-        return value, [0.0, 1.0]
-    spread = ((sums - value * counts) ** 2).sum() * num_runs / (num_runs - 1)
-    reach = Z_95 * float(np.sqrt(spread)) / float(total)
-    return value, [max(value - reach, 0.0), min(value + reach, 1.0)]
+    Success and recovery have Wilson's, with as many trials as runs: the objects of one run share
+    its particles, and are no trials of their own. Precision and recall, which are ratios of sums
+    over runs, have the normal one.
+    """
+    found = {name: np.concatenate([one[name] for one in outcomes]) for name in outcomes[0]}
+    counts = found["count"]
+    rates: dict[str, Any] = {"runs": len(counts)}
+    for name in ("success", "recovery"):
+        rates[name] = float(found[name].mean())
+        rates[f"{name}_interval"] = wilson(rates[name], len(counts))
+    for name in ("precision", "recall"):
+        total, num = max(float(counts.sum()), 1.0), len(counts)
+        value = float(found[name].sum()) / total
+        spread = ((found[name] - value * counts) ** 2).sum() * num / max(num - 1, 1)
+        reach = Z_95 * float(np.sqrt(spread)) / total if num > 1 and counts.any() else 1.0
+        rates[name], rates[f"{name}_interval"] = value, _within(value, reach)
+    return rates
 
 
 def over_scenes(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -103,23 +83,41 @@ def over_scenes(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
         value, deviation = float(shares.mean()), float(shares.std(ddof=1))
         reach = float(stats.t.ppf(0.975, len(shares) - 1)) * deviation / len(shares) ** 0.5
         mean[name], mean[f"{name}_sd"] = value, deviation
-        mean[f"{name}_interval"] = [max(value - reach, 0.0), min(value + reach, 1.0)]
+        mean[f"{name}_interval"] = _within(value, reach)
     return mean
 
 
-def least_and_greatest(
-    probabilities: Sequence[float], num_runs: int, num_draws: int
-) -> tuple[float, float]:
-    """The least and the greatest share expected of several draws that differ by chance alone.
+def _within(value: float, reach: float) -> list[float]:
+    return [max(value - reach, 0.0), min(value + reach, 1.0)]
 
-    Each draw adds `num_runs` trials of each probability, one for every scene.
+
+def how_far_apart(shares: np.ndarray, num_runs: int, *, each_scene: bool) -> dict[str, float]:
+    """The least and the greatest share of the orders, and what chance alone would make of them.
+
+    `shares` is (scenes, orders); they are those of the orders' means over scenes, or the means of
+    `each_scene`'s. `p` is the probability of totals at least as uneven, if in each scene all orders
+    recover alike: a χ² test of the orders' sums over scenes.
     """
+    groups = shares[:, None] if each_scene else shares[None]
+    means = groups.mean(axis=1)
+    by_chance = np.mean([_by_chance(group, num_runs) for group in groups], axis=0)
+    own = shares.mean(axis=1)
+    variance, totals = (own * (1 - own)).sum() / num_runs, shares.sum(axis=0)
+    statistic = ((totals - totals.mean()) ** 2).sum() / max(variance, 1e-12)
+    return {
+        "num_orders": shares.shape[1], "runs": num_runs, "mean": means.mean(),
+        "least": means.min(axis=1).mean(), "expected_least": by_chance[0],
+        "greatest": means.max(axis=1).mean(), "expected_greatest": by_chance[1],
+        "p": float(stats.chi2.sf(statistic, shares.shape[1] - 1)),
+    }  # fmt: skip
+
+
+def _by_chance(shares: np.ndarray, num_runs: int) -> np.ndarray:
+    """The least and the greatest mean expected of orders that all recover alike in each scene."""
     mass = np.ones(1)
-    for probability in probabilities:
+    for probability in shares.mean(axis=1):
         mass = np.convolve(mass, stats.binom.pmf(np.arange(num_runs + 1), num_runs, probability))
-    below = np.cumsum(mass).clip(0, 1)
-    total = num_runs * len(probabilities)
+    below, num_orders = np.cumsum(mass).clip(0, 1), shares.shape[1]
     # E[K] = Σ_k P(K > k) of a count K.
-    least = ((1 - below) ** num_draws).sum()
-    greatest = (1 - below**num_draws).sum()
-    return float(least / total), float(greatest / total)
+    sums = ((1 - below) ** num_orders).sum(), (1 - below**num_orders).sum()
+    return np.array(sums) / (num_runs * len(shares))

@@ -2,39 +2,24 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
-
-from matplotlib.figure import Figure
+from typing import Any
 
 from benchmarks import figures as plotting
 from benchmarks import harness
-from benchmarks.partitioned_sampling.rates import Rates, measure, over_scenes, pool
-from benchmarks.partitioned_sampling.scenes import DEFAULT, Scene, Setting, synthetic_scenes
-from benchmarks.partitioned_sampling.study import Row, study
+from benchmarks.partitioned_sampling.scenes import DEFAULT, synthetic_scenes
+from benchmarks.partitioned_sampling.study import study
+from benchmarks.partitioned_sampling.tables import content_of
 
 LAMBDA = 20.0
 FILTERS = {"joint": "joint PF", "ps": "PS, mean of orders", "dps": "DPS"}
-SIZE, SPEED, MOMENTUM = "objects' size [px]", "distracter's speed [px/frame]", "tracker's momentum"
-CHOSEN = {SIZE: DEFAULT.size[0], SPEED: DEFAULT.speed, MOMENTUM: DEFAULT.momentum}
-OLD = "the scene whose distracter runs away"
-
-
-class Case(NamedTuple):
-    """A setting, and where it stands in the picture."""
-
-    axis: str
-    value: float
-    setting: Setting
-
-
-CASES = [
-    *[Case(SIZE, side, DEFAULT._replace(size=(side, side))) for side in (20, 24, 26, 28, 32)],
-    *[Case(SPEED, speed, DEFAULT._replace(speed=speed)) for speed in (0.0, 2.0, 4.0, 6.0)],
-    *[Case(MOMENTUM, share, DEFAULT._replace(momentum=share)) for share in (0.0, 0.5, 0.75, 1.0)],
-    Case(OLD, 0.0, Setting((32, 40), 6.0, 3.0, "colour")),
-]
-
-
+OLD = {"size": (32, 40), "speed": 6.0, "deviation": 3.0, "noise": "colour", "momentum": 0.5}
+# What changes, by name and value.
+AXES: dict[str, dict[float, dict[str, Any]]] = {
+    "objects' size [px]": {side: {"size": (side, side)} for side in (20, 24, 26, 28, 32)},
+    "distracter's speed [px/frame]": {speed: {"speed": speed} for speed in (0.0, 2.0, 4.0, 6.0)},
+    "tracker's momentum": {share: {"momentum": share} for share in (0.0, 0.5, 0.75, 1.0)},
+    "the scene whose distracter runs away": {0.0: OLD},
+}
 COLUMNS = {
     "what": "{axis}", "value": "{value:g}", "filter": "{filter}", "success": "{success:.0%}",
     "recovery": "{recovery:.0%}", "precision": "{precision:.0%}",
@@ -44,84 +29,67 @@ COLUMNS = {
 
 
 def run_sensitivity(
-    out: Path, cases: Sequence[Case], keys: Sequence[int], num_scenes: int, num_particles: int,
-    num_runs: int, seed: int,
-) -> None:  # fmt: skip
+    out: Path, keys: Sequence[int], num_scenes: int, num_particles: int, num_runs: int, seed: int
+) -> None:
     """Every case on its own scenes, into sensitivity.json and sensitivity.png.
 
     Scenes are judged anew in every case, but for the tracker's momentum. Where the keys hold fewer
     than `num_scenes`, those there are; a case without any is left out, and said to be.
     """
     entries: list[dict[str, Any]] = []
-    done: dict[Setting, list[dict[str, Any]]] = {}
-    without: list[dict[str, Any]] = []
+    done: dict[str, list[dict[str, Any]]] = {}
     settings = harness.settings_of({
         "lambda": LAMBDA, "num_particles": num_particles, "runs": num_runs, "seed": seed,
         "keys": [keys[0], keys[-1]],
     })  # fmt: skip
-    for (case,) in harness.grid("setting", cases):
-        if case.setting not in done:
-            done[case.setting] = _run_case(
-                case.setting, keys, num_scenes, num_particles, num_runs, seed
-            )
-        head = {"axis": case.axis, "value": case.value, "setting": case.setting._asdict()}
-        entries += [head | entry for entry in done[case.setting]]
-        without += [] if done[case.setting] else [head]
-        content = {"settings": settings, "entries": entries, "without_scenes": without}
-        harness.data(out / "sensitivity.json", **content)
+    cases = [(axis, value) for axis, values in AXES.items() for value in values]
+    for ((axis, value),) in harness.grid("setting", cases):
+        setting = DEFAULT | AXES[axis][value]
+        if str(setting) not in done:
+            scenes = synthetic_scenes(keys, num_scenes, setting)
+            done[str(setting)] = _run_case(scenes, num_particles, num_runs, seed)
+        head = {"axis": axis, "value": value, "setting": setting}
+        entries += [head | entry for entry in done[str(setting)]]
+        if not done[str(setting)]:
+            print(f"{axis} {value:g}: no key to {keys[-1]} makes a scene")
+        harness.data(out / "sensitivity.json", settings=settings, entries=entries)
     print(harness.table(COLUMNS, entries))
-    for head in without:
-        print(f"{head['axis']} {head['value']:g}: no key to {keys[-1]} makes a scene")
-    if drawn := [entry for entry in entries if entry["axis"] in CHOSEN]:
-        harness.figures(out, dpi=110, sensitivity=draw_sensitivity(drawn, CHOSEN))
+    harness.figures(out, dpi=110, sensitivity=draw_sensitivity(entries))
 
 
-def _run_case(
-    setting: Setting, keys: Sequence[int], num_scenes: int, num_particles: int, num_runs: int,
-    seed: int,
-) -> list[dict[str, Any]]:  # fmt: skip
+def _run_case(found: Any, num_particles: int, num_runs: int, seed: int) -> list[dict[str, Any]]:
     """Success and precision of objects 2 to 7 and recovery of object 1, for each filter."""
-    found: dict[str, list[dict[str, Any]]] = {name: [] for name in FILTERS}
-    tried = kept = 0
-    for number, (_, scene) in enumerate(synthetic_scenes(keys, setting=setting)):
-        if kept == num_scenes:
-            break
+    scenes, rows, tried = [], [], 0
+    for number, (_, scene) in enumerate(found):
         tried = number + 1
-        if scene is None:
-            continue
-        kept += 1
-        lean = scene._replace(collector=lambda _, scene=scene: scene.collector(False))
-        rows = list(study(lean, number, [LAMBDA], num_particles, list(FILTERS), num_runs, seed))
-        for name in FILTERS:
-            own = [row for row in rows if row.method == name]
-            easy = _pooled(own, scene, [j for j in range(scene.num_objects) if j != scene.hard])
-            hard = _pooled(own, scene, [scene.hard])
-            entry = easy.as_dict()
-            entry["recovery"] = hard.as_dict()["recovery"]
-            entry["recovery_interval"] = hard.as_dict()["recovery_interval"]
-            found[name].append(entry)
-    return [
-        {"filter": FILTERS[name], "keys_tried": tried} | over_scenes(scenes)
-        for name, scenes in found.items()
-        if scenes
-    ]
+        if scene is not None:
+            scenes.append(scene)
+            rows += study(scene, number, [LAMBDA], num_particles, list(FILTERS), num_runs, seed)
+    if not scenes:
+        return []
+    means = content_of(scenes, rows)["means"]
+    of_hard = {(entry["method"], entry["order"]): entry for entry in means["2"]}
+    entries = []
+    for easy in means["1"]:
+        if easy["order"] in (None, "mean"):
+            hard = of_hard[easy["method"], easy["order"]]
+            recovery = {name: hard[name] for name in ("recovery", "recovery_interval")}
+            head = {"filter": FILTERS[easy["method"]], "keys_tried": tried}
+            entries.append(easy | recovery | head)
+    return entries
 
 
-def _pooled(rows: Sequence[Row], scene: Scene, objects: list[int]) -> Rates:
-    measured = [measure(row.kept.boxes[:, :, objects], scene.truth[:, objects]) for row in rows]
-    return pool(measured)
-
-
-def draw_sensitivity(entries: Sequence[dict[str, Any]], chosen: dict[str, Any]) -> Figure:
+def draw_sensitivity(entries: Sequence[dict[str, Any]]) -> Any:
     """Small multiples: a column for each thing that changes, a row for each rate.
 
-    `entries` hold `axis`, `value`, `filter` and the rates with intervals; `chosen` is the value
-    of each axis in the tables, at the dotted line.
+    A dotted line stands at the setting of the tables.
     """
     rows = (
         ("recovery", "recovery of object 1", (-0.03, 1.03)),
         ("precision", "precision of objects 2-7", (0.5, 1.0)),
     )
+    chosen = {axis: value for axis, values in AXES.items() for value, changed in values.items()
+              if DEFAULT | changed == DEFAULT}  # fmt: skip
 
     def panel(name: str, rate: str, label: str, limits: tuple[float, float]) -> plotting.Panel:
         own = [entry for entry in entries if entry["axis"] == name]

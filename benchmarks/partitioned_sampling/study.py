@@ -1,15 +1,18 @@
 """Runs of every filter at every λ, on one scene after the other."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from tqdm import tqdm
 
 import mpfjax
 from benchmarks.partitioned_sampling.rates import measure
-from benchmarks.partitioned_sampling.scenes import Kept, Scene
+from benchmarks.partitioned_sampling.scenes import Scene
+from mpfjax.metrics import uniqueness
 
 Order = tuple[int, ...] | None
 # A new filter is one more line: name -> (model, number of particles, order) -> filter.
@@ -23,21 +26,28 @@ METHODS: dict[str, Callable[[mpfjax.MultiObjectModel, int, Order], mpfjax.Filter
     "independent": lambda model, n, _: mpfjax.independent_particle_filters(model, n),
     "clusters": lambda model, n, _: mpfjax.clustered_particle_filter(model, n),
 }
-ORDERED = ("ps",)
-SHOWN = ("joint", "ps", "dps")  # in figure 4 or 8 and in the animation
+SHOWN = ("joint", "ps", "dps")  # in figure 4 or 8
 CYCLE = "cycle"  # a row of PS in an order that is no circular shift of the others
-NUM_CYCLES = 20
 
 
-class Row(NamedTuple):
-    """All runs of one filter on one scene at one λ."""
+class Collect(eqx.Module):
+    """What is kept of every step: the mean boxes, and how poor the particles of an object are.
 
-    scene: int | str
-    lambda_: float
-    method: str
-    order: Order
-    kept: Kept  # leading axes runs, t; of the centres only two runs, see `shown`
-    shown: dict[bool, int | None]  # a run that recovers, and one that does not
+    The variance of each object's place is over its particles, whatever their weights: section 3.1
+    measures how far the search reaches, and not the posterior.
+    """
+
+    model: mpfjax.MultiObjectModel
+    boxes_of: Callable = eqx.field(static=True)
+    everything: bool = eqx.field(static=True)
+
+    def __call__(self, mixture: mpfjax.ParticleMixture) -> dict[str, Any]:
+        """Of each object."""
+        kept = {"boxes": mixture.average(self.boxes_of(self.model, mixture.particles))}
+        if self.everything:
+            kept["uniqueness"] = uniqueness(mixture)
+            kept["variance"] = jnp.var(mixture.particles.box[:, :, :2], axis=0)
+        return kept
 
 
 def circular_orders(num_objects: int) -> list[tuple[int, ...]]:
@@ -45,7 +55,7 @@ def circular_orders(num_objects: int) -> list[tuple[int, ...]]:
     return [tuple(np.roll(np.arange(num_objects), -s).tolist()) for s in range(num_objects)]
 
 
-def other_cycles(num_objects: int, most: int = NUM_CYCLES) -> list[tuple[int, ...]]:
+def other_cycles(num_objects: int, most: int = 20) -> list[tuple[int, ...]]:
     """A sample of the (J-1)! - 1 cycles that are no circular shift of 0, ..., J-1, from 0 on."""
     rng, natural = np.random.default_rng(0), tuple(range(num_objects))
     others = int(np.prod(np.arange(1, num_objects), dtype=float)) - 1
@@ -55,18 +65,6 @@ def other_cycles(num_objects: int, most: int = NUM_CYCLES) -> list[tuple[int, ..
         if order != natural:
             found[order] = None
     return list(found)
-
-
-def filters(
-    scene: Scene, lambda_: float, num_particles: int, methods: Iterable[str]
-) -> dict[tuple[str, Order], mpfjax.Filter]:
-    """Every filter at one λ, PS once for each circular order."""
-    model = scene.model_at(lambda_)
-    return {
-        (name, order): METHODS[name](model, num_particles, order)
-        for name in methods
-        for order in (circular_orders(scene.num_objects) if name in ORDERED else [None])
-    }
 
 
 def study(
@@ -79,44 +77,39 @@ def study(
     seed: int,
     *,
     cycles: bool = False,
-) -> Iterator[Row]:
-    """All runs of every filter on the scene of this number, a row's under one vmap.
+) -> list[dict[str, Any]]:
+    """A row for every filter and λ on the scene of this number, its runs under one vmap.
 
-    Of the filters that are shown everything is kept at the first λ, and otherwise the boxes.
-    With `cycles`, PS in other orders as well, at the first λ.
+    With `cycles`, PS in other orders as well, at the first λ. A row has the rates of each table.
     """
+    rows = []
     for lambda_ in lambdas:
-        made = filters(scene, lambda_, num_particles, methods)
+        model = scene.model_at(lambda_)
+        circular = circular_orders(scene.truth.shape[1])
+        chosen = [(name, order) for name in methods
+                  for order in (circular if name == "ps" else [None])]  # fmt: skip
         if cycles and lambda_ == lambdas[0]:
-            model = scene.model_at(lambda_)
-            made |= {
-                (CYCLE, order): METHODS["ps"](model, num_particles, order)
-                for order in other_cycles(scene.num_objects)
-            }
-        for place, ((method, order), filter) in enumerate(made.items()):
-            everything = lambda_ == lambdas[0] and method in SHOWN
-            keys = row_keys(seed, number, lambda_, place, num_runs)
-            run = mpfjax.monte_carlo(keys, filter, scene.observations, scene.collector(everything))
+            chosen += [(CYCLE, order) for order in other_cycles(scene.truth.shape[1])]
+        # Numbers that do not fit come to light here, before anything compiles.
+        made = [METHODS["ps" if name == CYCLE else name](model, num_particles, order)
+                for name, order in chosen]  # fmt: skip
+        # No two rows have keys in common, whatever other λ there are.
+        key = jax.random.fold_in(jax.random.key(seed), number)
+        key = jax.random.fold_in(key, round(1000 * lambda_))
+        bar = tqdm(made, desc=f"{scene.name}, λ = {lambda_:g}", unit="row", disable=None)
+        for place, filter in enumerate(bar):
+            name, order = chosen[place]
+            keys = jax.random.split(jax.random.fold_in(key, place), num_runs)
+            everything = lambda_ == lambdas[0] and name in SHOWN
+            collect = Collect(model, scene.boxes_of, everything)
+            run = mpfjax.monte_carlo(keys, filter, scene.observations, collect)
             kept = jax.tree.map(np.asarray, run.collected)
-            yield _reduced(Row(scene.key, lambda_, method, order, kept, {}), scene)
-
-
-def row_keys(seed: int, scene: int, lambda_: float, place: int, num_runs: int) -> Array:
-    """Keys of one row's runs: no two rows have any in common, whatever other λ there are."""
-    key = jax.random.fold_in(jax.random.key(seed), scene)
-    key = jax.random.fold_in(key, round(1000 * lambda_))
-    return jax.random.split(jax.random.fold_in(key, place), num_runs)
-
-
-def _reduced(row: Row, scene: Scene) -> Row:
-    """The particles of one run that recovers and of one that does not, and no others'."""
-    if row.kept.centres is None:
-        return row
-    hard = [scene.hard]
-    recovered = measure(row.kept.boxes[:, :, hard], scene.truth[:, hard]).recovered
-    shown = {
-        wanted: next((k for k, found in enumerate(recovered[:, 0]) if found == wanted), None)
-        for wanted in (True, False)
-    }
-    runs = [0 if k is None else k for k in shown.values()]
-    return row._replace(kept=row.kept._replace(centres=row.kept.centres[runs]), shown=shown)
+            rows.append({
+                "scene": scene.key, "lambda": lambda_, "method": name,
+                "order": None if order is None else [j + 1 for j in order], "kept": kept,
+                "rates": {
+                    table: measure(kept["boxes"][:, :, objects], scene.truth[:, objects])
+                    for table, objects in scene.tables.items()
+                },
+            })  # fmt: skip
+    return rows

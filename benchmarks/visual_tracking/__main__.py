@@ -14,38 +14,38 @@ first frame that has any, and in the MPF and the GM-MPF a component is born for 
 dies when its object is gone (Lin et al. 2012, section 5).
 """
 
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import jax
 import numpy as np
 from jaxtyping import Array
 from tqdm import tqdm
 
-import mpfjax
+from benchmarks.coverage import coverage
 from benchmarks.harness import Count, Natural, Seed, command, data, table
-from benchmarks.visual_tracking.detected import detect_all, make_mixtures, track_detected
+from benchmarks.visual_tracking.detected import follow_detected, make_mixtures, rows_of_tracks
 from benchmarks.visual_tracking.pictures import NAMES, write_contact_sheet, write_video
-from benchmarks.visual_tracking.scores import COLUMNS, OF_TRACKING, score, tracking_scores
-from benchmarks.visual_tracking.source import Asked, Source, read_source, rendered_source
+from benchmarks.visual_tracking.source import Source, open_source
 from mpfjax.console import refuse_overwriting
-from mpfjax.vision import write_tracks
+from mpfjax.metrics import multi_object_scores
+from mpfjax.vision import BackgroundSubtraction, write_tracks
 from mpfjax.vision.boxes import recipes
 from mpfjax.vision.boxes.following import Snapshot, follow, track_rows
 from mpfjax.vision.files.frames import parse_range
 
-
-class Runs(NamedTuple):
-    """What yields the frames of a filter's runs with their seconds, and what makes tracks of them.
-
-    - `by_object`: tracks with objects for ids, where components keep to their first box.
-    """
-
-    frames: Callable[[tqdm], Iterator[tuple[Snapshot, float]]]
-    rows: Callable[[list[Snapshot]], list[np.ndarray]]
-    by_object: Callable[[list[Snapshot]], list[np.ndarray]] | None = None
+OF_TRACKING = ("HOTA", "MOTA", "IDF1")
+COLUMNS = {
+    "filter": lambda result: NAMES[result["filter"]], "all covered": "{all_covered:.3g}",
+    "on object": "{on_object:.3g}", "on another": "{on_other:.3g}", "id swaps": "{id_swaps:.3g}",
+    "by object": "{object_swaps:.3g}", "ms a frame": "{ms_per_frame:.3g}",
+}  # fmt: skip
+# The frames of a filter's runs, and what makes tracks of them.
+Runs = tuple[Iterator[Snapshot], Callable[..., list[np.ndarray]]]
 
 
 @command(frames="1:4")
@@ -76,50 +76,43 @@ def main(
     """
     if sum(map(bool, (box, ids, detect))) > 1 or (sequence and video):
         raise ValueError("one of --sequence and --video, and of --box, --ids and --detect")
-    span, asked = parse_range(frames, "--frames"), Asked(box, ids, detect)
-    paths = {"--sequence": sequence, "--video": video}
-    source = None
-    for name, path in paths.items():
+    span = parse_range(frames, "--frames")
+    for name, path in {"--sequence": sequence, "--video": video}.items():
         if path is not None:
-            if not (path.is_dir() if name == "--sequence" else path.is_file()):
-                kind = "folder" if name == "--sequence" else "file"
-                raise ValueError(f"{name}: {path} is not a {kind}")
             refuse_overwriting(out, ["tracking.mp4", "tracking.gif"], {name: path})
-            source = read_source(path, name, span, asked)
-    if source is None:
-        if box:
-            raise ValueError(
-                "--box: without --video FILE or --sequence DIR there is no frame to draw it in;"
-                " add one, or leave --box out for the rendered scene"
-            )
-        source = rendered_source(span, seed, asked)
+    source = open_source(sequence, video, span, seed, box, ids, detect)
     keys = jax.random.split(jax.random.key(seed), seeds)
     runs, source = (detected_runs if detect else drawn_runs)(preset, source, keys)
     settings = {
-        "source": source.name, "preset": preset, "detect": detect, "seed": seed, "seeds": seeds
+        "source": source.name, "preset": preset, "detect": detect, "seed": seed, "seeds": seeds,
+        "boxes": source.boxes,
     }  # fmt: skip
-    settings |= sizes(preset if not detect else "detect", source)
     tracked: dict[str, list[Snapshot]] = {}
     results: list[dict[str, Any]] = []
-    for name, own in runs.items():
-        tracked[name], seconds = [], []
+    for name, (snapshots, rows) in runs.items():
+        own, seconds, start = tracked.setdefault(name, []), [], time.perf_counter()
+        bar = tqdm(snapshots, desc=NAMES[name], total=source.num_frames, unit="frame", disable=None)
         try:
-            with tqdm(total=source.num_frames, desc=NAMES[name], unit="frame", disable=None) as bar:
-                for snapshot, elapsed in own.frames(bar):
-                    tracked[name].append(snapshot)
-                    seconds.append(elapsed)
+            for snapshot in bar:
+                own.append(snapshot)
+                seconds.append(time.perf_counter() - start)
+                start = time.perf_counter()
         finally:
             # Also on the way out of an interrupted run.
-            if number := len(tracked[name]):
-                tracks = own.rows(tracked[name])
-                by_object = None if own.by_object is None else own.by_object(tracked[name])
-                results.append(score(name, tracks, number, seconds, source, by_object))
-                if detect:
-                    results[-1] |= tracking_scores(tracks, source, number)
+            if own:
+                span = source.first, source.first + len(own) - 1
+                # Of the frames but the first, which compiles.
+                ms = 1000 * float(np.median(seconds[1:] or seconds))
+                found = score(rows(own), span, source, detect)
+                if preset == "objects" and name == "mpf" and not detect:
+                    # Components keep to their first box, so that tracks have objects for ids.
+                    of_objects = score(rows(own, by_reference=True), span, source, False)
+                    found["object_swaps"] = of_objects["id_swaps"]
+                results.append({"filter": name, "ms_per_frame": ms} | found)
                 out.mkdir(parents=True, exist_ok=True)
-                write_tracks(out / f"tracks_{name}.txt", tracks[0])
-                settings["frames"] = [source.first, source.first + number - 1]
-                data(out / "visual_tracking.json", settings=settings, results=results)
+                write_tracks(out / f"tracks_{name}.txt", rows(own)[0])
+                data(out / "visual_tracking.json", settings=settings | {"frames": span},
+                     results=results)  # fmt: skip
     write_contact_sheet(out / "contact_sheet.png", source, tracked)
     write_video(out / f"tracking.{'gif' if gif else 'mp4'}", source, tracked)
     more = OF_TRACKING if detect else ()
@@ -127,70 +120,63 @@ def main(
     print(f"written to {out}")
 
 
-def sizes(preset: str, source: Source) -> dict[str, Any]:
-    """What the settings say of the objects and the particles."""
-    components, particles = recipes.MAX_COMPONENTS, recipes.PARTICLES_PER_COMPONENT
-    if preset == "objects":
-        components = recipes.most_components(len(source.boxes))
-        particles = recipes.PARTICLES_PER_HYPOTHESIS
-    ids = None if source.truth is None else np.unique(source.truth[:, 1]).astype(int)
-    return {
-        "boxes": source.boxes, "ids": ids, "num_particles": particles * components,
-        "max_components": components, "particles_per_component": particles,
-    }  # fmt: skip
+def drawn_runs(
+    preset: str, source: Source, keys: Array, still: np.ndarray | None = None
+) -> tuple[dict[str, Runs], Source]:
+    """The filters of the preset, started at the given boxes of a frame, by default the first."""
+    still = next(iter(source.read())) if still is None else still
+    filters = recipes.PRESETS[preset](still, source.boxes)
 
+    def rows(shots: list[Snapshot], **how: bool) -> list[np.ndarray]:
+        return [track_rows(shots, run, source.first, **how) for run in range(len(keys))]
 
-def drawn_runs(preset: str, source: Source, keys: Array) -> tuple[dict[str, Runs], Source]:
-    """The filters of the preset, started at the given boxes."""
-    filters = recipes.PRESETS[preset](next(iter(source.read())), source.boxes)
-    runs = {name: plain_runs(filter, source, keys) for name, filter in filters.items()}
-    if preset == "objects":
-        by_object = lambda shots: rows_of(shots, source, keys, by_reference=True)  # noqa: E731
-        runs["mpf"] = runs["mpf"]._replace(by_object=by_object)
+    runs = {name: (follow(each, keys, source.read()), rows) for name, each in filters.items()}
     return runs, source
-
-
-def plain_runs(filter: mpfjax.Filter, source: Source, keys: Array) -> Runs:
-    """Those of a filter of boxes."""
-    return Runs(
-        lambda bar: track(filter, keys, source, bar), lambda shots: rows_of(shots, source, keys)
-    )
-
-
-def rows_of(shots: list[Snapshot], source: Source, keys: Array, **how: bool) -> list[np.ndarray]:
-    """The tracks of each run."""
-    return [track_rows(shots, run, source.first, **how) for run in range(len(keys))]
 
 
 def detected_runs(preset: str, source: Source, keys: Array) -> tuple[dict[str, Runs], Source]:
     """The PF of the preset, started at the first detections, and the two mixtures."""
-    detected = detect_all(source)
-    first = next((t for t, boxes in enumerate(detected.boxes) if len(boxes)), None)
-    if first is None:
+    detector = BackgroundSubtraction()
+    found = ((still, detector.detect(still)) for still in source.read())
+    still, boxes = next((pair for pair in found if len(pair[1])), (None, None))
+    if still is None or boxes is None:
         raise ValueError("--detect: nothing moves before a still camera in these frames")
-    boxes = detected.boxes[first][: recipes.MAX_COMPONENTS]
-    source = source._replace(boxes=boxes, num_frames=len(detected.boxes))
-    still = next(frame for t, frame in enumerate(source.read()) if t == first)
-    runs = {"pf": plain_runs(recipes.PRESETS[preset](still, boxes)["pf"], source, keys)}
-    for name, component in make_mixtures().items():
-        runs[name] = Runs(*track_detected(component, keys, source, detected))
+    source = source._replace(boxes=boxes[: recipes.MAX_COMPONENTS])
+    runs = {"pf": drawn_runs(preset, source, keys, still)[0]["pf"]}
+    for name, filter in make_mixtures().items():
+        kept: list[Any] = []
+        rows = partial(rows_of_tracks, kept, source.first, len(keys))
+        runs[name] = follow_detected(filter, keys, source.read(), kept), rows
     return runs, source
 
 
-def track(
-    filter: mpfjax.Filter, keys: Array, source: Source, bar: tqdm
-) -> Iterator[tuple[Snapshot, float]]:
-    """Each frame's snapshot, and the seconds since the frame was read."""
-    handed_over = [0.0]
+def score(
+    tracks: list[np.ndarray], span: tuple[int, int], source: Source, detect: bool
+) -> dict[str, Any]:
+    """Coverage, and HOTA and its like with --detect; null where there is no truth.
 
-    def stills() -> Iterator[np.ndarray]:
-        for still in source.read():
-            handed_over[0] = time.perf_counter()
-            yield still
-
-    for snapshot in follow(filter, keys, stills()):
-        bar.update()
-        yield snapshot, time.perf_counter() - handed_over[0]
+    Means over the runs' tracks.
+    """
+    measures = ["all_covered", "id_swaps", "on_object", "on_other"]
+    result: dict[str, Any] = dict.fromkeys([*measures, "per_object", "object_swaps", *OF_TRACKING])
+    truth = np.zeros((0, 6)) if source.truth is None else source.truth
+    truth = truth[truth[:, 0] <= span[1]]
+    if not len(truth):
+        return result
+    scores = [coverage(rows, truth, source.others)._asdict() for rows in tracks]
+    for measure in measures if source.all_labelled else measures[:2]:
+        result[measure] = float(np.mean([each[measure] for each in scores]))
+    result["per_object"] = {
+        str(id): float(np.mean([each["per_object"][id] for each in scores]))
+        for id in scores[0]["per_object"]
+    }
+    try:
+        found = [multi_object_scores(rows, truth, span) for rows in tracks if detect]
+    except ImportError as error:
+        print(f"no HOTA, MOTA and IDF1: {error}", file=sys.stderr)
+        found = []
+    return result | {name: float(np.mean([each[name] for each in found]))
+                     for name in OF_TRACKING if found}  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """Tracking without a drawn box: detections, and mixtures whose components are born of them."""
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,10 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
-from tqdm import tqdm
 
 import mpfjax
-from benchmarks.visual_tracking.source import Source
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractPropagation
 from mpfjax.vision import BackgroundSubtraction, Detections, ObjectTracker, Tracks
@@ -26,25 +23,6 @@ MAX_DETECTIONS, MAX_OBJECTS, PARTICLES = 32, 24, 16
 DECIDED = "decided"
 # Weights within a component differ by at most the factor e^30.
 FARTHEST = 30.0
-
-
-class Detected(NamedTuple):
-    """The boxes (k, 4) of every frame, top-left corner first, and the seconds that each took."""
-
-    boxes: list[np.ndarray]
-    seconds: list[float]
-
-
-def detect_all(source: Source) -> Detected:
-    """What moves in each frame; the background is learned on the way. Reading is timed too."""
-    detector = BackgroundSubtraction()
-    boxes, seconds = [], []
-    start = time.perf_counter()
-    for still in tqdm(source.read(), total=source.num_frames, desc="Detection", disable=None):
-        boxes.append(detector.detect(still))
-        seconds.append(time.perf_counter() - start)
-        start = time.perf_counter()
-    return Detected(boxes, seconds)
 
 
 class Seen(NamedTuple):
@@ -213,36 +191,28 @@ def make_mixtures() -> dict[str, mpfjax.Filter]:
     }
 
 
-def track_detected(
-    filter: mpfjax.Filter, keys: Array, source: Source, detected: Detected
-) -> tuple[Callable, Callable]:
-    """What yields the frames of the runs of a mixture, and what makes tracks of them.
+def follow_detected(
+    filter: mpfjax.Filter, keys: Array, stills: Iterable[np.ndarray], kept: list[Tracks]
+) -> Iterator[Snapshot]:
+    """A snapshot of the runs of a mixture for each frame, whose tracks go into `kept`."""
+    detector, tracker = BackgroundSubtraction(), ObjectTracker(MAX_OBJECTS)
+    mixtures = jax.vmap(filter.init)(keys)
+    for t, still in enumerate(stills):
+        found = Detections.from_boxes(detector.detect(still), MAX_DETECTIONS)
+        seen = Seen(found, tracker.look(still, found))
+        mixtures, *done = _advance(filter, keys, jnp.asarray(t), mixtures, seen)
+        tracks, snapshot = jax.tree.map(np.asarray, done)
+        kept.append(tracks)
+        yield snapshot
 
-    The seconds of a frame are those of reading, detecting and tracking.
-    """
-    kept: list[Tracks] = []
-    tracker = ObjectTracker(MAX_OBJECTS)
 
-    def frames_of_run(bar: tqdm) -> Iterator[tuple[Snapshot, float]]:
-        mixtures = jax.vmap(filter.init)(keys)
-        for t, (still, boxes) in enumerate(zip(source.read(), detected.boxes, strict=True)):
-            start = time.perf_counter()
-            found = Detections.from_boxes(boxes, MAX_DETECTIONS)
-            seen = Seen(found, tracker.look(still, found))
-            mixtures, tracks, snapshot = _advance(filter, keys, jnp.asarray(t), mixtures, seen)
-            kept.append(jax.tree.map(np.asarray, tracks))
-            snapshot = jax.tree.map(np.asarray, snapshot)
-            bar.update()
-            yield snapshot, time.perf_counter() - start + detected.seconds[t]
-
-    def rows_of_run(snapshots: list[Snapshot]) -> list[np.ndarray]:
-        tracked = kept[: len(snapshots)]
-        return [
-            offline_rows((_of_run(tracks, run) for tracks in tracked), source.first)
-            for run in range(len(keys))
-        ]
-
-    return frames_of_run, rows_of_run
+def rows_of_tracks(
+    kept: list[Tracks], first: int, num_runs: int, snapshots: list[Snapshot]
+) -> list[np.ndarray]:
+    """The rows of each run's tracks, as many frames as there are snapshots."""
+    tracked = kept[: len(snapshots)]
+    return [offline_rows((_of_run(each, run) for each in tracked), first)
+            for run in range(num_runs)]  # fmt: skip
 
 
 def _of_run(tracks: Tracks, run: int) -> Tracks:

@@ -1,11 +1,11 @@
 """The pictures of a run: an annotated video, and a contact sheet of its key frames."""
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.figures import draw_contact_sheet
+from benchmarks.figures import draw_contact_sheet, region
 from benchmarks.visual_tracking.source import Source
 from mpfjax.console import write_figure
 from mpfjax.vision.boxes.following import Snapshot, annotate
@@ -22,13 +22,13 @@ KEY_FRAMES = 4
 
 def write_video(path: Path, source: Source, tracked: dict[str, list[Snapshot]]) -> None:
     """The annotated frames of the filters side by side, PF to the left."""
-    frames.write_video(path, _panels(source, tracked))
 
+    def beside(still: np.ndarray, snapshots: Sequence[Snapshot]) -> np.ndarray:
+        zoom = max(1, round(640 / still.shape[1]))
+        return np.concatenate([annotate(still, s, zoom) for s in snapshots], axis=1)
 
-def _panels(source: Source, tracked: dict[str, list[Snapshot]]) -> Iterator[np.ndarray]:
-    for still, *snapshots in zip(source.read(), *tracked.values(), strict=False):
-        zoom = _zoom(still)
-        yield np.concatenate([annotate(still, s, zoom) for s in snapshots], axis=1)
+    shown = zip(source.read(), *tracked.values(), strict=False)
+    frames.write_video(path, (beside(still, snapshots) for still, *snapshots in shown))
 
 
 def write_contact_sheet(path: Path, source: Source, tracked: dict[str, list[Snapshot]]) -> None:
@@ -39,7 +39,9 @@ def write_contact_sheet(path: Path, source: Source, tracked: dict[str, list[Snap
         t: still for t, still in zip(range(length), source.read(), strict=False) if t in chosen
     }
     shown = [snapshots[t] for snapshots in tracked.values() for t in chosen]
-    crop = _region(shown, source.boxes, stills[0].shape)
+    points = [s.points[0][s.labels[0] >= 0] for s in shown]
+    points = np.concatenate([*points, box_files.centred(source.boxes)[:, :2]])
+    crop = region(points, source.boxes[:, 2:], stills[0].shape)
     zoom = max(1, round(900 / (crop[1].stop - crop[1].start)))
     rows = [
         (
@@ -50,18 +52,3 @@ def write_contact_sheet(path: Path, source: Source, tracked: dict[str, list[Snap
     ]
     titles = [f"frame {source.first + t}" for t in chosen]
     write_figure(path, draw_contact_sheet(rows, titles), dpi=110)
-
-
-def _region(shown: list[Snapshot], boxes: np.ndarray, shape: tuple) -> tuple[slice, slice]:
-    """The rows and columns of the frame in which anything happens, with room around."""
-    points = np.concatenate([s.points[0][s.labels[0] >= 0] for s in shown])
-    centres = np.concatenate([points, box_files.centred(boxes)[:, :2]])
-    margin = 1.2 * boxes[:, 2:].max(axis=0)
-    low, high = centres.min(axis=0) - margin, centres.max(axis=0) + margin
-    (left, top), (right, bottom) = low.astype(int), high.astype(int)
-    height, width, _ = shape
-    return slice(max(top, 0), min(bottom, height)), slice(max(left, 0), min(right, width))
-
-
-def _zoom(still: np.ndarray) -> int:
-    return max(1, round(640 / still.shape[1]))

@@ -22,84 +22,75 @@ class Source(NamedTuple):
     read: Callable[[], Iterable[np.ndarray]]
     first: int  # the number of the first frame
     num_frames: int | None  # None where only reading on will tell
-    boxes: np.ndarray  # (k, 4), where the objects start
     truth: np.ndarray | None  # rows of the objects to score against
-    all_labelled: bool  # whether the truth knows every object that was started
+    boxes: np.ndarray = np.zeros((0, 4))  # where the objects start
+    all_labelled: bool = True  # whether the truth knows every object that was started
     others: np.ndarray | None = None  # rows of those that were not started
 
 
-class Asked(NamedTuple):
-    """What the options say of the objects."""
+def open_source(
+    sequence: Path | None, video: Path | None, span: tuple[int, int | None], seed: int,
+    box: Sequence[str], ids: Sequence[int] | None, detect: bool,
+) -> Source:  # fmt: skip
+    """A folder, a video file, or the rendered scene, in which all of one team are started.
 
-    box: Sequence[str]
-    ids: Sequence[int] | None
-    detect: bool
+    Raises `ValueError`, with the name of the option, where it has no such frame or object.
+    """
+    (first, last), path = span, sequence or video
+    if path is None:
+        if box:
+            raise ValueError(
+                "--box: without --video FILE or --sequence DIR there is no frame to draw it in;"
+                " add one, or leave --box out for the rendered scene"
+            )
+        num_frames = last or max(first + 119, 120)
+        scene = football_scene(jax.random.key(seed), num_frames, still_camera=detect)
+        stills, rows = scene.frames[first - 1 :], scene.tracks
+        ids = [id for id, kit in scene.kits.items() if kit == 0] if ids is None else ids
+        source = Source("rendered scene", lambda: stills, first, len(stills), rows)
+    else:
+        name = "--video" if sequence is None else "--sequence"
+        if not (path.is_file() if sequence is None else path.is_dir()):
+            raise ValueError(f"{name}: {path} is not a {'file' if sequence is None else 'folder'}")
+        if next(frames.read_frames(path, first, first), None) is None:
+            raise ValueError(f"{name}: {path} has no frame {first}")
+        count = None if last is None else last - first + 1
+        if path.is_dir():
+            count = min(last or 10**9, frames.num_images(path)) - first + 1
+        truth = path / "gt.txt"
+        rows = read_truth(truth).objects if truth.is_file() else None
+        read = lambda: frames.read_frames(path, first, last)  # noqa: E731
+        source = Source(str(path), read, first, count, rows)
+    if rows is not None:
+        end = np.inf if source.num_frames is None else first + source.num_frames
+        source = source._replace(truth=rows[(rows[:, 0] >= first) & (rows[:, 0] < end)])
+    return source if detect else _with_objects(source, box, ids)
 
 
-def read_source(path: Path, name: str, span: tuple[int, int | None], asked: Asked) -> Source:
-    """A folder or a video file, or a `ValueError` that names the argument."""
-    first, last = span
-    still = next(frames.read_frames(path, first, first), None)
-    if still is None:
-        raise ValueError(f"{name}: {path} has no frame {first}")
-    count = None if last is None else last - first + 1
-    if path.is_dir():
-        count = min(last or 10**9, frames.num_images(path)) - first + 1
-    truth = path / "gt.txt"
-    rows = read_truth(truth).objects if truth.is_file() else None
-    read = lambda: frames.read_frames(path, first, last)  # noqa: E731
-    return _with_objects(Source(str(path), read, first, count, _NONE, rows, True), still, asked)
-
-
-def rendered_source(span: tuple[int, int | None], seed: int, asked: Asked) -> Source:
-    """The football scene, in which all of one team are started."""
-    first, last = span
-    num_frames = last or max(first + 119, 120)
-    scene = football_scene(jax.random.key(seed), num_frames, still_camera=asked.detect)
-    stills = scene.frames[first - 1 :]
-    if asked.ids is None:
-        asked = asked._replace(ids=[id for id, kit in scene.kits.items() if kit == 0])
-    whole = Source(
-        "rendered scene", lambda: stills, first, len(stills), _NONE, scene.tracks, True
-    )  # fmt: skip
-    return _with_objects(whole, stills[0], asked)
-
-
-_NONE = np.zeros((0, 4))
-
-
-def _with_objects(source: Source, still: np.ndarray, asked: Asked) -> Source:
+def _with_objects(source: Source, box: Sequence[str], ids: Sequence[int] | None) -> Source:
     """Settle which objects are started where, and which are scored."""
     rows, first = source.truth, source.first
-    if rows is not None:
-        last = np.inf if source.num_frames is None else first + source.num_frames - 1
-        rows = rows[(rows[:, 0] >= first) & (rows[:, 0] <= last)]
-    if asked.detect:
-        return source._replace(truth=rows, all_labelled=rows is not None)
     started = {} if rows is None else box_files.boxes_of_frame(rows, first)
-    if asked.box:
-        boxes = np.stack([box_files.parse_box(text, "--box") for text in asked.box])
-        ids = [id for id, box in started.items() if covers(boxes, box[None]).any()]
-        argument = "--box"
+    if box:
+        boxes = np.stack([box_files.parse_box(text, "--box") for text in box])
+        ids = [id for id, own in started.items() if covers(boxes, own[None]).any()]
+    elif rows is None:
+        raise ValueError("--box: without a gt.txt every object needs its box in the first frame")
     else:
-        ids, argument = _chosen_ids(asked, started, rows, first), "--ids"
+        ids = sorted(started) if ids is None else list(dict.fromkeys(ids))
+        missing = [id for id in ids if id not in started]
+        if missing or not ids:
+            missed = missing or "any object"
+            raise ValueError(f"--ids: gt.txt has no box of {missed} in frame {first}")
         boxes = np.stack([started[id] for id in ids])
+    argument = "--box" if box else "--ids"
     if len(boxes) > MAX_COMPONENTS:
         raise ValueError(f"{argument}: {len(boxes)} objects are more than {MAX_COMPONENTS}")
-    box_files.check_boxes(boxes, still.shape[0], still.shape[1], argument)
+    height, width, _ = next(iter(source.read())).shape
+    box_files.check_boxes(boxes, height, width, argument)
     truth = others = None
     if rows is not None and ids:
         is_started = np.isin(rows[:, 1], ids)
         truth, others = rows[is_started], rows[~is_started]
     all_labelled = len(ids) == len(boxes)
     return source._replace(boxes=boxes, truth=truth, all_labelled=all_labelled, others=others)
-
-
-def _chosen_ids(asked: Asked, started: dict, rows: np.ndarray | None, first: int) -> list[int]:
-    if rows is None:
-        raise ValueError("--box: without a gt.txt every object needs its box in the first frame")
-    ids = sorted(started) if asked.ids is None else list(dict.fromkeys(asked.ids))
-    missing = [id for id in ids if id not in started]
-    if missing or not ids:
-        raise ValueError(f"--ids: gt.txt has no box of {missing or 'any object'} in frame {first}")
-    return ids

@@ -31,8 +31,7 @@ COMMANDS = {
     "likelihood_tuning": "scores.json starts.json optimisations.png labels.json overlaps.png",
     "marginalised": "marginalised.json",
     "masses": "masses.json masses.png",
-    "partitioned_sampling": "partitioned_sampling.json uniqueness.png recovery.png recovery.gif "
-    "contact_sheet.png",
+    "partitioned_sampling": "partitioned_sampling.json uniqueness.png",
     "peers": "peers.json peers.png",
     "scaling": "scaling.json scaling.png",
     "score_vs_particles": "score_vs_particles.json score_vs_particles.png typical_run.png",
