@@ -347,7 +347,7 @@ def _draw_panel(axis: Axes, panel: Panel, names: Sequence[str], scales: tuple[st
         axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_locator(NullLocator())
     if panel.ylim is not None:
-        axis.set_ylim(panel.ylim)
+        axis.set_ylim(*panel.ylim)
     if scales[1] == "log":  # ticks at every decade, and between where there are few of them
         low, high = axis.get_ylim()
         subs = (1.0,) if high > 1000 * low else (1.0, 2.0, 5.0)

@@ -213,7 +213,7 @@ def test_the_scores_are_those_of_the_tracks(sequence, tmp_path):
 def test_bad_input_is_named_before_anything_compiles(
     sequence, tmp_path, capsys, monkeypatch, message, arguments
 ):
-    monkeypatch.setattr(visual_tracking, "track", lambda *_: pytest.fail("it went on to track"))
+    monkeypatch.setattr(visual_tracking, "follow", lambda *_: pytest.fail("it went on to track"))
     assert tracked("--sequence", sequence, "--out", tmp_path / "out", *arguments) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
