@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mpfjax.vision import ObjectTracker, track
+from tests.vision.test_track import by_frame
 
 TRACKER = ObjectTracker(6, frames_per_second=25)
 NUM_FRAMES = 40
@@ -32,12 +33,6 @@ def alone(boxes):
 def living(tracks):
     identities = np.asarray(tracks.identities)
     return sorted(identities[identities > 0].tolist())
-
-
-def by_frame(rows):
-    for frame in range(1, int(rows[:, 0].max()) + 1):
-        here = rows[rows[:, 0] == frame]
-        yield here[:, 2:6], here[:, 6]
 
 
 # --- gaps ----------------------------------------------------------------------------------

@@ -121,18 +121,6 @@ def test_a_damaged_stretch_of_a_video_is_said(tmp_path):
         assert 0 < len(list(read_frames(tmp_path / "damaged.mp4"))) < 40
 
 
-def test_a_sound_is_no_video(tmp_path):
-    av = pytest.importorskip("av", reason="the extra 'video' is missing")
-    with av.open(str(tmp_path / "sound.mp4"), "w") as file:
-        stream = file.add_stream("aac", rate=44100)
-        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
-        frame.sample_rate = 44100
-        file.mux(stream.encode(frame) + stream.encode(None))
-    for read in (frame_rate, lambda path: next(read_frames(path))):
-        with pytest.raises(ValueError, match=r"sound\.mp4: cannot be read as a video"):
-            read(tmp_path / "sound.mp4")
-
-
 @pytest.mark.parametrize("mode", ["L", "LA", "1", "I;16", "P", "RGBA"])
 def test_whatever_an_image_holds_it_becomes_three_channels_of_eight_bits(tmp_path, mode):
     """Grey, grey with transparency, black and white, 16 bits, a palette, colours likewise."""

@@ -1,4 +1,4 @@
-"""Several objects known by their colours: the likelihood, its pieces, and scenes gone wrong."""
+"""Several objects known by their colours: the likelihood and its pieces."""
 
 import equinox as eqx
 import jax
@@ -103,12 +103,3 @@ def test_another_lambda_and_order_are_the_same_program(frame):
     assert eqx.tree_equal(*rest)
     assert not eqx.tree_equal(*arrays)
     assert eqx.tree_equal(*(jax.eval_shape(lambda tree=tree: tree) for tree in arrays))
-
-
-class TestScenesGoneWrong:
-    def test_an_empty_histogram_lies_farthest_from_all(self, frame, model):
-        """A box that holds no pixel's centre: d² is that of nothing in common in each band."""
-        states = states_at(model, *centres())
-        tiny = eqx.tree_at(lambda s: s.box, states, states.box.at[:, :, 2:].set(1e-4))
-        value = model.log_likelihood(jnp.asarray(frame), tiny)
-        np.testing.assert_allclose(value, [-20.0 * 3 * 2], rtol=1e-5)

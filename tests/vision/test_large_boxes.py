@@ -4,10 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.vision import (
-    ColourModel,
-    RGBColours,
-)
+from mpfjax.vision import ColourModel, RGBColours
 from mpfjax.vision.boxes.colour_model import BoxState
 from mpfjax.vision.colour.histograms import integral_histogram, normalise
 

@@ -10,10 +10,7 @@ import pytest
 from mpfjax.mixture import single_component
 from mpfjax.vision import ColourModel, RGBColours
 from mpfjax.vision.boxes.colour_model import BoxState
-from mpfjax.vision.boxes.hypotheses import (
-    AdaptAppearance,
-    LearnedColourModel,
-)
+from mpfjax.vision.boxes.hypotheses import AdaptAppearance, LearnedColourModel
 
 RNG = np.random.default_rng(0)
 FIRST, NOW = (RNG.integers(0, 256, (40, 50, 3), dtype=np.uint8) for _ in range(2))

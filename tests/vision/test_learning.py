@@ -46,20 +46,15 @@ def test_a_box_is_filtered_as_by_the_kalman_filter():
         np.testing.assert_allclose(moments[:, 2:], expected, rtol=1e-3, atol=1e-5)
 
 
-def test_mixed_moments_are_those_of_draws_from_both():
-    rng = np.random.default_rng(0)
+def test_mixed_moments_are_those_of_the_mixture_of_both():
     a = Gaussian(*(np.full((1, 4), x, np.float32) for x in (1.0, 2.0, 1.0, 0.5, 0.8)))
     b = Gaussian(*(np.full((1, 4), x, np.float32) for x in (3.0, -1.0, 2.0, 0.1, 0.3)))
-    mixed = a.mixed_with(b, jnp.full((1, 1), 0.3))
-    draws = []
-    for one, number in ((a, 300_000), (b, 700_000)):
-        cov = [[one.var_place[0, 0], one.cov[0, 0]], [one.cov[0, 0], one.var_velocity[0, 0]]]
-        mean = [one.place[0, 0], one.velocity[0, 0]]
-        draws.append(rng.multivariate_normal(mean, cov, number))
-    draws = np.concatenate(draws)
-    np.testing.assert_allclose([m[0, 0] for m in mixed[:2]], draws.mean(axis=0), atol=0.01)
-    expected = np.cov(draws.T)[np.triu_indices(2)]
-    np.testing.assert_allclose([m[0, 0] for m in mixed[2:]], expected, atol=0.02)
+    mixed = [moment[0, 0] for moment in a.mixed_with(b, jnp.full((1, 1), 0.3))]
+    means, shares = np.array([[1.0, 2.0], [3.0, -1.0]]), np.array([0.3, 0.7])
+    within = np.array([[[1.0, 0.5], [0.5, 0.8]], [[2.0, 0.1], [0.1, 0.3]]])
+    off = means - shares @ means
+    cov = np.einsum("k,kij->ij", shares, within + off[:, :, None] * off[:, None])
+    np.testing.assert_allclose(mixed, [*(shares @ means), *cov[np.triu_indices(2)]], rtol=1e-5)
 
 
 # --- noises --------------------------------------------------------------------------------

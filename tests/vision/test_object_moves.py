@@ -7,10 +7,7 @@ import numpy as np
 
 from mpfjax.mixture import ParticleMixture
 from mpfjax.vision.boxes.colour_model import BoxState
-from mpfjax.vision.boxes.hypotheses import (
-    ObjectExclusion,
-    PruneHypotheses,
-)
+from mpfjax.vision.boxes.hypotheses import ObjectExclusion, PruneHypotheses
 
 # Component, reference, x, mass: object 0 has two hypotheses, object 1 has one near the first.
 ROWS = [(0, 0, 0.0, 0.2), (0, 0, 2.0, 0.2), (1, 0, 50.0, 0.1), (2, 1, 4.0, 0.3), (2, 1, 6.0, 0.2)]

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from mpfjax.vision import HSVColours, RGBColours
-from mpfjax.vision.colour.histograms import (
-    SampledBoxes,
-)
+from mpfjax.vision.colour.histograms import SampledBoxes
 
 RNG = np.random.default_rng(0)
 FRAME = RNG.integers(0, 256, (30, 40, 3), dtype=np.uint8)

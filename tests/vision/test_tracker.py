@@ -334,6 +334,3 @@ def test_still_objects_before_a_shaking_camera_are_shown_from_the_second_second_
         most.append(int(np.asarray(tracks.identities).max()))
     assert np.array(shown).min() == 4
     assert max(most) <= 8
-
-
-# --- settings ------------------------------------------------------------------------------

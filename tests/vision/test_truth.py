@@ -6,13 +6,12 @@ import io
 import numpy as np
 import pytest
 
-from mpfjax.metrics.tracking_scores import multi_object_scores, remove_ignored
+from mpfjax.metrics import multi_object_scores
 from mpfjax.vision import read_tracks, read_truth
 from mpfjax.vision.files.boxes import write_tracks
 
 NUM_FRAMES = 25
 SCORES = ("HOTA", "DetA", "AssA", "MOTA", "MOTP", "IDF1", "id_switches", "false_positives")
-BOX = (40.0, 30.0, 20.0, 40.0)
 
 
 def walking(rng, num, size=300.0):
@@ -162,32 +161,6 @@ def test_scores_are_those_of_trackevals_reader_of_kitti(tmp_path, kind):
     for part in ({"ignored": truth.ignored[truth.ignored[:, 1] == 1]}, {"min_height": 0.0}):
         without = ours(tracks, truth._replace(**part))
         assert without["false_positives"] > expected["false_positives"]
-
-
-def moved(box, x=0.0, y=0.0):
-    return np.array(box) + np.array([x, y, 0, 0])
-
-
-def test_what_is_taken_away_by_hand():
-    truth = np.array([[1, 1, *BOX]])
-    rider, occluder = moved(BOX, x=100), moved(BOX, y=300)
-    field = [200.0, 0, 100, 100]
-    ignored = np.array([[1, 1, *rider], [1, 2, *field], [1, 3, *occluder]])
-    tracks = np.array(
-        [
-            [1, 1, *BOX],  # the object
-            [1, 2, *moved(rider, x=2)],  # the rider
-            [1, 3, *moved(rider, x=15)],  # beside the rider: false
-            [1, 4, 210.0, 20, 20, 40],  # in the region
-            [1, 5, 190.0, 20, 19, 40],  # just less than half of it there: false
-            [1, 6, *occluder],  # on what is unscored: false
-            [1, 7, 500.0, 500, 10, 12],  # low
-            [2, 2, *rider],  # in another frame: false
-        ]
-    )
-    assert remove_ignored(tracks, truth, ignored)[:, 1].tolist() == [1, 3, 5, 6, 7, 2]
-    assert remove_ignored(tracks, truth, ignored, 12.0)[:, 1].tolist() == [1, 3, 5, 6, 2]
-    assert len(remove_ignored(tracks[:0], truth, ignored)) == 0
 
 
 def test_a_truth_is_found_in_its_folder_and_cut_to_frames(tmp_path):
