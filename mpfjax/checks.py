@@ -118,15 +118,14 @@ def _of_jax(name: str, array: Any) -> np.ndarray:
     return held
 
 
-def to_array(name: str, *, floating: bool = True, optional: bool = False) -> Callable[[Any], Any]:
+def to_array(name: str, *, floating: bool = True) -> Callable[[Any], Any]:
     """A converter of the argument of this name to an array, for `eqx.field(converter=...)`.
 
-    With `floating`, whole numbers and booleans become floating point numbers; with `optional`, None
-    stays None.
+    With `floating`, whole numbers and booleans become floating point numbers. None stays None.
     """
 
     def convert(value: Any) -> Any:
-        if optional and value is None:
+        if value is None:  # which the annotation may refuse
             return value
         numbers = as_numbers(name, value, floating=floating)
         return numbers if isinstance(numbers, jax.ShapeDtypeStruct) else jnp.asarray(numbers)

@@ -31,7 +31,7 @@ from benchmarks import harness
 from benchmarks.harness import AtLeast2, Seed, command
 from benchmarks.masses.filters import FILTERS
 from benchmarks.masses.scenes import SCENES, Scene
-from mpfjax.models.base import starts_from_noise
+from mpfjax.models.base import is_made_of_noise
 
 # A reference of so many particles where the likelihood of a particle is that of its pixels.
 _FEWER = {"look-alikes": 10}
@@ -166,7 +166,7 @@ def measure(
         for name, seconds in harness.turns(runs, 5).items()
     }
     found = {name: results(scene, filter, seeds, seed) for name, filter in filters.items()}
-    if importlib.util.find_spec("particles") and starts_from_noise(scene.model):
+    if importlib.util.find_spec("particles") and is_made_of_noise(scene.model, "initial"):
         from benchmarks.masses import through_particles
 
         name = "SQMC of particles"

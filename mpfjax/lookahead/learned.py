@@ -15,7 +15,7 @@ from mpfjax.lookahead.quadratics import neutral
 from mpfjax.lookahead.regression import fit_lookahead
 from mpfjax.lookahead.twisted import PropagateTwisted, RegroupTwisted, Twist, TwistInitial
 from mpfjax.mixture import flatten_states
-from mpfjax.models.base import mapped, require_noise, starts_from_noise
+from mpfjax.models.base import is_made_of_noise, mapped, require_noise
 from mpfjax.models.conditionally_linear import is_mixed, with_moments
 from mpfjax.models.noise import noise_dtype
 from mpfjax.models.steps import noise_dimension
@@ -107,7 +107,7 @@ def _knowing_nothing(
     one = neutral(size, num_features, noise.shape[0], dtype)
     steps = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (length + 1, *leaf.shape)), one)
     initial = None
-    if starts_from_noise(model):
+    if is_made_of_noise(model, "initial"):
         # x_0 has no state before it: one feature, which is zero.
         initial = neutral(size, 1, model.initial_noise_dimension, dtype)
     return Twist(steps, initial, features)

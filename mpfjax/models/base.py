@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Count, check, checked_by, shown
+from mpfjax.checks import Count, check, checked_by, kinds, shown
 from mpfjax.models.noise import noise_dtype
 from mpfjax.operations.random import direction_numbers, normal, split
 
@@ -51,13 +51,6 @@ class AbstractStateSpaceModel(eqx.Module):
     """
 
     handles_missing = False
-
-    @property
-    def takes_inputs(self) -> bool:
-        """Whether the model takes u_t: it has a field `inputs`, or its own `with_inputs`."""
-        default = AbstractStateSpaceModel.with_inputs
-        is_field = "inputs" in type(self).__dataclass_fields__
-        return is_field or type(self).with_inputs is not default
 
     def with_inputs(self, inputs: PyTree) -> "AbstractStateSpaceModel":
         """The model at a step whose known inputs are u_t: the field `inputs` is set.
@@ -101,10 +94,11 @@ class AbstractStateSpaceModel(eqx.Module):
 
 def takes_inputs(model: Any) -> bool:
     """Whether a model takes u_t: it has a field `inputs`, or its own `with_inputs`."""
-    if hasattr(type(model), "takes_inputs"):
-        return model.takes_inputs
-    # A model of one particle may be of any class.
-    return hasattr(model, "with_inputs") or hasattr(model, "inputs")
+    model = _innermost(model)
+    if not isinstance(model, AbstractStateSpaceModel):  # of one particle
+        return hasattr(model, "with_inputs") or hasattr(model, "inputs")
+    is_default = type(model).with_inputs is AbstractStateSpaceModel.with_inputs
+    return "inputs" in type(model).__dataclass_fields__ or not is_default
 
 
 def has_attribute(model: Any, name: str) -> bool:
@@ -141,56 +135,37 @@ def saying_that_none_were_given(model: Any) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        while not hasattr(model, "inputs"):  # of one particle, or of one object
-            model = getattr(model, "model", getattr(model, "object_model", error))
-            if model is error:
-                raise
+        model = _innermost(model)
         note = (
             f"mpfjax: inputs: there are none, so {type(model).__name__}.inputs is None; give"
             " u_1, ..., u_t by inputs=... (x_0 has no input)"
         )
         said = getattr(error, "__notes__", [])
-        if model.inputs is None and "None" in str(error) and note not in said:
+        if getattr(model, "inputs", 0) is None and "None" in str(error) and note not in said:
             error.add_note(note)
         raise
 
 
-def is_made_of_noise(model: Any) -> bool:
-    """Whether the model makes x_t of noise, and has no other law for it."""
-    has_noise = hasattr(model, "transition_from_noise") and hasattr(model, "noise_dimension")
-    return has_noise and not _draws_otherwise(model, "sample_transition", "transition_from_noise")
-
-
-def starts_from_noise(model: Any) -> bool:
-    """Whether the model makes x_0 of noise, and has no other law for it."""
-    has_noise = hasattr(model, "initial_from_noise") and hasattr(model, "initial_noise_dimension")
-    return has_noise and not _draws_otherwise(model, "sample_initial", "initial_from_noise")
-
-
-def _draws_otherwise(model: Any, drawing: str, making: str) -> bool:
-    """Whether a class draws a state itself, and inherits how it is made of noise."""
-    own = model.model if isinstance(model, _PerParticleModel) else model
-    for owner in type(own).__mro__:
-        if making in vars(owner):
-            return False
-        if drawing in vars(owner):
-            return callable(getattr(type(own), making, None))
-    return False
+def is_made_of_noise(model: Any, state: str = "transition") -> bool:
+    """Whether the model makes x_t of noise, or x_0 ("initial"), and has no other law for it."""
+    drawing, making = f"sample_{state}", f"{state}_from_noise"
+    size = "noise_dimension" if state == "transition" else "initial_noise_dimension"
+    own = type(_own(model))
+    # A class that draws a state itself may inherit how it is made of noise.
+    owners = [owner for owner in own.__mro__ if {drawing, making} & vars(owner).keys()]
+    is_other = callable(getattr(own, making, None)) and making not in vars(owners[0])
+    return hasattr(model, making) and hasattr(model, size) and not is_other
 
 
 def require_noise(model: Any, needed_by: str) -> None:
     """Raise a `ValueError` unless the model can make x_t of noise from the Sobol table."""
-    for name in ("transition_from_noise", "noise_dimension"):
-        if not hasattr(model, name):
-            raise ValueError(
-                f"model: {model_name(model)} defines no {name}, which {needed_by} needs"
-            )
+    require(model, "transition_from_noise", needed_by)
+    check(Count, noise_dimension=getattr(model, "noise_dimension", None))
     if not is_made_of_noise(model):
         raise ValueError(
             f"model: {model_name(model)} defines a sample_transition, but inherits its"
             f" transition_from_noise, which {needed_by} needs; it must define both"
         )
-    check(Count, noise_dimension=model.noise_dimension)
     direction_numbers(model.noise_dimension)
 
 
@@ -206,7 +181,17 @@ _FROM_NOISE = AbstractStateSpaceModel.sample_transition
 
 def model_name(model: Any) -> str:
     """The name of the user's own class, whether `per_particle` wraps it or not."""
-    return type(model.model if isinstance(model, _PerParticleModel) else model).__name__
+    return type(_own(model)).__name__
+
+
+def _own(model: Any) -> Any:
+    return model.model if isinstance(model, _PerParticleModel) else model
+
+
+def _innermost(model: Any) -> Any:
+    """The user's own model, of one particle or of one object where it is wrapped."""
+    inner = getattr(model, "object_model", _own(model))
+    return model if inner is model else _innermost(inner)
 
 
 def require_model(model: Any, needed_by: str, argument: str = "model") -> None:
@@ -215,14 +200,12 @@ def require_model(model: Any, needed_by: str, argument: str = "model") -> None:
         raise ValueError(f"{argument}: {shown(model)} is a class; write {model.__name__}(...)")
     for method in ("sample_initial", "sample_transition", "log_likelihood"):
         require(model, method, needed_by, argument)
-    own_law = callable(getattr(model, "latent_dynamics", None))
-    if getattr(type(model), "sample_transition", None) is _FROM_NOISE and not own_law:
-        for name in ("transition_from_noise", "noise_dimension"):
-            if not hasattr(model, name):
-                raise ValueError(
-                    f"{argument}: {model_name(model)} defines no sample_transition, nor {name},"
-                    f" one of which {needed_by} needs"
-                )
+    has_law = hasattr(model, "transition_from_noise") or hasattr(model, "latent_dynamics")
+    if getattr(type(model), "sample_transition", None) is _FROM_NOISE and not has_law:
+        raise ValueError(
+            f"{argument}: {model_name(model)} defines no sample_transition, nor"
+            f" transition_from_noise, one of which {needed_by} needs"
+        )
     try:
         signature = inspect.signature(model.sample_initial)
     except (TypeError, ValueError):  # functions not written in Python cannot be inspected
@@ -238,52 +221,36 @@ def require_model(model: Any, needed_by: str, argument: str = "model") -> None:
 
 def check_states(states: Any, model: Any, method: str, num_particles: int) -> None:
     """Raise a `ValueError` for states of another number of particles, or no states at all."""
-    who = f"model: {model_name(model)}.{method} returned"
-    if not jax.tree.leaves(states):
-        raise ValueError(f"{who} {shown(states)}, which holds no array of particles")
-    for place, leaf in jax.tree_util.tree_leaves_with_path(states):
-        if np.shape(leaf)[:1] != (num_particles,):
-            raise ValueError(
-                f"{who} a leaf of shape {np.shape(leaf)}{_at(place)}; its leading axis is not the"
-                f" number of particles, {num_particles}"
-            )
+    leaves = jax.tree.leaves(states)
+    if not leaves or any(np.shape(leaf)[:1] != (num_particles,) for leaf in leaves):
+        raise ValueError(
+            f"model: {model_name(model)}.{method} returned {shown(jax.tree.map(np.shape, states))},"
+            f" no shapes whose leading axis is the number of particles, {num_particles}"
+        )
 
 
 def check_moved(
     states: Any, previous_states: Any, model: Any, method: str = "sample_transition"
 ) -> None:
     """Raise a `ValueError` where structure, shapes or types of x_t are not those of x_{t-1}."""
-    structures = jax.tree.structure(states), jax.tree.structure(previous_states)
-    who = f"model: {model_name(model)}.{method} returned"
-    if structures[0] != structures[1]:
+    found, given = kinds(states), kinds(previous_states)
+    if found != given:
         raise ValueError(
-            f"{who} states of another structure, {structures[0]}, than it was given,"
-            f" {structures[1]}; sample_initial's is that of all states"
+            f"model: {model_name(model)}.{method} returned {found}, and was given {given};"
+            f" sample_initial and {method} must agree"
         )
-    before = jax.tree.leaves(previous_states)
-    for (place, new), old in zip(jax.tree_util.tree_leaves_with_path(states), before, strict=True):
-        dtype = getattr(new, "dtype", type(new).__name__)
-        if (np.shape(new), dtype) != (old.shape, old.dtype):
-            raise ValueError(
-                f"{who} {dtype}{list(np.shape(new))}{_at(place)} and was given"
-                f" {old.dtype}{list(old.shape)}; sample_initial and {method} must agree"
-            )
-
-
-def _at(place: tuple[Any, ...]) -> str:
-    return f" at states{jax.tree_util.keystr(place)}" if place else ""
 
 
 def check_log_density(
     values: Any, model: Any, method: str, num_particles: int
 ) -> Float[Array, " n"]:
     """The result of a density of the model; a `ValueError` unless it is one real number each."""
-    who = f"model: {model_name(model)}.{method} returned"
-    if getattr(values, "shape", None) != (num_particles,):
+    if getattr(values, "shape", None) != (num_particles,) or jnp.iscomplexobj(values):
         found = f"shape {values.shape}" if hasattr(values, "shape") else shown(values)
-        raise ValueError(f"{who} {found}, not one value a particle, ({num_particles},)")
-    if jnp.issubdtype(values.dtype, jnp.complexfloating):
-        raise ValueError(f"{who} complex values ({values.dtype}); a log-density is real")
+        raise ValueError(
+            f"model: {model_name(model)}.{method} returned {found}, not one real value a particle,"
+            f" ({num_particles},)"
+        )
     return jnp.asarray(values)
 
 
@@ -307,10 +274,6 @@ class _PerParticleModel(AbstractStateSpaceModel):
     @property
     def handles_missing(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return getattr(self.model, "handles_missing", False)
-
-    @property
-    def takes_inputs(self) -> bool:
-        return takes_inputs(self.model)
 
     def with_inputs(self, inputs: PyTree) -> "_PerParticleModel":
         return _PerParticleModel(with_inputs(self.model, inputs))

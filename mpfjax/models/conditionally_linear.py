@@ -290,8 +290,7 @@ def observation_rows(
 ) -> Float[Array, "p 1"]:
     """y_t as a column, checked."""
     found: Any = model.linear_observation(observation)
-    p, is_array = seen.matrix.shape[0], isinstance(found, jax.Array | np.ndarray | float | int)
-    shape = jnp.shape(found) if is_array else None
+    p, shape = seen.matrix.shape[0], getattr(found, "shape", None)
     if shape != (p,) and not (p == 1 and shape == ()):
         raise ValueError(
             f"observation: shape {shape} of {shown(found)} is not ({p},), the rows of H that"

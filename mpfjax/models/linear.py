@@ -44,6 +44,9 @@ PROBABILITIES = Rule(_check_probabilities, "probabilities along the last axis")
 # One of all regimes, or one for each.
 VectorOfEach = Float[Array, " d"] | Float[Array, "k d"]
 SquareOfEach = Float[Array, "d d"] | Float[Array, "k d d"]
+RowsOfEach = Float[Array, "p d"] | Float[Array, "k p d"]
+NoiseOfEach = Float[Array, "p p"] | Float[Array, "k p p"]
+OffsetOfEach = Float[Array, " p"] | Float[Array, "k p"]
 
 
 class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
@@ -69,11 +72,9 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
     m0: Annotated[Float[Array, " d"], FINITE] = eqx.field(converter=to_array("m0"))
     P0: Annotated[Float[Array, "d d"], FINITE] = eqx.field(converter=to_array("P0"))
     B: Annotated[Float[Array, "d k"], FINITE] | None = eqx.field(
-        converter=to_array("B", optional=True), default=None
+        converter=to_array("B"), default=None
     )
-    inputs: Float[Array, " k"] | None = eqx.field(
-        converter=to_array("inputs", optional=True), default=None
-    )
+    inputs: Float[Array, " k"] | None = eqx.field(converter=to_array("inputs"), default=None)
 
     def with_inputs(self, inputs: PyTree) -> "LinearGaussianModel":
         """The model at step t: u_t, (k,), or a dict of the fields that change in time."""
@@ -103,10 +104,7 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
         """x_0 ~ N(m0, P0)."""
         return self.m0[None] + noise @ _root(self.P0).T
 
-    @property
-    def noise_dimension(self) -> int:
-        """d."""
-        return self.m0.shape[0]
+    noise_dimension = initial_noise_dimension
 
     def transition_from_noise(
         self, noise: Float[Array, "n d"], states: Float[Array, "n d"]
@@ -119,11 +117,7 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
         self, observation: Float[Array, " p"], states: Float[Array, "n d"]
     ) -> Float[Array, " n"]:
         """log N(y_t; H x_t, R)."""
-        if jnp.shape(observation) != (self.H.shape[0],):
-            raise ValueError(
-                f"observation: shape {jnp.shape(observation)} is not ({self.H.shape[0]},),"
-                " the rows of H"
-            )
+        check_shape(f"{self.H.shape[0]}", observation=observation)
         return _log_normal(observation[None] - self.observation_mean(states), self.R)
 
     def sample_observation(
@@ -189,22 +183,14 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
     )
     F: Annotated[SquareOfEach, FINITE] = eqx.field(converter=to_array("F"))
     Q: Annotated[SquareOfEach, COVARIANCE] = eqx.field(converter=to_array("Q"))
-    H: Annotated[Float[Array, "p d"] | Float[Array, "k p d"], FINITE] = eqx.field(
-        converter=to_array("H")
-    )
-    R: Annotated[Float[Array, "p p"] | Float[Array, "k p p"], COVARIANCE] = eqx.field(
-        converter=to_array("R")
-    )
+    H: Annotated[RowsOfEach, FINITE] = eqx.field(converter=to_array("H"))
+    R: Annotated[NoiseOfEach, COVARIANCE] = eqx.field(converter=to_array("R"))
     m0: Annotated[VectorOfEach, FINITE] = eqx.field(converter=to_array("m0"))
     P0: Annotated[SquareOfEach, COVARIANCE] = eqx.field(converter=to_array("P0"))
-    b: Annotated[VectorOfEach, FINITE] | None = eqx.field(
-        converter=to_array("b", optional=True), default=None
-    )
-    c: Annotated[Float[Array, " p"] | Float[Array, "k p"], FINITE] | None = eqx.field(
-        converter=to_array("c", optional=True), default=None
-    )
+    b: Annotated[VectorOfEach, FINITE] | None = eqx.field(converter=to_array("b"), default=None)
+    c: Annotated[OffsetOfEach, FINITE] | None = eqx.field(converter=to_array("c"), default=None)
     initial_probabilities: Annotated[Float[Array, " k"], PROBABILITIES] | None = eqx.field(
-        converter=to_array("initial_probabilities", optional=True), default=None
+        converter=to_array("initial_probabilities"), default=None
     )
 
     @property
@@ -217,18 +203,14 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
         """P(z_0)."""
         if self.initial_probabilities is not None:
             return self.initial_probabilities
-        k = self.num_regimes
-        return jnp.full(k, 1 / k, self.transition_matrix.dtype)
+        return jnp.full(self.num_regimes, 1 / self.num_regimes, self.transition_matrix.dtype)
 
     def sample_initial(self, key: Key[Array, ""], num_particles: int) -> Int[Array, " n"]:
         """z_0 by its probabilities."""
         shares = uniform(key, (num_particles,), self.transition_matrix.dtype)
         return self._initial(shares)
 
-    @property
-    def initial_noise_dimension(self) -> int:
-        """1."""
-        return 1
+    noise_dimension = initial_noise_dimension = 1
 
     def initial_from_noise(self, noise: Float[Array, "n 1"]) -> Int[Array, " n"]:
         """z_0 of standard normal numbers."""
@@ -244,11 +226,6 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
         """z_t by the row of z_{t-1}."""
         shares = uniform(key, latent.shape, self.transition_matrix.dtype)
         return self._next(shares, latent)
-
-    @property
-    def noise_dimension(self) -> int:
-        """1."""
-        return 1
 
     def transition_from_noise(
         self, noise: Float[Array, "n 1"], latent: Int[Array, " n"]

@@ -16,7 +16,6 @@ from mpfjax.models.base import (
     check_log_density,
     is_made_of_noise,
     replaced,
-    takes_inputs,
     with_inputs,
 )
 from mpfjax.models.conditionally_linear import refuse_marginalised
@@ -89,11 +88,6 @@ class MultiObjectModel(AbstractStateSpaceModel):
         """Whether the objects' model does."""
         return getattr(self.object_model, "handles_missing", False)
 
-    @property
-    def takes_inputs(self) -> bool:
-        """Whether the objects' model does."""
-        return takes_inputs(self.object_model)
-
     def with_inputs(self, inputs: PyTree) -> "MultiObjectModel":
         """The model whose objects have u_t, all the same or each its own."""
         model, per_object = self.object_model, self.per_object
@@ -124,7 +118,8 @@ class MultiObjectModel(AbstractStateSpaceModel):
 
     def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
         """x_t of every object, independent of each other given x_{t-1}."""
-        return self._drawn("sample_transition", key, states)
+        keys = split(key, self.num_objects)
+        return self._of_each("sample_transition", (0, 1), keys, states)
 
     def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
         """Σ_j log L(y_t | x_t^j) + Σ_{i<j} log ψ(x_t^i, x_t^j)."""
@@ -161,11 +156,8 @@ class MultiObjectModel(AbstractStateSpaceModel):
         """The observation of every object, leaves (n, J, ...)."""
         if self.shared_observation:
             raise ValueError("shared_observation: how several objects make one is not known")
-        return self._drawn("sample_observation", key, states)
-
-    def _drawn(self, method: str, key: Key[Array, ""], states: PyTree) -> PyTree:
-        """The draws of every object, by a method of its model."""
-        return self._of_each(method, (0, 1), split(key, self.num_objects), states)
+        keys = split(key, self.num_objects)
+        return self._of_each("sample_observation", (0, 1), keys, states)
 
     def _of_each(self, method: str, axes: tuple[int, ...], *arguments: PyTree) -> PyTree:
         """What a method of each object's model gives, (n, J, ...), from its part of the arguments.

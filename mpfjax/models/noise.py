@@ -196,11 +196,7 @@ def noise_dtype(states: PyTree) -> jnp.dtype:
 
 def _multipliers(dimension: int) -> UInt32[Array, " d"]:
     """α in units of 2^-32: floating point would lose the fraction of i α for large i."""
-    return jnp.array([int(2**32 * alpha) | 1 for alpha in _lattice(dimension)], jnp.uint32)
-
-
-def _lattice(dimension: int) -> list[float]:
     root = 2.0
     for _ in range(64):
         root = (1 + root) ** (1 / (dimension + 1))
-    return [root ** -(j + 1) for j in range(dimension)]
+    return jnp.array([int(2**32 * root ** -(j + 1)) | 1 for j in range(dimension)], jnp.uint32)

@@ -52,19 +52,11 @@ class QuadraticModel(AbstractStateSpaceModel, Fitting):
             shares = uniform(key, (num_particles,))
         return self.low + (self.high - self.low) * shares
 
-    @property
-    def initial_noise_dimension(self) -> int:
-        """1."""
-        return 1
+    noise_dimension = initial_noise_dimension = 1
 
     def initial_from_noise(self, noise: Float[Array, "n 1"]) -> Float[Array, " n"]:
         """x_0, uniform on [low, high]."""
         return self.low + (self.high - self.low) * jax.scipy.special.ndtr(noise[:, 0])
-
-    @property
-    def noise_dimension(self) -> int:
-        """1."""
-        return 1
 
     def transition_from_noise(
         self, noise: Float[Array, "n 1"], states: Float[Array, " n"]

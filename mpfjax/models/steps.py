@@ -3,17 +3,16 @@ moments: the next states, and their likelihood.
 """
 
 import functools
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check, saying
+from mpfjax.checks import saying
 from mpfjax.mixture import MarginalisedState
 from mpfjax.models.base import check_log_density, check_moved, model_name
 from mpfjax.models.conditionally_linear import (
-    AbstractConditionallyLinearModel,
     emission_of,
     is_marginalised,
     is_mixed,
@@ -69,10 +68,9 @@ def drawn_part(model: Any, states: PyTree) -> PyTree:
     """The part of the particles that is drawn, of x_{t-1} or of x_t."""
     if not is_marginalised(model):
         return states
-    latent = _with_moments(model, states).latent
     if is_mixed(model):
-        latent_rows(model, latent)
-    return latent
+        latent_rows(model, states.latent)
+    return states.latent
 
 
 def completed(model: Any, draws: PyTree, states: PyTree) -> PyTree:
@@ -100,7 +98,6 @@ def seen(
     """The states, updated by y_t if they carry moments, and log L as its factors."""
     if not is_marginalised(model):
         return states, [own_likelihoods(model, observation, states)]
-    states = _with_moments(model, states)
     log_factors = [own_likelihoods(model, observation, states.latent)]
     states, log_density = updated(model, observation, states)
     if log_density is not None:
@@ -131,9 +128,3 @@ def log_predictive(
     law = predicted_gaussian(model, latent, state)
     rows = observation_rows(model, observation, seen, state.mean.dtype)
     return log_density + gaussians.update(law, rows, seen)[1]
-
-
-def _with_moments(model: AbstractConditionallyLinearModel, states: PyTree) -> MarginalisedState:
-    what = f"a MarginalisedState, as {model_name(model)} has, which is conditionally linear"
-    check(MarginalisedState, what, states=states)
-    return cast(MarginalisedState, states)

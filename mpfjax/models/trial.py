@@ -2,7 +2,6 @@
 series drawn from a model.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Count, as_numbers, checked, shown
+from mpfjax.checks import Count, checked
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     check_log_density,
@@ -21,14 +20,11 @@ from mpfjax.models.base import (
     require,
     require_noise,
     saying_that_none_were_given,
-    takes_inputs,
     with_inputs,
 )
-from mpfjax.models.conditionally_linear import (
-    is_mixed,
-    with_moments,
-)
+from mpfjax.models.conditionally_linear import is_mixed, with_moments
 from mpfjax.models.steps import drawn_part, likelihoods, log_transition, moved
+from mpfjax.observations import one_input, one_observation, steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 _KEYS, _PLACES, _DRAWS = 64, 4, 32  # of the draws that must differ
@@ -61,10 +57,7 @@ def check_model(
     The last two look at a few thousand random draws, of x_0 and of the first two steps: they accept
     a right model, and may accept one that is wrong by a few percent. `inputs` are u_1.
     """
-    inputs = _as_inputs(inputs, model)
-    if not jax.tree.leaves(observation):
-        raise ValueError(f"observation: {shown(observation)} holds no array")
-    observation = jax.tree.map(lambda leaf: as_numbers("observation", leaf), observation)
+    inputs, observation = one_input(inputs, model), one_observation(observation)
     if is_made_of_noise(model):
         require_noise(model, "check_model")
     keys = jax.random.split(key, 5)
@@ -144,28 +137,19 @@ def _check_likelihood(key: Key[Array, ""], model: Any, observation: PyTree, stat
     """log L of draws of x_1."""
     states = jax.tree.map(lambda leaf: jnp.repeat(leaf, _DRAWS, axis=0), states)
     states = jax.jit(lambda: moved(key, model, states))()
-    values = _own_values(lambda states: likelihoods(model, observation, states), states, model)
-    if (values == -np.inf).all():
-        raise ValueError(
-            f"model: {model_name(model)}.log_likelihood of the observation is -inf at all of"
-            f" {len(values)} draws of x_1: no particle explains it"
-        )
-
-
-def _own_values(
-    density: Callable[[PyTree], Float[Array, " n"]], states: PyTree, model: Any
-) -> np.ndarray:
-    """The log-likelihoods, none of them NaN and each that of its own particle alone."""
-    values = np.asarray(jax.jit(density)(states), float)
-    half = len(values) // 2
-    alone = jax.tree.map(lambda leaf: leaf[half:], states)
-    others = np.asarray(jax.jit(density)(alone), float)
+    density = jax.jit(lambda states: likelihoods(model, observation, states))
+    values, half = np.asarray(density(states), float), _FAMILIES * _DRAWS // 2
+    others = np.asarray(density(jax.tree.map(lambda leaf: leaf[half:], states)), float)
     who = f"model: {model_name(model)}.log_likelihood"
     if not (values < np.inf).all():
         raise ValueError(f"{who} is NaN or +inf at a draw of x_1")
     if not np.allclose(values[half:], others, rtol=1e-3, atol=1e-3):
         raise ValueError(f"{who} of a particle depends on the other particles")
-    return values
+    if (values == -np.inf).all():
+        raise ValueError(
+            f"{who} of the observation is -inf at all of {len(values)} draws of x_1: no particle"
+            " explains it"
+        )
 
 
 def _check_transition(key: Key[Array, ""], model: Any, states: PyTree) -> None:
@@ -216,13 +200,7 @@ def simulate(
 ) -> tuple[PyTree, PyTree]:
     """`AbstractStateSpaceModel.simulate`."""
     require(model, "sample_observation", "simulate")
-    inputs = _as_inputs(inputs, model)
-    for leaf in jax.tree.leaves(inputs):
-        if leaf.shape[:1] != (num_steps,):
-            raise ValueError(
-                f"inputs: the leading axis of a leaf of shape {leaf.shape} is not num_steps,"
-                f" {num_steps}"
-            )
+    inputs = steps_of_inputs(inputs, num_steps, model, "steps")
     with saying_that_none_were_given(model):
         return with_floats_traced(lambda model: _simulate(key, model, num_steps, inputs), model)
 
@@ -250,9 +228,3 @@ def _simulate(key, model, num_steps, inputs):
         lambda start, later: first(jnp.concatenate([start[None], later])), initial, states
     )
     return states, jax.tree.map(first, observations)
-
-
-def _as_inputs(inputs: PyTree, model: Any) -> PyTree:
-    if inputs is not None and not takes_inputs(model):
-        raise ValueError(f"inputs: {model_name(model)} has no place for them, a field inputs")
-    return jax.tree.map(lambda leaf: as_numbers("inputs", leaf), inputs)

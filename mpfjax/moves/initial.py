@@ -13,8 +13,8 @@ from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
     check_states,
+    is_made_of_noise,
     saying_that_none_were_given,
-    starts_from_noise,
 )
 from mpfjax.models.conditionally_linear import with_moments
 from mpfjax.models.noise import Noise, draw_noise
@@ -38,7 +38,7 @@ def sample_initial(
 ) -> PyTree:
     """The particles of x_0, of this noise if the model can; raises for leaves of another length."""
     with saying_that_none_were_given(model):
-        if noise == "independent" or not starts_from_noise(model):
+        if noise == "independent" or not is_made_of_noise(model, "initial"):
             particles = model.sample_initial(key, num_particles)
         else:
             maker = cast(Any, model)
