@@ -32,17 +32,18 @@ def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
     """
     available = jax.devices()
     if devices is None:
-        chosen = _default_devices(available)
+        default = getattr(jax.config, "jax_default_device", None)
+        one = jax.devices(default) if isinstance(default, str) else [default]
+        chosen = available if default is None else one
     elif isinstance(devices, int):
         if not 1 <= devices <= len(available):
             raise ValueError(f"devices: {devices} asked for, and there are {len(available)}")
         chosen = available[:devices]
     else:
         chosen = list(devices)
-        if not chosen or not all(isinstance(device, jax.Device) for device in chosen):
-            raise ValueError(f"devices: {devices} is not a number or some of jax.devices()")
-        if len(set(chosen)) < len(chosen):
-            raise ValueError(f"devices: {devices} names one twice")
+        are_devices = all(isinstance(device, jax.Device) for device in chosen)
+        if not chosen or not are_devices or len(set(chosen)) < len(chosen):
+            raise ValueError(f"devices: {devices} is no number, nor some of jax.devices()")
     idle = jax.process_count() - len({device.process_index for device in chosen})
     if jax.process_count() > 1 and idle:
         raise ValueError(f"devices: {chosen} leaves {idle} of the processes without any")
@@ -100,22 +101,9 @@ def _spread(run, inputs, arguments, mesh):
     def on_each(inputs: PyTree, arrays: PyTree) -> PyTree:
         return run(inputs, *eqx.combine(arrays, rest))
 
+    specs = {"in_specs": (P(DEVICE_AXIS), P()), "out_specs": P(DEVICE_AXIS)}
     # With this check, every loop in a user's model would have to declare what varies over devices.
-    mapped = jax.shard_map(
-        on_each,
-        mesh=mesh,
-        in_specs=(P(DEVICE_AXIS), P()),
-        out_specs=P(DEVICE_AXIS),
-        check_vma=False,
-    )
-    return mapped(inputs, arrays)
-
-
-def _default_devices(available: list[Any]) -> list[Any]:
-    default = getattr(jax.config, "jax_default_device", None)
-    if default is None:
-        return available
-    return jax.devices(default) if isinstance(default, str) else [default]
+    return jax.shard_map(on_each, mesh=mesh, **specs, check_vma=False)(inputs, arrays)
 
 
 def _placed(tree: PyTree, where: Any) -> PyTree:

@@ -82,13 +82,12 @@ def run_islands(
 def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any]:
     """The devices chosen; without a choice the most that deal the islands evenly."""
     chosen = choose_devices(devices)
-    if num_islands % len(chosen) == 0:
-        return chosen
-    if devices is not None or jax.process_count() > 1:
+    most = max(d for d in range(1, len(chosen) + 1) if num_islands % d == 0)
+    if most < len(chosen) and (devices is not None or jax.process_count() > 1):
         raise ValueError(
             f"num_islands: {num_islands} islands cannot be dealt evenly to {len(chosen)} devices"
         )
-    return chosen[: max(d for d in range(1, len(chosen)) if num_islands % d == 0)]
+    return chosen[:most]
 
 
 def _run_block(keys, filter, series, collect):

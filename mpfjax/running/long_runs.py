@@ -1,6 +1,5 @@
 """Long runs: one loop with a file to go on from, a bar, and an end at Ctrl-C or what is broken."""
 
-import json
 import os
 import warnings
 from collections.abc import Callable, Mapping
@@ -19,13 +18,10 @@ from mpfjax.running.storage import (
     described,
     differences,
     filled,
-    load_arrays,
     program_of,
-    read_description,
-    write_arrays,
+    read_described,
+    write_described,
 )
-
-_NOTES = "notes"
 
 
 class Checkpoint(Checked):
@@ -39,16 +35,12 @@ class Checkpoint(Checked):
       name and by the data and numbers of the call, and no longer by the program that JAX makes of
       the functions, such as a prior or an optimiser, which another version of JAX may change.
 
-    Raises `ValueError` for the path of a directory, and an `every` below one.
+    Raises `ValueError` for an `every` below one.
     """
 
     path: str | os.PathLike[str]
     every: Count = 50
     name: str | None = None
-
-    def __check_init__(self) -> None:
-        if Path(self.path).is_dir():
-            raise ValueError(f"path: {self.path} is a directory, not a file")
 
 
 class State(NamedTuple):
@@ -131,16 +123,15 @@ class LongRun:
             notes = {"caller": self.caller, "step": state.step}
             notes |= {"identity": dict(self.identity(state.step))}
             arrays = arrays_of({"carry": state.carry, "rows": rows})
-            write_arrays(self.checkpoint.path, arrays | {_NOTES: np.array(json.dumps(notes))})
+            write_described(self.checkpoint.path, arrays, notes)
         return rows
 
     def _loaded(self, like: State) -> State | None:
         """The state that the file holds, None without a file; a `ValueError` for another run's."""
         if self.checkpoint is None or not Path(self.checkpoint.path).exists():
             return None
-        path = Path(self.checkpoint.path)
-        arrays = load_arrays(path)
-        notes: dict[str, Any] = read_description(path, arrays, _NOTES) if _NOTES in arrays else {}
+        path = self.checkpoint.path
+        arrays, notes = read_described(path)
         if notes.get("caller") != self.caller:
             raise ValueError(f"checkpoint: {path} is no checkpoint of {self.caller}")
         found, own = notes["identity"], dict(self.identity(notes["step"]))

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 _MOST_SHOWN = 4
+_DESCRIPTION = "description"
 _DAY = 24 * 60 * 60
 
 
@@ -45,8 +46,7 @@ def save_checkpoint(path: str | os.PathLike[str], state: PyTree) -> None:
             if state["t"] % 1000 == 0:
                 mpfjax.save_checkpoint(path, state)
     """
-    description = {"description": np.array(json.dumps(describe(state)))}
-    write_arrays(path, arrays_of(state) | description)
+    write_described(path, arrays_of(state), describe(state))
 
 
 def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
@@ -60,9 +60,7 @@ def load_checkpoint(path: str | os.PathLike[str], like: PyTree) -> PyTree:
     file that is cut off, damaged, no checkpoint, or does not hold what it says, and for the
     checkpoint of another state, naming what differs.
     """
-    path = Path(path)
-    arrays = load_arrays(path)
-    saved, own = read_description(path, arrays), describe(like)
+    (arrays, saved), own = read_described(path), describe(like)
     if saved != own:
         raise ValueError(f"like: {path} holds another state: {differences(saved, own)}")
     return filled(path, arrays, like)
@@ -78,7 +76,7 @@ def arrays_of(state: PyTree) -> dict[str, np.ndarray]:
     return arrays
 
 
-def filled(path: Path, arrays: Mapping[str, np.ndarray], like: PyTree) -> PyTree:
+def filled(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], like: PyTree) -> PyTree:
     """A pytree like this one with the `arrays_of` another, of these dtypes but of any shapes.
 
     Raises `ValueError` where they do not fit.
@@ -290,13 +288,19 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def read_description(
-    path: Path, arrays: Mapping[str, np.ndarray], name: str = "description"
-) -> dict[str, Any]:
-    """The description in the arrays of a checkpoint, stored as JSON under this name."""
-    if name not in arrays:
-        raise ValueError(f"{path}: no checkpoint, for it does not describe what it holds")
+def write_described(
+    path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]
+) -> None:
+    """Write arrays by `write_arrays`, and beside them a description that JSON can hold."""
+    write_arrays(path, {**arrays, _DESCRIPTION: np.array(json.dumps(description))})
+
+
+def read_described(
+    path: str | os.PathLike[str],
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and the description that `write_described` wrote; `ValueError` for other files."""
+    arrays = load_arrays(path)
     try:
-        return dict(json.loads(str(arrays[name])))
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: no checkpoint, its description is no JSON ({error})") from error
+        return arrays, dict(json.loads(str(arrays.pop(_DESCRIPTION))))
+    except (KeyError, ValueError, TypeError) as error:
+        raise ValueError(f"{path}: it does not describe what it holds ({error})") from error

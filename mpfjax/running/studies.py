@@ -28,19 +28,17 @@ from mpfjax.running.scan import FilterRun
 from mpfjax.running.storage import (
     described,
     differences,
-    load_arrays,
     named,
-    read_description,
-    write_arrays,
+    read_described,
+    write_described,
     write_whole,
 )
 
 Values = Sequence[Any] | np.ndarray | Array
 
 _MANIFEST = "study.json"
-_CELL = "cell"
 _STUDY = "study"
-_TAKEN = ("filter", "num_particles", "file", _CELL, _STUDY)
+_TAKEN = ("filter", "num_particles", "file", "description", _STUDY)
 _CELL_FILE = re.compile(r"(\d+)-[\w.+-]*\.npz")  # as `_cells` names them
 
 
@@ -149,8 +147,8 @@ def run_study(
             error.add_note(f"in the cell {cell.description}")
             raise
         if jax.process_index() == 0:
-            mark = {_CELL: np.array(json.dumps({_STUDY: digest} | cell.description))}
-            write_arrays(directory / cell.file, measured | mark)
+            mark = {_STUDY: digest} | cell.description
+            write_described(directory / cell.file, measured, mark)
         results[cell.file] = cell.description | measured
 
     bar = tqdm(total=len(cells), initial=len(results), unit="cell", disable=None)
@@ -217,14 +215,10 @@ def _listed(name: str, values: Any) -> list[Any]:
     values = values.tolist() if isinstance(values, np.ndarray | jax.Array) else values
     if isinstance(values, str) or not isinstance(values, Sequence):
         raise ValueError(f"{name}: {shown(values)} are no values, [value, ...]")
-    is_scalar = lambda value: isinstance(value, np.generic | jax.Array) and value.ndim == 0  # noqa: E731
-    plain = [value.item() if is_scalar(value) else value for value in values]
+    plain = [value.item() if getattr(value, "shape", None) == () else value for value in values]
     for value in plain:
         if not isinstance(value, str | int | float | None):
-            raise ValueError(
-                f"{name}: {shown(value)} is no number or string; name it, and let the filter's"
-                " function look it up"
-            )
+            raise ValueError(f"{name}: {shown(value)} is no number or string; name it instead")
     if not plain or len(set(plain)) < len(plain):
         raise ValueError(f"{name}: {shown(values)} is empty or has the same twice")
     return plain
@@ -297,11 +291,9 @@ def _finished(directory: Path, digest: str) -> dict[str, dict[str, Any]]:
     results, faults = {}, []
     for path in _cell_files(directory):
         try:
-            arrays = load_arrays(path)
-            description = read_description(path, arrays, _CELL)
+            arrays, description = read_described(path)
             if description.pop(_STUDY, None) != digest:
                 raise ValueError(f"{path}: results of another study")
-            del arrays[_CELL]
             results[path.name] = description | arrays
         except ValueError as error:
             faults.append(str(error))
