@@ -22,24 +22,22 @@ def find_truth(source: Path, given: Path | None, first: int, last: int | None) -
     A video has no folder, and so no truth unless it is given. Warns of a truth beside the images
     that cannot be read; raises `ValueError` for a given one.
     """
-    if given is not None:
-        if not given.exists():
-            raise ValueError(f"--truth: {given} is neither a file nor a folder")
-        truth = read_truth(given).between(first, last or np.inf)
-        if not len(truth.objects):
-            raise ValueError(f"--truth: {given} has no box in these frames")
-        return truth
-    if not source.is_dir():
+    if given is not None and not given.exists():
+        raise ValueError(f"--truth: {given} is neither a file nor a folder")
+    if given is None and not source.is_dir():
         return None
     folder = Path(os.path.abspath(source))
     try:
-        truth = read_truth(folder.parent if folder.name in _INNER else folder)
-    except FileNotFoundError:
-        return None
+        truth = read_truth(given or (folder.parent if folder.name in _INNER else folder))
     except (ValueError, OSError) as error:
-        warnings.warn(f"{_NO_SCORES}: {error}", RuntimeWarning, stacklevel=2)
+        if given is not None:
+            raise
+        if not isinstance(error, FileNotFoundError):
+            warnings.warn(f"{_NO_SCORES}: {error}", RuntimeWarning, stacklevel=2)
         return None
     truth = truth.between(first, last or np.inf)
+    if given is not None and not len(truth.objects):
+        raise ValueError(f"--truth: {given} has no box in these frames")
     return truth if len(truth.objects) else None
 
 

@@ -352,10 +352,6 @@ def last_before(positions: Positions, points: Positions, num_slots: int) -> Int[
     last = take(upto, slot)
     first = last - take(at_slot, slot)
 
-    def is_open(bounds: tuple[Array, Array]) -> Array:
-        first, last = bounds
-        return jnp.any(first < last)
-
     def halve(bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         first, last = bounds
         middle = jnp.minimum((first + last) // 2, num_positions - 1)
@@ -366,5 +362,7 @@ def last_before(positions: Positions, points: Positions, num_slots: int) -> Int[
             jnp.where(seeks & ~is_before, middle, last),
         )
 
-    first, _ = jax.lax.while_loop(is_open, halve, (first, last))
+    first, _ = jax.lax.while_loop(
+        lambda bounds: jnp.any(bounds[0] < bounds[1]), halve, (first, last)
+    )
     return first - 1

@@ -218,21 +218,16 @@ def _words(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, ".
 
 @partial(jax.jit, static_argnames="shape")
 def _keys(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, "..."]:
-    """The key of each position: both halves of its hash, side by side."""
-    index = jax.lax.iota(jnp.uint32, math.prod(shape))
-    return _both_halves((key[0], key[1]), index).reshape(*shape, 2)
-
-
-def _both_halves(key: Any, low: UInt32[Array, " n"]) -> UInt32[Array, "n 2"]:
-    """The hash of each counter, its halves side by side.
+    """The key of each position: both halves of its hash, side by side.
 
     Each column hashes for itself and takes its half. If both were stacked, XLA would compile the
     rounds twice, and compute them as often.
     """
-    columns = jnp.broadcast_to(low[:, None], (low.shape[0], 2))
+    index = jax.lax.iota(jnp.uint32, math.prod(shape))
+    columns = jnp.broadcast_to(index[:, None], (index.shape[0], 2))
     is_low = jax.lax.broadcasted_iota(jnp.uint32, columns.shape, 1) == 1
     high, low = threefry(key, jnp.zeros_like(columns), columns)
-    return jnp.where(is_low, low, high)
+    return jnp.where(is_low, low, high).reshape(*shape, 2)
 
 
 def threefry(
@@ -254,12 +249,8 @@ def _rounds(
 ) -> tuple[UInt32[Array, " *shape"], UInt32[Array, " *shape"]]:
     for rotation in rotations:
         high = high + low
-        low = high ^ _rotate_left(low, rotation)
+        low = high ^ ((low << rotation) | (low >> (32 - rotation)))
     return high, low
-
-
-def _rotate_left(word: UInt32[Array, " *shape"], by: int) -> UInt32[Array, " *shape"]:
-    return (word << by) | (word >> (32 - by))
 
 
 _UNROLLED = define_prng_impl(

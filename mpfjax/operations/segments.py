@@ -140,7 +140,9 @@ def segment_reduce(
     """The sum ("add"), "max" or "min" of each segment's values, `nothing` for an empty one."""
     if not are_masked(len(values), num_segments):
         return _scattered(how, values, segments, num_segments, nothing)
-    own = jnp.where(_members(segments, num_segments), values[None], nothing)
+    # XLA fuses the masks into the sum and never stores them.
+    is_member = segments[None] == jnp.arange(num_segments, dtype=segments.dtype)[:, None]
+    own = jnp.where(is_member, values[None], nothing)
     return _REDUCTIONS[how](own.astype(values.dtype), axis=1)
 
 
@@ -259,8 +261,3 @@ def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, "
     for m in range(1, num_segments):
         segments = segments + (place >= firsts[m]).astype(jnp.int32)
     return segments
-
-
-def _members(segments: Int[Array, " n"], num_segments: int) -> Bool[Array, "num_segments n"]:
-    """A mask of the entries of each segment; XLA fuses it into a sum and never stores it."""
-    return segments[None] == jnp.arange(num_segments, dtype=segments.dtype)[:, None]
