@@ -19,6 +19,7 @@ from mpfjax.checks import (
     Fitting,
     InnerShare,
     check_shape,
+    shown,
     to_array,
 )
 from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
@@ -181,7 +182,10 @@ class RandomWalkWithJumps(RandomWalk):
 
 
 def _as_shares(gain: Any) -> tuple[float, ...]:
-    return tuple(map(float, np.ravel(gain)))
+    try:
+        return tuple(map(float, np.ravel(gain)))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"gain: {shown(gain)} is no number, nor one a coordinate") from error
 
 
 class WalkWithVelocity(AbstractDynamics):

@@ -32,7 +32,7 @@ def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
     """
     available = jax.devices()
     if devices is None:
-        default = getattr(jax.config, "jax_default_device", None)
+        default: Any = getattr(jax.config, "jax_default_device", None)
         one = jax.devices(default) if isinstance(default, str) else [default]
         chosen = available if default is None else one
     elif isinstance(devices, int):
