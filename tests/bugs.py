@@ -163,7 +163,7 @@ BUGS = {
         "proposals.py",
         "log_volume = -jnp.sum(jnp.log(_diagonals(factors)), axis=1)",
         "log_volume = jnp.sum(jnp.log(_diagonals(factors)), axis=1)",
-        "tests/moves/test_auxiliary.py -k normaliser",
+        "tests/test_proposals.py -k normaliser",
     ),
     "a chosen x_0 is weighed by its chance": Bug(
         "moves/initial.py",

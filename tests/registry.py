@@ -159,9 +159,6 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
         "gaussian mixture rqmc": lambda model: mpfjax.with_point_sets(
             mpfjax.gaussian_mixture_particle_filter(model, NUM_PARTICLES, m)
         ),
-        "mpf fixed number": lambda model: mpfjax.with_resampling(
-            _mpf(m)(model), Resample(particles_per_component=36 // m)
-        ),
         "guided mpf": lambda model: _mpf(m, proposal=GaussNewtonProposal(model))(model),
         "guided, sorted": _chain(
             Resample(sort_by=lambda states: states.reshape(NUM_PARTICLES, -1)[:, 0]),
@@ -173,7 +170,6 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
         "grouped by a label": _chain(Resample(), m=m, then=[GroupBy(_side)]),
         "kmeans only": _chain(Resample("stratified"), m=m, then=[KMeans()]),
         "split only, adaptive": _chain(Resample(ess_threshold=0.5), m=m, then=[Split(2.0)]),
-        "random labels, multinomial": _chain(Resample("multinomial"), m=m, then=[RandomLabels()]),
         "random labels, residual": _chain(RandomLabels(), Resample("residual"), m=m),
         "gaussian mixture": _chain(GaussianRegeneration(), m=m, then=[KMeans()]),
         "exclusion": _chain(
@@ -219,10 +215,6 @@ CHAINS: dict[str, Callable[..., Filter]] = {
         Resample(), then=[Every(2, [RandomWalkMetropolis(model)])]
     )(model),
     "resampled every second step": _chain(Every(2, [Resample("stratified"), KMeans(2)])),
-    "pf of families": lambda model: mpfjax.with_proposals_per_particle(_pf()(model), 3),
-    "point sets without an order": lambda model: Filter(
-        model, [Resample(ess_threshold=0.5), Propagate(model, noise="rqmc")], NUM_PARTICLES
-    ),
     "guided mpf rqmc of families": lambda model: mpfjax.with_proposals_per_particle(
         _mpf(proposal=GaussNewtonProposal(model), noise="rqmc")(model), 3
     ),

@@ -14,8 +14,9 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter
-from tests.marking import exactness
+from tests.marking import exactness, quick_of
 from tests.registry import CHAINS, NUM_PARTICLES, QUICK_CHAINS
+from tests.unbiased import assert_unbiased
 from tests.user_models import (
     BLINDED,
     BROKEN,
@@ -88,8 +89,17 @@ OTHERWISE = [
     *((chain, "drift", None) for chain in ("guided mpf", "partitioned in clusters", "mpf rqmc")),
     *((chain, "quadratic", 120) for chain in IN_SLOTS),
 ]
+# The parts of all other chains are in these, or have an exact answer in a file of their own.
+COVERING = (
+    "pf", "pf rqmc", "mpf", "mpf, M = 6", "guided mpf rqmc, adaptive", "patient merge",
+    "split only, adaptive", "random labels, residual", "resampled every second step", "metropolis",
+    "partitioned in clusters", "ps adaptive, random order", "dps", "independent filters",
+)  # fmt: skip
 EXACT = [
-    *((chain, "quadratic", None) for chain in CHAINS if is_exact(chain)),
+    *quick_of(
+        [(chain, "quadratic", None) for chain in CHAINS if is_exact(chain)],
+        [(chain, "quadratic", None) for chain in COVERING],
+    ),
     *exactness(OTHERWISE),
 ]
 
@@ -112,9 +122,7 @@ def test_evidence_and_moments_are_unbiased(chain, model, slots):
     log_evidence = np.cumsum(run.log_likelihood_increments, axis=1)
     ratios = np.exp(log_evidence - exact.log_evidence)
     first, second, _ = run.collected
-    # Loose estimates would prove nothing.
-    assert (ratios.std(axis=0) / np.sqrt(NUM_RUNS) < 0.03).all()
-    assert_unbiased(ratios, 1.0)
+    assert_unbiased(ratios, loosest=0.03)
     assert_unbiased(ratios[..., None] * first, exact.first)
     assert_unbiased(ratios[..., None] * second, exact.second)
     np.testing.assert_allclose(run.log_marginal_likelihood, log_evidence[:, -1], rtol=1e-4)
@@ -129,13 +137,6 @@ def test_evidence_and_moments_are_unbiased(chain, model, slots):
         assert ((ancestors >= 0) & (ancestors < NUM_PARTICLES)).all()
     else:
         assert (ancestors == -1).all()
-
-
-def assert_unbiased(estimates, expected):
-    """The mean over runs is within 4 standard errors of what is expected, in every entry."""
-    standard_error = estimates.std(axis=0) / np.sqrt(NUM_RUNS)
-    z = (estimates.mean(axis=0) - expected) / standard_error
-    assert np.abs(z).max() < 4, f"standard errors away: {z}"
 
 
 def test_what_is_approximate_is_declared():
@@ -175,7 +176,7 @@ class TestOnline:
         assert not bool(info.degenerate)
         assert np.isfinite(after.mean()).all()
 
-    @pytest.mark.parametrize("constant", [1e3, -1e6, 1e9, -1e30])
+    @pytest.mark.parametrize("constant", [1e3, -1e30])
     def test_a_constant_moves_the_evidence_and_nothing_else(self, chain, constant):
         """Added to every log-likelihood, of any size that the type holds.
 
@@ -196,10 +197,6 @@ class TestOnline:
             np.testing.assert_allclose(
                 info.log_likelihood_increment, increment, rtol=1e-6, atol=1e-5
             )
-            if chain == "joint pf":
-                # Here the model adds up its objects' log-likelihoods, and what that rounds away
-                # no filter can know.
-                return
             np.testing.assert_array_equal(info.resampled, plain.resampled)
             np.testing.assert_allclose(info.mixture_weights, plain.mixture_weights, atol=1e-5)
             np.testing.assert_allclose(mixture.weights, expected.weights, rtol=1e-4, atol=1e-6)
@@ -238,10 +235,8 @@ def started(chain):
     return filter.step(jax.random.key(5), mixture, OBSERVATIONS[0])[0]
 
 
-@pytest.mark.parametrize("chain", ["pf adaptive", "mpf"])
-def test_a_missing_observation_moves_the_particles_and_leaves_the_masses(chain):
-    filter = chain_filter(chain, "quadratic")
-    mixture = started(chain)
+def test_a_missing_observation_moves_the_particles_and_leaves_the_masses():
+    filter, mixture = chain_filter("mpf", "quadratic"), started("mpf")
     predicted, info = filter.predict(jax.random.key(6), mixture)
     assert float(info.log_likelihood_increment) == 0.0
     assert not np.array_equal(predicted.particles, mixture.particles)

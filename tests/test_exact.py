@@ -154,24 +154,6 @@ def test_a_grid_that_is_not_even_is_refused(grid):
         grid_filter(mpfjax.QuadraticModel(), jnp.zeros(2), grid)
 
 
-def test_grid_filter_agrees_with_quadrature_on_the_quadratic_model():
-    """Two steps of eqs. 1 and 2 by sums in numpy, in double precision."""
-    grid = np.linspace(-5, 5, 2001)
-    cell, normal = grid[1] - grid[0], scipy.stats.norm.pdf
-    density = np.where(np.abs(grid) <= 2, 0.25, 0.0)
-    density /= density.sum() * cell
-    log_evidence = 0.0
-    for y in (1.2, 0.7):
-        predicted = normal(grid[:, None], grid[None], 0.3) @ density * cell
-        joint = predicted * normal(y, grid**2, 0.5)
-        evidence = joint.sum() * cell
-        density, log_evidence = joint / evidence, log_evidence + np.log(evidence)
-    model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
-    run = grid_filter(model, jnp.array([1.2, 0.7]), jnp.asarray(grid))
-    np.testing.assert_allclose(run.log_marginal_likelihood, log_evidence, rtol=1e-4)
-    np.testing.assert_allclose(run.probabilities[-1] / cell, density, atol=1e-3)
-
-
 def test_the_modes_of_the_quadratic_model_have_equal_mass():
     model = mpfjax.QuadraticModel(0.1, 0.1)
     observations = (2 * jnp.sin(jnp.arange(1.0, 30.0) / 8)) ** 2

@@ -16,6 +16,7 @@ from mpfjax import GaussNewtonProposal, MultiObjectModel, Partitioned, Propagate
 from mpfjax.moves.resampling.allocation import EQUAL_PARTS, demands_by_variance
 from mpfjax.tuning import metropolis_hastings, smc2
 from tests.examples import make_mixture
+from tests.unbiased import assert_unbiased
 from tests.user_models import ScalarLinear
 
 MODEL = ScalarLinear()
@@ -172,9 +173,7 @@ def test_evidence_of_smc2_is_the_exact_one_where_every_filter_is_exact():
     error = found.std(ddof=1) / np.sqrt(len(found))
     assert error < 0.1
     assert abs(found.mean() + 0.5 * found.var(ddof=1) - exact) < 4 * error
-    means = np.array([run.mean("mean") for run in runs])
-    error = means.std(ddof=1) / np.sqrt(len(means))
-    assert abs(means.mean() - y.sum() / 5) < 4 * error
+    assert_unbiased([run.mean("mean") for run in runs], y.sum() / 5)
 
 
 def test_chains_accept_by_a_number_of_its_own():
@@ -191,7 +190,5 @@ def test_chains_accept_by_a_number_of_its_own():
     draws = np.asarray(run.parameters["mean"], float)[:, 50:]
     scaled = (draws - 1.0 / 3) * np.sqrt(3)
     for power, moment in ((1, 0.0), (2, 1.0), (3, 0.0)):
-        of_chains = (scaled**power).mean(axis=1)
-        error = of_chains.std(ddof=1) / np.sqrt(len(of_chains))
-        assert abs(of_chains.mean() - moment) < 4 * error, power
+        assert_unbiased((scaled**power).mean(axis=1), moment)
     assert 0.2 < run.acceptance_rate < 0.8

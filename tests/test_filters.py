@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 
 import mpfjax
 from mpfjax import Filter, Propagate, Resample
 from mpfjax.exact import kalman_filter
 from tests.registry import CHAINS
+from tests.unbiased import assert_unbiased, ratios_to
 from tests.user_models import (
     BLINDED,
     BROKEN,
@@ -36,13 +36,6 @@ PF = CHAINS["pf"](QUADRATIC)
 
 def mean(mixture):
     return mixture.mean()
-
-
-def assert_mean(estimates, expected, slack=0.0):
-    """The mean of independent estimates is within four standard errors of this."""
-    estimates = np.asarray(estimates, float)
-    error = 4 * estimates.std(axis=0, ddof=1) / np.sqrt(len(estimates))
-    assert (np.abs(estimates.mean(axis=0) - expected) < error + slack).all()
 
 
 def test_one_component_is_the_particle_filter_to_the_bit():
@@ -126,46 +119,34 @@ def test_resampling_is_reported_where_it_happens():
     np.testing.assert_array_equal(moved, due)
 
 
-def test_skipping_agrees_with_the_kalman_filter_of_two_steps():
-    """Seeing nothing at step 2 is one step of twice the dynamics."""
-    observations = jnp.array([[1.0], [jnp.nan], [0.3]])
-    filter = mpfjax.particle_filter(LINEAR, 500)
+BOTH = eqx.tree_at(
+    lambda model: (model.H, model.R), DRIFT_AS_LINEAR_GAUSSIAN, (jnp.eye(2), 0.49 * jnp.eye(2))
+)
+
+
+@pytest.mark.parametrize(
+    ("model", "linear", "observations"),
+    [
+        (LINEAR, LINEAR, [[1.0], [np.nan], [0.3]]),
+        (TwoSensors(), BOTH, [[1.0, np.nan], [np.nan, 0.3], [0.4, 0.1]]),
+    ],
+    ids=["a step", "one of two sensors"],
+)
+def test_what_is_missing_is_skipped_as_the_kalman_filter_does(model, linear, observations):
+    filter, observations = mpfjax.particle_filter(model, 500), np.array(observations, np.float32)
     keys = jax.random.split(KEY, 400)
     run = mpfjax.monte_carlo(keys, filter, observations, mean, missing="skip")
-    first = kalman_filter(LINEAR, observations[:1])
-    twice = mpfjax.LinearGaussianModel(
-        A=[[0.81]], Q=[[0.3 * 1.81]], H=[[1.0]], R=[[0.2]],
-        m0=first.means[0], P0=first.covariances[0],
-    )  # fmt: skip
-    last = kalman_filter(twice, observations[2:])
-    exact = first.log_marginal_likelihood + last.log_marginal_likelihood
-    ratios = np.exp(np.asarray(run.log_marginal_likelihood, float) - float(exact))
-    assert_mean(ratios, 1.0)
-    assert_mean(ratios[:, None] * np.asarray(run.collected)[:, -1], last.means[-1])
-    assert (run.log_likelihood_increments[:, 1] == 0).all()
-    assert not run.resampled[:, 1].any()
+    exact = kalman_filter(linear, observations, missing="skip")
+    ratios = ratios_to(exact, run)
+    assert_unbiased(ratios, loosest=0.03)
+    assert_unbiased(ratios[:, None] * np.asarray(run.collected)[:, -1], exact.means[-1])
+    nothing_seen = np.isnan(observations).all(axis=1)
+    assert (np.asarray(run.log_likelihood_increments)[:, nothing_seen] == 0).all()
+    assert not np.asarray(run.resampled)[:, nothing_seen].any()
 
 
-def test_one_of_two_sensors_may_be_missing():
-    """Against a Kalman filter that sees what is there."""
-    observations = np.array([[1.0, np.nan], [np.nan, 0.3], [0.4, 0.1]])
-    filter = mpfjax.particle_filter(TwoSensors(), 1000)
-    run = mpfjax.monte_carlo(jax.random.split(KEY, 200), filter, observations, mean)
-    m, P, A, Q = (
-        np.asarray(getattr(DRIFT_AS_LINEAR_GAUSSIAN, name), float)
-        for name in ("m0", "P0", "A", "Q")
-    )
-    log_evidence = 0.0
-    for y in observations:
-        m, P = A @ m, A @ P @ A.T + Q
-        H = np.eye(2)[~np.isnan(y)]
-        S = H @ P @ H.T + 0.49 * np.eye(len(H))
-        gain, residual = P @ H.T @ np.linalg.inv(S), y[~np.isnan(y)] - H @ m
-        log_evidence += multivariate_normal(np.zeros(len(H)), S).logpdf(residual)
-        m, P = m + gain @ residual, P - gain @ H @ P
-    ratios = np.exp(np.asarray(run.log_marginal_likelihood, float) - log_evidence)
-    assert_mean(ratios, 1.0)
-    assert_mean(ratios[:, None] * np.asarray(run.collected)[:, -1], m)
+def test_an_infinite_observation_is_not_a_missing_one():
+    filter = mpfjax.particle_filter(TwoSensors(), 20)
     with pytest.raises(ValueError, match="observations: infinite at index 1"):
         mpfjax.run_filter(KEY, filter, np.array([[0.0, np.nan], [np.inf, 0.0]]))
 
@@ -197,49 +178,7 @@ def test_slots_are_one_program_whatever_the_number_of_particles():
         assert np.isfinite([evidence(n) for n in (33, 61)]).all()
 
 
-def test_in_groups_each_run_is_that_of_its_key(monkeypatch):
-    keys = jax.random.split(KEY, 6)
-    filter = mpfjax.particle_filter(mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0), 32)
-    together = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean)
-    monkeypatch.setattr(mpfjax.running.run, "_IN_CACHE", 100)
-    monkeypatch.setattr(mpfjax.running.run, "_IN_NEAR_CACHE", 80)
-    assert mpfjax.running.run._group_size(6, filter) == 2
-    in_groups = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, lambda mixture: mean(mixture))
-    chex.assert_trees_all_close(in_groups, together, rtol=1e-5)
-
-
-class TestGradients:
-    def test_is_finite_with_dead_components_and_a_step_of_zero_likelihood_left_out(self):
-        def evidence_of_the_rest(filter, observations):
-            run = mpfjax.run_filter(KEY, filter, observations, mean)
-            increments = run.log_likelihood_increments
-            alive = jnp.exp(run.final.log_mixture_weights) > 0
-            return jnp.sum(jnp.where(run.degenerate, 0.0, increments)), alive
-
-        differentiate = eqx.filter_jit(eqx.filter_grad(evidence_of_the_rest, has_aux=True))
-        filter = CHAINS["patient merge"](QUADRATIC)
-        gradient, alive = differentiate(filter, OBSERVATIONS.at[1].set(BLINDED))
-        assert not alive.all()
-        chex.assert_tree_all_finite(gradient)
-
-    def test_is_that_of_the_exact_evidence_without_resampling(self):
-        """Weights alone are differentiable without bias; N is large enough to see it."""
-        one = jnp.array([[1.4]])
-        found, exact = (
-            eqx.filter_grad(evidence)(LINEAR)
-            for evidence in (
-                lambda model: (
-                    mpfjax.run_filter(
-                        KEY, Filter(model, [Propagate(model)], 200_000), one, mean
-                    ).log_marginal_likelihood
-                ),
-                lambda model: kalman_filter(model, one).log_marginal_likelihood,
-            )
-        )
-        for name in ("R", "m0", "A"):
-            expected = getattr(exact, name)
-            np.testing.assert_allclose(getattr(found, name), expected, rtol=0.05, atol=0.01)
-
+class TestParameters:
     def test_there_is_one_copy_of_the_models_parameters(self):
         for chain, build in CHAINS.items():
             model = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)

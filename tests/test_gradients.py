@@ -13,6 +13,7 @@ from mpfjax.exact import kalman_filter
 from mpfjax.moves.propagation.propagate import Predict, Reweight
 from tests.examples import example_mixtures
 from tests.marking import quick_of
+from tests.unbiased import assert_unbiased
 from tests.user_models import BLINDED, ScalarLinear
 
 NUM_PARTICLES, NUM_RUNS = 48, 1000
@@ -86,7 +87,7 @@ def deviations(name, transform):
     logs, slopes = score(MODEL, jax.random.split(jax.random.key(0), NUM_RUNS))
     exact, exact_slopes = eqx.filter_value_and_grad(exact_log_evidence)(MODEL)
     ratios = np.exp(np.asarray(logs - exact, float))
-    assert ratios.std() / np.sqrt(NUM_RUNS) < 0.04
+    assert_unbiased(ratios, loosest=0.04)
     found = {}
     for field in "aqhrmp":
         values = ratios * np.asarray(getattr(slopes, field), float)
@@ -95,7 +96,7 @@ def deviations(name, transform):
     return found
 
 
-@pytest.mark.parametrize("name", quick_of(FILTERS, ["mpf", "langevin"]))
+@pytest.mark.parametrize("name", quick_of(FILTERS, ["mpf"]))
 def test_stop_gradient_scores_are_unbiased(name):
     """∇Ẑ = Ẑ ∇log Ẑ is an unbiased estimate of ∇Z, for any number of particles."""
     found = deviations(name, (lambda f: f) if name == "pathwise" else with_score_gradient)
@@ -141,7 +142,8 @@ def test_gradients_are_finite_where_weights_and_components_vanish():
     observations = jnp.array([1.5, 1.0, BLINDED, 0.4, 0.9])
 
     def log_evidence(model):
-        moves = [Resample("systematic", 0.7, 4, gradient="stop"), Propagate(model, None, "stop")]
+        moves = [Resample("systematic", 0.7, 4, gradient="stop"), Propagate(model, None, "stop"),
+                 mpfjax.Merge(2.0, 1.0, patience=2)]  # fmt: skip
         filter = Filter(model, moves, 24, 6, initial_moves=[mpfjax.RandomPartition()])
         run = mpfjax.run_filter(jax.random.key(6), filter, observations)
         seen = jnp.isfinite(run.log_likelihood_increments)

@@ -1,58 +1,29 @@
 """x_0 chosen among K N draws by the first observation: an ordinary initial move."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mpfjax
+from mpfjax.exact import kalman_filter
 from mpfjax.moves.initial import SelectInitial, trusted
 from mpfjax.smoothing import conditional_filter, with_first_ancestors
+from tests.unbiased import assert_unbiased, ratios_to
+from tests.user_models import ScalarLinear
 
 KEY = jax.random.key(0)
 OBSERVATIONS = np.array([3.0, 3.3, 3.1], np.float32)
 
 
-class Wide(mpfjax.AbstractStateSpaceModel):
-    """x_0 from N(0, wide²), then a random walk, seen with a small error; states are numbers."""
-
-    wide: float = eqx.field(static=True, default=30.0)
-    step: float = eqx.field(static=True, default=0.3)
-
-    def sample_initial(self, key, num_particles):
-        return self.wide * jax.random.normal(key, (num_particles,))
-
-    def sample_transition(self, key, states):
-        return states + self.step * jax.random.normal(key, states.shape)
-
-    def log_transition(self, states, previous_states):
-        return jax.scipy.stats.norm.logpdf(states, previous_states, self.step)
-
-    def log_likelihood(self, observation, states):
-        return jax.scipy.stats.norm.logpdf(observation, states, 0.3)
-
-    def kalman(self):
-        """log Z and the mean of x_t at the end."""
-        mean, variance, log_z = 0.0, self.wide**2, 0.0
-        for observation in OBSERVATIONS:
-            variance += self.step**2
-            total = variance + 0.3**2
-            gap = observation - mean
-            log_z -= 0.5 * (gap**2 / total + np.log(2 * np.pi * total))
-            mean, variance = mean + variance / total * gap, variance * 0.3**2 / total
-        return log_z, mean
+# x_0 from N(0, 30²), then a random walk, seen with a small error.
+WIDE = ScalarLinear(a=1.0, q=0.3, r=0.3, m=0.0, p=30.0)
+EXACT = kalman_filter(WIDE.in_matrices(), OBSERVATIONS[:, None])
 
 
 def make(num_draws, num_particles=100, **options):
-    plain = mpfjax.particle_filter(Wide(), num_particles, **options)
+    plain = mpfjax.particle_filter(WIDE, num_particles, **options)
     return mpfjax.with_selected_start(plain, num_draws)
-
-
-def is_near(ratios, exact=1.0):
-    """Whether the mean of independent estimates is within four standard errors of what it is of."""
-    ratios = np.asarray(ratios, np.float64)
-    return abs(ratios.mean() - exact) < 4 * ratios.std(ddof=1) / np.sqrt(len(ratios))
 
 
 def nothing(mixture):
@@ -67,14 +38,13 @@ def runs():
 
 
 def test_evidence_and_moments_stay_unbiased_and_vary_less(runs):
-    log_z, mean = Wide().kalman()
+    log_z = EXACT.log_marginal_likelihood
     errors = {k: np.mean((run.log_marginal_likelihood - log_z) ** 2) for k, run in runs.items()}
     assert errors[8] < 0.36 * errors[1], errors
-    ratios = np.exp(np.asarray(runs[8].log_marginal_likelihood, np.float64) - log_z)
-    assert is_near(ratios)
-    assert is_near(
-        ratios * np.asarray(jax.vmap(lambda mixture: mixture.mean())(runs[8].final)), mean
-    )
+    ratios = ratios_to(EXACT, runs[8])
+    assert_unbiased(ratios)
+    means = np.asarray(jax.vmap(lambda mixture: mixture.mean())(runs[8].final))
+    assert_unbiased(ratios * means, EXACT.means[-1, 0])
 
 
 def test_the_chosen_particles_represent_the_prior(runs):
@@ -86,7 +56,7 @@ def test_the_chosen_particles_represent_the_prior(runs):
     weights = np.asarray(jax.vmap(lambda m: m.weights)(initial))
     weights = weights * np.exp(initial.log_scale)[:, None]
     for function, exact in ((near, 0.01325), (initial.particles > 0, 0.5), (weights > 0, 1.0)):
-        assert is_near(np.sum(weights * np.asarray(function), axis=1), exact)
+        assert_unbiased(np.sum(weights * np.asarray(function), axis=1), exact)
 
 
 def test_particles_descend_from_those_of_the_run():
@@ -119,7 +89,7 @@ def test_what_a_chain_weighs_before_it_propagates_counts():
         log_factors = jax.scipy.stats.norm.logpdf(observation, mixture.particles, 2.0)
         return mixture.weighed(log_factors)
 
-    model, observation = Wide(wide=3.0), 1.5
+    model, observation = ScalarLinear(a=1.0, q=0.3, r=0.3, m=0.0, p=3.0), 1.5
     propagate = mpfjax.Propagate(model)
     filter = mpfjax.Filter(
         model, [tilt, mpfjax.Resample(), propagate], 200,
@@ -132,15 +102,14 @@ def test_what_a_chain_weighs_before_it_propagates_counts():
     seen = np.full(2, observation)
     log_z = -0.5 * (seen @ np.linalg.solve(covariance, seen) + np.linalg.slogdet(covariance)[1])
     log_z -= np.log(2 * np.pi)
-    assert is_near(np.exp(np.asarray(found.log_marginal_likelihood, np.float64) - log_z))
+    assert_unbiased(ratios_to(log_z, found))
 
 
 def test_on_islands_the_masses_of_their_choices_count():
     def run(key):
         return mpfjax.run_islands(key, make(8, 50), OBSERVATIONS, nothing, num_islands=2)
 
-    found = jax.jit(jax.vmap(run))(jax.random.split(KEY, 300)).log_marginal_likelihood
-    assert is_near(np.exp(np.asarray(found, np.float64) - Wide().kalman()[0]))
+    assert_unbiased(ratios_to(EXACT, jax.jit(jax.vmap(run))(jax.random.split(KEY, 300))))
 
 
 def test_where_x_0_must_be_a_plain_draw_it_is_one():
@@ -152,29 +121,8 @@ def test_where_x_0_must_be_a_plain_draw_it_is_one():
     assert not with_first_ancestors(chosen).looks_at_first
 
 
-def expected_trust(values):
-    """By numpy: the linear predictor of E[L | x_0] from the mean of two draws."""
-    ratios = values / values.mean()
-    gaps = ratios - 1
-    r = max(np.mean(gaps[:, 0] * gaps[:, 1]) / np.mean(gaps**2), 0.0)
-    return 1 + min(2 * r / (1 + r), 0.75) * gaps.mean(axis=1)
-
-
-def test_likelihoods_are_trusted_by_what_two_draws_have_in_common():
-    rng = np.random.default_rng(1)
-    own = rng.gamma(2.0, size=(4000, 1))
-    noisy = own * rng.gamma(0.5, 2.0, size=(4000, 2))
-    everywhere = jnp.ones(4000)
-    found = np.asarray(trusted(jnp.log(noisy.T), everywhere))
-    np.testing.assert_allclose(found, expected_trust(noisy), rtol=1e-3)
-    # Where x_0 says nothing the chances are nearly equal; where it says all they have their bound.
-    nothing_said = trusted(jnp.log(rng.gamma(2.0, size=(2, 4000))), everywhere)
-    assert np.std(nothing_said) < 0.05
-    all_said = trusted(jnp.log(np.repeat(own, 2, axis=1).T), everywhere)
-    np.testing.assert_allclose(all_said, 0.25 + 0.75 * own[:, 0] / own.mean(), rtol=1e-4)
-
-
 def test_impossible_and_empty_particles():
+    """How far likelihoods are trusted otherwise is in `tests/lookahead/test_pilot.py`."""
     log_factors = jnp.array([[0.0, -jnp.inf, jnp.nan, 5.0], [0.0, -jnp.inf, 0.0, 5.0]])
     found = np.asarray(trusted(log_factors, jnp.array([1.0, 1.0, 1.0, 0.0])))
     assert np.all(np.isfinite(found))

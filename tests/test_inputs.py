@@ -17,6 +17,8 @@ from jax.scipy.stats import norm
 import mpfjax
 from mpfjax.exact import grid_filter, kalman_filter, kalman_smoother
 from mpfjax.smoothing import sample_trajectories, smoothed_sums
+from tests.marking import exactness, quick_of
+from tests.unbiased import assert_unbiased, ratios_to
 
 TIMES = np.cumsum([0.3, 1.7, 0.2, 0.2, 2.5, 0.6]).astype(np.float32)
 INPUTS = {
@@ -154,13 +156,12 @@ def test_evidence_and_means_are_unbiased():
     filter, keys = mpfjax.mixture_particle_filter(Driven(), 48, 3), jax.random.split(KEY, 2000)
     run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, mean, inputs=INPUTS)
     log_z, filtered, _ = truth()
-    ratios = np.exp(np.asarray(run.log_marginal_likelihood) - log_z)
-    assert ratios.std() / np.sqrt(2000) < 0.04
-    for estimates, expected in ((ratios, 1.0), (ratios * run.collected[:, -1], filtered[-1])):
-        assert abs(np.mean(estimates) - expected) < 4 * np.std(estimates) / np.sqrt(2000)
+    ratios = ratios_to(log_z, run)
+    assert_unbiased(ratios, loosest=0.04)
+    assert_unbiased(ratios * run.collected[:, -1], filtered[-1])
 
 
-@pytest.mark.parametrize("method", ["trajectories", "sums"])
+@pytest.mark.parametrize("method", ["trajectories", *exactness(["sums"])])
 def test_smoothed_means_are_those_of_the_joint_normal(method):
     """Of every time, within 4 standard errors over the runs."""
     filter, given = mpfjax.particle_filter(Driven(), 200), jax.tree.map(jnp.asarray, INPUTS)
@@ -180,10 +181,7 @@ def test_smoothed_means_are_those_of_the_joint_normal(method):
 
     one = by_sums if method == "sums" else by_trajectories
     keys = jax.random.split(jax.random.key(8), 120)
-    means = np.asarray(jax.lax.map(one, keys))
-    errors = means.std(axis=0) / np.sqrt(len(keys))
-    assert (errors < 0.01).all()
-    assert (np.abs(means.mean(axis=0) - truth()[2]) < 4 * errors).all()
+    assert_unbiased(jax.lax.map(one, keys), truth()[2], loosest=0.01)
 
 
 def built_in(dt=0.5, u=1.0):
@@ -233,7 +231,10 @@ EVERYWHERE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", EVERYWHERE)
+QUICK = ["guided mpf rqmc", "stages", "a proposal with a model of its own", "ps"]
+
+
+@pytest.mark.parametrize("name", quick_of(EVERYWHERE, QUICK))
 def test_every_move_sees_the_inputs(name):
     """Inputs give the step of the model with them built in, and other inputs another one."""
     make, y = EVERYWHERE[name], OBSERVATIONS[0]
@@ -287,19 +288,9 @@ def run(filter=FILTER, observations=OBSERVATIONS, collect=mean, inputs=INPUTS, *
     return mpfjax.run_filter(KEY, filter, observations, collect, inputs=inputs, **options)
 
 
-def test_steps_equal_the_scan():
-    expected = run()
-    key_initial, key_steps = jax.random.split(KEY)
-    mixture = FILTER.init(key_initial)
-    for t, key in enumerate(jax.random.split(key_steps, LENGTH)):
-        now = jax.tree.map(lambda leaf, t=t: leaf[t], INPUTS)
-        mixture, info = FILTER.step(key, mixture, OBSERVATIONS[t], inputs=now)
-        np.testing.assert_allclose(
-            info.log_likelihood_increment, expected.log_likelihood_increments[t], rtol=1e-4
-        )
-    np.testing.assert_allclose(mixture.mean(), expected.collected[-1], rtol=1e-4)
+def test_an_input_of_a_step_that_is_nan_is_an_error():
     with pytest.raises(RuntimeError, match="inputs: NaN or infinite"):
-        FILTER.step(KEY, mixture, OBSERVATIONS[0], inputs=built_in(u=np.nan))
+        FILTER.step(KEY, FILTER.init(KEY), OBSERVATIONS[0], inputs=built_in(u=np.nan))
 
 
 def test_a_missing_observation_does_not_miss_its_input():

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpfjax.mixture import flatten_states, single_component
+from mpfjax.mixture import ParticleMixture, flatten_states, single_component
 from mpfjax.moves.regrouping.features import ByFeatures
 from tests.examples import example_mixtures, log_masses
 
@@ -102,19 +102,18 @@ def test_states_that_are_not_floats_are_averaged_as_numbers():
     np.testing.assert_allclose(np.asarray(features)[filled, 0], modes - modes.mean(), atol=1e-5)
 
 
+# Summaries of one mixture: all properties but these, which a stack of them has too.
+OF_ANY = ("num_usable_slots", "occupied")
 SUMMARIES = {
     **{
         name: operator.attrgetter(name)
-        for name in (
-            "num_particles", "weights", "log_mass", "log_mixture_weights", "component_counts",
-            "active", "log_component_weights", "component_weights", "effective_sample_size",
-            "component_effective_sample_sizes",
-        )
+        for name, value in vars(ParticleMixture).items()
+        if isinstance(value, property) and name not in OF_ANY
     },
     **{name: operator.methodcaller(name) for name in ("mean", "component_covariances")},
     "average": lambda mixture: mixture.average(mixture.particles),
     "component_sums": lambda mixture: mixture.component_sums(mixture.particles),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", SUMMARIES)

@@ -53,7 +53,7 @@ RNG = np.random.default_rng(0)
 # On either side of one block, of blocks of blocks, and of those that need no filling up.
 SIZES = (1, 33, 1024, 1025, 33_000)
 # Masks for few segments or few entries, and scatters in lanes of many sizes.
-SEGMENTS = ((1, 90), (4, 90), (5, 1102), (17, 90), (60, 1000), (600, 1102), (50, 40))
+SEGMENTS = ((1, 90), (4, 90), (5, 1102), (17, 90), (60, 1000), (600, 1102), (5, 1), (257, 64))
 
 
 def close(found, expected, tolerance=1e-5):
@@ -226,14 +226,6 @@ def test_segments(m, n):
     np.testing.assert_array_equal(counts, np.bincount(labels, minlength=m + 1)[:m])
 
 
-@pytest.mark.parametrize(("n", "m"), [(1, 5), (33, 256), (64, 257)])
-def test_order_by_segment_counts_and_sorts_alike(n, m):
-    for labels in (np.full(n, m), np.arange(n)[::-1] % m):
-        order, counts = order_by_segment(indices(labels), m)
-        np.testing.assert_array_equal(order, np.argsort(labels, kind="stable"))
-        np.testing.assert_array_equal(counts, np.bincount(labels, minlength=m + 1)[:m])
-
-
 @pytest.mark.parametrize("columns", [1, 11])
 @pytest.mark.parametrize(("m", "n"), [(3, 200), (60, 1000)])
 def test_sums_of_segments_under_vmap_and_their_gradient(m, n, columns):
@@ -248,17 +240,6 @@ def test_sums_of_segments_under_vmap_and_their_gradient(m, n, columns):
     gradient = jax.grad(lambda v: jnp.sum(own(v, every[1]) * weights))(every[0])
     inside = (labels >= 0) & (labels < m)
     np.testing.assert_array_equal(gradient[:, :, 0], np.where(inside, labels + 1, 0))
-
-
-@pytest.mark.parametrize("m", [1, 5])
-def test_sums_of_a_million_values_far_from_zero_do_not_drift(m):
-    """In float32, to the precision of a pairwise sum."""
-    n = 10**6
-    segments = RNG.integers(0, m, n)
-    for values in (np.full(n, 0.3, np.float32), (1000 + RNG.normal(size=n)).astype(np.float32)):
-        expected = np.bincount(segments, weights=values.astype(float))
-        found = segment_sum(jnp.asarray(values), indices(segments), m)
-        np.testing.assert_allclose(found, expected, rtol=2e-5)
 
 
 @pytest.mark.parametrize("m", [1, 4, 33])
@@ -299,11 +280,7 @@ def test_the_largest_number(dtype):
             np.testing.assert_array_equal(found, values.max(initial=-np.inf))
         table = RNG.standard_normal((5, 7)).astype(dtype)
         np.testing.assert_array_equal(largest(jnp.asarray(table), axis=1), table.max(axis=1))
-
-
-def test_the_largest_number_is_a_constant_to_a_derivative():
-    values = jnp.array([1.0, 3.0, 2.0])
-    np.testing.assert_array_equal(jax.grad(largest)(values), np.zeros(3))
+    np.testing.assert_array_equal(jax.grad(largest)(jnp.array([1.0, 3.0, 2.0])), np.zeros(3))
     assert largest(jnp.array([3, 7, 5])) == 7
 
 

@@ -112,7 +112,7 @@ DEALT_ANEW = {
 }  # fmt: skip
 
 
-QUICK = ("variance of a forecast", "families", "regeneration of a part")
+QUICK = ("variance of a forecast", "families")
 
 
 @pytest.mark.parametrize("name", quick_of(DEALT_ANEW, QUICK))
@@ -199,25 +199,6 @@ def test_models_of_one_particle_are_made_of_noise_as_well(noise):
     mixture = filter.init(KEY).replace(particles=jnp.zeros((1024, 2)))
     moved = filter.predict(KEY, mixture)[0].particles
     np.testing.assert_allclose(np.std(moved, axis=0), 0.5, atol=0.05)
-
-
-DYNAMICS = {
-    "walk": mpfjax.RandomWalk([1.0, 2.0]),
-    "jumps": mpfjax.RandomWalkWithJumps([1.0, 2.0], [9.0, 8.0], 0.2),
-    "velocity": mpfjax.WalkWithVelocity(mpfjax.RandomWalk([1.0, 2.0]), 0.3),
-    "momentum": mpfjax.Autoregression.with_momentum(0.5, jnp.array([1.0, 2.0])),
-}
-
-
-@pytest.mark.parametrize("name", DYNAMICS)
-def test_dynamics_made_of_noise_have_the_law_that_they_draw_from(name):
-    dynamics, rows = DYNAMICS[name], jnp.tile(jnp.array([[1.0, -2.0]]), (20_000, 1))
-    noise = jax.random.normal(KEY, (len(rows), dynamics.noise_dimension))
-    made = np.asarray(dynamics.from_noise(noise, rows, 0.5 * rows))
-    drawn = np.asarray(dynamics.sample(jax.random.key(1), rows, 0.5 * rows))
-    for column in range(2):
-        assert scipy.stats.ks_2samp(made[:, column], drawn[:, column]).pvalue > 1e-4
-    np.testing.assert_allclose(made.std(axis=0), drawn.std(axis=0), rtol=0.04)
 
 
 def test_boxes_made_of_noise_switch_as_often_and_to_all_references():

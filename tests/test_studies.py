@@ -252,18 +252,13 @@ class TestOtherFiles:
     [
         ({"filters": {"pf": lambda n, noise: noise}}, "filters: pf made"),
         ({"observations": np.array([1.0, np.nan])}, "observations: NaN or infinite at index 1"),
+        ({"measure": lambda run: {"mean": np.ones(3)}}, r"measure: mean's shape, \(3,\)"),
     ],
 )
-def test_bad_input_to_one_cell_is_an_error_before_any_is_run(tmp_path, changes, named):
+def test_bad_input_to_one_cell_is_an_error_before_any_is_written(tmp_path, changes, named):
     with pytest.raises(ValueError, match=named):
-        run_study(small_study(**changes), tmp_path)
-    assert not list(tmp_path.iterdir())
-
-
-def test_bad_input_from_measure_is_named(tmp_path):
-    study = small_study(1, measure=lambda run: {"mean": np.ones(3)})
-    with pytest.raises(ValueError, match=r"measure: mean's shape, \(3,\)"):
-        run_study(study, tmp_path)
+        run_study(small_study(1, **changes), tmp_path)
+    assert not list(tmp_path.glob("*.npz"))
 
 
 def test_progress_is_shown_on_a_terminal_alone(tmp_path, monkeypatch, capsys):

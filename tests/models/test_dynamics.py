@@ -85,19 +85,6 @@ def test_a_set_of_parameters_for_each_particle(name):
         np.testing.assert_allclose(drawn[i], own, rtol=1e-5)
 
 
-def test_dynamics_in_units_far_apart_keep_their_density():
-    """Pixels beside shares of a box, a parameter set for each of many particles."""
-    scales = np.array([30.0, 20.0, 0.01, 0.02])
-    noise = (scales[:, None] * (np.eye(4) + 0.3 * np.tri(4, k=-1))).astype(np.float32)
-    one = Autoregression(np.eye(4), np.zeros((4, 4)), noise, np.zeros(4))
-    rows = jax.tree.map(lambda leaf: jnp.tile(leaf[None], (50,) + (1,) * leaf.ndim), one)
-    points = np.random.default_rng(0).normal(0, scales, (50, 4))
-    zeros = jnp.zeros((50, 4))
-    found = rows.log_density(jnp.asarray(points, jnp.float32), zeros, zeros)
-    expected = multivariate_normal(np.zeros(4), noise @ noise.T).logpdf(points)
-    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=2e-3)
-
-
 @pytest.mark.parametrize("gain", [0.0, 0.1, 1.0])
 def test_a_path_has_the_density_of_a_random_walk_velocity_seen_in_noise(gain):
     """Displacements y_t = u_t + e_t of a velocity u_t = u_{t-1} + w_t, in the steady state.

@@ -11,6 +11,7 @@ import scipy.stats
 
 import mpfjax
 from mpfjax import MultiObjectModel, PairwiseRepulsion
+from tests.examples import stack
 from tests.user_models import Batched, Drift
 
 KEY = jax.random.key(0)
@@ -26,10 +27,6 @@ def linear_gaussian(mean, noise):
         m0=jnp.array([mean, -mean]),
         P0=jnp.eye(2),
     )
-
-
-def stack(models):
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
 
 
 OBJECTS = [linear_gaussian(m, r) for m, r in ((0.0, 0.5), (3.0, 0.8), (-4.0, 1.5))]

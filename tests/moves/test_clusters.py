@@ -1,4 +1,4 @@
-"""Clusters of objects against Kalman filters and quadrature, and their merging by hand."""
+"""Clusters of objects against quadrature, and their merging by hand."""
 
 import equinox as eqx
 import jax
@@ -8,11 +8,10 @@ import pytest
 
 import mpfjax
 from mpfjax import MultiObjectModel, PairwiseRepulsion
-from mpfjax.exact import kalman_filter
 from tests.examples import stack, walker
 from tests.moves.test_partitioned import (
     NOISES,
-    assert_unbiased,
+    assert_both_unbiased,
     normal,
     pair_on_a_grid,
     repulsion,
@@ -59,7 +58,7 @@ def test_a_pair_that_repels_is_unbiased():
     filter, seen = mpfjax.clustered_particle_filter(PAIR, 20), OBSERVATIONS[:, :2]
     assert not filter.approximate
     *found, labels = runs(filter, seen)
-    assert_unbiased(*found, *pair_on_a_grid(MEANS, seen, STRENGTH, RADIUS))
+    assert_both_unbiased(*found, *pair_on_a_grid(MEANS, seen, STRENGTH, RADIUS))
     is_merged = labels[:, :, 1] == 0
     assert 0.05 < is_merged[:, 0].mean() < 0.99
     assert (is_merged[:, 1:] >= is_merged[:, :-1]).all()
@@ -80,7 +79,7 @@ def test_three_that_meet_in_one_step_are_unbiased():
     axes = ((1, 2), (0, 2), (0, 1))
     exact = np.array([grid @ density.sum(axis=axis) * cell**3 / mass for axis in axes])
     *found, labels = runs(mpfjax.clustered_particle_filter(model_of(close), 20), seen)
-    assert_unbiased(*found, np.log(mass), exact)
+    assert_both_unbiased(*found, np.log(mass), exact)
     assert (labels == 0).all(axis=(1, 2)).mean() > 0.9
 
 
@@ -107,46 +106,14 @@ class Momentum(mpfjax.AbstractStateSpaceModel):
         return jax.scipy.stats.norm.logpdf(observation[0] - states[:, 0], scale=jnp.sqrt(0.5))
 
 
-@pytest.mark.exactness
 def test_crossing_keeps_a_state_that_holds_the_past():
-    """Two AR2 objects in one cluster, against Kalman filters of (x_t, x_{t-1})."""
-    transition, noise = np.array([[1.5, -0.5], [1.0, 0.0]]), np.diag([0.3, 0.0])
-    exact = mpfjax.LinearGaussianModel(
-        transition, noise, np.array([[1.0, 0.0]]), np.array([[0.5]]), np.zeros(2), np.eye(2)
-    )
-    kalman = [kalman_filter(exact, OBSERVATIONS[:, j]) for j in (0, 1)]
-    joint = MultiObjectModel(Momentum(), 2)
-    filter = mpfjax.clustered_particle_filter(joint, 45, start="together")
-    log_evidence = sum(float(run.log_marginal_likelihood) for run in kalman)
-    means = np.array([run.means[-1, 0] for run in kalman])
-
-    def collect(mixture):
-        return mixture.mean()[:, 0]
-
-    keys = jax.random.split(jax.random.key(3), 600)
-    run = mpfjax.monte_carlo(keys, filter, OBSERVATIONS[:, :2], collect)
-    found = np.asarray(run.collected)[:, -1]
-    assert_unbiased(run.log_marginal_likelihood, found, log_evidence, means)
+    """Of two AR2 objects in one cluster, whose evidence is that of `test_chains.py`."""
+    filter = mpfjax.clustered_particle_filter(MultiObjectModel(Momentum(), 2), 45, start="together")
     before = filter.init(KEY)
     after, _ = filter.step(KEY, before, OBSERVATIONS[0, :2])
     pasts, parents = np.asarray(after.particles[:, :, 1]), np.asarray(before.particles[:, :, 0])
     of_one_row = (pasts[:, None] == parents[None]).all(axis=2)
     assert of_one_row.any(axis=1).all()
-
-
-@pytest.mark.exactness
-def test_what_one_object_is_shown_costs_another_no_hypotheses():
-    """Three objects in one cluster, the second of them seen sharply."""
-    sharp = MultiObjectModel(stack([walker(0.0), walker(1.0, 1e-4), walker(-1.0)]), 3)
-    crossing, partitioned = (
-        len(np.unique(filter.step(KEY, filter.init(KEY), OBSERVATIONS[0])[0].particles[:, 0]))
-        for filter in (
-            mpfjax.clustered_particle_filter(sharp, 100, start="together"),
-            mpfjax.partitioned_sampling(sharp, 100),
-        )
-    )
-    assert crossing > 30
-    assert partitioned < 15
 
 
 ONE = jnp.eye(1)

@@ -8,7 +8,7 @@ import pytest
 import mpfjax
 from mpfjax.exact import kalman_filter
 from tests.marking import exactness
-from tests.moves.test_marginalised import assert_unbiased
+from tests.unbiased import assert_unbiased
 
 # The whole state (z, x) is linear: z_t = f z + A x + v, x_t = F x + B z + w.
 SLOPE, COUPLING = 0.7, np.array([[0.5, -0.3]])
@@ -74,6 +74,6 @@ def test_evidence_and_moments_are_those_of_the_kalman_filter(is_correlated, nois
     second = covariances + means[..., 1:, None] * means[..., None, 1:]
     mean = np.asarray(exact.means)
     expected = np.asarray(exact.covariances)[:, 1:, 1:] + mean[:, 1:, None] * mean[:, None, 1:]
-    assert_unbiased(ratios, 1.0)
-    assert_unbiased(ratios[..., None] * means, mean)
-    assert_unbiased(ratios[..., None, None] * second, expected)
+    assert_unbiased(ratios, loosest=0.1)
+    assert_unbiased(ratios[..., None] * means, mean, loosest=0.1)
+    assert_unbiased(ratios[..., None, None] * second, expected, loosest=0.1)

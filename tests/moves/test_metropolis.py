@@ -7,12 +7,10 @@ passes through them in `tests/test_gradients.py`.
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import mpfjax
 from mpfjax import Every, Filter, KMeans, Propagate, Resample
 from mpfjax.moves.base import AbstractMarkovMove
-from tests.marking import exactness
 from tests.user_models import Drift
 
 
@@ -28,14 +26,10 @@ class Watch(AbstractMarkovMove):
         return {"parents": jnp.zeros((64, 2))}
 
 
-AGAIN = Resample("multinomial")
-
-
-@pytest.mark.parametrize("again", [Every(2, [AGAIN]), *exactness([AGAIN])])
-def test_parents_follow_their_particles(again):
+def test_parents_follow_their_particles():
     """Through resampling before and after the propagation, they are the states of the ancestors."""
     model = Drift()
-    moves = [Resample(), Propagate(model), again, Watch()]
+    moves = [Resample(), Propagate(model), Every(2, [Resample("multinomial")]), Watch()]
     filter = Filter(model, moves, 64, 3, initial_moves=[KMeans(3, reseed=True)])
     run = mpfjax.run_filter(jax.random.key(0), filter, jnp.array([1.0, 2.0]))
     before, after = run.collected.particles[0], run.final
