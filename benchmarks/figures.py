@@ -150,24 +150,20 @@ def draw_curves(
     figure = Figure(figsize=(7.0, 3.4), layout="constrained")
     axis = figure.subplots()
     for index, (name, values) in enumerate(curves.items()):
-        style = {"marker": MARKERS[index], "markevery": (3 * index, 12), "ms": 5}
-        _draw_band(axis, COLOURS[index], name, first, values, values.std(axis=0), **style)
+        frames, mean, spread = first + np.arange(values.shape[1]), values.mean(0), values.std(0)
+        axis.plot(
+            frames, mean, label=name, lw=1.4, color=COLOURS[index], marker=MARKERS[index],
+            markevery=(3 * index, 12), ms=5,
+        )  # fmt: skip
+        axis.fill_between(
+            frames, mean - spread, mean + spread, color=COLOURS[index], alpha=0.15, lw=0
+        )
     axis.set(xlabel=xlabel, ylabel=ylabel)
     axis.set_ylim(bottom=0)
     axis.set_title(title, fontsize=10)
     axis.grid(alpha=0.25)
     axis.legend(fontsize=8, ncols=len(curves), loc="upper right")
     return figure
-
-
-def _draw_band(
-    axis: Axes, colour: str, name: str, first: int, values: np.ndarray, spread: np.ndarray,
-    **style: Any,
-) -> None:  # fmt: skip
-    """The mean over seeds of (seeds, t), and a band about it."""
-    frames, mean = first + np.arange(values.shape[1]), values.mean(axis=0)
-    axis.plot(frames, mean, label=name, lw=1.4, color=colour, **style)
-    axis.fill_between(frames, mean - spread, mean + spread, color=colour, alpha=0.15, lw=0)
 
 
 def draw_object_bars(rows: Mapping[str, Sequence[np.ndarray]], titles: Sequence[str]) -> Figure:
@@ -234,24 +230,6 @@ def standard_error(values: np.ndarray) -> np.ndarray:
     if len(values) < 2:
         return np.full(values.shape[1:], np.nan)
     return np.asarray(values.std(axis=0, ddof=1) / np.sqrt(len(values)))
-
-
-def draw_overlaps(panels: Sequence[tuple[str, Mapping[str, np.ndarray], int]]) -> Figure:
-    """A panel for each sequence: its name, overlaps by kind, (runs, t), and their first frame.
-
-    Lines are means over runs, bands one standard error of them.
-    """
-    figure = Figure(figsize=(7.0, 2.2 * len(panels)), layout="constrained")
-    axes = figure.subplots(len(panels), squeeze=False)[:, 0]
-    for axis, (title, curves, first) in zip(axes, panels, strict=True):
-        for index, (name, values) in enumerate(curves.items()):
-            _draw_band(axis, COLOURS[index], name, first, values, standard_error(values))
-        axis.set(ylabel="overlap", ylim=(0, 1))
-        axis.set_title(title, fontsize=10)
-        axis.grid(alpha=0.25)
-    axes[0].legend(fontsize=8, loc="lower left")
-    axes[-1].set_xlabel("frame")
-    return figure
 
 
 class Panel(NamedTuple):

@@ -1,6 +1,6 @@
 """Labelled boxes as states of a model, and boxes around them."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +16,9 @@ from mpfjax.vision.files.boxes import centred
 def labelled_states(model: AbstractBoxModel, boxes: Float[np.ndarray, "t k 4"]) -> BoxState:
     """The states of k labelled objects in t consecutive frames: leaves (t, k, ...).
 
-    Boxes are (x, y, w, h), top-left corner first; object j is the model's reference j. With
-    dynamics of second order, the objects have no speed in the first frame. Raises `ValueError`
-    for another number of boxes than of references, and for a box that is not finite or has no area.
+    Boxes are (x, y, w, h), top-left corner first; object j is the model's reference j, and the
+    dynamics are of first order. Raises `ValueError` for another number of boxes than of references,
+    and for a box that is not finite or has no area.
     """
     boxes = np.asarray(boxes, float)
     k = model.reference_boxes.shape[0]
@@ -30,17 +30,7 @@ def labelled_states(model: AbstractBoxModel, boxes: Float[np.ndarray, "t k 4"]) 
     scales = places[..., 2:] / model.reference_boxes[None, :, 2:]
     box = jnp.concatenate([places[..., :2], scales], axis=-1)
     reference = jnp.broadcast_to(jnp.arange(k, dtype=jnp.int32)[None], box.shape[:2])
-    if model.dynamics.order == 1:
-        return BoxState(box, reference)
-    dynamics = model.dynamics_of(BoxState(box[0], reference[0]))
-
-    def follow(past: Any, places: tuple[Array, Array]) -> tuple[Any, Any]:
-        before, now = places
-        past = dynamics.remembered(now, before, past)
-        return past, past
-
-    _, pasts = jax.lax.scan(follow, box[0], (box[:-1], box[1:]))
-    return BoxState(box, reference, jnp.concatenate([box[:1], pasts]))
+    return BoxState(box, reference)
 
 
 @checked

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num, UInt8
 
-from mpfjax.checks import InnerShare, Positive, checked
+from mpfjax.checks import Positive, checked
 from mpfjax.models.dynamics import AbstractDynamics
 from mpfjax.vision.boxes.colour_model import AbstractBoxModel, BoxState, ColourModel
 from mpfjax.vision.colour.bins import RGBColours
@@ -23,9 +23,9 @@ class SoftColourModel(AbstractBoxModel):
         L(y | x) ∝ exp(-λ Σ_c B²(h^c, h_ref^c))
 
     as in `ColourModel` with λ = 1 / 2σ², where the histograms h are those of `soft_histograms`. h
-    and h_ref are mixed with the uniform histogram, which bounds the derivative of the square root
-    in B² = 1 - Σ_b sqrt(h_b h_ref,b). A box outside the frame has B = 1. The motion is that of
-    `ColourModel`.
+    and h_ref are mixed with a thousandth of the uniform histogram, which bounds the derivative of
+    the square root in B² = 1 - Σ_b sqrt(h_b h_ref,b). A box outside the frame has B = 1. The motion
+    is that of `ColourModel`.
 
     An observation is an RGB frame (h, w, 3), uint8 or floating point in [0, 256). Make one with
     `from_frame`. Use it to tune λ, the reference and the bandwidth (`maximise` with a
@@ -36,10 +36,9 @@ class SoftColourModel(AbstractBoxModel):
     - `lambda_`: λ.
     - `bandwidth`: of the soft bins, in bins.
     - `num_points`: K, of the grid in a box, a multiple of the number of parts; static.
-    - `floor`: the share of the uniform histogram; static.
 
-    Raises `ValueError` for a number that is not positive, a `floor` outside (0, 1), and a number of
-    points that is no multiple of the number of parts.
+    Raises `ValueError` for a number that is not positive, and a number of points that is no
+    multiple of the number of parts.
     """
 
     reference_boxes: Float[Array, "k 4"]
@@ -49,7 +48,6 @@ class SoftColourModel(AbstractBoxModel):
     lambda_: Float[Array, ""]
     bandwidth: Float[Array, ""]
     num_points: int = eqx.field(static=True, default=10)
-    floor: float = eqx.field(static=True, default=1e-3)
     switch_probability: float = eqx.field(static=True, default=0.0)
 
     @classmethod
@@ -62,14 +60,13 @@ class SoftColourModel(AbstractBoxModel):
         num_bins: int = 16,
         bandwidth: Positive = 0.5,
         num_points: int = 10,
-        floor: InnerShare = 1e-3,
         num_parts: int = 1,
         **options: Any,
     ) -> "SoftColourModel":
         """The model whose references are boxes (x, y, w, h), top-left corner first, of a frame.
 
         - `num_bins`: of each of red, green and blue.
-        - `bandwidth`, `num_points`, `floor`: see the class.
+        - `bandwidth`, `num_points`: see the class.
         - The other arguments and the errors are those of `ColourModel.from_frame`, but for σ, which
           is 0.15 and says λ = 1 / 2σ².
         """
@@ -81,13 +78,12 @@ class SoftColourModel(AbstractBoxModel):
         )
         return cls(
             reference_boxes=hard.reference_boxes,
-            reference_logits=jnp.log(_mixed(normalise(counts), floor)),
+            reference_logits=jnp.log(_mixed(normalise(counts))),
             dynamics=hard.dynamics,
             initial_deviations=hard.initial_deviations,
             lambda_=0.5 / hard.sigma**2,
             bandwidth=width,
             num_points=num_points,
-            floor=floor,
             switch_probability=hard.switch_probability,
         )
 
@@ -112,7 +108,7 @@ class SoftColourModel(AbstractBoxModel):
             observation, boxes, num_bins, self.bandwidth, self.num_points, num_parts
         )
         references = self.references[states.reference]
-        distances = bhattacharyya(_mixed(normalise(counts), self.floor), references)
+        distances = bhattacharyya(_mixed(normalise(counts)), references)
         empty = jnp.sum(counts, axis=-1) <= 0
         return jnp.mean(jnp.sum(jnp.where(empty, 1.0, distances), axis=2), axis=1)
 
@@ -204,5 +200,6 @@ def _soft_bins(
     )
 
 
-def _mixed(histograms: Float[Array, "*batch bins"], floor: float) -> Float[Array, "*batch bins"]:
-    return (1 - floor) * histograms + floor / histograms.shape[-1]
+def _mixed(histograms: Float[Array, "*batch bins"]) -> Float[Array, "*batch bins"]:
+    """A thousandth of them uniform."""
+    return (1 - 1e-3) * histograms + 1e-3 / histograms.shape[-1]

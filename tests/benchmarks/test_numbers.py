@@ -11,7 +11,6 @@ import mpfjax
 from benchmarks import harness
 from benchmarks.coverage import coverage, covers
 from benchmarks.interacting_objects.partitions import adaptive_partitions, independent_partitions
-from benchmarks.likelihood_tuning.labelled_boxes import labelled_states
 from benchmarks.likelihood_tuning.soft_colours import SoftColourModel, soft_histograms
 from benchmarks.masses.models import Bearings, MarginalisedBearings
 from benchmarks.masses.scenes import SCENES
@@ -19,7 +18,7 @@ from benchmarks.partitioned_sampling.posterior import Window, distance_maps
 from benchmarks.smoothing.jobs import Linear, Quadratic
 from benchmarks.tracking_by_detection import __main__ as by_detection
 from benchmarks.tracking_by_detection import football
-from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
+from mpfjax.vision.boxes.colour_model import BoxState
 from mpfjax.vision.colour.bins import RGBColours
 from mpfjax.vision.colour.histograms import integral_histogram
 from tests.examples import stack, walker
@@ -149,17 +148,6 @@ def test_derivatives_of_the_soft_model_are_those_of_differences():
         logits = logits + 0.3 * jax.random.normal(jax.random.key(1), logits.shape)
         given = (logits, model.lambda_, model.bandwidth, box.astype(float))
         check_grads(total, given, order=1, modes=["rev"], eps=1e-6, rtol=1e-3)
-
-
-def test_labels_with_a_velocity_remember_it_over_all_frames():
-    boxes = np.array([[10.0, 8, 12, 16], [35, 12, 12, 20]])
-    track = boxes + np.array([0.0, 1, 3])[:, None, None] * np.array([[1.0, 2, 3, 4]])
-    dynamics = mpfjax.WalkWithVelocity(mpfjax.RandomWalk(np.ones(4)), 0.25)
-    states = labelled_states(ColourModel.from_frame(NOISE, boxes, dynamics=dynamics), track)
-    velocity = np.zeros_like(states.box[0])
-    for t in range(1, 3):
-        velocity += 0.25 * np.asarray(states.box[t] - states.box[t - 1] - velocity)
-        np.testing.assert_allclose(states.box[t] - states.previous[t], velocity, atol=1e-5)
 
 
 # --- scores of tracks, and detections -----------------------------------------------------------
