@@ -13,13 +13,15 @@ round. Into --out DIR goes tracking_speed.json.
 import itertools
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from benchmarks.harness import Count, command, data, settings_of, table
-from benchmarks.peers.worker import Worker, stop_all
+from benchmarks.peers.worker import process
 from mpfjax.console import Clock, peak_memory
 from mpfjax.vision import BackgroundSubtraction, ObjectTracker, track
 from mpfjax.vision.tracking.adapters import LEAST_ROOM
@@ -160,29 +162,34 @@ class Timed:
         }
 
 
-def at_work(way: Way) -> tuple[dict[str, Any], Callable[..., dict[str, Any]]]:
-    """What a process does: a round for each number of frames that is asked for."""
+@cache
+def begun(way: Way) -> Timed:
+    """The tracker of a process."""
     # Background subtraction finds parts of objects as well, more than there is room for.
     warnings.simplefilter("ignore", RuntimeWarning)
-    return {}, Timed(way).round
+    return Timed(way)
+
+
+def round_of(way: Way, num_frames: int) -> dict[str, Any]:
+    """What a process does."""
+    return begun(way).round(num_frames)
 
 
 def in_turns(
     ways: Sequence[Way], num_frames: int, num_rounds: int
 ) -> dict[Way, list[dict[str, Any]]]:
     """What each round of each way took, the first of them left out."""
-    workers = {way: Worker(at_work, way) for way in ways}
     rounds: dict[Way, list[dict[str, Any]]] = {way: [] for way in ways}
-    try:
-        for number in range(2 + num_rounds):  # to say that they are there, to compile, and those
-            for way, worker in workers.items():
-                found = worker.run(num_frames=num_frames) if number else worker.answer()
-                if "error" in found:
-                    raise ValueError(f"{way.name}: {found['error']}")
-                if number > 1:
+    with ExitStack() as stack:
+        pools = {way: stack.enter_context(process()) for way in ways}
+        for number in range(1 + num_rounds):
+            for way, pool in pools.items():
+                try:
+                    found = pool.submit(round_of, way, num_frames).result()
+                except Exception as error:
+                    raise ValueError(f"{way.name}: {error}") from error
+                if number > 0:
                     rounds[way].append(found)
-    finally:
-        stop_all(workers.values())
     return rounds
 
 

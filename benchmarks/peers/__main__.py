@@ -12,7 +12,9 @@ agree with mpfjax's, and with the exact log-likelihood. Into --out DIR go peers.
 
 import importlib.util
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,27 +24,18 @@ from scipy import stats
 
 from benchmarks import figures as plotting
 from benchmarks import harness
-from benchmarks.harness import AtLeast2, Count, Positive, command
+from benchmarks.harness import AtLeast2, Count, command
 from benchmarks.peers.jobs import JOBS, Job, Quadratic
 from benchmarks.peers.libraries import LIBRARIES, model_of
-from benchmarks.peers.worker import Worker, library_at_work, stop_all
+from benchmarks.peers.worker import process, run_once
 from mpfjax.console import whole
 from mpfjax.exact import grid_filter, kalman_filter
 
-RIVALS = {  # and how each is installed
-    # particles 0.4 asks for numpy below 2, works with 2, and would take JAX back to 0.7.
-    "particles": "pip install joblib numba scikit-learn; pip install --no-deps particles",
-    "blackjax": "pip install blackjax",
-    "cuthbert": "pip install cuthbert",
-}
-ON_DEVICES = "mpfjax_devices"
+Run = Callable[[int], dict[str, Any]]
 MOST_PARTICLES = {"quadratic": 1_000_000, "constant_velocity": 10_000}
-GRID = (-4.0, 4.0, 1601)
-START_SECONDS = 120.0
 LEVEL = 1e-5  # of each test: a hundred of them refuse one that is right once in a thousand runs
 ROUNDING = 1e-4  # of float32 against float64, relative
 MOST_SPREAD = 1.0  # nats; log-likelihoods that spread more are not close enough to normal
-SLOW_SECONDS, FEWEST_REPEATS = 20.0, 3
 
 
 @command(particles=[64], seeds=10, repeats=2)
@@ -52,130 +45,112 @@ def main(
     jobs: Sequence[Annotated[str, (*JOBS,)]] = (*JOBS,),
     seeds: Annotated[int, whole(3)] = 20,
     repeats: Count = 9,
-    skip: Sequence[Annotated[str, (*RIVALS,)]] = (),
     devices: Count = 1,
-    time_limit: Positive = 600.0,
     out: Path = Path("results/peers"),
 ) -> int:
     """All cells in turn, each written as it is finished; 1 where a library was refused.
 
     - `seeds`: runs of each filter, at once.
     - `repeats`: times that each cell is timed.
-    - `skip`: libraries.
     - `devices`: mpfjax on so many, beside on one.
-    - `time_limit`: seconds, of one run.
     """
     settings = harness.settings_of(locals())
     results: list[dict[str, Any]] = []
-    found: dict[str, Any] = {}
     for job in jobs:
         exact = exact_log_likelihood(JOBS[job])
-        workers = {name: start(name, job, devices) for name in chosen_libraries(skip, devices)}
-        try:
-            for name, worker in list(workers.items()):
-                found[name] = worker.answer(START_SECONDS)
-                if "error" in found[name]:
-                    drop(workers, name, found[name]["error"])
+        with ExitStack() as stack:
+            pools = {name: stack.enter_context(process()) for name in chosen_libraries(devices)}
             for size in sorted(particles):
                 if size <= MOST_PARTICLES[job]:
-                    request = {"particles": size, "seeds": seeds}
-                    cell = time_cell(workers, request, exact, repeats, time_limit)
-                    results += [{"job": job, "particles": size} | entry for entry in cell]
-                harness.data(
-                    out / "peers.json", settings=settings, libraries=found, results=results
-                )
-        finally:
-            stop_all(workers.values())
-    labels = LIBRARIES | {ON_DEVICES: f"mpfjax, {devices} devices"}
+                    runs = {
+                        name: run_of(pool, name, job, devices, size, seeds)
+                        for name, pool in pools.items()
+                    }
+                    cell = {"job": job, "particles": size}
+                    results += [cell | entry for entry in time_cell(runs, exact, repeats)]
+                harness.data(out / "peers.json", settings=settings, results=results)
     for job in jobs:
-        print(as_tables(job, results, labels), end="\n\n")
-    harness.figures(out, peers=draw(results, labels))
+        print(as_tables(job, results), end="\n\n")
+    harness.figures(out, peers=draw(results))
     print(f"results and figure: {out}/")
     return int(any(entry["refused"] for entry in results))
 
 
-def chosen_libraries(skip: Sequence[str], num_devices: int) -> list[str]:
+def chosen_libraries(num_devices: int) -> list[str]:
     """The names of what runs, mpfjax first; says which rival is not installed."""
-    chosen = ["mpfjax"] + ([ON_DEVICES] if num_devices > 1 else [])
-    for name, how in RIVALS.items():
-        if name in skip:
-            continue
-        if importlib.util.find_spec(name) is None:
-            print(f"{name} is not installed and left out: {how}", file=sys.stderr)
-            continue
-        chosen += ["particles", "particles_2"] if name == "particles" else [name]
-    return chosen
+    found = {name: importlib.util.find_spec(name.partition("_")[0]) for name in LIBRARIES}
+    if missing := [name for name, spec in found.items() if spec is None]:
+        print(f"not installed, see docs/speed.md: {', '.join(missing)}", file=sys.stderr)
+    chosen = [name for name, spec in found.items() if spec is not None]
+    return [name for name in chosen if num_devices > 1 or name != "mpfjax_devices"]
 
 
-def start(name: str, job: str, num_devices: int) -> Worker:
-    """The process of a library; those of all start side by side."""
-    if name == ON_DEVICES:
-        return Worker(library_at_work, "mpfjax", job, num_devices)
-    return Worker(library_at_work, name, job, 1 if name == "mpfjax" else None)
+def run_of(
+    pool: ProcessPoolExecutor, name: str, job: str, num_devices: int, size: int, seeds: int
+) -> Run:
+    """A function of a seed: what a run in that process took, and what it found."""
+    number = num_devices if name == "mpfjax_devices" else 1
+    return lambda seed: pool.submit(run_once, name, job, number, size, seeds, seed).result()
 
 
 def exact_log_likelihood(job: Job) -> float:
     """log p(y_1..y_t), by quadrature or by the Kalman filter."""
     model, observations = model_of(job), jnp.asarray(job.observations)
     if isinstance(job, Quadratic):
-        return float(grid_filter(model, observations, jnp.linspace(*GRID)).log_marginal_likelihood)
-    return float(kalman_filter(model, observations).log_marginal_likelihood)
+        found = grid_filter(model, observations, jnp.linspace(-4.0, 4.0, 1601))
+    else:
+        found = kalman_filter(model, observations)
+    return float(found.log_marginal_likelihood)
 
 
 # --- what is measured: whether a library gives mpfjax's answer, then its times, in turns ---------
 
 
-def drop(workers: dict[str, Worker], name: str, reason: str) -> None:
-    """Go on without a library that failed; not without mpfjax."""
-    workers.pop(name).stop()
-    if name == "mpfjax":
-        raise ValueError(f"mpfjax: {reason}")
-    print(f"{name} failed and is left out from here on: {reason}", file=sys.stderr)
-
-
-def time_cell(
-    workers: dict[str, Worker], request: dict[str, int], exact: float, repeats: int, limit: float
-) -> list[dict[str, Any]]:
+def time_cell(libraries: Mapping[str, Run], exact: float, repeats: int) -> list[dict[str, Any]]:
     """One entry for each library: times in seconds, memory in bytes above the imports'.
 
     The first run of each is checked and counts as its start; then they take turns in random
     order. One that is slow is timed less often.
     """
-    order, runs = np.random.default_rng(0), {name: [] for name in workers}
+    found: dict[str, list[dict[str, Any]]] = {name: [] for name in libraries}
     reasons: dict[str, str | None] = {}
-    for turn in range(1 + repeats):
-        for name in list(workers) if turn == 0 else order.permutation(list(workers)).tolist():
-            own = [found["seconds"] for found in runs[name][1:]]
-            slow = sum(own) > SLOW_SECONDS and len(own) >= FEWEST_REPEATS
-            if slow or reasons.get(name) is not None:
-                continue
-            found = workers[name].run(limit, **request, seed=turn)
-            if "error" in found:
-                drop(workers, name, found["error"])
-                continue
-            runs[name].append(found)
-            if turn == 0:
-                reasons[name] = disagreement(found, runs["mpfjax"][0], exact)
-                if reasons[name] is not None:
-                    size = request["particles"]
-                    print(f"N = {size}: {name} is not timed: {reasons[name]}", file=sys.stderr)
+    for name, run in libraries.items():
+        try:
+            found[name].append(run(0))
+            reasons[name] = disagreement(found[name][0], found["mpfjax"][0], exact)
+        except Exception as error:  # the others go on without a library that fails
+            if name == "mpfjax":
+                raise
+            reasons[name] = f"{type(error).__name__}: {error}"
+        if reasons[name] is not None:
+            print(f"{name} is not timed: {reasons[name]}", file=sys.stderr)
+    timed = {
+        name: lambda turn, name=name: found[name].append(libraries[name](1 + turn))
+        for name, reason in reasons.items()
+        if reason is None
+    }
+    harness.turns(timed, repeats, warm_up=0, budget=20.0)
     entries: list[dict[str, Any]] = []
     for name, reason in reasons.items():
-        first, *others = runs[name]
-        seconds = [found["seconds"] for found in others]
-        median = float(np.median(seconds)) if seconds else None
-        base = entries[0]["median"] if entries else median
-        entries.append({
-            "library": name, "refused": reason, "seconds": seconds, "median": median,
-            "ratio": None if median is None or base is None else median / base,
-            "start": None if median is None else max(first["seconds"] - median, 0.0),
-            # What particles' other processes take is not seen from the first.
-            "memory": None if name == "particles_2" else max(r["memory"] for r in runs[name]),
-            "log_likelihood_mean": float(np.mean(first["log_likelihoods"])),
-            "log_likelihood_std": float(np.std(first["log_likelihoods"])),
-            "effective_sample_size": float(np.mean(first["effective_sample_sizes"])),
-        })  # fmt: skip
+        entries.append({"library": name, "refused": reason, "median": None})
+        if reason is None:
+            entries[-1] |= of_runs(found[name])
+            entries[-1]["ratio"] = entries[-1]["median"] / entries[0]["median"]
     return entries
+
+
+def of_runs(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """What the runs of a library took, of which the first one compiles, and what they found."""
+    first, *others = found
+    seconds = [run["seconds"] for run in others]
+    median = float(np.median(seconds))
+    return {
+        "version": first["version"], "seconds": seconds, "median": median,
+        "start": max(first["seconds"] - median, 0.0), "memory": max(r["memory"] for r in found),
+        "log_likelihood_mean": float(np.mean(first["log_likelihoods"])),
+        "log_likelihood_std": float(np.std(first["log_likelihoods"])),
+        "effective_sample_size": float(np.mean(first["effective_sample_sizes"])),
+    }  # fmt: skip
 
 
 def disagreement(
@@ -210,13 +185,13 @@ def disagreement(
 # --- tables and picture -------------------------------------------------------------------------
 
 
-def as_tables(job: str, results: list[dict[str, Any]], labels: Mapping[str, str]) -> str:
+def as_tables(job: str, results: list[dict[str, Any]]) -> str:
     """Times with their ratios to mpfjax's, and below them starts and memory."""
-    own = [entry | {"label": labels[entry["library"]]} for entry in results if entry["job"] == job]
+    own = [entry for entry in results if entry["job"] == job]
     forms = {"median [ms], ratio": _time, "start [s], memory [MB]": _start}
+    name = lambda entry: LIBRARIES[entry["library"]]  # noqa: E731
     tables = [
-        harness.pivot(title, own, "{label}", "N = {particles}", form)
-        for title, form in forms.items()
+        harness.pivot(title, own, name, "N = {particles}", form) for title, form in forms.items()
     ]
     return "\n\n".join([JOBS[job].title, *tables])
 
@@ -228,26 +203,22 @@ def _time(entry: Mapping[str, Any]) -> str:
 
 
 def _start(entry: Mapping[str, Any]) -> str:
-    memory = "-" if entry["memory"] is None else f"{entry['memory'] / 1e6:.0f}"
-    return f"{entry['start']:.1f} {memory:>5}"
+    # What particles' other processes take is not seen from the first.
+    is_seen = entry["library"] != "particles_2"
+    return f"{entry['start']:.1f} " + (f"{entry['memory'] / 1e6:5.0f}" if is_seen else "    -")
 
 
-def draw(results: list[dict[str, Any]], labels: Mapping[str, str]) -> Any:
-    """Time against N, a panel for each job and a line for each library; particles' faster mode."""
+def draw(results: list[dict[str, Any]]) -> Any:
+    """Time against N, a panel for each job and a line for each library."""
     panels = []
-    for name in dict.fromkeys(entry["job"] for entry in results):
-        lines: dict[str, dict[float, float]] = {}
-        for entry in results:
-            if entry["job"] == name and entry["median"] is not None:
-                # The two modes have one line.
-                library = entry["library"].removesuffix("_2")
-                label = "particles" if library == "particles" else labels[library]
-                line, size = lines.setdefault(label, {}), entry["particles"]
-                line[size] = min(1000 * entry["median"], line.get(size, np.inf))
-        title = f"{JOBS[name].title}, {JOBS[name].num_steps} steps"
-        points = {label: list(line.items()) for label, line in lines.items()}
+    for job in dict.fromkeys(entry["job"] for entry in results):
+        own = [e for e in results if e["job"] == job and e["median"] is not None]
+        lines = plotting.lines_of(
+            own, lambda e: LIBRARIES[e["library"]], "particles", lambda e: 1000 * e["median"]
+        )
+        title = f"{JOBS[job].title}, {JOBS[job].num_steps} steps"
         axes = "number of particles $N$", "time of all runs [ms]"
-        panels.append(plotting.Panel(title, *axes, points))
+        panels.append(plotting.Panel(title, *axes, lines))
     return plotting.draw_panels([panels])
 
 

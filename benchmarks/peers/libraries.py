@@ -18,6 +18,7 @@ from benchmarks.peers.jobs import Job, Quadratic
 
 LIBRARIES = {
     "mpfjax": "mpfjax",
+    "mpfjax_devices": "mpfjax, on --devices",
     "particles": "particles, 1 process",
     "particles_2": "particles, 2 processes",
     "blackjax": "blackjax",
@@ -50,7 +51,7 @@ def prepare(library: str, job: Job, num_particles: int, num_seeds: int) -> Prepa
     def make_keys(seed: int) -> Any:
         return jax.block_until_ready(jax.random.split(jax.random.key(seed), num_seeds))
 
-    if library == "mpfjax":
+    if library.startswith("mpfjax"):
         return Prepared(make_keys, through_mpfjax(job, num_particles))
     one_run = {"blackjax": through_blackjax, "cuthbert": through_cuthbert}[library]
     all_runs = jax.jit(jax.vmap(one_run(job, num_particles)))

@@ -18,29 +18,25 @@ from particles import collectors
 class FeynmanKac(particles.FeynmanKac):
     """The bootstrap filter of a job with `initial`, `step` and `log_likelihood`.
 
-    particles has no x_0 before the first observation: its time 0 is y_1, or with `with_start` x_0
-    and a potential of one, so that its time t is ours.
+    particles has no x_0 before the first observation: its time 0 is y_1.
     """
 
-    def __init__(self, job: Any, with_start: bool = False) -> None:
-        super().__init__(len(job.observations) + with_start)
-        self.job, self.with_start = job, with_start
+    def __init__(self, job: Any) -> None:
+        super().__init__(len(job.observations))
+        self.job = job
         self.observations = job.observations.astype(float)
 
     def M0(self, N: int) -> np.ndarray:
         """The first states."""
-        states = self.job.initial(N)
-        return states if self.with_start else self.job.step(states)
+        return self.job.step(self.job.initial(N))
 
     def M(self, t: int, xp: np.ndarray) -> np.ndarray:
         """A step of the dynamics."""
         return self.job.step(xp)
 
     def logG(self, t: int, xp: np.ndarray | None, x: np.ndarray) -> np.ndarray:
-        """log L of the states, zero for x_0."""
-        if self.with_start and t == 0:
-            return np.zeros(len(x))
-        return self.job.log_likelihood(self.observations[t - self.with_start], x)
+        """log L of the states."""
+        return self.job.log_likelihood(self.observations[t], x)
 
 
 def weighted_mean(weights: np.ndarray, states: np.ndarray) -> np.ndarray:
