@@ -5,9 +5,6 @@ neighbouring states. The exact one is that of the Rauch-Tung-Striebel smoother, 
 a grid.
 """
 
-# particles draws from numpy's global generator.
-# ruff: noqa: NPY002
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +14,6 @@ import numpy as np
 
 import mpfjax
 from benchmarks.peers import jobs
-from benchmarks.peers.jobs import LOG_2_PI
 from mpfjax.exact import kalman_smoother
 
 GRID = np.linspace(-5.0, 5.0, 1001)
@@ -51,18 +47,6 @@ class Linear:
         found = kalman_smoother(model, self.seen)
         means, pairs = np.asarray(found.means)[:, 0], np.asarray(found.lagged_covariances)[:, 0, 0]
         return float(np.mean(pairs + means[:-1] * means[1:]))
-
-    def initial(self, number: int) -> np.ndarray:
-        """x_0, for particles."""
-        return self.p * np.random.standard_normal(number)
-
-    def of_step(self) -> tuple[float, float]:
-        """The factor and the deviation of a step."""
-        return self.a, self.q
-
-    def log_likelihood(self, y: float, states: np.ndarray) -> np.ndarray:
-        """log L(y_t | x_t)."""
-        return -0.5 * ((y - states) / self.r) ** 2 - np.log(self.r) - 0.5 * LOG_2_PI
 
     def model(self, independent: bool = False) -> mpfjax.AbstractStateSpaceModel:
         """The model of the job; `independent` draws of x_0 are the only ones."""
@@ -99,10 +83,6 @@ class Quadratic(jobs.Quadratic):
             backward = kernel @ message
             backward /= backward.sum()
         return products / self.num_steps
-
-    def of_step(self) -> tuple[float, float]:
-        """The factor and the deviation of a step."""
-        return 1.0, self.sigma_x
 
     def model(self, independent: bool = False) -> mpfjax.AbstractStateSpaceModel:
         """The model of the job; with `independent` draws of x_0 or stratified ones."""

@@ -1,8 +1,8 @@
-"""(d) The posterior of σ_x and σ_y by three samplers, beside that of the grid filter."""
+"""(c) The posterior of σ_x and σ_y by three samplers, beside that of the grid filter."""
 
 import time
-import warnings
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,15 +23,8 @@ AXIS = np.exp(np.linspace(np.log(0.03), np.log(0.4), 61))
 STATES = (-4.0, 4.0, 501)
 
 
-class Draws(NamedTuple):
-    """What a sampler found: draws of both with weights, and what it took."""
-
-    values: dict[str, np.ndarray]  # (draws,)
-    weights: np.ndarray
-    effective_samples: float  # of the worse of the two
-    seconds: float  # with compiling
-
-
+# By sampler: draws of both with weights, their effective number for the worse one, and seconds.
+Draws = dict[str, dict[str, Any]]
 COLUMNS = {
     "": "{parameter}",
     "by": "{sampler}",
@@ -72,13 +65,10 @@ def exact(job: Quadratic) -> dict[str, np.ndarray]:
     table = np.exp(table - table.max()) * AXIS[:, None] * AXIS[None]  # per step of the logarithm
     step = float(np.log(AXIS[1] / AXIS[0]))
     marginals = dict(zip(NAMES, (table.sum(axis=1), table.sum(axis=0)), strict=True))
-    for name, values in marginals.items():
-        if max(values[0], values[-1]) > 0.01 * values.max():
-            warnings.warn(f"the posterior of {name} reaches the end of the grid", stacklevel=2)
     return {name: values / (values.sum() * step) / AXIS for name, values in marginals.items()}
 
 
-def measure(job: Quadratic, num_particles: int, num_steps: int, seed: int) -> dict[str, Draws]:
+def measure(job: Quadratic, num_particles: int, num_steps: int, seed: int) -> Draws:
     """Each sampler on the same filter, from the same start."""
     model: Any = job.model(independent=True)
     filter = mpfjax.mixture_particle_filter(
@@ -94,32 +84,39 @@ def measure(job: Quadratic, num_particles: int, num_steps: int, seed: int) -> di
         "progress": False,
     }
     keys = jax.random.split(jax.random.key(seed), 3)
-    found = {}
-    samplers = {"PMMH": tuning.metropolis_hastings, "particle Gibbs": tuning.particle_gibbs}
-    for key, (name, sample) in zip(keys[:2], samplers.items(), strict=True):
-        start = time.perf_counter()
+
+    def chains(sample: Any, key: Any) -> dict[str, Any]:
         posterior = sample(
             key, filter, observations, num_steps=num_steps, num_chains=2, log_prior=log_prior,
             proposal_deviations=0.2, **chosen,
         )  # fmt: skip
-        seconds = time.perf_counter() - start
         kept = {
-            each: np.asarray(posterior.parameters[each])[:, num_steps // 10 :] for each in NAMES
+            name: np.asarray(posterior.parameters[name])[:, num_steps // 10 :] for name in NAMES
         }
-        sizes = [_effective(np.log(values)) for values in kept.values()]
-        flat = {each: values.ravel() for each, values in kept.items()}
-        found[name] = Draws(flat, np.full(flat["sigma_x"].size, 1.0), min(sizes), seconds)
-    start = time.perf_counter()
-    num_samples = max(6 * (num_steps // 10), 12)
-    sequential = tuning.smc2(
-        keys[2], filter, observations, num_samples, sample_prior=sample_prior,
-        log_prior=log_prior, **chosen,
-    )  # fmt: skip
-    seconds = time.perf_counter() - start
-    weights = np.exp(np.asarray(sequential.log_weights, float))
-    size = float(weights.sum() ** 2 / (weights**2).sum())
-    values = {each: np.asarray(sequential.parameters[each]) for each in NAMES}
-    found["SMC²"] = Draws(values, weights, size, seconds)
+        size = min(_effective(np.log(values)) for values in kept.values())
+        flat = {name: values.ravel() for name, values in kept.items()}
+        return {"values": flat, "weights": None, "size": size}
+
+    def sequential(key: Any) -> dict[str, Any]:
+        samples = tuning.smc2(
+            key, filter, observations, max(6 * (num_steps // 10), 12), sample_prior=sample_prior,
+            log_prior=log_prior, **chosen,
+        )  # fmt: skip
+        weights = np.exp(np.asarray(samples.log_weights, float))
+        values = {name: np.asarray(samples.parameters[name]) for name in NAMES}
+        size = float(weights.sum() ** 2 / (weights**2).sum())
+        return {"values": values, "weights": weights, "size": size}
+
+    samplers = {
+        "PMMH": partial(chains, tuning.metropolis_hastings),
+        "particle Gibbs": partial(chains, tuning.particle_gibbs),
+        "SMC²": sequential,
+    }
+    found: Draws = {}
+    for key, (name, sample) in zip(keys, samplers.items(), strict=True):
+        start = time.perf_counter()
+        found[name] = sample(key)
+        found[name]["seconds"] = time.perf_counter() - start
     return found
 
 
@@ -129,7 +126,7 @@ def _effective(chains: np.ndarray) -> float:
     return float(effective_sample_size(jnp.asarray(chains)))
 
 
-def summary(truth: dict[str, np.ndarray], found: dict[str, Draws]) -> list[dict[str, Any]]:
+def summary(truth: dict[str, np.ndarray], found: Draws) -> list[dict[str, Any]]:
     """Mean and deviation of each parameter, with the error of the mean in standard errors."""
     step = float(np.log(AXIS[1] / AXIS[0]))
     entries = []
@@ -140,38 +137,31 @@ def summary(truth: dict[str, np.ndarray], found: dict[str, Draws]) -> list[dict[
         head = {"parameter": name}
         entries.append(head | {"sampler": "grid filter", "mean": mean, "deviation": deviation})
         for sampler, draws in found.items():
-            own = np.average(draws.values[name], weights=draws.weights)
-            spread = np.sqrt(np.average((draws.values[name] - own) ** 2, weights=draws.weights))
-            error = deviation / np.sqrt(draws.effective_samples)
+            values, weights, size = draws["values"][name], draws["weights"], draws["size"]
+            own = np.average(values, weights=weights)
+            spread = np.sqrt(np.average((values - own) ** 2, weights=weights))
+            error = deviation / np.sqrt(size)
             entries.append(head | {
                 "sampler": sampler, "mean": float(own), "deviation": float(spread),
                 "standard_errors_off": float((own - mean) / error),
-                "effective_samples": draws.effective_samples, "seconds": draws.seconds,
-                "effective_samples_per_second": draws.effective_samples / draws.seconds,
+                "effective_samples": size, "seconds": draws["seconds"],
+                "effective_samples_per_second": size / draws["seconds"],
             })  # fmt: skip
     return entries
 
 
-def picture(truth: dict[str, np.ndarray], found: dict[str, Draws]) -> Figure:
+def picture(truth: dict[str, np.ndarray], found: Draws) -> Figure:
     """For each parameter the density of every sampler's draws and the exact one."""
     figure = Figure(figsize=(8, 3.4), layout="constrained")
-    panels = figure.subplots(1, len(NAMES))
-    for panel, (name, label) in zip(panels, NAMES.items(), strict=True):
+    for panel, (name, label) in zip(figure.subplots(1, 2), NAMES.items(), strict=True):
         panel.plot(AXIS, truth[name], color="0.2", lw=2.2, label="grid filter")
         wide = AXIS[truth[name] > 1e-3 * truth[name].max()]
-        bins = np.linspace(wide[0], wide[-1], 21)
-        for index, (sampler, draws) in enumerate(found.items()):
-            heights, _ = np.histogram(
-                draws.values[name], bins=bins, weights=draws.weights, density=True
-            )
-            panel.stairs(
-                heights, bins, color=plotting.COLOURS[index], lw=1.3, label=sampler,
-                ls=("-", "--", ":")[index],
+        for (sampler, draws), colour in zip(found.items(), plotting.COLOURS, strict=False):
+            panel.hist(
+                draws["values"][name], np.linspace(wide[0], wide[-1], 21), density=True,
+                weights=draws["weights"], histtype="step", color=colour, label=sampler,
             )  # fmt: skip
-        panel.set_xlim(wide[0], wide[-1])
-        panel.set_ylim(bottom=0)
-        panel.set_xlabel(label)
+        panel.set(xlim=(wide[0], wide[-1]), xlabel=label, ylabel="posterior density")
         panel.grid(alpha=0.25)
-    panels[0].set_ylabel("posterior density")
-    panels[0].legend(fontsize=8)
+    figure.axes[0].legend(fontsize=8)
     return figure
