@@ -10,14 +10,14 @@ region less than a hundredth, `log_z_sd` the standard deviation of log Ẑ over 
 Masses are judged by symmetry (corridor, mirror), a grid (quadratic, jumps), or a plain filter of a
 million particles, as is log Z without a grid.
 
-A second table sets each filter beside the first one of --filters: by how many standard errors of
-the paired differences it is worse. --keys chooses other keys of the runs for the same scenes.
+The last columns set each filter beside the first one of --filters: by how many standard errors of
+the paired differences it is worse in the masses, in log Ẑ and in lost modes. --keys chooses other
+keys of the runs for the same scenes.
 
 Into --out DIR go masses.json and masses.png.
 """
 
-import importlib.util
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -31,17 +31,12 @@ from benchmarks import harness
 from benchmarks.harness import AtLeast2, Seed, command
 from benchmarks.masses.filters import FILTERS
 from benchmarks.masses.scenes import SCENES, Scene
-from mpfjax.models.base import is_made_of_noise
 
-# A reference of so many particles where the likelihood of a particle is that of its pixels.
-_FEWER = {"look-alikes": 10}
 # Runs of the filter that says what is true where nothing else does; a mode with less is lost.
 REFERENCE_RUNS, LOST = 8, 0.01
 # A picture has room for as many lines as there are colours.
-_IN_THE_TABLE_ONLY = (
-    "APF", "APF, rqmc", "MPF, 4 draws", "MPF, tempered", "MPF, look-ahead",
-    "MPF, rqmc, look-ahead", "MPF, learned look-ahead",
-    "MPF, pilot look-ahead", "MPF, rqmc, no look-ahead",
+_DRAWN = (
+    "PF", "PF, rqmc", "MPF", "MPF, equal slots", "MPF, rqmc", "MPF, rqmc, 4 draws",
 )  # fmt: skip
 COLUMNS = {
     "filter": "{filter}",
@@ -52,13 +47,9 @@ COLUMNS = {
     "RMSE of log Ẑ": "{log_z_rmse:.3f} ± {log_z_rmse_error:.3f}",
     "largest mass": "{largest_mass:.2f}",
     "ms a step": "{ms:.3f}",
-}
-DIFFERENCES = {
-    "filter": "{filter}",
-    "N": "{N}",
-    "masses": "{masses_worse:+.1f}",
+    "worse: masses": "{masses_worse:+.1f}",
     "log Ẑ": "{log_z_worse:+.1f}",
-    "lost": "{lost_worse:+.1f}",
+    "lost modes": "{lost_worse:+.1f}",
 }
 
 
@@ -78,22 +69,20 @@ def main(
     """Scene by scene; what is finished is written.
 
     - `steps`: of every scene; each has its own.
-    - `reference`: particles of the filter that says what is true, a tenth of it for look-alikes.
+    - `reference`: particles of the filter that says what is true.
     - `seed`: of the scenes.
     - `keys`: a seed of the filters' runs; by default that of scenes.
     """
     settings, rows, truths = harness.settings_of(locals()), [], {}
-    if importlib.util.find_spec("particles") is None:
-        print("particles is not installed: pip install particles")
     for name in scenes:
         make, num_steps = SCENES[name]
         scene = make(steps or num_steps, seed)
-        known = truth(scene, max(reference // _FEWER.get(name, 1), 2), seed + 1)
+        known = truth(scene, reference, seed + 1)
         truths[name] = known._asdict()
         own = []
         for size in particles:
             made = {each: FILTERS[each](scene, size) for each in filters}
-            for row in measure(scene, known, made, size, seeds, seed if keys is None else keys):
+            for row in measure(scene, known, made, seeds, seed if keys is None else keys):
                 own.append({"scene": name, "N": size, **row})
             harness.data(out / "masses.json", settings=settings, truth=truths, rows=rows + own)
         rows += own
@@ -102,9 +91,6 @@ def main(
         print(f"\n{name}: masses {masses}, {sure} ± {known.log_z_error:.2f}")
         own.sort(key=lambda row: row["N"])
         print(harness.table(COLUMNS, own))
-        if len(filters) > 1:
-            print(f"\nworse than {filters[0]} by so many standard errors:")
-            print(harness.table(DIFFERENCES, [row for row in own if "lost_worse" in row]))
         # Programs keep memory maps, of which a process has 65 530, and no other scene needs these.
         jax.clear_caches()
     harness.figures(out, dpi=130, masses=picture(rows))
@@ -151,7 +137,7 @@ def truth(scene: Scene, num_particles: int, seed: int) -> Known:
 
 
 def measure(
-    scene: Scene, known: Known, filters: dict[str, mpfjax.Filter], size: int, seeds: int, seed: int
+    scene: Scene, known: Known, filters: Mapping[Any, mpfjax.Filter], seeds: int, seed: int
 ) -> list[dict[str, Any]]:
     """Errors and time of each filter, and how much worse it is than the first one."""
     observations, key = jnp.asarray(scene.observations), jax.random.key(seed)
@@ -165,20 +151,13 @@ def measure(
         name: 1e3 * float(np.median(seconds)) / len(observations)
         for name, seconds in harness.turns(runs, 5).items()
     }
-    found = {name: results(scene, filter, seeds, seed) for name, filter in filters.items()}
-    if importlib.util.find_spec("particles") and is_made_of_noise(scene.model, "initial"):
-        from benchmarks.masses import through_particles
-
-        name = "SQMC of particles"
-        found[name], times[name] = through_particles.results_and_time(scene, size, seeds, seed)
-    first = losses(next(iter(found.values())), known, scene.truth)
-    rows = [
-        {"filter": name, **summary(of_runs, known, scene.truth), "ms": times[name]}
-        for name, of_runs in found.items()
-    ]
-    for row in rows[1:]:
-        own = losses(found[row["filter"]], known, scene.truth)
-        row |= {f"{what}_worse": harness.worse(own[what], first[what]) for what in own}
+    rows, first = [], {}
+    for name, filter in filters.items():
+        found = results(scene, filter, seeds, seed)
+        own = losses(found, known, scene.truth)
+        row = {"filter": name, **summary(found, own, scene.truth), "ms": times[name]}
+        row |= {f"{what}_worse": harness.worse(own[what], first[what]) for what in first}
+        rows, first = [*rows, row], first or own
     return rows
 
 
@@ -199,12 +178,11 @@ def losses(found: Found, known: Known, region: int) -> dict[str, np.ndarray]:
     }
 
 
-def summary(found: Found, known: Known, region: int) -> dict[str, float]:
+def summary(found: Found, own: dict[str, np.ndarray], region: int) -> dict[str, float]:
     """Errors of the masses and of log Ẑ, with standard errors.
 
     `lost` is the share of runs that leave the true `region` less than a hundredth of the mass.
     """
-    own = losses(found, known, region)
     rmse, rmse_error = harness.rms_and_error(own["masses"])
     log_rmse, log_rmse_error = harness.rms_and_error(own["log_z"])
     lost, runs, deviation = own["lost"].mean(), len(own["lost"]), found.log_z.std(ddof=1)
@@ -216,7 +194,6 @@ def summary(found: Found, known: Known, region: int) -> dict[str, float]:
         "largest_mass": float(np.median(found.masses.max(axis=1))),
         "log_z_sd": float(deviation),
         "log_z_sd_error": float(deviation / np.sqrt(2 * (runs - 1))),
-        "log_z_mean": float(found.log_z.mean()),
     }  # fmt: skip
 
 
@@ -225,7 +202,7 @@ def picture(rows: list[dict[str, Any]]) -> Any:
 
     def panel(scene: str, what: str, label: str) -> plotting.Panel:
         own = [row for row in rows if row["scene"] == scene]
-        shown = [row for row in own if row["filter"] not in _IN_THE_TABLE_ONLY]
+        shown = [row for row in own if row["filter"] in _DRAWN] or own
         lines = plotting.lines_of(shown, "filter", "ms", what)
         return plotting.Panel(scene, "milliseconds a step", label, lines)
 

@@ -1,6 +1,7 @@
 """What is compared: the plain filter, the mixture filter, and each option on top of it."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -28,31 +29,14 @@ def _mixture(**options: Any) -> Make:
     )
 
 
-def _changed(make: Make, *changes: Callable[[mpfjax.Filter], mpfjax.Filter]) -> Make:
-    """The filters of another row after some changes, one after the other."""
-
-    def changed(scene: Scene, num_particles: int) -> mpfjax.Filter:
-        filter = make(scene, num_particles)
-        for change in changes:
-            filter = change(filter)
-        return filter
-
-    return changed
+def _changed(make: Make, change: Callable[[mpfjax.Filter], mpfjax.Filter]) -> Make:
+    """The filters of another row after a change."""
+    return lambda scene, num_particles: change(make(scene, num_particles))
 
 
-def _with_equal_slots(filter: mpfjax.Filter) -> mpfjax.Filter:
-    return mpfjax.with_resampling(filter, mpfjax.Resample(allocation="equal"))
-
-
-def _with_four_draws(filter: mpfjax.Filter) -> mpfjax.Filter:
-    return mpfjax.with_proposals_per_particle(filter, 4)
-
-
-def _ahead(make: Make) -> Make:
-    """The filters of another row with the look-ahead of their scene."""
-    return lambda scene, num_particles: mpfjax.with_lookahead(
-        make(scene, num_particles), scene.lookahead
-    )
+def _ahead(scene: Scene, num_particles: int) -> mpfjax.Filter:
+    """The mixture filter with the look-ahead of its scene."""
+    return mpfjax.with_lookahead(_mixture()(scene, num_particles), scene.lookahead)
 
 
 def _tempered(scene: Scene, num_particles: int) -> mpfjax.Filter:
@@ -71,20 +55,21 @@ def _learned(scene: Scene, num_particles: int) -> mpfjax.Filter:
     return learn_lookahead(jax.random.key(0), plain, scene.observations, features=scene.features)
 
 
+_EQUAL_SLOTS = partial(mpfjax.with_resampling, resample=mpfjax.Resample(allocation="equal"))
+_FOUR_DRAWS = partial(mpfjax.with_proposals_per_particle, num_draws=4)
+
 FILTERS: dict[str, Make] = {
     "PF": _plain(),
     "PF, rqmc": _plain(noise="rqmc"),
     "APF": _auxiliary,
     "APF, rqmc": _changed(_auxiliary, mpfjax.with_point_sets),
     "MPF": _mixture(),
-    "MPF, equal slots": _changed(_mixture(), _with_equal_slots),
+    "MPF, equal slots": _changed(_mixture(), _EQUAL_SLOTS),
     "MPF, rqmc": _mixture(noise="rqmc"),
     "MPF, rqmc, no look-ahead": _changed(_mixture(), mpfjax.with_point_sets),
-    "MPF, 4 draws": _changed(_mixture(), _with_four_draws),
-    "MPF, rqmc, 4 draws": _changed(_mixture(noise="rqmc"), _with_four_draws),
-    "MPF, look-ahead": _ahead(_mixture()),
-    "MPF, rqmc, look-ahead": _ahead(_mixture(noise="rqmc")),
-    "MPF, pilot look-ahead": _changed(_mixture(), mpfjax.with_lookahead),
+    "MPF, 4 draws": _changed(_mixture(), _FOUR_DRAWS),
+    "MPF, rqmc, 4 draws": _changed(_mixture(noise="rqmc"), _FOUR_DRAWS),
+    "MPF, look-ahead": _ahead,
     "MPF, tempered": _tempered,
     "MPF, learned look-ahead": _learned,
 }

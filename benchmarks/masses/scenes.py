@@ -10,11 +10,7 @@ from jaxtyping import Array, PyTree
 
 import mpfjax
 from benchmarks.masses import models
-from benchmarks.scenes import football_scene
 from mpfjax.exact import grid_filter
-from mpfjax.vision.boxes.colour_model import ColourModel
-from mpfjax.vision.colour.bins import RGBColours
-from mpfjax.vision.files.boxes import boxes_of_frame
 
 GRID = jnp.linspace(-5.0, 5.0, 4001)
 JUMP_GRID = jnp.linspace(-30.0, 30.0, 2401)
@@ -98,21 +94,16 @@ def quadratic(num_steps: int, seed: int) -> Scene:
 def bearings(num_steps: int, seed: int) -> Scene:
     """A target on either side of two lines of hydrophones."""
     model = models.Bearings()
+
+    def place(states: PyTree) -> Array:
+        """Also of states whose velocity is marginalised."""
+        return states["motion"][:, :2] if isinstance(states, dict) else states.latent[:, :2]
+
     return Scene(
-        model, model.simulated(num_steps, seed), lambda states: by_sign(states["motion"][:, 1]), 4,
-        {"features": lambda states: states["motion"][:, :2], "scale": 4.0},
-        flattened(model, model.transition_mean), features=models.motion_and_turn, truth=1,
+        model, model.simulated(num_steps, seed), lambda states: by_sign(place(states)[:, 1]), 4,
+        {"features": place, "scale": 4.0}, flattened(model, model.transition_mean),
+        features=models.motion_and_turn, truth=1,
     )  # fmt: skip
-
-
-def with_marginalised_velocity(scene: Scene) -> Scene:
-    """The bearings with a Kalman filter in every particle, of velocity and push given the rest."""
-    place = lambda states: states.latent[:, :2]  # noqa: E731
-    return scene._replace(
-        model=models.MarginalisedBearings(),
-        region=lambda states: by_sign(states.latent[:, 1]),
-        grouping=scene.grouping | {"features": place},
-    )
 
 
 def mirror(num_steps: int, seed: int) -> Scene:
@@ -151,32 +142,6 @@ def jumps(num_steps: int, seed: int) -> Scene:
     )  # fmt: skip
 
 
-def look_alikes(num_steps: int, seed: int) -> Scene:
-    """Two players of one team, seen by a camera: which of the two is it that was pointed at?
-
-    The colour model of section 5.2 knows the colours of their kit and starts on both. It follows
-    one object; which of the two, nothing in the picture says but the small differences of looks.
-    """
-    scene = football_scene(jax.random.key(seed + 1), num_steps + 1, num_players=2, num_opponents=3)
-    first, last = (boxes_of_frame(scene.tracks, frame) for frame in (1, num_steps + 1))
-    deviations = np.array([3.0, 2.0, 0.03, 0.03])
-    model = ColourModel.from_frame(
-        scene.frames[0], np.stack([first[1], first[2]]), colours=RGBColours(8), sigma=0.5,
-        dynamics=mpfjax.RandomWalk(jnp.asarray(deviations, jnp.float32)), deviations=deviations,
-        num_parts=2, share_reference=True,
-    )  # fmt: skip
-    boxes = np.stack([last[1], last[2]])
-    centres = jnp.asarray(boxes[:, :2] + boxes[:, 2:] / 2, jnp.float32)
-
-    def nearest(states: PyTree) -> Array:
-        offsets = states.box[:, None, :2] - centres[None]
-        return jnp.argmin(jnp.sum(offsets**2, axis=2), axis=1).astype(jnp.int32)
-
-    place = lambda states: states.box[:, :2]  # noqa: E731
-    grouping = {"features": place, "scale": 20.0}
-    return Scene(model, scene.frames[1:], nearest, 4, grouping, flattened(model, itself))
-
-
 # The scene, and its number of steps.
 SCENES: dict[str, tuple[Callable[[int, int], Scene], int]] = {
     "corridor": (corridor, 80),
@@ -185,5 +150,4 @@ SCENES: dict[str, tuple[Callable[[int, int], Scene], int]] = {
     "mirror": (mirror, 40),
     "terrain": (terrain, 30),
     "jumps": (jumps, 40),
-    "look-alikes": (look_alikes, 30),
 }
