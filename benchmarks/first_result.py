@@ -8,8 +8,7 @@ programs, "kept" runs the same once more with what the cold run left there. The 
 calls within a process, after the imports; a row for the imports stands beside them. The others are
 whole commands, from start to end. The commands track a rendered scene, of one frame for the seconds
 to the first, and 795 frames of PETS where --data holds them. CPU seconds count all threads, so they
-change little when the machine does other work; seconds of the clock stand beside them. Drawing is
-in milliseconds a frame.
+change little when the machine does other work; seconds of the clock stand beside them.
 
 --before DIR runs the same in another checkout of mpfjax, in turns with this one, for a table of
 before and after. Into --out DIR go the table as first_result.json and nothing else.
@@ -18,9 +17,8 @@ before and after. Into --out DIR go the table as first_result.json and nothing e
 import json
 import shutil
 import tempfile
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -31,7 +29,7 @@ from benchmarks.scenes import football_scene
 from mpfjax.vision import write_tracks
 from mpfjax.vision.files.frames import write_image
 
-NUM_FRAMES = 60
+Arguments = tuple[str, ...]  # of Python; a script may print the seconds of a part of it
 _BEGIN = """
 import time, json, jax, jax.numpy as jnp, numpy as np, mpfjax
 model = mpfjax.QuadraticModel(0.1, 0.1, -2.5, 2.5)
@@ -46,20 +44,6 @@ start, began = time.process_time(), time.perf_counter()
 _END = """
 print(json.dumps({"cpu": time.process_time() - start, "wall": time.perf_counter() - began}))
 """
-_DRAW = """
-import time, json, numpy as np
-from mpfjax.vision.files.drawing import with_tracks
-frame = np.zeros((1080, 1920, 3), np.uint8)
-places = np.random.default_rng(0).uniform([0, 0], [1800, 900], (NUMBER, 2))
-rows = [np.column_stack([np.ones(NUMBER), np.arange(1, NUMBER + 1), places + shift,
-                         np.full((NUMBER, 2), [60, 120])]) for shift in range(60)]
-with_tracks(frame, rows[0])
-start, began = time.process_time(), time.perf_counter()
-for row in rows:
-    with_tracks(frame, row)
-print(json.dumps({"cpu": (time.process_time() - start) / len(rows),
-                  "wall": (time.perf_counter() - began) / len(rows)}))
-"""
 # What the rows import, so that its bytecode is there.
 _IMPORT_ALL = """
 import contextlib, importlib, pkgutil, mpfjax
@@ -71,14 +55,6 @@ for name in names:
     with contextlib.suppress(ImportError):
         importlib.import_module(name)
 """
-
-
-class Job(NamedTuple):
-    """What a process does: a script that prints its seconds, or a command that is timed whole."""
-
-    name: str
-    script: str = ""
-    command: tuple[str, ...] = ()
 
 
 @command(only="import")
@@ -103,46 +79,45 @@ def main(
     with tempfile.TemporaryDirectory() as folder:
         scene = render(Path(folder) / "scene")
         found = jobs(scene, Path(folder) / "out", data.resolve())
-        chosen = [job for job in found if only in job.name]
+        chosen = {name: job for name, job in found.items() if only in name}
         if not chosen:
             raise ValueError(f"--only: no row has {only!r} in its name")
         bytecode = Path(folder) / "bytecode"
         for root in roots.values():
-            spent(Job("the imports", _IMPORT_ALL), root, bytecode / "x", bytecode)
-        for job in chosen:
-            row: dict[str, Any] = {"job": job.name}
+            spent(("-c", _IMPORT_ALL), root, bytecode / "x", bytecode)
+        for job, arguments in chosen.items():
+            row: dict[str, Any] = {"CPU seconds": f"{job:40s}"}
             for name, root in roots.items():
                 try:
-                    row[name] = least([cold_and_kept(job, root, bytecode) for _ in range(rounds)])
-                except ValueError:
+                    row |= least(name, arguments, root, bytecode, rounds)
+                except ValueError:  # an earlier version may have no such command yet
                     if root is ROOT:
                         raise
-                    row[name] = None  # it has no such command yet
             results.append(row)
-            lines = table(columns_of(roots), [row]).splitlines()
+            lines = table(None, [row]).splitlines()
             print("\n".join(lines if len(results) == 1 else lines[-1:]))
     settings = settings_of({"rounds": rounds, "before": before})
     write(out / "first_result.json", settings=settings, rows=results)
     print(f"results: {out}/")
 
 
-def least(rounds: list[tuple[Spent, Spent]]) -> dict[str, dict[str, float]]:
-    """The least of each figure over the rounds."""
-    parts = np.round(np.array(rounds).min(axis=0), 4).tolist()
+def least(name: str, job: Arguments, root: Path, bytecode: Path, rounds: int) -> dict[str, float]:
+    """The least of each figure over rounds of two processes.
+
+    One has an empty folder of programs, the other what that has left there.
+    """
+    found = []
+    for _ in range(rounds):
+        with tempfile.TemporaryDirectory() as folder:
+            found.append([spent(job, root, Path(folder), bytecode) for _ in range(2)])
+    cold, kept = (Spent(*figures) for figures in np.array(found).min(axis=0).tolist())
     return {
-        name: dict(zip(Spent._fields, figures, strict=True))
-        for name, figures in zip(("cold", "kept"), parts, strict=True)
-    }
+        f"{name}, cold": cold.cpu, f"{name}, kept": kept.cpu, f"{name}, kept, clock": kept.wall,
+        f"{name}, kept, MB": kept.memory,
+    }  # fmt: skip
 
 
-def cold_and_kept(job: Job, root: Path, bytecode: Path) -> tuple[Spent, Spent]:
-    """A process with an empty folder of programs, and one with what that has left there."""
-    with tempfile.TemporaryDirectory() as folder:
-        cold, kept = (spent(job, root, Path(folder), bytecode) for _ in range(2))
-        return cold, kept
-
-
-def spent(job: Job, root: Path, programs: Path, bytecode: Path) -> Spent:
+def spent(job: Arguments, root: Path, programs: Path, bytecode: Path) -> Spent:
     """What one process took, of a script that says so the part between the imports and the end."""
     settings = {
         "PYTHONPYCACHEPREFIX": str(bytecode),
@@ -151,11 +126,11 @@ def spent(job: Job, root: Path, programs: Path, bytecode: Path) -> Spent:
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     }
-    found, lines = in_process(*(job.command or ("-c", job.script)), root=root, **settings)
-    return found._replace(**json.loads(lines[-1])) if job.script and lines else found
+    found, lines = in_process(*job, root=root, **settings)
+    return found._replace(**json.loads(lines[-1])) if job[0] == "-c" and lines else found
 
 
-def jobs(scene: Path, out: Path, data: Path) -> list[Job]:
+def jobs(scene: Path, out: Path, data: Path) -> dict[str, Arguments]:
     """All rows of the table, in order; commands track a scene, and sequences of `data`."""
     calls = {
         "run_filter, particle filter": "run(mpfjax.particle_filter(model, 1000))",
@@ -172,31 +147,25 @@ def jobs(scene: Path, out: Path, data: Path) -> list[Job]:
     }
     detections, pets = str(scene / "det.txt"), data / "pets09_s2l1"
 
-    def track(name: str, source: Path, *options: str) -> Job:
-        command = ("-m", "mpfjax", "track", str(source), "--out", str(out), *options)
-        return Job(f"mpfjax track{name}", command=command)
+    def track(source: Path, *options: str) -> Arguments:
+        return "-m", "mpfjax", "track", str(source), "--out", str(out), *options
 
     first, only = scene / "first", ("--no-video",)
     box = f"--box={_first_box(scene / 'gt.txt')}"
-    return [
-        Job("import mpfjax", command=("-c", "import mpfjax")),
-        *(Job(name, _BEGIN + call + _END) for name, call in calls.items()),
-        track(", detections, one frame", first, "--detections", detections, *only),
-        track(", detections", scene, "--detections", detections),
-        track(", detections alone", scene / "det.txt"),
-        track(" --box, one frame", first, box, *only),
-        track(" --box", scene, box),
-        *(
-            [track(", 795 frames of PETS", pets, "--detections", str(pets / "det.txt"))]
-            if pets.is_dir()
-            else []
-        ),
-        Job("README's first command", command=(
-            "-m", "benchmarks.score_vs_particles", "--out", str(out),
-        )),
-        Job("drawing 24 objects, a frame", _DRAW.replace("NUMBER", "24")),
-        Job("drawing 150 objects, a frame", _DRAW.replace("NUMBER", "150")),
-    ]  # fmt: skip
+    found = {"import mpfjax": ("-c", "import mpfjax")}
+    found |= {name: ("-c", _BEGIN + call + _END) for name, call in calls.items()}
+    found |= {
+        "mpfjax track, detections, one frame": track(first, "--detections", detections, *only),
+        "mpfjax track, detections": track(scene, "--detections", detections),
+        "mpfjax track, detections alone": track(scene / "det.txt"),
+        "mpfjax track --box, one frame": track(first, box, *only),
+        "mpfjax track --box": track(scene, box),
+    }
+    if pets.is_dir():
+        name = "mpfjax track, 795 frames of PETS"
+        found[name] = track(pets, "--detections", str(pets / "det.txt"))
+    command = "-m", "benchmarks.score_vs_particles", "--out", str(out)
+    return found | {"README's first command": command}
 
 
 def _first_box(truth: Path) -> str:
@@ -208,7 +177,7 @@ def _first_box(truth: Path) -> str:
 
 def render(folder: Path) -> Path:
     """A football scene as images, with its truth for detections."""
-    scene = football_scene(jax.random.key(0), NUM_FRAMES, num_players=8, num_opponents=0)
+    scene = football_scene(jax.random.key(0), 60, num_players=8, num_opponents=0)
     (folder / "img").mkdir(parents=True)
     for number, frame in enumerate(np.asarray(scene.frames), 1):
         write_image(folder / "img" / f"{number:06d}.jpg", frame)
@@ -218,26 +187,6 @@ def render(folder: Path) -> Path:
     write_tracks(folder / "gt.txt", scene.tracks)
     shutil.copy(folder / "gt.txt", folder / "det.txt")
     return folder
-
-
-def columns_of(names: Any) -> dict[str, Any]:
-    """Seconds of the CPU, then seconds of the clock and memory when kept, of each checkout."""
-    parts = {
-        "cold": ("cold", "cpu"), "kept": ("kept", "cpu"), "kept, clock": ("kept", "wall"),
-        "kept, MB": ("kept", "memory"),
-    }  # fmt: skip
-
-    def cell(row: dict[str, Any], name: str, part: str, figure: str) -> str:
-        value = row[name][part][figure]
-        if figure == "memory":
-            return f"{value:.0f}"
-        return f"{1e3 * value:.1f} ms" if row["job"].startswith("drawing") else f"{value:.1f}"
-
-    return {"CPU seconds": "{job:40s}"} | {
-        f"{name}, {title}": partial(cell, name=name, part=part, figure=figure)
-        for title, (part, figure) in parts.items()
-        for name in names
-    }
 
 
 if __name__ == "__main__":
