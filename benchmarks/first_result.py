@@ -29,6 +29,7 @@ from benchmarks.scenes import football_scene
 from mpfjax.vision import write_tracks
 from mpfjax.vision.files.frames import write_image
 
+FIGURES = ("cold", "kept", "kept, clock", "kept, MB")
 Arguments = tuple[str, ...]  # of Python; a script may print the seconds of a part of it
 _BEGIN = """
 import time, json, jax, jax.numpy as jnp, numpy as np, mpfjax
@@ -78,8 +79,8 @@ def main(
     results: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         scene = render(Path(folder) / "scene")
-        found = jobs(scene, Path(folder) / "out", data.resolve())
-        chosen = {name: job for name, job in found.items() if only in name}
+        rows = jobs(scene, Path(folder) / "out", data.resolve())
+        chosen = {name: job for name, job in rows.items() if only in name}
         if not chosen:
             raise ValueError(f"--only: no row has {only!r} in its name")
         bytecode = Path(folder) / "bytecode"
@@ -89,10 +90,12 @@ def main(
             row: dict[str, Any] = {"CPU seconds": f"{job:40s}"}
             for name, root in roots.items():
                 try:
-                    row |= least(name, arguments, root, bytecode, rounds)
+                    found: list[Any] = least(arguments, root, bytecode, rounds)
                 except ValueError:  # an earlier version may have no such command yet
                     if root is ROOT:
                         raise
+                    found = ["-"] * len(FIGURES)
+                row |= {f"{name}, {each}": x for each, x in zip(FIGURES, found, strict=True)}
             results.append(row)
             lines = table(None, [row]).splitlines()
             print("\n".join(lines if len(results) == 1 else lines[-1:]))
@@ -101,8 +104,8 @@ def main(
     print(f"results: {out}/")
 
 
-def least(name: str, job: Arguments, root: Path, bytecode: Path, rounds: int) -> dict[str, float]:
-    """The least of each figure over rounds of two processes.
+def least(job: Arguments, root: Path, bytecode: Path, rounds: int) -> list[float]:
+    """The least of the `FIGURES` over rounds of two processes.
 
     One has an empty folder of programs, the other what that has left there.
     """
@@ -111,10 +114,7 @@ def least(name: str, job: Arguments, root: Path, bytecode: Path, rounds: int) ->
         with tempfile.TemporaryDirectory() as folder:
             found.append([spent(job, root, Path(folder), bytecode) for _ in range(2)])
     cold, kept = (Spent(*figures) for figures in np.array(found).min(axis=0).tolist())
-    return {
-        f"{name}, cold": cold.cpu, f"{name}, kept": kept.cpu, f"{name}, kept, clock": kept.wall,
-        f"{name}, kept, MB": kept.memory,
-    }  # fmt: skip
+    return [cold.cpu, kept.cpu, kept.wall, kept.memory]
 
 
 def spent(job: Arguments, root: Path, programs: Path, bytecode: Path) -> Spent:
