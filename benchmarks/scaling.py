@@ -50,7 +50,7 @@ class Cell(NamedTuple):
     steps: int
 
 
-@command(particles=[64, 128], components=[2, 4], seeds=[2, 4], steps=[4, 8])
+@command(filters=["pf", "mpf"], particles=[64, 128], components=[2, 4], seeds=[2, 4], steps=[4, 8])
 def main(
     *,
     filters: Sequence[Annotated[str, (*FILTERS,)]] = (*FILTERS,),
