@@ -22,12 +22,12 @@ from typing import Any
 
 import jax
 import numpy as np
+from PIL import Image
 
 from benchmarks.harness import ROOT, Count, Spent, command, in_process, settings_of, table
 from benchmarks.harness import data as write
 from benchmarks.scenes import football_scene
 from mpfjax.vision import write_tracks
-from mpfjax.vision.files.frames import write_image
 
 FIGURES = ("cold", "kept", "kept, clock", "kept, MB")
 Arguments = tuple[str, ...]  # of Python; a script may print the seconds of a part of it
@@ -180,7 +180,7 @@ def render(folder: Path) -> Path:
     scene = football_scene(jax.random.key(0), 60, num_players=8, num_opponents=0)
     (folder / "img").mkdir(parents=True)
     for number, frame in enumerate(np.asarray(scene.frames), 1):
-        write_image(folder / "img" / f"{number:06d}.jpg", frame)
+        Image.fromarray(frame).save(folder / "img" / f"{number:06d}.jpg")
     # Without a truth beside it, which would be scored with.
     (folder / "first" / "img").mkdir(parents=True)
     shutil.copy(folder / "img" / "000001.jpg", folder / "first" / "img")

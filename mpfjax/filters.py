@@ -39,8 +39,6 @@ Importance = Literal["propagated", "predictive_gaussian"]
 _WARM_ITERATIONS, _ITERATIONS = 2, 5
 _INITIAL_DRAWS = 4
 
-Importance = Literal["propagated", "predictive_gaussian"]
-
 
 @checked
 def particle_filter(
@@ -253,20 +251,16 @@ def distributed_partitioned_sampling(
     all.
     """
     require_multi_object(model, "distributed_partitioned_sampling")
-    if orders is None:
-        orders = "circular"
-    num_sets = model.num_objects
-    if not isinstance(orders, str):
-        orders = check_orders(orders, model.num_objects)
-        num_sets = orders.shape[0]
+    orders = "circular" if orders is None else orders
     between = Resample(scheme, ess_threshold, allocation="equal")
     partitioned = Partitioned(model, orders, resample=between, reassembly=reassembly)
+    of_sets = partitioned.orders
     resample = Resample(scheme, ess_threshold)
     return Filter(
         model,
         moves=[Pool(), resample, RandomPartition(), partitioned],
         num_particles=num_particles,
-        num_components=num_sets,
+        num_components=model.num_objects if of_sets is None else len(of_sets),
     )
 
 

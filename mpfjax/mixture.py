@@ -148,14 +148,6 @@ class ParticleMixture(eqx.Module):
         return segment_any(self.occupied, self.component_indicators, self.num_components)
 
     @property
-    def log_component_weights(self) -> Float[Array, " n"]:
-        """log w_i, the weights within each component; they sum to one in each living one."""
-        log_mass = spread(self.log_mixture_weights, self.component_indicators)
-        return jnp.where(
-            self.occupied, self.log_weights - jnp.where(self.occupied, log_mass, 0.0), -jnp.inf
-        )
-
-    @property
     def component_weights(self) -> Float[Array, " n"]:
         """w_i, the weights within each component; they sum to one in each living one."""
         self._require_one()

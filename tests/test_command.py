@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import mpfjax
 from mpfjax import command
@@ -14,7 +15,7 @@ from mpfjax.command.scoring import find_truth, scores_of
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision.files import frames as frame_files
 from mpfjax.vision.files.boxes import read_tracks, write_tracks
-from mpfjax.vision.files.frames import read_frames, write_image, write_video
+from mpfjax.vision.files.frames import read_frames, write_video
 from mpfjax.vision.tracking.adapters import Rows
 from tests.examples import two_walkers
 
@@ -69,7 +70,7 @@ def sequence(tmp_path_factory):
         frames[frame - 1, y : y + h, x : x + w] = (220, 10, 10) if id == 1 else (10, 10, 220)
     (folder / "img").mkdir()
     for i, frame in enumerate(frames, 1):
-        write_image(folder / "img" / f"{i:06d}.png", frame)
+        Image.fromarray(frame).save(folder / "img" / f"{i:06d}.png")
     write_tracks(folder / "gt.txt", rows)
     write_detections(folder / "det.txt", detected())
     return folder
@@ -328,7 +329,7 @@ def test_files_that_will_not_do_are_named_in_a_line_and_not_written_over(
     monkeypatch.chdir(tmp_path)
     for folder in ("out", "img", "empty"):
         (tmp_path / folder).mkdir()
-    write_image(tmp_path / "img" / "1.png", np.zeros((8, 8, 3), np.uint8))
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "img" / "1.png")
     (tmp_path / "out" / "tracking.mp4").write_bytes(b"a video")
     (tmp_path / "out" / "tracks.txt").write_text("1,1,2,2,5,5\n")
     (tmp_path / "other.mp4").symlink_to("out/tracking.mp4")

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
 from mpfjax.checks import Count, CountOrZero, checked
-from mpfjax.vision.files.drawing import blend, draw_stroke, window
 
 _PITCH_DEPTH = (22.0, 52.0)
 _PLAYER_HEIGHT = 1.85
@@ -236,7 +235,7 @@ def _draw_player(
         return float(foot[0] + across * scale), float(foot[1] - up * scale)
 
     def limb(start: tuple, end: tuple, width: float, colour: np.ndarray) -> None:
-        draw_stroke(frame, at(*start), at(*end), width * scale, colour)
+        _draw_stroke(frame, at(*start), at(*end), width * scale, colour)
 
     _draw_ellipse(frame, at(0.25, 0.0), (0.55 * scale, 0.13 * scale), np.zeros(3), opacity=0.4)
     for side, shade in ((-1.0, 0.82), (1.0, 1.0)):
@@ -268,9 +267,54 @@ def _draw_ellipse(
 ) -> None:  # fmt: skip
     """Draw a filled ellipse along the axes."""
     (cx, cy), (rx, ry) = centre, radii
-    found = window(frame, cx - rx - 1, cy - ry - 1, cx + rx + 1, cy + ry + 1)
+    found = _window(frame, cx - rx - 1, cy - ry - 1, cx + rx + 1, cy + ry + 1)
     if found is None:
         return
     part, x, y = found
     inside = (1 - np.hypot((x - cx) / rx, (y - cy) / ry)) * min(rx, ry)
-    blend(part, np.clip(inside + 0.5, 0, 1) * opacity, colour)
+    _blend(part, np.clip(inside + 0.5, 0, 1) * opacity, colour)
+
+
+# Smooth strokes on a float frame, with values in [0, 255].
+
+
+def _draw_stroke(
+    frame: Float[np.ndarray, "h w 3"],
+    start: tuple[float, float],
+    end: tuple[float, float],
+    radius: float,
+    colour: Float[np.ndarray, "3"],
+    opacity: float = 1.0,
+) -> None:
+    """Draw a line of half-width `radius` with round ends; a dot where the ends coincide."""
+    (x0, y0), (x1, y1) = start, end
+    reach = radius + 1
+    found = _window(frame, min(x0, x1) - reach, min(y0, y1) - reach,
+                     max(x0, x1) + reach, max(y0, y1) + reach)  # fmt: skip
+    if found is None:
+        return
+    part, x, y = found
+    dx, dy = x1 - x0, y1 - y0
+    along = ((x - x0) * dx + (y - y0) * dy) / max(dx * dx + dy * dy, 1e-9)
+    along = np.clip(along, 0, 1)
+    distance = np.hypot(x - x0 - along * dx, y - y0 - along * dy)
+    _blend(part, np.clip(radius + 0.5 - distance, 0, 1) * opacity, colour)
+
+
+def _window(
+    frame: np.ndarray, left: float, top: float, right: float, bottom: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """The part of the frame between these edges, and the centres of its pixels."""
+    height, width, _ = frame.shape
+    if not np.all(np.isfinite([left, top, right, bottom])):
+        return None
+    x0, x1 = int(max(np.floor(left), 0)), int(min(np.ceil(right), width))
+    y0, y1 = int(max(np.floor(top), 0)), int(min(np.ceil(bottom), height))
+    if x0 >= x1 or y0 >= y1:
+        return None
+    return frame[y0:y1, x0:x1], np.arange(x0, x1)[None] + 0.5, np.arange(y0, y1)[:, None] + 0.5
+
+
+def _blend(part: np.ndarray, opacity: np.ndarray, colour: np.ndarray) -> None:
+    """Colour pixels, each by its opacity."""
+    part += opacity[:, :, None] * (np.asarray(colour, float) - part)

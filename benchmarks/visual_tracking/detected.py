@@ -158,7 +158,7 @@ class FollowDetections(AbstractPropagation):
         born = decided.born[owner]
         weights = jnp.where(born, 1.0, mixture.component_weights * factor)
         total = mixture.replace(log_weights=jnp.log(weights))
-        log_weights = total.log_component_weights - jnp.log(1.0 * MAX_OBJECTS)
+        log_weights = jnp.log(total.component_weights / MAX_OBJECTS)
         return mixture.replace(particles=begun.where(born, particles), log_weights=log_weights)
 
 

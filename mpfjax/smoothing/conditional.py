@@ -109,11 +109,6 @@ def _require(possible: Bool[Array, " t"]) -> None:
         raise ValueError(f"{_IMPOSSIBLE}, first at index {first} of its times")
 
 
-@jit_on_wide_vectors
-def _run(key, filter, series, trajectory, backward):
-    return renew(key, filter, series, trajectory, backward)
-
-
 def renew(
     key: Key[Array, ""],
     filter: Filter,
@@ -131,28 +126,27 @@ def renew(
     first_slot = jnp.clip(jnp.floor(uniform(key_slot, ()) * n).astype(jnp.int32), 0, n - 1)
     particles = _independent_initial(key_initial, filter.model, n)
     start = jax.tree.map(lambda leaf, own: put(leaf, own[0], first_slot), particles, trajectory)
-    around = _around(filter, Reference(trajectory, first_slot))
+    reference = Reference(trajectory, first_slot)
+    around = filter.replace(
+        moves=[move.around(reference) for move in filter.moves],
+        # x_0 is one of N draws of the model's.
+        initial_moves=[move for move in filter.initial_moves if not move.weighs],
+    )
     initial = around._init(initial_keys(key_run, around), particles=start)
     run = scan(key_run, around, series, None, initial=initial)
-    reference = run.collected.memory[REFERENCE]["slot"]
-    log_weights = jax.vmap(at)(run.collected.log_weights, reference)
+    slots = run.collected.memory[REFERENCE]["slot"]
+    log_weights = jax.vmap(at)(run.collected.log_weights, slots)
     seen = (log_weights > -jnp.inf) & ~run.degenerate
     drawn = draw_trajectory(key_back, filter.model, run, series.inputs, backward, checked)
     return ConditionalRun(
         trajectory=drawn,
         run=run,
-        slots=jnp.concatenate([first_slot[None], reference]),
+        slots=jnp.concatenate([first_slot[None], slots]),
         possible=possible_times(filter.model, trajectory, series.inputs).at[1:].min(seen),
     )
 
 
-def _around(filter: Filter, reference: Any) -> Filter:
-    """The same chain of moves around the trajectory; a `ValueError` for one that cannot."""
-    return filter.replace(
-        moves=[move.around(reference) for move in filter.moves],
-        # x_0 is one of N draws of the model's.
-        initial_moves=[move for move in filter.initial_moves if not move.weighs],
-    )
+_run = jit_on_wide_vectors(renew)
 
 
 def _independent_initial(key: Key[Array, ""], model: Any, num_particles: int) -> PyTree:

@@ -13,7 +13,7 @@ from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter
 from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
 from mpfjax.tuning.problem import Parameters, Problem, Reals, score_of_each
-from mpfjax.tuning.transforms import AbstractTransform, Interval, Positive, Simplex
+from mpfjax.tuning.transforms import AbstractTransform, Unconstrained
 
 _MOST_NUMBERS = 50
 # The range of the squared step, relative to 1 / I, that is near enough to one standard error.
@@ -23,7 +23,6 @@ _FURTHEST_ROUND = 16.0
 # In units in the last place of a parameter: a shorter step is mostly rounding.
 _FEWEST_PLACES = 256
 # Logarithms and logits have no unit, and a parabola fits up to about one half.
-_WITHOUT_UNIT = (Positive, Interval, Simplex)
 _LONGEST_WITHOUT_UNIT = 0.5
 _NUM_HALVINGS = 32
 _MOST_APART = 0.25
@@ -131,7 +130,11 @@ def _column(
     """
     step = float(np.clip(first, shortest, longest))
     for _ in range(_MOST_ROUNDS):
-        column = _difference(score, centre, axis, step)
+        below, above = centre.copy(), centre.copy()
+        below[axis] -= step
+        above[axis] += step
+        # Over the actual distance of the two points, after rounding.
+        column = (score(below) - score(above)) / (float(above[axis]) - float(below[axis]))
         # Twice the loss of a step in nats, for a parabola.
         told = abs(column[:, axis].mean()) * step**2
         if not np.isfinite(column).all():
@@ -149,22 +152,10 @@ def _column(
     return column
 
 
-def _difference(
-    score: Callable[[np.ndarray], np.ndarray], centre: np.ndarray, axis: int, step: float
-) -> Float[np.ndarray, "seeds d"]:
-    """-∂score/∂θ along one axis, for every seed."""
-    below, above = centre.copy(), centre.copy()
-    below[axis] -= step
-    above[axis] += step
-    # The actual distance of the two points, after rounding.
-    distance = float(above[axis]) - float(below[axis])
-    return (score(below) - score(above)) / distance
-
-
 def _longest_steps(problem: Problem, reals: Reals) -> np.ndarray:
     """By number, in the order of `ravel_pytree`, how far a step may go."""
     limit = {
-        name: _LONGEST_WITHOUT_UNIT if isinstance(transform, _WITHOUT_UNIT) else np.inf
+        name: np.inf if isinstance(transform, Unconstrained) else _LONGEST_WITHOUT_UNIT
         for name, transform in problem.transforms.items()
     }
     return np.concatenate([np.full(reals[name].size, limit[name]) for name in sorted(reals)])

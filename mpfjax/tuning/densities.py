@@ -99,10 +99,6 @@ class LogDensity(eqx.Module):
         """u of parameters by name."""
         return self.problem.unconstrain(parameters, "parameters")
 
-    def filter_at(self, reals: Reals) -> Filter:
-        """The filter with these parameters."""
-        return self.problem.at(reals)
-
 
 @checked
 def log_density(

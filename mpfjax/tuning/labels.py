@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Checked, Count, checked, shown
+from mpfjax.checks import Checked, Count, checked
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.steps import likelihoods, moved
 
@@ -24,20 +24,13 @@ class LabelLikelihood(Checked):
     - `candidates`: rival states of each: leaves (t, k, n, ...), such as `transition_candidates`.
     - `num_frames`: drawn for a step, without replacement; None takes all. Static.
 
-    Raises `ValueError` for leaves whose leading axes do not agree, no frames, labels or candidates,
-    and a `num_frames` that is not between 1 and t.
+    Raises `ValueError` for a `num_frames` below 1, and with the first call for one above t.
     """
 
     observations: PyTree
     labels: PyTree
     candidates: PyTree
     num_frames: Count | None = eqx.field(static=True, default=None)
-
-    def __check_init__(self) -> None:
-        super().__check_init__()
-        t = _check(self.observations, self.labels, self.candidates)
-        if self.num_frames is not None and self.num_frames > t:
-            raise ValueError(f"num_frames: {self.num_frames} is not between 1 and the {t} frames")
 
     def __call__(self, key: Key[Array, ""], model: AbstractStateSpaceModel) -> Float[Array, ""]:
         """The mean over labels, in nats; at most log(n + 1)."""
@@ -89,12 +82,9 @@ def transition_candidates(
     """Draws from D(. | the label one frame before), for every frame but the first.
 
     `labels` has leaves (t, k, ...), the result (t - 1, k, n, ...): rivals as a filter would meet
-    them. Raises `ValueError` for fewer than one candidate, fewer than two frames, and labels that
-    are no arrays.
+    them. Raises `ValueError` for fewer than one candidate.
     """
-    t, k = _leading_axes("labels", labels, 2)
-    if t < 2:
-        raise ValueError(f"labels: {t} frames leave none with a label one frame before")
+    t, k = jax.tree.leaves(labels)[0].shape[:2]
     lead = (t - 1, k, num_candidates)
     before = jax.tree.map(
         lambda leaf: jnp.repeat(leaf[:-1].reshape((t - 1) * k, *leaf.shape[2:]), lead[2], axis=0),
@@ -102,24 +92,3 @@ def transition_candidates(
     )
     drawn = moved(key, model, before)
     return jax.tree.map(lambda leaf: leaf.reshape(*lead, *leaf.shape[1:]), drawn)
-
-
-def _check(observations: PyTree, labels: PyTree, candidates: PyTree) -> int:
-    """The number of frames, or a `ValueError` for leading axes that do not agree."""
-    of_labels = _leading_axes("labels", labels, 2)
-    for name, tree in (("observations", observations), ("candidates", candidates)):
-        own = _leading_axes(name, tree, 1 if name == "observations" else 3)
-        if own[:2] != of_labels[: len(own)]:
-            raise ValueError(f"{name}: {own} leads, and of the labels {of_labels}")
-    return of_labels[0]
-
-
-def _leading_axes(name: str, tree: PyTree, count: int) -> tuple[int, ...]:
-    """The first axes, which all leaves share, none of them empty."""
-    leaves = jax.tree.leaves(tree)
-    found = {jnp.shape(leaf)[:count] if eqx.is_array_like(leaf) else () for leaf in leaves}
-    lead = found.pop() if len(found) == 1 else ()
-    if len(lead) < count or 0 in lead:
-        what = ("frames", "labels", "candidates")[:count]
-        raise ValueError(f"{name}: {shown(tree)} has no leading axes of {', '.join(what)}")
-    return lead

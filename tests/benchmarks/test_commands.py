@@ -9,6 +9,7 @@ from typing import Annotated
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import stats
 
 from benchmarks import harness, tracking_speed
@@ -17,7 +18,6 @@ from benchmarks.peers.__main__ import disagreement
 from benchmarks.scenes import football_scene
 from benchmarks.visual_tracking import __main__ as visual_tracking
 from mpfjax.vision import read_tracks, write_tracks
-from mpfjax.vision.files.frames import write_image
 
 # The files that each writes; options beside --quick follow the name.
 OF_VIDEO = "visual_tracking.json contact_sheet.png tracking.mp4 tracks_pf.txt tracks_mpf.txt"
@@ -173,7 +173,7 @@ def sequence(tmp_path_factory):
     scene = football_scene(jax.random.key(1), 6, height=96, width=160)
     (folder / "img").mkdir()
     for i, frame in enumerate(scene.frames, 1):
-        write_image(folder / "img" / f"{i:06d}.png", frame)
+        Image.fromarray(frame).save(folder / "img" / f"{i:06d}.png")
     write_tracks(folder / "gt.txt", scene.tracks)
     return folder
 

@@ -104,7 +104,7 @@ def test_offspring_are_unbiased_where_resampled_and_kept_elsewhere(name, m):
         offspring = np.bincount(slots, minlength=NUM_DRAWS * n).reshape(NUM_DRAWS, n)
         labels, occupied = np.asarray(before.component_indicators), np.asarray(before.occupied)
         targets = new_counts(after, m)
-        weights = np.exp(np.asarray(before.log_component_weights, float))
+        weights = np.asarray(before.component_weights, float)
         error = np.abs(offspring.mean(axis=0) - targets[labels] * weights)
         # Particles that should have offspring once in thousands of draws: their counts are few.
         bound = 4.5 * offspring.std(axis=0) / np.sqrt(NUM_DRAWS) + 4 / NUM_DRAWS

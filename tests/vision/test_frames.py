@@ -6,9 +6,9 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from PIL import Image as pillow
+from PIL import Image
 
-from mpfjax.vision.files.frames import frame_rate, num_images, read_frames, write_image, write_video
+from mpfjax.vision.files.frames import frame_rate, num_images, read_frames, write_video
 
 
 def shades(num, height=32, width=48):
@@ -22,7 +22,7 @@ def shades(num, height=32, width=48):
 def folder(tmp_path):
     (tmp_path / "img").mkdir()
     for i, frame in enumerate(shades(5), 1):
-        write_image(tmp_path / "img" / f"{i:06d}.png", frame)
+        Image.fromarray(frame).save(tmp_path / "img" / f"{i:06d}.png")
     return tmp_path
 
 
@@ -35,7 +35,7 @@ def test_a_folder_is_read_in_order_and_both_ends_are_in(folder):
 def test_images_come_in_natural_order_without_hidden_companions(tmp_path):
     names = ["1.png", "02.png", "2.png", "10.png", "11.png", "a1.png", "a1b9.png", "a1b10.png"]
     for name, still in zip(names, shades(len(names)), strict=True):
-        write_image(tmp_path / name, still)
+        Image.fromarray(still).save(tmp_path / name)
     (tmp_path / "._1.png").write_bytes(b"what another system says of 1.png")
     np.testing.assert_array_equal(np.stack(list(read_frames(tmp_path))), shades(len(names)))
     assert num_images(tmp_path) == len(names)
@@ -127,9 +127,9 @@ def test_whatever_an_image_holds_it_becomes_three_channels_of_eight_bits(tmp_pat
     grey = np.tile(np.linspace(0, 255, 48).astype(np.uint8), (32, 1))
     if mode == "1":
         grey = np.where(grey > 127, 255, 0).astype(np.uint8)
-    image = pillow.fromarray(grey)
+    image = Image.fromarray(grey)
     if mode == "I;16":
-        image = pillow.fromarray(grey.astype(np.uint16) * 257)
+        image = Image.fromarray(grey.astype(np.uint16) * 257)
     elif mode == "RGBA":
         image = image.convert("RGB").convert(mode)
     else:

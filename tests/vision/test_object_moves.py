@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpfjax.mixture import ParticleMixture
+from mpfjax.moves.regrouping.merge import Prune
 from mpfjax.vision.boxes.colour_model import BoxState
-from mpfjax.vision.boxes.hypotheses import ObjectExclusion, PruneHypotheses
+from mpfjax.vision.boxes.hypotheses import ObjectExclusion
 
 # Component, reference, x, mass: object 0 has two hypotheses, object 1 has one near the first.
 ROWS = [(0, 0, 0.0, 0.2), (0, 0, 2.0, 0.2), (1, 0, 50.0, 0.1), (2, 1, 4.0, 0.3), (2, 1, 6.0, 0.2)]
@@ -45,7 +46,8 @@ def test_hypotheses_of_one_object_do_not_exclude_each_other():
 
 def test_pruning_compares_within_an_object_only():
     rows = [(0, 0, 0.0, 0.5), (1, 0, 9.0, 5e-4), (2, 0, 9.0, 4e-3), (3, 1, 5.0, 1e-4)]
-    moved = PruneHypotheses(least_share=2e-3)(jax.random.key(0), mixture_of(rows), None)
+    prune = Prune(least_share=2e-3, among=lambda states: states.reference)
+    moved = prune(jax.random.key(0), mixture_of(rows), None)
     assert moved.active.tolist() == [True, False, True, True]
     kept = np.asarray(moved.log_weights)[[0, 2, 3]]
     np.testing.assert_allclose(kept, np.log([0.5, 4e-3, 1e-4]), rtol=1e-6)

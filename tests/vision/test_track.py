@@ -7,10 +7,10 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 from mpfjax.vision import Detections, ObjectTracker, Tracks, track
 from mpfjax.vision.boxes.following import follow_boxes
-from mpfjax.vision.files.frames import write_image
 from mpfjax.vision.tracking.track import offline_rows, online_rows
 
 SHAPE = (48, 64, 3)
@@ -92,7 +92,7 @@ def test_files_are_tracked_by_their_paths(tmp_path, with_pixels, without_pixels)
     for path in (tmp_path / "det.txt", str(tmp_path / "det.txt")):
         assert_same(tracked(None, path), without_pixels)
     for number, still in enumerate(stills(), 1):
-        write_image(tmp_path / f"{number}.png", still)
+        Image.fromarray(still).save(tmp_path / f"{number}.png")
     assert_same(tracked(tmp_path, walks()), with_pixels)
 
 

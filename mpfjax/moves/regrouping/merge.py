@@ -1,5 +1,7 @@
 """Merge: components that overlap become one. Prune: improbable components are emptied."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,13 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 from mpfjax.checks import Count, InnerShare, Positive
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractMove, AbstractRegrouping, Regrouped
-from mpfjax.moves.regrouping.features import ByFeatures, relative_weights, separation, summarise
+from mpfjax.moves.regrouping.features import (
+    ByFeatures,
+    component_groups,
+    relative_weights,
+    separation,
+    summarise,
+)
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
 
@@ -109,11 +117,17 @@ class Prune(AbstractMove):
     With M components, a step loses at most the share (M - 1) `least_share` of the mass, and Ẑ falls
     by at most as much.
 
+    - `among`: a function that gives each particle the whole number of its group, the same within a
+      component, as `share_by` of `Resample` does. A component is then compared with the heaviest of
+      its group: hypotheses about one object of several, whose odds their masses are. None compares
+      all.
+
     Raises `ValueError` for a share outside (0, 1). Use it after a propagation, before regrouping,
     where hypotheses that turned out wrong hold particles that others need.
     """
 
     least_share: InnerShare = eqx.field(static=True, default=1e-6)
+    among: Callable[[PyTree], Int[Array, " n"]] | None = eqx.field(static=True, default=None)
 
     approximate = True
     """the mass of the pruned components is lost."""
@@ -127,6 +141,11 @@ class Prune(AbstractMove):
         """Set the weights of improbable components to zero."""
         del key, observation
         masses = mixture.log_mixture_weights
-        hopeless = masses < jnp.max(masses) + jnp.log(self.least_share)
+        heaviest = jnp.max(masses)
+        if self.among is not None:
+            groups = component_groups(mixture, self.among(mixture.particles))
+            is_rival = groups[:, None] == groups[None]
+            heaviest = jnp.max(jnp.where(is_rival, masses[None], -jnp.inf), axis=1)
+        hopeless = masses < heaviest + jnp.log(self.least_share)
         dies = spread(hopeless, mixture.component_indicators)
         return mixture.replace(log_weights=jnp.where(dies, -jnp.inf, mixture.log_weights))

@@ -1,4 +1,4 @@
-"""Rival hypotheses about objects: colours that are learned, exclusion, and pruning."""
+"""Rival hypotheses about objects: colours that are learned, and exclusion."""
 
 import dataclasses
 from typing import Any
@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt8
 from mpfjax.mixture import ParticleMixture
 from mpfjax.moves.base import AbstractPropagation
 from mpfjax.moves.objects.exclusion import AbstractExclusion
+from mpfjax.moves.regrouping.features import component_groups
 from mpfjax.vision.boxes.colour_model import BoxState, ColourModel
 from mpfjax.vision.colour.histograms import IntegralHistogram, normalise
 
@@ -149,33 +150,6 @@ class ObjectExclusion(AbstractExclusion):
         return mixture.replace(log_weights=mixture.log_weights - penalty)
 
 
-class PruneHypotheses(AbstractPropagation):
-    """Empty the components that have become improbable hypotheses about their object.
-
-    A component dies if its mass is less than `least_share` of that of the heaviest component with
-    the same reference. Within one object the mixture weights are the posterior odds of its
-    hypotheses (Vermaak et al. 2003, eq. 4). Each component that dies takes away at most this share
-    of its object's mass. Use it with `Split`, to remove hypotheses that turned out wrong.
-    """
-
-    least_share: float = eqx.field(static=True, default=1e-6)
-
-    approximate = True
-    """the mass of the pruned components is lost."""
-
-    def __call__(
-        self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree
-    ) -> ParticleMixture:
-        """Set the weights of improbable components to zero."""
-        del key, observation
-        masses = mixture.log_mixture_weights
-        rivals = _same_object(mixture, component_references(mixture))
-        heaviest = jnp.max(jnp.where(rivals, masses[None], -jnp.inf), axis=1)
-        hopeless = mixture.active & (masses < heaviest + jnp.log(self.least_share))
-        dies = hopeless[mixture.component_indicators]
-        return mixture.replace(log_weights=jnp.where(dies, -jnp.inf, mixture.log_weights))
-
-
 def best_components(
     mixture: ParticleMixture, num_objects: int
 ) -> tuple[Int[Array, " k"], Bool[Array, " k"]]:
@@ -186,18 +160,12 @@ def best_components(
 
 
 def component_references(mixture: ParticleMixture) -> Int[Array, " m"]:
-    """The reference of each component: the integer nearest to its particles' mean."""
-    reference = mixture.particles.reference.astype(mixture.log_weights.dtype)
-    return jnp.round(mixture.component_averages(reference)).astype(jnp.int32)
-
-
-def _same_object(mixture: ParticleMixture, owners: Int[Array, " m"]) -> Bool[Array, "m m"]:
-    alive = mixture.active
-    return (owners[:, None] == owners[None]) & alive[:, None] & alive[None]
+    """The reference of each component."""
+    return component_groups(mixture, mixture.particles.reference)
 
 
 def _log_shares(mixture: ParticleMixture, owners: Int[Array, " m"]) -> Float[Array, " m"]:
     """log of each component's share of the mass of its object, -inf for a dead one."""
     masses = mixture.log_mixture_weights
-    rivals = jnp.where(_same_object(mixture, owners), masses[None], -jnp.inf)
+    rivals = jnp.where(owners[:, None] == owners[None], masses[None], -jnp.inf)
     return jnp.where(mixture.active, masses - jax.nn.logsumexp(rivals, axis=1), -jnp.inf)

@@ -18,7 +18,7 @@ from mpfjax.models.dynamics import AbstractDynamics, RandomWalkWithJumps, WalkWi
 from mpfjax.moves.objects.exclusion import Exclusion
 from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.regrouping.kmeans import KMeans
-from mpfjax.moves.regrouping.merge import Merge
+from mpfjax.moves.regrouping.merge import Merge, Prune
 from mpfjax.moves.regrouping.partitions import GroupBy
 from mpfjax.moves.regrouping.split import Split
 from mpfjax.moves.resampling.resample import Resample
@@ -28,7 +28,6 @@ from mpfjax.vision.boxes.hypotheses import (
     AdaptAppearance,
     LearnedColourModel,
     ObjectExclusion,
-    PruneHypotheses,
 )
 from mpfjax.vision.colour.bins import RGBColours
 
@@ -123,7 +122,7 @@ def objects_filters(
             *([exclusion] if len(boxes) > 1 else []),
             learn,
             Merge(None, 0.25, patience=10, **apart),
-            PruneHypotheses(least_share=1e-15),
+            Prune(least_share=1e-15, among=_object),
             Split(4.0, 0.5, min_share=0.05, sample_size=None, **apart),
         ],
         num_particles=num_particles,

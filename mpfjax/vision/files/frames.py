@@ -167,13 +167,6 @@ def of_one_kind(
         yield frame
 
 
-def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write one RGB image, its format chosen by the ending of `path`."""
-    from PIL import Image
-
-    Image.fromarray(image).save(path)
-
-
 def _even(frame: np.ndarray) -> np.ndarray:
     """Pad to an even height and width, which the pixel format of an MP4 needs."""
     height, width, _ = frame.shape

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from mpfjax.checks import Count, InnerShare, NotNegative, Positive, checked
 from mpfjax.vision.files.frames import check_frame
-from mpfjax.vision.tracking.optical_flow import opencv
+from mpfjax.vision.tracking.optical_flow import opencv, reduced
 
 # What OpenCV's mask holds where a pixel is foreground; a shadow has another value.
 _FOREGROUND = 255
@@ -117,7 +117,11 @@ class BackgroundSubtraction:
         if self._frames_seen <= self.warm_up:
             return np.zeros((0, 4))
         boxes = np.array(self._blobs(foreground), float).reshape(-1, 4)
-        boxes = boxes[self._fitting(boxes, foreground.size)]
+        width, height = boxes[:, 2], boxes[:, 3]
+        shares = width * height / foreground.size
+        fits = (shares >= self.area[0]) & (shares <= self.area[1])
+        fits &= (height >= self.aspect[0] * width) & (height <= self.aspect[1] * width)
+        boxes = boxes[fits]
         boxes = boxes[np.lexsort((boxes[:, 1], boxes[:, 0]))]
         scale = np.divide(np.shape(frame)[1::-1], foreground.shape[::-1])
         return boxes * np.tile(scale, 2)
@@ -144,18 +148,10 @@ class BackgroundSubtraction:
                 f"frame: {frame.shape} differs from the shape of those before it, {self._shape}"
             )
         self._shape = frame.shape
-        mask = self._background.apply(self._reduced(frame), learningRate=rate)
+        factor = int(np.ceil(np.sqrt(frame[..., 0].size / self.most_pixels)))
+        small = reduced(np.ascontiguousarray(frame), factor)
+        mask = self._background.apply(small, learningRate=rate)
         return (mask == _FOREGROUND).astype(np.uint8)
-
-    def _reduced(self, frame: np.ndarray) -> np.ndarray:
-        """The frame, or means over squares of its pixels where it has too many."""
-        height, width, _ = frame.shape
-        factor = int(np.ceil(np.sqrt(height * width / self.most_pixels)))
-        frame = np.ascontiguousarray(frame)
-        if factor == 1:
-            return frame
-        size = (max(width // factor, 1), max(height // factor, 1))
-        return self._cv2.resize(frame, size, interpolation=self._cv2.INTER_AREA)
 
     def _blobs(self, foreground: np.ndarray) -> list[tuple[int, int, int, int]]:
         known = len(self._heights) >= _ENOUGH
@@ -212,9 +208,3 @@ class BackgroundSubtraction:
             return [(x, y, width, height)]
         parts = (blob[:, :cut], x), (blob[:, cut:], x + cut)
         return [box for part, left in parts for box in self._cut(part, left, y, widest)]
-
-    def _fitting(self, boxes: np.ndarray, pixels: int) -> np.ndarray:
-        width, height = boxes[:, 2], boxes[:, 3]
-        shares = width * height / pixels
-        sized = (shares >= self.area[0]) & (shares <= self.area[1])
-        return sized & (height >= self.aspect[0] * width) & (height <= self.aspect[1] * width)

@@ -68,10 +68,7 @@ class OpticalFlow:
     def _reduced(self, frame: np.ndarray, factor: int) -> np.ndarray:
         # Grey first: OpenCV reduces one channel in a third of the time of three.
         frame = frame if frame.ndim == 2 else self._cv2.cvtColor(frame, self._cv2.COLOR_RGB2GRAY)
-        if factor == 1:
-            return frame
-        size = max(frame.shape[1] // factor, 1), max(frame.shape[0] // factor, 1)
-        return self._cv2.resize(frame, size, interpolation=self._cv2.INTER_AREA)
+        return reduced(frame, factor)
 
     def _followed(
         self, before: np.ndarray, picture: np.ndarray, boxes: np.ndarray
@@ -110,6 +107,15 @@ class OpticalFlow:
         return CameraMotion(
             matrix[:, 0].astype(np.float32), shift.astype(np.float32), np.asarray(True)
         )
+
+
+def reduced(frame: np.ndarray, factor: int) -> np.ndarray:
+    """The means over squares of pixels, so many along each side."""
+    if factor == 1:
+        return frame
+    cv2: Any = opencv()
+    size = max(frame.shape[1] // factor, 1), max(frame.shape[0] // factor, 1)
+    return cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
 
 
 def has_opencv() -> bool:
