@@ -16,7 +16,7 @@ from mpfjax.moves.base import AbstractMove, Gradient, as_moves
 from mpfjax.moves.every import Every
 from mpfjax.moves.objects.clusters import PropagateInClusters
 from mpfjax.moves.objects.independent import PropagateIndependently
-from mpfjax.moves.objects.partitioned import Partitioned, Reassembly, check_orders
+from mpfjax.moves.objects.partitioned import Partitioned, Reassembly
 from mpfjax.moves.propagation.propagate import Predict, Propagate, Reweight
 from mpfjax.moves.regrouping.features import Scale
 from mpfjax.moves.regrouping.kmeans import KMeans
@@ -86,8 +86,6 @@ def auxiliary_particle_filter(
         model, num_particles, proposal=proposal, scheme=scheme, ess_threshold=ess_threshold,
         sort_by=sort_by,
     )  # fmt: skip
-    if lookahead is None:
-        raise ValueError("lookahead: None; with_lookahead(particle_filter(...)) makes one")
     return with_lookahead(plain, lookahead)
 
 
@@ -219,13 +217,8 @@ def partitioned_sampling(
     `scheme` and `ess_threshold` are those of the resampling between steps and objects.
     """
     require_multi_object(model, "partitioned_sampling")
-    orders: Any = order
-    if not (isinstance(order, str) and order == "random"):
-        orders = check_orders(order, model.num_objects, "order")
-        if orders.shape[0] != 1:
-            raise ValueError(f"order: {orders.shape[0]} orders where there is one component")
     between = Resample(scheme, ess_threshold, allocation="equal")
-    moves = [Resample(scheme, ess_threshold), Partitioned(model, orders, resample=between)]
+    moves = [Resample(scheme, ess_threshold), Partitioned(model, order, resample=between)]
     return Filter(model, moves, num_particles)
 
 

@@ -45,7 +45,16 @@ def fit_lookahead(
         model = filter.with_inputs(now.inputs).model
         points = _draw_points(key, model, twist, used, after, mixture, now)
         fitted = _fit_step(points, used)
-        fitted = _scaled(fitted, mixture, twist.features_of(mixture.particles))
+        # ν with a mean of 1 over the filtering distribution, and its floor, δ of that mean.
+        log_fitted = fitted.log_fitted(twist.features_of(mixture.particles))
+        log_fitted = jnp.where(mixture.occupied, log_fitted, -jnp.inf)
+        log_mean = jax.nn.logsumexp(mixture.log_weights + log_fitted)
+        fitted = replace(
+            fitted,
+            constants=fitted.constants - log_mean,
+            log_cap=fitted.log_cap - log_mean,
+            log_floor=jnp.log(fitted.defence),
+        )
         fitted = _if_finite(fitted, used)
         return fitted, fitted
 
@@ -139,20 +148,6 @@ def _fit_step(points: _Points, used: LocalQuadratics) -> LocalQuadratics:
         noise_whitening=_inverses(experts["noise_factors"]),
         log_cap=jnp.max(points.targets),
         defence=jnp.clip(missed, _LEAST_DEFENCE, _MOST_DEFENCE),
-    )
-
-
-def _scaled(
-    fitted: LocalQuadratics, mixture: ParticleMixture, features: Float[Array, "n d"]
-) -> LocalQuadratics:
-    """ν with a mean of 1 over the filtering distribution, and its floor, δ of that mean."""
-    log_factors = jnp.where(mixture.occupied, fitted.log_fitted(features), -jnp.inf)
-    log_mean = jax.nn.logsumexp(mixture.log_weights + log_factors)
-    return replace(
-        fitted,
-        constants=fitted.constants - log_mean,
-        log_cap=fitted.log_cap - log_mean,
-        log_floor=jnp.log(fitted.defence),
     )
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from mpfjax.checks import NOT_NEGATIVE, POSITIVE, checked, real_arrays
+from mpfjax.checks import NOT_NEGATIVE, POSITIVE, check_shape, checked, real_arrays
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.steps import likelihoods
@@ -32,14 +32,10 @@ def crps(
     of the forecast's mixtures. Raises `ValueError` for anything but arrays of real numbers, for
     shapes that do not fit, and for a weight below zero.
     """
-    values, weights = real_arrays("... n", values=values, weights=weights)
-    observations = real_arrays("...", observations=observations)
-    for name, given, wanted in (
-        ("weights", weights, values.shape),
-        ("observations", observations, values.shape[:-1]),
-    ):
-        if given.shape != wanted:
-            raise ValueError(f"{name}: shape {given.shape} is not {wanted}, by that of values")
+    values = real_arrays("... n", values=values)
+    *batch, n = map(str, values.shape)
+    weights = real_arrays(" ".join([*batch, n]), weights=weights)
+    observations = real_arrays(" ".join(batch), observations=observations)
     errors = jnp.where(weights > 0, values - observations[..., None], 0.0)
     order = jnp.argsort(errors, axis=-1)
     errors = jnp.take_along_axis(errors, order, axis=-1)
@@ -85,11 +81,9 @@ def modes_represented(
     than the positions, and a radius that is not positive and finite.
     """
     positions = real_arrays("... n", positions=positions)
-    modes = real_arrays("... k", modes=modes)
-    if occupied.shape != positions.shape:
-        raise ValueError(f"occupied: shape {occupied.shape} is no mask of the positions")
-    if modes.shape[:-1] != positions.shape[:-1]:
-        raise ValueError(f"modes: shape {modes.shape} does not go with that of {positions.shape}")
+    *batch, n = map(str, positions.shape)
+    check_shape(" ".join([*batch, n]), occupied=occupied)
+    modes = real_arrays(" ".join([*batch, "k"]), modes=modes)
     distance = jnp.abs(positions[..., None, :] - modes[..., :, None])
     return jnp.any((distance < radius) & occupied[..., None, :], axis=-1)
 

@@ -107,11 +107,7 @@ def tracking_quality(
     boxes of other shapes, and as `recovery_rate` does.
     """
     estimates = real_arrays("runs t objects 4", estimates=estimates)
-    truth = real_arrays("t objects 4", truth=truth)
-    if truth.shape != estimates.shape[1:]:
-        raise ValueError(
-            f"truth: shape {truth.shape} is not {estimates.shape[1:]}, that of one run's estimates"
-        )
+    truth = real_arrays(" ".join(map(str, estimates.shape[1:])), truth=truth)
     present = jnp.all(jnp.isfinite(truth), axis=-1)
     states = track_state(estimates, truth[None])
     tracked = states.astype(estimates.dtype)

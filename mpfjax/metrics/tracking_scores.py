@@ -111,7 +111,9 @@ def remove_ignored(
         kept[here[matched[objects[owners, 1] == IGNORED_OBJECT]]] = False
         left = np.delete(here, matched)
         boxes = tracks[left, 2:]
-        inside = np.any(_share_within(boxes, fields) > 0.5 + _ROUNDING, axis=1)
+        shared, areas, _ = _areas(boxes, fields)
+        shares = np.where(areas > 0, shared / np.where(areas > 0, areas, 1.0), 0.0)
+        inside = np.any(shares > 0.5 + _ROUNDING, axis=1)
         low = (min_height > 0) & (boxes[:, 3] <= min_height + _ROUNDING)
         kept[left[inside | low]] = False
     return tracks[kept]
@@ -127,12 +129,6 @@ def matches(boxes: np.ndarray, objects: np.ndarray) -> tuple[np.ndarray, np.ndar
     owners, matched = linear_sum_assignment(-shares.T)
     real = shares[matched, owners] > 0
     return matched[real], owners[real]
-
-
-def _share_within(boxes: np.ndarray, regions: np.ndarray) -> np.ndarray:
-    """The share of each box's area that lies in each region; 0 of a box without area."""
-    shared, areas, _ = _areas(boxes, regions)
-    return np.where(areas > 0, shared / np.where(areas > 0, areas, 1.0), 0.0)
 
 
 def overlap(

@@ -124,7 +124,9 @@ def renew(
     key_slot, key_initial, key_run, key_back = split(key, 4)
     n = filter.num_particles
     first_slot = jnp.clip(jnp.floor(uniform(key_slot, ()) * n).astype(jnp.int32), 0, n - 1)
-    particles = _independent_initial(key_initial, filter.model, n)
+    # x_0 of every particle, drawn separately: a model may draw many of them in strata.
+    own = jax.vmap(lambda key: sample_initial(key, filter.model, 1))(split(key_initial, n))
+    particles = jax.tree.map(lambda leaf: leaf[:, 0], own)
     start = jax.tree.map(lambda leaf, own: put(leaf, own[0], first_slot), particles, trajectory)
     reference = Reference(trajectory, first_slot)
     around = filter.replace(
@@ -147,15 +149,6 @@ def renew(
 
 
 _run = jit_on_wide_vectors(renew)
-
-
-def _independent_initial(key: Key[Array, ""], model: Any, num_particles: int) -> PyTree:
-    """x_0 of every particle, drawn separately: a model may draw many of them in strata."""
-
-    def draw(key: Key[Array, ""]) -> PyTree:
-        return jax.tree.map(lambda leaf: leaf[0], sample_initial(key, model, 1))
-
-    return jax.vmap(draw)(split(key, num_particles))
 
 
 def draw_trajectory(

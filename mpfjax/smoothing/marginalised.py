@@ -133,26 +133,19 @@ def _joined(one: Information, other: Information) -> Information:
 def _told(target: Float[Array, "p #n"], seen: Linear, law: Gaussian) -> Information:
     """The likelihood of y = A x + b + N(0, C) as a function of x, around the mean of its law."""
     known = sandwiched(seen.matrix, law.covariance)
-    factor = cholesky(_with_least_noise(seen.noise, known), floor=True)
+    # Each variance of y is at least a share of that which x itself makes. With less, Ω would round
+    # away what is known of x in other directions.
+    p, share = seen.noise.shape[0], float(jnp.finfo(seen.noise.dtype).eps) ** 0.5
+    own = jnp.stack([seen.noise[j, j] for j in range(p)])
+    least = share * jnp.stack([known[j, j] for j in range(p)])
+    least = jnp.where((own > 0) | (least > 0), least, 1.0)  # an exact y of an x known exactly
+    lacking = jnp.maximum(least - own, 0.0)[None]
+    noise = seen.noise + jnp.eye(p, dtype=own.dtype)[:, :, None] * lacking
+    factor = cholesky(noise, floor=True)
     rows = solve_lower(factor, seen.matrix)
     missed = target - seen.offset - applied(seen.matrix, law.mean)
     white = solve_lower(factor, missed[:, None])[:, 0]
     return Information(product(transposed(rows), rows), applied(transposed(rows), white), law.mean)
-
-
-def _with_least_noise(
-    noise: Float[Array, "p p #n"], known: Float[Array, "p p n"]
-) -> Float[Array, "p p n"]:
-    """The noise of y, each variance at least a share of that which x itself makes.
-
-    With less, Ω would round away what is known of x in other directions.
-    """
-    p, share = noise.shape[0], float(jnp.finfo(noise.dtype).eps) ** 0.5
-    own = jnp.stack([noise[j, j] for j in range(p)])
-    least = share * jnp.stack([known[j, j] for j in range(p)])
-    least = jnp.where((own > 0) | (least > 0), least, 1.0)  # an exact y of an x known exactly
-    lacking = jnp.maximum(least - own, 0.0)
-    return noise + jnp.eye(p, dtype=noise.dtype)[:, :, None] * lacking[None]
 
 
 def _before(

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, Key, PyTree
+from jaxtyping import Array, Key, PyTree
 
 from mpfjax.chain import check_keep_parents
 from mpfjax.checks import Count, CountOrZero, check_one_each, checked, saying
@@ -115,7 +115,19 @@ def _smooth(key, filter, series, options):
         t, step_key, draw_key, now = step
         moved, info = step_or_predict(filter, step_key, mixture, now)
         model = with_inputs(filter.model, now.inputs)
-        indices = _draw_pasts(draw_key, model, mixture, moved, method, num_draws)
+        needed, start = moved.occupied, moved.ancestor_indices
+        if method == "exact":
+            log_density = log_transition_from(model, mixture)
+            futures = moved.particles
+            indices = draw_exactly(draw_key, log_density, futures, mixture, num_draws, needed)
+        else:
+            key_proposed, key_walk = split(draw_key, 2)
+            # The start counts as a draw, unless it would be the only one.
+            shape = (max(num_draws - 1, 1), start.shape[0])
+            proposed = draw(key_proposed, shape, mixture.log_weights)
+            later = walk(key_walk, model, moved.particles, mixture, start, proposed, needed).T
+            both = [start[:, None], later]
+            indices = later if num_draws == 1 else jnp.concatenate(both, axis=1)
         places = indices.reshape(-1)
         earlier = jax.tree.map(lambda leaf: take(leaf, places), mixture.particles)
         repeat = lambda leaf: jnp.repeat(leaf, num_draws, axis=0)  # noqa: E731
@@ -148,27 +160,6 @@ def _smooth(key, filter, series, options):
             lambda done, rest: jnp.concatenate([done[lag:], rest]), oldest, open_terms
         )
     return SmoothedSums(sums, terms, run_of(initial, final, None, reports))
-
-
-def _draw_pasts(
-    key: Key[Array, ""],
-    model: Any,
-    before: ParticleMixture,
-    after: ParticleMixture,
-    method: str,
-    num_draws: int,
-) -> Int[Array, "n draws"]:
-    """For each particle some of the step before, by the backward kernel."""
-    needed = after.occupied
-    if method == "exact":
-        log_density = log_transition_from(model, before)
-        return draw_exactly(key, log_density, after.particles, before, num_draws, needed)
-    key_proposed, key_walk = split(key, 2)
-    # The start counts as a draw, unless it would be the only one.
-    num_steps, start = max(num_draws - 1, 1), after.ancestor_indices
-    proposed = draw(key_proposed, (num_steps, start.shape[0]), before.log_weights)
-    later = walk(key_walk, model, after.particles, before, start, proposed, needed).T
-    return later if num_draws == 1 else jnp.concatenate([start[:, None], later], axis=1)
 
 
 def _mean_of_pasts(values: Array, num_draws: int) -> Array:

@@ -80,7 +80,13 @@ def sample_trajectories(
     if method == "exact" and num_steps is not None:
         raise ValueError(f"num_steps: {num_steps} does nothing with method 'exact'")
     stacked = mixtures_of(mixtures)
-    inputs = _inputs_between(inputs, model, stacked, isinstance(mixtures, FilterRun))
+    # Those of the steps from each of the mixtures to the next.
+    length = stacked.log_weights.shape[0]
+    if isinstance(mixtures, FilterRun):
+        inputs = steps_of_inputs(inputs, length - 1, model, "run")
+    else:
+        inputs = steps_of_inputs(inputs, length, model, "mixtures")
+        inputs = jax.tree.map(lambda leaf: leaf[1:], inputs)
     if component is not None:
         _check_component(stacked, component)
     if is_marginalised(model) or observations is not None:
@@ -97,17 +103,6 @@ def sample_trajectories(
             drawn, indices = draw_trajectories(key, model, stacked, inputs, *options)
     _warn_of_few(indices, stacked.log_weights)
     return drawn
-
-
-def _inputs_between(
-    inputs: PyTree, model: Any, mixtures: ParticleMixture, with_initial: bool
-) -> PyTree:
-    """The inputs of the steps from each of the mixtures to the next."""
-    num_mixtures = mixtures.log_weights.shape[0]
-    if with_initial:
-        return steps_of_inputs(inputs, num_mixtures - 1, model, "run")
-    inputs = steps_of_inputs(inputs, num_mixtures, model, "mixtures")
-    return jax.tree.map(lambda leaf: leaf[1:], inputs)
 
 
 def _check_component(mixtures: ParticleMixture, component: int) -> None:

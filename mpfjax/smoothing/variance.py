@@ -221,10 +221,11 @@ def batch_estimate(
     values = jax.vmap(quantity)(runs.final)
     # Each run is left out in turn; a difference of sums would be lost to rounding.
     stays = jnp.concatenate([jnp.ones((1, number), bool), ~jnp.eye(number, dtype=bool)])
-    log_z, estimates = jax.vmap(lambda kept: _combined(jnp.where(kept, logs, -jnp.inf), values))(
-        stays
+    kept = jnp.where(stays, logs[None], -jnp.inf)
+    estimates = jax.vmap(lambda shares: jnp.tensordot(shares, values, axes=1))(
+        jax.nn.softmax(kept, axis=1).astype(values.dtype)
     )
-    log_z -= jnp.log(jnp.sum(stays, axis=1).astype(log_z.dtype))
+    log_z = jax.vmap(log_sum_exp)(kept) - jnp.log(jnp.sum(stays, axis=1).astype(logs.dtype))
     shares = jax.nn.softmax(logs)
     return BatchEstimate(
         value=estimates[0],
@@ -233,13 +234,6 @@ def batch_estimate(
         log_marginal_likelihood_error=_jackknife(log_z[1:]),
         effective_runs=1 / jnp.sum(shares**2),
     )
-
-
-def _combined(
-    logs: Float[Array, " b"], values: Float[Array, "b *shape"]
-) -> tuple[Float[Array, ""], Float[Array, " *shape"]]:
-    shares = jax.nn.softmax(logs).astype(values.dtype)
-    return log_sum_exp(logs), jnp.tensordot(shares, values, axes=1)
 
 
 def _jackknife(without: Float[Array, "b *shape"]) -> Float[Array, " *shape"]:

@@ -23,7 +23,7 @@ _FURTHEST_ROUND = 16.0
 # In units in the last place of a parameter: a shorter step is mostly rounding.
 _FEWEST_PLACES = 256
 # Logarithms and logits have no unit, and a parabola fits up to about one half.
-_LONGEST_WITHOUT_UNIT = 0.5
+_LONGEST = 0.5
 _NUM_HALVINGS = 32
 _MOST_APART = 0.25
 
@@ -82,7 +82,12 @@ def errors_at(
         each = [np.asarray(score_of_each(problem, at, keys), float) for keys in batches]
         return np.concatenate(each)
 
-    informations = _informations(score, np.asarray(point), _longest_steps(problem, reals))
+    # By number, how far a step may go.
+    longest = np.concatenate([
+        np.full(reals[name].size, np.inf if isinstance(transform, Unconstrained) else _LONGEST)
+        for name, transform in sorted(problem.transforms.items())
+    ])  # fmt: skip
+    informations = _informations(score, np.asarray(point), longest)
     covariance = _inverse(informations.mean(axis=0))
     if covariance is None:
         warnings.warn(
@@ -150,15 +155,6 @@ def _column(
             break
         step = following
     return column
-
-
-def _longest_steps(problem: Problem, reals: Reals) -> np.ndarray:
-    """By number, in the order of `ravel_pytree`, how far a step may go."""
-    limit = {
-        name: np.inf if isinstance(transform, Unconstrained) else _LONGEST_WITHOUT_UNIT
-        for name, transform in problem.transforms.items()
-    }
-    return np.concatenate([np.full(reals[name].size, limit[name]) for name in sorted(reals)])
 
 
 def _inverse(information: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"] | None:

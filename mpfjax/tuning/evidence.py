@@ -50,8 +50,12 @@ def pose_evidence(
     for sequence in sequences:
         series = as_series(sequence, filter.model)
         groups.setdefault(kinds((series.observations, series.inputs)), []).append(series)
-    objective = LogEvidence([_stacked(group) for group in groups.values()])
-    return pose(filter, objective, parameters, transforms)
+    stacked = []
+    for group in groups.values():
+        if any(series.present is not None for series in group):
+            group = [with_present(series) for series in group]
+        stacked.append(jax.tree.map(lambda *leaves: jnp.stack(leaves), *group))
+    return pose(filter, LogEvidence(stacked), parameters, transforms)
 
 
 def one_sequence(observations: PyTree, model: Any) -> Series:
@@ -105,13 +109,6 @@ def _nodes(tree: PyTree, kind: type) -> list[Any]:
 
     jax.tree.leaves(tree, is_leaf=looked_at)
     return found
-
-
-def _stacked(group: list[Series]) -> Series:
-    """Sequences of one shape in one `Series`, whose leaves have a leading axis of them."""
-    if any(series.present is not None for series in group):
-        group = [with_present(series) for series in group]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *group)
 
 
 def with_present(series: Series) -> Series:

@@ -52,7 +52,11 @@ def to_inference_data(result: Chains | PyTree) -> Any:
         states = _states(result.trajectories)
         stats = {"acceptance_rate": result.accepted, "renewed": result.renewed}
     elif isinstance(result, SequentialPosterior):
-        draws = _of_equal_weight(result.weights)
+        # Systematic resampling. In their own order copies would look like a chain that sticks.
+        num, cumulative = len(result.weights), np.cumsum(result.weights, dtype=float)
+        quantiles = (np.arange(num) + 0.5) / num * cumulative[-1]
+        draws = np.minimum(np.searchsorted(cumulative, quantiles, side="right"), num - 1)
+        draws = np.random.default_rng(0).permutation(draws)
         parameters = {name: values[draws][None] for name, values in parameters.items()}
     else:
         states = {name: leaf[None] for name, leaf in _states(result).items()}
@@ -73,18 +77,6 @@ def to_inference_data(result: Chains | PyTree) -> Any:
     if "posterior" in inspect.signature(arviz.from_dict).parameters:
         return arviz.from_dict(**groups, dims=dims, coords=coords)
     return arviz.from_dict(groups, dims=dims, coords=coords)
-
-
-def _of_equal_weight(weights: np.ndarray) -> np.ndarray:
-    """Indices of samples by systematic resampling, the same in every call.
-
-    In their own order, copies would stand side by side and look like a chain that sticks.
-    """
-    num = len(weights)
-    cumulative = np.cumsum(weights, dtype=float)
-    quantiles = (np.arange(num) + 0.5) / num * cumulative[-1]
-    indices = np.minimum(np.searchsorted(cumulative, quantiles, side="right"), num - 1)
-    return np.random.default_rng(0).permutation(indices)
 
 
 def _states(trajectories: PyTree) -> dict[str, np.ndarray]:

@@ -1,7 +1,6 @@
 """Maps between a parameter's domain and unconstrained numbers, in which optimisers step."""
 
 import abc
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -94,7 +93,11 @@ class Interval(AbstractTransform):
     def constrain(self, reals: Float[Array, "..."]) -> Float[Array, "..."]:
         """Between the ends, and never rounded to one of them."""
         inside = self.low + (self.high - self.low) * jax.nn.sigmoid(reals)
-        return jnp.clip(inside, *self._range(inside.dtype))
+        # To the first and last number between the ends that is neither an end nor subnormal.
+        low, high = np.asarray([self.low, self.high], inside.dtype)
+        tiny = np.finfo(inside.dtype).tiny
+        first, last = np.nextafter(low, high), np.nextafter(high, low)
+        return jnp.clip(inside, first if low != 0 else tiny, last if high != 0 else -tiny)
 
     def unconstrain(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """The logit of where it lies between the ends."""
@@ -108,13 +111,6 @@ class Interval(AbstractTransform):
         """The sum of log((high - low) sigmoid(u) sigmoid(-u))."""
         slopes = jax.nn.log_sigmoid(reals) + jax.nn.log_sigmoid(-reals)
         return jnp.sum(slopes + jnp.log(jnp.asarray(self.high - self.low, reals.dtype)))
-
-    def _range(self, dtype: jnp.dtype) -> tuple[Any, Any]:
-        """The first and the last number between the ends that is neither an end nor subnormal."""
-        low, high = np.asarray(self.low, dtype), np.asarray(self.high, dtype)
-        tiny = np.finfo(dtype).tiny
-        first, last = np.nextafter(low, high), np.nextafter(high, low)
-        return first if low != 0 else tiny, last if high != 0 else -tiny
 
 
 class Simplex(AbstractTransform):

@@ -135,7 +135,11 @@ class PropagateInClusters(AbstractPropagationByObject):
         else:
             rows, log_growth = self._resampled(keys_rows, memory["labels"], log_likelihoods)
             particles = rows_of_each(points, rows)
-        particles = _shifted(key_shift, particles, memory["labels"])
+        # Row i is then a draw of the product of the clusters: any row of one cluster meets any row
+        # of another with the same probability.
+        keys_shift = take(split(key_shift, self.model.num_objects), memory["labels"])
+        places = jnp.arange(mixture.num_particles, dtype=jnp.int32)
+        particles = rows_of_each(particles, jax.vmap(rotated, (0, None))(keys_shift, places))
         moved = mixture.replace(
             particles=particles,
             ancestor_indices=no_ancestors(mixture),
@@ -201,14 +205,3 @@ class PropagateInClusters(AbstractPropagationByObject):
         rows, log_growths = drawn_rows(self.scheme, take(keys, labels), log_weights)
         is_first = labels == jnp.arange(len(labels), dtype=labels.dtype)
         return rows, jnp.sum(jnp.where(is_first, log_growths, 0.0))
-
-
-def _shifted(key: Key[Array, ""], particles: PyTree, labels: Int[Array, " objects"]) -> PyTree:
-    """The rows of every cluster, shifted in a circle by a random number of places.
-
-    Row i is then a draw of the product of the clusters: any row of one cluster meets any row of
-    another with the same probability.
-    """
-    places = jnp.arange(jax.tree.leaves(particles)[0].shape[0], dtype=jnp.int32)
-    keys = take(split(key, len(labels)), labels)
-    return rows_of_each(particles, jax.vmap(rotated, in_axes=(0, None))(keys, places))

@@ -116,6 +116,7 @@ def recombined(
     starts = rotated(key_start, jnp.arange(num_objects, dtype=jnp.int32))[ks % num_objects]
     alone = jnp.sum(together, axis=1) == 1
     by_object = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), points)
+    strides = _GOLDEN * np.arange(num_particles) % 1
 
     def choose(carry: tuple, inputs: tuple) -> tuple[tuple, None]:
         chosen, log_weights, has_moved = carry
@@ -128,7 +129,12 @@ def recombined(
         log_b = log_b + log_point_weights[objects]
         partners = has_moved & together[objects]
         log_psi = _log_potentials(model, chosen, partners, own)
-        picked, log_gain = _draw_columns(key, log_b + log_psi)
+        log_table = log_b + log_psi
+        # One random shift serves all rows, and the quantile of each next row is a golden-ratio step
+        # further: each is uniform, and a run of equal rows draws evenly.
+        quantiles = (strides.astype(log_table.dtype) + uniform(key, (), log_table.dtype)) % 1
+        weights, _ = jax.vmap(scaled_exp)(jax.lax.stop_gradient(log_table))
+        picked, log_gain = draw_columns(quantiles, weights), jax.vmap(log_sum_exp)(log_table)
         before = log_sums[objects, parent_rows]
         # A row without weight is drawn only if no row of the cluster has any.
         counts = jnp.any(partners, axis=1) & (before != -jnp.inf)
@@ -184,21 +190,6 @@ def _log_potentials(
 
     objects = jnp.arange(partners.shape[1], dtype=jnp.int32)
     return jax.lax.scan(add, total, (objects, partners.T))[0]
-
-
-def _draw_columns(
-    key: Key[Array, ""], log_table: Float[Array, "n n"]
-) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
-    """A column of each line, drawn in proportion to its entries, and log of the line's sum.
-
-    One random shift serves all lines. The quantile of each next line is a golden-ratio step
-    further, modulo 1. So each quantile is uniform, and a run of equal lines draws evenly.
-    """
-    strides = _GOLDEN * np.arange(log_table.shape[0])
-    shift = uniform(key, (), log_table.dtype)
-    quantiles = (jnp.asarray(strides % 1, log_table.dtype) + shift) % 1
-    weights, _ = jax.vmap(scaled_exp)(jax.lax.stop_gradient(log_table))
-    return draw_columns(quantiles, weights), jax.vmap(log_sum_exp)(log_table)
 
 
 def rotated(key: Key[Array, ""], indices: Int[Array, " k"]) -> Int[Array, " k"]:

@@ -152,33 +152,21 @@ class Partitioned(AbstractPropagation):
             log_density = model.object_log_transition(states, previous, objects)
             log_factors = add_gradient(log_factors, log_density.astype(log_factors.dtype))
         moved = mixture.weighed(log_factors)
-        if model.interaction is not None and model.num_objects > 1:
-            moved = moved.weighed(self._log_potentials(states, mixture, orders, rank))
+        if (interaction := model.interaction) is not None and model.num_objects > 1:
+            ranks = jnp.arange(model.num_objects - 1, dtype=jnp.int32)
+            has_moved = ranks < rank
+            # Ranks still to come are replaced by the first: an object must not meet itself, since
+            # a potential may have no gradient there.
+            partners = orders[:, jnp.where(has_moved, ranks, 0)]
+
+            def potential(partner: Int[Array, " m"]) -> Float[Array, " n"]:
+                others = model.object_states(particles, _of_particles(partner, mixture))
+                return interaction(states, others)
+
+            values = jax.vmap(potential, in_axes=1)(partners).astype(log_factors.dtype)
+            moved = moved.weighed(jnp.sum(jnp.where(has_moved[:, None], values, 0.0), axis=0))
         moved = moved.replace(particles=model.replace_object(particles, objects, states))
         return moved, jnp.any(~(moved.log_weights < jnp.inf))
-
-    def _log_potentials(
-        self,
-        states: PyTree,
-        mixture: ParticleMixture,
-        orders: Int[Array, "m objects"],
-        rank: Int[Array, ""],
-    ) -> Float[Array, " n"]:
-        """Σ log ψ of the object of this rank with those that moved before it."""
-        interaction, dtype = self.model.interaction, mixture.log_weights.dtype
-        assert interaction is not None
-        ranks = jnp.arange(self.model.num_objects - 1, dtype=jnp.int32)
-        has_moved = ranks < rank
-        # Ranks still to come are replaced by the first: an object must not meet itself, since
-        # a potential may have no gradient there.
-        partners = orders[:, jnp.where(has_moved, ranks, 0)]
-
-        def potential(partner: Int[Array, " m"]) -> Float[Array, " n"]:
-            others = self.model.object_states(mixture.particles, _of_particles(partner, mixture))
-            return interaction(states, others)
-
-        values = jax.vmap(potential, in_axes=1)(partners).astype(dtype)
-        return jnp.sum(jnp.where(has_moved[:, None], values, 0.0), axis=0)
 
     def _orders(self, key: Key[Array, ""], num_components: int) -> Int[Array, "m objects"]:
         """The order of the objects in each component."""
@@ -203,15 +191,15 @@ def circular_orders(num_orders: int, num_objects: int) -> Int[np.ndarray, "order
     return (shifts % num_objects).astype(np.int32)
 
 
-def check_orders(orders: Any, num_objects: int, name: str = "orders") -> Int[Array, "c objects"]:
+def check_orders(orders: Any, num_objects: int) -> Int[Array, "c objects"]:
     """One order a row; raises `ValueError` for one that is no permutation of the objects."""
     if isinstance(orders, Tracer):
         return jnp.atleast_2d(orders).astype(jnp.int32)
-    table = to_rows(num_objects, name, range(num_objects) if orders is None else orders)
+    table = to_rows(num_objects, "orders", range(num_objects) if orders is None else orders)
     is_order = np.sort(table, axis=1) == np.arange(num_objects)[None]
     if not is_order.size or not is_order.all():
         raise ValueError(
-            f"{name}: {shown(orders)} is no permutation of the objects 0 to {num_objects - 1}"
+            f"orders: {shown(orders)} is no permutation of the objects 0 to {num_objects - 1}"
         )
     return jnp.asarray(table, jnp.int32)
 

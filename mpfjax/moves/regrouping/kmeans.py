@@ -46,10 +46,12 @@ class KMeans(AbstractRegrouping, ByFeatures):
             labels = nearest(features, farthest_first(features, occupied, m), alive)
         else:
             labels = mixture.component_indicators
+        filled = jnp.where(occupied[:, None], features, 0.0)
 
         def iterate(_: int | Int[Array, ""], labels: Int[Array, " n"]) -> Int[Array, " n"]:
-            centroids, alive = _centroids(features, occupied, labels, m)
-            return nearest(features, centroids, alive)
+            counts, sums = segment_counts(occupied, labels, m), segment_sum(filled, labels, m)
+            centroids = sums / jnp.maximum(counts, 1).astype(features.dtype)[:, None]
+            return nearest(features, centroids, counts > 0)
 
         labels = jax.lax.fori_loop(0, self.num_iterations, iterate, labels)
         return labels, mixture.memory
@@ -81,17 +83,6 @@ def farthest_first(
     nowhere_near = jnp.full(features.shape[0], jnp.inf, features.dtype)
     _, seeds = jax.lax.scan(add, (nowhere_near, first), length=num_seeds)
     return seeds
-
-
-def _centroids(
-    features: Float[Array, "n k"],
-    occupied: Bool[Array, " n"],
-    labels: Int[Array, " n"],
-    num_components: int,
-) -> tuple[Float[Array, "m k"], Bool[Array, " m"]]:
-    counts = segment_counts(occupied, labels, num_components)
-    sums = segment_sum(jnp.where(occupied[:, None], features, 0.0), labels, num_components)
-    return sums / jnp.maximum(counts, 1).astype(features.dtype)[:, None], counts > 0
 
 
 def nearest(

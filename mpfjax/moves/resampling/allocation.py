@@ -50,7 +50,9 @@ def allocate_slots(
     pool = num_slots - jnp.sum(kept, dtype=jnp.int32)
     sharers = jnp.maximum(jnp.sum(due, dtype=jnp.int32), 1)
     if demands is None:
-        share = _evenly(pool, due, sharers)
+        # One more for the first ones if it does not divide evenly.
+        share = jax.lax.div(pool, sharers)  # neither is negative
+        share += (few_upto(due) - 1 < pool - share * sharers).astype(jnp.int32)
     else:
         first = jnp.minimum(pool // sharers, 1)
         share = first + _in_proportion(pool - first * sharers, due, demands)
@@ -102,15 +104,6 @@ def demands_of_groups(
     group = component_groups(mixture, groups)
     rivals = jnp.sum((group[:, None] == group[None]) & due[None], axis=1)
     return 1 / jnp.maximum(rivals, 1).astype(mixture.log_weights.dtype)
-
-
-def _evenly(
-    pool: Int[Array, ""], due: Bool[Array, " m"], sharers: Int[Array, ""]
-) -> Int[Array, " m"]:
-    """The same number for each, and one more for the first ones if it does not divide evenly."""
-    rank = few_upto(due) - 1
-    share = jax.lax.div(pool, sharers)  # neither is negative
-    return share + (rank < pool - share * sharers).astype(jnp.int32)
 
 
 def _in_proportion(

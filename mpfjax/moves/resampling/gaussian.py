@@ -71,13 +71,10 @@ class GaussianRegeneration(AbstractResampling):
         drawn = self._draw(key_noise, self._redrawn(mixture.particles), mixture, vacated)
         if self.where is not None:
             drawn = eqx.tree_at(self.where, vacated.particles, drawn)
-        return self._in_line(vacated, drawn)
-
-    def _in_line(self, vacated: ParticleMixture, drawn: PyTree) -> ParticleMixture:
-        """The mixture of these draws, ordered if the next noise is a point set over its slots."""
         mixture = vacated.replace(particles=drawn, ancestor_indices=no_ancestors(vacated))
         if self.noise != "rqmc":
             return mixture
+        # The next noise is a point set over its slots.
         labels = mixture.component_indicators
         labels = jnp.where(mixture.occupied, labels, mixture.num_components)
         own = lambda particles: flatten_states(self._redrawn(particles))  # noqa: E731

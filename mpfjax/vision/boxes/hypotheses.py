@@ -141,7 +141,11 @@ class ObjectExclusion(AbstractExclusion):
         filled = mixture.occupied.astype(centres.dtype)[:, None]
         counts = jnp.maximum(mixture.component_sums(filled), 1.0)
         means = mixture.component_sums(filled * centres) / counts
-        shares = jnp.exp(_log_shares(mixture, owners)).astype(centres.dtype)
+        # Of each component in the mass of its object.
+        masses = mixture.log_mixture_weights
+        rivals = jnp.where(owners[:, None] == owners[None], masses[None], -jnp.inf)
+        shares = jnp.where(mixture.active, masses - jax.nn.logsumexp(rivals, axis=1), -jnp.inf)
+        shares = jnp.exp(shares).astype(centres.dtype)
         squares = jnp.sum((centres[:, None] - means[None]) ** 2, axis=-1)
         nearness = shares[None] * self.nearness(squares)
         others = states.reference[:, None] != owners[None]
@@ -162,10 +166,3 @@ def best_components(
 def component_references(mixture: ParticleMixture) -> Int[Array, " m"]:
     """The reference of each component."""
     return component_groups(mixture, mixture.particles.reference)
-
-
-def _log_shares(mixture: ParticleMixture, owners: Int[Array, " m"]) -> Float[Array, " m"]:
-    """log of each component's share of the mass of its object, -inf for a dead one."""
-    masses = mixture.log_mixture_weights
-    rivals = jnp.where(owners[:, None] == owners[None], masses[None], -jnp.inf)
-    return jnp.where(mixture.active, masses - jax.nn.logsumexp(rivals, axis=1), -jnp.inf)

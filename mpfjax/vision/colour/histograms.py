@@ -141,12 +141,10 @@ def _table(
         return below, below
 
     table = jax.lax.scan(add_row, above, bins)[1]
-    return jax.lax.fori_loop(1, columns, _add_to_column, table) if soon else table
-
-
-def _add_to_column(column: Int[Array, ""], table: Array) -> Array:
-    """The table, with the column to the left added to this one."""
-    return table.at[:, column].add(table[:, column - 1])
+    if not soon:
+        return table
+    add_left = lambda k, table: table.at[:, k].add(table[:, k - 1])  # noqa: E731
+    return jax.lax.fori_loop(1, columns, add_left, table)
 
 
 def _stored_bins(num_bins: int, num_channels: int) -> int:

@@ -123,7 +123,9 @@ def open_video(
 
         def append(frame: np.ndarray) -> None:
             nonlocal file, stream
-            frame = _even(frame)
+            # The pixel format of an MP4 needs an even height and width.
+            height, width, _ = frame.shape
+            frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             if stream is None:
                 file = opened.enter_context(library.open(str(path), "w"))
                 stream = file.add_stream("libx264", rate=rate, options=_X264)
@@ -165,12 +167,6 @@ def of_one_kind(
                 f" and those before it {shape[1]} x {shape[0]}"
             )
         yield frame
-
-
-def _even(frame: np.ndarray) -> np.ndarray:
-    """Pad to an even height and width, which the pixel format of an MP4 needs."""
-    height, width, _ = frame.shape
-    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
 def _image_paths(folder: Path) -> list[Path]:

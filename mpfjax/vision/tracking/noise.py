@@ -19,6 +19,7 @@ _RIVALS = _GRID.T[:, None, :, None]  # for all objects and coordinates
 _PRIOR = np.array(
     [(0.03, 0.03, 0.04, 0.04), (0.02, 0.015, 0.03, 0.02), (0.01, 0.006, 0.003, 0.003)], np.float32
 )
+_LOG_GRID, _LOG_PRIOR = np.log(_RIVALS[:, 0]), np.log(_PRIOR)[:, None]
 _DOUBTS = np.array([0.7, 0.7, 0.9], np.float32)
 # The deviation of a newborn object's velocity at 25 frames a second, and at most times as large.
 _SPEED, _MOST = np.array([0.1, 0.05, 0.05, 0.03], np.float32), 2.5
@@ -102,7 +103,9 @@ class NoiseState(NamedTuple):
         moments = begun.where(born, posterior.where(detected, moments))
         squares, newborn = self._speeds(grown, objects)
         speed = jnp.sqrt((_NEWBORN * self.start**2 + squares) / (_NEWBORN + newborn))
-        errors, place, velocity = _believed(evidence)
+        log_prior = -0.5 * np.sum(((_LOG_GRID - _LOG_PRIOR) / _DOUBTS[:, None, None]) ** 2, axis=0)
+        believed = jax.nn.softmax(evidence + log_prior, axis=0)
+        errors, place, velocity = jnp.exp(jnp.sum(believed[None] * _LOG_GRID, axis=1))
         noises = Noises(errors, place, velocity, speed)
         return NoiseState(moments, evidence, squares, newborn, self.start, noises)
 
@@ -119,10 +122,3 @@ class NoiseState(NamedTuple):
         kept = (1 - 1 / _LATEST) ** number
         total = jnp.sum(jnp.where(grown[:, None], trust * squares, 0.0), axis=0)
         return kept * self.squares + total, kept * self.newborn + number
-
-
-def _believed(evidence: Float[Array, "l 4"]) -> Float[Array, "3 4"]:
-    """The geometric mean of each noise under the posterior of the candidates."""
-    grid = np.log(_RIVALS[:, 0])
-    log_prior = -0.5 * np.sum(((grid - np.log(_PRIOR)[:, None]) / _DOUBTS[:, None, None]) ** 2, 0)
-    return jnp.exp(jnp.sum(jax.nn.softmax(evidence + log_prior, axis=0)[None] * grid, axis=1))
