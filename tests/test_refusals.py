@@ -389,7 +389,7 @@ REFUSED = (
     ("log_initial: shape", lambda: exact.grid_filter(MODEL, TWO, np.linspace(-1, 1, 9), TWO)),
     # scores
     ("weights: shape", lambda: metrics.crps(np.ones((2, 3)), np.ones((2, 4)), TWO)),
-    (r"observations: shape \(3,\) is not \(2,\)",
+    (r"observations: shape \(3,\) is not \(2\)",
      lambda: metrics.crps(np.ones((2, 3)), np.ones((2, 3)), THREE)),
     ("truth: shape", lambda: metrics.tracking_quality(np.ones((2, 3, 1, 4)), np.ones((2, 1, 4)))),
     ("tracks: id 1 has more than one box in frame 1",
@@ -443,7 +443,7 @@ REFUSED = (
     ("IslandInteraction leaves no particle one parent", lambda: Filter(MODEL, [Propagate(MODEL),
         mpfjax.Every(2, [IslandInteraction()]), mpfjax.RandomWalkMetropolis(MODEL)], 4)),
     ("model: .* is conditionally linear", lambda: Reweight(SWITCHING, 0.5)),
-    ("order: ", lambda: mpfjax.partitioned_sampling(JOINT, 10, (0, 0))),
+    ("orders: ", lambda: mpfjax.partitioned_sampling(JOINT, 10, (0, 0))),
     ("orders: 2 of them, for 1 components",
      lambda: run(Filter(JOINT, [mpfjax.Partitioned(JOINT, [(0, 1), (1, 0)])], 4))),
     ("mixture: 2 components, not one",
