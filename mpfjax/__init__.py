@@ -28,6 +28,7 @@ from mpfjax.models.linear import LinearGaussianModel as LinearGaussianModel
 from mpfjax.models.linear import SwitchingLinearGaussianModel as SwitchingLinearGaussianModel
 from mpfjax.models.multi_object import MultiObjectModel as MultiObjectModel
 from mpfjax.models.multi_object import PairwiseRepulsion as PairwiseRepulsion
+from mpfjax.models.observations import Series as Series
 from mpfjax.models.quadratic import QuadraticModel as QuadraticModel
 from mpfjax.models.trial import check_model as check_model
 from mpfjax.moves.base import AbstractMarkovMove as AbstractMarkovMove
@@ -56,7 +57,6 @@ from mpfjax.moves.regrouping.split import Split as Split
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample as AuxiliaryResample
 from mpfjax.moves.resampling.gaussian import GaussianRegeneration as GaussianRegeneration
 from mpfjax.moves.resampling.resample import Resample as Resample
-from mpfjax.observations import Series as Series
 from mpfjax.operations.compiling import keep_programs as keep_programs
 from mpfjax.operations.random import normal as normal
 from mpfjax.proposals import AbstractProposal as AbstractProposal

@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from mpfjax.checks import kinds, shown
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, saying_that_none_were_given, with_inputs
+from mpfjax.models.observations import Fault, faults_of
 from mpfjax.moves.base import AbstractMove, Moves, name_of, with_inner, without_dead
 from mpfjax.moves.eve_indices import EVE_INDICES, evidence_variance, mass_variances
-from mpfjax.observations import Fault, faults_of
 from mpfjax.operations.logarithms import (
     excess_over_islands,
     island_index,

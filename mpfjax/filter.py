@@ -26,9 +26,9 @@ from mpfjax.checks import Count, checked
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import AbstractStateSpaceModel, saying_that_none_were_given
 from mpfjax.models.noise import Noise
+from mpfjax.models.observations import one_input, one_observation, raise_faults
 from mpfjax.moves.base import AbstractMove, as_moves, initial_memory
 from mpfjax.moves.initial import sample_initial
-from mpfjax.observations import one_input, one_observation, raise_faults
 from mpfjax.operations.compiling import jit_with_floats_traced
 from mpfjax.operations.random import split, split_keys
 from mpfjax.operations.stored import drawn_once

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mpfjax
-from mpfjax.observations import Series
+from mpfjax.models.observations import Series
 from mpfjax.running.scan import scan
 from tests.precision import float64
 from tests.registry import CHAINS, QUICK_CHAINS

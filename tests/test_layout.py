@@ -9,7 +9,7 @@ import mpfjax
 PACKAGE = Path(__file__).resolve().parents[1] / "mpfjax"
 # From the ground up: each part may import from those above it here, and from itself.
 ORDER = """
-    checks operations mixture models proposals moves observations chain filter running lookahead
+    checks operations mixture models proposals moves chain filter running lookahead
     transforms filters smoothing console exact metrics vision tuning plotting command __main__
 """
 # Inside the folders that hold several floors: files, and folders.

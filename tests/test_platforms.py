@@ -9,7 +9,7 @@ import pytest
 from jax import export
 
 import mpfjax
-from mpfjax.observations import Series
+from mpfjax.models.observations import Series
 from mpfjax.operations import stored as forms
 from mpfjax.operations.prefix_sums import count_upto, exact_sum_before, sum_before
 from mpfjax.operations.stored import stored

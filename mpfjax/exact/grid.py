@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, PyTree
 from mpfjax.checks import real_arrays, shown
 from mpfjax.models.base import check_log_density, require, saying_that_none_were_given, with_inputs
 from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.observations import Series, as_series
 from mpfjax.models.steps import likelihoods
-from mpfjax.observations import Series, as_series
 from mpfjax.operations.logarithms import log_or_nothing, log_sum_exp, softmax
 
 

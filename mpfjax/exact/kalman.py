@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PyTree
 from mpfjax.checks import as_numbers, check_shape, checked
 from mpfjax.models.base import with_inputs
 from mpfjax.models.linear import LinearGaussianModel
-from mpfjax.observations import Series, gathered, steps_of_inputs
+from mpfjax.models.observations import Series, gathered, steps_of_inputs
 from mpfjax.operations.matrices import cholesky
 
 

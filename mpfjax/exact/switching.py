@@ -15,7 +15,7 @@ from mpfjax.exact.kalman import (
     smoothed_moments,
 )
 from mpfjax.models.linear import SwitchingLinearGaussianModel
-from mpfjax.observations import Series
+from mpfjax.models.observations import Series
 from mpfjax.operations.logarithms import log_sum_exp
 
 

@@ -18,9 +18,9 @@ from mpfjax.mixture import flatten_states
 from mpfjax.models.base import is_made_of_noise, mapped, require_noise
 from mpfjax.models.conditionally_linear import is_mixed, with_moments
 from mpfjax.models.noise import noise_dtype
+from mpfjax.models.observations import as_series
 from mpfjax.models.steps import noise_dimension
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
-from mpfjax.observations import as_series
 from mpfjax.running.run import run_filter
 
 # So many times the particles of a run in each pass.

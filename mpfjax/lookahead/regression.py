@@ -13,8 +13,8 @@ from mpfjax.lookahead.quadratics import LocalQuadratics
 from mpfjax.lookahead.twisted import Twist
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.conditionally_linear import with_moments
+from mpfjax.models.observations import Series
 from mpfjax.models.steps import completed, made_of, noise_dimension, seen
-from mpfjax.observations import Series
 from mpfjax.running.scan import FilterRun
 
 # The effective number of particles for each coefficient of a regression.

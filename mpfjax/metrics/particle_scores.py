@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 from mpfjax.checks import NOT_NEGATIVE, POSITIVE, check_shape, checked, real_arrays
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.models.base import AbstractStateSpaceModel
+from mpfjax.models.observations import one_observation
 from mpfjax.models.steps import likelihoods
-from mpfjax.observations import one_observation
 from mpfjax.operations.logarithms import log_sum_exp
 
 

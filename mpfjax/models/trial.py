@@ -23,8 +23,8 @@ from mpfjax.models.base import (
     with_inputs,
 )
 from mpfjax.models.conditionally_linear import is_mixed, with_moments
+from mpfjax.models.observations import one_input, one_observation, steps_of_inputs
 from mpfjax.models.steps import drawn_part, likelihoods, log_transition, moved
-from mpfjax.observations import one_input, one_observation, steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 _KEYS, _PLACES, _DRAWS = 64, 4, 32  # of the draws that must differ

@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Key, PyTree
 from mpfjax.checks import Count, Share, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
+from mpfjax.models.observations import as_series
 from mpfjax.moves.base import AbstractMove
-from mpfjax.observations import as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.logarithms import (
     DEVICE_AXIS,

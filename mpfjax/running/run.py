@@ -10,8 +10,8 @@ from jaxtyping import Array, Key, PyTree
 from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
+from mpfjax.models.observations import as_series
 from mpfjax.moves.eve_indices import EVE_INDICES, with_new_eve_indices
-from mpfjax.observations import as_series
 from mpfjax.operations.compiling import is_traced, jit_on_wide_vectors, with_floats_traced
 from mpfjax.running.devices import choose_devices, num_processors, over_devices, over_threads
 from mpfjax.running.scan import FilterRun, first_mixture, initial_keys, scan, sound

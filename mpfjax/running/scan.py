@@ -15,7 +15,7 @@ from mpfjax.chain import BROKEN_DENSITY
 from mpfjax.checks import saying
 from mpfjax.filter import Filter, StepInfo
 from mpfjax.mixture import ParticleMixture
-from mpfjax.observations import Series
+from mpfjax.models.observations import Series
 from mpfjax.operations.logarithms import num_islands
 from mpfjax.operations.random import split, split_for_run, split_keys
 

@@ -21,7 +21,7 @@ from tqdm import tqdm
 from mpfjax.checks import Checked, Count, check, checked, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
-from mpfjax.observations import as_series, check_series
+from mpfjax.models.observations import as_series, check_series
 from mpfjax.operations.logarithms import default_float
 from mpfjax.running.run import monte_carlo
 from mpfjax.running.scan import FilterRun

@@ -13,9 +13,9 @@ from mpfjax.checks import checked, kinds
 from mpfjax.filter import Filter
 from mpfjax.models.base import AbstractStateSpaceModel, model_name, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.observations import Series, as_arrays, as_series
 from mpfjax.moves.conditional import REFERENCE, ConditionalPropagation, Reference, at, put
 from mpfjax.moves.initial import sample_initial
-from mpfjax.observations import Series, as_arrays, as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.random import split, uniform
 from mpfjax.running.scan import FilterRun, initial_keys, scan, sound

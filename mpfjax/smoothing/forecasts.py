@@ -12,7 +12,7 @@ from mpfjax.checks import Count, check_one_each, checked, saying
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped
-from mpfjax.observations import steps_of_inputs
+from mpfjax.models.observations import steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 
 

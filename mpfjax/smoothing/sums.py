@@ -16,7 +16,7 @@ from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import mapped, require, with_inputs
 from mpfjax.models.conditionally_linear import refuse_marginalised
-from mpfjax.observations import as_series
+from mpfjax.models.observations import as_series
 from mpfjax.operations.compiling import jit_on_wide_vectors, with_floats_traced
 from mpfjax.operations.logarithms import as_inexact
 from mpfjax.operations.random import split, split_keys

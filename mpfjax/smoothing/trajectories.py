@@ -18,7 +18,7 @@ from mpfjax.models.base import (
     with_inputs,
 )
 from mpfjax.models.conditionally_linear import is_marginalised, is_mixed
-from mpfjax.observations import as_arrays, gathered, steps_of_inputs
+from mpfjax.models.observations import as_arrays, gathered, steps_of_inputs
 from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split_keys
 from mpfjax.operations.stored import take

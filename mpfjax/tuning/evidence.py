@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import kinds
 from mpfjax.filter import Filter
+from mpfjax.models.observations import Series, as_series, gathered
 from mpfjax.moves.base import AbstractMove
-from mpfjax.observations import Series, as_series, gathered
 from mpfjax.proposals import AbstractProposal
 from mpfjax.running.scan import scan
 from mpfjax.tuning.problem import Parameters, Place, Problem, placed, pose

@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from mpfjax.checks import Count, checked, saying, shown
 from mpfjax.filter import Filter
 from mpfjax.models.base import require, with_inputs
+from mpfjax.models.observations import Series
 from mpfjax.models.steps import likelihoods
-from mpfjax.observations import Series
 from mpfjax.running.scan import scan
 from mpfjax.smoothing.backward import log_transitions
 from mpfjax.smoothing.conditional import (

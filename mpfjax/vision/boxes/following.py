@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Key, UInt8
 from mpfjax.checks import Count, CountOrZero, checked, to_rows
 from mpfjax.filter import Filter, step_and_faults
 from mpfjax.mixture import ParticleMixture
-from mpfjax.observations import Fault, one_observation, raise_faults
+from mpfjax.models.observations import Fault, one_observation, raise_faults
 from mpfjax.operations.compiling import cpu_options, in_little_memory, jit_with
 from mpfjax.operations.random import split_once
 from mpfjax.vision.boxes.hypotheses import LearnedColourModel, best_components, component_references
