@@ -344,6 +344,7 @@ class Fitting(Checked):
     def __check_init__(self) -> None:
         super().__check_init__()
         known: dict[str, Any] = {}
+        said: dict[str, str] = {}
         for name, choices in _shapes(type(self)).items():
             shape = getattr(getattr(self, name), "shape", None)
             if shape is None:
@@ -352,7 +353,9 @@ class Fitting(Checked):
             fitting = [own for own in found if own is not None and _agree(own, known)]
             if not fitting:
                 shapes = " or ".join(f"({', '.join(axes)})" for axes in choices)
-                raise ValueError(f"{name}: shape {shape} is not {shapes}, where {known}")
+                known_by = ", ".join(f"{word} is {known[word]} by {said[word]}" for word in known)
+                raise ValueError(f"{name}: shape {shape} is not {shapes}, where {known_by}")
+            said = dict.fromkeys(fitting[0], name) | said
             known |= fitting[0]
 
 
