@@ -6,7 +6,10 @@ import multiprocessing
 import os
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -18,9 +21,14 @@ from benchmarks.peers import libraries
 from benchmarks.peers.jobs import JOBS
 
 
-def process() -> ProcessPoolExecutor:
+@contextmanager
+def process() -> Iterator[ProcessPoolExecutor]:
     """One that starts anew, and keeps what it has made from one call to the next."""
-    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _silent)
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _silent) as pool:
+        yield pool
+        # It does not wait for processes of its own, which joblib leaves.
+        with suppress(BrokenProcessPool):
+            pool.submit(os._exit, 0)
 
 
 def _silent() -> None:
