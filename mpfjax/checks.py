@@ -41,15 +41,6 @@ _MOST = 2**31 - 1
 _ROUNDING = 1e-4
 
 
-def check_numbered(what: str, number: int, /, **arguments: Any) -> None:
-    """Each of the counted things gets a 32-bit index; the arguments are their counts."""
-    if number > _MOST:
-        named = ", ".join(f"{name}: {shown(value)}" for name, value in arguments.items())
-        raise ValueError(
-            f"{named} would need {what} {number}, more than {_MOST}, the most there are"
-        )
-
-
 def is_series(value: Any) -> TypeGuard[Iterable[Any]]:
     """Whether it is an iterable of several things: no text, no mapping, no array."""
     single = str | bytes | dict | np.ndarray | jax.Array

@@ -18,7 +18,6 @@ from mpfjax.checks import (
     POSITIVE,
     Fitting,
     InnerShare,
-    check_shape,
     shown,
     to_array,
 )
@@ -74,7 +73,6 @@ class AbstractDynamics(Fitting):
         self, noise: Float[Array, "n k"], current: Rows, previous: Rows | None = None
     ) -> Rows:
         """x_t given x_{t-1}, and x_{t-2} where the order is 2, made of standard normal noise."""
-        check_shape(f"n {self.noise_dimension}", noise=noise)
         return self.expected(current, previous) + self.step(noise)
 
     def sample(self, key: Key[Array, ""], current: Rows, previous: Rows | None = None) -> Rows:

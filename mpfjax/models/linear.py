@@ -110,7 +110,6 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
         self, noise: Float[Array, "n d"], states: Float[Array, "n d"]
     ) -> Float[Array, "n d"]:
         """x_t ~ N(A x_{t-1} + B u_t, Q)."""
-        check_shape(f"n {self.noise_dimension}", noise=noise)
         return self.transition_mean(states) + noise @ _root(self.Q).T
 
     def log_likelihood(
@@ -231,7 +230,6 @@ class SwitchingLinearGaussianModel(AbstractConditionallyLinearModel, Fitting):
         self, noise: Float[Array, "n 1"], latent: Int[Array, " n"]
     ) -> Int[Array, " n"]:
         """z_t of standard normal numbers."""
-        check_shape("n 1", noise=noise)
         return self._next(jax.scipy.special.ndtr(noise[:, 0]), latent)
 
     def log_transition(

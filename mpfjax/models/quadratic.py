@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from mpfjax.checks import POSITIVE, Finite, Fitting, check_shape, to_array
+from mpfjax.checks import POSITIVE, Finite, Fitting, to_array
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.noise import stratified_uniform
 from mpfjax.operations.random import normal, uniform
@@ -62,7 +62,6 @@ class QuadraticModel(AbstractStateSpaceModel, Fitting):
         self, noise: Float[Array, "n 1"], states: Float[Array, " n"]
     ) -> Float[Array, " n"]:
         """x_t ~ N(x_{t-1}, σ_x²)."""
-        check_shape("n 1", noise=noise)
         return states + self.sigma_x * noise[:, 0]
 
     def log_likelihood(

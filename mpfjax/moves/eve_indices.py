@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mpfjax.checks import check_numbered
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.segments import segment_sum
 from mpfjax.operations.stored import take
@@ -38,7 +37,6 @@ class EveIndices(eqx.Module):
     ) -> Float[Array, "labels n"]:
         """The weight of the descendants of each particle of x_0, by the particles' labels."""
         n = weights.shape[0]
-        check_numbered("families by label up to", num_labels * n, num_particles=n)
         families = labels * n + self.indices
         return segment_sum(weights, families, num_labels * n).reshape(num_labels, n)
 

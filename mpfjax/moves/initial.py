@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Count, check_numbered, shown
+from mpfjax.checks import Count, shown
 from mpfjax.mixture import ParticleMixture, single_component
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -93,7 +93,6 @@ class SelectInitial(AbstractMove):
             return mixture
         key_drawn, key_look, key_kept = split(key, 3)
         num_drawn = self.num_draws * mixture.num_particles
-        check_numbered("draws up to", 2 * num_drawn, num_draws=self.num_draws)
         drawn = sample_initial(key_drawn, self.propagation.model, num_drawn, self.noise)
         pool = single_component(drawn)
         log_factors = self._look(key_look, pool, observation)

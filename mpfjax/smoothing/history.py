@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PyTree
 
-from mpfjax.checks import check_numbered, checked
+from mpfjax.checks import checked
 from mpfjax.mixture import ParticleMixture
 from mpfjax.operations.stored import count_places, take
 from mpfjax.running.scan import FilterRun
@@ -104,7 +104,6 @@ def trace_ancestors(mixtures: FilterRun | ParticleMixture) -> Genealogy:
 def _trace(mixtures: ParticleMixture) -> Genealogy:
     final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
     n, m = final.num_particles, final.num_components
-    check_numbered("ancestors by component up to", (m + 1) * n, num_particles=n)
     indices = ancestors_of(jnp.arange(n, dtype=jnp.int32), mixtures)
 
     def num_ancestors(ancestors: Array) -> Array:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt8
 
-from mpfjax.checks import Count, NotNegative, Positive, Share, check_shape, checked, shown
+from mpfjax.checks import Count, NotNegative, Positive, Share, checked, shown
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.dynamics import AbstractDynamics, RandomWalk
 from mpfjax.operations.random import fast_key
@@ -92,7 +92,6 @@ class AbstractBoxModel(AbstractStateSpaceModel):
 
     def transition_from_noise(self, noise: Float[Array, "n k"], states: BoxState) -> BoxState:
         """The same, made of standard normal noise."""
-        check_shape(f"n {self.noise_dimension}", noise=noise)
         reference = states.reference
         if self.switch_probability > 0:
             # A uniform number below the probability is uniform there, so that it also draws r.
