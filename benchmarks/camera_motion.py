@@ -91,7 +91,6 @@ def accuracy(recording: Recording) -> dict[str, Any]:
     """A row of the first table."""
     import cv2
 
-    threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     flow, moved, errors, known, seconds = OpticalFlow(), [], [], [], []
     centre = np.array([recording.size]) / 2
@@ -113,14 +112,11 @@ def accuracy(recording: Recording) -> dict[str, Any]:
         moved.append((after - before)[seen])
         if known[-1]:
             errors.append((before @ matrix.T + motion.shift - after)[seen])
-    cv2.setNumThreads(threads)
     return {
-        "recording": recording.name,
-        "moved": root_mean_square(moved),
+        "recording": recording.name, "moved": root_mean_square(moved),
         "error": root_mean_square(errors) if errors else None,
-        "known": float(np.mean(known)),
-        "cpu_ms": float(1e3 * np.median(seconds[1:])),
-    }
+        "known": np.mean(known), "cpu_ms": 1e3 * np.median(seconds[1:]),
+    }  # fmt: skip
 
 
 def root_mean_square(gaps: list[np.ndarray]) -> float:
@@ -130,10 +126,9 @@ def root_mean_square(gaps: list[np.ndarray]) -> float:
 
 def scores(recording: Recording, motion: Motion, seeds: range) -> dict[str, Any]:
     """A row of the second table: the tracker's mean scores."""
-    width, height = recording.size
     found = []
     for seed in seeds:
-        match = football.Match(recording.name, 0, height, width)
+        match = football.Match(recording.name, 0, *recording.size[::-1])
         rows = football.detect(match, recording.truth, seed)
         tracked = track(iter(recording.frames), rows, camera_motion=motion)
         kept = np.concatenate([online_rows(t, tracks) for t, tracks in enumerate(tracked, 1)])

@@ -17,7 +17,6 @@ class Coverage(NamedTuple):
     """The scores of `coverage`.
 
     - `all_covered`: the share of frames in which every object is covered by some track.
-    - `per_object`: the share of its frames in which each object is covered, by its id.
     - `on_object`: the share of all boxes of tracks that cover some object.
     - `id_swaps`: how often an object's identity passes from one track to another.
     - `on_other`: the share of all boxes of tracks that cover none of the objects but one of
@@ -25,7 +24,6 @@ class Coverage(NamedTuple):
     """
 
     all_covered: float
-    per_object: dict[int, float]
     on_object: float
     id_swaps: int
     on_other: float = 0.0
@@ -51,7 +49,6 @@ def coverage(
     on_object: list[bool] = []
     on_other: list[bool] = []
     swaps = 0
-    covered: dict[int, list[bool]] = {}
     identity: dict[int, int] = {}
     for frame in np.unique(objects[:, 0]):
         truth, boxes = objects[objects[:, 0] == frame], tracks[tracks[:, 0] == frame]
@@ -62,12 +59,9 @@ def coverage(
         on_other += [
             bool(other.any() and not own.any()) for other, own in zip(strays, hits, strict=True)
         ]
-        for row, column in zip(truth, hits.T, strict=True):
-            covered.setdefault(int(row[1]), []).append(bool(column.any()))
         swaps += _reassign(identity, boxes, truth, hits)
     return Coverage(
         all_covered=float(np.mean(complete)),
-        per_object={id: float(np.mean(hits)) for id, hits in sorted(covered.items())},
         on_object=float(np.mean(on_object)) if on_object else 0.0,
         id_swaps=swaps,
         on_other=float(np.mean(on_other)) if on_other else 0.0,

@@ -2,7 +2,6 @@
 
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,34 +9,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from mpfjax.plotting import COLOURS as COLOURS
-from mpfjax.plotting import MARKERS as MARKERS
-
-_MOST_TICKS = 6
-
-
-@dataclass(frozen=True)
-class ParticleHistory:
-    """The particles of one run over time, (t, n), of a scalar state."""
-
-    positions: np.ndarray
-    occupied: np.ndarray
-    component_indicators: np.ndarray
-    score: float
+from mpfjax.plotting import COLOURS, MARKERS
 
 
 def draw_typical_run(
-    histories: Mapping[str, ParticleHistory],
+    histories: Mapping[str, Mapping[str, Any]],
     truth: np.ndarray,
     observations: np.ndarray,
     labels: Mapping[str, str],
 ) -> Figure:
-    """Figure 1 of Vermaak et al. (2003): the data, and every filter's particles over time."""
-    num_rows = 1 + len(histories)
+    """Figure 1 of Vermaak et al. (2003): the data, and every filter's particles over time.
+
+    A history has the particles of one run, `positions`, `occupied` and `component_indicators`
+    (t, n), and its `score`.
+    """
     figure = Figure(figsize=(7.0, 1.6 + 2.1 * len(histories)), layout="constrained")
     axes = figure.subplots(
-        num_rows, 1, sharex=True, squeeze=False, height_ratios=[1.3] + [2.0] * len(histories)
-    )[:, 0]
+        1 + len(histories), sharex=True, height_ratios=[1.3] + [2.0] * len(histories)
+    )
     times = np.arange(1, len(truth) + 1)
     axes[0].plot(times, truth, color="black", label="true state $x^*_t$")
     axes[0].plot(times, observations, ".", color=COLOURS[4], ms=4, label="observations $y_t$")
@@ -45,31 +34,25 @@ def draw_typical_run(
     axes[0].legend(loc="lower left", fontsize=8, ncols=2, framealpha=0.9)
     for axis, (name, history) in zip(axes[1:], histories.items(), strict=True):
         _draw_history(axis, history, truth)
-        num_particles = history.positions.shape[1]
-        axis.set_title(
-            f"{labels[name]}, N = {num_particles}: both modes at"
-            f" {100 * history.score:.0f}% of the steps",
-            fontsize=10,
-        )
+        title = f"{labels[name]}, N = {history['positions'].shape[1]}: both modes at"
+        axis.set_title(f"{title} {100 * history['score']:.0f}% of the steps", fontsize=10)
     axes[-1].set_xlabel("time step $t$")
     return figure
 
 
-def _draw_history(axis: Axes, history: ParticleHistory, truth: np.ndarray) -> None:
-    times = np.broadcast_to(np.arange(1, len(truth) + 1)[:, None], history.positions.shape)
-    for component in np.unique(history.component_indicators):
-        chosen = history.occupied & (history.component_indicators == component)
+def _draw_history(axis: Axes, history: Mapping[str, Any], truth: np.ndarray) -> None:
+    positions, owners = history["positions"], history["component_indicators"]
+    steps = np.arange(1, len(truth) + 1)
+    times = np.broadcast_to(steps[:, None], positions.shape)
+    for component in np.unique(owners):
+        chosen = history["occupied"] & (owners == component)
         axis.plot(
-            times[chosen], history.positions[chosen], MARKERS[component % len(MARKERS)], ms=2.0,
+            times[chosen], positions[chosen], MARKERS[component % len(MARKERS)], ms=2.0,
             mew=0, alpha=0.5, color=COLOURS[component % len(COLOURS)],
             label=f"particles of component {component + 1}",
         )  # fmt: skip
-    for sign in (1, -1):
-        axis.plot(
-            np.arange(1, len(truth) + 1), sign * truth, color="black", lw=0.9,
-            ls="-" if sign == 1 else "--",
-            label=r"mode at $x^*_t$" if sign == 1 else r"mode at $-x^*_t$",
-        )  # fmt: skip
+    for sign, line, name in ((1, "-", "$x^*_t$"), (-1, "--", "$-x^*_t$")):
+        axis.plot(steps, sign * truth, color="black", lw=0.9, ls=line, label=f"mode at {name}")
     axis.set_ylabel("state $x_t$")
     axis.set_ylim(-2.9, 3.6)  # the legend stands above the modes
     axis.legend(
@@ -80,27 +63,26 @@ def _draw_history(axis: Axes, history: ParticleHistory, truth: np.ndarray) -> No
 
 def draw_scores(results: Sequence[Mapping[str, Any]], labels: Mapping[str, str]) -> Figure:
     """Figure 2 of Vermaak et al. (2003), and the error of the modes' mass beside it."""
-    entries: list[dict[str, Any]] = []
-    for entry in sorted(results, key=lambda entry: list(labels).index(entry["filter"])):
-        mean, std = np.mean(entry["scores"]), np.std(entry["scores"])
-        weight, spread = entry["weight_mean"], entry["weight_std"]
-        entries.append({
-            "label": labels[entry["filter"]], **entry, "weight_low": weight - spread,
-            "weight_high": weight + spread,
-            # A score lies in [0, 1]: the bars end there too.
-            "score": mean, "low": max(mean - std, 0), "high": min(mean + std, 1),
-        })  # fmt: skip
+    entries = sorted(results, key=lambda entry: list(labels).index(entry["filter"]))
     mixtures = [entry for entry in entries if entry["filter"] != "pf"]
-    at, x, limits = ("label", "particles"), "number of particles $N$", (-0.03, 1.06)
+
+    def score(entry: Mapping[str, Any], k: int) -> float:
+        # A score lies in [0, 1]: the bars end there too.
+        return float(np.clip(np.mean(entry["scores"]) + k * np.std(entry["scores"]), 0, 1))
+
+    scores = [lambda e, k=k: score(e, k) for k in (0, -1, 1)]
+    weights = [lambda e, k=k: e["weight_mean"] + k * e["weight_std"] for k in (0, -1, 1)]
+    at = (lambda e: labels[e["filter"]], "particles")
+    x, limits = "number of particles $N$", (-0.03, 1.06)
     panels = [
         Panel(
             f"score, mean ± std of {len(results[0]['scores'])} runs", x,
             "share of steps with both modes",
-            lines_of(entries, *at, "score", "low", "high"), limits,
+            lines_of(entries, *at, *scores), limits,
         ),
         Panel(
             "weight of component one, mean ± std", x, r"mixture weight $\pi_1$",
-            lines_of(mixtures, *at, "weight_mean", "weight_low", "weight_high"), limits,
+            lines_of(mixtures, *at, *weights), limits,
         ),
         Panel(
             "RMS error of the upper mode's mass", x,
@@ -141,95 +123,6 @@ def region(points: np.ndarray, sizes: np.ndarray, shape: Sequence[int]) -> tuple
     left, top = (points.min(axis=0) - margin).astype(int)
     right, bottom = (points.max(axis=0) + margin).astype(int)
     return slice(max(top, 0), min(bottom, shape[0])), slice(max(left, 0), min(right, shape[1]))
-
-
-def draw_curves(
-    curves: Mapping[str, np.ndarray], first: int, *, xlabel: str, ylabel: str, title: str
-) -> Figure:
-    """Named curves over frames, (seeds, t) each: the mean over seeds, and a band of one std."""
-    figure = Figure(figsize=(7.0, 3.4), layout="constrained")
-    axis = figure.subplots()
-    for index, (name, values) in enumerate(curves.items()):
-        frames, mean, spread = first + np.arange(values.shape[1]), values.mean(0), values.std(0)
-        axis.plot(
-            frames, mean, label=name, lw=1.4, color=COLOURS[index], marker=MARKERS[index],
-            markevery=(3 * index, 12), ms=5,
-        )  # fmt: skip
-        axis.fill_between(
-            frames, mean - spread, mean + spread, color=COLOURS[index], alpha=0.15, lw=0
-        )
-    axis.set(xlabel=xlabel, ylabel=ylabel)
-    axis.set_ylim(bottom=0)
-    axis.set_title(title, fontsize=10)
-    axis.grid(alpha=0.25)
-    axis.legend(fontsize=8, ncols=len(curves), loc="upper right")
-    return figure
-
-
-def draw_object_bars(rows: Mapping[str, Sequence[np.ndarray]], titles: Sequence[str]) -> Figure:
-    """Figures 4 and 8 of Smith and Gatica-Perez (2004): a bar for each object.
-
-    There is a row for each filter, by name, with a panel for each of the `titles`. A panel shows an
-    array of one value for each object. Panels below each other share their axes.
-    """
-    figure = Figure(figsize=(3.1 * len(titles), 0.4 + 1.5 * len(rows)), layout="constrained")
-    axes = figure.subplots(len(rows), len(titles), squeeze=False, sharex=True, sharey="col")
-    for row, (name, panels) in zip(axes, rows.items(), strict=True):
-        row[0].set_ylabel(
-            textwrap.fill(name.replace(" {", "\n{"), 20, replace_whitespace=False), fontsize=8
-        )
-        for index, (axis, values) in enumerate(zip(row, panels, strict=True)):
-            objects = np.arange(1, len(values) + 1)
-            bars = axis.bar(objects, values, color=COLOURS[index], width=0.7)
-            axis.bar_label(bars, fmt="%.0f", fontsize=7)
-            axis.set_xticks(objects)
-            axis.margins(y=0.18)
-    for axis, title in zip(axes[0], titles, strict=True):
-        axis.set_title(title, fontsize=9)
-    for axis in axes[-1]:
-        axis.set_xlabel("object")
-    return figure
-
-
-def draw_optimisations(
-    sigmas_x: np.ndarray,
-    sigmas_y: np.ndarray,
-    log_likelihood: np.ndarray,
-    paths: Sequence[np.ndarray],
-    best: np.ndarray,
-) -> Figure:
-    """Paths of a tuning, (steps, 2) each, on the log marginal likelihood of σ_x and σ_y.
-
-    `log_likelihood` has a row for each σ_y; `best` is the exact maximum.
-    """
-    figure = Figure(figsize=(6.2, 5.0), layout="constrained")
-    axis = figure.subplots()
-    below = np.max(log_likelihood) - log_likelihood
-    levels = [0.5, 2, 5, 10, 20, 50, 100, 200, 500, 1000]
-    lines = axis.contour(sigmas_x, sigmas_y, below, levels, colors="0.7", linewidths=0.8)
-    axis.clabel(lines, fmt="-%g", fontsize=7)
-    for index, path in enumerate(paths):
-        colour = COLOURS[index % len(COLOURS)]
-        axis.plot(path[:, 0], path[:, 1], color=colour, lw=1.0, alpha=0.8)
-        axis.plot(*path[0], MARKERS[index % len(MARKERS)], color=colour, ms=4)
-    axis.plot(*best, "*", color="black", ms=13, label="exact maximum", zorder=3)
-    axis.set(xscale="log", yscale="log", xlabel=r"$\sigma_x$", ylabel=r"$\sigma_y$")
-    for one, sigmas in ((axis.xaxis, sigmas_x), (axis.yaxis, sigmas_y)):
-        ticks = [tick for tick in (0.03, 0.05, 0.1, 0.2, 0.5) if sigmas[0] <= tick <= sigmas[-1]]
-        one.set_ticks(ticks, labels=[str(tick) for tick in ticks])
-    axis.minorticks_off()
-    axis.set_title(
-        "log marginal likelihood below its maximum, and optimisations to it", fontsize=10
-    )
-    axis.legend(fontsize=8, loc="lower left")
-    return figure
-
-
-def standard_error(values: np.ndarray) -> np.ndarray:
-    """s / √n of runs, (n, ...), with n - 1 in s²; NaN, which draws nothing, where n is 1."""
-    if len(values) < 2:
-        return np.full(values.shape[1:], np.nan)
-    return np.asarray(values.std(axis=0, ddof=1) / np.sqrt(len(values)))
 
 
 class Panel(NamedTuple):
@@ -300,7 +193,7 @@ def _draw_panel(axis: Axes, panel: Panel, names: Sequence[str], scales: tuple[st
         index = names.index(name)
         style: dict[str, Any] = {
             "label": name, "color": COLOURS[index % len(COLOURS)], "lw": 1.4, "ms": 5,
-            "marker": MARKERS[index % len(MARKERS)],
+            "marker": MARKERS[index % len(MARKERS)], "markevery": 1 + len(points) // 12,
         }  # fmt: skip
         x, y, *ends = np.array(sorted(points)).T
         if ends:
@@ -313,14 +206,10 @@ def _draw_panel(axis: Axes, panel: Panel, names: Sequence[str], scales: tuple[st
             axis.plot(x, y, **style)
     axis.set(xscale=scales[0], yscale=scales[1], xlabel=panel.xlabel, ylabel=panel.ylabel)
     axis.set_title(textwrap.fill(panel.title, 50), fontsize=10)
-    if len(ticks) <= _MOST_TICKS:
-        whole = [f"{tick:,.0f}".replace(",", "\u2009") for tick in ticks]
-        labels = [
-            name if tick == int(tick) else f"{tick:g}"
-            for name, tick in zip(whole, ticks, strict=True)
-        ]
+    if len(ticks) <= 6:
+        labels = [f"{tick:,.10g}".replace(",", "\u2009") for tick in ticks]
         axis.set_xticks(ticks, labels, fontsize=8)
-    else:  # times, of which every point has its own
+    elif scales[0] == "log":  # times, of which every point has its own
         axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
         axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_locator(NullLocator())

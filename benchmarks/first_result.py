@@ -151,7 +151,9 @@ def jobs(scene: Path, out: Path, data: Path) -> dict[str, Arguments]:
         return "-m", "mpfjax", "track", str(source), "--out", str(out), *options
 
     first, only = scene / "first", ("--no-video",)
-    box = f"--box={_first_box(scene / 'gt.txt')}"
+    truth = np.loadtxt(scene / "gt.txt", delimiter=",", max_rows=8)
+    inside = truth[(truth[:, 2:4] >= 0).all(axis=1)][0]
+    box = f"--box={','.join(f'{value:.0f}' for value in inside[2:6])}"
     found = {"import mpfjax": ("-c", "import mpfjax")}
     found |= {name: ("-c", _BEGIN + call + _END) for name, call in calls.items()}
     found |= {
@@ -166,13 +168,6 @@ def jobs(scene: Path, out: Path, data: Path) -> dict[str, Arguments]:
         found[name] = track(pets, "--detections", str(pets / "det.txt"))
     command = "-m", "benchmarks.score_vs_particles", "--out", str(out)
     return found | {"README's first command": command}
-
-
-def _first_box(truth: Path) -> str:
-    """The first object of the first frame that is wholly inside it, as --box takes it."""
-    rows = np.loadtxt(truth, delimiter=",")
-    inside = (rows[:, 0] == 1) & (rows[:, 2] >= 0) & (rows[:, 3] >= 0)
-    return ",".join(f"{value:.0f}" for value in rows[inside][0, 2:6])
 
 
 def render(folder: Path) -> Path:

@@ -1,4 +1,4 @@
-"""Lin et al. (2012), figures 1 to 6 and table 1: PF, GPF, MPF and GM-MPF on two targets.
+"""Lin et al. (2012), figures 1 to 4 and table 1: PF, GPF, MPF and GM-MPF on two targets.
 
     python -m benchmarks.gm_mpf                       # pets09_s2l1, or a rendered scene
     python -m benchmarks.gm_mpf --sequence DIR --ids 3 5 --frames 1:80
@@ -102,28 +102,24 @@ def main(
         errors = errors_of(step.estimates, targets.truth[:, :, :2])
         results.append({
             "filter": name, "name": NAMES[name], "particles": size, "rmse": errors.mean(axis=0),
-            "rmse_std": errors.std(axis=0), "rmse_error": plotting.standard_error(errors),
-            "both_held": held(step, targets.truth).mean(),
+            "rmse_std": errors.std(axis=0), "both_held": held(step, targets.truth).mean(),
             "n_eff": step.effective_sample_size.mean(),
         })  # fmt: skip
         if name in own:
             errors = errors_of(step.estimates, own[name])
-            results[-1] |= {
-                "monte_carlo_error": errors.mean(axis=0),
-                "monte_carlo_error_error": plotting.standard_error(errors),
-            }
+            results[-1]["monte_carlo_error"] = errors.mean(axis=0)
         content = {"timing": timing, "profile": profile, "results": results}
         harness.data(out / "gm_mpf.json", settings=settings, **content)
     print(f"\ntwo targets of {targets.name}, {seeds} seeds; the reference has N = {reference}")
     print(harness.table(COLUMNS, results))
-    curves = {NAMES[name]: step.effective_sample_size for name, step in steps.items()}
+    curves = {
+        NAMES[name]: [*enumerate(step.effective_sample_size.mean(axis=0), targets.first)]
+        for name, step in steps.items()
+    }
+    sizes = plotting.Panel(f"mean of the seeds, N = {particles[0]}", "frame", "eq. 14", curves)
     harness.figures(
         out, dpi=130, particle_migration=draw_migration(steps, targets),
-        effective_sample_size=plotting.draw_curves(  # figures 3 and 4
-            curves, targets.first, xlabel="frame", ylabel=r"effective sample size $N_{eff}$",
-            title=f"eq. 14, N = {particles[0]}, mean ± std over seeds",
-        ),
-        rmse=draw_errors(results),
+        effective_sample_size=plotting.draw_panels([[sizes]], ("linear", "linear")),
     )  # fmt: skip
     print(f"written to {out}")
 
@@ -346,30 +342,6 @@ def _annotated(still: np.ndarray, step: Step, t: int, crop: tuple[slice, slice])
     places, colours = zoom * (step.centres[0, t] - corner), drawing.PALETTE[step.target[0, t]]
     drawing.draw_points(canvas, places, colours, 0.9 * zoom)
     return np.clip(canvas, 0, 255).astype(np.uint8)
-
-
-def draw_errors(results: list[dict[str, Any]]) -> Any:
-    """Figures 5 and 6: each target's error against the number of particles.
-
-    Below, what of it is the Monte Carlo error of the mixtures.
-    """
-
-    def panel(what: str, measure: str, target: int) -> plotting.Panel:
-        entries = [entry for entry in results if measure in entry]
-        axes = (
-            lambda e, k=k: e[measure][target] + k * e[f"{measure}_error"][target]
-            for k in (0, -1, 1)
-        )
-        lines = plotting.lines_of(entries, "name", "particles", *axes)
-        label = "RMSE [pixels], mean ± s.e."
-        title = f"target {target + 1}, from {what}"
-        return plotting.Panel(title, "number of particles $N$", label, lines)
-
-    rows = {"the true box": "rmse"}
-    if any("monte_carlo_error" in entry for entry in results):
-        rows["the estimate of the reference"] = "monte_carlo_error"
-    panels = [[panel(what, measure, k) for k in (0, 1)] for what, measure in rows.items()]
-    return plotting.draw_panels(panels, ("linear", "log"))
 
 
 if __name__ == "__main__":

@@ -76,8 +76,7 @@ def compiled() -> Any:
     wide = ["-mprefer-vector-width=512"] if platform.machine() in ("x86_64", "AMD64") else []
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "filter.so")
-        made = [compiler, *FLAGS, *wide, str(SOURCE), "-o", path, "-lm"]
-        subprocess.run(made, check=True)
+        subprocess.run([compiler, *FLAGS, *wide, str(SOURCE), "-o", path, "-lm"], check=True)
         return ctypes.CDLL(path)
 
 

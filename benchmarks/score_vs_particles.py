@@ -75,12 +75,6 @@ def main(
     model = mpfjax.QuadraticModel(SIGMA, SIGMA, LOW, HIGH)
     truth, observations = simulate(data_seed)
     exact_mass = np.asarray(grid_filter(model, observations, jnp.linspace(*GRID)).mass_above(0.0))
-
-    def write(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        results = [summarise(cell, exact_mass) for cell in cells]
-        data(out / "score_vs_particles.json", settings=settings, results=results)
-        return results
-
     typical_size = min(particles, key=lambda n: abs(n - TYPICAL_NUM_PARTICLES))
     small = [n for n in particles if n <= MOST_SHARED_SLOTS]
     mixture = {
@@ -97,16 +91,13 @@ def main(
         collect=collect,
     )
     unfinished = out / "unfinished"
-    try:
-        # One cell compiles while the one before it runs; all small filters run in as many slots.
-        cells = mpfjax.run_study(
-            study, unfinished, resume=resume, seeds_at_once=SEEDS_AT_ONCE, cells_at_once=2,
-            slots=max(small) if len(small) > 1 else None,
-        )  # fmt: skip
-    except KeyboardInterrupt:
-        write(mpfjax.read_study(unfinished))
-        raise
-    results = write(cells)
+    # One cell compiles while the one before it runs; all small filters run in as many slots.
+    cells = mpfjax.run_study(
+        study, unfinished, resume=resume, seeds_at_once=SEEDS_AT_ONCE, cells_at_once=2,
+        slots=max(small) if len(small) > 1 else None,
+    )  # fmt: skip
+    results = [summarise(cell, exact_mass) for cell in cells]
+    data(out / "score_vs_particles.json", settings=settings, results=results)
     print(table(COLUMNS, sorted(results, key=lambda entry: list(LABELS).index(entry["filter"]))))
     typical = {
         cell["filter"]: typical_run(cell) for cell in cells if cell["num_particles"] == typical_size
@@ -207,16 +198,11 @@ def summarise(runs: dict[str, Any], exact_mass: np.ndarray) -> dict[str, Any]:
     }
 
 
-def typical_run(runs: dict[str, np.ndarray]) -> "plotting.ParticleHistory":
+def typical_run(runs: dict[str, np.ndarray]) -> dict[str, Any]:
     """The particles of the run whose score is the median one."""
     scores = runs["both"].mean(axis=1)
     index = int(np.argsort(scores, kind="stable")[(len(scores) - 1) // 2])
-    return plotting.ParticleHistory(
-        positions=runs["positions"][index],
-        occupied=runs["occupied"][index],
-        component_indicators=runs["component_indicators"][index],
-        score=float(scores[index]),
-    )
+    return {"score": scores[index]} | {name: runs[name][index] for name in OF_PARTICLES}
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ round. Into --out DIR goes tracking_speed.json.
 
 import itertools
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import cache
 from pathlib import Path
@@ -32,7 +32,7 @@ LARGE, SMALL = (1080, 1920), (288, 384)
 ERROR = 0.02  # of a detection, in boxes
 COLUMNS = {
     "": "{way}", "detect [ms]": "{detect_ms:.2f}", "track [ms]": "{track_ms:.2f}",
-    "frames/s": "{frames_per_second:.0f}", "median": "{median_frames_per_second:.0f}",
+    "frames/s": "{frames_per_second:.0f}",
     "x small": "{times_small:.2f}", "objects": "{objects}", "MB": "{peak_memory_mb:.0f}",
 }  # fmt: skip
 
@@ -47,14 +47,9 @@ class Way(NamedTuple):
     motion: Literal["detections", "pixels"] = "detections"  # what the camera's motion is found from
 
     @property
-    def num_objects(self) -> int:
-        """As many as there are fields."""
-        return self.fields[0] * self.fields[1]
-
-    @property
     def room(self) -> int:
         """Room for objects, as `mpfjax track` has it for a file with so many a frame, or none."""
-        return LEAST_ROOM if self.detect else 8 * -(-3 * self.num_objects // 16)
+        return LEAST_ROOM if self.detect else 8 * -(-3 * int(np.prod(self.fields)) // 16)
 
 
 WAYS = (
@@ -128,25 +123,22 @@ class Timed:
     """A tracker at work on a street that has no end, and what it took."""
 
     def __init__(self, way: Way) -> None:
-        self.clock = Clock("read", "detect", "track")
+        self.clock, self.background = Clock("read", "detect", "track"), BackgroundSubtraction()
         street = Street(*(way.size or LARGE), way.fields)
         frames = None
         if way.size is not None:
             frames = self.clock.over("read", map(street.frame, itertools.count()))
         if way.detect:
-            detections: Any = self._detecting(BackgroundSubtraction())
+            detections: Any = self._detect
         else:
             detections = self.clock.over("read", map(street.detected, itertools.count()))
         tracker = ObjectTracker(way.room)
         tracked = track(frames, detections, tracker, camera_motion=way.motion)
         self.tracked = self.clock.over("track", tracked)
 
-    def _detecting(self, background: BackgroundSubtraction) -> Callable[[np.ndarray], np.ndarray]:
-        def detect(frame: np.ndarray) -> np.ndarray:
-            with self.clock.of("detect"):
-                return background.detect(frame)
-
-        return detect
+    def _detect(self, frame: np.ndarray) -> np.ndarray:
+        with self.clock.of("detect"):
+            return self.background.detect(frame)
 
     def round(self, num_frames: int) -> dict[str, Any]:
         """Milliseconds a frame over so many more frames, and how many objects are shown."""
@@ -155,23 +147,18 @@ class Timed:
             tracks = next(self.tracked)
         spent = {part: 1e3 * (self.clock.seconds[part] - before[part]) for part in before}
         return {
-            "detect_ms": spent["detect"] / num_frames,
-            "track_ms": spent["track"] / num_frames,
-            "objects": int(tracks.shown.sum()),
-            "peak_memory_mb": peak_memory(),
-        }
+            "detect_ms": spent["detect"] / num_frames, "track_ms": spent["track"] / num_frames,
+            "objects": int(tracks.shown.sum()), "peak_memory_mb": peak_memory(),
+        }  # fmt: skip
 
 
-@cache
-def begun(way: Way) -> Timed:
-    """The tracker of a process."""
-    # Background subtraction finds parts of objects as well, more than there is room for.
-    warnings.simplefilter("ignore", RuntimeWarning)
-    return Timed(way)
+begun = cache(Timed)  # the tracker of a process
 
 
 def round_of(way: Way, num_frames: int) -> dict[str, Any]:
     """What a process does."""
+    # Background subtraction finds parts of objects as well, more than there is room for.
+    warnings.simplefilter("ignore", RuntimeWarning)
     return begun(way).round(num_frames)
 
 
@@ -198,14 +185,12 @@ def summary(
 ) -> dict[str, Any]:
     """The best round, the memory, and the time as a multiple of that in small frames."""
     best = min(rounds, key=milliseconds)
-    ratio = milliseconds(best) / min(map(milliseconds, rounds_of_small))
     return {
         "way": way.name,
         "detect_ms": round(best["detect_ms"], 3),
         "track_ms": round(best["track_ms"], 3),
         "frames_per_second": round(1e3 / milliseconds(best), 1),
-        "median_frames_per_second": round(1e3 / np.median([*map(milliseconds, rounds)]), 1),
-        "times_small": round(ratio, 3),
+        "times_small": round(milliseconds(best) / min(map(milliseconds, rounds_of_small)), 3),
         "objects": rounds[-1]["objects"],
         "peak_memory_mb": round(max(found["peak_memory_mb"] for found in rounds), 1),
     }

@@ -1,22 +1,13 @@
-"""What figures show: standard errors of the sample, and the moments of components."""
+"""What figures show: the moments of components."""
 
 import jax
 import numpy as np
-import scipy.stats
 from matplotlib.collections import LineCollection
 
 import mpfjax
-from benchmarks.figures import standard_error
 from mpfjax.plotting import draw_components
 from tests.switching import MODEL as SWITCHING
 from tests.switching import OBSERVATIONS as SEEN
-
-RUNS = np.random.default_rng(0).normal(size=(3, 5))
-
-
-def test_standard_errors_divide_by_n_minus_one():
-    np.testing.assert_allclose(standard_error(RUNS), scipy.stats.sem(RUNS, axis=0))
-    assert np.isnan(standard_error(RUNS[:1])).all()
 
 
 def kept_run(model, observations):

@@ -22,7 +22,7 @@ import mpfjax
 from benchmarks import harness
 from benchmarks.harness import Count, command
 from benchmarks.interacting_objects import scenes as made
-from benchmarks.interacting_objects.partitions import adaptive_partitions, independent_partitions
+from benchmarks.interacting_objects.partitions import adaptive_partitions as adaptive
 from benchmarks.interacting_objects.scenes import BOX, NUM_FRAMES, SCENES, SHARPNESS, Scene
 from mpfjax.metrics.tracking_quality import recovery_rate, track_state
 
@@ -37,10 +37,10 @@ METHODS: dict[str, tuple[str, Callable[..., mpfjax.Filter]]] = {
     "dps_prior": ("DPS, prior", partial(dps, reassembly="prior")),
     "dps_evidence": ("DPS, evidence", partial(dps, reassembly="evidence")),
     "independent": ("independent", mpfjax.independent_particle_filters),
-    "independent_partitions": ("independent partitions", independent_partitions),
-    "adaptive": ("adaptive partitions", adaptive_partitions),
+    "independent_partitions": ("independent partitions", partial(adaptive, num_draws=None)),
+    "adaptive": ("adaptive partitions", adaptive),
     # Five points in each row, so up to five times the likelihoods.
-    "adaptive_draws": ("adaptive partitions, K = 5", partial(adaptive_partitions, num_draws=5)),
+    "adaptive_draws": ("adaptive partitions, K = 5", partial(adaptive, num_draws=5)),
     "crossing": ("one cluster", partial(clusters, start="together")),
     "clusters": ("clusters", clusters),
     # Clusters that part after five steps without contact, an approximation.

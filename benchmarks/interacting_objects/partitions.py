@@ -1,7 +1,5 @@
 """Independent and adaptive partitions, proposals of one joint filter that are close to clusters."""
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -122,10 +120,9 @@ def _from_own_row(
 def adaptive_partitions(
     model: mpfjax.MultiObjectModel, num_particles: int, num_draws: int | None = 1
 ) -> mpfjax.Filter:
-    """Objects near another one drawn in their rows, the others each on its own."""
+    """Objects near another one drawn in their rows, the others each on its own.
+
+    Without `num_draws` every object is drawn on its own: independent partitions.
+    """
     moves = [mpfjax.Resample(), ProposeInPartitions(model, num_draws)]
     return mpfjax.Filter(model, moves=moves, num_particles=num_particles)
-
-
-# Every object drawn on its own; the rows weighed by ψ.
-independent_partitions = partial(adaptive_partitions, num_draws=None)

@@ -18,7 +18,6 @@ from jaxtyping import Array
 from scipy.optimize import minimize
 
 import mpfjax
-from benchmarks import figures as plotting
 from benchmarks import harness
 from benchmarks.harness import AtLeast2, Count, Seed, command
 from benchmarks.score_vs_particles import HIGH, LOW, simulate
@@ -53,7 +52,7 @@ def main(
     seed: Seed = 0,
     out: Path = Path("results/likelihood_tuning"),
 ) -> None:
-    """Run the parts that were asked for, print their tables, write their results and figures.
+    """Run the parts that were asked for, print their tables, write their results.
 
     - `runs`: a: seeds for each estimator.
     - `particles`: a.
@@ -83,9 +82,9 @@ def build_quadratic(point: Array) -> mpfjax.QuadraticModel:
     return mpfjax.QuadraticModel(jnp.exp(point[0]), jnp.exp(point[1]), LOW, HIGH)
 
 
-def exact_quadratic(grid_size: int = 1201) -> Callable[[np.ndarray], tuple]:
+def exact_quadratic() -> Callable[[np.ndarray], tuple]:
     """log Z and its gradient by the grid filter, under the precision of the caller."""
-    observations, points = jnp.asarray(OBSERVATIONS, float), jnp.linspace(-3.0, 3.0, grid_size)
+    observations, points = jnp.asarray(OBSERVATIONS, float), jnp.linspace(-3.0, 3.0, 1201)
 
     def log_evidence(point: Array) -> Array:
         return grid_filter(build_quadratic(point), observations, points).log_marginal_likelihood
@@ -218,11 +217,9 @@ def run_starts(starts: int, steps: int, seed: int, settings: dict[str, Any], out
     rng = np.random.default_rng(seed)
     places = np.exp(rng.uniform(*np.log((0.04, 0.5)), size=(starts, 2)))
     results: list[dict[str, Any]] = []
-    paths = []
     for ((k, start),) in harness.grid("start", enumerate(places)):
         run = optimisation(jax.random.fold_in(jax.random.key(seed), k), start, steps)
         results.append(compare(start, run, best, errors))
-        paths.append(np.stack([run.history["sigma_x"], run.history["sigma_y"]], axis=1))
         harness.data(
             out / "starts.json", settings=settings, exact=best, exact_relative_errors=errors,
             results=results,
@@ -238,10 +235,6 @@ def run_starts(starts: int, steps: int, seed: int, settings: dict[str, Any], out
     near = sum(np.abs(entry["relative_error"]).max() < 0.03 for entry in results)
     print(f"{near} of {starts} end within 3% of the exact maximum,", end=" ")
     print(numbers("{:.4f}", best))
-    sigmas, both = np.geomspace(0.03, 0.6, 16), exact_quadratic(801)
-    surface = np.array([[both(np.log([x, y]))[0] for x in sigmas] for y in sigmas], float)
-    figure = plotting.draw_optimisations(sigmas, sigmas, surface, paths, best)
-    harness.figures(out, optimisations=figure)
 
 
 def optimisation(key: Array, start: np.ndarray, num_steps: int) -> TuningRun:

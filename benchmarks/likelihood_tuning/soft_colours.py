@@ -8,9 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Float, Num, UInt8
 
-from mpfjax.checks import Positive, checked
 from mpfjax.models.dynamics import AbstractDynamics
 from mpfjax.vision.boxes.colour_model import AbstractBoxModel, BoxState, ColourModel
 from mpfjax.vision.colour.bins import RGBColours
@@ -36,9 +36,6 @@ class SoftColourModel(AbstractBoxModel):
     - `lambda_`: λ.
     - `bandwidth`: of the soft bins, in bins.
     - `num_points`: K, of the grid in a box, a multiple of the number of parts; static.
-
-    Raises `ValueError` for a number that is not positive, and a number of points that is no
-    multiple of the number of parts.
     """
 
     reference_boxes: Float[Array, "k 4"]
@@ -51,14 +48,13 @@ class SoftColourModel(AbstractBoxModel):
     switch_probability: float = eqx.field(static=True, default=0.0)
 
     @classmethod
-    @checked
     def from_frame(
         cls,
         frame: UInt8[np.ndarray, "h w 3"],
         boxes: Float[np.ndarray, "k 4"],
         *,
         num_bins: int = 16,
-        bandwidth: Positive = 0.5,
+        bandwidth: float = 0.5,
         num_points: int = 10,
         num_parts: int = 1,
         **options: Any,
@@ -96,12 +92,6 @@ class SoftColourModel(AbstractBoxModel):
         self, observation: Num[Array, "h w 3"], states: BoxState
     ) -> Float[Array, " n"]:
         """-λ Σ_c B², each B² averaged over the bands."""
-        return -self.lambda_ * self.squared_distances(observation, states)
-
-    def squared_distances(
-        self, observation: Num[Array, "h w 3"], states: BoxState
-    ) -> Float[Array, " n"]:
-        """Σ_c B² of each box from its reference, averaged over the bands: between 0 and 3."""
         _, num_parts, _, num_bins = self.reference_logits.shape
         boxes = self.boxes(states)
         counts = soft_histograms(
@@ -110,7 +100,8 @@ class SoftColourModel(AbstractBoxModel):
         references = self.references[states.reference]
         distances = bhattacharyya(_mixed(normalise(counts)), references)
         empty = jnp.sum(counts, axis=-1) <= 0
-        return jnp.mean(jnp.sum(jnp.where(empty, 1.0, distances), axis=2), axis=1)
+        squares = jnp.mean(jnp.sum(jnp.where(empty, 1.0, distances), axis=2), axis=1)
+        return -self.lambda_ * squares
 
 
 @partial(jax.jit, static_argnames=("num_bins", "num_points", "num_parts"))
@@ -133,10 +124,8 @@ def soft_histograms(
 
     Boxes are (x, y, w, h) about their centre, in pixels. Points outside the frame do not count, and
     those within half a pixel of its edge count in part. Bands run from top to bottom. A box that is
-    not finite has zero counts. Raises `ValueError` for K that is no multiple of `num_parts`.
+    not finite has zero counts. K is a multiple of `num_parts`.
     """
-    if num_points % num_parts:
-        raise ValueError(f"num_points: {num_points} is no multiple of num_parts, {num_parts}")
     finite = jnp.all(jnp.isfinite(boxes), axis=1, keepdims=True)
     boxes = jnp.where(finite, boxes, -1e6)
     steps = (jnp.arange(num_points, dtype=boxes.dtype)[None] + 0.5) / num_points - 0.5
@@ -155,25 +144,10 @@ def _interpolated(
     frame: Num[Array, "h w 3"], x: Float[Array, "n K"], y: Float[Array, "n K"]
 ) -> Float[Array, "n K K 3"]:
     """The frame between its pixels, whose centres are at half coordinates."""
-    height, width, _ = frame.shape
-    top, row = _between(y, height)
-    left, column = _between(x, width)
-
-    def pixels(rows: Array, columns: Array) -> Array:
-        return frame[rows[:, :, None], columns[:, None]].astype(x.dtype)
-
-    right, below = jnp.minimum(left + 1, width - 1), jnp.minimum(top + 1, height - 1)
-    across, down = column[:, None, :, None], row[:, :, None, None]
-    upper = (1 - across) * pixels(top, left) + across * pixels(top, right)
-    lower = (1 - across) * pixels(below, left) + across * pixels(below, right)
-    return (1 - down) * upper + down * lower
-
-
-def _between(places: Float[Array, "n K"], size: int) -> tuple[Array, Array]:
-    """The last pixel whose centre is not past each place, and the distance from that centre."""
-    within = jnp.clip(places - 0.5, 0.0, size - 1.0)
-    first = jax.lax.stop_gradient(jnp.floor(within))
-    return first.astype(jnp.int32), within - first
+    rows, columns = jnp.broadcast_arrays(y[:, :, None] - 0.5, x[:, None] - 0.5)
+    channels = jnp.moveaxis(frame.astype(x.dtype), -1, 0)
+    at = lambda channel: map_coordinates(channel, [rows, columns], 1, "nearest")  # noqa: E731
+    return jnp.stack([at(channel) for channel in channels], axis=-1)
 
 
 def _inside(places: Float[Array, "n K"], size: int) -> Float[Array, "n K"]:

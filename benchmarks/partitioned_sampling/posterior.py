@@ -10,8 +10,6 @@ mostly back a frame or more before: when the distracter goes, nothing looks like
 itself, and the likelihood weighs up tails of 1e-20, which no number of particles reaches.
 """
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -96,29 +94,15 @@ def mapped_boxes(model: mpfjax.MultiObjectModel, states: PlaceState) -> Float[Ar
     return jnp.concatenate([states.box - sizes / 2, sizes], axis=-1)
 
 
-class Window(NamedTuple):
-    """The places of a map: a box's top row and left column, from the first to before the end."""
-
-    top: int
-    bottom: int
-    left: int
-    right: int
-
-    @classmethod
-    def whole(cls, bins: Int[np.ndarray, "h w"], sides: tuple[int, int]) -> "Window":
-        """Every place from which a box reaches the frame, and one more on each side."""
-        return cls(-sides[1], bins.shape[0] + 1, -sides[0], bins.shape[1] + 1)
-
-
 def distance_maps(
     bins: Int[np.ndarray, "h w"],
     references: Float[np.ndarray, "objects parts bins"],
     sides: tuple[int, int],
-    window: Window,
 ) -> Float[np.ndarray, "objects rows columns"]:
-    """Σ over the bands of B² between each reference and the box at every place of a window.
+    """Σ over the bands of B² between each reference and the box at every place.
 
-    `bins`: the colour of each pixel. Raises `ValueError` for a height that the bands do not share
+    Places are those from which a box reaches the frame, and one more on each side. `bins`: the
+    colour of each pixel. Raises `ValueError` for a height that the bands do not share
     equally, where a band's rows would depend on the fraction of a pixel.
     """
     width, height = sides
@@ -126,12 +110,9 @@ def distance_maps(
     if height % num_parts:
         raise ValueError(f"sides: {num_parts} bands of a height of {height} end within pixels")
     band = height // num_parts
-    rows, columns = window.bottom - window.top, window.right - window.left
+    rows, columns = bins.shape[0] + height + 1, bins.shape[1] + width + 1
     # The pixels that the boxes hold, -1 outside the frame.
-    bottom, right = window.bottom + height - 1, window.right + width - 1
-    edge = max(0, -window.top, -window.left, bottom - len(bins), right - bins.shape[1])
-    seen = np.pad(bins, edge, constant_values=-1)
-    seen = seen[window.top + edge : bottom + edge, window.left + edge : right + edge]
+    seen = np.pad(bins, ((height, height), (width, width)), constant_values=-1)
     roots = np.sqrt(references).astype(np.float32)
     alike = np.zeros((num_objects, num_parts, len(seen) - band + 1, columns), np.float32)
     for colour in np.flatnonzero(roots.any(axis=(0, 1))):

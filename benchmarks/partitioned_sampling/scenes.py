@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 import mpfjax
 from benchmarks.partitioned_sampling import posterior
-from benchmarks.partitioned_sampling.posterior import Verdict, Window, judge
+from benchmarks.partitioned_sampling.posterior import Verdict, judge
 from benchmarks.scenes import NoPath, boxes_over_time, distracter_scene
 from mpfjax import vision
 from mpfjax.vision.boxes.joint_colour import PAPER_DEVIATIONS, object_boxes
@@ -85,12 +85,10 @@ def synthetic_scene(
     # Of one reference and one channel each: (objects, parts, bins).
     references = np.asarray(learned.object_model.references)[:, 0, :, 0]  # pyright: ignore
     bins = np.asarray(_bins(jnp.asarray(drawn.frames)))
-    whole, steps = Window.whole(bins[0], size), PAPER_DEVIATIONS[:2]
+    steps = PAPER_DEVIATIONS[:2]
 
     def maps_of(objects: slice) -> np.ndarray:
-        return np.stack(
-            [posterior.distance_maps(one, references[objects], size, whole) for one in bins]
-        )
+        return np.stack([posterior.distance_maps(one, references[objects], size) for one in bins])
 
     first = maps_of(slice(0, 1))
     means = posterior.particle_means(first, starts[0], size, steps)

@@ -158,12 +158,13 @@ def draw_impoverishment(entries: Sequence[dict[str, Any]]) -> Any:
         "uniqueness": "uniqueness U/N [%]", "dynamics_u": "effective dynamics in u [%]",
         "dynamics_v": "effective dynamics in v [%]",
     }  # fmt: skip
-    chosen = {
-        entry["filter"]: [100 * entry[measure] for measure in measures]
-        for entry in entries
-        if entry["order"] is None or 1 in (entry["order"][0], entry["order"][-1])
-    }
-    return plotting.draw_object_bars(chosen, list(measures.values()))
+    chosen = [e for e in entries if e["order"] is None or 1 in (e["order"][0], e["order"][-1])]
+    panels = [
+        plotting.Panel("", "object", label,
+                       {e["filter"]: [*enumerate(100 * e[name], 1)] for e in chosen})
+        for name, label in measures.items()
+    ]  # fmt: skip
+    return plotting.draw_panels([panels], ("linear", "linear"))
 
 
 # --- as text, beside the paper's --------------------------------------------------------------

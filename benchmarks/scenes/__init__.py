@@ -5,10 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.scenes.distracter import DistracterScene as DistracterScene
 from benchmarks.scenes.distracter import NoPath as NoPath
 from benchmarks.scenes.distracter import distracter_scene as distracter_scene
-from benchmarks.scenes.football import Scene as Scene
 from benchmarks.scenes.football import football_scene as football_scene
 
 

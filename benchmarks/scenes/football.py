@@ -267,7 +267,7 @@ def _draw_ellipse(
 ) -> None:  # fmt: skip
     """Draw a filled ellipse along the axes."""
     (cx, cy), (rx, ry) = centre, radii
-    found = _window(frame, cx - rx - 1, cy - ry - 1, cx + rx + 1, cy + ry + 1)
+    found = _window(frame, np.subtract(centre, radii), np.add(centre, radii), 1)
     if found is None:
         return
     part, x, y = found
@@ -284,13 +284,10 @@ def _draw_stroke(
     end: tuple[float, float],
     radius: float,
     colour: Float[np.ndarray, "3"],
-    opacity: float = 1.0,
 ) -> None:
     """Draw a line of half-width `radius` with round ends; a dot where the ends coincide."""
     (x0, y0), (x1, y1) = start, end
-    reach = radius + 1
-    found = _window(frame, min(x0, x1) - reach, min(y0, y1) - reach,
-                     max(x0, x1) + reach, max(y0, y1) + reach)  # fmt: skip
+    found = _window(frame, np.minimum(start, end), np.maximum(start, end), radius + 1)
     if found is None:
         return
     part, x, y = found
@@ -298,18 +295,15 @@ def _draw_stroke(
     along = ((x - x0) * dx + (y - y0) * dy) / max(dx * dx + dy * dy, 1e-9)
     along = np.clip(along, 0, 1)
     distance = np.hypot(x - x0 - along * dx, y - y0 - along * dy)
-    _blend(part, np.clip(radius + 0.5 - distance, 0, 1) * opacity, colour)
+    _blend(part, np.clip(radius + 0.5 - distance, 0, 1), colour)
 
 
 def _window(
-    frame: np.ndarray, left: float, top: float, right: float, bottom: float
+    frame: np.ndarray, low: np.ndarray, high: np.ndarray, more: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """The part of the frame between these edges, and the centres of its pixels."""
-    height, width, _ = frame.shape
-    if not np.all(np.isfinite([left, top, right, bottom])):
-        return None
-    x0, x1 = int(max(np.floor(left), 0)), int(min(np.ceil(right), width))
-    y0, y1 = int(max(np.floor(top), 0)), int(min(np.ceil(bottom), height))
+    """The part of the frame between two corners and so many pixels more, and its pixels."""
+    x0, y0 = np.maximum(np.floor(low - more), 0).astype(int)
+    x1, y1 = np.minimum(np.ceil(high + more), frame.shape[1::-1]).astype(int)
     if x0 >= x1 or y0 >= y1:
         return None
     return frame[y0:y1, x0:x1], np.arange(x0, x1)[None] + 0.5, np.arange(y0, y1)[:, None] + 0.5
@@ -317,4 +311,4 @@ def _window(
 
 def _blend(part: np.ndarray, opacity: np.ndarray, colour: np.ndarray) -> None:
     """Colour pixels, each by its opacity."""
-    part += opacity[:, :, None] * (np.asarray(colour, float) - part)
+    part += opacity[:, :, None] * (colour - part)

@@ -10,24 +10,23 @@ file run `mpfjax.vision.track`, which draws nothing at random, and the peers tha
 the SORT-like trackers of the packages `trackers` and `norfair`, with their defaults, with what
 their documentation advises, and then all of them, ours
 as well, with the same minimal score, that below which weaker detections are left out. It is the
-threshold that parts the file's scores best in two (Otsu's), unless --min-score gives one. With
---scene football the sequences are rendered, and the detections simulated.
+threshold that parts the file's scores best in two (Otsu's). With --scene football the sequences are
+rendered, and the detections simulated.
 """
 
 import time
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.harness import Count, Folders, Positive, Seed, command, data, table
+from benchmarks.harness import Folders, Seed, command, data, table
 from benchmarks.tracking_by_detection import football
 from benchmarks.tracking_by_detection.peers import Peer, installed
 from mpfjax import vision
-from mpfjax.console import Clock, finite
+from mpfjax.console import Clock
 from mpfjax.metrics import multi_object_scores
 from mpfjax.vision.files import frames as files
 from mpfjax.vision.files import sequences
@@ -83,12 +82,8 @@ def main(
     *,
     scene: Annotated[str, ("football",)] | None = None,
     seed: Seed = 0,
-    seeds: Count = 1,
     frames: str | None = None,
-    fps: Positive | None = None,
-    min_score: Annotated[float, finite] | None = None,
     peers: bool = True,
-    colour: bool = True,
     camera_motion: Motion | None = None,
     out: Path = Path("results/tracking_by_detection"),
 ) -> None:
@@ -97,37 +92,31 @@ def main(
     - `folders`: img/, gt.txt, det*.
     - `scene`: rendered, in place of any folder.
     - `seed`: of the rendered scene.
-    - `seeds`: nothing is drawn: one will do.
     - `frames`: A:B, frames A to B, counted from 1, both in.
-    - `fps`: frames a second, where nothing says it.
-    - `min_score`: the same minimal score for all.
     - `peers`: or our own tracker alone.
-    - `colour`: or ours on the detections alone.
     - `camera_motion`: where ours has it from.
     """
-    del seeds
     if bool(folders) == (scene is not None):
         raise ValueError("one of DIR and --scene is needed, and not both")
     span = files.parse_range(frames, "--frames")
     if scene is None:
-        found = [each for folder in folders for each in opened(folder, *span, fps)]
+        found = [each for folder in folders for each in opened(folder, *span)]
     else:
         found = [rendered(match, seed, *span) for match in football.MATCHES]
-    run_ours = partial(ours, use_colours=colour, camera_motion=camera_motion)
     others, rows = installed() if peers else [], []
     for sequence in found:
-        for name, run in runs_of(sequence, run_ours, others, min_score):
-            rows.append(result(name, sequence, run))
-            data(out / "tracking_by_detection.json", rows=rows)
-    order = {(each.name, each.detections): place for place, each in enumerate(found)}
-    key = lambda row: (order[row["sequence"], row["detections"]], -row["HOTA"])  # noqa: E731
-    print(table(COLUMNS, sorted(rows, key=key)))
+        own = []
+        for name, run in runs_of(sequence, camera_motion, others):
+            own.append(result(name, sequence, run))
+            data(out / "tracking_by_detection.json", rows=rows + own)
+        rows += sorted(own, key=lambda row: -row["HOTA"])
+    print(table(COLUMNS, rows))
     if len(found) > 1:
         print(table({"mean of": "{tracker}"} | OF_SCORES, means(rows, len(found))))
     print(f"written to {out}")
 
 
-def opened(folder: Path, first: int, last: int | None, fps: float | None) -> list[Sequence]:
+def opened(folder: Path, first: int, last: int | None) -> list[Sequence]:
     """Every file of detections of a folder, or a `ValueError` that names what is missing."""
     if not folder.is_dir():
         raise ValueError(f"DIR: {folder} is not a folder")
@@ -145,10 +134,8 @@ def opened(folder: Path, first: int, last: int | None, fps: float | None) -> lis
         count = held or sequences.last_frame(info, rows, whole.objects)
         end = max(min(last or count, count), first)
         known = between(rows, first, end), whole.between(first, end), first, end
-        source = folder if held else None
-        found.append(
-            Sequence(folder.name, path.name, *known, fps or info.frame_rate, source, info.size)
-        )
+        known += info.frame_rate, folder if held else None, info.size
+        found.append(Sequence(folder.name, path.name, *known))
     return found
 
 
@@ -163,25 +150,22 @@ def rendered(match: football.Match, seed: int, first: int, last: int | None) -> 
 
 
 def runs_of(
-    sequence: Sequence, run_ours: Callable[..., Run], others: list[Peer], least: float | None
+    sequence: Sequence, camera_motion: Motion | None, others: list[Peer]
 ) -> Iterator[tuple[str, Run]]:
     """The name of each tracker with its setting, and its run, made as it is asked for."""
-    if least is None and sequence.scores is not None:
-        least = otsu(sequence.scores)
-    yield OURS, run_ours(sequence, None)
+    yield OURS, ours(sequence, None, camera_motion)
     for peer in others:
         yield f"{peer.name}, {peer.setting}", theirs(sequence, peer, None)
-    if least is not None:
+    if sequence.scores is not None:
+        least = otsu(sequence.scores)
         end = f"score >= {least:.3g}"
-        yield f"{OURS}, {end}", run_ours(sequence, least)
+        yield f"{OURS}, {end}", ours(sequence, least, camera_motion)
         for peer in others:
             if peer.setting == "defaults":
                 yield f"{peer.name}, defaults, {end}", theirs(sequence, peer, least)
 
 
-def ours(
-    sequence: Sequence, least: float | None, *, use_colours: bool, camera_motion: Motion | None
-) -> Run:
+def ours(sequence: Sequence, least: float | None, camera_motion: Motion | None) -> Run:
     """One run; the camera's motion is that of the options where there are pixels."""
     rows = Rows(sequence.rows, last=sequence.last)
     tracker = vision.ObjectTracker(
@@ -190,7 +174,7 @@ def ours(
     clock, stills = Clock("read", "track"), sequence.stills()
     tracked = vision.track(
         None if stills is None else clock.over("read", stills), rows, tracker,
-        first=sequence.first, min_score=least, use_colours=use_colours,
+        first=sequence.first, min_score=least,
         frame_size=sequence.frame_size, camera_motion=None if stills is None else camera_motion,
     )  # fmt: skip
     kept, compiling = [], 0.0
@@ -201,7 +185,8 @@ def ours(
     for frame, tracks in steps:
         kept.append(online_rows(frame, tracks))
         compiling = compiling or clock.seconds["track"]
-    return Run(np.concatenate(kept), rate(len(kept) - 1, clock.seconds["track"] - compiling))
+    seconds = max(clock.seconds["track"] - compiling, 1e-9)
+    return Run(np.concatenate(kept), (len(kept) - 1) / seconds)
 
 
 def theirs(sequence: Sequence, peer: Peer, least: float | None) -> Run:
@@ -222,7 +207,7 @@ def theirs(sequence: Sequence, peer: Peer, least: float | None) -> Run:
         tracked = step(boxes, strengths)
         seconds += time.perf_counter() - start
         kept.append(np.column_stack([np.full(len(tracked), frame), tracked]))
-    return Run(np.round(np.concatenate(kept), 3), rate(len(kept), seconds))
+    return Run(np.round(np.concatenate(kept), 3), len(kept) / seconds)
 
 
 def otsu(scores: np.ndarray) -> float:
@@ -255,7 +240,7 @@ def means(rows: list[dict[str, Any]], num_sequences: int) -> list[dict[str, Any]
     for row in rows:
         by_name.setdefault(row["tracker"], []).append(row)
     found = [
-        {"tracker": name} | {score: float(np.mean([row[score] for row in own])) for score in SCORES}
+        {"tracker": name} | {score: np.mean([row[score] for row in own]) for score in SCORES}
         for name, own in by_name.items()
         if len(own) == num_sequences
     ]
@@ -265,11 +250,6 @@ def means(rows: list[dict[str, Any]], num_sequences: int) -> list[dict[str, Any]
 def between(rows: np.ndarray, first: int, last: int) -> np.ndarray:
     """The rows of these frames."""
     return rows[(rows[:, 0] >= first) & (rows[:, 0] <= last)]
-
-
-def rate(count: int, seconds: float) -> float:
-    """Frames a second."""
-    return count / seconds if seconds > 0 else 0.0
 
 
 if __name__ == "__main__":

@@ -26,45 +26,35 @@ class Peer(NamedTuple):
     make: Callable[[float | None], Step]  # given the frames per second, where they are known
 
 
-_BOT_SORT = {"enable_cmc": False}
-# By class: what the table calls it, what it always gets, and what its documentation advises.
-TRACKERS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
-    "SORTTracker": (
-        "SORT",
-        {},
-        {"lost_track_buffer": 10, "track_activation_threshold": 0.75,
-         "minimum_consecutive_frames": 2, "minimum_iou_threshold": 0.3},
-    ),
-    "ByteTrackTracker": (
-        "ByteTrack",
-        {},
-        {"lost_track_buffer": 10, "track_activation_threshold": 0.7,
-         "minimum_consecutive_frames": 1, "minimum_iou_threshold": 0.3,
-         "high_conf_det_threshold": 0.5},
-    ),
-    "OCSORTTracker": (
-        "OC-SORT",
-        {},
-        {"lost_track_buffer": 30, "minimum_iou_threshold": 0.3, "minimum_consecutive_frames": 3,
-         "direction_consistency_weight": 0.2, "high_conf_det_threshold": 0.4, "delta_t": 1},
-    ),
-    "BoTSORTTracker": (
-        "BoT-SORT",
-        _BOT_SORT,
-        {"lost_track_buffer": 30, "minimum_consecutive_frames": 2,
-         "minimum_iou_threshold_first_assoc": 0.2, "minimum_iou_threshold_second_assoc": 0.5,
-         "minimum_iou_threshold_unconfirmed_assoc": 0.2, "high_conf_det_threshold": 0.5,
-         "track_activation_threshold": 0.6},
-    ),
-    "CBIoUTracker": (
-        "C-BIoU",
-        {},
-        {"lost_track_buffer": 30, "minimum_consecutive_frames": 2,
-         "minimum_iou_threshold_first_assoc": 0.2, "minimum_iou_threshold_second_assoc": 0.5,
-         "minimum_iou_threshold_unconfirmed_assoc": 0.3, "high_conf_det_threshold": 0.6,
-         "track_activation_threshold": 0.7, "buffer_ratio_first": 0.3, "buffer_ratio_second": 0.5},
-    ),
+# By name: what their documentation advises.
+TRACKERS: dict[str, dict[str, Any]] = {
+    "SORT": {
+        "lost_track_buffer": 10, "track_activation_threshold": 0.75,
+        "minimum_consecutive_frames": 2, "minimum_iou_threshold": 0.3,
+    },
+    "ByteTrack": {
+        "lost_track_buffer": 10, "track_activation_threshold": 0.7,
+        "minimum_consecutive_frames": 1, "minimum_iou_threshold": 0.3,
+        "high_conf_det_threshold": 0.5,
+    },
+    "OC-SORT": {
+        "lost_track_buffer": 30, "minimum_iou_threshold": 0.3, "minimum_consecutive_frames": 3,
+        "direction_consistency_weight": 0.2, "high_conf_det_threshold": 0.4, "delta_t": 1,
+    },
+    "BoT-SORT": {
+        "lost_track_buffer": 30, "minimum_consecutive_frames": 2,
+        "minimum_iou_threshold_first_assoc": 0.2, "minimum_iou_threshold_second_assoc": 0.5,
+        "minimum_iou_threshold_unconfirmed_assoc": 0.2, "high_conf_det_threshold": 0.5,
+        "track_activation_threshold": 0.6,
+    },
+    "C-BIoU": {
+        "lost_track_buffer": 30, "minimum_consecutive_frames": 2,
+        "minimum_iou_threshold_first_assoc": 0.2, "minimum_iou_threshold_second_assoc": 0.5,
+        "minimum_iou_threshold_unconfirmed_assoc": 0.3, "high_conf_det_threshold": 0.6,
+        "track_activation_threshold": 0.7, "buffer_ratio_first": 0.3, "buffer_ratio_second": 0.5,
+    },
 }  # fmt: skip
+ALWAYS = {"BoT-SORT": {"enable_cmc": False}}  # no camera motion
 # norfair has no default distance; that of its demonstrations on boxes, and of MOTChallenge's.
 NORFAIR: dict[str, dict[str, Any]] = {
     "defaults": {"distance_function": "iou", "distance_threshold": 0.7},
@@ -92,13 +82,14 @@ def _of_trackers() -> list[Peer]:
     import trackers  # pyright: ignore[reportMissingImports]
 
     found = []
-    for name, (title, always, advised) in TRACKERS.items():
+    for name, advised in TRACKERS.items():
         # Older versions have the first two alone.
-        kind = getattr(trackers, name, None)
+        kind = getattr(trackers, f"{name.replace('-', '')}Tracker", None)
         if kind is not None:
             for setting, options in (("defaults", {}), ("advised", advised)):
-                make = partial(_through_trackers, kind, always | options, supervision)
-                found.append(Peer(title, setting, make))
+                options = ALWAYS.get(name, {}) | options
+                make = partial(_through_trackers, kind, options, supervision)
+                found.append(Peer(name, setting, make))
     return found
 
 
@@ -130,8 +121,7 @@ def _through_trackers(
 def _of_norfair() -> list[Peer]:
     import norfair  # pyright: ignore[reportMissingImports]
 
-    def make(frames_per_second: float | None, options: dict[str, Any]) -> Step:
-        del frames_per_second
+    def make(_: float | None, options: dict[str, Any]) -> Step:
         tracker = norfair.Tracker(**options)
 
         def step(boxes: np.ndarray, scores: np.ndarray) -> np.ndarray:

@@ -60,7 +60,6 @@ def main(
     preset: Annotated[str, (*sorted(recipes.PRESETS),)] = "default",
     seed: Seed = 0,
     seeds: Count = 1,
-    gif: bool = False,
     out: Path = Path("results/visual_tracking"),
 ) -> None:
     """Track with every filter, writing each one's results as soon as it has finished.
@@ -72,14 +71,12 @@ def main(
     - `detect`: find what moves; a still camera.
     - `frames`: A:B, frames A to B, counted from 1, both in.
     - `seeds`: runs; scores are their means.
-    - `gif`: an animated GIF in place of an MP4.
     """
     if sum(map(bool, (box, ids, detect))) > 1 or (sequence and video):
         raise ValueError("one of --sequence and --video, and of --box, --ids and --detect")
     span = parse_range(frames, "--frames")
-    for name, path in {"--sequence": sequence, "--video": video}.items():
-        if path is not None:
-            refuse_overwriting(out, ["tracking.mp4", "tracking.gif"], {name: path})
+    if video is not None:
+        refuse_overwriting(out, ["tracking.mp4"], {"--video": video})
     source = open_source(sequence, video, span, seed, box, ids, detect)
     keys = jax.random.split(jax.random.key(seed), seeds)
     runs, source = (detected_runs if detect else drawn_runs)(preset, source, keys)
@@ -90,19 +87,18 @@ def main(
     tracked: dict[str, list[Snapshot]] = {}
     results: list[dict[str, Any]] = []
     for name, (snapshots, rows) in runs.items():
-        own, seconds, start = tracked.setdefault(name, []), [], time.perf_counter()
+        own, times = tracked.setdefault(name, []), [time.perf_counter()]
         bar = tqdm(snapshots, desc=NAMES[name], total=source.num_frames, unit="frame", disable=None)
         try:
             for snapshot in bar:
                 own.append(snapshot)
-                seconds.append(time.perf_counter() - start)
-                start = time.perf_counter()
+                times.append(time.perf_counter())
         finally:
             # Also on the way out of an interrupted run.
             if own:
                 span = source.first, source.first + len(own) - 1
                 # Of the frames but the first, which compiles.
-                ms = 1000 * float(np.median(seconds[1:] or seconds))
+                ms = 1000 * float(np.median(np.diff(times[1:] if len(own) > 1 else times)))
                 found = score(rows(own), span, source, detect)
                 if preset == "objects" and name == "mpf" and not detect:
                     # Components keep to their first box, so that tracks have objects for ids.
@@ -114,9 +110,8 @@ def main(
                 data(out / "visual_tracking.json", settings=settings | {"frames": span},
                      results=results)  # fmt: skip
     write_contact_sheet(out / "contact_sheet.png", source, tracked)
-    write_video(out / f"tracking.{'gif' if gif else 'mp4'}", source, tracked)
-    more = OF_TRACKING if detect else ()
-    print(table(COLUMNS | {each: f"{{{each}:.3g}}" for each in more}, results))
+    write_video(out / "tracking.mp4", source, tracked)
+    print(table(COLUMNS | {each: f"{{{each}:.3g}}" for each in OF_TRACKING if detect}, results))
     print(f"written to {out}")
 
 
@@ -158,7 +153,7 @@ def score(
     Means over the runs' tracks.
     """
     measures = ["all_covered", "id_swaps", "on_object", "on_other"]
-    result: dict[str, Any] = dict.fromkeys([*measures, "per_object", "object_swaps", *OF_TRACKING])
+    result: dict[str, Any] = dict.fromkeys([*measures, "object_swaps", *OF_TRACKING])
     truth = np.zeros((0, 6)) if source.truth is None else source.truth
     truth = truth[truth[:, 0] <= span[1]]
     if not len(truth):
@@ -166,10 +161,6 @@ def score(
     scores = [coverage(rows, truth, source.others)._asdict() for rows in tracks]
     for measure in measures if source.all_labelled else measures[:2]:
         result[measure] = float(np.mean([each[measure] for each in scores]))
-    result["per_object"] = {
-        str(id): float(np.mean([each["per_object"][id] for each in scores]))
-        for id in scores[0]["per_object"]
-    }
     try:
         found = [multi_object_scores(rows, truth, span) for rows in tracks if detect]
     except ImportError as error:

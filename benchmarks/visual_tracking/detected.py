@@ -210,13 +210,11 @@ def rows_of_tracks(
     kept: list[Tracks], first: int, num_runs: int, snapshots: list[Snapshot]
 ) -> list[np.ndarray]:
     """The rows of each run's tracks, as many frames as there are snapshots."""
-    tracked = kept[: len(snapshots)]
-    return [offline_rows((_of_run(each, run) for each in tracked), first)
-            for run in range(num_runs)]  # fmt: skip
-
-
-def _of_run(tracks: Tracks, run: int) -> Tracks:
-    return jax.tree.map(lambda leaf: leaf[run], tracks)
+    rows, tracked = [], kept[: len(snapshots)]
+    for run in range(num_runs):
+        own = (jax.tree.map(lambda leaf, run=run: leaf[run], each) for each in tracked)
+        rows.append(offline_rows(own, first))
+    return rows
 
 
 @eqx.filter_jit
