@@ -116,7 +116,7 @@ def main(
         NAMES[name]: [*enumerate(step.effective_sample_size.mean(axis=0), targets.first)]
         for name, step in steps.items()
     }
-    sizes = plotting.Panel(f"mean of the seeds, N = {particles[0]}", "frame", "eq. 14", curves)
+    sizes = plotting.Panel(f"mean of seeds, N = {particles[0]}", "frame", "N_eff, eq. 14", curves)
     harness.figures(
         out, dpi=130, particle_migration=draw_migration(steps, targets),
         effective_sample_size=plotting.draw_panels([[sizes]], ("linear", "linear")),
