@@ -175,14 +175,3 @@ def test_both_are_differentiable():
         below, above = (log_evidence(jnp.array(at + step)) for step in (-0.01, 0.01))
         slope = jax.grad(log_evidence)(jnp.array(at))
         np.testing.assert_allclose(slope, (above - below) / 0.02, rtol=1e-2)
-
-
-@pytest.mark.usefixtures("as_installed")
-def test_numbers_that_nobody_called_missing_are_refused():
-    model = mpfjax.LinearGaussianModel(**MODEL)
-    with pytest.raises(ValueError, match="observations: NaN or infinite at index 1"):
-        kalman_filter(model, GAPS[[2, 1]])
-    with pytest.raises(ValueError, match="observations: infinite at index 0"):
-        kalman_smoother(model, Series.skipping(np.full((1, 2), np.inf)))
-    with pytest.raises(ValueError, match="observations: NaN or infinite at index 1"):
-        grid_filter(mpfjax.QuadraticModel(), np.array([1.0, NAN]), jnp.linspace(-1.0, 1.0, 9))

@@ -151,10 +151,6 @@ def sample_standard_normal(key):
     return {"mean": jax.random.normal(key)}
 
 
-def mean_alone(model):
-    return {"mean": model.mean}
-
-
 def test_evidence_of_smc2_is_the_exact_one_where_every_filter_is_exact():
     """Of y ~ N(θ, 1), θ ~ N(0, 1): log N(y; 0, I + 1 1ᵀ) without its constant, over ten runs."""
     observations = jnp.array([2.0, 1.4, 2.6, 1.8])

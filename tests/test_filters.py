@@ -44,6 +44,7 @@ def test_one_component_is_the_particle_filter_to_the_bit():
     chex.assert_trees_all_equal(*runs)
 
 
+@pytest.mark.exactness
 def test_a_start_is_what_its_parts_give_one_after_the_other():
     """To the last digit: the draws of x_0 are not part of the program that groups them."""
     filter = mpfjax.mixture_particle_filter(mpfjax.QuadraticModel(), 60, max_components=3)
@@ -145,12 +146,6 @@ def test_what_is_missing_is_skipped_as_the_kalman_filter_does(model, linear, obs
     assert not np.asarray(run.resampled)[:, nothing_seen].any()
 
 
-def test_an_infinite_observation_is_not_a_missing_one():
-    filter = mpfjax.particle_filter(TwoSensors(), 20)
-    with pytest.raises(ValueError, match="observations: infinite at index 1"):
-        mpfjax.run_filter(KEY, filter, np.array([[0.0, np.nan], [np.inf, 0.0]]))
-
-
 def test_broken_and_impossible_densities_within_a_run():
     filter, keys = CHAINS["kmeans only"](QUADRATIC), jax.random.split(KEY, 2)
     run = mpfjax.run_filter(KEY, filter, OBSERVATIONS.at[1].set(BLINDED))
@@ -164,6 +159,7 @@ def test_broken_and_impossible_densities_within_a_run():
             runner(key, filter, broken)
 
 
+@pytest.mark.exactness
 def test_slots_are_one_program_whatever_the_number_of_particles():
     def evidence(num_particles):
         model = TrickyQuadraticModel(0.3, 0.5, -2.0, 2.0)

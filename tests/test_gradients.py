@@ -137,6 +137,7 @@ class Window(mpfjax.QuadraticModel):
         return jnp.where(jnp.abs(observation - states**2) < 0.4, honest, -jnp.inf)
 
 
+@pytest.mark.exactness
 def test_gradients_are_finite_where_weights_and_components_vanish():
     """In float32, with empty slots, dead components, and a step of zero likelihood throughout."""
     observations = jnp.array([1.5, 1.0, BLINDED, 0.4, 0.9])

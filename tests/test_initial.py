@@ -59,6 +59,7 @@ def test_the_chosen_particles_represent_the_prior(runs):
         assert_unbiased(np.sum(weights * np.asarray(function), axis=1), exact)
 
 
+@pytest.mark.exactness
 def test_particles_descend_from_those_of_the_run():
     """Without noise in the dynamics x_1 is x_0 of its ancestor, where the run says it was."""
     model = mpfjax.LinearGaussianModel(
@@ -105,6 +106,7 @@ def test_what_a_chain_weighs_before_it_propagates_counts():
     assert_unbiased(ratios_to(log_z, found))
 
 
+@pytest.mark.exactness
 def test_on_islands_the_masses_of_their_choices_count():
     def run(key):
         return mpfjax.run_islands(key, make(8, 50), OBSERVATIONS, nothing, num_islands=2)
@@ -112,6 +114,7 @@ def test_on_islands_the_masses_of_their_choices_count():
     assert_unbiased(ratios_to(EXACT, jax.jit(jax.vmap(run))(jax.random.split(KEY, 300))))
 
 
+@pytest.mark.exactness
 def test_where_x_0_must_be_a_plain_draw_it_is_one():
     trajectory = np.full(4, 3.0, np.float32)
     found = conditional_filter(KEY, make(8), OBSERVATIONS, trajectory)

@@ -14,6 +14,7 @@ from mpfjax.operations import stored as forms
 from mpfjax.operations.prefix_sums import count_upto, exact_sum_before, sum_before
 from mpfjax.operations.stored import stored
 from mpfjax.running.scan import scan
+from tests.marking import quick_of
 
 MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
 FILTER = mpfjax.mixture_particle_filter(MODEL, 40, 3)
@@ -40,7 +41,7 @@ def default_forms():
     jax.clear_caches()
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", quick_of(FORMS, list(FORMS)[:-1]))
 def test_every_form_has_one_for_a_gpu_and_it_gives_the_same(form):
     """The triangle and the identity matrix are what makes a CPU fast."""
     own = jax.jit(FORMS[form])()

@@ -112,7 +112,7 @@ DEALT_ANEW = {
 }  # fmt: skip
 
 
-QUICK = ("variance of a forecast", "families")
+QUICK = ("families",)
 
 
 @pytest.mark.parametrize("name", quick_of(DEALT_ANEW, QUICK))
@@ -222,6 +222,7 @@ class OneSided(mpfjax.QuadraticModel):
         return jnp.full(num_particles, 1.5) + 0 * super().sample_initial(key, num_particles)
 
 
+@pytest.mark.exactness
 def test_x_0_is_a_point_set_unless_it_has_another_law():
     filter = mpfjax.particle_filter(OneSided(0.3, 0.5), 20, noise="rqmc")
     np.testing.assert_array_equal(filter.init(KEY).particles, 1.5)

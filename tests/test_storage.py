@@ -1,10 +1,8 @@
 """Checkpoints go on to the bit, and files are whole or an error that names them."""
 
 import errno
-import io
 import os
 import time
-import zipfile
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
@@ -176,25 +174,13 @@ class TestFiles:
             load_arrays(tmp_path / "code.npz")
         assert not trace.exists()
 
-    @pytest.mark.parametrize("shape", [(10**12,), (2, 10**30), (3,), (-1, -2)])
-    def test_headers_that_lie_are_errors_that_name_the_file(self, tmp_path, shape):
-        file = io.BytesIO()
-        header = {"descr": "<f8", "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(file, header)
-        with zipfile.ZipFile(tmp_path / "lies.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("x.npy", file.getvalue() + bytes(16))
-        with pytest.raises(ValueError, match=r"lies.npz: cut off, damaged"):
-            load_arrays(tmp_path / "lies.npz")
-
     @pytest.mark.parametrize(
         ("name", "array"),
         [
             ("description", None),
-            ("description", np.array("null")),
             ("description", np.array("{")),
             ("['x']", None),
             ("['x']", np.arange(3.0)),
-            ("['x']", np.array("abc")),
             ("['key']", np.zeros(3, np.uint32)),
             ("['t']", np.array([2, 3])),
             ("['half']", np.ones(2, np.float16)),

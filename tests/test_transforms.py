@@ -3,6 +3,7 @@
 import chex
 import jax
 import numpy as np
+import pytest
 
 import mpfjax
 from mpfjax import (
@@ -49,6 +50,7 @@ def test_the_keywords_of_recipes_are_transforms():
         chex.assert_trees_all_equal(final(recipe), final(transform(plain)))
 
 
+@pytest.mark.exactness
 def test_they_compose_on_a_chain_of_ones_own():
     filter = own_chain()
     for change in (

@@ -43,6 +43,7 @@ class TestCrps:
 
 
 class TestLogScore:
+    @pytest.mark.exactness
     def test_of_a_conditionally_linear_model_x_is_integrated_out(self):
         """The sum over all sequences of regimes has -log p(y_4 | y_1..y_3)."""
         filter = mpfjax.particle_filter(switching.MODEL, 4000)

@@ -132,27 +132,3 @@ def test_a_model_of_one_particle_draws_each_from_a_key_of_its_own():
     for drawn in (states, moved):
         assert drawn.shape == (5, 2)
         assert len(np.unique(np.asarray(drawn))) == 10
-
-
-class Counting(mpfjax.AbstractStateSpaceModel):
-    """Counts that come and go; also mixes its key with one of its own."""
-
-    def sample_initial(self, key, num_particles):
-        return jax.random.poisson(key, 4.0, (num_particles,)).astype(jnp.float32)
-
-    def sample_transition(self, key, states):
-        own = jax.random.key(7)
-        either = jnp.where(states.sum() > 0, key, own)
-        both = jnp.concatenate([key[None], own[None]])
-        arrivals = jax.random.poisson(either, 1.0, states.shape).astype(states.dtype)
-        return jax.random.binomial(both[0], states, 0.8).astype(states.dtype) + arrivals
-
-    def log_likelihood(self, observation, states):
-        return -0.5 * (observation - states) ** 2
-
-
-def test_keys_of_models_are_those_that_all_of_jax_random_takes():
-    joint = mpfjax.MultiObjectModel(Counting(), 2, shared_observation=True)
-    filter = mpfjax.partitioned_sampling(joint, 20)
-    run = mpfjax.run_filter(jax.random.key(1), filter, jnp.array([3.0, 5.0]))
-    assert np.isfinite(run.log_marginal_likelihood)

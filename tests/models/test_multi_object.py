@@ -38,6 +38,7 @@ OWN = jnp.array([2, 0, 1, 1, 0], jnp.int32)  # an object of each particle
 
 
 class TestDensities:
+    @pytest.mark.exactness
     def test_draws_have_an_axis_of_objects_and_the_objects_own_moments(self):
         states = MODEL.sample_initial(KEY, 4000)
         assert states.shape == (4000, NUM_OBJECTS, 2)

@@ -5,7 +5,6 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from scipy.stats import multivariate_normal
 
 import mpfjax
@@ -92,10 +91,3 @@ def test_draws_of_regimes_follow_the_transition_matrix():
     for k, (regime, log_probability) in enumerate(pairs):
         assert (np.asarray(regime) == k).all()
         np.testing.assert_allclose(log_probability, MODEL.log_transition(regime, latent), rtol=1e-6)
-
-
-def test_too_long_a_series_and_an_infinity_are_refused():
-    with pytest.raises(ValueError, match="observations: 20 steps of 3 regimes"):
-        switching_filter(MODEL, jnp.zeros((20, 1)))
-    with pytest.raises(ValueError, match="observations: infinite at index 1"):
-        switching_filter(MODEL, jnp.array([[0.3], [jnp.inf]]))

@@ -8,6 +8,7 @@ from jax.scipy.stats import cauchy, norm
 
 import mpfjax
 from tests import switching
+from tests.marking import quick_of
 from tests.user_models import DRIFT_AS_LINEAR_GAUSSIAN, Drift, DriftOfOne, ScalarLinear
 
 NUMBER = jnp.asarray(0.3)
@@ -71,7 +72,7 @@ RIGHT = {
 }
 
 
-@pytest.mark.parametrize("name", RIGHT)
+@pytest.mark.parametrize("name", quick_of(RIGHT, ["x_0 known", "regimes", "volatile", "quadratic"]))
 def test_what_is_right_is_accepted(name):
     mpfjax.check_model(jax.random.key(0), *RIGHT[name])
 
@@ -152,6 +153,7 @@ class Near(Drift):
         return jnp.where(jnp.abs(observation - states[:, 0]) < 5.0, 0.1, -jnp.inf)
 
 
+@pytest.mark.exactness
 def test_a_run_without_any_likelihood_says_so_once(recwarn):
     filter = mpfjax.particle_filter(Near(), 20)
     keys, far = jax.random.split(jax.random.key(0), 3), np.array([90.0, np.nan, 80.0])

@@ -34,6 +34,7 @@ def test_laplaces_approximation_is_close_where_the_state_is_well_known():
         assert float(value) == pytest.approx(exact, abs=0.06)
 
 
+@pytest.mark.exactness
 def test_fully_adapted_weights_are_equal_and_the_evidence_is_unbiased():
     filter = mpfjax.auxiliary_particle_filter(TWO, 100, ADAPTED)
     keys = jax.random.split(KEY, 300)

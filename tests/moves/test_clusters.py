@@ -9,12 +9,11 @@ import pytest
 import mpfjax
 from mpfjax import MultiObjectModel, PairwiseRepulsion
 from tests.examples import stack, walker
+from tests.marking import exactness
 from tests.moves.test_partitioned import (
     NOISES,
     assert_both_unbiased,
-    normal,
     pair_on_a_grid,
-    repulsion,
 )
 
 KEY = jax.random.key(0)
@@ -53,6 +52,7 @@ def runs(filter, observations):
     return *found, np.asarray(labels)
 
 
+@pytest.mark.exactness
 def test_a_pair_that_repels_is_unbiased():
     """In some runs the pair meets at once, in others later."""
     filter, seen = mpfjax.clustered_particle_filter(PAIR, 20), OBSERVATIONS[:, :2]
@@ -62,25 +62,6 @@ def test_a_pair_that_repels_is_unbiased():
     is_merged = labels[:, :, 1] == 0
     assert 0.05 < is_merged[:, 0].mean() < 0.99
     assert (is_merged[:, 1:] >= is_merged[:, :-1]).all()
-
-
-@pytest.mark.exactness
-def test_three_that_meet_in_one_step_are_unbiased():
-    """Against quadrature over all three, y_1 only."""
-    close, seen, grid = (0.0, 1.0, -1.0), 0.3 * OBSERVATIONS[:1], np.linspace(-6, 6, 161)
-    cell = grid[1] - grid[0]
-    parts = [
-        normal(grid - 0.9 * mean, 0.81 + 0.4) * normal(float(y) - grid, noise)
-        for mean, y, noise in zip(close, seen[0, :, 0], NOISES, strict=True)
-    ]
-    table = repulsion(grid, STRENGTH, RADIUS)
-    density = np.einsum("i,j,k,ij,ik,jk->ijk", *parts, table, table, table)
-    mass = density.sum() * cell**3
-    axes = ((1, 2), (0, 2), (0, 1))
-    exact = np.array([grid @ density.sum(axis=axis) * cell**3 / mass for axis in axes])
-    *found, labels = runs(mpfjax.clustered_particle_filter(model_of(close), 20), seen)
-    assert_both_unbiased(*found, np.log(mass), exact)
-    assert (labels == 0).all(axis=(1, 2)).mean() > 0.9
 
 
 class Momentum(mpfjax.AbstractStateSpaceModel):
@@ -106,6 +87,7 @@ class Momentum(mpfjax.AbstractStateSpaceModel):
         return jax.scipy.stats.norm.logpdf(observation[0] - states[:, 0], scale=jnp.sqrt(0.5))
 
 
+@pytest.mark.exactness
 def test_crossing_keeps_a_state_that_holds_the_past():
     """Of two AR2 objects in one cluster, whose evidence is that of `test_chains.py`."""
     filter = mpfjax.clustered_particle_filter(MultiObjectModel(Momentum(), 2), 45, start="together")
@@ -128,7 +110,9 @@ def placed(places, filter):
     return mixture.replace(particles=states[:, :, None])
 
 
-@pytest.mark.parametrize(("split_after", "at_the_end"), [(None, [0, 1, 0, 0]), (2, [0, 1, 0, 3])])
+@pytest.mark.parametrize(
+    ("split_after", "at_the_end"), [*exactness([(None, [0, 1, 0, 0])]), (2, [0, 1, 0, 3])]
+)
 def test_who_touches_merges_and_is_split_after_long_enough_where_asked(split_after, at_the_end):
     """Object 2 touches 0 and 3, which do not touch each other; then 3 goes away."""
     model = MultiObjectModel(STILL, 4, PairwiseRepulsion(2.0, 1.0), per_object=False)

@@ -8,6 +8,7 @@ import pytest
 
 from mpfjax import Resample
 from tests.examples import example_mixtures, log_masses
+from tests.marking import quick_of
 from tests.registry import REGROUPINGS, WITHIN_COMPONENTS
 
 # One component has a path of its own, and up to four are worked on as rows.
@@ -17,6 +18,13 @@ NUM_DRAWS = 2000
 PLAIN = ("systematic", "stratified", "multinomial", "residual", "ssp")
 CASES = [(name, 3 if name.startswith("s") else 6) for name in WITHIN_COMPONENTS]
 CASES += [(name, 1) for name in PLAIN]
+# Each takes a program of its own; these are one of every kind.
+QUICK = [
+    ("systematic", 1),
+    *((name, 3) for name in ("systematic", "stratified", "ssp", "systematic, sorted")),
+    *((name, 6) for name in ("residual", "multinomial, adaptive", "gaussian")),
+    ("residual, fixed number, adaptive", 6),
+]
 RESAMPLINGS = [(name, m) for name, m in CASES if isinstance(WITHIN_COMPONENTS[name], Resample)]
 
 
@@ -67,7 +75,7 @@ def draws_of(move, mixture):
     return jax.vmap(lambda key: move(key, mixture))(keys)
 
 
-@pytest.mark.parametrize(("name", "m"), CASES)
+@pytest.mark.parametrize(("name", "m"), quick_of(CASES, QUICK))
 def test_components_keep_their_mass_and_their_offspring(name, m):
     """And a slot is fed from a particle of weight, as many of them as the move says."""
     move = WITHIN_COMPONENTS[name]
@@ -93,7 +101,7 @@ def test_components_keep_their_mass_and_their_offspring(name, m):
             np.testing.assert_array_equal(after.particles[filled], copied)
 
 
-@pytest.mark.parametrize(("name", "m"), RESAMPLINGS)
+@pytest.mark.parametrize(("name", "m"), quick_of(RESAMPLINGS, QUICK))
 def test_offspring_are_unbiased_where_resampled_and_kept_elsewhere(name, m):
     """E[weight of i's offspring] is i's weight, the definition of unbiased resampling."""
     move = WITHIN_COMPONENTS[name]

@@ -3,9 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import mpfjax
-from mpfjax import Every, KMeans, Merge, Propagate, Resample, Split
+from mpfjax import Every, KMeans, Merge, Propagate, Split
 from tests.registry import RandomLabels
 
 MODEL = mpfjax.QuadraticModel(0.3, 0.5, -2.0, 2.0)
@@ -41,12 +42,7 @@ def test_they_run_at_the_steps_k_2k_and_so_on_and_a_missing_observation_is_no_st
         np.testing.assert_array_equal(changed, np.tile(expected, (len(KEYS), 1)))
 
 
-def test_resampling_is_reported_where_it_happens():
-    found, _ = run(Every(2, [Resample(), KMeans(1)]))
-    happened = np.asarray(found.resampled).any(axis=2)
-    np.testing.assert_array_equal(happened, [[False, True] * 3 + [False]] * len(KEYS))
-
-
+@pytest.mark.exactness
 def test_at_every_step_they_are_the_moves_themselves():
     moves = [Merge(2.0, patience=2), Split(1.0), KMeans(2)]
     _, plain = run(*moves)

@@ -10,6 +10,7 @@ import mpfjax
 from mpfjax import GaussianRegeneration
 from mpfjax.exact import kalman_filter
 from tests.examples import make_mixture
+from tests.marking import exactness
 from tests.unbiased import assert_unbiased
 
 NUM_DRAWS = 2000
@@ -48,6 +49,7 @@ def test_draws_have_the_moments_of_their_component(noise):
         assert_unbiased(products, covariances[m])
 
 
+@pytest.mark.exactness
 def test_a_singular_covariance_draws_within_its_plane_and_where_leaves_the_rest_to_resampling():
     flat = {"box": MIXTURE.particles[:, :1] * jnp.array([[1.0, 2.0]]), "kind": 10 * LABELS}
     mixture = MIXTURE.replace(particles=jax.tree.map(jnp.asarray, flat))
@@ -73,7 +75,8 @@ def test_units_of_any_size_keep_the_spread_of_every_coordinate():
 
 
 @pytest.mark.parametrize(
-    ("max_components", "importance"), [(1, "propagated"), (3, "predictive_gaussian")]
+    ("max_components", "importance"),
+    [(1, "propagated"), *exactness([(3, "predictive_gaussian")])],
 )
 def test_moments_are_the_kalman_filters(max_components, importance):
     """On a linear-Gaussian model one component is exact, and any number close to it."""

@@ -91,14 +91,6 @@ def test_evidence_regimes_and_moments_are_unbiased(name):
         assert_unbiased(own * found, expected, loosest=0.1)
 
 
-@pytest.mark.exactness
-def test_regimes_have_their_share_without_components_too():
-    """Children of a regime stand side by side: in turn, Ẑ would have three times the deviation."""
-    names = ("all children", "all children, by regime")
-    one, many = (np.exp(runs(n).log_marginal_likelihood - truth()[0][-1]).std() for n in names)
-    assert one < 1.5 * many
-
-
 class OnePath(mpfjax.AbstractConditionallyLinearModel):
     """A latent that counts the steps, so that every particle is the Kalman filter itself."""
 
@@ -195,6 +187,7 @@ class Wandering(OnePath):
         return LINEAR.H, jnp.repeat(jnp.sin(latent), 2, axis=1), LINEAR.R
 
 
+@pytest.mark.exactness
 def test_a_covariance_that_all_share_is_that_of_each():
     """Computed once or for each particle, also where an entry or an observation is missing."""
     series = SERIES.at[1].set(jnp.nan).at[2, 0].set(jnp.nan)
@@ -269,6 +262,7 @@ def test_with_the_optimal_proposal_all_weights_are_equal():
     np.testing.assert_allclose(run.collected, -np.log(NUM_PARTICLES), atol=1e-4)
 
 
+@pytest.mark.exactness
 def test_optimal_resampling_keeps_heavy_children_and_none_twice():
     filter = FILTERS["all children"]()
     start = mpfjax.run_filter(KEY, filter, OBSERVATIONS[:4], lambda mixture: None).final
@@ -319,6 +313,7 @@ def test_no_child_is_kept_twice_and_every_component_keeps_its_mass(name):
     assert (np.abs(after.mean(axis=0) - regimes(start) @ TRANSITIONS) <= 4 * error + 1e-4).all()
 
 
+@pytest.mark.exactness
 def test_more_slots_than_children_stay_empty():
     """Copies would have the moments that they copy: with every child, the filter is exact."""
     filter = own([PropagateRegimes(MODEL)], num_particles=NUM_REGIMES**4)

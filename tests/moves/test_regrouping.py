@@ -172,6 +172,7 @@ class TestSplit:
         mixture = self.one(states, log_weights=np.log(np.repeat([0.9, 0.1], 50) / 50))
         assert labels_after(move, mixture).max() == splits
 
+    @pytest.mark.exactness
     def test_there_are_never_more_than_m_components_and_the_clearest_splits(self):
         parts = [RNG.normal(size=40) + centre for centre in (0, 12, 200, 260)]
         states = np.concatenate(parts)[:, None]
@@ -281,7 +282,7 @@ class TestGroupBy:
         assert int(counts.collected.min()) == 10
 
 
-@pytest.mark.parametrize("masses", [(0.9, 0.0999, 1e-4), (0.6, 0.1, 0.2, 0.0999, 1e-4, 1e-6), (1,)])
+@pytest.mark.parametrize("masses", [(0.6, 0.1, 0.2, 0.0999, 1e-4, 1e-6), (1,)])
 def test_only_what_is_below_the_share_of_the_heaviest_is_pruned(masses):
     log_weights = np.repeat(np.log(np.array(masses) / 3), 3)
     before = make_mixture(np.zeros(len(masses) * 3), log_weights,
@@ -312,6 +313,7 @@ class FourAlike(mpfjax.AbstractStateSpaceModel):
 MODES = np.array([-30.0, -10.0, 10.0, 30.0])
 
 
+@pytest.mark.exactness
 def test_modes_that_share_a_label_keep_their_mass():
     """E[Ẑ π_k] = Z / 4 for each of the four modes, with two labels, which run out."""
     filter = mpfjax.mixture_particle_filter(FourAlike(), 200, 2)
@@ -331,8 +333,7 @@ def test_modes_that_share_a_label_keep_their_mass():
         assert wider.step(KEY, final.replace(num_components=m), 0.0)[1].labels_ran_out == ran_out
 
 
-@pytest.mark.parametrize("num_groups", [3, 12])
-@pytest.mark.parametrize("num_features", [1, 3, 10])
+@pytest.mark.parametrize(("num_groups", "num_features"), [(3, 1), (12, 10)])
 def test_moments_of_groups_equal_those_of_numpy(num_groups, num_features):
     features = RNG.normal(size=(300, num_features)) + 5
     weights = RNG.random(300) * (RNG.random(300) < 0.8)

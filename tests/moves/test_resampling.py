@@ -13,6 +13,7 @@ from mpfjax.moves.resampling.allocation import EQUAL_PARTS, FEWEST, place_slots
 from mpfjax.moves.resampling.ancestors import SCHEMES, random_points
 from mpfjax.operations import prefix_sums
 from tests.examples import make_mixture
+from tests.marking import exactness, quick_of
 from tests.unbiased import assert_unbiased
 
 NEARLY_ONE = 1 - 2.0**-24
@@ -70,7 +71,11 @@ def redraw_with(move):
 
 
 @pytest.mark.parametrize(
-    ("scheme", "n", "most"), [("systematic", 100_000, None), *((s, 1003, 0) for s in SCHEMES)]
+    ("scheme", "n", "most"),
+    quick_of(
+        [("systematic", 100_000, None), *((s, 1003, 0) for s in SCHEMES)],
+        [("systematic", 1003, 0), ("ssp", 1003, 0)],
+    ),
 )
 def test_no_particle_of_zero_weight_is_ever_fed(scheme, n, most, monkeypatch):
     """Not with random draws, nor with uniform draws at their ends; nor is mass moved.
@@ -104,8 +109,11 @@ MANY, NUM_KEYS = 2**17, 20
 @pytest.mark.parametrize(
     ("scheme", "kind", "m"),
     [
-        ("systematic", "random", 12), ("stratified", "in turn", 1), ("multinomial", "in turn", 1),
-        ("residual", "sorted", 12), ("ssp", "random", 1),
+        ("systematic", "random", 12),
+        *exactness(
+            [("stratified", "in turn", 1), ("multinomial", "in turn", 1),
+             ("residual", "sorted", 12), ("ssp", "random", 1)]
+        ),
     ],
 )  # fmt: skip
 def test_means_of_many_particles_stay_where_they_are(scheme, kind, m):
@@ -130,15 +138,15 @@ def test_means_of_many_particles_stay_where_they_are(scheme, kind, m):
     assert_unbiased(found, 0.0, slack=4e-7)
 
 
-@pytest.mark.parametrize("word", [0, 2**32 - 1])
-def test_points_stay_within_their_components_stretch_of_slots(word, monkeypatch):
+def test_points_stay_within_their_components_stretch_of_slots(monkeypatch):
     """The largest uniform numbers round up onto the border, which is the next component's."""
     targets = jnp.asarray([1, 25_000, 2**20, 74_999], jnp.int32)
     slots = place_slots(targets, 2**20 + 100_000)
     ends = np.asarray(slots.firsts) + np.asarray(targets)
-    end_of_unit = {0: 0.0, 2**32 - 1: NEARLY_ONE}[word]
-    monkeypatch.setattr(prefix_sums, "bits", lambda key, shape: jnp.full(shape, word, jnp.uint32))
-    monkeypatch.setattr(prefix_sums, "uniform", lambda key, shape: jnp.full(shape, end_of_unit))
+    monkeypatch.setattr(
+        prefix_sums, "bits", lambda key, shape: jnp.full(shape, 2**32 - 1, jnp.uint32)
+    )
+    monkeypatch.setattr(prefix_sums, "uniform", lambda key, shape: jnp.full(shape, NEARLY_ONE))
     points = jax.jit(lambda key: random_points(key, slots, targets))(KEY)
     own = np.asarray(slots.components)
     assert (points.whole >= np.asarray(slots.firsts)[own]).all()
@@ -224,7 +232,7 @@ def test_between_these_parts_as_much_is_shared_equally_as_keeps_ten_effective_pa
     assert abs(int(draw(Resample(), mixture).component_counts[2]) - expected) <= 1
 
 
-@pytest.mark.parametrize("n", [1, 3, 29])
+@pytest.mark.parametrize("n", [3, *exactness([1, 29])])
 def test_fewer_slots_than_components_fill_up_all_the_same(n):
     rng = np.random.default_rng(n)
     mixture = make_mixture(np.zeros((n, 1)), rng.normal(size=n), rng.integers(0, 8, n), 8)

@@ -120,6 +120,7 @@ def call(trajectory=(0.5, 0.6, 0.7, 0.8), model=None, n=6, observations=ONES, **
     return conditional_filter(jax.random.key(0), filter, observations, path, **options)
 
 
+@pytest.mark.exactness
 def test_one_particle_none_seen_and_no_log_transition():
     unseen = call(observations=mpfjax.Series.skipping(np.full(3, np.nan, np.float32)))
     assert float(unseen.run.log_marginal_likelihood) == 0.0
@@ -131,7 +132,6 @@ def test_one_particle_none_seen_and_no_log_transition():
 @pytest.mark.parametrize(
     ("trajectory", "index"),
     [
-        ((1.5, 1.6, 1.7, 1.8), 0),  # no x_0
         ((0.5, 0.6, 0.4, 0.8), 2),  # a step back
         ((0.9, 1.5, 1.9, 2.5), 3),  # too far from y
     ],

@@ -59,6 +59,7 @@ class Known(mpfjax.AbstractStateSpaceModel):
         return norm.logpdf(observation, states, 0.02)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("options", [{}, {"method": "mcmc", "num_steps": 20}])
 def test_few_states_that_have_many_pasts_are_no_reason(options):
     observations = np.cumsum(np.random.default_rng(1).normal(size=20)).astype(np.float32)

@@ -15,11 +15,13 @@ from mpfjax.smoothing import (
     trace_ancestors,
     with_first_ancestors,
 )
+from tests.marking import exactness
 
 QUADRATIC = mpfjax.QuadraticModel(0.3, 0.4, -2.0, 2.0)
 SQUARES = np.array([1.2, 0.8, 1.5, 1.0], np.float32)
 
 
+@pytest.mark.exactness
 def test_trajectories_of_one_component_stay_with_its_mode():
     """With little noise the modes are apart from the second step on, and nobody changes sides."""
     sharp = mpfjax.QuadraticModel(0.1, 0.1, -2.0, 2.0)
@@ -114,6 +116,7 @@ def test_what_follows_ancestors_refuses_particles_without_one_parent():
         with_first_ancestors(filter)
 
 
+@pytest.mark.exactness
 def test_objects_that_come_from_particles_of_their_own_are_smoothed_right():
     """Backward sampling by all weights, against each object's Kalman smoother."""
     filter = mpfjax.independent_particle_filters(OBJECTS, 500)
@@ -131,7 +134,7 @@ class Bounded(NoTransition):
         return jnp.where(jnp.abs(states - previous_states) > 1e3, -jnp.inf, 0.0)
 
 
-@pytest.mark.parametrize("method", ["exact", "mcmc"])
+@pytest.mark.parametrize("method", ["exact", *exactness(["mcmc"])])
 def test_a_step_that_no_particle_can_have_taken_is_an_error(method):
     """The mixtures of one run before those of another, far away."""
     run = mpfjax.run_filter(jax.random.key(1), mpfjax.particle_filter(QUADRATIC, 30), SQUARES)

@@ -48,6 +48,7 @@ def blind(num_steps, *, num_chains=30, key=0, **options):
 
 
 class TestLearning:
+    @pytest.mark.exactness
     def test_burn_in_finds_the_covariance_and_the_posterior_stays_right(self):
         """Of two numbers of correlation .9, one twenty times as wide as the other, from
         deviations that are the other way round.

@@ -8,6 +8,7 @@ import pytest
 import mpfjax
 from mpfjax.exact import kalman_filter
 from mpfjax.tuning import standard_errors
+from tests.marking import exactness
 from tests.user_models import ScalarLinear
 
 TRUTH = {"a": 0.8, "q": 0.6, "h": 1.0, "r": 0.5, "m": 0.5, "p": 0.3}
@@ -59,6 +60,7 @@ def exact_errors(names):
     return dict(zip(names, np.sqrt(np.diag(np.linalg.inv(information))), strict=True))
 
 
+@pytest.mark.exactness
 def test_numbers_of_very_different_units_have_their_exact_errors():
     """Standard errors from 1e-4 to 1e3, none of them by a transform."""
     units, names = (1e3, 1e-3), ("a", "m", "r")
@@ -71,6 +73,7 @@ def test_numbers_of_very_different_units_have_their_exact_errors():
     np.testing.assert_allclose(ratios, 1.0, atol=0.2)
 
 
+@pytest.mark.exactness
 def test_a_step_is_no_shorter_than_what_rounding_leaves():
     """A level of 1e4 standard deviations, in which a float has three digits left."""
     level = 1e4
@@ -90,7 +93,7 @@ def test_a_step_is_no_shorter_than_what_rounding_leaves():
     assert found["m"] == pytest.approx(exact, rel=0.1)
 
 
-@pytest.mark.parametrize("num_seeds", [1, 6])
+@pytest.mark.parametrize("num_seeds", [1, *exactness([6])])
 def test_too_few_seeds_are_said_to_be_too_few(num_seeds):
     """Eight particles and six seeds differ by half and more; one seed cannot be halved."""
     filter, observations = filter_in(1.0, 1.0, 8), jnp.asarray(OBSERVATIONS)

@@ -10,6 +10,7 @@ from mpfjax.exact import kalman_filter
 from mpfjax.tuning import log_density
 from mpfjax.tuning.evidence import pose_evidence
 from mpfjax.tuning.problem import scores
+from tests.marking import exactness
 from tests.test_inputs import INPUTS, OBSERVATIONS, Driven, in_matrices
 from tests.user_models import TwoSensors
 
@@ -17,7 +18,7 @@ SEEN = np.array([[1.0, np.nan], [0.7, 0.3], [np.nan, 0.9], [np.nan, np.nan], [0.
 KEY, GAIN = jax.random.key(0), {"gain": lambda filter: filter.model.gain}
 
 
-@pytest.mark.parametrize("missing", ["error", "skip"])
+@pytest.mark.parametrize("missing", ["skip", *exactness(["error"])])
 def test_a_missing_number_is_the_models_to_deal_with(missing):
     filter = mpfjax.particle_filter(TwoSensors(), 50, gradient="stop")
     series = mpfjax.Series(SEEN, skips_missing=missing == "skip")

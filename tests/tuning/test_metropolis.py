@@ -70,17 +70,6 @@ def test_a_nan_is_rejected_and_counted():
     assert not run.num_invalid["log_prior"].any()
 
 
-def test_a_prior_that_is_nan_outside_its_support_is_zero_there():
-    def sided(parameters):
-        return jnp.log(0.9 - parameters["a"])
-
-    filter = mpfjax.particle_filter(Fragile(a=0.5), 12)
-    with pytest.warns(UserWarning, match=r"zero density: log_prior \d+ times$"):
-        run = sample(60, filter=filter, num_chains=4, log_prior=sided)
-    assert (run.parameters["a"] <= 0.9).all()
-    assert not run.num_invalid["log_marginal_likelihood"].any()
-
-
 def test_a_start_that_breaks_is_an_error():
     with pytest.raises(RuntimeError, match="was NaN or inf"):
         sample(filter=mpfjax.particle_filter(Fragile(a=0.95), 12), num_chains=4)

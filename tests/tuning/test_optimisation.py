@@ -51,6 +51,7 @@ def series_of(length, rng):
     return jnp.array(rows)
 
 
+@pytest.mark.exactness
 def test_the_maximum_is_found_with_its_standard_errors():
     """On a linear-Gaussian model, whose likelihood the Kalman filter gives."""
     rng = np.random.default_rng(0)

@@ -131,6 +131,7 @@ def test_references_switch_as_often_as_they_should(frame):
     assert stayed / switched == pytest.approx(0.85 / 0.15, rel=1e-4)
 
 
+@pytest.mark.exactness
 def test_second_order_dynamics_carry_the_last_box_along(frame):
     dynamics = Autoregression.with_momentum(0.5, jnp.asarray(DEVIATIONS))
     model = model_of(frame, dynamics=dynamics)

@@ -77,6 +77,7 @@ def test_dynamics_are_the_papers(model):
     np.testing.assert_allclose(noise.std(axis=0) / deviations[None], 1, atol=4 / 8000**0.5)
 
 
+@pytest.mark.exactness
 def test_a_template_from_elsewhere(frame):
     """Object 0 starts in the red box and is known by the looks of the blue one."""
     learned = joint_colour_model(frame, BOXES, colours=COLOURS, templates={0: (frame, BOXES[1])})

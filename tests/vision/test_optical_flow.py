@@ -178,6 +178,7 @@ def distances(tracks, boxes):
     return np.linalg.norm(objects[None] - centres[:, None], axis=2).min(axis=1)
 
 
+@pytest.mark.exactness
 def test_an_object_without_detections_moves_with_the_picture():
     """For the last four frames nothing is detected, and so detections cannot tell of jumps."""
     frames, boxes = shaken(seed=4)

@@ -260,6 +260,7 @@ def test_the_second_frame_is_tracked_by_the_program_of_the_first():
     assert jax.tree.structure(before) == jax.tree.structure(after)
 
 
+@pytest.mark.exactness
 def test_drawn_boxes_give_one_track_each_in_the_order_given():
     first = walks()[walks()[:, 0] == 1][:, 2:6]
     run = list(follow_boxes(stills()[:3], first[::-1]))
