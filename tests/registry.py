@@ -188,7 +188,7 @@ def _of_components(m: int) -> dict[str, Callable[..., Filter]]:
 
 
 # One of each kind of filter and of each way to do its sums.
-QUICK_CHAINS = ("pf", "pf rqmc", "mpf", "gaussian mixture", "dps")
+QUICK_CHAINS = ("pf rqmc", "mpf", "gaussian mixture")
 CHAINS: dict[str, Callable[..., Filter]] = {
     "pf": _pf(),
     "pf multinomial": _pf(scheme="multinomial"),

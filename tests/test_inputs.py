@@ -231,7 +231,7 @@ EVERYWHERE = {
 }  # fmt: skip
 
 
-QUICK = ["guided mpf rqmc", "a proposal with a model of its own"]
+QUICK = ["a proposal with a model of its own"]
 
 
 @pytest.mark.parametrize("name", quick_of(EVERYWHERE, QUICK))
@@ -307,6 +307,7 @@ def test_a_missing_observation_does_not_miss_its_input():
     np.testing.assert_allclose(forecast.mixtures.particles.mean(), expected, atol=0.3)
 
 
+@pytest.mark.exactness
 def test_monte_carlo_islands_and_studies_hand_them_on(tmp_path):
     expected, series = run().log_marginal_likelihood, mpfjax.Series(OBSERVATIONS, INPUTS)
     runs = mpfjax.monte_carlo(KEY[None], FILTER, OBSERVATIONS, nothing, inputs=INPUTS)

@@ -87,6 +87,7 @@ class TestResults:
         (entry,) = run_study(plain, tmp_path / "plain", **options)
         np.testing.assert_allclose(entry["log_marginal_likelihood"], results[0]["evidence"], 1e-5)
 
+    @pytest.mark.exactness
     def test_of_one_shape_or_within_shared_slots_compile_once(self, tmp_path):
         def one(sizes, num_cells=1):
             return small_study(num_cells, filters={"pf": tricky}, num_particles=sizes)

@@ -130,6 +130,7 @@ def test_who_touches_merges_and_is_split_after_long_enough_where_asked(split_aft
         assert labels_of(mixture).tolist() == at_the_end
 
 
+@pytest.mark.exactness
 def test_what_cannot_be_leaves_the_particles_to_their_dynamics():
     """A pair that excludes each other altogether, on one spot."""
 

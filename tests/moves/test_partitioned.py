@@ -73,6 +73,7 @@ FILTERS = {
 }
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("name", ["dps", *exactness(["ps"])])
 def test_a_pair_that_repels_is_unbiased(name):
     @eqx.filter_jit

@@ -44,6 +44,7 @@ def test_particles_between_the_stages_follow_the_tempered_target():
         assert abs(weights @ values**power - truth) <= 4 * error
 
 
+@pytest.mark.exactness
 def test_one_stage_is_the_plain_propagation_and_ancestors_are_those_of_the_step_before():
     """Without stages between there is nothing to resample or move: weights are L."""
     still = mpfjax.QuadraticModel(1e-6, 0.5, -2.0, 2.0)

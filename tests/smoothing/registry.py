@@ -159,6 +159,5 @@ QUICK_CASES = [
       for smoother in SMOOTHERS if SMOOTHERS[smoother].of_run
       for chain, model in (("pf", "four dimensions"), ("mpf", "two modes"))),
     ("PaRIS", "mpf", "two modes"),
-    ("fixed lag, MCMC", "mpf", "one dimension"),
     ("conditional filter", "mpf", "one dimension"),
 ]  # fmt: skip

@@ -20,6 +20,7 @@ def observe(key, states):
     return states + np.sqrt(0.4) * jax.random.normal(key, states.shape)
 
 
+@pytest.mark.exactness
 def test_moments_are_the_kalman_filters_and_components_keep_their_masses():
     filter = mpfjax.mixture_particle_filter(LINEAR, 100, 3)
 

@@ -60,6 +60,7 @@ def test_rows_that_do_not_fit_together_are_drawn_in_turn(monkeypatch):
 
 
 class TestGenealogy:
+    @pytest.mark.exactness
     def test_indices_and_states_are_those_of_a_loop(self):
         filter = mpfjax.mixture_particle_filter(QUADRATIC, 40, 3)
         found = mpfjax.run_filter(jax.random.key(4), filter, jnp.asarray(SQUARES))
@@ -97,6 +98,7 @@ OBJECTS = mpfjax.MultiObjectModel(
 SEEN = jnp.array([[[0.8], [-0.5]], [[1.3], [-0.2]], [[0.9], [0.3]]])
 
 
+@pytest.mark.exactness
 def test_what_follows_ancestors_refuses_particles_without_one_parent():
     filter, seen = mpfjax.gaussian_particle_filter(QUADRATIC, 50), jnp.full(3, 1.5)
     run = mpfjax.run_filter(jax.random.key(0), filter, seen)

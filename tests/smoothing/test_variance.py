@@ -101,6 +101,7 @@ def exact_pairs(run):
     return relative + relative**2 / 2, np.array(masses)
 
 
+@pytest.mark.exactness
 @pytest.mark.parametrize("num_components", [3, *exactness([1])])
 def test_averages_of_pairs_are_close_to_the_pairs_themselves(num_components):
     """And the report of a step has both errors; nothing else is changed."""

@@ -154,6 +154,7 @@ def test_a_file_of_other_chains_is_refused(other, named, tmp_path):
         blind(4, **options | other)
 
 
+@pytest.mark.exactness
 def test_a_start_without_a_likelihood_is_drawn_again():
     def half(parameters):
         return jnp.where(parameters["a"] > 0, correlated(parameters), -jnp.inf)

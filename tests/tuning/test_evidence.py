@@ -29,6 +29,7 @@ def test_a_missing_number_is_the_models_to_deal_with(missing):
     np.testing.assert_allclose(found, run.log_marginal_likelihood, rtol=1e-4)
 
 
+@pytest.mark.exactness
 def test_the_score_of_a_controls_coefficient_is_that_of_kalmans_filter():
     """The gradient that other libraries' samplers take: times Ẑ it is unbiased, over seeds."""
 

@@ -18,6 +18,7 @@ class NoTransition(Pushed):
     log_transition = None
 
 
+@pytest.mark.exactness
 def test_without_log_transition_the_trajectory_follows_its_ancestors():
     run = sample(NoTransition())
     assert np.isfinite(run.parameters["a"]).all()

@@ -38,6 +38,7 @@ class Counted(ScalarLinear):
         return super().log_likelihood(observation, states)
 
 
+@pytest.mark.exactness
 def test_likelihoods_are_those_of_the_states_and_calls_share_a_program():
     """They change when, and only when, a step moves; of any length, burn-in and thinning."""
     filter = mpfjax.particle_filter(Counted(), 12)
@@ -58,6 +59,7 @@ class Fragile(ScalarLinear):
         return jnp.where(self.a > 0.9, jnp.nan, honest)
 
 
+@pytest.mark.exactness
 def test_a_nan_is_rejected_and_counted():
     filter = mpfjax.particle_filter(Fragile(a=0.5), 12)
     with pytest.warns(UserWarning, match=r"zero density: log_marginal_likelihood \d+ times$"):

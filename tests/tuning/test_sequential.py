@@ -121,6 +121,7 @@ class Fragile(ScalarLinear):
         return jnp.where((self.a > 0.5) & (observation > 1.8), jnp.nan, honest)
 
 
+@pytest.mark.exactness
 def test_a_nan_costs_its_sample_alone(monkeypatch):
     """The weight of such a θ is zero; nothing else is lost, and they are counted."""
     with_thresholds(monkeypatch, ess=0.0)
