@@ -174,7 +174,10 @@ def test_smoothed_means_are_those_of_the_joint_normal(method):
 
     def by_sums(key):
         # With a lag of the whole series, each term is smoothed by all observations.
-        pair = lambda before, after: jnp.stack([before, after], axis=1)  # noqa: E731
+
+        def pair(before, after):
+            return jnp.stack([before, after], axis=1)
+
         series = mpfjax.Series(OBSERVATIONS, given)
         found = smoothed_sums(key, filter, series, pair, lag=LENGTH, method="exact", num_draws=2)
         return jnp.concatenate([found.terms[:1, 0], found.terms[:, 1]])
@@ -312,7 +315,10 @@ def test_monte_carlo_islands_and_studies_hand_them_on(tmp_path):
     expected, series = run().log_marginal_likelihood, mpfjax.Series(OBSERVATIONS, INPUTS)
     runs = mpfjax.monte_carlo(KEY[None], FILTER, OBSERVATIONS, nothing, inputs=INPUTS)
     np.testing.assert_allclose(runs.log_marginal_likelihood[0], expected, rtol=1e-5)
-    make = lambda num_particles: mpfjax.particle_filter(Driven(), num_particles)  # noqa: E731
+
+    def make(num_particles):
+        return mpfjax.particle_filter(Driven(), num_particles)
+
     (cell,) = mpfjax.run_study(mpfjax.Study({"pf": make}, [32], KEY[None], series), tmp_path)
     np.testing.assert_allclose(cell["log_marginal_likelihood"][0], expected, rtol=1e-5)
     island = mpfjax.run_islands(KEY, FILTER, series, nothing, num_islands=1)

@@ -137,7 +137,10 @@ def test_derivatives_of_the_soft_model_are_those_of_differences():
 
     @jax.jit
     def total(logits, lambda_, bandwidth, box):
-        names = lambda m: (m.reference_logits, m.lambda_, m.bandwidth)  # noqa: E731
+
+        def names(m):
+            return (m.reference_logits, m.lambda_, m.bandwidth)
+
         changed = eqx.tree_at(names, model, (logits, lambda_, bandwidth))
         state = BoxState(box, jnp.arange(2, dtype=jnp.int32))
         return jnp.sum(changed.log_likelihood(jnp.asarray(NOISE), state))

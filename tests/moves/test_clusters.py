@@ -39,7 +39,10 @@ def estimates(keys, filter, observations):
     """log Ẑ, the means at the end and the clusters' labels after each step, of a run a key."""
 
     def run(key):
-        collect = lambda mixture: (mixture.mean()[:, 0], labels_of(mixture))  # noqa: E731
+
+        def collect(mixture):
+            return (mixture.mean()[:, 0], labels_of(mixture))
+
         run = mpfjax.run_filter(key, filter, observations, collect)
         means, labels = run.collected
         return run.log_marginal_likelihood, means[-1], labels

@@ -245,7 +245,10 @@ def test_thousands_of_steps_in_float32_leave_covariances_positive_and_log_z_as_i
         series.append(state[:2] + 1e-4 * rng.normal(size=2))
     series = np.array(series, np.float32)
     filter = mpfjax.particle_filter(mpfjax.SwitchingLinearGaussianModel(np.ones((1, 1)), *parts), 1)
-    collect = lambda mixture: mixture.particles.covariance[0]  # noqa: E731
+
+    def collect(mixture):
+        return mixture.particles.covariance[0]
+
     run = mpfjax.run_filter(KEY, filter, jnp.asarray(series), collect)
     assert np.linalg.eigvalsh(np.asarray(run.collected, float)).min() > 0
     with float64():

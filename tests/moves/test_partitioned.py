@@ -79,7 +79,10 @@ def test_a_pair_that_repels_is_unbiased(name):
     @eqx.filter_jit
     @jax.vmap
     def estimates(key):
-        collect = lambda mixture: mixture.mean()[:, 0]  # noqa: E731
+
+        def collect(mixture):
+            return mixture.mean()[:, 0]
+
         run = mpfjax.run_filter(key, FILTERS[name](), OBSERVATIONS[:, :2], collect)
         return run.log_marginal_likelihood, run.collected[-1]
 

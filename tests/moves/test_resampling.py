@@ -1,6 +1,7 @@
 """Resampling at its edges and its slots; what every scheme keeps is in `test_contracts.py`."""
 
 import itertools
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -128,7 +129,10 @@ def test_means_of_many_particles_stay_where_they_are(scheme, kind, m):
     labels = np.arange(MANY) * m // MANY if kind == "sorted" else rng.integers(0, m, MANY)
     mixture = make_mixture(states, np.log(weights), labels, m)
     weights = np.exp(np.asarray(mixture.log_weights, float))
-    sums = lambda values: np.bincount(labels, values, minlength=m)  # noqa: E731
+
+    def sums(values):
+        return np.bincount(labels, values, minlength=m)
+
     exact, found = sums(weights * states) / sums(weights), []
     for key in jax.random.split(KEY, NUM_KEYS):
         moved = draw(Resample(scheme), mixture, key)
@@ -159,8 +163,8 @@ def test_ssp_draws_no_two_neighbours_together_as_systematic_resampling_does():
     mixture = make_mixture(np.arange(8.0), np.log(np.tile([0.25, 0.75], 4)), np.zeros(8), 1)
     counts = {}
     for scheme in ("systematic", "ssp"):
-        each = jax.jit(jax.vmap(lambda key: Resample(scheme)(key, mixture).ancestor_indices))  # noqa: B023
-        drawn = np.asarray(each(jax.random.split(KEY, 2000)))
+        each = jax.vmap(partial(Resample(scheme), mixture=mixture))
+        drawn = np.asarray(jax.jit(each)(jax.random.split(KEY, 2000)).ancestor_indices)
         counts[scheme] = (drawn[..., None] == np.arange(8)).sum(axis=1)
     assert len(np.unique(counts["systematic"], axis=0)) == 2
     assert len(np.unique(counts["ssp"], axis=0)) > 10

@@ -51,7 +51,10 @@ def test_rows_that_do_not_fit_together_are_drawn_in_turn(monkeypatch):
 
     def drawn():
         log_density = backward.log_transition_from(QUADRATIC, mixture)
-        draw = lambda key: backward.draw_exactly(key, log_density, futures, mixture)  # noqa: E731
+
+        def draw(key):
+            return backward.draw_exactly(key, log_density, futures, mixture)
+
         return jax.jit(draw)(jax.random.key(2))
 
     together = drawn()
