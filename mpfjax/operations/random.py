@@ -113,10 +113,25 @@ def split_for_run(
     `split(key, 2)` gives a key for the start, which is split into `num_initial`, and one for the
     steps, which is split into `num_steps`, and each of these into `num_moves`.
     """
-    key_initial, key_steps = split(key, 2)
-    # Not by `vmap`, under which keys of some generators are split differently.
-    moves = jax.lax.map(lambda key: split(key, num_moves), split(key_steps, num_steps))
-    return split(key_initial, num_initial), moves
+    if fast_key(key) is key:
+        key_initial, key_steps = split(key, 2)
+        # Not by `vmap`, under which keys of some generators are split differently.
+        moves = jax.lax.map(lambda key: split(key, num_moves), split(key_steps, num_steps))
+        return split(key_initial, num_initial), moves
+    # Key i of a split is the hash of i. One loop over the three generations compiles one hash.
+    starts, index = jnp.arange(num_initial), jnp.arange(num_steps * num_moves)
+    of_starts = jnp.stack([jnp.zeros_like(starts), starts, jnp.full_like(starts, -1)])
+    of_moves = jnp.stack([jnp.ones_like(index), index // num_moves, index % num_moves])
+    counters = jnp.concatenate([of_starts, of_moves], 1)[..., None]
+
+    def next_generation(words: UInt32[Array, "e 2"], counter: Int[Array, "e 1"]) -> tuple:
+        hashed = _both_halves(words[:, :1], words[:, 1:], counter.astype(jnp.uint32))
+        return jnp.where(counter < 0, words, hashed), None  # a start has no third generation
+
+    first = jnp.broadcast_to(jax.random.key_data(key), (counters.shape[1], 2))
+    words, _ = jax.lax.scan(next_generation, first, counters)
+    keys = jax.random.wrap_key_data(words, impl=jax.random.key_impl(key))
+    return keys[:num_initial], keys[num_initial:].reshape(num_steps, num_moves)
 
 
 def uniform(
@@ -218,16 +233,23 @@ def _words(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, ".
 
 @partial(jax.jit, static_argnames="shape")
 def _keys(key: UInt32[Array, " 2"], shape: tuple[int, ...]) -> UInt32[Array, "..."]:
-    """The key of each position: both halves of its hash, side by side.
+    """The key of each position: both halves of its hash, side by side."""
+    index = jax.lax.iota(jnp.uint32, math.prod(shape))
+    return _both_halves(key[0], key[1], index[:, None]).reshape(*shape, 2)
+
+
+def _both_halves(
+    high_key: UInt32[Array, "*#n"], low_key: UInt32[Array, "*#n"], low: UInt32[Array, "n 1"]
+) -> UInt32[Array, "n 2"]:
+    """The hash of each counter (0, low).
 
     Each column hashes for itself and takes its half. If both were stacked, XLA would compile the
     rounds twice, and compute them as often.
     """
-    index = jax.lax.iota(jnp.uint32, math.prod(shape))
-    columns = jnp.broadcast_to(index[:, None], (index.shape[0], 2))
+    columns = jnp.broadcast_to(low, (low.shape[0], 2))
     is_low = jax.lax.broadcasted_iota(jnp.uint32, columns.shape, 1) == 1
-    high, low = threefry(key, jnp.zeros_like(columns), columns)
-    return jnp.where(is_low, low, high).reshape(*shape, 2)
+    high, low = threefry((high_key, low_key), jnp.zeros_like(columns), columns)
+    return jnp.where(is_low, low, high)
 
 
 def threefry(
