@@ -8,6 +8,7 @@ long sums stay small.
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +26,7 @@ from mpfjax.operations.logarithms import (
 from mpfjax.operations.prefix_sums import count_starts
 from mpfjax.operations.stored import (
     EXACT_IN_FLOAT32,
+    block_size,
     from_the_start,
     stored,
     take,
@@ -261,3 +263,40 @@ def segments_in_order(firsts: Int[Array, " m"], num_places: int) -> Int[Array, "
     for m in range(1, num_segments):
         segments = segments + (place >= firsts[m]).astype(jnp.int32)
     return segments
+
+
+class SideBySide(NamedTuple):
+    """Segments whose entries are neighbours: whole blocks of entries, and where segments end.
+
+    Most blocks lie in one segment, so that blocks are summed before segments are.
+    """
+
+    labels: Int[Array, "blocks size"]
+    ends: Int[Array, "2 m"]  # each segment's first and last block
+
+    def reduce(self, how: str, values: Shaped[Array, " p"], nothing: float) -> Shaped[Array, " m"]:
+        """As `segment_reduce`."""
+        m, reduced = self.ends.shape[1], _REDUCTIONS[how]
+        if are_masked(len(values), m):
+            return segment_reduce(how, values, self.labels.reshape(-1), m, nothing)
+        blocks = values.reshape(self.labels.shape)
+        is_whole = self.labels[:, 0] == self.labels[:, -1]
+        labels = jnp.where(is_whole, self.labels[:, 0], m)
+        inner = segment_reduce(how, reduced(blocks, axis=1), labels, m, nothing)
+        ends = self.ends.reshape(-1)
+        # A segment that lies in one block has it twice.
+        counts = jnp.concatenate([jnp.ones(m, bool), self.ends[0] < self.ends[1]])
+        own = take(self.labels, ends) == jnp.tile(jnp.arange(m, dtype=labels.dtype), 2)[:, None]
+        own &= (counts & ~take(is_whole, ends))[:, None]
+        outer = jnp.where(own, take(blocks, ends), nothing).astype(values.dtype)
+        return reduced(jnp.stack([inner, *reduced(outer, axis=1).reshape(2, m)]), axis=0)
+
+
+def side_by_side(labels: Int[Array, " p"], num_segments: int) -> SideBySide:
+    """Segments by labels in ascending order, which fill whole blocks; the label M is in none."""
+    blocks = labels.reshape(-1, block_size(labels.shape[0]))
+    label, last = jnp.arange(num_segments, dtype=labels.dtype), len(blocks) - 1
+    before = jnp.sum((blocks[:, -1:] < label).astype(jnp.int32), axis=0)
+    after = jnp.sum((blocks[:, :1] > label).astype(jnp.int32), axis=0)
+    ends = jnp.stack([jnp.minimum(before, last), jnp.maximum(last - after, 0)])
+    return SideBySide(blocks, stored(ends))

@@ -8,6 +8,7 @@ curve.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -30,11 +31,10 @@ from mpfjax.operations.prefix_sums import (
     unit_shift,
 )
 from mpfjax.operations.segments import (
+    SideBySide,
     column_sums,
     segment_counts,
-    segment_max,
-    segment_reduce,
-    segment_sum,
+    side_by_side,
     spread,
 )
 from mpfjax.operations.sorting import (
@@ -55,7 +55,7 @@ class Line(NamedTuple):
     """The particles in a line of p places, those of a component side by side.
 
     p is a multiple of the block length of the prefix sums. The particles of a single component
-    that nothing sorts stand where they are: `order`, `components` and `labels` are then None.
+    that nothing sorts stand where they are: `order`, `components` and `segments` are then None.
     """
 
     num_particles: int
@@ -65,7 +65,7 @@ class Line(NamedTuple):
     is_drawn: Bool[Array, " p"]  # at which places a particle may be drawn, or stays as it is
     order: Int[Array, " p"] | None = None  # which particle stands at each place
     components: Int[Array, " p"] | None = None
-    labels: Int[Array, " p"] | None = None  # as `components`, but M at an empty place
+    segments: SideBySide | None = None  # of the components; an empty place is in none
 
     @property
     def counts(self) -> Int[Array, " m"]:
@@ -87,9 +87,9 @@ class Line(NamedTuple):
 
     def sums(self, values: Float[Array, " p"]) -> Float[Array, " m"]:
         """The sum over each component's places."""
-        if self.labels is None:
+        if self.segments is None:
             return jnp.sum(values, keepdims=True)
-        return segment_sum(values, self.labels, self.totals.shape[0])
+        return self.segments.reduce("add", values, 0.0)
 
     def of_places(self, values: Shaped[Array, " m"]) -> Shaped[Array, " #p"]:
         """The value of the component at each place."""
@@ -97,14 +97,15 @@ class Line(NamedTuple):
 
     def extents(self, drawn: bool) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
         """The first and the last place of each component: of those `drawn` from, or of all."""
-        if self.labels is None:
-            return jnp.zeros(1, jnp.int32), jnp.full(1, self.weights.shape[0] - 1, jnp.int32)
-        m, last = self.totals.shape[0], self.weights.shape[0] - 1
-        labels = jnp.where(self.is_drawn, self.labels, m) if drawn else self.labels
+        last = self.weights.shape[0] - 1
+        if self.segments is None:
+            return jnp.zeros(1, jnp.int32), jnp.full(1, last, jnp.int32)
         places = jnp.arange(last + 1, dtype=jnp.int32)
         # The last place is the least of the negative ones: one minimum finds both.
-        least = lambda row: segment_reduce("min", row, labels, m, last)  # noqa: E731
-        firsts, lasts = stored(jax.vmap(least)(jnp.stack([places, -places])))
+        signed = jnp.stack([places, -places])
+        signed = jnp.where(self.is_drawn, signed, last) if drawn else signed
+        least = partial(self.segments.reduce, "min", nothing=last)
+        firsts, lasts = stored(jax.vmap(least)(signed))
         return firsts, jnp.maximum(-lasts, 0)
 
     def expected(self, targets: Int[Array, " m"]) -> Float[Array, " p"]:
@@ -204,14 +205,15 @@ def in_line(
     else:
         order = sorted_order(mixture, labels[:n], sort_by)
         order, log_weights, labels = in_order(whole(order, labels.shape[0] - 1))
-    log_largest = finite_or_zero(segment_max(log_weights, labels, m))
+    segments = side_by_side(labels, m)
+    log_largest = finite_or_zero(segments.reduce("max", log_weights, -jnp.inf))
     components = jnp.minimum(labels, m - 1)
     relative = exp(log_weights - spread(log_largest, components))
     is_drawn = relative > 0
     if stays is not None:
         is_drawn |= (log_weights > -jnp.inf) & take(whole(stays, False), order)
-    totals = segment_sum(relative, labels, m)
-    return Line(n, relative, totals, log_largest, is_drawn, order, components, labels)
+    totals = segments.reduce("add", relative, 0.0)
+    return Line(n, relative, totals, log_largest, is_drawn, order, components, segments)
 
 
 def sorted_order(
