@@ -295,7 +295,7 @@ class SideBySide(NamedTuple):
 def side_by_side(labels: Int[Array, " p"], num_segments: int) -> SideBySide:
     """Segments by labels in ascending order, which fill whole blocks; the label M is in none."""
     blocks = labels.reshape(-1, block_size(labels.shape[0]))
-    label, last = jnp.arange(num_segments, dtype=labels.dtype), len(blocks) - 1
+    label, last = jnp.arange(num_segments, dtype=labels.dtype)[None], len(blocks) - 1
     before = jnp.sum((blocks[:, -1:] < label).astype(jnp.int32), axis=0)
     after = jnp.sum((blocks[:, :1] > label).astype(jnp.int32), axis=0)
     ends = jnp.stack([jnp.minimum(before, last), jnp.maximum(last - after, 0)])
