@@ -15,7 +15,7 @@ ORDER = """
 # Inside the folders that hold several floors: files, and folders.
 FLOORS = {
     "operations": """
-        logarithms stored matrices gaussians compiling random prefix_sums segments sorting
+        logarithms stored matrices compiling random prefix_sums segments
     """,
     "moves": """
         base eve_indices conditional every regrouping resampling propagation metropolis objects

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mpfjax.moves.resampling.sorting import order_by_segment
 from mpfjax.operations import prefix_sums
 from mpfjax.operations.logarithms import exp, largest, log_sum_exp, softmax
 from mpfjax.operations.matrices import (
@@ -30,7 +31,6 @@ from mpfjax.operations.segments import (
     segments_in_order,
     spread,
 )
-from mpfjax.operations.sorting import order_by_segment
 from mpfjax.operations.stored import (
     cond_if_any,
     count_places,

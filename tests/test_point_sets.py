@@ -18,18 +18,18 @@ from mpfjax.models.noise import (
     stratified_normal,
     stratified_uniform,
 )
+from mpfjax.moves.resampling.sorting import (
+    bits_per_dimension,
+    hilbert_index,
+    order_by_key,
+    sortable_bits,
+)
 from mpfjax.operations.random import (
     MOST_DIMENSIONS,
     direction_numbers,
     scrambled_directions,
     shuffled,
     sobol_points,
-)
-from mpfjax.operations.sorting import (
-    bits_per_dimension,
-    hilbert_index,
-    order_by_key,
-    sortable_bits,
 )
 
 # As one program each: to compile operations one by one takes longer.

@@ -12,9 +12,9 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import shown
 from mpfjax.mixture import MarginalisedState
+from mpfjax.models import gaussians
 from mpfjax.models.base import AbstractStateSpaceModel, check_moved, model_name
-from mpfjax.operations import gaussians
-from mpfjax.operations.gaussians import (
+from mpfjax.models.gaussians import (
     Gaussian,
     Linear,
     applied,

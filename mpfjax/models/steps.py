@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import saying
 from mpfjax.mixture import MarginalisedState
+from mpfjax.models import gaussians
 from mpfjax.models.base import check_log_density, check_moved, model_name
 from mpfjax.models.conditionally_linear import (
     emission_of,
@@ -25,7 +26,6 @@ from mpfjax.models.conditionally_linear import (
     updated,
 )
 from mpfjax.models.noise import noise_dtype
-from mpfjax.operations import gaussians
 from mpfjax.operations.random import normal
 
 

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.mixture import MarginalisedState, ParticleMixture
+from mpfjax.models import gaussians
 from mpfjax.models.base import with_inputs
 from mpfjax.models.conditionally_linear import (
     decorrelated,
@@ -34,10 +35,7 @@ from mpfjax.models.conditionally_linear import (
     updated,
     with_moments,
 )
-from mpfjax.models.steps import log_transition
-from mpfjax.operations import gaussians
-from mpfjax.operations.compiling import jit_on_wide_vectors
-from mpfjax.operations.gaussians import (
+from mpfjax.models.gaussians import (
     Gaussian,
     Linear,
     applied,
@@ -50,6 +48,8 @@ from mpfjax.operations.gaussians import (
     transposed,
     without_missing,
 )
+from mpfjax.models.steps import log_transition
+from mpfjax.operations.compiling import jit_on_wide_vectors
 from mpfjax.operations.random import split
 from mpfjax.operations.stored import take
 from mpfjax.smoothing.backward import draw_ends, draw_exactly

@@ -18,6 +18,13 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped, UInt32
 
 from mpfjax.checks import saying, shown
 from mpfjax.mixture import ParticleMixture, points
+from mpfjax.moves.resampling.sorting import (
+    bits_per_dimension,
+    hilbert_index,
+    order_by_key,
+    order_by_segment,
+    sortable_bits,
+)
 from mpfjax.operations.logarithms import as_inexact, exp, finite_or_zero, log_or_nothing
 from mpfjax.operations.prefix_sums import (
     Positions,
@@ -36,13 +43,6 @@ from mpfjax.operations.segments import (
     segment_counts,
     side_by_side,
     spread,
-)
-from mpfjax.operations.sorting import (
-    bits_per_dimension,
-    hilbert_index,
-    order_by_key,
-    order_by_segment,
-    sortable_bits,
 )
 from mpfjax.operations.stored import cond_if_any, stored, take, whole
 
