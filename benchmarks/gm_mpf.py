@@ -337,11 +337,11 @@ def draw_migration(fewest: dict[str, Step], targets: Targets) -> Any:
 
 def _annotated(still: np.ndarray, step: Step, t: int, crop: tuple[slice, slice]) -> np.ndarray:
     zoom = max(1, round(360 / (crop[0].stop - crop[0].start)))
-    canvas = still[crop].repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
+    image, draw = drawing.canvas_of(still[crop].repeat(zoom, axis=0).repeat(zoom, axis=1))
     corner = np.array([crop[1].start, crop[0].start], float)
-    places, colours = zoom * (step.centres[0, t] - corner), drawing.PALETTE[step.target[0, t]]
-    drawing.draw_points(canvas, places, colours, 0.9 * zoom)
-    return np.clip(canvas, 0, 255).astype(np.uint8)
+    places = zoom * (step.centres[0, t] - corner)
+    drawing.draw_points(draw, places, step.target[0, t], 0.9 * zoom)
+    return np.asarray(image)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ import mpfjax
 from benchmarks import figures as plotting
 from benchmarks.harness import AtLeast2, Count, Seed, command, data, figures, settings_of, table
 from mpfjax.exact import grid_filter
-from mpfjax.metrics import mass_above, modes_represented
 
 PERIOD = 100
 AMPLITUDE = 2.0
@@ -152,7 +151,7 @@ def collect(mixture: mpfjax.ParticleMixture) -> dict[str, Array]:
         "component_indicators": mixture.component_indicators,
         "weight": mixture.mixture_weights[0],
         "components": jnp.sum(mixture.active.astype(jnp.int32)),
-        "mass_above": mass_above(mixture, 0.0),
+        "mass_above": mixture.average(mixture.particles > 0),
     }
 
 
@@ -175,8 +174,8 @@ def both_represented(
     positions: Float[Array, "s t n"], occupied: Bool[Array, "s t n"], truth: Float[Array, " t"]
 ) -> Bool[Array, "s t"]:
     """Whether both modes, at x*_t and -x*_t, are represented, at every step of every run."""
-    modes = jnp.broadcast_to(jnp.stack([truth, -truth], axis=1)[None], (*positions.shape[:2], 2))
-    return modes_represented(positions, occupied, modes, RADIUS).all(axis=-1)
+    near = jnp.abs(positions[:, :, None] - jnp.stack([truth, -truth], axis=1)[..., None]) < RADIUS
+    return (near & occupied[:, :, None]).any(axis=-1).all(axis=-1)
 
 
 def summarise(runs: dict[str, Any], exact_mass: np.ndarray) -> dict[str, Any]:

@@ -20,7 +20,7 @@ import inspect
 import math
 import types
 import typing
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, ParamSpec, TypeGuard, TypeVar
 
@@ -256,6 +256,15 @@ def one_of(choices: Iterable[str]) -> Rule:
     """The rule for one of some strings, where they are not written out as a `Literal`."""
     names = sorted(choices)
     return of(lambda value: isinstance(value, str) and value in names, f"one of {names}")
+
+
+def by_name(holds: Callable[[Any], Any], what: str) -> Rule:
+    """The rule for None, or a mapping from names to values of each of which this holds."""
+
+    def all_hold(value: Any) -> bool:
+        return isinstance(value, Mapping) and all(map(holds, value.values()))
+
+    return of(lambda value: value is None or all_hold(value), f"a mapping from names to {what}")
 
 
 def entries(holds: Callable[[np.ndarray], Any], what: str) -> Rule:

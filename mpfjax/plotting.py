@@ -40,10 +40,7 @@ def draw_components(
     time. Use it to see where modes part, and how much of the mass each has.
     """
     if mixtures.log_weights.ndim != 2:
-        raise ValueError(
-            f"mixtures: log-weights of shape {mixtures.log_weights.shape}, not (t, n); keep them by"
-            " run_filter(..., collect=None)"
-        )
+        raise ValueError("mixtures: these are not all of one run; keep them by collect=None")
     masses, means, variances = map(np.asarray, jax.vmap(_moments)(mixtures))
     if index >= means.shape[2]:
         raise ValueError(f"index: {shown(index)} of a state of {means.shape[2]} numbers")

@@ -107,8 +107,8 @@ class TestManyDevices:
 
     def test_what_is_no_choice_of_devices_is_named(self, started):
         told = started["eight"][1]
-        assert told["too many"] == "devices: 9 asked for, and there are 8"
-        assert "no number, nor some of" in told["twice"]
+        assert told["too many"] == "devices: 9 are not some of the 8 devices"
+        assert "are not some of the 8 devices" in told["twice"]
         assert "cannot be dealt evenly to 3 devices" in told["uneven"]
         assert told["only device"]
 

@@ -268,7 +268,7 @@ class TestLongRuns:
         with pytest.raises(ValueError, match=r"checkpoint: .* is of another adding: start is 0"):
             self.go(path, 3, start=1)
         mpfjax.save_checkpoint(path, MIXTURE)
-        with pytest.raises(ValueError, match=r"checkpoint: .* is no checkpoint of adding"):
+        with pytest.raises(ValueError, match=r"of another adding: caller is not there and adding"):
             self.go(path, 3)
         with pytest.raises(ValueError, match="every: 0"):
             Checkpoint(path, 0)

@@ -254,9 +254,9 @@ class TestOtherFiles:
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"filters": {"pf": lambda n, noise: noise}}, "filters: pf made"),
+        ({"filters": {"pf": lambda n, noise: noise}}, "filters: pf: .* is not a Filter"),
         ({"observations": np.array([1.0, np.nan])}, "observations: NaN or infinite at index 1"),
-        ({"measure": lambda run: {"mean": np.ones(3)}}, r"measure: mean's shape, \(3,\)"),
+        ({"measure": lambda run: {"mean": np.ones(3)}}, r"measure: mean of shape \(3,\)"),
     ],
 )
 def test_bad_input_to_one_cell_is_an_error_before_any_is_written(tmp_path, changes, named):

@@ -12,7 +12,7 @@ from tqdm import tqdm
 import mpfjax
 from benchmarks.partitioned_sampling.rates import measure
 from benchmarks.partitioned_sampling.scenes import Scene
-from mpfjax.metrics import uniqueness
+from mpfjax.metrics.particle_scores import uniqueness
 
 Order = tuple[int, ...] | None
 # A new filter is one more line: name -> (model, number of particles, order) -> filter.

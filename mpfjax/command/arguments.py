@@ -39,6 +39,10 @@ TRACKS, VIDEO, SUMMARY = OUTPUTS = ("tracks.txt", "tracking.mp4", "summary.json"
 
 
 _TEXT = (".txt", ".csv")
+_NOT_WITH = {
+    "box": ("max_objects", "min_score", "no_colour", "camera_motion", "offline"),
+    "detect": ("min_score",),
+}
 
 
 class Source(NamedTuple):
@@ -82,7 +86,7 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
     track.add_argument("--out", type=Path, required=True, metavar="DIR", help="where results go")
     what = track.add_mutually_exclusive_group()
     what.add_argument(
-        "--detections", type=Path, metavar="FILE", help="MOTChallenge rows, with scores if any"
+        "--detections", type=_existing, metavar="FILE", help="MOTChallenge rows, with scores if any"
     )
     what.add_argument("--detect", action="store_true", help="what moves before a still camera")
     what.add_argument(
@@ -105,9 +109,8 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
         choices=("pixels", "detections"),
         help="what it is found from; by default from pixels, except with --detect and --no-colour",
     )
-    track.add_argument(
-        "--truth", type=Path, metavar="FILE", help="gt.txt to score with, where none is beside img/"
-    )
+    truth = "gt.txt to score with, where none is beside img/"
+    track.add_argument("--truth", type=_existing, metavar="FILE", help=truth)
     track.add_argument("--no-video", action="store_true", help="do not draw tracking.mp4")
     track.add_argument(
         "--offline",
@@ -119,22 +122,19 @@ def _parsers() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
 
 def _check(track: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """An error of `track` for options that do not go together."""
-    if not (options.detections or options.detect or options.box) and _has_pixels(options.source):
-        track.error(
-            "one of the arguments --detections --detect --box is required, for a file of detections"
-            " alone is .txt or .csv"
-        )
-    if options.box is not None:
-        for name in ("max_objects", "min_score", "no_colour", "camera_motion", "offline"):
-            if getattr(options, name):
-                track.error(f"argument --{name.replace('_', '-')}: not allowed with --box")
-    if options.detect and options.min_score is not None:
-        track.error("argument --min-score: not allowed with --detect, which gives no scores")
-    if options.camera_motion == "pixels":
-        if options.detect:
-            track.error("argument --camera-motion pixels: not allowed with --detect")
-        if not _has_pixels(options.source):
-            track.error(f"argument --camera-motion pixels: {options.source} has no pixels")
+    by_pixels, has_pixels = options.camera_motion == "pixels", _has_pixels(options.source)
+    of_pixels = {"detect": options.detect, "box": options.box, "camera-motion pixels": by_pixels}
+    for name, given in of_pixels.items():
+        if given and not has_pixels:
+            track.error(f"argument --{name}: {options.source} has no pixels")
+    if has_pixels and not (options.detections or options.detect or options.box):
+        track.error("one of the arguments --detections --detect --box is required")
+    if options.detect and by_pixels:
+        track.error("argument --camera-motion pixels: not allowed with --detect")
+    found_by = "box" if options.box else "detect" if options.detect else None
+    for name in _NOT_WITH.get(found_by, ()):
+        if getattr(options, name) not in (None, False):
+            track.error(f"argument --{name.replace('_', '-')}: not allowed with --{found_by}")
 
 
 def _existing(text: str) -> Path:
@@ -155,21 +155,21 @@ def open_source(options: argparse.Namespace) -> Source:
         written,
         {"SOURCE": path, "--detections": detections, "--truth": options.truth},
     )
-    rows = None if detections is None else _read_detections(options, detections)
-    folder, info, num_frames = path, SequenceInfo(), None
+    rows = None if detections is None else box_files.read_detections(detections)
+    folder, info = path, SequenceInfo()
     if not has_pixels:
         folder = path if path.is_dir() else sequence_of(path) or path
         info = read_sequence_info(folder)
-    truth = find_truth(folder, options.truth, first, last)
+    truth, end = find_truth(folder, options.truth, first, last), last
     if not has_pixels:
         known = (rows, None if truth is None else truth.objects)
-        end = last_frame(info, *(found for found in known if found is not None))
-        num_frames = _num_frames(path, end, "frames", first, last)
-        last = first + num_frames - 1
+        held = last_frame(info, *(found for found in known if found is not None))
+        last = end = min(last or held, held)
+        if last < first:
+            raise ValueError(f"SOURCE: {path} holds {held} frames, and no frame {first}")
     elif path.is_dir():
-        num_frames = _num_frames(path, frames.num_images(path), "images", first, last)
-    elif last is not None:
-        num_frames = last - first + 1
+        end = min(last or np.inf, frames.num_images(path))
+    num_frames = None if end is None else end - first + 1
     if rows is not None and options.frames is not None and last is not None:
         rows = rows[rows[:, 0] <= last]
     rate = options.fps or (frames.frame_rate(path) if has_pixels else info.frame_rate)
@@ -186,9 +186,6 @@ def _has_pixels(path: Path) -> bool:
 def _detections_alone(options: argparse.Namespace) -> Path:
     """The file of detections where there are no pixels: that of the folder, or the source."""
     path = options.source
-    for name in ("detect", "box"):
-        if getattr(options, name):
-            raise ValueError(f"--{name}: {path} holds no images to look at")
     if path.is_file():
         if options.detections is not None:
             raise ValueError(f"--detections: not allowed where SOURCE, {path}, is such a file")
@@ -198,21 +195,6 @@ def _detections_alone(options: argparse.Namespace) -> Path:
     if options.detections is None and len(files) > 1:
         raise ValueError(f"SOURCE: {path} holds {len(files)} files of detections; name one of them")
     return options.detections or files[0]
-
-
-def _num_frames(path: Path, held: int, what: str, first: int, last: int | None) -> int:
-    if held < first:
-        raise ValueError(f"SOURCE: {path} holds {held} {what}, and no frame {first}")
-    return min(last or held, held) - first + 1
-
-
-def _read_detections(options: argparse.Namespace, path: Path) -> np.ndarray:
-    if not path.is_file():
-        raise ValueError(f"--detections: {path} is not a file")
-    rows = box_files.read_detections(path)
-    if options.min_score is not None and rows.shape[1] < 7:
-        raise ValueError(f"--min-score: {path} has no scores")
-    return rows
 
 
 def read_boxes(options: argparse.Namespace, still: np.ndarray) -> np.ndarray:

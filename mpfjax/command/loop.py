@@ -88,7 +88,8 @@ def run(options: argparse.Namespace) -> None:
     """Track, and write all results so far, also where the run ends before the frames do."""
     source = open_source(options)
     results = Results(options, source)
-    start = _start(results, _first_still(source) if source.has_pixels else None)
+    one = (source.path, source.first, source.first)
+    start = _start(results, next(frames.read_frames(*one)) if source.has_pixels else None)
     options.out.mkdir(parents=True, exist_ok=True)
     try:
         _track(results, start)
@@ -100,13 +101,6 @@ def run(options: argparse.Namespace) -> None:
             write_json(options.out / SUMMARY, summary)
             print(_table(summary))
             print(f"written to {options.out}")
-
-
-def _first_still(source: Source) -> np.ndarray:
-    still = next(frames.read_frames(source.path, source.first, source.first), None)
-    if still is None:
-        raise ValueError(f"SOURCE: {source.path} has no frame {source.first}")
-    return still
 
 
 # What makes tracks of stills that are seen once, one after the other, or without any.

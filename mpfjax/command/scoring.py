@@ -22,8 +22,6 @@ def find_truth(source: Path, given: Path | None, first: int, last: int | None) -
     A video has no folder, and so no truth unless it is given. Warns of a truth beside the images
     that cannot be read; raises `ValueError` for a given one.
     """
-    if given is not None and not given.exists():
-        raise ValueError(f"--truth: {given} is neither a file nor a folder")
     if given is None and not source.is_dir():
         return None
     folder = Path(os.path.abspath(source))

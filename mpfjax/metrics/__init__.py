@@ -1,9 +1,5 @@
 from mpfjax.metrics.particle_scores import crps as crps
 from mpfjax.metrics.particle_scores import log_score as log_score
-from mpfjax.metrics.particle_scores import mass_above as mass_above
-from mpfjax.metrics.particle_scores import modes_represented as modes_represented
-from mpfjax.metrics.particle_scores import uniqueness as uniqueness
 from mpfjax.metrics.set_distances import gospa as gospa
 from mpfjax.metrics.set_distances import ospa as ospa
-from mpfjax.metrics.tracking_quality import tracking_quality as tracking_quality
 from mpfjax.metrics.tracking_scores import multi_object_scores as multi_object_scores

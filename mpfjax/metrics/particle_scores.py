@@ -1,13 +1,12 @@
-"""Scores of weighted particles: of forecasts, of modes that are kept, of how many differ."""
+"""Scores of weighted particles: of forecasts, and of how many differ."""
 
-import math
 from typing import Annotated
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
-from mpfjax.checks import NOT_NEGATIVE, POSITIVE, check_shape, checked, real_arrays
+from mpfjax.checks import NOT_NEGATIVE, checked, real_arrays
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.observations import one_observation
@@ -64,44 +63,6 @@ def log_score(
     values = likelihoods(model, observation, mixture.particles)
     joint = jnp.where(mixture.occupied, mixture.log_weights + values, -jnp.inf)
     return -log_sum_exp(joint)
-
-
-@checked
-def modes_represented(
-    positions: Float[Array, "*batch n"],
-    occupied: Bool[Array, "*batch n"],
-    modes: Float[Array, "*batch k"],
-    radius: Annotated[float | Float[Array, ""], POSITIVE],
-) -> Bool[Array, "*batch k"]:
-    """Whether some particle of positive weight lies within `radius` of each mode.
-
-    Vermaak et al. (2003), section 5.1, count the steps at which both modes are represented; their
-    share over a run is its score. Positions, modes and radius are in the state's unit. Use it on a
-    model whose modes are known. Raises `ValueError` for anything but arrays, masks of another shape
-    than the positions, and a radius that is not positive and finite.
-    """
-    positions = real_arrays("... n", positions=positions)
-    *batch, n = map(str, positions.shape)
-    check_shape(" ".join([*batch, n]), occupied=occupied)
-    modes = real_arrays(" ".join([*batch, "k"]), modes=modes)
-    distance = jnp.abs(positions[..., None, :] - modes[..., :, None])
-    return jnp.any((distance < radius) & occupied[..., None, :], axis=-1)
-
-
-@checked
-def mass_above(mixture: ParticleMixture, threshold: float | Float[Array, ""]) -> Float[Array, ""]:
-    """P(x_t > threshold | y_1..y_t) of a scalar state; a particle at the threshold counts half.
-
-    The particles' estimate of `GridFilterRun.mass_above`. With a threshold between two modes it is
-    the mass of the upper one. Raises `ValueError` for anything but a mixture of scalar states.
-    """
-    shapes = [leaf.shape for leaf in jax.tree.leaves(mixture.particles)]
-    if len(shapes) != 1 or math.prod(shapes[0]) != mixture.num_particles:
-        raise ValueError(f"mixture: particles of shapes {shapes} are no scalars")
-    positions = jax.tree.leaves(mixture.particles)[0].reshape(mixture.num_particles)
-    below = jnp.where(positions < threshold, 0.0, jnp.nan)
-    above = jnp.where(positions > threshold, 1.0, jnp.where(positions == threshold, 0.5, below))
-    return mixture.average(above.astype(mixture.log_weights.dtype))
 
 
 @checked

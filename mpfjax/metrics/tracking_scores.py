@@ -38,15 +38,12 @@ def multi_object_scores(
 
     Without tracks every object is a miss and every ratio 0. A box without area overlaps nothing.
     Raises `ValueError` for rows that are not six finite numbers, for an id with two boxes in one
-    frame, for `frames` that end before they begin, without true boxes to score against, and as
-    `remove_ignored` does; `ImportError` without the extra "trackeval". Use it to compare with
-    published trackers.
+    frame, without true boxes to score against, and as `remove_ignored` does; `ImportError` without
+    the extra "trackeval". Use it to compare with published trackers.
     """
     tracks, truth = _checked(tracks, "tracks"), _checked(truth, "truth")
     if frames is not None:
         first, last = frames
-        if not first <= last:
-            raise ValueError(f"frames: {last}, the last, comes before {first}, the first")
         tracks, truth = (
             rows[(first <= rows[:, 0]) & (rows[:, 0] <= last)] for rows in (tracks, truth)
         )

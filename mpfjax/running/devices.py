@@ -35,15 +35,12 @@ def choose_devices(devices: int | Sequence[Any] | None) -> list[Any]:
         default: Any = getattr(jax.config, "jax_default_device", None)
         one = jax.devices(default) if isinstance(default, str) else [default]
         chosen = available if default is None else one
-    elif isinstance(devices, int):
-        if not 1 <= devices <= len(available):
-            raise ValueError(f"devices: {devices} asked for, and there are {len(available)}")
-        chosen = available[:devices]
     else:
-        chosen = list(devices)
-        are_devices = all(isinstance(device, jax.Device) for device in chosen)
-        if not chosen or not are_devices or len(set(chosen)) < len(chosen):
-            raise ValueError(f"devices: {devices} is no number, nor some of jax.devices()")
+        is_number = isinstance(devices, int)
+        chosen = available[: max(devices, 0)] if is_number else list(devices)
+        distinct = {device for device in chosen if isinstance(device, jax.Device)}
+        if not chosen or len(distinct) != (devices if is_number else len(chosen)):
+            raise ValueError(f"devices: {devices} are not some of the {len(available)} devices")
     idle = jax.process_count() - len({device.process_index for device in chosen})
     if jax.process_count() > 1 and idle:
         raise ValueError(f"devices: {chosen} leaves {idle} of the processes without any")

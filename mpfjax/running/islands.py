@@ -85,7 +85,7 @@ def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any
     most = max(d for d in range(1, len(chosen) + 1) if num_islands % d == 0)
     if most < len(chosen) and (devices is not None or jax.process_count() > 1):
         raise ValueError(
-            f"num_islands: {num_islands} islands cannot be dealt evenly to {len(chosen)} devices"
+            f"num_islands: {num_islands} cannot be dealt evenly to {len(chosen)} devices"
         )
     return chosen[:most]
 
@@ -182,12 +182,12 @@ class IslandInteraction(AbstractMove):
     ) -> ParticleMixture:
         """Deal the particles if it is due."""
         del key, observation
-        if num_islands() == 1:
+        n, islands = mixture.num_particles, num_islands()
+        if islands == 1:
             return mixture
-        if mixture.num_particles % num_islands():
+        if n % islands:
             raise ValueError(
-                f"num_particles: {mixture.num_particles} of an island cannot be dealt evenly to"
-                f" {num_islands()} islands, as IslandInteraction does"
+                f"num_particles: {n} of an island cannot be dealt to {islands} islands"
             )
         return jax.lax.cond(
             self.is_due(mixture), lambda: mixture.map_slots(deal_to_islands), lambda: mixture

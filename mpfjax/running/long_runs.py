@@ -120,9 +120,8 @@ class LongRun:
         """All rows in one piece, written to the file with the state."""
         rows = _joined(pieces)
         if self.checkpoint is not None:
-            notes = {"caller": self.caller, "step": state.step}
-            notes |= {"identity": dict(self.identity(state.step))}
             arrays = arrays_of({"carry": state.carry, "rows": rows})
+            notes = {"step": state.step, "identity": self._described(state.step)}
             write_described(self.checkpoint.path, arrays, notes)
         return rows
 
@@ -130,20 +129,20 @@ class LongRun:
         """The state that the file holds, None without a file; a `ValueError` for another run's."""
         if self.checkpoint is None or not Path(self.checkpoint.path).exists():
             return None
-        path = self.checkpoint.path
+        path, caller = self.checkpoint.path, self.caller
         arrays, notes = read_described(path)
-        if notes.get("caller") != self.caller:
-            raise ValueError(f"checkpoint: {path} is no checkpoint of {self.caller}")
-        found, own = notes["identity"], dict(self.identity(notes["step"]))
+        step, found = notes.get("step", 0), notes.get("identity", {})
+        own = self._described(step)
         if found != own:
             raise ValueError(
-                f"checkpoint: {path} is of another {self.caller}: {differences(found, own)}"
+                f"checkpoint: {path} is of another {caller}: {differences(found, own)}"
             )
-        try:
-            held = filled(path, arrays, {"carry": like.carry, "rows": like.rows})
-        except ValueError as error:
-            raise ValueError(f"checkpoint: {error}") from error
-        return State(notes["step"], held["carry"], held["rows"])
+        held = filled(path, arrays, {"carry": like.carry, "rows": like.rows})
+        return State(step, held["carry"], held["rows"])
+
+    def _described(self, step: int) -> dict[str, str]:
+        """All that has to be the same for a file to be of this run, up to a step."""
+        return {"caller": self.caller, **self.identity(step)}
 
 
 def identity_of(

@@ -11,14 +11,14 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 from tqdm import tqdm
 
-from mpfjax.checks import Checked, Count, check, checked, shown
+from mpfjax.checks import Checked, Count, by_name, check, checked, shown
 from mpfjax.filter import Filter
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.observations import as_series, check_series
@@ -38,7 +38,7 @@ Values = Sequence[Any] | np.ndarray | Array
 
 _MANIFEST = "study.json"
 _STUDY = "study"
-_TAKEN = ("filter", "num_particles", "file", "description", _STUDY)
+_TAKEN = {"filter", "num_particles", "file", "description", _STUDY}
 _CELL_FILE = re.compile(r"(\d+)-[\w.+-]*\.npz")  # as `_cells` names them
 
 
@@ -60,14 +60,16 @@ class Study(Checked):
     that returns no filter, and what `monte_carlo` raises it for.
     """
 
-    filters: Mapping[str, Callable[..., Filter]]
+    filters: Annotated[Mapping[str, Callable[..., Filter]], by_name(callable, "functions of N")]
     """by name: functions of N, and of the settings by name, that build a filter."""
     num_particles: Values
     keys: Key[Array, " seeds"]
     """one for each run of a cell; the same in all cells."""
     observations: PyTree
     """y_1..y_t, one data set for all, or a `Series`."""
-    settings: Mapping[str, Values] = field(default_factory=dict)
+    settings: Annotated[Mapping[str, Values], by_name(np.iterable, "values")] = field(
+        default_factory=dict
+    )
     """by name: the values of each setting, numbers or strings. All combinations are run."""
     measure: Callable[[FilterRun], Mapping[str, Any]] = log_evidence
     """arrays by name from a cell's runs, each with the leading axis of seeds."""
@@ -75,15 +77,9 @@ class Study(Checked):
     """as for `run_filter`, for `measure` to use; None keeps all of every mixture."""
 
     def __check_init__(self) -> None:
-        what = "a dictionary, {name: value}"
-        check(Mapping, what, filters=self.filters, settings=self.settings)
-        for name, build in self.filters.items():
-            check(
-                Callable[..., Any], "a function that builds a filter", **{f"filters: {name}": build}
-            )
-        for name in self.settings:
-            if name in _TAKEN:
-                raise ValueError(f"settings: {name!r} is a name that a cell has already")
+        super().__check_init__()
+        for name in self.settings.keys() & _TAKEN:
+            raise ValueError(f"settings: {name!r} is a name that a cell has already")
         for number in _axes(self)["num_particles"]:
             check(Count, num_particles=number)
         check_series(self.observations)
@@ -194,8 +190,7 @@ def _cells(study: Study) -> list[_Cell]:
         name, num_particles = description["filter"], description["num_particles"]
         settings = {name: description[name] for name in study.settings}
         filter = study.filters[name](num_particles, **settings)
-        if not isinstance(filter, Filter):
-            raise ValueError(f"filters: {name} made {filter!r}, no Filter")
+        check(Filter, **{f"filters: {name}": filter})
         as_series(study.observations, filter.model)
         words = [name, f"N{num_particles}", *(f"{k}_{v}" for k, v in settings.items())]
         stem = re.sub(r"[^\w.+-]+", "_", "-".join([f"{index:04d}", *words]))[:100]
@@ -212,15 +207,11 @@ def _axes(study: Study) -> dict[str, list[Any]]:
 
 def _listed(name: str, values: Any) -> list[Any]:
     """The values along one axis; a `ValueError` for what is no list of numbers and strings."""
-    values = values.tolist() if isinstance(values, np.ndarray | jax.Array) else values
-    if isinstance(values, str) or not isinstance(values, Sequence):
-        raise ValueError(f"{name}: {shown(values)} are no values, [value, ...]")
-    plain = [value.item() if getattr(value, "shape", None) == () else value for value in values]
-    for value in plain:
-        if not isinstance(value, str | int | float | None):
-            raise ValueError(f"{name}: {shown(value)} is no number or string; name it instead")
-    if not plain or len(set(plain)) < len(plain):
-        raise ValueError(f"{name}: {shown(values)} is empty or has the same twice")
+    each = [] if isinstance(values, str) or not np.iterable(values) else values
+    plain = [value.item() if getattr(value, "shape", None) == () else value for value in each]
+    simple = {value for value in plain if isinstance(value, str | int | float | None)}
+    if not plain or len(simple) < len(plain):
+        raise ValueError(f"{name}: {shown(values)} are no numbers or strings, each there once")
     return plain
 
 
@@ -317,9 +308,10 @@ def _measure(
         run = monte_carlo(batch, cell.filter, study.observations, study.collect, slots=slots)
         measured = {name: np.asarray(array) for name, array in study.measure(run).items()}
         for name, array in measured.items():
-            if name in cell.description or name in _TAKEN:
-                raise ValueError(f"measure: {name!r} is what a cell is described by")
-            if array.shape[:1] != (size,):
-                raise ValueError(f"measure: {name}'s shape, {array.shape}, has no axis of seeds")
+            if name in cell.description or name in _TAKEN or array.shape[:1] != (size,):
+                said = f"{name} of shape {array.shape}"
+                raise ValueError(
+                    f"measure: {said} describes a cell, or has no axis of {size} seeds"
+                )
         parts.append(measured)
     return {name: np.concatenate([part[name] for part in parts])[:num_seeds] for name in parts[0]}

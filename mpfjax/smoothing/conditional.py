@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import checked, kinds
 from mpfjax.filter import Filter
-from mpfjax.models.base import AbstractStateSpaceModel, model_name, require
+from mpfjax.models.base import AbstractStateSpaceModel, require
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.observations import Series, as_arrays, as_series
 from mpfjax.moves.conditional import REFERENCE, ConditionalPropagation, Reference, at, put
@@ -191,9 +191,7 @@ def check_conditional(filter: Filter, backward: bool, needed_by: str) -> None:
     moves = [move.around(Reference(None, jnp.zeros((), jnp.int32))) for move in filter.moves]
     number = sum(isinstance(move, ConditionalPropagation) for move in moves)
     if number != 1:
-        raise ValueError(
-            f"filter: {needed_by} needs one Propagate or Predict among its moves, not {number}"
-        )
+        raise ValueError(f"filter: {needed_by} needs one Propagate or Predict, not {number}")
 
 
 def shape_of_trajectory(model: Any, length: int) -> PyTree:
@@ -214,8 +212,5 @@ def _as_states(trajectory: Any, model: AbstractStateSpaceModel, length: int) -> 
     if jax.tree.structure(own) == jax.tree.structure(like):
         own = jax.tree.map(convert, own, like)
     if kinds(own) != kinds(like):
-        raise ValueError(
-            f"trajectory: {kinds(own)} is not {kinds(like)}, x_0 and one state for each of the"
-            f" observations, of the states of {model_name(model)}"
-        )
+        raise ValueError(f"trajectory: {kinds(own)} is not {kinds(like)}, x_0 and a state a step")
     return own

@@ -22,10 +22,7 @@ def mixtures_of(run: FilterRun | ParticleMixture) -> ParticleMixture:
     is_run = isinstance(run, FilterRun)
     mixtures: Any = run.collected if is_run else run
     if not isinstance(mixtures, ParticleMixture) or mixtures.log_weights.ndim != 2:
-        raise ValueError(
-            "mixtures: these are not all the mixtures of one run, as run_filter(..., collect=None)"
-            " keeps them; jax.vmap over the leading axis of several runs"
-        )
+        raise ValueError("mixtures: these are not all of one run; keep them by collect=None")
     # Smoothing does not use the moves' memory, whose leaves may not stack.
     mixtures = jax.vmap(lambda mixture: mixture.replace(memory={}))(mixtures)
     if not is_run:

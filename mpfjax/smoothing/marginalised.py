@@ -67,16 +67,15 @@ def check_marginalised(
     model: Any, mixtures: ParticleMixture, observations: Any, method: str
 ) -> None:
     """Raise a `ValueError` for data that backward sampling of latents cannot use."""
-    if not is_marginalised(model) or observations is None:
-        raise ValueError("observations: a conditionally linear model needs y, and it alone")
-    if method != "exact":
-        raise ValueError(f"method: {method!r} is not there for a conditionally linear model")
+    if not is_marginalised(model) or observations is None or method != "exact":
+        raise ValueError(
+            "observations, method: a conditionally linear model alone takes y, 'exact'"
+        )
     lengths = {jnp.shape(leaf)[0] for leaf in jax.tree.leaves(observations)}
     num_steps = mixtures.log_weights.shape[0] - 1
     if lengths != {num_steps}:
         raise ValueError(
-            f"observations: {sorted(lengths)} steps are not {num_steps}, those of mixtures from x_0"
-            " on; take the whole run of run_filter(..., collect=None)"
+            f"observations: {sorted(lengths)} steps are not {num_steps}, as from x_0 on"
         )
 
 

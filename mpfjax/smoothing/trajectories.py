@@ -68,8 +68,8 @@ def sample_trajectories(
       each x_s given these and y_1..y_t. It needs a whole run, with x_0, and method "exact".
 
     Raises `ValueError` for a model without `log_transition`, mixtures of another kind, a component
-    that is not there or dead, for `num_steps` with "exact", and for "mcmc" where particles have no
-    single ancestors (index -1; RuntimeError within jit); a RuntimeError where no particle
+    that is not there or dead, and for "mcmc" where particles have no single ancestors (index -1;
+    RuntimeError within jit); a RuntimeError where no particle
     can have moved to the next. If the backward weights degenerate, so that at some time fewer than
     a tenth of the trajectories are distinct, a RuntimeWarning names the share. Use it for estimates
     of the past. The genealogy of the particles (`trace_ancestors`) is exact as well, but has few
@@ -77,8 +77,6 @@ def sample_trajectories(
     """
     if not is_mixed(model):
         require(model, "log_transition", "sample_trajectories")
-    if method == "exact" and num_steps is not None:
-        raise ValueError(f"num_steps: {num_steps} does nothing with method 'exact'")
     stacked = mixtures_of(mixtures)
     # Those of the steps from each of the mixtures to the next.
     length = stacked.log_weights.shape[0]
@@ -106,13 +104,10 @@ def sample_trajectories(
 
 
 def _check_component(mixtures: ParticleMixture, component: int) -> None:
-    if component >= mixtures.num_components:
-        raise ValueError(f"component: {component} is not one of {mixtures.num_components}")
-    final = jax.tree.map(lambda leaf: leaf[-1], mixtures)
-    active = final.active
-    if not isinstance(active, Tracer) and not np.asarray(active)[component]:
-        alive = np.flatnonzero(np.asarray(active)).tolist()
-        raise ValueError(f"component: {component} is dead at the end; alive are {alive}")
+    active = jax.tree.map(lambda leaf: leaf[-1], mixtures).active
+    alive = range(component + 1) if isinstance(active, Tracer) else np.flatnonzero(active)
+    if component not in alive:
+        raise ValueError(f"component: {component} is dead at the end; alive are {[*alive]}")
 
 
 @jit_on_wide_vectors

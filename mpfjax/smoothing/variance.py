@@ -57,20 +57,15 @@ def with_first_ancestors(filter: Filter) -> Filter:
     check_keep_parents("filter", filter.moves, "with_first_ancestors")
     for move in with_inner(filter.moves):
         if move.approximate or not move.keeps_families:
-            raise ValueError(
-                f"filter: {type(move).__name__}, one of its moves, is approximate or draws in a way"
-                " of its own; the variance of log Ẑ is not known from one run"
-            )
+            name = type(move).__name__
+            raise ValueError(f"filter: {name} is approximate or draws in a way of its own")
     # Draws that are more even than independent ones are not what the formulae are made of.
     draws = lambda node: hasattr(node, "scheme") or hasattr(node, "noise")  # noqa: E731
     for part in [filter, *jax.tree.leaves(filter.moves, is_leaf=draws)]:
         for option, known in _INDEPENDENT.items():
-            chosen = getattr(part, option, known)
+            chosen, name = getattr(part, option, known), type(part).__name__
             if chosen != known:
-                raise ValueError(
-                    f"filter: {option} of {type(part).__name__} is {chosen!r}; the variance of"
-                    f" log Ẑ is known from one run for {known!r} alone"
-                )
+                raise ValueError(f"filter: {option} of {name} is {chosen!r}, not {known!r}")
     if any(isinstance(move, _KeepFirstAncestors) for move in filter.initial_moves):
         return filter
     kept = [move for move in filter.initial_moves if not move.weighs]
@@ -165,9 +160,7 @@ def _with_lineage(run: FilterRun | ParticleMixture) -> ParticleMixture:
     if EVE_INDICES not in mixture.memory:
         raise ValueError("run: its filter keeps no first ancestors; run with_first_ancestors of it")
     if mixture.memory[EVE_INDICES].indices.ndim != 1:
-        raise ValueError(
-            "run: islands have no first ancestors in common; of several runs, jax.vmap over them"
-        )
+        raise ValueError("run: islands, or several runs, have no first ancestors in common")
     return mixture
 
 
@@ -213,10 +206,7 @@ def batch_estimate(
     """
     number = runs.log_marginal_likelihood.size
     if runs.log_marginal_likelihood.ndim != 1 or number < FEWEST_RUNS:
-        raise ValueError(
-            f"runs: {number}; a standard error asks for {FEWEST_RUNS} at least, as monte_carlo"
-            " returns them for several keys"
-        )
+        raise ValueError(f"runs: {number}; a standard error asks for {FEWEST_RUNS} at least")
     logs = runs.log_marginal_likelihood
     values = jax.vmap(quantity)(runs.final)
     # Each run is left out in turn; a difference of sums would be lost to rounding.

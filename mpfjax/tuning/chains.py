@@ -94,10 +94,7 @@ class Sampling(Checked):
     def __check_init__(self) -> None:
         super().__check_init__()
         if self.thinning > self.num_steps:
-            raise ValueError(
-                f"thinning: {self.thinning} is more than num_steps, {self.num_steps}: no step"
-                " would be kept"
-            )
+            raise ValueError(f"thinning: {self.thinning} is more than num_steps, {self.num_steps}")
 
     def run(
         self, kernel: AbstractKernel, settings: dict[str, Any], functions: dict[str, Any]

@@ -1,7 +1,7 @@
 """Standard errors from the curvature of the log marginal likelihood."""
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, Key, PyTree
 from mpfjax.checks import Count, checked
 from mpfjax.filter import Filter
 from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
-from mpfjax.tuning.problem import Parameters, Problem, Reals, score_of_each
-from mpfjax.tuning.transforms import AbstractTransform, Unconstrained
+from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms, score_of_each
+from mpfjax.tuning.transforms import Unconstrained
 
 _MOST_NUMBERS = 50
 # The range of the squared step, relative to 1 / I, that is near enough to one standard error.
@@ -35,7 +35,7 @@ def standard_errors(
     observations: PyTree,
     *,
     parameters: Parameters = None,
-    transforms: Mapping[str, AbstractTransform] | None = None,
+    transforms: Transforms = None,
     num_seeds: Count = 100,
 ) -> dict[str, np.ndarray] | None:
     """Standard errors of a filter's parameters where they maximise the likelihood.
@@ -72,10 +72,7 @@ def errors_at(
     """
     point, unravel = ravel_pytree(reals)
     if point.size > _MOST_NUMBERS:
-        raise ValueError(
-            f"parameters: {point.size} numbers are too many for a curvature by differences,"
-            f" which is for at most {_MOST_NUMBERS}"
-        )
+        raise ValueError(f"parameters: {point.size} numbers; differences do for {_MOST_NUMBERS}")
 
     def score(flat: np.ndarray) -> Float[np.ndarray, "seeds d"]:
         at = unravel(jnp.asarray(flat))

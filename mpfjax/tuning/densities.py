@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import checked, shown
-from mpfjax.filter import Filter
-from mpfjax.tuning.evidence import check_exact, pose_evidence
-from mpfjax.tuning.problem import Parameters, Problem, Reals
+from mpfjax.tuning.evidence import UnbiasedFilter, pose_evidence
+from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms
 from mpfjax.tuning.transforms import AbstractTransform
 
 LogPrior = Callable[[dict[str, Array]], Float[Array, ""]]
@@ -102,12 +101,12 @@ class LogDensity(eqx.Module):
 
 @checked
 def log_density(
-    filter: Filter,
+    filter: UnbiasedFilter,
     observations: PyTree,
     *,
     log_prior: LogPrior,
     parameters: Parameters = None,
-    transforms: Mapping[str, AbstractTransform] | None = None,
+    transforms: Transforms = None,
 ) -> LogDensity:
     """The posterior's log density in unconstrained numbers, for samplers of other libraries.
 
@@ -126,7 +125,6 @@ def log_density(
     blackjax as `partial(density, key=key)`, with numpyro as
     `potential_fn=lambda u: -density(u, key)`.
     """
-    check_exact(filter, "likelihood")
     problem = pose_evidence(filter, observations, parameters, transforms)
     return LogDensity(problem, checked_prior(log_prior, problem))
 

@@ -1,8 +1,7 @@
 """The log marginal likelihood of a filter as an objective of its parameters."""
 
 import warnings
-from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -10,14 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import kinds
+from mpfjax.checks import kinds, of
 from mpfjax.filter import Filter
 from mpfjax.models.observations import Series, as_series, gathered
 from mpfjax.moves.base import AbstractMove
 from mpfjax.proposals import AbstractProposal
 from mpfjax.running.scan import scan
-from mpfjax.tuning.problem import Parameters, Place, Problem, placed, pose
-from mpfjax.tuning.transforms import AbstractTransform
+from mpfjax.tuning.problem import Parameters, Place, Problem, Transforms, placed, pose
+
+UnbiasedFilter = Annotated[
+    Filter,
+    of(
+        lambda value: isinstance(value, Filter) and not value.approximate,
+        "a filter with an unbiased likelihood: none of its moves is approximate",
+    ),
+]
 
 
 class LogEvidence(eqx.Module):
@@ -40,7 +46,7 @@ def pose_evidence(
     filter: Filter,
     observations: PyTree,
     parameters: Parameters,
-    transforms: Mapping[str, AbstractTransform] | None,
+    transforms: Transforms,
 ) -> Problem:
     """The problem of the log marginal likelihood; without `parameters`, in those of the model."""
     sequences = observations if isinstance(observations, list) else [observations]
@@ -61,19 +67,8 @@ def pose_evidence(
 def one_sequence(observations: PyTree, model: Any) -> Series:
     """The data of one sequence; a `ValueError` for a list of several."""
     if isinstance(gathered(observations).observations, list):
-        raise ValueError(
-            "observations: a list is several sequences, and this takes one;"
-            " jnp.asarray(observations) is one of numbers"
-        )
+        raise ValueError("observations: a list, of several sequences; jnp.asarray makes it one")
     return as_series(observations, model)
-
-
-def check_exact(filter: Filter, what: str) -> None:
-    """Raise a `ValueError` for a filter whose estimates of the likelihood are biased."""
-    if filter.approximate:
-        raise ValueError(
-            f"filter: an approximate one has no unbiased likelihood, and so no exact {what}"
-        )
 
 
 def warn_of_bias(caller: str, problem: Problem) -> None:

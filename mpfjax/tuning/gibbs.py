@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import Count, checked, saying, shown
+from mpfjax.checks import Count, checked, saying
 from mpfjax.filter import Filter
 from mpfjax.models.base import require, with_inputs
 from mpfjax.models.observations import Series
@@ -35,8 +35,7 @@ from mpfjax.tuning.densities import (
     is_invalid,
 )
 from mpfjax.tuning.evidence import one_sequence
-from mpfjax.tuning.problem import Parameters, Problem, Reals, pose
-from mpfjax.tuning.transforms import AbstractTransform
+from mpfjax.tuning.problem import Parameters, Problem, Reals, Transforms, pose
 from mpfjax.tuning.walks import RandomWalk, checked_deviations, metropolis_step
 
 _NUM_METROPOLIS_STEPS = 5  # for one new trajectory; they cost little
@@ -86,7 +85,7 @@ def particle_gibbs(
     log_prior: LogPrior | None = None,
     proposal_deviations: float | Mapping[str, Any] = 0.1,
     parameters: Parameters = None,
-    transforms: Mapping[str, AbstractTransform] | None = None,
+    transforms: Transforms = None,
     collect: Callable[[PyTree], PyTree] | None = None,
     **options: Unpack[ChainOptions],
 ) -> GibbsPosterior:
@@ -132,9 +131,7 @@ def particle_gibbs(
     noise of the dynamics does, steps are short and `metropolis_hastings` is better.
     """
     if (draw is None) == (log_prior is None):
-        raise ValueError(
-            f"draw, log_prior: {shown(draw)} and {shown(log_prior)}; exactly one must be given"
-        )
+        raise ValueError("draw, log_prior: exactly one must be given")
     backward = callable(getattr(filter.model, "log_transition", None))
     check_conditional(filter, backward, "particle_gibbs")
     joint = LogJoint(one_sequence(observations, filter.model))

@@ -60,13 +60,9 @@ def to_inference_data(result: Chains | PyTree) -> Any:
         parameters = {name: values[draws][None] for name, values in parameters.items()}
     else:
         states = {name: leaf[None] for name, leaf in _states(result).items()}
-        leaves = list(states.values())
-        is_stack = all(leaf.ndim > 2 and np.issubdtype(leaf.dtype, np.number) for leaf in leaves)
-        if not is_stack or len({leaf.shape[:3] for leaf in leaves}) != 1:
-            raise ValueError(
-                f"result: {shown(result)} is not what metropolis_hastings, particle_gibbs or smc2"
-                " returns, nor trajectories, leaves (trajectories, times, ...)"
-            )
+        stacks = {leaf.shape[:3] if leaf.dtype.kind in "iufc" else () for leaf in states.values()}
+        if [len(stack) for stack in stacks] != [3]:
+            raise ValueError(f"result: {shown(result)} is no posterior of parameters or states")
     length = stats["renewed"].shape[2] if "renewed" in stats else None
     dims, coords = {}, {}
     for name, leaf in (states | stats).items():

@@ -9,12 +9,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from mpfjax.checks import Count, checked
-from mpfjax.filter import Filter
 from mpfjax.tuning.chains import AbstractKernel, ChainOptions, Sampling, Step
 from mpfjax.tuning.densities import LogDensity, LogPrior, Point, checked_prior
-from mpfjax.tuning.evidence import check_exact, pose_evidence
-from mpfjax.tuning.problem import Parameters, Reals
-from mpfjax.tuning.transforms import AbstractTransform
+from mpfjax.tuning.evidence import UnbiasedFilter, pose_evidence
+from mpfjax.tuning.problem import Parameters, Reals, Transforms
 from mpfjax.tuning.walks import RandomWalk, checked_deviations, metropolis_step
 
 
@@ -45,14 +43,14 @@ class Posterior:
 @checked
 def metropolis_hastings(
     key: Key[Array, ""],
-    filter: Filter,
+    filter: UnbiasedFilter,
     observations: PyTree,
     num_steps: Count,
     *,
     log_prior: LogPrior,
     proposal_deviations: float | Mapping[str, Any] = 0.1,
     parameters: Parameters = None,
-    transforms: Mapping[str, AbstractTransform] | None = None,
+    transforms: Transforms = None,
     **options: Unpack[ChainOptions],
 ) -> Posterior:
     """Sample p(θ | y_1..y_t) with the filter's estimate Ẑ(θ) in place of the likelihood.
@@ -103,7 +101,6 @@ def metropolis_hastings(
     prior without one, a checkpoint of other chains, and what `fit` does; `RuntimeError` where the
     start, or a hundred draws of the prior, have no likelihood.
     """
-    check_exact(filter, "chain")
     problem = pose_evidence(filter, observations, parameters, transforms)
     deviations = checked_deviations(proposal_deviations, problem.start())
     sampling = Sampling("metropolis_hastings", key, problem, deviations, num_steps, **options)

@@ -1,7 +1,6 @@
 """`fit` and `maximise`: gradient ascent on the log marginal likelihood, or another objective."""
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -12,23 +11,20 @@ import numpy as np
 import optax
 from jaxtyping import Array, Key, PyTree
 
-from mpfjax.checks import Count, CountOrZero, Rule, checked, shown
+from mpfjax.checks import Count, CountOrZero, checked, of, shown
 from mpfjax.filter import Filter
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.curvature import errors_at
 from mpfjax.tuning.evidence import pose_evidence, warn_of_bias
-from mpfjax.tuning.problem import Objective, Parameters, Problem, Reals, pose, scores
-from mpfjax.tuning.transforms import AbstractTransform
+from mpfjax.tuning.problem import Objective, Parameters, Problem, Reals, Transforms, pose, scores
 
-
-def _check_optimizer(optimizer: Any, name: str) -> None:
-    if isinstance(optimizer, type) or not callable(getattr(optimizer, "update", None)):
-        raise ValueError(
-            f"{name}: {shown(optimizer)} has no update; take one of optax, as optax.adam(0.05)"
-        )
-
-
-Optimizer = Annotated[optax.GradientTransformation, Rule(_check_optimizer, "an optimiser")]
+Optimizer = Annotated[
+    optax.GradientTransformation,
+    of(
+        lambda value: not isinstance(value, type) and callable(getattr(value, "update", None)),
+        "an optimiser of optax, as optax.adam(0.05)",
+    ),
+]
 
 
 @dataclass(frozen=True)
@@ -70,7 +66,7 @@ def fit(
     num_steps: Count,
     *,
     parameters: Parameters = None,
-    transforms: Mapping[str, AbstractTransform] | None = None,
+    transforms: Transforms = None,
     num_seeds: Count = 8,
     curvature_seeds: CountOrZero = 0,
     checkpoint: Checkpoint | None = None,
@@ -128,7 +124,7 @@ def maximise(
     num_steps: Count,
     *,
     parameters: Parameters = None,
-    transforms: Mapping[str, AbstractTransform] | None = None,
+    transforms: Transforms = None,
     num_seeds: Count = 1,
     checkpoint: Checkpoint | None = None,
     progress: bool = True,
@@ -151,8 +147,7 @@ def maximise(
     problem = pose(model, objective, parameters, transforms)
     ascent = _Ascent("maximise", "value", key, problem, optimizer, num_seeds)
     found = eqx.filter_eval_shape(problem.value, problem.start(), key)
-    shape, dtype = getattr(found, "shape", None), getattr(found, "dtype", None)
-    if shape != () or dtype is None or not jnp.issubdtype(dtype, jnp.floating):
+    if getattr(found, "shape", None) != () or not jnp.issubdtype(found.dtype, jnp.floating):
         raise ValueError(f"objective: it returns {shown(found)}, no floating point scalar")
     functions = {"objective": (problem.value, problem.start(), key)}
     data = {"objective": objective}

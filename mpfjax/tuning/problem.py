@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -12,12 +12,19 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import check, shown
+from mpfjax.checks import by_name, shown
 from mpfjax.tuning.transforms import AbstractTransform, Unconstrained
 
 _DECLARED = "eqx.field(converter=jnp.asarray)"
 
-Parameters = Mapping[str, Callable[[Any], PyTree]] | None
+Parameters = Annotated[
+    Mapping[str, Callable[[Any], PyTree]] | None,
+    by_name(callable, 'functions, as {"r": lambda filter: filter.model.r}'),
+]
+Transforms = Annotated[
+    Mapping[str, AbstractTransform] | None,
+    by_name(lambda value: isinstance(value, AbstractTransform), "transforms, as Positive()"),
+]
 Reals = dict[str, Array]
 Objective = Callable[..., Any]
 
@@ -64,19 +71,14 @@ class Problem(eqx.Module):
 
         It is one as well for values outside their domains, unless they are traced.
         """
-        if not isinstance(values, Mapping) or set(values) != set(self.transforms):
-            names = sorted(values) if isinstance(values, Mapping) else shown(values)
-            raise ValueError(
-                f"{whose}: it gave {names}, no values by the names {sorted(self.transforms)}"
-            )
+        names = sorted(values) if isinstance(values, Mapping) else shown(values)
+        if names != sorted(self.transforms):
+            raise ValueError(f"{whose}: it gave {names}, not values of {sorted(self.transforms)}")
         reals = {}
         for name, index in self.tuned:
             value, present = jnp.asarray(values[name]), self.leaves[index]
             if value.shape != jnp.shape(present):
-                raise ValueError(
-                    f"{whose}: {name} of shape {value.shape}, where the parameter's is"
-                    f" {jnp.shape(present)}"
-                )
+                raise ValueError(f"{whose}: {name} of shape {value.shape}, not {present.shape}")
             # A strong type: an optimiser makes a weak one strong, and it would compile again.
             value = jax.lax.convert_element_type(value, present.dtype)
             reals[name] = self.transforms[name].unconstrain(value)
@@ -141,24 +143,20 @@ def pose(
     tree: PyTree,
     objective: Objective,
     parameters: Parameters,
-    transforms: Mapping[str, AbstractTransform] | None,
+    transforms: Transforms,
 ) -> Problem:
     """The problem; a `ValueError` for arguments that do not make one."""
     leaves, structure = jax.tree.flatten(tree)
     tuned = _tuned(tree, parameters)
     if not tuned:
         raise ValueError(
-            "parameters: there is nothing to tune; Python floats are tuned where `parameters` names"
-            f" them, or where their fields are declared {_DECLARED}"
+            f"parameters: there is nothing to tune; name Python floats, or declare them {_DECLARED}"
         )
     for name, index in tuned.items():
         leaves[index] = _as_array(name, leaves[index])
     transforms = {} if transforms is None else transforms
-    check(Mapping, "a mapping from names to transforms", transforms=transforms)
-    for name, transform in transforms.items():
-        check(AbstractTransform, "a transform", **{f"transforms[{name!r}]": transform})
-        if name not in tuned:
-            raise ValueError(f"transforms: {name} is not among the parameters, {sorted(tuned)}")
+    for name in transforms.keys() - tuned.keys():
+        raise ValueError(f"transforms: {name} is not among the parameters, {sorted(tuned)}")
     return Problem(
         leaves=leaves,
         transforms={name: transforms.get(name, Unconstrained()) for name in tuned},
@@ -188,8 +186,7 @@ def _as_array(name: str, value: Any) -> Array:
         if jnp.issubdtype(array.dtype, jnp.floating):
             return array
     raise ValueError(
-        f"parameters: {name} is {shown(value)}, no floating point number; give the model one, or"
-        f" declare it {_DECLARED}"
+        f"parameters: {name} is {shown(value)}, no floating point number; declare it {_DECLARED}"
     )
 
 
@@ -197,8 +194,6 @@ def _tuned(tree: PyTree, parameters: Parameters) -> dict[str, int]:
     """Each parameter's name, and its place among the tree's leaves."""
     if parameters is None:
         parameters = {"": lambda tree: getattr(tree, "model", tree)}
-    example = 'a mapping from names to functions, as {"r": lambda filter: filter.model.r}'
-    check(Mapping, example, parameters=parameters)
     leaves, places = jax.tree.leaves(tree), placed(tree)
     tuned: dict[str, int] = {}
     for name, where in parameters.items():
@@ -220,9 +215,8 @@ def _picked(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[st
     for _, place in found:
         if not isinstance(place, Place):
             raise ValueError(
-                f"parameters: {name} picks {shown(place)}, which is no leaf but a static field, or"
-                f" made from others; a field can be tuned where it is declared {_DECLARED}, without"
-                " static=True"
+                f"parameters: {name} picks {shown(place)}, no leaf; a field can be tuned where it"
+                f" is declared {_DECLARED}, without static=True"
             )
     if len(found) > 1 or not name:  # a network has functions among its leaves
         found = [

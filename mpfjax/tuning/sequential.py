@@ -1,6 +1,5 @@
 """The posterior of parameters as observations come in, by SMC²."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
@@ -11,12 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.checks import Count, checked, kinds
-from mpfjax.filter import Filter
 from mpfjax.models.observations import Series
 from mpfjax.running.long_runs import Broken, Checkpoint, LongRun, State, identity_of
 from mpfjax.tuning.chains import warn_of_invalid
 from mpfjax.tuning.densities import LogPrior, SamplePrior, checked_prior, drawn
-from mpfjax.tuning.evidence import check_exact, one_sequence, with_present
+from mpfjax.tuning.evidence import UnbiasedFilter, one_sequence, with_present
 from mpfjax.tuning.parameter_particles import (
     FilterOf,
     Sampler,
@@ -25,8 +23,7 @@ from mpfjax.tuning.parameter_particles import (
     rejuvenated,
     started,
 )
-from mpfjax.tuning.problem import Parameters, pose
-from mpfjax.tuning.transforms import AbstractTransform
+from mpfjax.tuning.problem import Parameters, Transforms, pose
 
 # The share of their number below which the effective sample size of the θs leads to moves.
 _ESS_THRESHOLD = 0.5
@@ -88,7 +85,7 @@ class SequentialPosterior:
 @checked
 def smc2(
     key: Key[Array, ""],
-    filter: Filter,
+    filter: UnbiasedFilter,
     observations: PyTree,
     num_samples: Count,
     *,
@@ -97,7 +94,7 @@ def smc2(
     num_moves: Count = 5,
     max_particles: Count | None = None,
     parameters: Parameters = None,
-    transforms: Mapping[str, AbstractTransform] | None = None,
+    transforms: Transforms = None,
     checkpoint: Checkpoint | None = None,
     progress: bool = True,
 ) -> SequentialPosterior:
@@ -140,7 +137,6 @@ def smc2(
     for posteriors with several modes, and to compare models; `metropolis_hastings` is simpler where
     only the last posterior is wanted.
     """
-    check_exact(filter, "SMC²")
     if num_samples % (num_moves + 1):
         raise ValueError(
             f"num_samples: {num_samples} is no multiple of num_moves + 1, {num_moves + 1}"

@@ -1,7 +1,6 @@
 """Computer vision: frames, boxes, colour histograms, detections, the object tracker."""
 
 from mpfjax.vision.boxes.colour_model import ColourModel as ColourModel
-from mpfjax.vision.boxes.following import annotate as annotate
 from mpfjax.vision.boxes.following import follow as follow
 from mpfjax.vision.boxes.following import follow_boxes as follow_boxes
 from mpfjax.vision.boxes.following import track_rows as track_rows

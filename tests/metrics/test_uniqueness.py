@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpfjax.metrics import uniqueness
+from mpfjax.metrics.particle_scores import uniqueness
 from tests.examples import make_mixture
 
 

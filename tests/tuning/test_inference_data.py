@@ -71,7 +71,7 @@ def test_of_trajectories_and_of_nothing_else():
     assert groups["posterior"]["state"].shape == (1, 50, 6)
     assert dims["state"] == ["time"]
     for wrong in (None, jnp.ones(4), {"a": jnp.ones((2, 3)), "b": jnp.ones((2, 4))}):
-        with pytest.raises(ValueError, match=r"(?s)result: .* is not what"):
+        with pytest.raises(ValueError, match=r"(?s)result: .* is no posterior"):
             to_inference_data(wrong)
 
 

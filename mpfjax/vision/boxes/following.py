@@ -54,10 +54,6 @@ def follow(
     for anything but a filter and a stack of keys. Use it with the `PRESETS`, and `track_rows` to
     make tracks of the snapshots.
     """
-    return _follow(filter, keys, frames)
-
-
-def _follow(filter: Filter, keys: Array, frames: Iterable[np.ndarray]) -> Iterator[Snapshot]:
     mixtures = jax.vmap(filter.init)(keys)
     for t, frame in enumerate(frames):
         step = jnp.asarray(t)  # an array: a new Python number would compile again
@@ -132,17 +128,16 @@ def annotate(
     negative numbers count from the end. `zoom` is the side in pixels to which each pixel is
     enlarged. Raises `ValueError` for a zoom that is not a whole number from 1 on.
     """
-    canvas = frame[crop].repeat(zoom, axis=0).repeat(zoom, axis=1).astype(float)
+    image, draw = drawing.canvas_of(frame[crop].repeat(zoom, axis=0).repeat(zoom, axis=1))
     top, left = (part.indices(n)[0] for part, n in zip(crop, frame.shape[:2], strict=True))
     corner = np.array([left, top], float)
-    labels, palette = snapshot.labels[0], drawing.PALETTE
     for m in np.flatnonzero(snapshot.active[0]):
         box = box_files.top_left(snapshot.means[0][m][None])[0] - [*corner, 0, 0]
-        drawing.draw_box(canvas, zoom * box, palette[m % len(palette)], thickness=2)
-    filled = labels >= 0
+        drawing.draw_box(draw, zoom * box, int(m))
+    filled = snapshot.labels[0] >= 0
     points = zoom * (snapshot.points[0][filled] - corner)
-    drawing.draw_points(canvas, points, palette[labels[filled] % len(palette)], 0.9 * zoom)
-    return np.clip(canvas, 0, 255).astype(np.uint8)
+    drawing.draw_points(draw, points, snapshot.labels[0][filled], 0.9 * zoom)
+    return np.asarray(image)
 
 
 @checked
@@ -166,19 +161,11 @@ def follow_boxes(
     frames as `track` does. Use it if no detector finds the objects, and a user draws boxes around
     them.
     """
-    boxes = to_rows(4, "boxes", boxes)
-    if len(boxes) == 0:
-        raise ValueError("boxes: there are none")
-    key = jax.random.key(0) if key is None else key
-    return _followed(of_one_kind(frames), boxes, key)
-
-
-def _followed(
-    stills: Iterator[np.ndarray], boxes: np.ndarray, key: Array
-) -> Generator[Tracks, None, None]:
+    stills = of_one_kind(frames)
     first = next(stills, None)
     if first is None:
         return
+    boxes, key = to_rows(4, "boxes", boxes), jax.random.key(0) if key is None else key
     filter = objects_filters(first, boxes)["mpf"]
     model: Any = filter.model
     # It runs once, and takes longer to compile than to run.

@@ -11,18 +11,15 @@ from jaxtyping import Float
 from mpfjax.checks import shown, to_rows
 
 _COMMENTS = ("#", "%", "//")
-# The names that a header may give to the first seven columns, in lower case and without "_".
-_BOX = "(bb|bbox|box)?"
-_NAMES = (
-    "f|t|frame(id|index|idx|number|no)?",
-    ".*id|identity|track|target|object",
-    f"{_BOX}(x|left|x[01]|xmin|xtl|topleftx)",
-    f"{_BOX}(y|top|y[01]|ymin|ytl|toplefty)",
-    f"{_BOX}(w|width)",
-    f"{_BOX}(h|height)",
-    "conf.*|score.*|prob.*|flag|mark|valid|active|consider.*|(not)?ignored?|outofview",
+# The names that a header may give to the columns, in lower case and without "_".
+_FRAME, _BOX = "(f|t|frame(id|index|idx|number|no)?)", "(bb|bbox|box)?"
+_SCORE = "((conf|score|prob|consider).*|flag|mark|valid|active|(not)?ignored?|outofview)"
+_HEADER = re.compile(
+    rf"{_FRAME},(\w*id|identity|track|target|object),{_BOX}(x|left|x[01]|xmin|xtl|topleftx)"
+    rf",{_BOX}(y|top|y[01]|ymin|ytl|toplefty),{_BOX}(w|width),{_BOX}(h|height)(,{_SCORE}(,.*)?)?"
 )
-TRACK_FORM = "frame,id,x,y,w,h and one to four more columns"
+_LIKE_A_HEADER = re.compile(f"{_FRAME}(,[^,]*){{5}}")
+TRACK_FORM = "frame,id,x,y,w,h and one to four more columns, frames from 1 on"
 TRACK_COLUMNS = range(7, 11)
 
 
@@ -46,17 +43,13 @@ def check_boxes(
     for what is not four finite numbers.
     """
     rows = to_rows(4, argument, boxes)
-    if len(rows) == 0:
-        raise ValueError(f"{argument}: there are none")
-    for x, y, w, h in rows.tolist():
-        named = f"{argument}: {x:g},{y:g},{w:g},{h:g}"
-        if not np.all(np.isfinite([x, y, w, h])):
-            raise ValueError(f"{named} is not finite")
-        if not (w > 0 and h > 0):
-            raise ValueError(f"{named} has no area")
-        # With less than a pixel inside, it may hold no pixel's centre, and so no colour to track.
-        if not (x + w >= 1 and y + h >= 1 and x <= width - 1 and y <= height - 1):
-            raise ValueError(f"{named} lies outside the first frame, {width} x {height}")
+    low, sides = rows[:, :2], rows[:, 2:]
+    # With less than a pixel inside, it may hold no pixel's centre, and so no colour to track.
+    inside = (low + sides >= 1) & (low <= [width - 1, height - 1])
+    fits = (inside & (sides > 0)).all(axis=1) & np.isfinite(rows).all(axis=1)
+    if not len(rows) or not fits.all():
+        wrong = shown(rows[~fits].tolist())
+        raise ValueError(f"{argument}: {wrong} have no area in the first frame, {width} x {height}")
     return rows
 
 
@@ -82,10 +75,7 @@ def read_tracks(path: str | Path) -> Float[np.ndarray, "rows 6"]:
     any box. Warns where the seventh column is that of a ground truth of which some rows do not
     count.
     """
-    found = read_rows(path, TRACK_FORM, TRACK_COLUMNS)
-    for number, row in found.items():
-        check_identity(path, number, row)
-    rows = list(found.values())
+    rows = list(read_rows(path, TRACK_FORM, TRACK_COLUMNS, least_id=0).values())
     flags = [row[6] for row in rows]
     if set(flags) == {0.0, 1.0}:
         warnings.warn(
@@ -106,14 +96,11 @@ def read_detections(path: str | Path) -> Float[np.ndarray, "rows columns"]:
     not finite, lies in a frame before 1, or has a score where other rows have none; and for a file
     without any detection.
     """
-    form = "frame,id,x,y,w,h,score and up to three more columns"
+    form = "frame,id,x,y,w,h,score and up to three more columns, as the lines before it"
     found = read_rows(path, form, range(6, 11), holds="detections")
     rows = [row[:7] for row in found.values()]
     for number, row in zip(found, rows, strict=True):
-        if len(row) != len(rows[0]):
-            said = "has a score, or none, unlike the lines before it"
-            raise ValueError(f"{path}, line {number}: {said}")
-        if not np.all(np.isfinite(row)):
+        if len(row) != len(rows[0]) or not np.all(np.isfinite(row)):
             raise ValueError(f"{path}, line {number}: {shown(row)} is not {form}")
     return np.array(rows)
 
@@ -147,16 +134,21 @@ def boxes_of_frame(rows: Float[np.ndarray, "rows 6"], frame: int) -> dict[int, n
 
 
 def read_rows(
-    path: str | Path, form: str, columns: range, *, holds: str | None = "boxes"
+    path: str | Path,
+    form: str,
+    columns: range,
+    *,
+    least_id: float = -np.inf,
+    holds: str | None = "boxes",
 ) -> dict[int, list[float]]:
     """The rows of a text file by the numbers of their lines, from 1.
 
     Columns are parted by commas, semicolons, tabs or blanks. The first six, of which the first is
-    a frame from 1 on, are finite; further ones may be NaN, also where they are no numbers. Blank
-    lines, comments after "#", "%" or "//", and a header that names the columns of MOTChallenge are
-    left out. Raises `ValueError` with the file and the line for any other text, also for a header
-    of other columns, where `form` says what was expected; and for a file without any row, unless
-    `holds`, the name of what it should hold, is None.
+    a frame from 1 on and the second an id, are finite; further ones may be NaN, also where they are
+    no numbers. Blank lines, comments after "#", "%" or "//", and a header that names the columns of
+    MOTChallenge are left out. Raises `ValueError` with the file and the line for any other text,
+    also for a header of other columns, where `form` says what was expected; and for a file without
+    any row, unless `holds`, the name of what it should hold, is None.
     """
     rows: dict[int, list[float]] = {}
     for number, line in enumerate(read_text(path).splitlines(), 1):
@@ -164,17 +156,13 @@ def read_rows(
         commented = text.startswith(_COMMENTS)
         fields = _fields(text.lstrip("#%/ ") if commented else text.partition("#")[0])
         values = [_number(field) for field in fields]
-        if not rows and _is_header(fields, values, commented):
-            _check_header(f"{path}, line {number}", fields)
+        names = ",".join(re.sub(r"[\W_]", "", field.lower()) for field in fields)
+        is_comment = commented and (rows or not _LIKE_A_HEADER.match(names))
+        if is_comment or not fields or (not rows and _HEADER.fullmatch(names)):
             continue
-        if commented or not fields:
-            continue
-        if len(fields) not in columns or not np.all(np.isfinite(values[:6])) or values[0] % 1:
+        is_row = len(fields) in columns and np.all(np.isfinite(values[:6]))
+        if not is_row or values[0] < 1 or values[0] % 1 or values[1] < least_id:
             raise ValueError(f"{path}, line {number}: {shown(text)} is not {form}")
-        if values[0] < 1:
-            raise ValueError(
-                f"{path}, line {number}: lies in frame {values[0]:.0f}, and frames count from 1"
-            )
         rows[number] = values
     if not rows and holds is not None:
         raise ValueError(f"{path}: holds no {holds}")
@@ -188,38 +176,11 @@ def read_text(path: str | Path) -> str:
     return content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
 
 
-def check_identity(path: str | Path, number: int, values: list[float]) -> None:
-    """Raise `ValueError` with the file and the line for an id that is not whole, or below 0."""
-    if values[1] % 1 or values[1] < 0:
-        raise ValueError(f"{path}, line {number}: {values[1]:g} is no id, a whole number from 0 on")
-
-
 def _fields(text: str) -> list[str]:
     """The columns of a line; a separator at its end begins none."""
     mark = next((mark for mark in ",;\t" if mark in text), None)
     fields = [field.strip().strip("\"'") for field in text.split(mark)]
     return fields[:-1] if fields and not fields[-1] else fields
-
-
-def _is_header(fields: list[str], values: list[float], commented: bool) -> bool:
-    """Whether these are names: no numbers, and in a comment those of columns from a frame on."""
-    if not fields or not np.all(np.isnan(values)) or re.match(r"[-+.\d]", fields[0]):
-        return False
-    return not commented or (len(fields) >= 6 and _named(_NAMES[0], fields[0]))
-
-
-def _check_header(line: str, fields: list[str]) -> None:
-    known = all(map(_named, _NAMES, fields))
-    if not known or len(fields) < 6:
-        raise ValueError(
-            f"{line}: {shown(','.join(fields))} is a header, and its columns are not"
-            " frame,id,x,y,w,h and, if any, a score"
-        )
-
-
-def _named(pattern: str, field: str) -> bool:
-    """Whether a column has such a name, whatever its case and what stands between its words."""
-    return re.fullmatch(pattern, re.sub(r"[\W_]", "", field.lower())) is not None
 
 
 def _number(field: str) -> float:

@@ -1,69 +1,48 @@
-"""Drawing on RGB frames: boxes, points and numbers, in place, clipped at the frame's border.
+"""Drawing on RGB frames by Pillow: boxes with their numbers, and points.
 
 Coordinates are in pixels; the centre of the first pixel is at (0.5, 0.5). What is drawn covers
 whole pixels, which is a hundred times quicker than smooth edges on a large frame.
 """
 
-import functools
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Num, UInt8
+from jaxtyping import Float, Int, UInt8
 
 # Okabe and Ito's palette, in the order of use; people with colour blindness can tell it apart. In
 # place of black, which numbers on a dark plate cannot have, there is a light green.
-PALETTE = np.array(
-    [
-        [230, 159, 0], [86, 180, 233], [240, 228, 66], [204, 121, 167], [0, 114, 178],
-        [213, 94, 0], [0, 158, 115], [255, 255, 255], [153, 153, 153], [170, 255, 195],
-    ],
-    dtype=float,
+_PALETTE = (
+    (230, 159, 0), (86, 180, 233), (240, 228, 66), (204, 121, 167), (0, 114, 178),
+    (213, 94, 0), (0, 158, 115), (255, 255, 255), (153, 153, 153), (170, 255, 195),
 )  # fmt: skip
 
-# Five rows of three bits for each digit, a row in an octal figure.
-_DIGITS = ("75557", "26227", "71747", "71717", "55711", "74717", "74757", "71122", "75757", "75717")
 
-# The share of the brightness that remains under the plate of a number.
-_DARKENED = (np.arange(256) - 0.6 * np.arange(256)).astype(np.uint8)
+def canvas_of(frame: UInt8[np.ndarray, "h w 3"]) -> tuple[Any, Any]:
+    """A copy of a frame as an image of Pillow, and what draws on it."""
+    from PIL import Image, ImageDraw
+
+    image = Image.fromarray(frame)
+    return image, ImageDraw.Draw(image)
 
 
-def draw_box(
-    frame: Num[np.ndarray, "h w 3"],
-    box: Float[np.ndarray, "4"],
-    colour: Num[np.ndarray, "3"],
-    thickness: int = 2,
-) -> None:
-    """Outline a box (x, y, w, h), (x, y) its top-left corner."""
-    x, y, w, h = (float(value) for value in box)
-    left, top, right, bottom = (round(edge) for edge in (x, y, x + w, y + h))
-    for x0, y0, x1, y1 in (
-        (left, top, right, top + thickness), (left, bottom - thickness, right, bottom),
-        (left, top, left + thickness, bottom), (right - thickness, top, right, bottom),
-    ):  # fmt: skip
-        frame[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = colour
+def draw_box(draw: Any, box: Float[np.ndarray, "4"], number: int, thickness: int = 2) -> None:
+    """Outline a box (x, y, w, h), (x, y) its top-left corner, in the colour of a number."""
+    x, y, w, h = box.tolist()
+    corners = (round(x), round(y), round(x + w), round(y + h))
+    draw.rectangle(corners, outline=_PALETTE[number % len(_PALETTE)], width=thickness)
 
 
 def draw_points(
-    frame: Num[np.ndarray, "h w 3"],
+    draw: Any,
     points: Float[np.ndarray, "n 2"],
-    colours: Num[np.ndarray, "n 3"],
+    numbers: Int[np.ndarray, " n"],
     radius: float = 1.5,
 ) -> None:
     """Draw a dot at each (x, y), with a dark rim so that it is visible on any background."""
-    for (x, y), colour in zip(points.tolist(), colours, strict=True):
-        for reach, ink in ((radius + 1, 0), (radius, colour)):
-            edges = (max(round(edge), 0) for edge in (x - reach, x + reach, y - reach, y + reach))
-            left, right, top, bottom = edges
-            frame[top:bottom, left:right] = ink
-
-
-@functools.lru_cache(maxsize=4096)
-def _plate(number: int, size: int) -> Bool[np.ndarray, "height width"]:
-    """The plate of a number, and where its digits are; cached, since ids come in every frame."""
-    rows = [" ".join(f"{int(_DIGITS[int(d)][i]):03b}" for d in str(number)) for i in range(5)]
-    dots = np.array([[character == "1" for character in row] for row in rows])
-    plate = np.pad(np.kron(dots, np.ones((size, size), bool)), 2)
-    plate.setflags(write=False)
-    return plate
+    for (x, y), number in zip(points.tolist(), numbers.tolist(), strict=True):
+        for reach, ink in ((radius + 1, (0, 0, 0)), (radius, _PALETTE[number % len(_PALETTE)])):
+            ends = (round(x - reach), round(y - reach), round(x + reach), round(y + reach))
+            draw.rectangle(ends, fill=ink)
 
 
 def with_tracks(
@@ -73,16 +52,15 @@ def with_tracks(
 
     An id keeps its colour.
     """
-    canvas = frame.copy()
-    palette = PALETTE.astype(np.uint8)
+    from PIL import ImageFont
+
+    image, draw = canvas_of(frame)
     thickness = max(1, round(frame.shape[0] / 360))
-    size = 1 + thickness
-    for _, id, x, y, w, h in rows.tolist():
-        colour = palette[int(id) % len(palette)]
-        draw_box(canvas, np.array([x, y, w, h]), colour, thickness)
-        plate = _plate(int(id), size)
-        above, start = max(round(y) - 5 * size - 4, 0), max(round(x), 0)
-        label = canvas[above : above + plate.shape[0], start : start + plate.shape[1]]
-        label[:] = _DARKENED[label]
-        label[plate[: label.shape[0], : label.shape[1]]] = colour
-    return canvas
+    font = ImageFont.load_default(size=8 + 4 * thickness)
+    for row in rows:
+        number, box = int(row[1]), row[2:]
+        draw_box(draw, box, number, thickness)
+        place = (max(box[0], 0), max(box[1], font.size + 4))
+        draw.rectangle(draw.textbbox(place, str(number), font, anchor="lb"), fill=(40, 40, 40))
+        draw.text(place, str(number), _PALETTE[number % len(_PALETTE)], font, anchor="lb")
+    return np.asarray(image)

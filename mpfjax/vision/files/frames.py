@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from mpfjax.checks import Count, Positive, check_shape, checked
+from mpfjax.checks import Count, Positive, checked
 from mpfjax.vision.files.sequences import read_sequence_info
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp")
@@ -54,11 +54,9 @@ def parse_range(text: str | None, argument: str = "frames") -> tuple[int, int | 
     if text is None:
         return 1, None
     a, colon, b = text.partition(":")
-    try:
-        first, last = int(a), int(b) if b else None
-    except ValueError:
-        first, last = 0, None
-    if not colon or first < 1 or (last is not None and last < first):
+    whole = colon and a.isdecimal() and (b.isdecimal() or not b)
+    first, last = (int(a), int(b) if b else None) if whole else (0, None)
+    if first < 1 or (last is not None and last < first):
         raise ValueError(f"{argument}: {text!r} is not A:B with 1 <= A <= B")
     return first, last
 
@@ -137,13 +135,11 @@ def open_video(
         yield append
 
 
-def check_frame(frame: Any, argument: str = "frame", *, eight_bits: bool = True) -> None:
-    """Raise `ValueError` unless `frame` is a colour image (h, w, 3), by default of eight bits."""
-    check_shape("...", **{argument: frame})
-    if frame.ndim != 3 or frame.shape[2] != 3 or 0 in frame.shape:
-        raise ValueError(f"{argument}: {frame.shape} is not the shape (h, w, 3) of a colour image")
-    if eight_bits and frame.dtype != np.uint8:
-        raise ValueError(f"{argument}: {frame.dtype} is not uint8")
+def check_frame(frame: Any, argument: str = "frame") -> None:
+    """Raise `ValueError` unless `frame` is a colour image (h, w, 3) of eight bits."""
+    shape, dtype = getattr(frame, "shape", ()), getattr(frame, "dtype", None)
+    if len(shape) != 3 or shape[2] != 3 or 0 in shape or dtype != np.uint8:
+        raise ValueError(f"{argument}: {dtype}, {shape}, is no colour image, uint8 of (h, w, 3)")
 
 
 def of_one_kind(
@@ -162,10 +158,7 @@ def of_one_kind(
         check_frame(frame, argument)
         shape = shape or frame.shape
         if frame.shape != shape:
-            raise ValueError(
-                f"{argument}: frame {number} is {frame.shape[1]} x {frame.shape[0]},"
-                f" and those before it {shape[1]} x {shape[0]}"
-            )
+            raise ValueError(f"{argument}: {number} has the shape {frame.shape}, others {shape}")
         yield frame
 
 
@@ -213,7 +206,7 @@ def _decoded(path: Path) -> Iterator[Any]:
     """The frames of a video, their pixels not yet converted."""
     with _opened(path) as (container, stream):
         stream.thread_type = "AUTO"
-        packets, any_frame, damaged = container.demux(stream), False, None
+        packets, damaged = container.demux(stream), False
         while True:
             with _naming(path, "a video"):
                 packet = next(packets, None)
@@ -221,13 +214,10 @@ def _decoded(path: Path) -> Iterator[Any]:
                 break
             try:
                 frames = packet.decode()
-            except (OSError, ValueError) as error:  # the library's error for a damaged packet
-                damaged = damaged or error
+            except (OSError, ValueError):  # the library's error for a damaged packet
+                damaged = True
                 continue
-            any_frame = any_frame or bool(frames)
             yield from frames
-        if damaged and not any_frame:
-            raise ValueError(f"{path}: cannot be read as a video ({damaged})")
     if damaged:
         warnings.warn(
             f"{path}: some frames are damaged, and were left out", RuntimeWarning, stacklevel=2

@@ -8,15 +8,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.checks import checked, shown
+from mpfjax.checks import checked
 from mpfjax.metrics.tracking_scores import IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT
-from mpfjax.vision.files.boxes import (
-    TRACK_COLUMNS,
-    TRACK_FORM,
-    check_identity,
-    read_rows,
-    read_text,
-)
+from mpfjax.vision.files.boxes import TRACK_COLUMNS, TRACK_FORM, read_rows, read_text
 
 # MOTChallenge's classes: 1 are pedestrians; a track of one of these is no false positive. Rows of
 # the others (vehicles, occluders) only take part when boxes are matched.
@@ -34,6 +28,7 @@ _LABELS = [
 _CATEGORIES = range(12)
 _KITTI_HEIGHT = 25.0
 _FLAG, _CLASS = 6, 7
+_KNOWN = {"motchallenge": _CLASSES, "visdrone": _CATEGORIES}
 Format = Literal["motchallenge", "visdrone", "uavdt", "cvat"]
 _INFO = "seqinfo.ini"
 
@@ -99,15 +94,17 @@ def read_truth(path: str | Path, *, format: Format | None = None) -> Truth:
         here[: len(row)] = row
     format = _format_of(path, name, table) if format is None else format
     boxes, counted, ignored = table[:, :6], table[:, _FLAG] != 0, np.zeros((0, 6))
+    classes, known = table[:, _CLASS], _KNOWN.get(format)
+    if known is not None and not np.isin(classes, known).all():
+        raise ValueError(f"{path}: no class from {known[0]} to {known[-1]} in each eighth column")
     if format == "motchallenge":
-        classes = _classes(path, rows, _CLASSES)
         kinds = _NOT_TO_BLAME | ({_VEHICLE} if name.startswith("mot20") else set())
         counted &= classes == _PEDESTRIAN
         # In the order of the file, by which TrackEval breaks ties.
         ignored = _as_ignored(boxes[~counted], UNSCORED_OBJECT)
         ignored[np.isin(classes, sorted(kinds))[~counted], 1] = IGNORED_OBJECT
     elif format == "visdrone":
-        counted &= np.isin(_classes(path, rows, _CATEGORIES), _CATEGORIES[1:-1])
+        counted &= np.isin(classes, _CATEGORIES[1:-1])
         ignored = _as_ignored(boxes[~counted], IGNORED_REGION)
     elif format == "uavdt":
         counted[:] = True
@@ -115,9 +112,8 @@ def read_truth(path: str | Path, *, format: Format | None = None) -> Truth:
         if beside != path and beside.is_file():
             regions = read_rows(beside, TRACK_FORM, range(6, TRACK_COLUMNS.stop), holds=None)
             ignored = _as_ignored([row[:6] for row in regions.values()], IGNORED_REGION)
-    for (number, row), counts in zip(rows.items(), counted, strict=True):
-        if counts:
-            check_identity(path, number, row)
+    for number in np.array(list(rows))[counted & (boxes[:, 1] < 0)]:
+        raise ValueError(f"{path}, line {number}: an object without an id, which is at least 0")
     ignored = np.concatenate([ignored, _ignore_file(path.parent / "ignore.txt")])
     min_height = _KITTI_HEIGHT if name.startswith("kitti") else 0.0
     return Truth(boxes[counted], ignored, min_height)
@@ -153,17 +149,6 @@ def _format_of(path: Path, name: str, table: Float[np.ndarray, "r 10"]) -> Forma
     return "visdrone" if (few & np.isin(classes, _CATEGORIES)).all() else "cvat"
 
 
-def _classes(path: Path, rows: dict[int, list[float]], known: range) -> np.ndarray:
-    """The class of every row."""
-    for number, row in rows.items():
-        if len(row) <= _CLASS or row[_CLASS] not in known:
-            raise ValueError(
-                f"{path}, line {number}: has no class from {known[0]} to {known[-1]} in its eighth"
-                " column"
-            )
-    return np.array([row[_CLASS] for row in rows.values()])
-
-
 def _as_ignored(boxes: Any, kind: int) -> Float[np.ndarray, "r 6"]:
     """Rows frame,id,x,y,w,h as rows frame,kind,x,y,w,h."""
     ignored = np.array(boxes, float).reshape(-1, 6)
@@ -175,9 +160,6 @@ def _ignore_file(path: Path) -> Float[np.ndarray, "r 6"]:
     """The rows of an ignore.txt; none where there is no such file."""
     form = "frame,kind,x,y,w,h with the kind 1 or 2"
     rows = read_rows(path, form, range(6, 7), holds=None) if path.is_file() else {}
-    for number, row in rows.items():
-        if row[1] not in (IGNORED_OBJECT, IGNORED_REGION):
-            raise ValueError(f"{path}, line {number}: {shown(row)} is not {form}")
     return np.array(list(rows.values())).reshape(-1, 6)
 
 
@@ -214,20 +196,18 @@ def read_sequence_info(*folders: Path) -> SequenceInfo:
     parser.optionxform = lambda optionstr: re.sub(r"[\W_]", "", optionstr.lower())
     # Keys before the first section, and indented ones, are keys too.
     lines = ["[Sequence]", *(line.strip() for line in read_text(path).splitlines())]
+    keys = ("framerate", "seqlength", "imheight", "imwidth")
     try:
         parser.read_string("\n".join(lines))
-    except configparser.Error as error:
+        values = {key: value for name in parser.sections() for key, value in parser.items(name)}
+        rate, length, height, width = (float(values.get(key) or 0) for key in keys)
+    except (configparser.Error, ValueError) as error:
         raise ValueError(f"{path}: {error}") from error
-    values = {key: value for name in parser.sections() for key, value in parser.items(name)}
-    rate, length, height, width = (
-        _positive(path, key, values.get(key.lower()))
-        for key in ("frameRate", "seqLength", "imHeight", "imWidth")
-    )
     return SequenceInfo(
         name=values.get("name") or None,
-        frame_rate=rate,
-        length=None if length is None else int(length),
-        size=None if height is None or width is None else (int(height), int(width)),
+        frame_rate=rate if 0 < rate < np.inf else None,
+        length=int(length) if 0 < length < np.inf else None,
+        size=(int(height), int(width)) if 0 < height * width < np.inf else None,
     )
 
 
@@ -247,12 +227,3 @@ def last_frame(info: SequenceInfo, *rows: np.ndarray) -> int:
     if info.length is not None:
         return info.length
     return int(max((found[:, 0].max() for found in rows if len(found)), default=0))
-
-
-def _positive(path: Path, key: str, value: str | None) -> float | None:
-    """A positive number, None where there is none."""
-    try:
-        number = float(value or 0)
-    except ValueError:
-        raise ValueError(f"{path}: {key}: {shown(value)} is not a number") from None
-    return number if 0 < number < np.inf else None

@@ -43,18 +43,15 @@ class Rows:
     ) -> None:
         if rows.ndim != 2 or not (rows.size == 0 or 6 <= rows.shape[1] <= 10):
             raise ValueError(
-                f"detections: shape {rows.shape} is not that of rows frame,id,x,y,w,h and,"
-                " if any, a score"
+                f"detections: shape {rows.shape} is not that of frame,id,x,y,w,h,score"
             )
         rows = rows if rows.size else np.zeros((0, 7))
         rows = to_masked_rows(rows.shape[1], "detections", rows)
         bad = ~np.isfinite(rows[:, : _SCORE + 1]).all(axis=1)
         bad |= (rows[:, 0] % 1 != 0) | (rows[:, 0] < 1)
         for number in np.flatnonzero(bad.filled(False))[:1]:
-            raise ValueError(
-                f"detections: row {number}, {shown(rows.data[number])}, is not finite, or its"
-                " frame is no whole number from 1 on"
-            )
+            row = shown(rows.data[number])
+            raise ValueError(f"detections: row {number}, {row}, is not finite, or of no frame")
         rows = rows[~np.ma.getmaskarray(rows)[:, 0]]
         rows = rows[np.argsort(rows.data[:, 0], kind="stable")]
         self._rows, self._frames = rows, rows.data[:, 0].astype(int)
@@ -92,10 +89,7 @@ def as_detector(detections: Any) -> Detector:
     is_detector = callable(detections) and not isinstance(detections, type)
     if is_detector or isinstance(detections, Rows) or is_series(detections):
         return detections
-    raise ValueError(
-        f"detections: {shown(detections)} is neither a detector to call with a frame, nor an array"
-        " or a file of rows frame,id,x,y,w,h,score, nor the boxes of one frame after the other"
-    )
+    raise ValueError(f"detections: {shown(detections)} is no detector, rows, file or boxes a frame")
 
 
 def observed(
@@ -147,9 +141,7 @@ class Sieve:
         (boxes, scores), keep = _present(found, number)
         if self.min_score is not None and len(boxes):
             if scores is None:
-                raise ValueError(
-                    f"min_score: {self.min_score} is given, and detections have no scores"
-                )
+                raise ValueError(f"min_score: {self.min_score}, and detections have no scores")
             keep &= scores >= self.min_score
         frame_size = self.frame_size if frame is None else frame.shape[:2]
         height, width = (np.inf, np.inf) if frame_size is None else frame_size
@@ -183,8 +175,6 @@ def _as_found(value: Any, number: int) -> DetectedBoxes:
     """A pair of boxes and scores, whether the user gave both or boxes alone."""
     boxes, scores = value if isinstance(value, tuple) and len(value) == 2 else (value, None)
     named = f"detections: frame {number}"
-    if boxes is None:
-        raise ValueError(f"{named}: None is no array; [] has no detections")
     scores = None if scores is None else np.asanyarray(scores, float).reshape(-1)
     return DetectedBoxes(to_masked_rows(4, named, boxes), scores)
 

@@ -145,7 +145,7 @@ class BackgroundSubtraction:
         # OpenCV would silently start a new background.
         if self._shape is not None and frame.shape != self._shape:
             raise ValueError(
-                f"frame: {frame.shape} differs from the shape of those before it, {self._shape}"
+                f"frame: {frame.shape} is not the shape of those before, {self._shape}"
             )
         self._shape = frame.shape
         factor = int(np.ceil(np.sqrt(frame[..., 0].size / self.most_pixels)))

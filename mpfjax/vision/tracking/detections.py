@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mpfjax.checks import Count, as_numbers, checked, shown, to_array, to_rows
 from mpfjax.operations.stored import take
-from mpfjax.vision.files.boxes import centred, top_left
+from mpfjax.vision.files.boxes import centred
 
 # Finite, as observations have to be.
 _FAR = float(np.finfo(np.float32).max)
@@ -61,9 +61,6 @@ class Detections(eqx.Module):
         each box; and for a size below one.
         """
         rows = to_masked_rows(4, "boxes", boxes)
-        # A single box without its axis is more likely a slip than meant.
-        if len(rows) > 0 and np.ndim(boxes) != 2:
-            raise ValueError(f"boxes: shape {np.shape(boxes)} is not (k, 4), of boxes x,y,w,h")
         strengths = _one_each("scores", scores, len(rows), 1)
         classes = _one_each("labels", labels, len(rows), 0)
         if not np.array_equal(classes, np.abs(classes).astype(np.int32)):
@@ -72,7 +69,13 @@ class Detections(eqx.Module):
         rows, strengths = centred(rows.data[present]), strengths[present]
         corner = np.zeros(2) if origin is None else np.asarray(origin, float)
         rows[:, :2] -= corner
-        _check_float32(rows)
+        rounded = rows.astype(np.float32)
+        steps, sides = np.spacing(np.abs(rounded[:, :2])), rounded[:, 2:]
+        sound = (sides > 0) & (steps <= _FINEST * sides) & np.isfinite(sides)
+        for box in rows[~sound.all(axis=1)].tolist():
+            raise ValueError(
+                f"boxes: centre, size {box}: no area, or float32 needs an origin there"
+            )
         strongest = np.lexsort((-rows[:, 2] * rows[:, 3], -strengths))[:max_detections]
         kept = np.sort(strongest)
         extent = np.array(_UNBOUNDED, np.float32)
@@ -112,25 +115,9 @@ def to_masked_rows(width: int, name: str, value: Any) -> np.ma.MaskedArray:
     return np.ma.array(rows, mask=np.broadcast_to(mask, rows.shape))
 
 
-def _check_float32(boxes: Float[np.ndarray, "k 4"]) -> None:
-    """Boxes by their centres have areas, are finite, and are not lost to rounding."""
-    rounded = boxes.astype(np.float32)
-    sound = np.isfinite(rounded).all(axis=1) & (rounded[:, 2:] > 0).all(axis=1)
-    for row in boxes[~sound]:
-        raise ValueError(f"boxes: {top_left(row[None])[0].tolist()} has no area, or is not finite")
-    steps = np.spacing(np.abs(rounded[:, :2]))
-    for row in boxes[(steps > _FINEST * rounded[:, 2:]).any(axis=1)]:
-        raise ValueError(
-            f"boxes: {top_left(row[None])[0].tolist()} is too fine for float32 at its place; give"
-            " an origin near the boxes"
-        )
-
-
 def _one_each(name: str, values: Any, number: int, none: int) -> np.ndarray:
     """A finite number for each box, the same one for all where none are given."""
     values = np.asarray(as_numbers(name, np.full(number, none) if values is None else values))
-    if values.shape != (number,):
-        raise ValueError(f"{name}: shape {values.shape} is not that of one a box, ({number},)")
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name}: {shown(values)} are not all finite")
+    if values.shape != (number,) or not np.isfinite(values).all():
+        raise ValueError(f"{name}: {shown(values)} are not {number} finite numbers, one a box")
     return values

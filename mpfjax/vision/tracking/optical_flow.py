@@ -148,8 +148,5 @@ def opencv() -> ModuleType:
     try:
         import cv2
     except ImportError as error:
-        raise ImportError(
-            "OpenCV is needed for background subtraction and the camera's motion from pixels:"
-            " pip install opencv-python-headless"
-        ) from error
+        raise ImportError("OpenCV is missing: pip install opencv-python-headless") from error
     return cv2

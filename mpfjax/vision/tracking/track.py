@@ -92,10 +92,8 @@ def track(
         frames = read_frames(frames, first)
     del key
     detector, sieve = as_detector(detections), Sieve(min_score, frame_size)
-    if frames is None and callable(detector):
-        raise ValueError("detections: a detector needs frames, and frames is None")
-    if frames is None and camera_motion == "pixels":
-        raise ValueError("camera_motion: 'pixels' needs frames, and frames is None")
+    if frames is None and (callable(detector) or camera_motion == "pixels"):
+        raise ValueError("frames: None; a detector, and camera_motion 'pixels', need them")
     if tracker is None:
         of_rows = isinstance(detector, Rows)
         tracker = ObjectTracker(detector.most_objects() if of_rows else LEAST_ROOM)
