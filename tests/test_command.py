@@ -334,7 +334,7 @@ def test_files_that_will_not_do_are_named_in_a_line_and_not_written_over(
     (tmp_path / "broken.mp4").write_bytes(b"no video")
     (tmp_path / "short.txt").write_text("1,-1,5,5,5,5,1\n1,-1,nan,5,5,5,1\n")
     (tmp_path / "picture.txt").write_bytes(b"\x89PNG\r\n\x1a\n\x00\x00" + bytes(range(256)))
-    out = "elsewhere" if "min-score" in named else "out"
+    out = "elsewhere" if "min_score" in named else "out"
     assert run(source, "--out", out, *options) == 2
     line = capsys.readouterr().err.splitlines()[-1]
     assert named in line

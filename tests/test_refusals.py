@@ -472,7 +472,7 @@ REFUSED = (
     ("run: its filter keeps no first", lambda: log_marginal_likelihood_variance(HISTORY)),
     ("runs: 1; a standard error asks for 4", lambda: batch_estimate(HISTORY, nothing)),
     # tuning
-    ("filter: .* none of its moves is approximate", lambda: chain(GAUSSIAN)),
+    ("(?s)filter: .* none of its moves is approximate", lambda: chain(GAUSSIAN)),
     (r"proposal_deviations: those of \['b'\]", lambda: chain(proposal_deviations={"b": 1.0})),
     ("log_prior: -inf at the start", lambda: chain(log_prior=lambda p: 0 * p["a"] - jnp.inf)),
     ("log_prior: .* is no floating", lambda: chain(log_prior=lambda p: jnp.ones(2) * p["a"])),

@@ -131,7 +131,7 @@ def _check(track: argparse.ArgumentParser, options: argparse.Namespace) -> None:
         track.error("one of the arguments --detections --detect --box is required")
     if options.detect and by_pixels:
         track.error("argument --camera-motion pixels: not allowed with --detect")
-    found_by = "box" if options.box else "detect" if options.detect else None
+    found_by = "box" if options.box else "detect" if options.detect else ""
     for name in _NOT_WITH.get(found_by, ()):
         if getattr(options, name) not in (None, False):
             track.error(f"argument --{name.replace('_', '-')}: not allowed with --{found_by}")
@@ -168,7 +168,8 @@ def open_source(options: argparse.Namespace) -> Source:
         if last < first:
             raise ValueError(f"SOURCE: {path} holds {held} frames, and no frame {first}")
     elif path.is_dir():
-        end = min(last or np.inf, frames.num_images(path))
+        held = frames.num_images(path)
+        end = min(last or held, held)
     num_frames = None if end is None else end - first + 1
     if rows is not None and options.frames is not None and last is not None:
         rows = rows[rows[:, 0] <= last]

@@ -56,11 +56,12 @@ def with_tracks(
 
     image, draw = canvas_of(frame)
     thickness = max(1, round(frame.shape[0] / 360))
-    font = ImageFont.load_default(size=8 + 4 * thickness)
+    size = 8 + 4 * thickness
+    font = ImageFont.load_default(size)
     for row in rows:
         number, box = int(row[1]), row[2:]
         draw_box(draw, box, number, thickness)
-        place = (max(box[0], 0), max(box[1], font.size + 4))
+        place = (max(box[0], 0), max(box[1], size + 4))
         draw.rectangle(draw.textbbox(place, str(number), font, anchor="lb"), fill=(40, 40, 40))
         draw.text(place, str(number), _PALETTE[number % len(_PALETTE)], font, anchor="lb")
     return np.asarray(image)
