@@ -17,6 +17,7 @@ from mpfjax.filters import partitioned_sampling as partitioned_sampling
 from mpfjax.mixture import ParticleMixture as ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel as AbstractStateSpaceModel
 from mpfjax.models.base import per_particle as per_particle
+from mpfjax.models.clutter import ClutteredModel as ClutteredModel
 from mpfjax.models.conditionally_linear import (
     AbstractConditionallyLinearModel as AbstractConditionallyLinearModel,
 )

@@ -110,6 +110,8 @@ GOOD = {
         "walk": mpfjax.RandomWalk([1.0]), "gain": 0.1, "initial_velocity": [0.5]},
     mpfjax.Autoregression: {"A1": EYE, "A2": EYE, "B": EYE, "mean": ZERO},
     mpfjax.MultiObjectModel: {"object_model": MODEL, "num_objects": 2},
+    mpfjax.ClutteredModel: {
+        "object_model": MODEL, "detection_probability": 0.9, "clutter_density": 0.1},
     mpfjax.per_particle: {"model": DriftOfOne()},
     mpfjax.AuxiliaryResample: {"resample": Resample(), "lookahead": GUIDE},
     mpfjax.Merge: {"max_distance": 2.0},
@@ -440,6 +442,8 @@ REFUSED = (
     ("IslandInteraction leaves no particle one parent", lambda: Filter(MODEL, [Propagate(MODEL),
         mpfjax.Every(2, [IslandInteraction()]), mpfjax.RandomWalkMetropolis(MODEL)], 4)),
     ("model: .* is conditionally linear", lambda: Reweight(SWITCHING, 0.5)),
+    ("object_model: .* is conditionally linear",
+     lambda: mpfjax.ClutteredModel(SWITCHING, 0.9, 0.1)),
     ("orders: ", lambda: mpfjax.partitioned_sampling(JOINT, 10, (0, 0))),
     ("orders: 2 of them, for 1 components",
      lambda: run(Filter(JOINT, [mpfjax.Partitioned(JOINT, [(0, 1), (1, 0)])], 4))),

@@ -274,10 +274,11 @@ class TestGroupBy:
         with pytest.raises(RuntimeError, match="GroupBy"):
             mpfjax.run_filter(KEY, Filter(MODEL, moves, 20, 2), jnp.ones(3))
 
-    def test_each_label_keeps_its_particles_however_improbable_it_is(self):
+    @pytest.mark.parametrize("label", [side, lambda states: states > 0])
+    def test_each_label_keeps_its_particles_however_improbable_it_is(self, label):
         """Observations of x² say nothing of the sign; a plain filter of 20 loses one."""
-        moves = [Resample(), Propagate(MODEL), GroupBy(side)]
-        kept = Filter(MODEL, moves, 20, 2, initial_moves=[GroupBy(side)])
+        moves = [Resample(), Propagate(MODEL), GroupBy(label)]
+        kept = Filter(MODEL, moves, 20, 2, initial_moves=[GroupBy(label)])
         counts = mpfjax.run_filter(KEY, kept, jnp.full(100, 3.0), lambda m: m.component_counts)
         assert int(counts.collected.min()) == 10
 

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, Key, PyTree
+from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from mpfjax.checks import Count, saying, shown
 from mpfjax.mixture import ParticleMixture
@@ -74,16 +74,16 @@ class GroupBy(AbstractRegrouping):
     particles even while it is improbable. For regimes this is the IMM particle filter (Blom and
     Bloem 2007).
 
-    - `function`: gives the label of each particle: whole numbers (n,), in [0, M), where M is the
-      filter's `num_components`. A function of the particles, as `lambda states: states["room"]`.
+    - `function`: gives the label of each particle, (n,): whole numbers in [0, M), where M is the
+      filter's `num_components`, or True and False for 1 and 0. A function of the particles, as
+      `lambda states: states["room"]`.
 
     A label outside [0, M) of a filled slot is a RuntimeError that names the move. Raises
-    `ValueError` for anything but a function, and for a function that does not return whole numbers
-    (n,). Use it where you know what the modes are, and `KMeans`, `Merge` and `Split` where you do
-    not.
+    `ValueError` for anything but a function, and for one that does not return such labels. Use it
+    where you know what the modes are, and `KMeans`, `Merge` and `Split` where you do not.
     """
 
-    function: Callable[[PyTree], Int[Array, " n"]] = eqx.field(static=True)
+    function: Callable[[PyTree], Int[Array, " n"] | Bool[Array, " n"]] = eqx.field(static=True)
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree = None
@@ -99,6 +99,8 @@ class GroupBy(AbstractRegrouping):
         with saying("in function, of GroupBy, which is called with the particles"):
             labels: Any = self.function(mixture.particles)
         n, dtype = mixture.num_particles, getattr(labels, "dtype", float)
+        if dtype == jnp.bool_:
+            labels, dtype = labels.astype(jnp.int32), jnp.int32
         if jnp.shape(labels) != (n,) or not jnp.issubdtype(dtype, jnp.integer):
             raise ValueError(
                 f"function: it returned {shown(labels)}, not one whole number a particle, ({n},)"

@@ -1,0 +1,123 @@
+"""An object among clutter: measurements of which at most one is its own."""
+
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import logsumexp
+from jaxtyping import Array, Bool, Float, Key, PyTree
+
+from mpfjax.checks import POSITIVE, Fitting, entries, to_array
+from mpfjax.models.base import (
+    AbstractStateSpaceModel,
+    is_made_of_noise,
+    mapped,
+    replaced,
+    with_inputs,
+)
+from mpfjax.models.conditionally_linear import refuse_marginalised
+from mpfjax.models.steps import own_likelihoods
+
+_SHARE = entries(lambda array: (array >= 0) & (array <= 1), "in [0, 1]")
+# What the object's model has beside its three methods and its likelihood of one measurement.
+_PASSED_ON = (
+    "log_transition", "log_initial", "with_history", "initial_from_noise", "transition_from_noise",
+    "initial_noise_dimension", "noise_dimension", "transition_mean", "transition_covariance",
+)  # fmt: skip
+
+
+def _number_or_function(name: str) -> Callable[[Any], Any]:
+    numbers = to_array(name)
+    return lambda value: value if callable(value) else numbers(value)
+
+
+class ClutteredModel(AbstractStateSpaceModel, Fitting):
+    """An object that a sensor may miss, and clutter beside it: a radar's plots, say.
+
+    y_t is a set of measurements y_1, ..., y_k. With probability p_D the object is detected, and one
+    of them is its own, of density N(y | x) by `object_model`. The others are a Poisson process of
+    density λ(y). Summed over all associations, as in the filter of Bar-Shalom and Tse (1975),
+
+        L(y_1, ..., y_k | x) = (1 - p_D) + p_D Σ_j N(y_j | x) / λ(y_j).
+
+    This is the density of the set over that of the same set as clutter alone, exp(-∫λ) Π_j λ(y_j),
+    which says nothing of x. So log Ẑ estimates the log odds of an object against clutter alone;
+    log p(y_1..y_t) is Σ_t (Σ_j log λ(y_j) - ∫λ) more, which counts where λ is a parameter.
+
+    - `object_model`: its `log_likelihood`, of one measurement, must be log of a normalised density
+      of y; a constant left out would count as clutter.
+    - `detection_probability`: p_D, a number in [0, 1], or a function of the states, (n,), as where
+      a sensor sees only so far.
+    - `clutter_density`: λ, how many false measurements to expect in a step in a unit of the
+      measurements' space. A positive number, or a function of one measurement.
+
+    Each observation has room for K measurements, leaves (K, ...): rows with a NaN are none, and a
+    step without any says that the object was missed. A step in which the sensor was off is one that
+    is missing, see `Series`. Everything else is the object's model's, without what is about a
+    single measurement, as `observation_mean` for `GaussNewtonProposal`. Raises `ValueError` for
+    numbers outside of these, and for a conditionally linear model: draw regimes with the state, and
+    `GroupBy` them. Use it for an object among false alarms; before several objects, two may claim
+    one measurement.
+    """
+
+    object_model: AbstractStateSpaceModel
+    detection_probability: (
+        Annotated[Float[Array, ""], _SHARE] | Callable[[PyTree], Float[Array, " n"]]
+    ) = eqx.field(converter=_number_or_function("detection_probability"))
+    clutter_density: (
+        Annotated[Float[Array, ""], POSITIVE] | Callable[[PyTree], Float[Array, ""]]
+    ) = eqx.field(converter=_number_or_function("clutter_density"))
+
+    handles_missing = True
+
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        instead, name = "draw its regimes as part of the state", "object_model"
+        refuse_marginalised(self.object_model, "ClutteredModel", instead, name)
+
+    def with_inputs(self, inputs: PyTree) -> "ClutteredModel":
+        """The model whose object has u_t."""
+        return replaced(self, object_model=with_inputs(self.object_model, inputs))
+
+    def sample_initial(self, key: Key[Array, ""], num_particles: int) -> PyTree:
+        """x_0 of the object."""
+        return self.object_model.sample_initial(key, num_particles)
+
+    def sample_transition(self, key: Key[Array, ""], states: PyTree) -> PyTree:
+        """x_t of the object."""
+        return self.object_model.sample_transition(key, states)
+
+    def log_likelihood(self, observation: PyTree, states: PyTree) -> Float[Array, " n"]:
+        """log L of the measurements, over that of clutter alone."""
+        there = _measured(observation)
+        # A number that no logarithm turns into one that is not finite, nor its gradient.
+        fill = lambda leaf: jnp.where(jnp.isnan(leaf), jnp.ones_like(leaf), leaf)  # noqa: E731
+
+        def log_odds(measurement: PyTree) -> Float[Array, " n"]:
+            density = self.clutter_density
+            density = density(measurement) if callable(density) else density
+            values = own_likelihoods(self.object_model, measurement, states)
+            return values - jnp.log(density).astype(values.dtype)
+
+        odds = jax.vmap(log_odds)(jax.tree.map(fill, observation))
+        p = self.detection_probability
+        p = mapped(self.object_model, p)(states) if callable(p) else p
+        p = jnp.broadcast_to(p, odds.shape[1:]).astype(odds.dtype)
+        detected = jnp.where(there[:, None], odds + jnp.log(p)[None], -jnp.inf)
+        return logsumexp(jnp.concatenate([jnp.log1p(-p)[None], detected]), axis=0)
+
+    def __getattr__(self, name: str) -> Any:
+        # Only reached for names that the class lacks.
+        model, is_of_noise = self.__dict__.get("object_model"), "noise" in name
+        state = "initial" if name.startswith("initial") else "transition"
+        if name in _PASSED_ON and (not is_of_noise or is_made_of_noise(model, state)):
+            return getattr(model, name)
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+
+def _measured(observation: PyTree) -> Bool[Array, " k"]:
+    """Which rows are measurements: those without a NaN."""
+    rows = [jnp.isnan(leaf).reshape(leaf.shape[0], -1) for leaf in jax.tree.leaves(observation)]
+    return ~jnp.any(jnp.concatenate(rows, axis=1), axis=1)

@@ -1,0 +1,147 @@
+"""An object among clutter, against the sum over all associations."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+import mpfjax
+from mpfjax import ClutteredModel, Filter, GroupBy, Propagate, Resample
+from tests.unbiased import assert_unbiased
+
+KEY = jax.random.key(0)
+A, Q, R, P0, P_D, CLUTTER = 0.9, 0.5, 0.3, 1.0, 0.7, 0.2
+OBJECT = mpfjax.LinearGaussianModel([[A]], [[Q]], [[1.0]], [[R]], [0.0], [[P0]])
+MODEL = ClutteredModel(OBJECT, P_D, CLUTTER)
+NAN = np.nan
+# Steps with two measurements, one (in either row) and none.
+SETS = np.array([[0.4, -2.0], [NAN, 0.9], [NAN, NAN], [1.5, 0.2], [-1.0, NAN]])[..., None]
+
+
+def by_associations(sets, p_d=P_D, clutter=CLUTTER):
+    """Z and E[x_t | y_1..y_t] by a Kalman filter for each sequence of associations."""
+    total, first = 0.0, 0.0
+    choices = [[None, *np.flatnonzero(~np.isnan(y))] for y in sets[..., 0]]
+    for sources in itertools.product(*choices):
+        mean, variance, weight = 0.0, P0, 1.0
+        for own, seen in zip(sources, sets[..., 0], strict=True):
+            mean, variance = A * mean, A**2 * variance + Q
+            weight *= 1 - p_d if own is None else p_d / clutter
+            if own is not None:
+                spread = variance + R
+                weight *= scipy.stats.norm.pdf(seen[own], mean, np.sqrt(spread))
+                mean += variance / spread * (seen[own] - mean)
+                variance *= R / spread
+        total, first = total + weight, first + weight * mean
+    return total, first / total
+
+
+class Wide(mpfjax.AbstractProposal):
+    """A guided proposal that does without a single measurement: twice the variance."""
+
+    def propose(self, key, observation, previous_states):
+        noise = jax.random.normal(key, previous_states.shape)
+        drawn = A * previous_states + np.float32(np.sqrt(2 * Q)) * noise
+        return drawn, self.log_density(observation, drawn, previous_states)
+
+    def log_density(self, observation, states, previous_states):
+        gaps = states - A * previous_states
+        return jnp.sum(jax.scipy.stats.norm.logpdf(gaps, scale=np.sqrt(2 * Q)), axis=1)
+
+
+CHAINS = {
+    "plain": Filter(MODEL, [Resample(), Propagate(MODEL)], 100),
+    "guided": Filter(MODEL, [Resample(), Propagate(MODEL, Wide())], 100),
+    "rqmc": mpfjax.particle_filter(MODEL, 100, noise="rqmc"),
+    "by regime": Filter(
+        MODEL, [Resample(), Propagate(MODEL), GroupBy(lambda states: states[:, 0] > 0)], 100, 2
+    ),
+}
+
+
+@pytest.mark.parametrize("chain", list(CHAINS))
+def test_evidence_and_moments_are_those_of_all_associations(chain):
+    exact, mean = by_associations(SETS)
+    runs = mpfjax.monte_carlo(
+        jax.random.split(KEY, 300), CHAINS[chain], jnp.asarray(SETS),
+        collect=lambda mixture: mixture.mean()[0],
+    )  # fmt: skip
+    ratios = np.exp(np.asarray(runs.log_marginal_likelihood)) / exact
+    assert_unbiased(ratios, loosest=0.02)
+    assert_unbiased(ratios * np.asarray(runs.collected)[:, -1], mean, loosest=0.02)
+
+
+def test_the_gradient_is_that_of_all_associations():
+    """E[Ẑ ∂ log Ẑ] = ∂Z, for p_D and log λ, through steps without a measurement."""
+
+    @jax.jit
+    @jax.vmap
+    def values(key):
+        def log_evidence(parameters):
+            model = ClutteredModel(OBJECT, parameters[0], jnp.exp(parameters[1]))
+            filter = mpfjax.particle_filter(model, 100, gradient="stop")
+            return mpfjax.run_filter(key, filter, SETS).log_marginal_likelihood
+
+        return jax.value_and_grad(log_evidence)(jnp.array([P_D, np.log(CLUTTER)]))
+
+    log_z, gradients = values(jax.random.split(KEY, 300))
+    h = 1e-4
+    at = lambda p, log_clutter: by_associations(SETS, p, np.exp(log_clutter))[0]  # noqa: E731
+    log_clutter = np.log(CLUTTER)
+    exact = [
+        (at(P_D + h, log_clutter) - at(P_D - h, log_clutter)) / (2 * h),
+        (at(P_D, log_clutter + h) - at(P_D, log_clutter - h)) / (2 * h),
+    ]
+    exact = np.array(exact) / by_associations(SETS)[0]
+    ratios = np.exp(np.asarray(log_z))[:, None] / by_associations(SETS)[0]
+    assert_unbiased(ratios * np.asarray(gradients), exact, loosest=0.05)
+
+
+class Bearings:
+    """Of one particle, with an input; its likelihood has no gradient where y is 0."""
+
+    inputs = None
+
+    def sample_initial(self, key):
+        return jax.random.normal(key)
+
+    def sample_transition(self, key, state):
+        return state + self.inputs + jax.random.normal(key)
+
+    def log_likelihood(self, observation, state):
+        return jax.scipy.stats.norm.logpdf(jnp.log(observation["y"]), state) - jnp.log(
+            observation["y"]
+        )
+
+
+def test_chances_and_densities_may_be_functions_and_measurements_trees_of_one_particle():
+    def seen(state):
+        return 0.9 * jnp.exp(-jnp.abs(state))
+
+    def clutter(measurement):
+        return 0.1 * measurement["y"]
+
+    model = ClutteredModel(mpfjax.per_particle(Bearings()), seen, clutter)
+    states, y = np.array([-1.0, 0.3, 2.0], np.float32), np.array([NAN, 0.5, 3.0, NAN], np.float32)
+    values, gradients = jax.value_and_grad(
+        lambda x: jnp.sum(model.log_likelihood({"y": jnp.asarray(y)}, x))
+    )(jnp.asarray(states))
+    p, measured = 0.9 * np.exp(-np.abs(states)), y[1:3]
+    density = scipy.stats.norm.pdf(np.log(measured)[:, None], states) / measured[:, None]
+    expected = 1 - p + p * np.sum(density / (0.1 * measured[:, None]), axis=0)
+    np.testing.assert_allclose(values, np.log(expected).sum(), rtol=1e-5)
+    assert np.isfinite(gradients).all()
+    moved = model.with_inputs(jnp.float32(100.0)).sample_transition(KEY, jnp.zeros(3))
+    assert (moved > 90).all()
+
+
+def test_what_needs_a_single_measurement_is_refused():
+    for missing, make in (
+        ("observation_mean", lambda: mpfjax.GaussNewtonProposal(MODEL)),
+        ("sample_observation", lambda: MODEL.simulate(KEY, 2)),
+    ):
+        with pytest.raises(ValueError, match=f"ClutteredModel.* {missing}"):
+            make()
