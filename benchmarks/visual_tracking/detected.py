@@ -17,7 +17,7 @@ from mpfjax.vision.boxes.following import Snapshot
 from mpfjax.vision.tracking.gaussian import Gaussian, boxes_of, places_of, units
 from mpfjax.vision.tracking.state import TrackerState
 from mpfjax.vision.tracking.track import offline_rows
-from mpfjax.vision.tracking.tracker import WEAK_ERROR
+from mpfjax.vision.tracking.tracker import WEAK_ERROR, advanced, colours_of
 
 MAX_DETECTIONS, MAX_OBJECTS, PARTICLES = 32, 24, 16
 DECIDED = "decided"
@@ -90,9 +90,8 @@ class Decide(AbstractMove):
         """Nobody, and no detection."""
         m, none = num_components, jnp.zeros(num_components, jnp.int32)
         never = jnp.zeros(m, bool)
-        tracks = Tracks(
-            jnp.zeros((m, 4)), none, never, none, jnp.zeros((), bool), never, none - 1, jnp.zeros(m)
-        )
+        boxes, full, unsure = jnp.zeros((m, 4)), jnp.zeros((), bool), jnp.zeros(m)
+        tracks = Tracks(boxes, none, never, none, full, never, none - 1, unsure, none)
         return {DECIDED: Decided(self.start, tracks, never)}
 
     def __call__(
@@ -101,7 +100,7 @@ class Decide(AbstractMove):
         """Remember what is decided."""
         before = mixture.memory[DECIDED].tracker
         state = before._replace(objects=moments(mixture))
-        state, tracks = self.tracker.step(None, state, observation.colours, observation.detections)
+        state, tracks = advanced(self.tracker, state, observation.detections, observation.colours)
         born = (tracks.identities > 0) & (tracks.identities != before.lives.identities)
         decided = {DECIDED: Decided(state, tracks, born)}
         return mixture.replace(memory=mixture.memory | decided)
@@ -195,11 +194,11 @@ def follow_detected(
     filter: mpfjax.Filter, keys: Array, stills: Iterable[np.ndarray], kept: list[Tracks]
 ) -> Iterator[Snapshot]:
     """A snapshot of the runs of a mixture for each frame, whose tracks go into `kept`."""
-    detector, tracker = BackgroundSubtraction(), ObjectTracker(MAX_OBJECTS)
+    detector = BackgroundSubtraction()
     mixtures = jax.vmap(filter.init)(keys)
     for t, still in enumerate(stills):
         found = Detections.from_boxes(detector.detect(still), MAX_DETECTIONS)
-        seen = Seen(found, tracker.look(still, found))
+        seen = Seen(found, colours_of(still, found))
         mixtures, *done = _advance(filter, keys, jnp.asarray(t), mixtures, seen)
         tracks, snapshot = jax.tree.map(np.asarray, done)
         kept.append(tracks)

@@ -171,8 +171,8 @@ def test_two_thousand_detections_leave_the_strongest():
 
 def test_more_objects_than_room_are_flagged_and_the_strongest_kept():
     places = np.stack([np.arange(6) * 10, np.full(6, 10), np.full(6, 6), np.full(6, 12)], axis=1)
-    scores = np.arange(6.0)
-    tracker = ObjectTracker(3, scores=(0.0, 0.0))
+    scores = np.linspace(0.5, 1, 6)
+    tracker = ObjectTracker(3, scores="as_given")
     with pytest.warns(RuntimeWarning, match="frame 1 has more objects than the 3 .* max_objects"):
         run = list(track(None, [(places, scores)] * 3, tracker))
     assert run[0].full
@@ -230,7 +230,7 @@ def said(identities, confirmed, shown):
     unseen = np.zeros(len(identities), int)
     return Tracks(
         boxes, np.array(identities), np.array(confirmed), unseen, np.array(False), np.array(shown),
-        np.full(len(identities), -1), np.zeros(len(identities)),
+        np.full(len(identities), -1), np.zeros(len(identities)), unseen,
     )  # fmt: skip
 
 

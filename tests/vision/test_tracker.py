@@ -7,7 +7,7 @@ import pytest
 
 import mpfjax
 from mpfjax.vision import Detections, ObjectTracker
-from mpfjax.vision.tracking.tracker import advanced
+from mpfjax.vision.tracking.tracker import advanced, colours_of
 
 HEIGHT, WIDTH, M, ROOM, SIZE = 48, 64, 4, 6, (6, 12)
 PATIENCE = 8  # a second, and the least there is
@@ -30,24 +30,24 @@ def boxes_at(corners):
     return np.array(rows, float).reshape(-1, 4)
 
 
-def detections(boxes, scores=None, labels=None):
+def detections(boxes, scores=None, classes=None):
     boxes = np.asarray(boxes, float).reshape(-1, 4)
     scores = None if scores is None else np.asarray(scores, float)
-    labels = None if labels is None else np.asarray(labels)
+    classes = None if classes is None else np.asarray(classes)
     size = (HEIGHT, WIDTH)
-    return Detections.from_boxes(boxes, ROOM, scores, labels=labels, frame_size=size)
+    return Detections.from_boxes(boxes, ROOM, scores, classes=classes, frame_size=size)
 
 
-def run(corners_of_frames, tracker=TRACKER, seen=None, pixels=False, scores=None, labels=None):
+def run(corners_of_frames, tracker=TRACKER, seen=None, pixels=False, scores=None, classes=None):
     """The tracks of each frame.
 
     `seen(t, corners)` says what is detected, all by default, `scores(t)` how surely, and
-    `labels(t)` of which class.
+    `classes(t)` of which class.
     """
     state, tracks = tracker.init(), []
     for t, corners in enumerate(corners_of_frames):
         boxes = boxes_at(corners) if seen is None else seen(t, corners)
-        found = detections(boxes, *(None if of is None else of(t) for of in (scores, labels)))
+        found = detections(boxes, *(None if of is None else of(t) for of in (scores, classes)))
         state, now = tracker.step(None, state, draw(corners) if pixels else None, found)
         tracks.append(jax.device_get(now))
         assert_sound(state, tracks[-1])
@@ -224,11 +224,34 @@ def test_who_looks_alike_in_place_is_told_by_colour():
     def corners(t):
         return [(8 + 3 * t, 20), (44 - 3 * t, 20)]
 
-    looked = TRACKER.look(draw(corners(0)), detections(boxes_at(corners(0))))
+    looked = colours_of(draw(corners(0)), detections(boxes_at(corners(0))))
     assert sum(leaf.size for leaf in jax.tree.leaves(looked)) < 4 * ROOM * 18 * 8 * 3
     tracks = run([corners(t) for t in range(13)], pixels=True)
     first = 1 if box_of(tracks[0], 1)[0] < box_of(tracks[0], 2)[0] else 2
     assert box_of(tracks[-1], first)[0] > box_of(tracks[-1], 3 - first)[0]
+
+
+def test_a_step_takes_what_a_detector_gives():
+    """Boxes, with scores, and with classes too, or the same with room of one's own."""
+    scores, classes = np.array([1.0, 0.9]), np.array([1, 2])
+    for pixels in (False, True):
+        states = []
+        for given in (True, False):
+            state = TRACKER.init()
+            for t in range(3):
+                corners = [(5 + t, 5), (50 - t, 30)]
+                boxes, frame = boxes_at(corners), draw(corners)
+                found = (boxes, scores, classes)
+                if not given:
+                    size = (HEIGHT, WIDTH) if pixels else None
+                    found = Detections.from_boxes(
+                        boxes, 2 * M, scores, classes=classes, frame_size=size
+                    )
+                state, tracks = TRACKER.step(None, state, frame if pixels else None, found)
+            states.append(state)
+            assert tracks.classes[:2].tolist() == [1, 2]
+        for a, b in zip(*map(jax.tree.leaves, states), strict=True):
+            np.testing.assert_array_equal(a, b)
 
 
 # --- scores and classes --------------------------------------------------------------------
@@ -260,29 +283,32 @@ def test_scores_count_in_shares_of_a_sure_one():
         np.testing.assert_array_equal(a.unseen, b.unseen)
 
 
-def test_scores_may_be_ignored_or_have_thresholds_of_your_own():
+@pytest.mark.parametrize(
+    ("pair", "rank", "as_given"), [([1, 0.3], 1, 1), ([9, 1], 1, 2), ([0.4, 0.3], 2, 0)]
+)
+def test_scores_may_be_ranked_taken_as_given_or_ignored(pair, rank, as_given):
     corners = [[(5 + t, 5), (50 - t, 30)] for t in range(4)]
-
-    def numbers(scores):
+    for scores, number in (("rank", rank), ("as_given", as_given), ("ignore", 2)):
         chosen = ObjectTracker(M, frames_per_second=8, scores=scores)
-        return [len(living(each)) for each in run(corners, chosen, scores=lambda t: [1.0, 0.1])]
-
-    assert numbers("learned") == [1] * 4
-    assert numbers("ignore") == [2] * 4
-    assert numbers((0.05, 0.08)) == [2] * 4
-    assert numbers((0.5, 2.0)) == [0] * 4
+        tracks = run(corners, chosen, scores=lambda t: pair)
+        assert [len(living(each)) for each in tracks] == [number] * 4
 
 
 def test_classes_keep_objects_apart_unless_they_do_not_matter():
-    """One box in the same place for ever, whose label changes in the fifth frame."""
+    """One box in the same place for ever, whose class changes in the fifth frame."""
 
     def ever(class_matters, change):
         chosen = ObjectTracker(M, frames_per_second=8, class_matters=class_matters)
-        tracks = run([[(20, 20)]] * 8, chosen, labels=lambda t: [1 if t < 4 else change])
-        return sorted({name for each in tracks for name in living(each)})
+        tracks = run([[(20, 20)]] * 8, chosen, classes=lambda t: [1 if t < 4 else change])
+        of_class = {}
+        for each in tracks:
+            for name in living(each):
+                of_class.setdefault(name, set()).update(each.classes[each.identities == name])
+        assert all(len(classes) == 1 for classes in of_class.values())  # it keeps the first
+        return sorted(of_class)
 
-    assert ever("always", 2) == [1, 2]
-    assert ever("always", 0) == [1]  # 0 is no label, and goes with all
+    assert ever(True, 2) == [1, 2]
+    assert ever(True, 0) == [1]  # 0 is none, and goes with all
     assert ever("prefers", 2) == [1]
     assert ever(False, 2) == [1]
 
@@ -293,14 +319,14 @@ def test_boxes_of_other_classes_are_no_doubles_and_the_likelier_class_is_taken()
 
     def number(class_matters):
         chosen = ObjectTracker(M, frames_per_second=8, class_matters=class_matters)
-        tracks = run([[]] * 5, chosen, seen=lambda t, c: pair, labels=lambda t: [1, 2])
+        tracks = run([[]] * 5, chosen, seen=lambda t, c: pair, classes=lambda t: [1, 2])
         return len(living(tracks[-1]))
 
-    assert number("always") == 2
+    assert number(True) == 2
     assert number(False) == 1
     chosen = ObjectTracker(M, frames_per_second=8, class_matters="prefers")
     both = [(20, 20), (26, 20)]
-    tracks = run([both] * 6, chosen, labels=lambda t: [1, 2])
+    tracks = run([both] * 6, chosen, classes=lambda t: [1, 2])
     rows = {name: set() for name in (1, 2)}
     for each in tracks:
         for name in rows:

@@ -202,5 +202,5 @@ def _advance_boxes(
     unseen = jnp.zeros(num_objects, jnp.int32)
     none, never = jnp.full(num_objects, -1, jnp.int32), jnp.zeros(num_objects)
     full = jnp.zeros((), bool)
-    tracks = Tracks(means[best], identities, held, unseen, full, held, none, never)
+    tracks = Tracks(means[best], identities, held, unseen, full, held, none, never, unseen)
     return mixture, tracks, faults

@@ -4,7 +4,7 @@ import itertools
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,23 +12,13 @@ from jaxtyping import Bool, Float, Int
 
 from mpfjax.checks import CountOrZero, checked, is_series, saying, shown
 from mpfjax.vision.files.boxes import read_detections
-from mpfjax.vision.tracking.detections import to_masked_rows
+from mpfjax.vision.tracking.detections import DetectedBoxes, to_masked_rows
 
 # MOTChallenge's columns: frame, id, x, y, w, h, and the score, where there is one.
 _BOX, _SCORE = slice(2, 6), 6
 # A tracker that is made for rows of detections has room for at most so many objects.
 LEAST_ROOM, MOST_ROOM = 24, 1024
 _END = object()
-
-
-class DetectedBoxes(NamedTuple):
-    """The boxes (x, y, w, h) detected in one frame, and a score for each, or None.
-
-    Boxes with a masked entry are no detections.
-    """
-
-    boxes: Float[np.ndarray, "k 4"]
-    scores: Float[np.ndarray, " k"] | None
 
 
 class Rows:
@@ -116,7 +106,7 @@ def observed(
             return
         if found is _END:
             raise ValueError(f"detections: end before the frames do, at frame {number}")
-        yield number, still, _as_found(found, number)
+        yield number, still, DetectedBoxes.of(found, f"detections: frame {number}")
     if next(coming, _END) is not _END:
         _warn(f"detections: go on after the last frame, {number}, and were left out")
 
@@ -138,7 +128,8 @@ class Sieve:
         self, found: DetectedBoxes, number: int, frame: np.ndarray | None
     ) -> tuple[DetectedBoxes, Int[np.ndarray, " k"]]:
         """The detections of a frame that can be tracked, and the row of each among all of them."""
-        (boxes, scores), keep = _present(found, number)
+        found, keep = _present(found, number)
+        boxes, scores, _ = found
         if self.min_score is not None and len(boxes):
             if scores is None:
                 raise ValueError(f"min_score: {self.min_score}, and detections have no scores")
@@ -154,8 +145,8 @@ class Sieve:
             if np.any(keep & ~good):
                 self.once.warn(what, f"detections: frame {number} has boxes {what}; left out")
             keep &= good
-        kept = DetectedBoxes(boxes[keep], None if scores is None else scores[keep])
-        return kept, np.flatnonzero(keep).astype(np.int32)
+        rest = (None if part is None else part[keep] for part in found[1:])
+        return DetectedBoxes(boxes[keep], *rest), np.flatnonzero(keep).astype(np.int32)
 
 
 class Once:
@@ -171,26 +162,16 @@ class Once:
             _warn(f"{message} (here and wherever else it is so)")
 
 
-def _as_found(value: Any, number: int) -> DetectedBoxes:
-    """A pair of boxes and scores, whether the user gave both or boxes alone."""
-    boxes, scores = value if isinstance(value, tuple) and len(value) == 2 else (value, None)
-    named = f"detections: frame {number}"
-    scores = None if scores is None else np.asanyarray(scores, float).reshape(-1)
-    return DetectedBoxes(to_masked_rows(4, named, boxes), scores)
-
-
 def _present(found: DetectedBoxes, number: int) -> tuple[DetectedBoxes, Bool[np.ndarray, " k"]]:
     """The boxes and scores without masks, and which of them are detections."""
-    boxes, scores = found
+    boxes, scores, classes = found
     present = np.logical_not(np.any(np.ma.getmaskarray(boxes), axis=1))
     named = f"detections: frame {number}"
-    if scores is not None and len(scores) != len(boxes):
-        raise ValueError(f"{named}: {len(scores)} scores for {len(boxes)} boxes")
     for what, values in (("", boxes), ("scores ", scores)):
         if values is not None and not np.isfinite(np.ma.filled(values[present], np.nan)).all():
             raise ValueError(f"{named}: {what}{shown(values)} is not finite, or masked")
     kept = None if scores is None else np.ma.getdata(scores)
-    return DetectedBoxes(np.ma.getdata(boxes), kept), present
+    return DetectedBoxes(np.ma.getdata(boxes), kept, classes), present
 
 
 def _warn(message: str) -> None:

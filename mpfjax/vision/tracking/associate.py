@@ -27,7 +27,7 @@ def stronger(scores: Float[Array, " d"], areas: Float[Array, " d"]) -> Bool[Arra
 
 
 def compatible(a: Int[Array, " m"], b: Int[Array, " d"]) -> Bool[Array, "m d"]:
-    """Whether labels are the same, or one of them is 0 for none."""
+    """Whether classes are the same, or one of them is 0 for none."""
     a, b = a[:, None], b[None]
     return (a == b) | (a == 0) | (b == 0)
 

@@ -1,6 +1,6 @@
 """The detections of a frame: boxes, and how sure the detector was of each."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,6 +18,30 @@ _UNBOUNDED = (-_FAR, -_FAR, _FAR, _FAR)
 _FINEST = 0.1
 
 
+class DetectedBoxes(NamedTuple):
+    """The boxes (x, y, w, h) detected in one frame; a score and a class for each, or None.
+
+    Boxes with a masked entry are no detections.
+    """
+
+    boxes: Float[np.ndarray, "k 4"]
+    scores: Float[np.ndarray, " k"] | None = None
+    classes: Int[np.ndarray, " k"] | None = None
+
+    @classmethod
+    def of(cls, found: Any, named: str) -> "DetectedBoxes":
+        """What users hand over: boxes, or (boxes, scores), or (boxes, scores, classes)."""
+        several = isinstance(found, tuple) and len(found) in (2, 3)
+        boxes, scores, classes = (*(found if several else (found,)), None, None)[:3]
+        scores = None if scores is None else np.asanyarray(scores, float).reshape(-1)
+        classes = None if classes is None else np.asarray(classes).reshape(-1)
+        rows = to_masked_rows(4, named, boxes)
+        for each, values in (("scores", scores), ("classes", classes)):
+            if values is not None and len(values) != len(rows):
+                raise ValueError(f"{named}: {len(values)} {each} for {len(rows)} boxes")
+        return cls(rows, scores, classes)
+
+
 class Detections(eqx.Module):
     """The boxes that a detector found in one frame, padded to a fixed number.
 
@@ -26,7 +50,7 @@ class Detections(eqx.Module):
     - `scores`: (d,), how sure the detector was of each, on any scale, higher for surer.
     - `rows`: (d,), the row of each in what the detector gave; None counts them as they stand here.
     - `extent`: left, top, right, bottom of the frame; as far as can be where not known.
-    - `labels`: (d,), the class of each, whole numbers from 1 on; 0 for none.
+    - `classes`: (d,), the class of each, whole numbers from 1 on; 0 for none.
     """
 
     boxes: Float[Array, "d 4"] = eqx.field(converter=to_array("boxes"))
@@ -34,7 +58,7 @@ class Detections(eqx.Module):
     scores: Float[Array, " d"] = eqx.field(converter=to_array("scores"))
     rows: Int[Array, " d"] | None = None
     extent: Float[Array, "4"] = eqx.field(converter=to_array("extent"), default=_UNBOUNDED)
-    labels: Int[Array, " d"] = eqx.field(converter=to_array("labels", floating=False), default=0)
+    classes: Int[Array, " d"] = eqx.field(converter=to_array("classes", floating=False), default=0)
 
     @classmethod
     @checked
@@ -46,9 +70,9 @@ class Detections(eqx.Module):
         *,
         frame_size: tuple[int, int] | None = None,
         origin: Float[np.ndarray, "2"] | None = None,
-        labels: Int[np.ndarray, " k"] | None = None,
+        classes: Int[np.ndarray, " k"] | None = None,
     ) -> "Detections":
-        """Boxes (x, y, w, h), top-left corner first, and a score for each; all 1 where None.
+        """Boxes (x, y, w, h), top-left corner first, a score (1 where None) and a class for each.
 
         The boxes stay in their order. If there are too many, the strongest are kept, and of equally
         strong ones the largest. They may leave the frame in part or as a whole. Rows of a masked
@@ -62,9 +86,9 @@ class Detections(eqx.Module):
         """
         rows = to_masked_rows(4, "boxes", boxes)
         strengths = _one_each("scores", scores, len(rows), 1)
-        classes = _one_each("labels", labels, len(rows), 0)
-        if not np.array_equal(classes, np.abs(classes).astype(np.int32)):
-            raise ValueError(f"labels: {shown(classes)} are not all whole numbers from 0 on")
+        kinds = _one_each("classes", classes, len(rows), 0)
+        if not np.array_equal(kinds, np.abs(kinds).astype(np.int32)):
+            raise ValueError(f"classes: {shown(kinds)} are not all whole numbers from 0 on")
         present = np.flatnonzero(~np.any(np.ma.getmaskarray(rows), axis=1))
         rows, strengths = centred(rows.data[present]), strengths[present]
         corner = np.zeros(2) if origin is None else np.asarray(origin, float)
@@ -94,7 +118,7 @@ class Detections(eqx.Module):
             scores=padded(strengths[kept], 0, np.float32),
             rows=padded(present[kept], -1, np.int32),
             extent=jnp.asarray(extent),
-            labels=padded(classes[present[kept]], 0, np.int32),
+            classes=padded(kinds[present[kept]], 0, np.int32),
         )
 
     def rows_of(self, indices: Int[Array, " m"]) -> Int[Array, " m"]:

@@ -47,7 +47,7 @@ class Spans(NamedTuple):
 class Lives(NamedTuple):
     """The identity of each object, and its counts of frames.
 
-    - `identities`: (m,), 0 in an empty row; `labels`: (m,), of the class, 0 for none.
+    - `identities`: (m,), 0 in an empty row; `classes`: (m,), 0 for none.
     - `seen`: (m,), in how many frames it had a strong detection.
     - `unseen`, `unsure`: (m,), for how many frames it has had no detection, and no strong one.
     - `confirmed`: (m,), whether it has had enough; `shown`: (m,), whether it should be shown.
@@ -57,7 +57,7 @@ class Lives(NamedTuple):
     """
 
     identities: Int[Array, " m"]
-    labels: Int[Array, " m"]
+    classes: Int[Array, " m"]
     seen: Int[Array, " m"]
     unseen: Int[Array, " m"]
     unsure: Int[Array, " m"]
@@ -119,14 +119,14 @@ class Lives(NamedTuple):
     ) -> "Lives":
         """The lives with those who are born; `wanted` is how many there should have been.
 
-        `told` are the labels of the detections; an object has the last that there was.
+        `told` are the classes of the detections; an object keeps the first that there was.
         """
-        kept = jnp.where(born, 0, self.labels)
+        kept = jnp.where(born, 0, self.classes)
         number = jnp.cumsum(born, dtype=jnp.int32)
         at_once = born & ~self.begun
         return Lives(
             identities=jnp.where(born, self.last_identity + number, self.identities),
-            labels=jnp.where(told > 0, told, kept),
+            classes=jnp.where(kept > 0, kept, told),
             seen=jnp.where(born, 1, self.seen),
             unseen=jnp.where(born, 0, self.unseen),
             unsure=jnp.where(born, 0, self.unsure),

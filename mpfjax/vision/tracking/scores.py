@@ -16,7 +16,7 @@ _HIGH = 0.9  # the quantile of the scores that is called a sure score
 _BINS = 10  # of shares of a sure detection's score
 _CENTRES = (np.arange(_BINS, dtype=np.float32) + np.float32(0.5)) / _BINS
 _SURE = 0.9  # a chain that reaches this share is an object
-_STRONG, _WEAK = 0.5, 0.2  # the shares that are strong before anything is learned, and that count
+STRONG, WEAK = 0.5, 0.2  # the shares that are strong before anything is learned, and that count
 _SLOPE = 0.15  # the prior odds are logistic in the share, of this scale
 PRIOR = 5.0  # detections that the prior of each bin counts as
 KEPT = 0.995  # kept from each frame to the next
@@ -107,7 +107,7 @@ class ScoreState(NamedTuple):
         state = self._continued(found.boxes, single, stronger, shift, shares, lasting)
         strong = lowest + state.strong_share() * spread
         # Where all scores are equal, rounding must not put them below the threshold.
-        weak = jnp.where(count > 0, jnp.minimum(lowest + _WEAK * spread, strong), -jnp.inf)
+        weak = jnp.where(count > 0, jnp.minimum(lowest + WEAK * spread, strong), -jnp.inf)
         return state._replace(recent=recent, count=count, weak=weak, strong=strong)
 
     def _continued(
@@ -152,7 +152,7 @@ class ScoreState(NamedTuple):
 
     def strong_share(self) -> Float[Array, ""]:
         """The share above which a detection is more probably an object than none."""
-        prior = jax.nn.sigmoid((_CENTRES - _STRONG) / _SLOPE)
+        prior = jax.nn.sigmoid((_CENTRES - STRONG) / _SLOPE)
         number = self.good + self.bad + PRIOR
         odds = jax.scipy.special.logit(rising((self.good + PRIOR * prior) / number, number))
         above = jnp.argmax(odds >= 0)

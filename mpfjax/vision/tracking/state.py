@@ -45,6 +45,7 @@ class Tracks(NamedTuple):
     - `detections`: (m,), the row of the detection assigned to each in this frame, in what the
       detector gave; -1 for none. Use it to look up masks and features.
     - `probabilities`: (m,), that this detection is the object's own; 0 where there is none.
+    - `classes`: (m,), the class of each, the first that its detections had; 0 for none.
     """
 
     boxes: Float[Array, "m 4"]
@@ -55,6 +56,7 @@ class Tracks(NamedTuple):
     shown: Bool[Array, " m"]
     detections: Int[Array, " m"]
     probabilities: Float[Array, " m"]
+    classes: Int[Array, " m"]
 
     @property
     def corner_boxes(self) -> Float[Array | np.ndarray, "m 4"]:

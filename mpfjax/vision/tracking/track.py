@@ -16,18 +16,17 @@ from mpfjax.vision.files.frames import of_one_kind, read_frames
 from mpfjax.vision.files.threads import read_ahead
 from mpfjax.vision.tracking.adapters import (
     LEAST_ROOM,
-    DetectedBoxes,
     Once,
     Rows,
     Sieve,
     as_detector,
     observed,
 )
-from mpfjax.vision.tracking.detections import Detections
+from mpfjax.vision.tracking.detections import DetectedBoxes, Detections
 from mpfjax.vision.tracking.gaussian import CameraMotion
 from mpfjax.vision.tracking.optical_flow import OpticalFlow, has_opencv
 from mpfjax.vision.tracking.state import Tracks
-from mpfjax.vision.tracking.tracker import ObjectTracker, advanced
+from mpfjax.vision.tracking.tracker import ObjectTracker, advanced, colours_of
 
 # Compiling in four fifths of the time is worth a tenth of a frame's up to here.
 _FEW_OBJECTS = 48
@@ -52,7 +51,7 @@ def track(
 
     The tracks of a frame depend on this frame and earlier ones only. Any detector will do:
 
-        track(frames, lambda frame: network(frame))        # boxes (k, 4), or (boxes, scores)
+        track(frames, lambda frame: network(frame))        # boxes, scores and classes
         track(frames, read_detections("det.txt"))          # rows of a MOTChallenge file
         track(frames, BackgroundSubtraction().detect)      # what moves before a still camera
         track(None, rows)                                  # without pixels, for speed or radar
@@ -61,9 +60,9 @@ def track(
       path of a video or of a folder of images, from frame `first` on; None where there are only
       detections.
     - `detections`: a function from a frame to its boxes (x, y, w, h), top-left corner first, in
-      pixels, or to a tuple of boxes and scores; or an iterable of these, one item for each frame;
-      or an array of rows (frame, id, x, y, w, h, score) whose frames count from 1, or the path of a
-      MOTChallenge file of these.
+      pixels, or to a tuple of boxes and scores (None for none), or of boxes, scores and classes;
+      or an iterable of these, one item for each frame; or an array of rows (frame, id, x, y, w, h,
+      score) whose frames count from 1, or the path of a MOTChallenge file of these.
     - `tracker`: None takes `ObjectTracker()`, with more room where a frame has more rows.
     - `key`: counts for nothing, since nothing is drawn.
     - `first`: the number of the first frame, by which rows are found.
@@ -142,9 +141,9 @@ def _seen(
         corner = np.zeros(2) if origin is None else origin
         size = sieve.frame_size if still is None else still.shape[:2]
         observation = Detections.from_boxes(
-            found.boxes, room, found.scores, frame_size=size, origin=corner
+            found.boxes, room, found.scores, frame_size=size, origin=corner, classes=found.classes
         )
-        pixels = tracker.look(still, observation) if use_colours and still is not None else None
+        pixels = colours_of(still, observation) if use_colours and still is not None else None
         motion = None if flow is None or still is None else flow(still, found.boxes)
         yield _Seen(number, pixels, observation, motion, kept, corner)
 

@@ -8,17 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
-from mpfjax.checks import (
-    POSITIVE,
-    Checked,
-    Count,
-    Finite,
-    Rule,
-    as_numbers,
-    check,
-    checked,
-    one_of,
-)
+from mpfjax.checks import POSITIVE, Checked, Count, as_numbers, checked
 from mpfjax.vision.colour.bins import HSVColours
 from mpfjax.vision.colour.histograms import SampledBoxes, normalise
 from mpfjax.vision.tracking.associate import (
@@ -32,7 +22,7 @@ from mpfjax.vision.tracking.associate import (
     unlikeness,
 )
 from mpfjax.vision.tracking.camera import CameraState
-from mpfjax.vision.tracking.detections import Detections
+from mpfjax.vision.tracking.detections import DetectedBoxes, Detections
 from mpfjax.vision.tracking.gaussian import (
     CameraMotion,
     Gaussian,
@@ -46,12 +36,12 @@ from mpfjax.vision.tracking.gaussian import (
 )
 from mpfjax.vision.tracking.lives import Doubles, Guesses, Lives, Spans
 from mpfjax.vision.tracking.noise import NoiseState
-from mpfjax.vision.tracking.scores import ScoreState
+from mpfjax.vision.tracking.scores import STRONG, WEAK, ScoreState
 from mpfjax.vision.tracking.state import TrackerState, Tracks
 
 _COLOURS, _BANDS = HSVColours(8, 4, 6), 3
-# Of a weak detection, of an object that is not confirmed, and of one with another label.
-_WEAK_COST, _DOUBT_COST, _LABEL_COST = 8.0, 2.0, 8.0
+# Of a weak detection, of an object that is not confirmed, and of one of another class.
+_WEAK_COST, _DOUBT_COST, _CLASS_COST = 8.0, 2.0, 8.0
 WEAK_ERROR = 1.35  # times the error of a strong detection
 _YIELDING = 0.01  # of the claim of an object that takes only what others leave
 _BIRTH_OVERLAP = 0.5  # with an object or a stronger detection: it is one more box of the same
@@ -64,16 +54,6 @@ def _as_rate(frames_per_second: Any) -> np.ndarray:
     """An array, so that one program serves all rates."""
     rate = 25 if frames_per_second is None else frames_per_second
     return np.asarray(as_numbers("frames_per_second", rate), np.float32)
-
-
-def _check_scores(scores: Any, name: str) -> None:
-    if not isinstance(scores, tuple) or len(scores) != 2:
-        one_of(("learned", "ignore", "(weak, strong)")).check(scores, name)
-        return
-    weak, strong = scores
-    check(Finite, **{f"{name}: weak": weak, f"{name}: strong": strong})
-    if weak > strong:
-        raise ValueError(f"{name}: the weak one, {weak}, is above the strong one, {strong}")
 
 
 class ObjectTracker(Checked):
@@ -96,13 +76,13 @@ class ObjectTracker(Checked):
     - `max_objects`: M, how many objects there is room for.
     - `frames_per_second`: of the video. An object ends after a second without a detection. None
       takes 25.
-    - `scores`: "learned" finds from which score on a detection is strong, and starts an object.
-      "ignore" takes all for strong. A pair (weak, strong) has thresholds of your own: below weak a
-      detection counts for nothing.
-    - `class_matters`: "always" pairs objects with detections of their own label only, and does not
-      take those of another one for doubles. "prefers" is for detectors that mix up classes: another
-      label costs as much as a weak score does. False does not look at labels, True is "always". The
-      label 0 is none, and goes with all.
+    - `scores`: "rank" finds from which score on a detection is strong, and starts an object, on any
+      scale. "as_given" takes scores for probabilities: strong from .5 on, and below .2 a detection
+      counts for nothing. "ignore" takes all for strong.
+    - `class_matters`: with True objects have detections of their own class only, and those of
+      another one are no doubles. "prefers" is for detectors that mix up classes: another class
+      costs as much as a weak score does. False does not look at classes. Class 0 is none, and goes
+      with all.
 
     Raises `ValueError` for a number of objects that is not whole, or below 1, a rate that is not
     positive, and scores or classes that are none of these.
@@ -112,12 +92,10 @@ class ObjectTracker(Checked):
     frames_per_second: Annotated[Float[Array | np.ndarray, ""], POSITIVE] = eqx.field(
         converter=_as_rate, default=None, kw_only=True
     )
-    scores: Annotated[str | tuple[float, float], Rule(_check_scores, "scores")] = eqx.field(
-        static=True, default="learned", kw_only=True
+    scores: Literal["rank", "as_given", "ignore"] = eqx.field(
+        static=True, default="rank", kw_only=True
     )
-    class_matters: Literal["always", "prefers"] | bool = eqx.field(
-        static=True, default="always", kw_only=True
-    )
+    class_matters: Literal["prefers"] | bool = eqx.field(static=True, default=True, kw_only=True)
 
     def init(self) -> TrackerState:
         """The state before the first frame: no objects."""
@@ -139,42 +117,47 @@ class ObjectTracker(Checked):
         self,
         key: Key[Array, ""] | None,
         state: TrackerState,
-        frame: UInt8[np.ndarray, "h w 3"] | SampledBoxes | None,
-        detections: Detections,
+        frame: UInt8[np.ndarray, "h w 3"] | None,
+        detections: Any,
         motion: CameraMotion | None = None,
     ) -> tuple[TrackerState, Tracks]:
         """The state after a frame and its detections, and the tracks in it.
 
-        The result of `look` may be given in place of the frame. Where `frame` is None detections
-        are tracked alone, without colours. `motion` is what `OpticalFlow` makes of the frames; None
-        leaves the camera's motion to the detections. Nothing is drawn: the key may be None. Raises
-        `ValueError` for a frame that is not (h, w, 3) of type uint8, and for anything but
-        `Detections` and a state of `init`.
+        `detections` are what a detector of `track` gives: boxes, (boxes, scores), or (boxes,
+        scores, classes). There is room for twice `max_objects`; `Detections` have room of your own.
+        Where `frame` is None detections are tracked alone, without colours. `motion` is what
+        `OpticalFlow` makes of the frames; None leaves the camera's motion to the detections.
+        Nothing is drawn: the key may be None. Raises `ValueError` for a frame that is not (h, w, 3)
+        of type uint8, for boxes as `Detections.from_boxes` does, and for anything but a state of
+        `init`.
         """
         del key
-        if frame is not None and not isinstance(frame, SampledBoxes):
-            frame = self.look(frame, detections)
-        return _advanced(self, state, detections, frame, motion)
+        if not isinstance(detections, Detections):
+            boxes, scores, classes = DetectedBoxes.of(detections, "detections")
+            size = None if frame is None else np.shape(frame)[:2]
+            detections = Detections.from_boxes(
+                boxes, 2 * self.max_objects, scores, frame_size=size, classes=classes
+            )
+        seen = None if frame is None else colours_of(frame, detections)
+        return _advanced(self, state, detections, seen, motion)
 
-    def look(self, frame: UInt8[np.ndarray, "h w 3"], detections: Detections) -> SampledBoxes:
-        """The part of a frame that `step` needs: the detections' colours.
 
-        Raises `ValueError` for a frame as `step` does.
-        """
-        return SampledBoxes.of(np.asarray(frame), np.asarray(detections.boxes), _COLOURS)
+def colours_of(frame: UInt8[np.ndarray, "h w 3"], detections: Detections) -> SampledBoxes:
+    """The part of a frame that a step needs: the detections' colours."""
+    return SampledBoxes.of(np.asarray(frame), np.asarray(detections.boxes), _COLOURS)
 
 
 class _Found(NamedTuple):
     """The detections of a frame, and what they are to each other.
 
-    - `places`: (d, 4); `labels`: (d,), 0 where they do not matter; `extent`: of the frame.
+    - `places`: (d, 4); `classes`: (d,), 0 where they do not matter; `extent`: of the frame.
     - `colours`: (d, bins), None without pixels.
     - `stronger`: (d, d), whether the first of a pair is; `overlaps`: (d, d), of what may be one.
     """
 
     detections: Detections
     places: Float[Array, "d 4"]
-    labels: Int[Array, " d"]
+    classes: Int[Array, " d"]
     extent: Float[Array, "4"]
     colours: Float[Array, "d bins"] | None
     stronger: Bool[Array, "d d"]
@@ -193,11 +176,11 @@ class _Found(NamedTuple):
             extent = jnp.array([0, 0, 1, 1]) * jnp.tile(jnp.stack([seen.width, seen.height]), 2)
             extent = extent.astype(boxes.dtype)
             colours = normalise(seen.counts(_BANDS)).reshape(len(boxes), -1)
-        labels = detections.labels if tracker.class_matters else 0
-        labels = jnp.broadcast_to(labels, detections.valid.shape).astype(jnp.int32)
+        classes = detections.classes if tracker.class_matters else 0
+        classes = jnp.broadcast_to(classes, detections.valid.shape).astype(jnp.int32)
         ranked = stronger(detections.scores, jnp.prod(boxes[:, 2:], axis=1))
-        overlaps = jnp.where(_may_be_one(tracker, labels, labels), overlap(boxes, boxes), 0.0)
-        return cls(detections, places_of(boxes), labels, extent, colours, ranked, overlaps)
+        overlaps = jnp.where(_may_be_one(tracker, classes, classes), overlap(boxes, boxes), 0.0)
+        return cls(detections, places_of(boxes), classes, extent, colours, ranked, overlaps)
 
     def strong(self, least: Float[Array, ""]) -> Bool[Array, " d"]:
         """Which detections have at least this score."""
@@ -240,8 +223,8 @@ def advanced(
     scores = state.scores.after(
         found.detections, found.stronger, found.overlaps, shift, spans.lasting
     )
-    if isinstance(tracker.scores, tuple):
-        weak, strong = (jnp.full_like(scores.weak, score) for score in tracker.scores)
+    if tracker.scores == "as_given":
+        weak, strong = (jnp.full_like(scores.weak, score) for score in (WEAK, STRONG))
         scores = scores._replace(weak=weak, strong=strong)
     strong = found.strong(scores.strong)
 
@@ -265,10 +248,10 @@ def advanced(
     unit = units(taken.place)
     start = Gaussian.begun(taken.place, unit * errors[None], unit * speed[None])
     objects = start.where(born, objects)
-    lives = lives.begins(born, taken.values(found.labels, 0), jnp.sum(wanted, dtype=jnp.int32))
+    lives = lives.begins(born, taken.values(found.classes, 0), jnp.sum(wanted, dtype=jnp.int32))
 
     boxes = boxes_of(objects.place)
-    alike = _may_be_one(tracker, lives.labels, lives.labels)
+    alike = _may_be_one(tracker, lives.classes, lives.classes)
     overlaps = jnp.where(alike, overlap(boxes, boxes), 0.0)
     doubles = state.doubles.after(lives.identities, stays, taken.there, overlaps)
     lives = lives._replace(shown=lives.shown & ~doubles.doubtful)
@@ -285,7 +268,7 @@ def advanced(
     rows = detections.rows_of(jnp.where(taken.there, taken.rows, -1))
     probability = jnp.where(born, 1.0, jnp.where(stays, probability, 0.0))
     told = lives.identities, lives.confirmed, lives.unseen, lives.full, lives.shown
-    return state, Tracks(boxes, *told, rows, probability)
+    return state, Tracks(boxes, *told, rows, probability, lives.classes)
 
 
 _advanced = eqx.filter_jit(advanced)
@@ -294,16 +277,16 @@ _advanced = eqx.filter_jit(advanced)
 def _may_be_one(
     tracker: ObjectTracker, a: Int[Array, " m"], b: Int[Array, " d"]
 ) -> Bool[Array, "m d"]:
-    """Whether boxes with these labels may be of one object."""
+    """Whether boxes of these classes may be of one object."""
     return compatible(a, b) | (tracker.class_matters == "prefers")
 
 
 def _unlikeness(tracker: ObjectTracker, state: TrackerState, found: _Found) -> Float[Array, "m d"]:
-    """What pairs cost beside distance: for their colours and labels, and infinitely if need be."""
+    """What pairs cost beside distance: for their colours and classes, and infinitely if need be."""
     cost = unlikeness(found.colours, state.colours)
     if tracker.class_matters == "prefers":
-        cost += jnp.where(compatible(state.lives.labels, found.labels), 0.0, _LABEL_COST)
-    return jnp.where(_may_be_one(tracker, state.lives.labels, found.labels), cost, jnp.inf)
+        cost += jnp.where(compatible(state.lives.classes, found.classes), 0.0, _CLASS_COST)
+    return jnp.where(_may_be_one(tracker, state.lives.classes, found.classes), cost, jnp.inf)
 
 
 def _moved(
@@ -364,7 +347,7 @@ def _unexplained(
     """Which strong detections begin an object: no object has them, or is there already."""
     boxes = found.detections.boxes
     covered = lives.alive[:, None] & (overlap(boxes_of(objects.place), boxes) > _BIRTH_OVERLAP)
-    covered &= _may_be_one(tracker, state.lives.labels, found.labels)
+    covered &= _may_be_one(tracker, state.lives.classes, found.classes)
     past = jnp.where(source >= 0, source, len(strong))  # a scatter drops it
     free = jnp.ones_like(strong).at[past].set(False, mode="drop")
     wanted = strong & free & within(boxes, found.extent) & ~jnp.any(covered, axis=0)
