@@ -16,6 +16,7 @@ own classes; `| None` adds None. Any other annotation is for readers alone.
 import contextlib
 import dataclasses
 import functools
+import importlib
 import inspect
 import math
 import types
@@ -488,6 +489,14 @@ def _any_of(rules: list[Rule | None]) -> Rule | None:
         rule.check(value, name)
 
     return Rule(check, what)
+
+
+def optional(module: str, package: str) -> types.ModuleType:
+    """The module of an extra, or an `ImportError` that says how to install it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(f"{module} is missing: pip install {package}") from error
 
 
 @contextlib.contextmanager

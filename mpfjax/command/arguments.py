@@ -187,15 +187,13 @@ def _has_pixels(path: Path) -> bool:
 def _detections_alone(options: argparse.Namespace) -> Path:
     """The file of detections where there are no pixels: that of the folder, or the source."""
     path = options.source
-    if path.is_file():
-        if options.detections is not None:
-            raise ValueError(f"--detections: not allowed where SOURCE, {path}, is such a file")
-        return path
+    if options.detections is not None or path.is_file():
+        return options.detections or path
     files = detection_files(path)
     files = [file for file in files if file.name == "det.txt"] or files
-    if options.detections is None and len(files) > 1:
+    if len(files) > 1:
         raise ValueError(f"SOURCE: {path} holds {len(files)} files of detections; name one of them")
-    return options.detections or files[0]
+    return files[0]
 
 
 def read_boxes(options: argparse.Namespace, still: np.ndarray) -> np.ndarray:

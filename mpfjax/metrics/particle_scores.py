@@ -75,9 +75,6 @@ def uniqueness(mixture: ParticleMixture) -> Float[Array, " objects"]:
     step lowers it for the objects that have moved, as in the paper's figure 4. Raises `ValueError`
     for particles of other shapes.
     """
-    shapes = [leaf.shape for leaf in jax.tree.leaves(mixture.particles)]
-    if any(len(shape) < 2 for shape in shapes):
-        raise ValueError(f"mixture: particles of shapes {shapes} are not of objects, (n, J, ...)")
     distinct = jax.vmap(lambda states: _distinct_rows(states, mixture), in_axes=1)
     return distinct(mixture.particles) / jnp.asarray(
         mixture.num_usable_slots, mixture.log_weights.dtype

@@ -85,8 +85,6 @@ def recovery_rate(
     `num_last` frames that have a true box. An object that is tracked throughout fulfils this too.
     Raises `ValueError` for no runs or no frames, or `num_last` below 1.
     """
-    if 0 in track_states.shape[:2]:
-        raise ValueError(f"track_states: shape {track_states.shape} holds no runs or no frames")
     if present is None:
         present = jnp.ones(track_states.shape[1:], bool)
     to_come = jnp.cumsum(present[::-1].astype(jnp.int32), axis=0)[::-1]

@@ -1,11 +1,9 @@
 """The scores that trackers are compared by: HOTA, MOTA and IDF1, counted by TrackEval."""
 
-from types import ModuleType
-
 import numpy as np
 from jaxtyping import Float
 
-from mpfjax.checks import NotNegative, checked, to_rows
+from mpfjax.checks import NotNegative, checked, optional, to_rows
 
 # The kinds of objects and regions that are not scored, in the second column of their rows.
 IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT = 1, 2, 3
@@ -51,7 +49,7 @@ def multi_object_scores(
         raise ValueError("truth: there are no true boxes to score against")
     ignored = np.zeros((0, 6)) if ignored is None else ignored
     tracks = remove_ignored(tracks, truth, ignored, min_height)
-    metrics = _trackeval_metrics()
+    metrics = optional("trackeval", "trackeval").metrics
     sequence = _sequence(tracks, truth)
     hota = metrics.HOTA().eval_sequence(sequence)
     clear = metrics.CLEAR(_SETTINGS).eval_sequence(sequence)
@@ -176,11 +174,3 @@ def _sequence(tracks: np.ndarray, truth: np.ndarray) -> dict[str, object]:
         sequence[f"num_{name}_dets"] = len(rows)
     sequence["similarity_scores"] = [overlap(*pair) for pair in zip(*boxes, strict=True)]
     return sequence
-
-
-def _trackeval_metrics() -> ModuleType:
-    try:
-        from trackeval import metrics
-    except ImportError as error:
-        raise ImportError("trackeval is needed to score tracks: pip install trackeval") from error
-    return metrics

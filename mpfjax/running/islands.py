@@ -84,9 +84,7 @@ def _dividing(num_islands: int, devices: int | Sequence[Any] | None) -> list[Any
     chosen = choose_devices(devices)
     most = max(d for d in range(1, len(chosen) + 1) if num_islands % d == 0)
     if most < len(chosen) and (devices is not None or jax.process_count() > 1):
-        raise ValueError(
-            f"num_islands: {num_islands} cannot be dealt evenly to {len(chosen)} devices"
-        )
+        raise ValueError(f"num_islands: {num_islands} cannot be dealt to {len(chosen)} devices")
     return chosen[:most]
 
 
@@ -186,9 +184,7 @@ class IslandInteraction(AbstractMove):
         if islands == 1:
             return mixture
         if n % islands:
-            raise ValueError(
-                f"num_particles: {n} of an island cannot be dealt to {islands} islands"
-            )
+            raise ValueError(f"num_particles: {n} of an island, for {islands} islands alike")
         return jax.lax.cond(
             self.is_due(mixture), lambda: mixture.map_slots(deal_to_islands), lambda: mixture
         )

@@ -129,14 +129,13 @@ class LongRun:
         """The state that the file holds, None without a file; a `ValueError` for another run's."""
         if self.checkpoint is None or not Path(self.checkpoint.path).exists():
             return None
-        path, caller = self.checkpoint.path, self.caller
+        path = self.checkpoint.path
         arrays, notes = read_described(path)
         step, found = notes.get("step", 0), notes.get("identity", {})
         own = self._described(step)
         if found != own:
-            raise ValueError(
-                f"checkpoint: {path} is of another {caller}: {differences(found, own)}"
-            )
+            said = differences(found, own)
+            raise ValueError(f"checkpoint: {path} is of another {self.caller}: {said}")
         held = filled(path, arrays, {"carry": like.carry, "rows": like.rows})
         return State(step, held["carry"], held["rows"])
 

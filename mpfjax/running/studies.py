@@ -1,10 +1,8 @@
 """Monte Carlo studies over filters, numbers of particles and settings; they can be interrupted."""
 
 import datetime
-import hashlib
 import importlib
 import itertools
-import json
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -25,19 +23,11 @@ from mpfjax.models.observations import as_series, check_series
 from mpfjax.operations.logarithms import default_float
 from mpfjax.running.run import monte_carlo
 from mpfjax.running.scan import FilterRun
-from mpfjax.running.storage import (
-    described,
-    differences,
-    named,
-    read_described,
-    write_described,
-    write_whole,
-)
+from mpfjax.running.storage import described, differences, named, read_described, write_described
 
 Values = Sequence[Any] | np.ndarray | Array
 
-_MANIFEST = "study.json"
-_STUDY = "study"
+_STUDY, _MOST_FAULTS = "study", 4
 _TAKEN = {"filter", "num_particles", "file", "description", _STUDY}
 _CELL_FILE = re.compile(r"(\d+)-[\w.+-]*\.npz")  # as `_cells` names them
 
@@ -127,9 +117,10 @@ def run_study(
     long.
     """
     directory = Path(directory)
-    cells = _cells(study)
-    digest = _claim(directory, _manifest(study), resume)
-    results = _finished(directory, digest)
+    cells, identity = _cells(study), _identity(study)
+    if _cell_files(directory) and not resume:
+        raise ValueError(f"directory: {directory} holds {_said(directory)}; say resume to go on")
+    results = _finished(directory, identity)
     pending = [cell for cell in cells if cell.file not in results]
     if results and jax.process_index() == 0:
         print(f"{directory}: {_said(directory)} taken over, {len(pending)} to run")
@@ -143,8 +134,8 @@ def run_study(
             error.add_note(f"in the cell {cell.description}")
             raise
         if jax.process_index() == 0:
-            mark = {_STUDY: digest} | cell.description
-            write_described(directory / cell.file, measured, mark)
+            described_by = {_STUDY: identity} | cell.description
+            write_described(directory / cell.file, measured, described_by)
         results[cell.file] = cell.description | measured
 
     bar = tqdm(total=len(cells), initial=len(results), unit="cell", disable=None)
@@ -162,12 +153,11 @@ def run_study(
 def read_study(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
     """The finished cells of a study, as `run_study` returns them.
 
-    It does not need the `Study`, and works while the study runs. Raises `FileNotFoundError` for a
-    directory without a study, and `ValueError` for files in it that are cut off, damaged or from
-    another study.
+    It does not need the `Study`, and works while the study runs. Raises `FileNotFoundError` where
+    there is no such directory, and `ValueError` for files in it that are cut off, damaged or of
+    different studies.
     """
-    directory = Path(directory)
-    return list(_finished(directory, _digest(_read_manifest(directory / _MANIFEST))).values())
+    return list(_finished(Path(directory).resolve(strict=True)).values())
 
 
 class _Cell(NamedTuple):
@@ -215,52 +205,14 @@ def _listed(name: str, values: Any) -> list[Any]:
     return plain
 
 
-def _manifest(study: Study) -> dict[str, Any]:
-    """All that identifies the study of a directory, in a form that JSON can hold."""
+def _identity(study: Study) -> dict[str, str]:
+    """All that has to be the same for a cell to be of this study, as text."""
     package = importlib.import_module(__name__.partition(".")[0])
-    versions = [f"mpfjax {package.__version__}", f"jax {jax.__version__}"]
-    return {
-        "axes": _axes(study),
-        **described(keys=study.keys, observations=study.observations),
-        "measure": named(study.measure),
-        "collect": named(study.collect),
-        "versions": [*versions, str(default_float())],
-    }
-
-
-def _digest(manifest: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
-
-
-def _claim(directory: Path, manifest: dict[str, Any], resume: bool) -> str:
-    """The digest of this study, whose manifest the directory then holds."""
-    path = directory / _MANIFEST
-    if _cell_files(directory) and not resume:
-        raise ValueError(
-            f"directory: {directory} holds {_said(directory)}; say resume to take over those of"
-            " this study, or take another directory"
-        )
-    if resume and path.exists():
-        there = _read_manifest(path)
-        # By their digests, since a NaN is equal to itself only as text.
-        if _digest(there) != _digest(manifest):
-            found, own = ({**each.pop("axes"), **each} for each in (there, manifest.copy()))
-            raise ValueError(
-                f"directory: {directory} holds another study ({differences(found, own)});"
-                " take another directory, or delete that one"
-            )
-    elif jax.process_index() == 0:
-        content = json.dumps(manifest, indent=1) + "\n"
-        write_whole(path, lambda file: file.write(content.encode()))
-    return _digest(manifest)
-
-
-def _read_manifest(path: Path) -> dict[str, Any]:
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        return manifest | {"axes": dict(manifest["axes"])}
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise ValueError(f"{path}: cut off, damaged or no study ({error})") from error
+    versions = f"mpfjax {package.__version__}, jax {jax.__version__}, {default_float()}"
+    functions = {"measure": named(study.measure), "collect": named(study.collect)}
+    axes = {name: str(values) for name, values in _axes(study).items()}
+    data = described(keys=study.keys, observations=study.observations)
+    return axes | data | functions | {"versions": versions}
 
 
 def _cell_files(directory: Path) -> list[Path]:
@@ -276,20 +228,26 @@ def _said(directory: Path) -> str:
     return f"{len(times)} finished cells of {' to '.join(days)}"
 
 
-def _finished(directory: Path, digest: str) -> dict[str, dict[str, Any]]:
-    """The finished cells by their files: described, and with what was measured."""
+def _finished(directory: Path, identity: dict[str, str] | None = None) -> dict[str, dict[str, Any]]:
+    """The finished cells by their files: described, and with what was measured.
+
+    They are all of one study, that of the first where none is given.
+    """
     # An error, not a warning and a second run: if one file is damaged, others may be as well.
     results, faults = {}, []
     for path in _cell_files(directory):
         try:
             arrays, description = read_described(path)
-            if description.pop(_STUDY, None) != digest:
-                raise ValueError(f"{path}: results of another study")
+            found = dict(description.pop(_STUDY, {}))
+            identity = identity or found
+            if found != identity:
+                raise ValueError(f"{path}: of another study ({differences(found, identity)})")
             results[path.name] = description | arrays
         except ValueError as error:
             faults.append(str(error))
     if faults:
-        raise ValueError("; ".join([*faults, "delete these, and only their cells are run again"]))
+        said = "; ".join(faults[:_MOST_FAULTS])
+        raise ValueError(f"directory: {said}; delete such files, and only their cells run again")
     return results
 
 
@@ -310,8 +268,6 @@ def _measure(
         for name, array in measured.items():
             if name in cell.description or name in _TAKEN or array.shape[:1] != (size,):
                 said = f"{name} of shape {array.shape}"
-                raise ValueError(
-                    f"measure: {said} describes a cell, or has no axis of {size} seeds"
-                )
+                raise ValueError(f"measure: {said} is of a cell, or has no axis of {size} seeds")
         parts.append(measured)
     return {name: np.concatenate([part[name] for part in parts])[:num_seeds] for name in parts[0]}

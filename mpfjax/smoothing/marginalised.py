@@ -68,15 +68,11 @@ def check_marginalised(
 ) -> None:
     """Raise a `ValueError` for data that backward sampling of latents cannot use."""
     if not is_marginalised(model) or observations is None or method != "exact":
-        raise ValueError(
-            "observations, method: a conditionally linear model alone takes y, 'exact'"
-        )
+        raise ValueError("observations, method: y is for conditionally linear models, by 'exact'")
     lengths = {jnp.shape(leaf)[0] for leaf in jax.tree.leaves(observations)}
     num_steps = mixtures.log_weights.shape[0] - 1
     if lengths != {num_steps}:
-        raise ValueError(
-            f"observations: {sorted(lengths)} steps are not {num_steps}, as from x_0 on"
-        )
+        raise ValueError(f"observations: {sorted(lengths)} steps, not {num_steps}, from x_0 on")
 
 
 @jit_on_wide_vectors

@@ -156,9 +156,7 @@ class Sampling(Checked):
             walk = random_walk(self.deviations, states.reals)
             chains, fine = Chains(states, walk, chains.num_invalid), fine | now_fine
         if not np.all(fine):
-            raise RuntimeError(
-                f"{self.caller}: the log prior or log marginal likelihood was NaN or inf at {where}"
-            )
+            raise RuntimeError(f"{self.caller}: the prior or likelihood was NaN or inf at {where}")
         return chains
 
     def _num_draws(self, step: int) -> int:

@@ -1,6 +1,5 @@
 """Conversion of posteriors to ArviZ."""
 
-import importlib
 import inspect
 import re
 from typing import Any
@@ -38,10 +37,7 @@ def to_inference_data(result: Chains | PyTree) -> Any:
     Raises `ImportError` where arviz is missing, `ValueError` for anything else. Use it for
     effective sample sizes and R-hat: `arviz.summary(to_inference_data(chains))`.
     """
-    try:
-        arviz = importlib.import_module("arviz")
-    except ImportError as error:
-        raise ImportError("to_inference_data needs arviz: pip install arviz") from error
+    arviz: Any = optional("arviz", "arviz")
     stats: dict[str, np.ndarray] = {}
     states: dict[str, np.ndarray] = {}
     parameters = getattr(result, "parameters", {})

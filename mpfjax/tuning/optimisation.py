@@ -222,10 +222,8 @@ class _Ascent:
             raise Broken(fault)
         idle = [name for name, leaf in gradient.items() if not np.asarray(leaf).any()]
         if step == 0 and idle:
-            raise ValueError(
-                f"parameters: the {self.objective.replace('_', ' ')} does not depend on"
-                f" {', '.join(idle)}; with gradient='stop' no filter's ever does on a proposal's"
-            )
+            named = self.objective.replace("_", " ")
+            raise ValueError(f"parameters: the {named} does not depend on {', '.join(idle)}")
         updated, optimizer = self._updated(gradient, optimizer, reals)
         row = values.mean(), values.std(), jax.tree.map(np.asarray, reals)
         row = jax.tree.map(lambda leaf: np.asarray(leaf)[None], row)

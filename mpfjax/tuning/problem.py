@@ -149,9 +149,7 @@ def pose(
     leaves, structure = jax.tree.flatten(tree)
     tuned = _tuned(tree, parameters)
     if not tuned:
-        raise ValueError(
-            f"parameters: there is nothing to tune; name Python floats, or declare them {_DECLARED}"
-        )
+        raise ValueError(f"parameters: there are none; name floats, or declare them {_DECLARED}")
     for name, index in tuned.items():
         leaves[index] = _as_array(name, leaves[index])
     transforms = {} if transforms is None else transforms
@@ -185,9 +183,7 @@ def _as_array(name: str, value: Any) -> Array:
         array = jnp.asarray(value, float if isinstance(value, float) else None)
         if jnp.issubdtype(array.dtype, jnp.floating):
             return array
-    raise ValueError(
-        f"parameters: {name} is {shown(value)}, no floating point number; declare it {_DECLARED}"
-    )
+    raise ValueError(f"parameters: {name}, {shown(value)}, is no float; declare it {_DECLARED}")
 
 
 def _tuned(tree: PyTree, parameters: Parameters) -> dict[str, int]:
@@ -214,10 +210,8 @@ def _picked(name: str, where: Any, places: PyTree, leaves: list[Any]) -> dict[st
     found = jax.tree_util.tree_leaves_with_path(picked)
     for _, place in found:
         if not isinstance(place, Place):
-            raise ValueError(
-                f"parameters: {name} picks {shown(place)}, no leaf; a field can be tuned where it"
-                f" is declared {_DECLARED}, without static=True"
-            )
+            said = f"{name} picks {shown(place)}, a static field or a new value"
+            raise ValueError(f"parameters: {said}; declare its field {_DECLARED}")
     if len(found) > 1 or not name:  # a network has functions among its leaves
         found = [
             (path, place) for path, place in found if eqx.is_inexact_array(leaves[place.index])

@@ -184,9 +184,8 @@ class _Run:
             before, after = with_present(before), with_present(after)
         one_step = lambda series: kinds(jax.tree.map(lambda leaf: leaf[-1], series))  # noqa: E731
         if one_step(before) != one_step(after):
-            raise ValueError(
-                f"observations: {one_step(after)} is not like those before, {one_step(before)}"
-            )
+            here, there = one_step(after), one_step(before)
+            raise ValueError(f"observations: {here} is not like those before, {there}")
         series = jax.tree.map(lambda *leaves: np.concatenate(leaves), before, after)
         held = self.sampler.run.series.length
         # With room for as many more, so that observations that come one by one share a program.

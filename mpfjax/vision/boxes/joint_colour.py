@@ -75,14 +75,10 @@ def joint_colour_model(
         )
 
     model = learn(frame, boxes)
-    for j, template in (templates or {}).items():
+    for j, (other_frame, box) in (templates or {}).items():
         if j not in range(len(boxes)):
             raise ValueError(f"templates: {j} is none of the {len(boxes)} objects, from 0 on")
-        try:
-            other_frame, box = template
-            looks = learn(other_frame, to_rows(4, "box", box)[:1]).references[0]
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"templates: of object {j}, (frame, box): {error}") from error
+        looks = learn(other_frame, to_rows(4, "templates", box)[:1]).references[0]
         model = eqx.tree_at(lambda m: m.references, model, model.references.at[j].set(looks))
     return MultiObjectModel(
         _one_each(model),

@@ -7,13 +7,12 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from mpfjax.checks import Count, Positive, checked
+from mpfjax.checks import Count, Positive, checked, optional
 from mpfjax.vision.files.sequences import read_sequence_info
 
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp")
@@ -33,15 +32,13 @@ def read_frames(
     `path` is a video file, a folder of images in the natural order of their names (2.png before
     10.png), or a folder with such a folder `img` or `img1`. All frames of a video are read,
     whatever the time between them, rotated as the file says. A `RuntimeWarning` names those that
-    are too damaged to be decoded. Raises `ImportError` if PyAV is missing for a video,
-    `FileNotFoundError` if `path` is, and `ValueError` with `path` if it cannot be read, has no
-    frames, or has frames of different sizes, and for `first` and `last` that are no range.
+    are too damaged to be decoded. Raises `ImportError` if PyAV is missing for a video, and
+    `ValueError` with `path` if it cannot be read, has no frames, or has frames of different sizes,
+    and for `first` and `last` that are no range.
     """
     if last is not None and last < first:
         raise ValueError(f"first, last: {first}, {last} is not a range of frames from 1 on")
     path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such video or folder of images")
     frames = _read_images(path, first, last) if path.is_dir() else _read_video(path, first, last)
     return of_one_kind(frames, first, str(path))
 
@@ -114,7 +111,7 @@ def open_video(
     """
     if Path(path).suffix.lower() != ".mp4":
         raise ValueError(f"path: {path} ends in neither .mp4 nor .gif")
-    library, rate = _av(), Fraction(frames_per_second).limit_denominator(1001)
+    library, rate = optional("av", "av"), Fraction(frames_per_second).limit_denominator(1001)
     with contextlib.ExitStack() as opened:
         file: Any = None
         stream: Any = None
@@ -227,7 +224,7 @@ def _decoded(path: Path) -> Iterator[Any]:
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """A video file and its first stream of frames."""
-    library = _av()
+    library = optional("av", "av")
     with _naming(path, "a video"):
         container = library.open(str(path))
     with container:
@@ -258,11 +255,3 @@ def _naming(path: Path, what: str) -> Iterator[None]:
     except Exception as error:
         said = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
         raise ValueError(f"{path}: cannot be read as {what} ({said.splitlines()[0]})") from error
-
-
-def _av() -> ModuleType:
-    try:
-        import av
-    except ImportError as error:
-        raise ImportError("av is needed to read and write video: pip install av") from error
-    return av

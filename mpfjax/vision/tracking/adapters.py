@@ -32,9 +32,7 @@ class Rows:
         self, rows: Float[np.ndarray, "r columns"], *, last: CountOrZero | None = None
     ) -> None:
         if rows.ndim != 2 or not (rows.size == 0 or 6 <= rows.shape[1] <= 10):
-            raise ValueError(
-                f"detections: shape {rows.shape} is not that of frame,id,x,y,w,h,score"
-            )
+            raise ValueError(f"detections: shape {rows.shape} is not of frame,id,x,y,w,h,score")
         rows = rows if rows.size else np.zeros((0, 7))
         rows = to_masked_rows(rows.shape[1], "detections", rows)
         bad = ~np.isfinite(rows[:, : _SCORE + 1]).all(axis=1)

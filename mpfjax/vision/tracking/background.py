@@ -144,9 +144,7 @@ class BackgroundSubtraction:
         check_frame(frame)
         # OpenCV would silently start a new background.
         if self._shape is not None and frame.shape != self._shape:
-            raise ValueError(
-                f"frame: {frame.shape} is not the shape of those before, {self._shape}"
-            )
+            raise ValueError(f"frame: {frame.shape} is not the shape before it, {self._shape}")
         self._shape = frame.shape
         factor = int(np.ceil(np.sqrt(frame[..., 0].size / self.most_pixels)))
         small = reduced(np.ascontiguousarray(frame), factor)

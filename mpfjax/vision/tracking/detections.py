@@ -97,9 +97,7 @@ class Detections(eqx.Module):
         steps, sides = np.spacing(np.abs(rounded[:, :2])), rounded[:, 2:]
         sound = (sides > 0) & (steps <= _FINEST * sides) & np.isfinite(sides)
         for box in rows[~sound.all(axis=1)].tolist():
-            raise ValueError(
-                f"boxes: centre, size {box}: no area, or float32 needs an origin there"
-            )
+            raise ValueError(f"boxes: about {box}: no area, or float32 needs an origin there")
         strongest = np.lexsort((-rows[:, 2] * rows[:, 3], -strengths))[:max_detections]
         kept = np.sort(strongest)
         extent = np.array(_UNBOUNDED, np.float32)

@@ -1,14 +1,14 @@
 """The camera's motion from pixels: corners of what stands still, followed by OpenCV."""
 
 import contextlib
+import importlib.util
 from collections.abc import Iterator
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from mpfjax.checks import to_rows
-from mpfjax.vision.files.frames import check_frame
+from mpfjax.checks import optional, to_rows
+from mpfjax.vision.files.frames import of_one_kind
 from mpfjax.vision.tracking.gaussian import CameraMotion
 
 _WIDTH = 320  # of the reduced picture, about
@@ -50,14 +50,11 @@ class OpticalFlow:
         the motion is unknown. Raises `ValueError` for a frame that is no image of eight bits, and
         for boxes that are not rows of four numbers.
         """
-        frame = np.ascontiguousarray(frame)
-        if frame.ndim == 3 and frame.shape[2] == 1:
-            frame = frame[:, :, 0]
-        check_frame(np.stack([frame] * 3, axis=2) if frame.ndim == 2 else frame)
+        (frame,) = of_one_kind([frame], argument="frame")
         boxes = to_rows(4, "boxes", np.zeros((0, 4)) if boxes is None else boxes)
         factor = max(round(frame.shape[1] / _WIDTH), 1)
         # Grey first: OpenCV reduces one channel in a third of the time of three.
-        grey = frame if frame.ndim == 2 else self._cv2.cvtColor(frame, self._cv2.COLOR_RGB2GRAY)
+        grey = self._cv2.cvtColor(np.ascontiguousarray(frame), self._cv2.COLOR_RGB2GRAY)
         picture = reduced(grey, factor)
         before, self._before = self._before, picture
         left, self._boxes = self._boxes, boxes / factor
@@ -119,11 +116,7 @@ def reduced(frame: np.ndarray, factor: int) -> np.ndarray:
 
 def has_opencv() -> bool:
     """Whether OpenCV is installed."""
-    try:
-        opencv()
-    except ImportError:
-        return False
-    return True
+    return importlib.util.find_spec("cv2") is not None
 
 
 @contextlib.contextmanager
@@ -143,10 +136,6 @@ def opencv_on_one_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def opencv() -> ModuleType:
+def opencv() -> Any:
     """OpenCV, or an `ImportError` that says how to install it."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError("OpenCV is missing: pip install opencv-python-headless") from error
-    return cv2
+    return optional("cv2", "opencv-python-headless")
