@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from mpfjax.checks import shown
+from mpfjax.checks import optional, shown
 from mpfjax.tuning.gibbs import GibbsPosterior
 from mpfjax.tuning.metropolis import Posterior
 from mpfjax.tuning.sequential import SequentialPosterior
