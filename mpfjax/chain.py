@@ -78,18 +78,12 @@ def step_info(
 
 def check_chain(moves: Moves, num_particles: int, num_components: int) -> None:
     """Raise a `ValueError` for moves that make no filter of this size."""
-    if num_particles < num_components:
+    each = max((move.particles_per_component or 1 for move in with_inner(moves)), default=1)
+    if each * num_components > num_particles:
         raise ValueError(
-            f"num_particles: {num_particles} is less than num_components, {num_components};"
-            " every component needs a particle"
+            f"num_particles: {num_particles} is less than particles_per_component, {each}, for each"
+            f" of num_components, {num_components}"
         )
-    for move in with_inner(moves):
-        per_component = move.particles_per_component
-        if per_component is not None and per_component * num_components > num_particles:
-            raise ValueError(
-                f"particles_per_component: {per_component} for each of {num_components}"
-                f" components needs more than num_particles, {num_particles}"
-            )
     names = ", ".join(map(name_of, moves))
     if not any(move.weighs for move in moves):
         raise ValueError(
@@ -100,7 +94,7 @@ def check_chain(moves: Moves, num_particles: int, num_components: int) -> None:
     read = {name for move in with_inner(moves) for name in move.reads}
     for name in sorted(read | set(kept)):
         if kept.count(name) != 1:
-            number = f"{kept.count(name) or 'none'} of {names}"
+            number = f"{kept.count(name)} of {names}"
             raise ValueError(f"moves: the memory {name!r} is kept by {number}, and not by one")
     if any(move.needs_parents for move in moves):
         first = next((t for t, move in enumerate(moves) if move.propagates), 0)
@@ -165,10 +159,9 @@ def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> Pa
     who = f"moves: {name_of(move)} returned"
     if not isinstance(moved, ParticleMixture):
         raise ValueError(f"{who} {shown(moved)}, no ParticleMixture")
-    for name in ("particles", "log_weights", "component_indicators"):
-        own, given = (kinds(getattr(each, name)) for each in (moved, mixture))
-        if own != given:
-            raise ValueError(f"{who} {name} of {own}, and was given {given}")
+    parts = lambda of: (of.particles, of.log_weights, of.component_indicators)  # noqa: E731
+    if kinds(parts(moved)) != kinds(parts(mixture)):
+        raise ValueError(f"{who} {kinds(parts(moved))}, and was given {kinds(parts(mixture))}")
     return moved
 
 

@@ -14,7 +14,6 @@ own classes; `| None` adds None. Any other annotation is for readers alone.
 """
 
 import contextlib
-import dataclasses
 import functools
 import importlib
 import inspect
@@ -34,7 +33,6 @@ from jax.core import Tracer
 
 P = ParamSpec("P")
 R = TypeVar("R")
-T = TypeVar("T")
 
 _LONGEST = 200
 _MOST = 2**31 - 1
@@ -48,19 +46,6 @@ def is_series(value: Any) -> TypeGuard[Iterable[Any]]:
     return isinstance(value, Iterable) and not isinstance(value, single)
 
 
-def check_key(key: Any, name: str = "key", *, batch: bool = False) -> None:
-    """It is one typed key, or with `batch` a vector of at least one."""
-    is_array = isinstance(key, jax.Array | np.ndarray)
-    if not is_array or not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
-        use = "jax.random.split(jax.random.key(0), seeds)" if batch else "jax.random.key(0)"
-        raise ValueError(
-            f"{name}: {shown(key)} is no typed key (one of JAX's old kind is none); use {use}"
-        )
-    if key.ndim != batch or key.size < 1:
-        wanted = "one key a run, (seeds,)" if batch else "one key, (); monte_carlo takes many"
-        raise ValueError(f"{name}: shape {key.shape} is not that of {wanted}")
-
-
 def as_numbers(
     name: str, value: Any, *, floating: bool = False, may_be_complex: bool = False
 ) -> Any:
@@ -68,38 +53,15 @@ def as_numbers(
 
     JAX alone would misread bytes of another order, keep the lower half of whole numbers beyond 32
     bits, and drop masks. Raises `ValueError` for masked numbers, anything but numbers, complex ones
-    unless allowed, and numbers that JAX's own type cannot hold. With `floating`, whole numbers and
-    booleans become floating point numbers.
+    unless allowed, and numbers that JAX's own type cannot hold; floating point numbers may be
+    rounded. With `floating`, whole numbers and booleans become floating point numbers.
     """
-    if isinstance(value, jax.ShapeDtypeStruct):
-        return value
-    if np.ma.is_masked(value):
-        raise ValueError(f"{name}: {shown(value)} is masked; fill it, as by .filled(np.nan)")
-    is_list = isinstance(value, list | tuple)
-    of_jax = any(isinstance(leaf, jax.Array) for leaf in (value if is_list else [value]))
-    try:
-        array = jnp.asarray(value) if of_jax else np.asarray(value)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{name}: {shown(value)} is no array of numbers") from error
-    if not _has_numbers(array):
-        raise ValueError(f"{name}: {shown(value)} is no array of numbers")
-    if jnp.iscomplexobj(array) and not may_be_complex:
-        # Later the imaginary part would be dropped silently, at the latest in a density.
-        raise ValueError(
-            f"{name}: {array.dtype} is complex; give the real and the imaginary part as two numbers"
-        )
+    array = _array_of_numbers(name, value, may_be_complex)
     if floating and not jnp.issubdtype(array.dtype, jnp.inexact):
         array = array.astype(float)
-    return array if of_jax else _of_jax(name, array)
-
-
-def _of_jax(name: str, array: Any) -> np.ndarray:
-    """The array in the type that JAX gives it; a `ValueError` where numbers would change.
-
-    Floating point numbers may be rounded.
-    """
-    shorter = {"g": np.float64, "G": np.complex128}.get(array.dtype.char, array.dtype)
-    dtype = jax.dtypes.canonicalize_dtype(np.dtype(shorter).newbyteorder("="))
+    if isinstance(array, jax.Array):
+        return array
+    dtype = jax.dtypes.canonicalize_dtype(array.dtype.newbyteorder("="))
     with np.errstate(over="ignore"):
         held = array.astype(dtype)
     is_whole = not jnp.issubdtype(dtype, np.inexact)
@@ -110,76 +72,75 @@ def _of_jax(name: str, array: Any) -> np.ndarray:
     return held
 
 
+def _array_of_numbers(name: str, value: Any, may_be_complex: bool = False) -> Any:
+    """The argument as an array of its own type, of JAX where any part of it is."""
+    of_jax = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
+    try:
+        array = jnp.asarray(value) if of_jax else np.asarray(value)
+    except (TypeError, ValueError, OverflowError):
+        array = None
+    # A mask or an imaginary part would later be dropped without a word.
+    is_real = may_be_complex or not np.iscomplexobj(array)
+    if np.ma.is_masked(value) or not _has_numbers(array) or not is_real:
+        kind = "numbers" if may_be_complex else "real numbers"
+        raise ValueError(f"{name}: {shown(value)} is no array of {kind}, none of them masked")
+    return array
+
+
 def to_array(name: str, *, floating: bool = True) -> Callable[[Any], Any]:
     """A converter of the argument of this name to an array, for `eqx.field(converter=...)`.
 
-    With `floating`, whole numbers and booleans become floating point numbers. None stays None.
+    With `floating`, whole numbers and booleans become floating point numbers. None stays None,
+    which the annotation may refuse.
     """
 
     def convert(value: Any) -> Any:
-        if value is None:  # which the annotation may refuse
-            return value
-        numbers = as_numbers(name, value, floating=floating)
-        return numbers if isinstance(numbers, jax.ShapeDtypeStruct) else jnp.asarray(numbers)
+        return value if value is None else jnp.asarray(as_numbers(name, value, floating=floating))
 
     return convert
 
 
-def real_arrays(shape: str, /, **arguments: Any) -> Any:
-    """The arguments as arrays of JAX in floating point, all of this shape, see `check_shape`.
+def to_numbers(name: str) -> Callable[[Any], tuple[float, ...]]:
+    """A converter of the argument of this name, one number or several, to a tuple of them."""
+    return lambda value: tuple(np.ravel(_array_of_numbers(name, value)).astype(float).tolist())
 
-    One array alone comes as itself.
-    """
-    check_shape(shape, **arguments)
-    arrays = [
-        jnp.asarray(as_numbers(name, value, floating=True)) for name, value in arguments.items()
-    ]
-    return arrays if len(arrays) > 1 else arrays[0]
+
+def real_array(shape: str, name: str, value: Any) -> Any:
+    """The argument as an array of JAX in floating point, of this shape, see `check_shape`."""
+    array = jnp.asarray(as_numbers(name, value, floating=True))
+    check_shape(shape, **{name: array})
+    return array
 
 
 def check_shape(shape: str, /, **arguments: Any) -> None:
-    """Each argument is an array of this shape, as "n 4" or "... bins".
+    """Each argument is an array of numbers of this shape, as "n 4" or "... bins".
 
     Numbers stand for themselves and words for any length; the dots are any axes at all. Traced
     arrays are checked as well.
     """
-    axes = shape.removeprefix("...").split()
     for name, value in arguments.items():
-        lengths = getattr(value, "shape", None)
-        if isinstance(value, type) or not isinstance(lengths, tuple) or not _has_numbers(value):
-            raise ValueError(f"{name}: {shown(value)} is no array of numbers")
-        own = lengths[max(len(lengths) - len(axes), 0) :] if "..." in shape else lengths
-        fits = len(own) == len(axes) and all(
-            not axis.isdigit() or int(axis) == length
-            for axis, length in zip(axes, own, strict=True)
-        )
-        if not fits:
-            raise ValueError(f"{name}: shape {lengths} is not ({', '.join(shape.split())})")
+        with jaxtyping.jaxtyped("context"):
+            if not (_has_numbers(value) and isinstance(value, jaxtyping.Shaped[Any, shape])):
+                found = getattr(value, "shape", shown(value))
+                axes = ", ".join(shape.split())
+                raise ValueError(f"{name}: shape {found} is not ({axes}), that of numbers")
 
 
 def to_rows(width: int, name: str, value: Any) -> np.ndarray:
     """The argument as rows of `width` numbers; a vector is one row, and an empty list is none."""
-    if np.ma.is_masked(value):
-        raise ValueError(f"{name}: {shown(value)} are masked in part; fill them, as by .filled(0)")
-    try:
-        rows = np.asarray(value)
-        if rows.dtype.kind not in "cmM":  # numpy would drop an imaginary part, or a unit
-            rows = rows.astype(float)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: {shown(value)} are no rows of {width} numbers") from error
-    if rows.ndim > 0 and rows.size == 0:
+    rows = np.atleast_2d(np.asarray(_array_of_numbers(name, value), float))
+    if rows.size == 0:
         return np.zeros((0, width))
-    rows = np.atleast_2d(rows)
-    if rows.dtype != float or rows.ndim != 2 or rows.shape[1] != width:
-        raise ValueError(f"{name}: {rows.dtype}{rows.shape} are no rows of {width} numbers")
+    if rows.ndim != 2 or rows.shape[1] != width:
+        raise ValueError(f"{name}: shape {rows.shape} is not that of rows of {width} numbers")
     return rows
 
 
 def _has_numbers(array: Any) -> bool:
     dtype = getattr(array, "dtype", None)
-    is_duration = getattr(dtype, "kind", None) == "m"  # for numpy a whole number
-    kinds = (np.number, np.bool_)
-    return dtype is not None and not is_duration and any(jnp.issubdtype(dtype, k) for k in kinds)
+    is_numeric = dtype is not None and any(jnp.issubdtype(dtype, k) for k in (np.number, np.bool_))
+    # Durations are whole numbers for numpy. No type of JAX holds long doubles.
+    return is_numeric and dtype.char not in "mgG"
 
 
 def kinds(tree: Any) -> str:
@@ -226,7 +187,8 @@ def of(holds: Callable[[Any], Any], what: str) -> Rule:
 
     def check(value: Any, name: str) -> None:
         if not holds(value):
-            raise ValueError(f"{name}: {shown(value)} is not {what}")
+            hint = f"; write {value.__name__}(...)" if isinstance(value, type) else ""
+            raise ValueError(f"{name}: {shown(value)} is not {what}{hint}")
 
     return Rule(check, what)
 
@@ -269,34 +231,26 @@ def by_name(holds: Callable[[Any], Any], what: str) -> Rule:
 
 
 def entries(holds: Callable[[np.ndarray], Any], what: str) -> Rule:
-    """The rule for an array with this in all its entries, where its values are known."""
+    """The rule for an array of which this holds, or each of whose entries it holds for.
 
-    def check(array: Any, name: str) -> None:
-        if isinstance(array, Tracer | jax.ShapeDtypeStruct):
-            return
-        if np.size(array) == 0:
-            raise ValueError(f"{name}: shape {np.shape(array)} holds no number")
-        if not _has_numbers(array if hasattr(array, "dtype") else np.asarray(array)):
-            raise ValueError(f"{name}: {shown(array)} is no array of numbers")
-        if not np.all(holds(np.asarray(array))):
-            raise ValueError(f"{name}: {shown(array)} is not {what} throughout")
+    It must hold at least one number. One whose values are not known yet, a traced one, passes.
+    """
 
-    return Rule(check, what)
+    def all_hold(array: Any) -> bool:
+        if isinstance(array, Tracer):
+            return True
+        is_numeric = _has_numbers(array if hasattr(array, "dtype") else np.asarray(array))
+        return is_numeric and np.size(array) > 0 and bool(np.all(holds(np.asarray(array))))
+
+    return of(all_hold, what)
 
 
-def _check_covariance(array: Any, name: str) -> None:
-    FINITE.check(array, name)
-    if isinstance(array, Tracer | jax.ShapeDtypeStruct):
-        return
-    values = 1.0 * np.asarray(array)
-    if values.ndim < 2 or values.shape[-1] != values.shape[-2]:
-        raise ValueError(f"{name}: shape {values.shape} is not that of square matrices")
-    largest = np.abs(values).max()
-    mirrored = np.swapaxes(values, -1, -2)
-    if np.abs(values - mirrored).max() > _ROUNDING * largest:
-        raise ValueError(f"{name}: {shown(array)} is not symmetric")
-    if np.linalg.eigvalsh(0.5 * (values + mirrored)).min() < -_ROUNDING * largest:
-        raise ValueError(f"{name}: {shown(array)} is no covariance: it has a negative eigenvalue")
+def _is_covariance(array: np.ndarray) -> bool:
+    if array.ndim < 2 or array.shape[-1] != array.shape[-2] or not np.isfinite(array).all():
+        return False
+    mirrored, slack = np.swapaxes(array, -1, -2), _ROUNDING * np.abs(array).max()
+    lowest = np.linalg.eigvalsh(0.5 * (array + mirrored).astype(float)).min()
+    return bool(np.abs(array - mirrored).max() <= slack and lowest >= -slack)
 
 
 Count = Annotated[int, whole(1)]
@@ -308,31 +262,25 @@ Share = Annotated[float, share()]
 InnerShare = Annotated[float, number(lambda x: 0 < x < 1, "a number in (0, 1)")]
 Exponent = Annotated[float, number(lambda x: 0 < x <= 1, "a number in (0, 1]")]
 # For arrays: `Annotated[Float[Array, " d"], POSITIVE]`.
-POSITIVE = entries(lambda array: (array > 0) & np.isfinite(array), "positive and finite")
+POSITIVE = entries(lambda array: (array > 0) & np.isfinite(array), "positive and finite throughout")
 NOT_NEGATIVE = entries(lambda array: (array >= 0) & np.isfinite(array), "finite and not negative")
-FINITE = entries(np.isfinite, "finite")
-COVARIANCE = Rule(_check_covariance, "a covariance")
-_FUNCTION = of(lambda value: callable(value) and not isinstance(value, type), "a function")
-_FLAG = of(lambda value: isinstance(value, bool | np.bool_), "True or False")
+FINITE = entries(np.isfinite, "finite throughout")
+COVARIANCE = entries(_is_covariance, "a covariance, symmetric without a negative eigenvalue")
 
 
 def check(hint: Any, what: str = "", /, **arguments: Any) -> None:
     """Check each argument by an annotation; `what` says in words what it should be."""
+    rule = _rule(hint) or _instance(hint)
     for name, value in arguments.items():
-        rule = _rule(hint) or _instance(hint)
-        if what:
-            rule = of(rule.holds, what)
-        rule.check(value, name)
+        (of(rule.holds, what) if what else rule).check(value, name)
 
 
 class Checked(eqx.Module):
     """A base of classes whose fields are checked by their annotations."""
 
     def __check_init__(self) -> None:
-        rules = _rules(type(self))
-        for field in dataclasses.fields(self):
-            if field.name in rules:
-                rules[field.name].check(getattr(self, field.name), field.name)
+        for name, rule in _rules(type(self)).items():
+            rule.check(getattr(self, name), name)
 
 
 class Fitting(Checked):
@@ -344,20 +292,15 @@ class Fitting(Checked):
 
     def __check_init__(self) -> None:
         super().__check_init__()
-        known: dict[str, Any] = {}
-        said: dict[str, str] = {}
-        for name, choices in _shapes(type(self)).items():
-            shape = getattr(getattr(self, name), "shape", None)
-            if shape is None:
-                continue
-            found = [_lengths(shape, axes) for axes in choices]
-            fitting = [own for own in found if own is not None and _agree(own, known)]
-            if not fitting:
-                shapes = " or ".join(f"({', '.join(axes)})" for axes in choices)
-                known_by = ", ".join(f"{word} is {known[word]} by {said[word]}" for word in known)
-                raise ValueError(f"{name}: shape {shape} is not {shapes}, where {known_by}")
-            said = dict.fromkeys(fitting[0], name) | said
-            known |= fitting[0]
+        fitting: dict[str, tuple[int, ...]] = {}
+        with jaxtyping.jaxtyped("context"):
+            for name, kinds in _arrays(type(self)).items():
+                if (value := getattr(self, name)) is None:
+                    continue
+                if not isinstance(value, kinds):
+                    axes = " or ".join(f"({', '.join(kind.dim_str.split())})" for kind in kinds)
+                    raise ValueError(f"{name}: shape {value.shape} is not {axes}, with {fitting}")
+                fitting[name] = value.shape
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
@@ -375,20 +318,8 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     return call
 
 
-def checked_by(check: Callable[[Any, str], None]) -> Callable[[type[T]], type[T]]:
-    """For a class: arguments of it are checked by `check`, which takes a value and its name.
-
-    Without it they must be instances.
-    """
-
-    def marked(kind: type[T]) -> type[T]:
-        _CHECKS[kind] = check
-        return kind
-
-    return marked
-
-
-_CHECKS: dict[type, Callable[[Any, str], None]] = {}
+# By class: how an argument of it is checked, if not as an instance.
+CHECKS: dict[type, Callable[[Any, str], None]] = {}
 
 
 @functools.cache
@@ -396,6 +327,19 @@ def _rules(owner: Any) -> dict[str, Rule]:
     """By name, the rules for the arguments of a function or the fields of a class."""
     rules = {name: _rule(hint) for name, hint in _hints(owner).items() if name != "return"}
     return {name: rule for name, rule in rules.items() if rule is not None}
+
+
+@functools.cache
+def _arrays(owner: type) -> dict[str, tuple[Any, ...]]:
+    """By name, the kinds of array that a field may be."""
+    return {name: kinds for name, hint in _hints(owner).items() if (kinds := _array_kinds(hint))}
+
+
+def _array_kinds(hint: Any) -> tuple[Any, ...]:
+    if isinstance(hint, type) and hasattr(hint, "dim_str"):
+        return (hint,)
+    parts = () if typing.get_origin(hint) is Callable else typing.get_args(hint)
+    return tuple(kind for part in parts for kind in _array_kinds(part))
 
 
 def _hints(owner: Any) -> dict[str, Any]:
@@ -408,37 +352,6 @@ def _hints(owner: Any) -> dict[str, Any]:
     return hints
 
 
-@functools.cache
-def _shapes(owner: type) -> dict[str, list[list[str]]]:
-    """By name, the shapes that an array may have, each as the words of its axes."""
-    shapes = {name: _axes(hint) for name, hint in _hints(owner).items()}
-    return {name: choices for name, choices in shapes.items() if choices}
-
-
-def _axes(hint: Any) -> list[list[str]]:
-    words = getattr(hint, "dim_str", None)
-    if words is not None:
-        return [words.split()]
-    parts = [] if typing.get_origin(hint) is Callable else typing.get_args(hint)
-    return [choice for part in parts for choice in _axes(part)]
-
-
-def _lengths(shape: tuple[int, ...], axes: list[str]) -> dict[str, Any] | None:
-    """What each word stands for; None where the shape is not of these axes."""
-    if axes and axes[0].startswith("*"):
-        split = max(len(shape) - len(axes) + 1, 0)
-        shape = (shape[:split], *shape[split:])  # pyright: ignore[reportAssignmentType]
-    found: dict[str, Any] = {}
-    fits = len(shape) == len(axes) and all(
-        found.setdefault(axis, length) == length for axis, length in zip(axes, shape, strict=True)
-    )
-    return found if fits else None
-
-
-def _agree(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    return all(one[word] == other[word] for word in one.keys() & other.keys())
-
-
 def _is_ours(kind: type) -> bool:
     return kind.__module__.startswith("mpfjax.")
 
@@ -449,46 +362,30 @@ def _rule(hint: Any) -> Rule | None:
     if origin is Annotated:
         return next((extra for extra in choices[1:] if isinstance(extra, Rule)), None)
     if origin in (typing.Union, types.UnionType):
-        return _any_of([_rule(choice) for choice in choices if choice is not types.NoneType])
+        known = [rule for choice in choices if (rule := _rule(choice)) is not None]
+        holds = lambda value: any(rule.holds(value) for rule in known)  # noqa: E731
+        what = " or ".join(rule.what for rule in known)
+        return of(holds, what) if len(known) == len(choices) else None
     if origin is Literal:
         return one_of(choices)
     if origin is Callable:
-        return _FUNCTION
+        return of(lambda value: callable(value) and not isinstance(value, type), "a function")
     if hint is bool:
-        return _FLAG
-    if getattr(hint, "dtype", None) is jaxtyping.Key and hint.index_variadic is None:
-        is_batch = len(hint.dims) > 0
-        return Rule(lambda value, name: check_key(value, name, batch=is_batch), "typed keys")
-    if hint in _CHECKS:
-        return Rule(_CHECKS[hint], hint.__name__)
+        return of(lambda value: isinstance(value, bool | np.bool_), "True or False")
+    if hint is types.NoneType:
+        return of(lambda value: value is None, "None")
+    if getattr(hint, "dtype", None) is jaxtyping.Key:
+        made = "split(jax.random.key(0), runs)" if hint.dims else "key(0)"
+        has_keys = lambda value: isinstance(value, hint) and value.size > 0  # noqa: E731
+        return of(has_keys, f"of typed keys, as jax.random.{made}")
+    if hint in CHECKS:
+        return Rule(CHECKS[hint], hint.__name__)
     return _instance(hint) if isinstance(hint, type) and _is_ours(hint) else None
 
 
 def _instance(kind: type) -> Rule:
-    what = f"{'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
-
-    def check(value: Any, name: str) -> None:
-        if not isinstance(value, kind):
-            hint = f"; write {value.__name__}(...)" if isinstance(value, type) else ""
-            raise ValueError(f"{name}: {shown(value)} is not {what}{hint}")
-
-    return Rule(check, what)
-
-
-def _any_of(rules: list[Rule | None]) -> Rule | None:
-    """The rule that lets pass None and what one of these does; None where one checks nothing."""
-    known = [rule for rule in rules if rule is not None]
-    if len(known) < len(rules):
-        return None
-    what = " or ".join(rule.what for rule in known)
-
-    def check(value: Any, name: str) -> None:
-        if value is None:
-            return
-        rule = known[0] if len(known) == 1 else of(lambda v: any(r.holds(v) for r in known), what)
-        rule.check(value, name)
-
-    return Rule(check, what)
+    article = "an" if kind.__name__[0] in "AEIO" else "a"
+    return of(lambda value: isinstance(value, kind), f"{article} {kind.__name__}")
 
 
 def optional(module: str, package: str) -> types.ModuleType:

@@ -10,7 +10,7 @@ from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead
 from mpfjax.models.base import AbstractStateSpaceModel, mapped
 from mpfjax.models.conditionally_linear import is_marginalised, refuse_marginalised
-from mpfjax.models.multi_object import MultiObjectModel, require_multi_object
+from mpfjax.models.multi_object import MultiObjectModel
 from mpfjax.models.noise import Noise
 from mpfjax.moves.base import AbstractMove, Gradient, as_moves
 from mpfjax.moves.every import Every
@@ -216,7 +216,6 @@ def partitioned_sampling(
     hardly recover from an occlusion. It is unbiased in every order, also with an interaction.
     `scheme` and `ess_threshold` are those of the resampling between steps and objects.
     """
-    require_multi_object(model, "partitioned_sampling")
     between = Resample(scheme, ess_threshold, allocation="equal")
     moves = [Resample(scheme, ess_threshold), Partitioned(model, order, resample=between)]
     return Filter(model, moves, num_particles)
@@ -243,7 +242,6 @@ def distributed_partitioned_sampling(
     it where it is unknown which object will be hard to track, and N/C particles are enough to track
     all.
     """
-    require_multi_object(model, "distributed_partitioned_sampling")
     orders = "circular" if orders is None else orders
     between = Resample(scheme, ess_threshold, allocation="equal")
     partitioned = Partitioned(model, orders, resample=between, reassembly=reassembly)
@@ -268,7 +266,6 @@ def independent_particle_filters(
     that cross may end on the same object. Estimates are after resampling; see
     `PropagateIndependently`.
     """
-    require_multi_object(model, "independent_particle_filters")
     return Filter(model, [PropagateIndependently(model, scheme=scheme)], num_particles)
 
 

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import POSITIVE, Checked, Count, Positive, checked, to_array
-from mpfjax.models.base import has_attribute, model_name
+from mpfjax.models.base import require
 from mpfjax.operations.matrices import cholesky, solve_lower
 from mpfjax.operations.random import normal
 
@@ -142,8 +142,8 @@ class GaussNewtonProposal(_GaussianProposal):
     - `model`: has `transition_mean`, `observation_mean`, `transition_covariance`, (d, d), and
       `observation_covariance`, (p, p). States are one array, (n,) or (n, d); Q is invertible.
 
-    Raises `ValueError` for a model without these, no iterations, or an inflation not above 0. Use
-    it where bootstrap particles mostly miss the likelihood.
+    Raises `ValueError` for a model without these means, no iterations, or an inflation not above 0.
+    Use it where bootstrap particles mostly miss the likelihood.
     """
 
     model: Any
@@ -151,11 +151,8 @@ class GaussNewtonProposal(_GaussianProposal):
     inflation: Positive = eqx.field(static=True, default=1.1)
 
     def __check_init__(self) -> None:
-        for moment in ("mean", "covariance"):
-            for name in (f"transition_{moment}", f"observation_{moment}"):
-                if not has_attribute(self.model, name):
-                    needed = f"{name}, which GaussNewtonProposal needs"
-                    raise ValueError(f"model: {model_name(self.model)} defines no {needed}")
+        for mean in ("transition_mean", "observation_mean"):
+            require(self.model, mean, "GaussNewtonProposal")
 
     def propose_from_noise(
         self,

@@ -347,14 +347,14 @@ REFUSED = (
     # observations
     (r"observations: shapes .* jnp.asarray\(observations\)", lambda: run(FILTER, [0.0, 1.0])),
     ("observations: NaN or infinite at index 1", lambda: run(FILTER, np.array([0.0, NAN, 1.0]))),
-    ("observations: complex128 is complex", lambda: run(FILTER, np.array([0.0, 1j]))),
+    ("observations: .* is no array of real numbers", lambda: run(FILTER, np.array([0.0, 1j]))),
     (r"observations: 1e\+300 is more than float32", lambda: run(FILTER, np.array([0.0, 1e300]))),
     (r"observation: shape \(2,\)", lambda: run(FILTER, jnp.zeros((3, 2)))),
     # what a model's methods return
     ("model: DriftOfOne.sample_initial.*per_particle",
      lambda: mpfjax.particle_filter(DriftOfOne(), 10)),
     *(
-        (f"model: Changed.{method} returned",
+        (f"model: Changed.{method}.* returned",
          lambda method=method, v=value: run_of(changed(Batched, **{method: lambda *given: v})))
         for method, value in (
             ("sample_initial", jnp.zeros((3, 10))), ("sample_transition", jnp.zeros(10, int)),
@@ -362,7 +362,7 @@ REFUSED = (
             ("log_likelihood", jnp.zeros(10, complex)),
         )
     ),
-    (r"model: Changed.log_transition returned shape \(3,\)",
+    (r"model: Changed.log_transition returned .*, \(10,\)",
      lambda: run_of(changed(Batched, log_transition=lambda *given: THREE), gradient="stop")),
     *(
         (f"model: Changed.{method} returned",
@@ -376,12 +376,14 @@ REFUSED = (
     # how models' arrays fit together, and exact answers
     (r"Q: shape \(2, 2\) is not \(d, d\)",
      lambda: mpfjax.LinearGaussianModel(**LINEAR | {"Q": np.eye(2)})),
-    ("transition_matrix: .* do not sum to one",
+    ("(?s)transition_matrix: .* rows that sum to one",
      lambda: mpfjax.SwitchingLinearGaussianModel(**PARTS | {"transition_matrix": 0.6 * EYE})),
     *(
-        (f"(?s)R: .* {what}", lambda R=R: mpfjax.SwitchingLinearGaussianModel(
-            **PARTS | {"H": np.ones((2, 1)), "R": R}))
-        for R, what in (([[1, 0.5], [0, 1]], "not symmetric"), ([[1, 2], [2, 1]], "negative eig"))
+        ("(?s)R: .* is not a covariance", lambda kind=kind, R=R: kind(
+            **(LINEAR if kind is mpfjax.LinearGaussianModel else PARTS)
+            | {"H": np.ones((2, 1)), "R": R}))
+        for kind in (mpfjax.LinearGaussianModel, mpfjax.SwitchingLinearGaussianModel)
+        for R in ([[1, 0.5], [0, 1]], [[1, 2], [2, 1]])
     ),
     ("high: 1.0 is not above low", lambda: mpfjax.QuadraticModel(low=1.0, high=1.0)),
     (r"observations: shape \(2,\) is not \(t, 1\)",
@@ -436,7 +438,7 @@ REFUSED = (
         changed(Drift, sample_initial=lambda self, key, n: jnp.zeros((n, 9))), noise="rqmc")),
     ("propagate: gradient 'stop'",
      lambda: mpfjax.PropagateNested(Propagate(MODEL, gradient="stop"))),
-    ("exponents: .* do not rise", lambda: mpfjax.PropagateTempered(MODEL, exponents=(0.1, 0.5))),
+    ("exponents: .* that rise", lambda: mpfjax.PropagateTempered(MODEL, exponents=(0.1, 0.5))),
     ("resample: sort_by", lambda: mpfjax.PropagateTempered(MODEL, Resample(sort_by="hilbert"))),
     ("comes before any propagation: there is no x_t yet",
      lambda: run(Filter(MODEL, [mpfjax.RandomWalkMetropolis(MODEL), Propagate(MODEL)], 4))),

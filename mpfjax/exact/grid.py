@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.checks import real_arrays, shown
+from mpfjax.checks import real_array, shown
 from mpfjax.models.base import check_log_density, require, saying_that_none_were_given, with_inputs
 from mpfjax.models.conditionally_linear import refuse_marginalised
 from mpfjax.models.observations import Series, as_series
@@ -75,7 +75,7 @@ def grid_filter(
     if log_initial is None:
         require(model, "log_initial", "grid_filter without log_initial")
     else:
-        log_initial = real_arrays(str(len(points)), log_initial=log_initial)
+        log_initial = real_array(str(len(points)), "log_initial", log_initial)
     series = as_series(observations, model, inputs, missing)
     with saying_that_none_were_given(model):
         return _grid_filter(model, series, points, width, log_initial, state_shape)
@@ -90,7 +90,7 @@ def _width(grid: Any) -> Any:
 
 def _checked_grid(grid: Any) -> tuple[Float[Array, " g"], Any]:
     """The points and the width; a `ValueError` unless they ascend evenly, as far as is known."""
-    points = real_arrays("points", grid=grid)
+    points = real_array("points", "grid", grid)
     if len(points) < 2:
         raise ValueError(f"grid: shape {points.shape} is not that of two points or more")
     width = _width(grid)

@@ -6,14 +6,12 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.checks import as_numbers, check_shape, checked
+from mpfjax.checks import as_numbers, checked
 from mpfjax.models.base import with_inputs
 from mpfjax.models.linear import LinearGaussianModel
-from mpfjax.models.observations import Series, gathered, steps_of_inputs
+from mpfjax.models.observations import Series, gathered, present_steps, steps_of_inputs
 from mpfjax.operations.matrices import cholesky
 
 
@@ -112,21 +110,12 @@ def _checked(model: Any, data: PyTree, inputs: PyTree, missing: str) -> tuple[Ar
 
 def checked_rows(series: Series, num_rows: int, dtype: jnp.dtype) -> Float[Array, "t p"]:
     """y_1..y_t as an array of this type, NaN where missing; a `ValueError` for what is none."""
-    rows = jnp.asarray(as_numbers("observations", series.observations, floating=True))
+    rows = as_numbers("observations", series.observations, floating=True)
     if rows.ndim != 2 or rows.shape[1] != num_rows:
         raise ValueError(f"observations: shape {rows.shape} is not (t, {num_rows})")
-    takes_nan = series.skips_missing
-    if series.present is not None:
-        check_shape(f"{len(rows)}", present=series.present)
-        rows, takes_nan = jnp.where(jnp.asarray(series.present)[:, None], rows, jnp.nan), True
-    if not isinstance(rows, Tracer):
-        values = np.asarray(rows)
-        usable = ~np.isinf(values) if takes_nan else np.isfinite(values)
-        if not usable.all():
-            what = "infinite" if takes_nan else "NaN or infinite"
-            first = int(np.argmin(usable.all(axis=1)))
-            raise ValueError(f"observations: {what} at index {first} of the leading axis")
-    return rows.astype(dtype)
+    present = present_steps(rows, series, takes_nan=series.skips_missing)
+    rows = jnp.asarray(rows).astype(dtype)
+    return rows if present is None else jnp.where(present[:, None], rows, jnp.nan)
 
 
 @eqx.filter_jit

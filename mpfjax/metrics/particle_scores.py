@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from mpfjax.checks import NOT_NEGATIVE, checked, real_arrays
+from mpfjax.checks import NOT_NEGATIVE, checked, real_array
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.models.base import AbstractStateSpaceModel
 from mpfjax.models.observations import one_observation
@@ -31,10 +31,10 @@ def crps(
     of the forecast's mixtures. Raises `ValueError` for anything but arrays of real numbers, for
     shapes that do not fit, and for a weight below zero.
     """
-    values = real_arrays("... n", values=values)
+    values = real_array("... n", "values", values)
     *batch, n = map(str, values.shape)
-    weights = real_arrays(" ".join([*batch, n]), weights=weights)
-    observations = real_arrays(" ".join(batch), observations=observations)
+    weights = real_array(" ".join([*batch, n]), "weights", weights)
+    observations = real_array(" ".join(batch), "observations", observations)
     errors = jnp.where(weights > 0, values - observations[..., None], 0.0)
     order = jnp.argsort(errors, axis=-1)
     errors = jnp.take_along_axis(errors, order, axis=-1)

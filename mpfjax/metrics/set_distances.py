@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.checks import Positive, check_shape, checked, number, real_arrays
+from mpfjax.checks import Positive, check_shape, checked, number, real_array
 
 Order = Annotated[float, number(lambda p: 1 <= p < np.inf, "a finite number of at least 1")]
 Alpha = Annotated[float, number(lambda alpha: 0 < alpha <= 2, "a number in (0, 2]")]
@@ -152,8 +152,8 @@ def _paired(
     base_distance: Callable[[Array, Array], Array],
 ) -> _Pairing:  # fmt: skip
     """The cheapest pairing of the two sets; a `ValueError` for sets that will not do."""
-    estimates = real_arrays("number d", estimates=estimates)
-    truths = real_arrays("number d", truths=truths)
+    estimates = real_array("number d", "estimates", estimates)
+    truths = real_array("number d", "truths", truths)
     is_estimate = _mask("estimate_mask", estimate_mask, estimates.shape[0])
     is_truth = _mask("truth_mask", truth_mask, truths.shape[0])
     distances = base_distance(estimates, truths) / cutoff

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mpfjax.checks import Count, checked, real_arrays
+from mpfjax.checks import Count, checked, real_array
 
 
 class TrackingQuality(NamedTuple):
@@ -104,8 +104,8 @@ def tracking_quality(
     it. `num_last` is that of `recovery_rate`. Raises `ValueError` for no runs or no frames, for
     boxes of other shapes, and as `recovery_rate` does.
     """
-    estimates = real_arrays("runs t objects 4", estimates=estimates)
-    truth = real_arrays(" ".join(map(str, estimates.shape[1:])), truth=truth)
+    estimates = real_array("runs t objects 4", "estimates", estimates)
+    truth = real_array(" ".join(map(str, estimates.shape[1:])), "truth", truth)
     present = jnp.all(jnp.isfinite(truth), axis=-1)
     states = track_state(estimates, truth[None])
     tracked = states.astype(estimates.dtype)

@@ -13,15 +13,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Count, check, checked_by, kinds, shown
+from mpfjax.checks import CHECKS, Count, check, check_one_each, kinds, shown
 from mpfjax.models.noise import noise_dtype
 from mpfjax.operations.random import direction_numbers, normal, split
 
 
-@checked_by(lambda model, name: require_model(model, "a filter", name))
 class AbstractStateSpaceModel(eqx.Module):
     """A Markov state x_t with observations y_t; all methods act on all particles at once.
 
@@ -101,14 +99,6 @@ def takes_inputs(model: Any) -> bool:
     return "inputs" in type(model).__dataclass_fields__ or not is_default
 
 
-def has_attribute(model: Any, name: str) -> bool:
-    """Whether the model has it; a property may need inputs, which are not there before a run."""
-    try:
-        return hasattr(model, name)
-    except Exception:
-        return True
-
-
 def with_inputs(model: Any, inputs: PyTree) -> Any:
     """The model with u_t, or unchanged where there is none, or where it takes none."""
     if inputs is None or not takes_inputs(model):
@@ -171,6 +161,8 @@ def require_noise(model: Any, needed_by: str) -> None:
 
 def require(model: Any, method: str, needed_by: str, argument: str = "model") -> None:
     """Raise a `ValueError` where `model` lacks `method`, before anything compiles."""
+    if isinstance(model, type):
+        raise ValueError(f"{argument}: {shown(model)} is a class; write {model.__name__}(...)")
     if not callable(getattr(model, method, None)):
         who = shown(model) if model is None else model_name(model)
         raise ValueError(f"{argument}: {who} defines no {method}, which {needed_by} needs")
@@ -194,39 +186,28 @@ def _innermost(model: Any) -> Any:
     return model if inner is model else _innermost(inner)
 
 
-def require_model(model: Any, needed_by: str, argument: str = "model") -> None:
+def require_model(model: Any, argument: str) -> None:
     """Raise a `ValueError` for anything but a model, and for one written for a single particle."""
-    if isinstance(model, type):
-        raise ValueError(f"{argument}: {shown(model)} is a class; write {model.__name__}(...)")
-    for method in ("sample_initial", "sample_transition", "log_likelihood"):
+    law, needed_by = "sample_transition", "a filter"
+    if getattr(type(model), law, None) is _FROM_NOISE and not hasattr(model, "latent_dynamics"):
+        law, needed_by = "transition_from_noise", "a model without sample_transition"
+    for method in ("sample_initial", law, "log_likelihood"):
         require(model, method, needed_by, argument)
-    has_law = hasattr(model, "transition_from_noise") or hasattr(model, "latent_dynamics")
-    if getattr(type(model), "sample_transition", None) is _FROM_NOISE and not has_law:
-        raise ValueError(
-            f"{argument}: {model_name(model)} defines no sample_transition, nor"
-            f" transition_from_noise, one of which {needed_by} needs"
-        )
     try:
-        signature = inspect.signature(model.sample_initial)
-    except (TypeError, ValueError):  # functions not written in Python cannot be inspected
-        return
-    try:
-        signature.bind("key", "num_particles")
+        inspect.signature(model.sample_initial).bind("key", "num_particles")
     except TypeError as error:
         raise ValueError(
-            f"{argument}: {model_name(model)}.sample_initial{signature} takes no (key,"
-            " num_particles); if it is of one particle, wrap it, mpfjax.per_particle(model)"
+            f"{argument}: {model_name(model)}.sample_initial takes no (key, num_particles); if it"
+            " is of one particle, wrap it, mpfjax.per_particle(model)"
         ) from error
+
+
+CHECKS[AbstractStateSpaceModel] = require_model
 
 
 def check_states(states: Any, model: Any, method: str, num_particles: int) -> None:
     """Raise a `ValueError` for states of another number of particles, or no states at all."""
-    leaves = jax.tree.leaves(states)
-    if not leaves or any(np.shape(leaf)[:1] != (num_particles,) for leaf in leaves):
-        raise ValueError(
-            f"model: {model_name(model)}.{method} returned {shown(jax.tree.map(np.shape, states))},"
-            f" no shapes whose leading axis is the number of particles, {num_particles}"
-        )
+    check_one_each(num_particles, **{f"model: {model_name(model)}.{method}": states})
 
 
 def check_moved(
@@ -245,12 +226,14 @@ def check_log_density(
     values: Any, model: Any, method: str, num_particles: int
 ) -> Float[Array, " n"]:
     """The result of a density of the model; a `ValueError` unless it is one real number each."""
+    return real_each(values, f"model: {model_name(model)}.{method}", num_particles)
+
+
+def real_each(values: Any, who: str, num_particles: int) -> Float[Array, " n"]:
+    """What the user's function returned; a `ValueError` unless it is one real number a particle."""
     if getattr(values, "shape", None) != (num_particles,) or jnp.iscomplexobj(values):
-        found = f"shape {values.shape}" if hasattr(values, "shape") else shown(values)
-        raise ValueError(
-            f"model: {model_name(model)}.{method} returned {found}, not one real value a particle,"
-            f" ({num_particles},)"
-        )
+        real = f"one real value a particle, ({num_particles},)"
+        raise ValueError(f"{who} returned {shown(values)}, not {real}")
     return jnp.asarray(values)
 
 
@@ -346,8 +329,6 @@ def per_particle(model: Any) -> AbstractStateSpaceModel:
 
     Raises `ValueError` where one of the three methods is missing.
     """
-    if isinstance(model, type):
-        raise ValueError(f"model: {shown(model)} is a class; write {model.__name__}(...)")
     from_noise = hasattr(model, "transition_from_noise") and hasattr(model, "noise_dimension")
     for method in ("sample_initial", "sample_transition", "log_likelihood"):
         if not (from_noise and method == "sample_transition"):

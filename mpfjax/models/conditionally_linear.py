@@ -3,11 +3,11 @@ particle, which carries the moments of the rest in place of a draw.
 """
 
 import abc
+import operator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
 from mpfjax.checks import shown
@@ -217,11 +217,9 @@ def log_latent_density(model: Any, latent: Array, state: MarginalisedState) -> F
 
 def latent_rows(model: Any, latent: Any) -> Float[Array, "k n"]:
     """z_t of the mixed form with the particles last; a `ValueError` for other than one array."""
-    if not isinstance(latent, jax.Array | np.ndarray) or latent.ndim != 2:
-        raise ValueError(
-            f"model: {model_name(model)} has latent_dynamics, so that its latent must be one array"
-            f" (n, k), and it is {shown(latent)}"
-        )
+    if getattr(latent, "ndim", None) != 2:
+        who = f"model: {model_name(model)}, which has latent_dynamics,"
+        raise ValueError(f"{who} has the latent {shown(latent)}, not one array (n, k)")
     return jnp.asarray(latent).T
 
 
@@ -293,8 +291,8 @@ def observation_rows(
     p, shape = seen.matrix.shape[0], getattr(found, "shape", None)
     if shape != (p,) and not (p == 1 and shape == ()):
         raise ValueError(
-            f"observation: shape {shape} of {shown(found)} is not ({p},), the rows of H that"
-            f" {model_name(model)}.emission returned; linear_observation may pick y_t"
+            f"observation: shape {shape} is not ({p},), the rows of H by {model_name(model)};"
+            " linear_observation may pick y_t"
         )
     return jnp.reshape(jnp.asarray(found, dtype), (p, 1))
 
@@ -309,13 +307,12 @@ def _length(parts: Any, place: int, axis: int) -> int:
 
 def _checked(model: Any, method: str, parts: Any, n: int, **shapes: tuple[int, ...]) -> list[Array]:
     """The arrays that a method returned, one for all particles or one for each."""
-    who = f"model: {model_name(model)}.{method} returned"
-    is_tuple = isinstance(parts, tuple | list) and len(parts) == len(shapes)
-    if not is_tuple or not all(isinstance(part, jax.Array | np.ndarray) for part in parts):
-        raise ValueError(f"{who} {shown(parts)}, not the arrays {', '.join(shapes)}")
-    for (name, shape), part in zip(shapes.items(), parts, strict=True):
-        if part.shape not in (shape, (n, *shape)):
-            raise ValueError(
-                f"{who} {name} of shape {part.shape}, which is neither {shape} nor {(n, *shape)}"
-            )
-    return [jnp.asarray(part) for part in parts]
+    arrays = list(parts) if isinstance(parts, tuple | list) else []
+    found = [getattr(array, "shape", None) for array in arrays]
+    wanted = [(shape, (n, *shape)) for shape in shapes.values()]
+    if len(found) != len(wanted) or not all(map(operator.contains, wanted, found)):
+        raise ValueError(
+            f"model: {model_name(model)}.{method} returned {shown(found or parts)}, not arrays of"
+            f" shapes {shapes}, or with a leading axis of {n}"
+        )
+    return [jnp.asarray(array) for array in arrays]

@@ -3,13 +3,11 @@ and second-order autoregression.
 """
 
 import abc
-from collections.abc import Sequence
 from typing import Annotated, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from mpfjax.checks import (
@@ -18,8 +16,9 @@ from mpfjax.checks import (
     POSITIVE,
     Fitting,
     InnerShare,
-    shown,
+    entries,
     to_array,
+    to_numbers,
 )
 from mpfjax.operations.matrices import cholesky, row_sums, solve_lower
 from mpfjax.operations.random import fast_key, normal, split_once
@@ -179,11 +178,9 @@ class RandomWalkWithJumps(RandomWalk):
         return jnp.logaddexp(log_odds[0] + short, log_odds[1] + long)
 
 
-def _as_shares(gain: Any) -> tuple[float, ...]:
-    try:
-        return tuple(map(float, np.ravel(gain)))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"gain: {shown(gain)} is no number, nor one a coordinate") from error
+Shares = Annotated[
+    tuple[float, ...], entries(lambda shares: (shares >= 0) & (shares <= 1), "in [0, 1] throughout")
+]
 
 
 class WalkWithVelocity(AbstractDynamics):
@@ -202,7 +199,7 @@ class WalkWithVelocity(AbstractDynamics):
     - `initial_velocity`: deviations of v_0 about 0, of the shape of the walk's deviations, in units
       of the state a frame; None takes 0.
 
-    Raises `ValueError` for a gain outside [0, 1], a negative deviation and shapes that do not fit.
+    Raises `ValueError` for a gain outside [0, 1] and a negative deviation.
     Use it where objects keep their velocity: look-alikes that cross keep their identities, and a
     hidden object moves on.
     """
@@ -210,19 +207,10 @@ class WalkWithVelocity(AbstractDynamics):
     order = 2
 
     walk: RandomWalk
-    gain: float | Sequence[float] = eqx.field(static=True, converter=_as_shares, default=0.1)
+    gain: Shares = eqx.field(static=True, converter=to_numbers("gain"), default=0.1)
     initial_velocity: Annotated[Float[Array, "*n d"], NOT_NEGATIVE] | None = eqx.field(
         converter=to_array("initial_velocity"), default=None
     )
-
-    def __check_init__(self) -> None:
-        super().__check_init__()
-        shape, gain = self.shape, np.asarray(self.gain)
-        if len(gain) not in (1, shape[-1]) or not ((gain >= 0) & (gain <= 1)).all():
-            raise ValueError(f"gain: {self.gain} is not one or {shape[-1]} numbers in [0, 1]")
-        start = self.initial_velocity
-        if start is not None and start.shape != shape:
-            raise ValueError(f"initial_velocity: shape {start.shape} is not {shape}, the walk's")
 
     @property
     def noise_dimension(self) -> int:

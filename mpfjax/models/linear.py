@@ -1,23 +1,20 @@
 """Linear-Gaussian models: one system, and K of them with a Markov chain that chooses one."""
 
 import dataclasses
-from typing import Annotated, Any
+from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from mpfjax.checks import (
     COVARIANCE,
     FINITE,
-    NOT_NEGATIVE,
     Fitting,
-    Rule,
     check_shape,
-    shown,
+    entries,
     to_array,
 )
 from mpfjax.models.base import AbstractStateSpaceModel
@@ -30,17 +27,10 @@ from mpfjax.operations.segments import spread
 _IN_TIME = ("A", "Q", "H", "R", "B", "inputs")
 # Sums of probabilities may differ from one by this much, for rounding.
 _ROUNDING = 1e-4
-
-
-def _check_probabilities(array: Any, name: str) -> None:
-    NOT_NEGATIVE.check(array, name)
-    if isinstance(array, Tracer | jax.ShapeDtypeStruct):
-        return
-    if np.abs(np.atleast_1d(array).sum(axis=-1) - 1).max() > _ROUNDING:
-        raise ValueError(f"{name}: {shown(array)} has rows that do not sum to one")
-
-
-PROBABILITIES = Rule(_check_probabilities, "probabilities along the last axis")
+PROBABILITIES = entries(
+    lambda rows: (rows >= 0).all() & (np.abs(rows.sum(axis=-1) - 1) <= _ROUNDING),
+    "probabilities, rows that sum to one",
+)
 # One of all regimes, or one for each.
 VectorOfEach = Float[Array, " d"] | Float[Array, "k d"]
 SquareOfEach = Float[Array, "d d"] | Float[Array, "k d d"]
@@ -61,16 +51,16 @@ class LinearGaussianModel(AbstractStateSpaceModel, Fitting):
     {"A": ..., "Q": ..., "inputs": ...}: each is that field at step t. So the matrices of a
     continuous-time system at irregular times are inputs too.
 
-    Raises `ValueError` for shapes that do not fit together. Use it to compare a filter
-    with the Kalman filter, or where the system is linear.
+    Raises `ValueError` for shapes that do not fit together, and for Q, R or P0 that is no
+    covariance. Use it to compare a filter with the Kalman filter, or where the system is linear.
     """
 
     A: Annotated[Float[Array, "d d"], FINITE] = eqx.field(converter=to_array("A"))
-    Q: Annotated[Float[Array, "d d"], FINITE] = eqx.field(converter=to_array("Q"))
+    Q: Annotated[Float[Array, "d d"], COVARIANCE] = eqx.field(converter=to_array("Q"))
     H: Annotated[Float[Array, "p d"], FINITE] = eqx.field(converter=to_array("H"))
-    R: Annotated[Float[Array, "p p"], FINITE] = eqx.field(converter=to_array("R"))
+    R: Annotated[Float[Array, "p p"], COVARIANCE] = eqx.field(converter=to_array("R"))
     m0: Annotated[Float[Array, " d"], FINITE] = eqx.field(converter=to_array("m0"))
-    P0: Annotated[Float[Array, "d d"], FINITE] = eqx.field(converter=to_array("P0"))
+    P0: Annotated[Float[Array, "d d"], COVARIANCE] = eqx.field(converter=to_array("P0"))
     B: Annotated[Float[Array, "d k"], FINITE] | None = eqx.field(
         converter=to_array("B"), default=None
     )

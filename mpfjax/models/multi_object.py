@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import POSITIVE, Count, Fitting, check, checked, to_array
+from mpfjax.checks import POSITIVE, Count, Fitting, checked, to_array
 from mpfjax.mixture import flatten_states
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -311,11 +311,6 @@ class PairwiseRepulsion(Fitting):
 
     def _positions(self, states: PyTree) -> Float[Array, "n k"]:
         return flatten_states(states if self.position is None else self.position(states))
-
-
-def require_multi_object(model: Any, needed_by: str) -> None:
-    """Raise a `ValueError` where `model` is not of several objects."""
-    check(MultiObjectModel, f"a MultiObjectModel, which {needed_by} needs", model=model)
 
 
 def _is_array(leaf: Any) -> bool:

@@ -1,5 +1,6 @@
 """The data of each step: observations, which of them are missing, and known inputs."""
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
@@ -54,7 +55,7 @@ def as_series(data: PyTree, model: Any, inputs: PyTree = None, missing: str = "e
     series = gathered(data, inputs, missing)
     observations = as_arrays(series.observations)
     length = _length(observations, series.observations, "observations")
-    present = _present_steps(observations, series, length, model)
+    present = present_steps(observations, series, getattr(model, "handles_missing", False))
     return Series(observations, steps_of_inputs(series.inputs, length, model), present)
 
 
@@ -89,21 +90,7 @@ def steps_of_inputs(
         raise ValueError(
             f"inputs: the leading axis t is {own_length}, and that of the {of_what} is {length}"
         )
-
-    def check(leaf: Any) -> Any:
-        if not _is_inexact(leaf):
-            return leaf
-        if isinstance(leaf, Tracer):
-            # No value can be named: the check runs with the caller's program.
-            return eqx.error_if(leaf, ~jnp.all(jnp.isfinite(leaf)), "inputs: NaN or infinite")
-        usable = _each_step(np.isfinite(leaf)).all(axis=1)
-        if not usable.all():
-            raise ValueError(
-                f"inputs: NaN or infinite at index {int(np.argmin(usable))} of the leading axis"
-            )
-        return leaf
-
-    return jax.tree.map(check, arrays)
+    return _refused_where(~_usable_steps(arrays, False), arrays, "inputs: NaN or infinite")
 
 
 def one_input(inputs: PyTree, model: Any) -> PyTree:
@@ -111,8 +98,6 @@ def one_input(inputs: PyTree, model: Any) -> PyTree:
     if inputs is None:
         return None
     _require_place_for(inputs, model)
-    if not jax.tree.leaves(inputs):
-        raise ValueError("inputs: there are none")
     return as_arrays(inputs, "inputs")
 
 
@@ -125,14 +110,14 @@ def _require_place_for(inputs: PyTree, model: Any) -> None:
 
 
 def as_arrays(observations: PyTree, name: str = "observations") -> PyTree:
-    """The observations as arrays of numbers that JAX takes as they are."""
+    """The observations as arrays of numbers that JAX takes as they are; a `ValueError` for none."""
+    if not jax.tree.leaves(observations):
+        raise ValueError(f"{name}: there is none")
     return jax.tree.map(lambda leaf: as_numbers(name, leaf), observations)
 
 
 def one_observation(observation: PyTree) -> PyTree:
     """The arrays of y_t; a `ValueError` for none, anything but numbers, and too large ones."""
-    if not jax.tree.leaves(observation):
-        raise ValueError("observation: there is none; use predict to skip it")
     return as_arrays(observation, "observation")
 
 
@@ -174,54 +159,64 @@ def raise_faults(value: PyTree, faults: tuple[Fault, ...]) -> PyTree:
     return value
 
 
-def _present_steps(
-    observations: PyTree, series: Series, length: int, model: Any
-) -> Bool[Array, " t"] | None:
-    """Which observations are there, or None where all are; raises for data that cannot be run."""
-    leaves = jax.tree.leaves(observations)
-    inexact = [leaf for leaf in leaves if _is_inexact(leaf)]
-    mask = series.present
-    if mask is not None:
-        check_shape(f"{length}", present=mask)
-    is_traced = any(isinstance(leaf, Tracer) for leaf in [*inexact, mask])
-    numpy: Any = jnp if is_traced else np
-    takes_nan = getattr(model, "handles_missing", False)
-    whole = numpy.ones(length, bool)
-    present = whole if mask is None else numpy.asarray(mask, bool)
-    usable = whole
-    for leaf in inexact:
-        usable = usable & _each_step(_usable(numpy, leaf, takes_nan)).all(axis=1)
-    if series.skips_missing and not takes_nan:
-        present = present & usable
-    elif series.skips_missing and len(inexact) == len(leaves):  # whole numbers are always there
-        seen = [_each_step(~numpy.isnan(leaf)).any(axis=1) for leaf in inexact]
-        present = present & numpy.stack(seen).any(axis=0)
-    broken = present & ~usable
+def present_steps(observations: PyTree, series: Series, takes_nan: bool) -> Any:
+    """Which observations are there, (t,), or None where all are; raises for data not to be run."""
+    usable, present = _usable_steps(observations, takes_nan), series.present
+    numpy: Any = jnp if any(isinstance(mask, Tracer) for mask in (usable, present)) else np
+    if present is None:
+        present = numpy.ones(usable.shape, bool)
+    check_shape(f"{len(usable)}", present=present)
+    present = numpy.asarray(present, bool)
+    if series.skips_missing:
+        seen = usable
+        if takes_nan:
+            seen = _steps_where(observations, "any", lambda numpy, leaf: ~numpy.isnan(leaf))
+        present = present & seen
     what = "infinite" if takes_nan else "NaN or infinite"
-    if is_traced:  # No value can be named: the check runs with the caller's program.
-        return eqx.error_if(present, broken, f"observations: {what}")
+    hint = "" if takes_nan else "; missing='skip', or Series.skipping, takes them as missing"
+    present = _refused_where(present & ~usable, present, f"observations: {what}", hint)
+    return None if numpy is np and present.all() else jnp.asarray(present)
+
+
+def _usable_steps(arrays: PyTree, takes_nan: bool) -> Any:
+    """At which steps all numbers may be handed to the model."""
+    return _steps_where(arrays, "all", lambda numpy, leaf: _usable(numpy, leaf, takes_nan))
+
+
+def _steps_where(arrays: PyTree, combine: str, holds: Callable[[Any, Any], Any]) -> Any:
+    """At which steps it holds for "all" of the numbers, or for "any"; for whole numbers always."""
+    leaves = jax.tree.leaves(arrays)
+    numpy: Any = jnp if any(isinstance(leaf, Tracer) for leaf in leaves) else np
+    rows = [
+        getattr(holds(numpy, leaf).reshape(len(leaf), -1), combine)(axis=1)
+        if _is_inexact(leaf)
+        else numpy.ones(len(leaf), bool)
+        for leaf in leaves
+    ]
+    return getattr(numpy.stack(rows), combine)(axis=0)
+
+
+def _refused_where(broken: Any, tree: PyTree, fault: str, hint: str = "") -> PyTree:
+    """The tree; a `ValueError` that names the first broken step, if there is one.
+
+    Within a caller's jit no value can be named, and the check runs with the caller's program.
+    """
+    if isinstance(broken, Tracer):
+        return eqx.error_if(tree, broken, fault)
     if broken.any():
-        hint = "" if takes_nan else "; missing='skip', or Series.skipping, takes them as missing"
-        raise ValueError(
-            f"observations: {what} at index {int(np.argmax(broken))} of the leading axis{hint}"
-        )
-    return None if present.all() else jnp.asarray(present)
+        raise ValueError(f"{fault} at index {int(np.argmax(broken))} of the leading axis{hint}")
+    return tree
 
 
 def _length(arrays: PyTree, tree: PyTree, name: str) -> int:
     """t, the length of the leading axis that all leaves share; a `ValueError` without one."""
-    leaves = jax.tree.leaves(arrays)
-    if not leaves:
-        raise ValueError(f"{name}: there are none")
-    lengths = {leaf.shape[0] for leaf in leaves if leaf.ndim}
-    if len(lengths) != 1 or not all(leaf.ndim for leaf in leaves):
-        shapes = [leaf.shape for leaf in leaves]
-        is_list = isinstance(tree, list | tuple)
-        hint = f"; a list is so many arrays, jnp.asarray({name}) is one" if is_list else ""
-        raise ValueError(f"{name}: shapes {shapes} do not share a leading axis t{hint}")
-    if lengths == {0}:
-        raise ValueError(f"{name}: the leading axis t is empty")
-    return lengths.pop()
+    shapes = [leaf.shape for leaf in jax.tree.leaves(arrays)]
+    lengths = {shape[:1] for shape in shapes}
+    if len(lengths) != 1 or lengths & {(), (0,)}:
+        hint = f"; a list is so many arrays, jnp.asarray({name}) is one"
+        hint = hint if isinstance(tree, list | tuple) else ""
+        raise ValueError(f"{name}: shapes {shapes} do not share a leading axis t > 0{hint}")
+    return shapes[0][0]
 
 
 def _is_inexact(leaf: Any) -> bool:
@@ -231,8 +226,3 @@ def _is_inexact(leaf: Any) -> bool:
 def _usable(numpy: Any, leaf: Any, takes_nan: bool) -> Any:
     """Which numbers may be handed to the model."""
     return ~numpy.isinf(leaf) if takes_nan else numpy.isfinite(leaf)
-
-
-def _each_step(mask: Any) -> Any:
-    """The mask with all numbers of a step in one row."""
-    return mask.reshape(mask.shape[0], -1)

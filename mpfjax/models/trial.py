@@ -2,6 +2,7 @@
 series drawn from a model.
 """
 
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -60,15 +61,27 @@ def check_model(
     inputs, observation = one_input(inputs, model), one_observation(observation)
     if is_made_of_noise(model):
         require_noise(model, "check_model")
-    keys = jax.random.split(key, 5)
     with saying_that_none_were_given(model):
-        _check_initial(keys[0], model)
-        states = jax.jit(lambda: _initial(keys[1], model, _FAMILIES))()
-        model = with_inputs(model, inputs)
-        _check_draws(keys[2], model, states)
-        _check_likelihood(keys[3], model, observation, states)
-        if is_mixed(model) or callable(getattr(model, "log_transition", None)):
-            _check_transition(keys[4], model, states)
+        for fault in _faults(key, model, observation, inputs):
+            raise ValueError(f"model: {model_name(model)}.{fault}")
+
+
+def _faults(key: Key[Array, ""], model: Any, observation: PyTree, inputs: PyTree) -> Iterator[str]:
+    """What is wrong with the model's methods, one after the other, by their names."""
+    keys = jax.random.split(key, 5)
+    yield from _of_draws("sample_initial", keys[0], lambda key: _initial(key, model, _DRAWS))
+    if callable(getattr(model, "log_initial", None)):
+        values = model.log_initial(model.sample_initial(key, _DRAWS))
+        if not np.isfinite(check_log_density(values, model, "log_initial", _DRAWS)).all():
+            yield "log_initial is NaN or infinite at draws of sample_initial"
+    starts = jax.jit(lambda: _initial(keys[1], model, _FAMILIES))()
+    model = with_inputs(model, inputs)
+    copies = jax.tree.map(lambda leaf: jnp.repeat(leaf, _DRAWS, axis=0), starts)
+    same = jax.tree.map(lambda leaf: leaf[: _PLACES * _DRAWS], copies)
+    yield from _of_draws("sample_transition", keys[2], lambda key: moved(key, model, same))
+    yield from _of_likelihood(keys[3], model, observation, copies)
+    if is_mixed(model) or callable(getattr(model, "log_transition", None)):
+        yield from _of_transition(keys[4], model, starts)
 
 
 def _initial(key: Key[Array, ""], model: Any, number: int) -> PyTree:
@@ -77,52 +90,28 @@ def _initial(key: Key[Array, ""], model: Any, number: int) -> PyTree:
     return with_moments(model, drawn)
 
 
-def _check_initial(key: Key[Array, ""], model: Any) -> None:
-    """x_0: its draws, and its density at them."""
-    draw = jax.vmap(lambda key: _initial(key, model, _DRAWS))
-    _require_own_noise(jax.jit(draw)(jax.random.split(key, _KEYS)), model, "sample_initial")
-    if callable(getattr(model, "log_initial", None)):
-        drawn = model.sample_initial(key, _DRAWS)
-        values = check_log_density(model.log_initial(drawn), model, "log_initial", _DRAWS)
-        if not np.isfinite(values).all():
-            raise ValueError(
-                f"model: {model_name(model)}.log_initial is NaN or infinite at draws of"
-                " sample_initial"
-            )
+def _of_draws(
+    method: str, key: Key[Array, ""], draw: Callable[[Key[Array, ""]], PyTree]
+) -> Iterator[str]:
+    """Faults of draws for many keys, of particles of a few places side by side.
 
-
-def _check_draws(key: Key[Array, ""], model: Any, states: PyTree) -> None:
-    """x_1, drawn many times from the same few states."""
-    same = jax.tree.map(lambda leaf: jnp.repeat(leaf[:_PLACES], _DRAWS, axis=0), states)
-    draw = jax.vmap(lambda key: moved(key, model, same))
-    draws = jax.jit(draw)(jax.random.split(key, _KEYS))
-    _require_own_noise(draws, model, "sample_transition")
-    for column in _columns(draws):
-        by_place = column.reshape(_KEYS, _PLACES, _DRAWS)
-        if (column == column[:1]).all() and (by_place != by_place[:, :, :1]).any():
-            raise ValueError(
-                f"model: {model_name(model)}.sample_transition gives the same draws for every key;"
-                " draw with the key that it is given"
-            )
-
-
-def _require_own_noise(draws: PyTree, model: Any, method: str) -> None:
-    """Raise a `ValueError` where the mean over particles varies more than that of independent ones.
-
-    The leaves are (keys, particles, ...), with the particles of a place side by side.
+    Their mean must not vary more than that of independent ones.
     """
-    for column in _columns(draws):
-        if np.isnan(column).any():
-            raise ValueError(f"model: {model_name(model)}.{method} draws NaN")
+    for column in _columns(jax.jit(jax.vmap(draw))(jax.random.split(key, _KEYS))):
         by_place = column.reshape(_KEYS, -1, _DRAWS)
+        if np.isnan(column).any():
+            yield f"{method} draws NaN"
+        is_same = (column == column[:1]).all() and (by_place != by_place[:, :, :1]).any()
+        if is_same and method == "sample_transition":
+            yield f"{method} gives the same draws for every key; draw with the key that it is given"
         of_means = by_place.mean(axis=2).var(axis=0, ddof=1).mean()
         expected = by_place.var(axis=2, ddof=1).mean() / _DRAWS
         rounding = (1e-5 * np.abs(column).max()) ** 2
         if of_means > _MOST_RATIO * expected + rounding:
-            raise ValueError(
-                f"model: {model_name(model)}.{method} draws noise that particles share; one key"
-                " serves all of them, so that the shape of what is drawn must begin with their"
-                " number, as jax.random.normal(key, states.shape) does"
+            yield (
+                f"{method} draws noise that particles share; one key serves all of them, so that"
+                " the shape of what is drawn must begin with their number, as"
+                " jax.random.normal(key, states.shape) does"
             )
 
 
@@ -133,27 +122,24 @@ def _columns(draws: PyTree) -> list[np.ndarray]:
     return [row[:, :, k] for row in rows for k in range(row.shape[2])]
 
 
-def _check_likelihood(key: Key[Array, ""], model: Any, observation: PyTree, states: PyTree) -> None:
-    """log L of draws of x_1."""
-    states = jax.tree.map(lambda leaf: jnp.repeat(leaf, _DRAWS, axis=0), states)
-    states = jax.jit(lambda: moved(key, model, states))()
+def _of_likelihood(
+    key: Key[Array, ""], model: Any, observation: PyTree, starts: PyTree
+) -> Iterator[str]:
+    """Faults of log L of draws of x_1."""
+    states = jax.jit(lambda: moved(key, model, starts))()
     density = jax.jit(lambda states: likelihoods(model, observation, states))
     values, half = np.asarray(density(states), float), _FAMILIES * _DRAWS // 2
     others = np.asarray(density(jax.tree.map(lambda leaf: leaf[half:], states)), float)
-    who = f"model: {model_name(model)}.log_likelihood"
     if not (values < np.inf).all():
-        raise ValueError(f"{who} is NaN or +inf at a draw of x_1")
+        yield "log_likelihood is NaN or +inf at a draw of x_1"
     if not np.allclose(values[half:], others, rtol=1e-3, atol=1e-3):
-        raise ValueError(f"{who} of a particle depends on the other particles")
+        yield "log_likelihood of a particle depends on the other particles"
     if (values == -np.inf).all():
-        raise ValueError(
-            f"{who} of the observation is -inf at all of {len(values)} draws of x_1: no particle"
-            " explains it"
-        )
+        yield f"log_likelihood is -inf at all {len(values)} draws of x_1: no particle explains it"
 
 
-def _check_transition(key: Key[Array, ""], model: Any, states: PyTree) -> None:
-    """log D of a draw given its own x_{t-1}, beside that given its siblings."""
+def _of_transition(key: Key[Array, ""], model: Any, states: PyTree) -> Iterator[str]:
+    """Faults of log D of a draw given its own x_{t-1}, beside that given its siblings."""
     key_parents, key_children = jax.random.split(key)
     rows, columns = np.divmod(np.arange(_SIBLINGS**2), _SIBLINGS)
 
@@ -169,28 +155,22 @@ def _check_transition(key: Key[Array, ""], model: Any, states: PyTree) -> None:
     of_each = lambda pair: of_family(*pair)  # noqa: E731
     found = jax.jit(lambda: jax.lax.map(of_each, (jnp.stack(keys, 1), states)))()
     logs, parents = np.asarray(found[0], float), found[1]
-    own = np.diagonal(logs, axis1=1, axis2=2)
-    who = f"model: {model_name(model)}.log_transition"
-    if np.isnan(logs).any() or not np.isfinite(own).all():
-        raise ValueError(f"{who} is NaN, or infinite at a draw of sample_transition")
+    if np.isnan(logs).any() or not np.isfinite(np.diagonal(logs, axis1=1, axis2=2)).all():
+        yield "log_transition is NaN, or infinite at a draw of sample_transition"
     shares = np.exp(logs - logs.max(axis=2, keepdims=True))
     shares /= shares.sum(axis=2, keepdims=True)
-    # Where the shares are right, the expectation of the own value is that of the siblings' values.
-    scores = own - np.sum(shares * np.where(shares > 0, logs, 0.0), axis=2)
-    mean, error = scores.mean(), scores.std() / np.sqrt(scores.size)
-    if abs(mean) > _MOST_ERRORS * error + 1e-3:
-        far = "nearer to" if mean > 0 else "further from"
-        raise ValueError(
-            f"{who} is not the density of sample_transition: draws are {far} what it expects, by"
-            f" {abs(mean):.2g} ± {error:.2g} in log D"
-        )
-    for column in _columns(parents):
-        scores = column - np.einsum("fij,fj->fi", shares, column)
-        error = scores.std() / np.sqrt(scores.size)
-        if abs(scores.mean()) > _MOST_ERRORS * error + 1e-3 * column.std():
-            raise ValueError(
-                f"{who} is not the density of sample_transition: draws come from other x_(t-1) than"
-                " it says; does a factor that depends on x_(t-1) lack?"
+    values = [("log D", np.where(shares > 0, logs, 0.0))]
+    values += [("x_(t-1)", np.tile(x[:, None], (1, _SIBLINGS, 1))) for x in _columns(parents)]
+    for what, of_siblings in values:
+        # Where the shares are right, the expectation of the own value is theirs.
+        own = np.diagonal(of_siblings, axis1=1, axis2=2)
+        excess = own - np.sum(shares * of_siblings, axis=2)
+        mean, error = excess.mean(), excess.std() / np.sqrt(excess.size)
+        if abs(mean) > _MOST_ERRORS * error + 1e-3 * own.std():
+            yield (
+                "log_transition is not the density of sample_transition: given the x_(t-1) that"
+                f" draws come from, {what} is {mean:.2g} ± {error:.2g} above what it says; does a"
+                " factor that depends on x_(t-1) lack?"
             )
 
 

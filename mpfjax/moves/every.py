@@ -39,14 +39,12 @@ class Every(AbstractMove):
     moves: tuple[Any, ...] = eqx.field(converter=lambda moves: as_moves(moves, "moves"))
 
     def __check_init__(self) -> None:
-        if not self.moves:
-            raise ValueError("moves: there must be at least one to run at every k-th step")
-        for move in self.moves:
-            if not move.keeps_mass:
-                raise ValueError(
-                    f"moves: {name_of(move)} neither regroups, resamples nor moves by a Markov"
-                    " kernel; what propagates belongs into the chain, at every step"
-                )
+        others = [name_of(move) for move in self.moves if not move.keeps_mass]
+        if others or not self.moves:
+            raise ValueError(
+                f"moves: {others or 'none'} neither regroups, resamples nor moves by a Markov"
+                " kernel; what propagates belongs into the chain, at every step"
+            )
 
     weighs = False
     keeps_mass = True

@@ -107,11 +107,11 @@ WRONG = {
     ),
     "another deviation": (
         Drift, {"log_transition": lambda self, x, old: normal(x, self.transition_mean(old), 0.8)},
-        "draws are nearer to what it expects",
+        "is not the density of sample_transition",
     ),
     "another mean": (
         Drift, {"log_transition": lambda self, x, old: normal(x, old, 0.5)},
-        "draws are further from what it expects",
+        "is not the density of sample_transition",
     ),
     "a factor of the past": (
         Volatile,

@@ -78,10 +78,8 @@ class Propagate(AbstractPropagation):
         model, proposal, needs_noise = self.model, self.proposal, self.noise != "independent"
         # The mixed form has the law of z_t and its noise whatever the model's methods are.
         has_law = is_mixed(model)
-        if not has_law and self.gradient == "stop":
-            require(model, "log_transition", "gradient='stop'")
-        if not has_law and proposal is not None:
-            require(model, "log_transition", f"proposal {type(proposal).__name__}")
+        if not has_law and (self.gradient == "stop" or proposal is not None):
+            require(model, "log_transition", "gradient='stop' or a proposal")
         if needs_noise and proposal is not None:
             require(proposal, "propose_from_noise", f"noise={self.noise!r}", "proposal")
         elif needs_noise and not has_law:

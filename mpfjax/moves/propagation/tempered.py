@@ -1,6 +1,6 @@
 """Tempered propagation: the likelihood enters by powers, and particles move in between."""
 
-from typing import Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from mpfjax.checks import Count, InnerShare, as_numbers, shown
+from mpfjax.checks import Count, InnerShare, entries, to_numbers
 from mpfjax.mixture import ParticleMixture
 from mpfjax.models.base import AbstractStateSpaceModel, require_noise
 from mpfjax.models.conditionally_linear import refuse_marginalised
@@ -29,8 +29,10 @@ class TemperedParticles(NamedTuple):
     log_likelihoods: Float[Array, " n"]
 
 
-def _as_exponents(numbers: Any) -> tuple[float, ...]:
-    return tuple(np.ravel(as_numbers("exponents", numbers, floating=True)).tolist())
+_RISING = entries(
+    lambda powers: (np.diff(np.ravel(powers), prepend=0) > 0).all() and np.ravel(powers)[-1] == 1,
+    "exponents that rise from above 0 to 1",
+)
 
 
 class PropagateTempered(AbstractPropagation):
@@ -61,8 +63,8 @@ class PropagateTempered(AbstractPropagation):
 
     model: AbstractStateSpaceModel
     resample: Resample = eqx.field(default_factory=Resample)
-    exponents: tuple[float, ...] = eqx.field(
-        converter=_as_exponents, static=True, default=(1 / 64, 1 / 16, 1 / 4, 1.0)
+    exponents: Annotated[tuple[float, ...], _RISING] = eqx.field(
+        converter=to_numbers("exponents"), static=True, default=(1 / 64, 1 / 16, 1 / 4, 1.0)
     )
     num_moves: Count = eqx.field(static=True, default=1)
     least_step: InnerShare = eqx.field(static=True, default=0.02)
@@ -73,9 +75,6 @@ class PropagateTempered(AbstractPropagation):
         require_noise(self.model, "PropagateTempered")
         if self.resample.sort_by is not None:
             raise ValueError("resample: sort_by has no use between the stages")
-        rises = np.all(np.diff([0.0, *self.exponents]) > 0)
-        if not rises or self.exponents[-1:] != (1.0,):
-            raise ValueError(f"exponents: {shown(self.exponents)} do not rise from above 0 to 1")
 
     def __call__(
         self, key: Key[Array, ""], mixture: ParticleMixture, observation: PyTree

@@ -1,14 +1,14 @@
 """The features of the state that regrouping uses, and their units."""
 
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from mpfjax.checks import POSITIVE, Checked, shown
+from mpfjax.checks import POSITIVE, Checked, to_numbers
 from mpfjax.mixture import ParticleMixture, flatten_states
 from mpfjax.operations.logarithms import as_inexact, exp, finite_or_zero
 from mpfjax.operations.segments import are_masked, column_sums, segment_max, spread
@@ -17,13 +17,6 @@ from mpfjax.operations.stored import stored
 # Up to this many features are multiplied one by one, which runs on vectors.
 _FEW_FEATURES = 8
 Scale = ArrayLike | Sequence[float]
-
-
-def _as_units(scale: Any) -> tuple[float, ...]:
-    try:
-        return tuple(map(float, np.ravel(scale)))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"scale: {shown(scale)} is no number, nor one a feature") from error
 
 
 class ByFeatures(Checked):
@@ -39,7 +32,7 @@ class ByFeatures(Checked):
 
     features: Callable[[PyTree], Array] | None = eqx.field(static=True, default=None, kw_only=True)
     scale: Annotated[tuple[float, ...], POSITIVE] = eqx.field(
-        static=True, default=(1.0,), converter=_as_units, kw_only=True
+        static=True, default=(1.0,), converter=to_numbers("scale"), kw_only=True
     )
 
     def features_of(self, mixture: ParticleMixture) -> Float[Array, "n k"]:

@@ -1,19 +1,26 @@
 """Resampling with a look-ahead: the auxiliary particle filter as a move."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from mpfjax.checks import check, saying, shown
+from mpfjax.checks import of, saying
 from mpfjax.mixture import ParticleMixture
-from mpfjax.models.base import require
+from mpfjax.models.base import real_each
 from mpfjax.moves.base import AbstractMove
 from mpfjax.moves.resampling.resample import Resample
 from mpfjax.operations.segments import spread
 from mpfjax.operations.stored import take
-from mpfjax.proposals import AbstractProposal
+
+_LOOKAHEAD = of(
+    lambda look: (
+        not isinstance(look, type)
+        and (callable(look) or hasattr(look, "log_normaliser") or hasattr(look, "at_step_of"))
+    ),
+    "a function of an observation and states, nor a proposal with log_normaliser",
+)
 
 
 class AuxiliaryResample(AbstractMove):
@@ -41,14 +48,7 @@ class AuxiliaryResample(AbstractMove):
     """
 
     resample: Resample
-    lookahead: Any
-
-    def __check_init__(self) -> None:
-        if isinstance(self.lookahead, AbstractProposal):
-            require(self.lookahead, "log_normaliser", "AuxiliaryResample", "lookahead")
-        elif not hasattr(self.lookahead, "at_step_of"):
-            what = "a function of an observation and states, nor a proposal"
-            check(Callable[..., Any], what, lookahead=self.lookahead)
+    lookahead: Annotated[Any, _LOOKAHEAD]
 
     def map_inner(self, change: Callable[[Any], Any]) -> "AuxiliaryResample":
         """The same with another `Resample`."""
@@ -102,11 +102,8 @@ class AuxiliaryResample(AbstractMove):
         with saying("in lookahead, which is called with an observation and the particles"):
             look = getattr(look, "log_normaliser", look)
             values = look(observation, mixture.particles)
-        expected = (mixture.num_particles,)
-        if jnp.shape(values) != expected or jnp.iscomplexobj(values):
-            found = f"{shown(values)} of shape {jnp.shape(values)}"
-            raise ValueError(f"lookahead: it returned {found}, not real numbers {expected}")
-        log_factors = jnp.asarray(values).astype(mixture.log_weights.dtype)
+        values = real_each(values, "lookahead: it", mixture.num_particles)
+        log_factors = values.astype(mixture.log_weights.dtype)
         seen = mixture.weighed(log_factors).active
         is_seen = spread(seen, mixture.component_indicators) | ~(log_factors < jnp.inf)
         return jnp.where(is_seen, log_factors, 0.0)
