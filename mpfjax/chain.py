@@ -86,10 +86,8 @@ def check_chain(moves: Moves, num_particles: int, num_components: int) -> None:
         )
     names = ", ".join(map(name_of, moves))
     if not any(move.weighs for move in moves):
-        raise ValueError(
-            f"moves: {names or 'none'} never weigh the particles by what is observed, and log Ẑ"
-            " would be 0; Propagate does, or Reweight after Predict"
-        )
+        who = f"moves: {names or 'none'}"
+        raise ValueError(f"{who} never weigh the particles by what is observed, as Propagate does")
     kept = [name for move in with_inner(moves) for name in move.own_memory]
     read = {name for move in with_inner(moves) for name in move.reads}
     for name in sorted(read | set(kept)):
@@ -105,10 +103,8 @@ def check_keep_parents(argument: str, moves: Iterable[AbstractMove], needed_by: 
     """Raise a `ValueError` that names a move after which particles have no single parents."""
     for move in with_inner(moves):
         if not move.inner and not move.keeps_parents:
-            raise ValueError(
-                f"{argument}: {name_of(move)} leaves no particle one parent x_(t-1), which"
-                f" {needed_by} needs"
-            )
+            which = f"one parent x_(t-1), which {needed_by} needs"
+            raise ValueError(f"{argument}: {name_of(move)} leaves no particle {which}")
 
 
 # One move of a step.
@@ -148,10 +144,8 @@ def moved_by(
 def check_mixture(mixture: ParticleMixture, num_components: int) -> None:
     """Raise a `ValueError` for a mixture that a filter of this M cannot go on from."""
     if mixture.num_components != num_components:
-        raise ValueError(
-            f"mixture: its num_components, {mixture.num_components}, is not the filter's,"
-            f" {num_components}"
-        )
+        found = mixture.num_components
+        raise ValueError(f"mixture: num_components, {found}, is not the filter's, {num_components}")
 
 
 def check_result(moved: Any, mixture: ParticleMixture, move: AbstractMove) -> ParticleMixture:

@@ -150,15 +150,13 @@ def kinds(tree: Any) -> str:
     return f"{', '.join(each)} in {structure}"
 
 
-def check_one_each(num_particles: int, /, **results: Any) -> None:
-    """What the user's function of this name returned has arrays with an entry for each particle."""
-    for name, values in results.items():
-        leaves = jax.tree.leaves(values)
-        if not leaves or any(jnp.shape(leaf)[:1] != (num_particles,) for leaf in leaves):
-            raise ValueError(
-                f"{name}: it returned {shown(jax.tree.map(jnp.shape, values))}, no arrays whose"
-                f" leading axis is that of the {num_particles} particles"
-            )
+def check_one_each(number: int, of_what: str = "particles", /, **trees: Any) -> None:
+    """Each tree has arrays, all of them with a leading axis of this length, one for each."""
+    for name, tree in trees.items():
+        leaves = jax.tree.leaves(tree)
+        if not leaves or any(jnp.shape(leaf)[:1] != (number,) for leaf in leaves):
+            found = shown(jax.tree.map(jnp.shape, tree))
+            raise ValueError(f"{name}: shape {found} has no leading axis of {number} {of_what}")
 
 
 @dataclass(frozen=True)

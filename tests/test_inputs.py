@@ -279,7 +279,7 @@ def test_objects_have_one_input_or_their_own(per_object, shared):
     np.testing.assert_allclose(moved.mean(axis=0), expected, atol=0.02)
     if not shared:
         with pytest.raises(
-            ValueError, match=r"inputs: shape \(\) has no leading axis of num_objects"
+            ValueError, match=r"inputs: shape \(\) has no leading axis of 3 objects"
         ):
             model.with_inputs(jnp.array(10.0))
 

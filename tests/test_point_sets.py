@@ -14,8 +14,6 @@ from scipy.stats import qmc
 from mpfjax.models.noise import (
     draw_family_noise,
     draw_noise,
-    rqmc_normal,
-    stratified_normal,
     stratified_uniform,
 )
 from mpfjax.moves.resampling.sorting import (
@@ -132,9 +130,9 @@ def one_of_family(key, d):
 
 
 DRAWS = {
-    "stratified": lambda key, d: stratified_normal(key, (N, d), FLOAT),
-    "rqmc": lambda key, d: rqmc_normal(key, (N, d), FLOAT, LABELS, 3),
-    "rqmc, dealt anew": lambda key, d: rqmc_normal(key, (N, d), FLOAT, LABELS, 3, True),
+    "stratified": lambda key, d: draw_noise("stratified", key, (N, d), FLOAT),
+    "rqmc": lambda key, d: draw_noise("rqmc", key, (N, d), FLOAT, LABELS, 3),
+    "rqmc, dealt anew": lambda key, d: draw_noise("rqmc", key, (N, d), FLOAT, LABELS, 3, True),
     "one of a family": one_of_family,
 }
 
@@ -193,9 +191,7 @@ def test_noise_dealt_twice_is_independent_of_itself_and_still_a_point_set(name, 
     n, keys = 1000, jax.random.split(jax.random.key(3), 400)
 
     def draw(key):
-        if name == "rqmc":
-            return draw_noise("rqmc", key, (n, d), FLOAT, shuffle=True)
-        return stratified_normal(key, (n, d), FLOAT)
+        return draw_noise(name, key, (n, d), FLOAT, shuffle=True)
 
     found = np.asarray(jax.jit(jax.vmap(draw))(keys), float)
     products = np.mean(found[0::2] * found[1::2], axis=1)
@@ -206,8 +202,8 @@ def test_noise_dealt_twice_is_independent_of_itself_and_still_a_point_set(name, 
 
 
 def test_a_hundred_thousand_rows_stay_finite_and_uniform_ones_fill_each_cell():
-    for draw in (rqmc_normal, stratified_normal):
-        noise = np.asarray(jax.jit(lambda key, draw=draw: draw(key, (100_000, 2), FLOAT))(KEYS[0]))
+    for kind in ("rqmc", "stratified"):
+        noise = draw_noise(kind, KEYS[0], (100_000, 2), FLOAT)
         assert np.isfinite(noise).all()
         assert len(np.unique(noise[:, 0])) > 99_000
     points = np.asarray(stratified_uniform(KEYS[0], 50))

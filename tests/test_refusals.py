@@ -354,7 +354,7 @@ REFUSED = (
     ("model: DriftOfOne.sample_initial.*per_particle",
      lambda: mpfjax.particle_filter(DriftOfOne(), 10)),
     *(
-        (f"model: Changed.{method}.* returned",
+        (f"model: Changed.{method}.* (returned|leading axis)",
          lambda method=method, v=value: run_of(changed(Batched, **{method: lambda *given: v})))
         for method, value in (
             ("sample_initial", jnp.zeros((3, 10))), ("sample_transition", jnp.zeros(10, int)),
@@ -464,14 +464,14 @@ REFUSED = (
     *(
         (f"filter: .*{words}", lambda filter=filter: around(filter))
         for words, filter in (
-            ("not noise='rqmc'", mpfjax.with_point_sets(FILTER)),
+            ("needs noise='independent'", mpfjax.with_point_sets(FILTER)),
             ("one Propagate or Predict", Filter(MODEL, [Reweight(MODEL)], 4)),
             ("PropagateNested cannot keep", mpfjax.with_proposals_per_particle(FILTER, 2)),
             ("Partitioned cannot keep", mpfjax.partitioned_sampling(JOINT, 4)),
             ("GaussianRegeneration cannot keep", GAUSSIAN),
         )
     ),
-    ("function: it returned",
+    (r"function: shape \(\) has no leading axis",
      lambda: smoothing.smoothed_sums(**FILTERED, function=lambda previous, states: states.sum())),
     ("filter: .* is approximate or draws in a way of its own", lambda:
         smoothing.with_first_ancestors(mpfjax.distributed_partitioned_sampling(JOINT, 4))),

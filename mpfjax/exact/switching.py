@@ -56,10 +56,8 @@ def switching_filter(
     rows = checked_rows(series, model.H.shape[-2], model.m0.dtype)
     length, k = rows.shape[0], model.num_regimes
     if k ** (length + 1) > _MOST_SEQUENCES:
-        raise ValueError(
-            f"observations: {length} steps of {k} regimes are {k}^{length + 1} sequences, more than"
-            f" {_MOST_SEQUENCES}"
-        )
+        number = f"{k}^{length + 1} sequences, more than {_MOST_SEQUENCES}"
+        raise ValueError(f"observations: {length} steps of {k} regimes are {number}")
     return _enumerated(model, rows)
 
 

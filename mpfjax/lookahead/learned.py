@@ -127,10 +127,8 @@ def _twisted(filter: Filter, twist: Twist, num_particles: int) -> Filter:
             return PropagateTwisted(dataclasses.replace(move, proposal=None), twist)
         if move.inner:
             return move.map_inner(ahead)
-        raise ValueError(
-            f"filter: {type(move).__name__}, one of its moves, cannot look ahead; Resample,"
-            " Propagate or PropagateMarginalised of gradient 'none', and regrouping can"
-        )
+        who = f"filter: {type(move).__name__}"
+        raise ValueError(f"{who} cannot look ahead, as Resample, Propagate and regrouping can")
 
     moves = [ahead(move) for move in filter.moves]
     for kind, needed in ((AuxiliaryResample, "Resample"), (PropagateTwisted, "Propagate")):

@@ -152,10 +152,8 @@ def require_noise(model: Any, needed_by: str) -> None:
     require(model, "transition_from_noise", needed_by)
     check(Count, noise_dimension=getattr(model, "noise_dimension", None))
     if not is_made_of_noise(model):
-        raise ValueError(
-            f"model: {model_name(model)} defines a sample_transition, but inherits its"
-            f" transition_from_noise, which {needed_by} needs; it must define both"
-        )
+        who = f"model: {model_name(model)}, which has a sample_transition of its own,"
+        raise ValueError(f"{who} inherits its transition_from_noise, which {needed_by} needs")
     direction_numbers(model.noise_dimension)
 
 
@@ -216,10 +214,8 @@ def check_moved(
     """Raise a `ValueError` where structure, shapes or types of x_t are not those of x_{t-1}."""
     found, given = kinds(states), kinds(previous_states)
     if found != given:
-        raise ValueError(
-            f"model: {model_name(model)}.{method} returned {found}, and was given {given};"
-            f" sample_initial and {method} must agree"
-        )
+        who = f"model: {model_name(model)}.{method}"
+        raise ValueError(f"{who} returned {found}, and not the kind of x_(t-1), {given}")
 
 
 def check_log_density(

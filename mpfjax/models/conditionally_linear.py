@@ -3,14 +3,13 @@ particle, which carries the moments of the rest in place of a draw.
 """
 
 import abc
-import operator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree, Shaped, jaxtyped
 
-from mpfjax.checks import shown
+from mpfjax.checks import as_numbers, check_shape, shown
 from mpfjax.mixture import MarginalisedState
 from mpfjax.models import gaussians
 from mpfjax.models.base import AbstractStateSpaceModel, check_moved, model_name
@@ -118,10 +117,8 @@ def refuse_marginalised(
 ) -> None:
     """Raise a `ValueError` for a conditionally linear model, which is not propagated as a whole."""
     if is_marginalised(model):
-        raise ValueError(
-            f"{name}: {model_name(model)} is conditionally linear, and {needed_by} needs states"
-            f" that are drawn as a whole; {instead}"
-        )
+        who = f"{name}: {model_name(model)} is conditionally linear"
+        raise ValueError(f"{who}, and {needed_by} needs states drawn as a whole; {instead}")
 
 
 def is_mixed(model: Any) -> bool:
@@ -143,10 +140,8 @@ def with_moments(model: Any, drawn: PyTree) -> PyTree:
 
 def _initial_moments(model: Any, latent: PyTree) -> list[Array]:
     """m0 and P0, checked."""
-    moments = model.initial_moments(latent)
-    d = _length(moments, 0, -1)
     n = jax.tree.leaves(latent)[0].shape[0]
-    return _checked(model, "initial_moments", moments, n, m0=(d,), P0=(d, d))
+    return _checked(model, "initial_moments", model.initial_moments(latent), n, m0="d", P0="d d")
 
 
 def predicted(model: Any, latent: PyTree, state: MarginalisedState) -> MarginalisedState:
@@ -259,7 +254,7 @@ def gaussian_of(state: MarginalisedState) -> Gaussian:
 def dynamics_of(model: Any, latent: PyTree, state: MarginalisedState) -> Linear:
     """F, b and Q, checked, the particles last."""
     (n, d), parts = state.mean.shape, model.dynamics(latent, state.latent)
-    return Linear.of(*_checked(model, "dynamics", parts, n, F=(d, d), b=(d,), Q=(d, d)))
+    return Linear.of(*_checked(model, "dynamics", parts, n, F=f"{d} {d}", b=f"{d}", Q=f"{d} {d}"))
 
 
 def emission_of(model: Any, latent: PyTree, state: MarginalisedState) -> Linear | None:
@@ -267,8 +262,8 @@ def emission_of(model: Any, latent: PyTree, state: MarginalisedState) -> Linear 
     parts = model.emission(latent)
     if parts is None:
         return None
-    (n, d), p = state.mean.shape, _length(parts, 0, -2)
-    return Linear.of(*_checked(model, "emission", parts, n, H=(p, d), c=(p,), R=(p, p)))
+    n, d = state.mean.shape
+    return Linear.of(*_checked(model, "emission", parts, n, H=f"p {d}", c="p", R="p p"))
 
 
 def latent_dynamics_of(
@@ -276,9 +271,10 @@ def latent_dynamics_of(
 ) -> tuple[Linear, Float[Array, "d k n"] | None]:
     """f, A and V of the mixed form, and S if there is one, checked, the particles last."""
     (n, d), k = state.mean.shape, latent_rows(model, state.latent).shape[0]
-    parts, shapes = model.latent_dynamics(state.latent), {"f": (k,), "A": (k, d), "V": (k, k)}
-    if isinstance(parts, tuple) and len(parts) == 4:
-        shapes["S"] = (d, k)
+    shapes = {"f": f"{k}", "A": f"{k} {d}", "V": f"{k} {k}", "S": f"{d} {k}"}
+    parts = model.latent_dynamics(state.latent)
+    if isinstance(parts, tuple) and len(parts) == 3:
+        del shapes["S"]
     offset, matrix, noise, *rest = _checked(model, "latent_dynamics", parts, n, **shapes)
     return Linear.of(matrix, offset, noise), particles_last(rest[0], 2) if rest else None
 
@@ -287,32 +283,20 @@ def observation_rows(
     model: Any, observation: PyTree, seen: Linear, dtype: jnp.dtype
 ) -> Float[Array, "p 1"]:
     """y_t as a column, checked."""
-    found: Any = model.linear_observation(observation)
-    p, shape = seen.matrix.shape[0], getattr(found, "shape", None)
-    if shape != (p,) and not (p == 1 and shape == ()):
-        raise ValueError(
-            f"observation: shape {shape} is not ({p},), the rows of H by {model_name(model)};"
-            " linear_observation may pick y_t"
-        )
-    return jnp.reshape(jnp.asarray(found, dtype), (p, 1))
+    found = as_numbers("observation", model.linear_observation(observation))
+    rows, p = jnp.atleast_1d(found).astype(dtype), seen.matrix.shape[0]
+    check_shape(f"{p}", observation=rows)
+    return jnp.reshape(rows, (p, 1))
 
 
-def _length(parts: Any, place: int, axis: int) -> int:
-    """The length of an axis of an array among several; 0 where there is no such array."""
-    try:
-        return parts[place].shape[axis]
-    except (TypeError, IndexError, KeyError, AttributeError):
-        return 0
-
-
-def _checked(model: Any, method: str, parts: Any, n: int, **shapes: tuple[int, ...]) -> list[Array]:
+def _checked(model: Any, method: str, parts: Any, n: int, **shapes: str) -> list[Array]:
     """The arrays that a method returned, one for all particles or one for each."""
-    arrays = list(parts) if isinstance(parts, tuple | list) else []
-    found = [getattr(array, "shape", None) for array in arrays]
-    wanted = [(shape, (n, *shape)) for shape in shapes.values()]
-    if len(found) != len(wanted) or not all(map(operator.contains, wanted, found)):
-        raise ValueError(
-            f"model: {model_name(model)}.{method} returned {shown(found or parts)}, not arrays of"
-            f" shapes {shapes}, or with a leading axis of {n}"
-        )
-    return [jnp.asarray(array) for array in arrays]
+    fits = isinstance(parts, tuple | list) and len(parts) == len(shapes)
+    with jaxtyped("context"):
+        for part, shape in zip(parts, shapes.values(), strict=True) if fits else ():
+            fits &= isinstance(part, Shaped[Any, shape] | Shaped[Any, f"{n} {shape}"])
+    if not fits:
+        who = f"model: {model_name(model)}.{method}"
+        found = shown(jax.tree.map(jnp.shape, parts))
+        raise ValueError(f"{who} returned {found}, not {shapes}, or {n} of them")
+    return [jnp.asarray(part) for part in parts]

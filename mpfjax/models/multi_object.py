@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from mpfjax.checks import POSITIVE, Count, Fitting, checked, to_array
+from mpfjax.checks import POSITIVE, Count, Fitting, check_one_each, checked, to_array
 from mpfjax.mixture import flatten_states
 from mpfjax.models.base import (
     AbstractStateSpaceModel,
@@ -95,7 +95,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
             model = with_inputs(model, inputs)
         else:
             if not self.shared_inputs:
-                self._require_object_axis("inputs", inputs)
+                check_one_each(self.num_objects, "objects", inputs=inputs)
             axes = (eqx.if_array(0) if per_object else None, None if self.shared_inputs else 0)
             give = eqx.filter_vmap(with_inputs, in_axes=axes, axis_size=self.num_objects)
             model, per_object = give(model, inputs), True
@@ -230,7 +230,7 @@ class MultiObjectModel(AbstractStateSpaceModel):
     def prepare_observation(self, observation: PyTree) -> PyTree:
         """What the objects' likelihoods look at: y_t, or what the object model makes of it."""
         if not self.shared_observation:
-            self._require_object_axis("observation", observation)
+            check_one_each(self.num_objects, "objects", observation=observation)
             return observation
         prepare = getattr(self.object_at(0), "prepare_observation", None)
         return observation if prepare is None else prepare(observation)
@@ -265,14 +265,6 @@ class MultiObjectModel(AbstractStateSpaceModel):
         if not self.per_object or objects.ndim == 0:
             return weigh(states, previous_states, objects)
         return _one_by_one(weigh, (states, previous_states), objects)
-
-    def _require_object_axis(self, name: str, tree: PyTree) -> None:
-        for leaf in jax.tree.leaves(tree):
-            if jnp.shape(leaf)[:1] != (self.num_objects,):
-                raise ValueError(
-                    f"{name}: shape {jnp.shape(leaf)} has no leading axis of num_objects,"
-                    f" {self.num_objects}; is it shared by all objects?"
-                )
 
     @property
     def _indices(self) -> Int[Array, " objects"]:

@@ -38,66 +38,41 @@ def draw_noise(
     num_components: int = 1,
     shuffle: bool = False,
 ) -> Float[Array, "n d"]:
-    """Standard normal noise of one of the kinds in `NOISES`, one row a particle.
+    """Standard normal draws, one row a particle, that cover the normal evenly if not "independent".
 
-    Each row is exactly normal for every kind. "rqmc" draws a point set for each component; the
-    other arguments are those of `rqmc_normal`.
-    """
-    if kind == "rqmc":
-        return rqmc_normal(key, shape, dtype, components, num_components, shuffle)
-    return normal(key, shape, dtype)
+    Every single row is exactly normal and independent of the past, so that a sum over particles
+    keeps its expectation; rows are negatively dependent, and the sum has less variance.
 
+    "stratified": row i is the Gaussian quantile of the fractional part of i α + U: a lattice
+    shifted by one uniform number U in each dimension. α_j = φ_d^{-j}, where φ_d solves
+    x^{d+1} = x + 1; for d = 1 it is the golden ratio. Points are dealt to the rows anew each time.
 
-def stratified_normal(
-    key: Key[Array, ""], shape: tuple[int, ...], dtype: jnp.dtype
-) -> Float[Array, "n d"]:
-    """Standard normal draws, one row a particle, that together cover the normal evenly.
-
-    Row i is the Gaussian quantile of the fractional part of i α + U: a lattice shifted by one
-    uniform number U in each dimension. α_j = φ_d^{-j}, where φ_d solves x^{d+1} = x + 1; for d = 1
-    it is the golden ratio. The points are dealt to the rows anew each time (`shuffled`). Every
-    single row is exactly normal and independent of the past, so a sum over particles keeps its
-    expectation. Rows are negatively dependent, so the sum has less variance.
-    """
-    n, d = shape
-    key_shift, key_rows = split(key, 2)
-    shift, rows = bits(key_shift, (d,)), _shuffled_ranks(key_rows, jnp.arange(n, dtype=jnp.int32))
-    points = rows.astype(jnp.uint32)[:, None] * _multipliers(d)[None] + shift[None]
-    return _normal_of(points, dtype)
-
-
-def rqmc_normal(
-    key: Key[Array, ""],
-    shape: tuple[int, int],
-    dtype: jnp.dtype,
-    components: Int[Array, " n"] | None = None,
-    num_components: int = 1,
-    shuffle: bool = False,
-) -> Float[Array, "n d"]:
-    """Standard normal draws, one row a particle, from a randomised point set for each component.
-
-    The r-th slot of a component gets point r. Systematic resampling of k slots takes its points
-    at (r + U) / k, so slot and noise together are a point set of d + 1 dimensions: where particles
-    stand in the order of their states, the step is array randomised quasi-Monte Carlo (L'Ecuyer,
-    Lécot and Tuffin 2008). In two dimensions or more, point r is that of Sobol, its digits
-    scrambled by a random matrix and shifted. In one it is the fractional part of r times the golden
-    ratio plus a random shift: any run of neighbours is then spread evenly, as narrow likelihoods
-    ask for. Each component has a shift of its own, so the noise of any two particles of different
-    components is independent. Every single row is exactly normal and independent of the past, so
-    a sum over particles keeps its expectation.
-
-    Where particles stand as they did when they were last moved, the same slot would get the same
-    point again, and two steps would be functions of each other. `shuffle` deals the points anew.
+    "rqmc": a randomised point set for each component, whose r-th slot gets point r. Systematic
+    resampling of k slots takes its points at (r + U) / k, so slot and noise together are a point
+    set of d + 1 dimensions: where particles stand in the order of their states, the step is array
+    randomised quasi-Monte Carlo (L'Ecuyer, Lécot and Tuffin 2008). In two dimensions or more,
+    point r is that of Sobol, its digits scrambled by a random matrix and shifted. In one it is the
+    fractional part of r times the golden ratio plus a random shift: any run of neighbours is then
+    spread evenly, as narrow likelihoods ask for. Each component has a shift of its own, so the
+    noise of any two particles of different components is independent. Where particles stand as
+    they did when they were last moved, the same slot would get the same point again, and two steps
+    would be functions of each other. `shuffle` deals the points anew.
 
     Raises `ValueError` for more dimensions than the table of direction numbers holds.
     """
+    if kind == "independent":
+        return normal(key, shape, dtype)
     n, d = shape
-    key_matrix, key_shift = split(key, 2)
-    ranks, shifts = _ranks_and_shifts(key_shift, shape, components, num_components, shuffle)
+    key_first, key_second = split(key, 2)
+    if kind == "stratified":
+        ranks = _shuffled_ranks(key_second, jnp.arange(n, dtype=jnp.int32)).astype(jnp.uint32)
+        points = ranks[:, None] * _multipliers(d)[None] + bits(key_first, (d,))[None]
+        return _normal_of(points, dtype)
+    ranks, shifts = _ranks_and_shifts(key_second, shape, components, num_components, shuffle)
     if d == 1:
         points = (ranks.astype(jnp.uint32) * _multipliers(1))[None] + shifts
     else:
-        directions = scrambled_directions(key_matrix, d, _num_digits(n))
+        directions = scrambled_directions(key_first, d, _num_digits(n))
         points = sobol_points(ranks, directions) ^ shifts
     # Drawn row by row, then transposed: operations on short rows are not vectorised.
     return stored(_normal_of(points, dtype)).T
@@ -118,7 +93,7 @@ def draw_family_noise(
     K strata, in order: a draw's noise on its own is not normal, but one of the K at random is. So
     an average over the draws keeps its expectation. The last dimension is the uniform number, by
     which one of the draws is kept. Each particle's share of the point set is independent of the
-    past, and its uniform number of its noise. `shuffle` is that of `rqmc_normal`.
+    past, and its uniform number of its noise. `shuffle` is that of `draw_noise`.
     """
     n, d = shape
     key_matrix, key_shift = split(key, 2)

@@ -65,9 +65,7 @@ def gathered(data: PyTree, inputs: PyTree = None, missing: str = "error") -> Ser
     if not isinstance(data, Series):
         return Series(data, inputs, skips_missing=missing == "skip")
     if inputs is not None or missing != "error":
-        raise ValueError(
-            "observations: a Series says itself what its inputs are and which steps are missing"
-        )
+        raise ValueError("observations: a Series says itself its inputs and what is missing")
     return data
 
 
@@ -87,9 +85,7 @@ def steps_of_inputs(
     arrays = as_arrays(inputs, "inputs")
     own_length = _length(arrays, inputs, "inputs")
     if own_length != length:
-        raise ValueError(
-            f"inputs: the leading axis t is {own_length}, and that of the {of_what} is {length}"
-        )
+        raise ValueError(f"inputs: their t is {own_length}, and that of the {of_what} is {length}")
     return _refused_where(~_usable_steps(arrays, False), arrays, "inputs: NaN or infinite")
 
 
@@ -103,10 +99,8 @@ def one_input(inputs: PyTree, model: Any) -> PyTree:
 
 def _require_place_for(inputs: PyTree, model: Any) -> None:
     if not takes_inputs(model):
-        raise ValueError(
-            f"inputs: {model_name(model)} has no place for them; declare a field"
-            " `inputs: PyTree = None`, which is then u_t at each step, or define with_inputs"
-        )
+        place = "a field `inputs: PyTree = None`, nor with_inputs, where u_t would go"
+        raise ValueError(f"inputs: {model_name(model)} has neither {place}")
 
 
 def as_arrays(observations: PyTree, name: str = "observations") -> PyTree:

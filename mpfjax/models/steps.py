@@ -66,11 +66,7 @@ def noise_dimension(model: Any, states: PyTree) -> int:
 
 def drawn_part(model: Any, states: PyTree) -> PyTree:
     """The part of the particles that is drawn, of x_{t-1} or of x_t."""
-    if not is_marginalised(model):
-        return states
-    if is_mixed(model):
-        latent_rows(model, states.latent)
-    return states.latent
+    return states.latent if is_marginalised(model) else states
 
 
 def completed(model: Any, draws: PyTree, states: PyTree) -> PyTree:

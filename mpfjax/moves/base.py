@@ -80,10 +80,8 @@ class AbstractMove(Checked):
         del reference
         if self.keeps_trajectories:
             return self
-        raise ValueError(
-            f"filter: {type(self).__name__} cannot keep a trajectory, as conditional SMC does;"
-            " regrouping, Resample, AuxiliaryResample, Propagate, Predict and Reweight can"
-        )
+        who = f"filter: {type(self).__name__}"
+        raise ValueError(f"{who} cannot keep a trajectory, as Resample and Propagate can")
 
     def predict(self, key: Key[Array, ""], mixture: ParticleMixture) -> ParticleMixture:
         """The move when y_t is missing. Only a propagation does anything then."""

@@ -42,10 +42,7 @@ class ConditionalPropagation(AbstractPropagation):
 
     def __check_init__(self) -> None:
         if self.move.noise != "independent":
-            raise ValueError(
-                "filter: conditional SMC needs draws that are independent of each other, and not"
-                f" noise={self.move.noise!r}; take noise='independent'"
-            )
+            raise ValueError("filter: conditional SMC needs noise='independent' in its propagation")
         if self.move.proposal is not None:
             require(self.move.proposal, "log_density", "conditional SMC", "proposal")
 

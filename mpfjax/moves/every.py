@@ -41,10 +41,8 @@ class Every(AbstractMove):
     def __check_init__(self) -> None:
         others = [name_of(move) for move in self.moves if not move.keeps_mass]
         if others or not self.moves:
-            raise ValueError(
-                f"moves: {others or 'none'} neither regroups, resamples nor moves by a Markov"
-                " kernel; what propagates belongs into the chain, at every step"
-            )
+            which = "neither regroups, resamples nor moves by a Markov kernel"
+            raise ValueError(f"moves: {', '.join(others) or 'none'} {which}")
 
     weighs = False
     keeps_mass = True

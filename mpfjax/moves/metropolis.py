@@ -89,9 +89,8 @@ class AbstractMetropolis(AbstractMarkovMove):
     ) -> ParticleMixture:
         """Move every particle."""
         if mixture.parents is None:
-            raise ValueError(
-                f"moves: {type(self).__name__} comes before any propagation: there is no x_t yet"
-            )
+            who = f"moves: {type(self).__name__}"
+            raise ValueError(f"{who} comes before any propagation: there is no x_t yet")
         target = _Target(self.model, mixture.parents, observation, self.exponent)
         states = mixture.particles
         if self.gradient == "stop":

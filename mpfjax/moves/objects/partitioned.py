@@ -179,9 +179,7 @@ class Partitioned(AbstractPropagation):
             return jnp.asarray(circular_orders(num_components, num_objects))
         assert self.orders is not None
         if self.orders.shape[0] not in (1, num_components):
-            raise ValueError(
-                f"orders: {self.orders.shape[0]} of them, for {num_components} components"
-            )
+            raise ValueError(f"orders: {len(self.orders)} of them, for {num_components} components")
         return jnp.broadcast_to(self.orders, (num_components, num_objects))
 
 
@@ -198,9 +196,8 @@ def check_orders(orders: Any, num_objects: int) -> Int[Array, "c objects"]:
     table = to_rows(num_objects, "orders", range(num_objects) if orders is None else orders)
     is_order = np.sort(table, axis=1) == np.arange(num_objects)[None]
     if not is_order.size or not is_order.all():
-        raise ValueError(
-            f"orders: {shown(orders)} is no permutation of the objects 0 to {num_objects - 1}"
-        )
+        what = f"no permutation of the objects 0 to {num_objects - 1}"
+        raise ValueError(f"orders: {shown(orders)} is {what}")
     return jnp.asarray(table, jnp.int32)
 
 

@@ -48,10 +48,8 @@ class RandomPartition(AbstractRegrouping):
         """A random set for every particle."""
         n = mixture.num_particles
         num_sets = mixture.num_components if self.num_sets is None else self.num_sets
-        if num_sets > mixture.num_components:
-            raise ValueError(
-                f"num_sets: {num_sets} is more than num_components, {mixture.num_components}"
-            )
+        if num_sets > (most := mixture.num_components):
+            raise ValueError(f"num_sets: {num_sets} is more than num_components, {most}")
         # Sets are dealt in turn and then sorted into a random order. Each is a word: the set in the
         # lowest bits, random bits above it. Words of empty slots come after all others.
         width = (num_sets - 1).bit_length()

@@ -11,7 +11,7 @@ from jaxtyping import Array, Key, PyTree
 
 from mpfjax.checks import Count, Positive
 from mpfjax.mixture import ParticleMixture, flatten_states, no_ancestors
-from mpfjax.models.noise import draw_noise, stratified_normal
+from mpfjax.models.noise import draw_noise
 from mpfjax.moves.base import AbstractResampling
 from mpfjax.moves.regrouping.features import origin, summarise
 from mpfjax.moves.resampling.line import sorted_order
@@ -95,10 +95,8 @@ class GaussianRegeneration(AbstractResampling):
         """Draws for the new slots, with the moments of `mixture`'s components."""
         for place, leaf in jax.tree_util.tree_leaves_with_path(chosen):
             if not jnp.issubdtype(leaf.dtype, jnp.floating):
-                raise ValueError(
-                    f"where: the state{jax.tree_util.keystr(place)} is {leaf.dtype}, and no draw of"
-                    " a Gaussian is; choose the leaves that are floating point"
-                )
+                which = f"the state{jax.tree_util.keystr(place)} is {leaf.dtype}"
+                raise ValueError(f"where: {which}, not floating point as a Gaussian is")
         states = jnp.where(mixture.occupied[:, None], flatten_states(chosen), 0.0)
         centre = origin(states, mixture)  # far from zero, rounding would lose the moments
         states = jnp.where(mixture.occupied[:, None], states - centre[None], 0.0)
@@ -106,12 +104,8 @@ class GaussianRegeneration(AbstractResampling):
         moments = summarise(states, weights, mixture.component_indicators, mixture.num_components)
         factors = self.inflation * cholesky(moments.covariances)
         factors = spread(factors, vacated.component_indicators)
-        shape = (states.shape[0], states.shape[1])
-        if self.noise == "stratified":
-            noise = stratified_normal(key, shape, states.dtype)
-        else:
-            labels, num_components = vacated.component_indicators, mixture.num_components
-            noise = draw_noise(self.noise, key, shape, states.dtype, labels, num_components)
+        labels, num_components = vacated.component_indicators, mixture.num_components
+        noise = draw_noise(self.noise, key, states.shape, states.dtype, labels, num_components)
         offsets = jnp.einsum("nij,nj->ni", factors, noise)
         means = spread(moments.means, vacated.component_indicators)
         unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], chosen))[1]

@@ -85,10 +85,7 @@ class Resample(AbstractResampling):
 
     def __check_init__(self) -> None:
         if self.share_by is not None and self.particles_per_component is not None:
-            raise ValueError(
-                "share_by: groups have no effect where particles_per_component is"
-                f" {self.particles_per_component}"
-            )
+            raise ValueError("share_by: groups have no effect beside particles_per_component")
 
     @property
     def biases_score(self) -> bool:
