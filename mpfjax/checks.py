@@ -75,10 +75,9 @@ def as_numbers(
 def _array_of_numbers(name: str, value: Any, may_be_complex: bool = False) -> Any:
     """The argument as an array of its own type, of JAX where any part of it is."""
     of_jax = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
-    try:
+    array: Any = None
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
         array = jnp.asarray(value) if of_jax else np.asarray(value)
-    except (TypeError, ValueError, OverflowError):
-        array = None
     # A mask or an imaginary part would later be dropped without a word.
     is_real = may_be_complex or not np.iscomplexobj(array)
     if np.ma.is_masked(value) or not _has_numbers(array) or not is_real:
@@ -118,9 +117,10 @@ def check_shape(shape: str, /, **arguments: Any) -> None:
     Numbers stand for themselves and words for any length; the dots are any axes at all. Traced
     arrays are checked as well.
     """
+    kind: Any = jaxtyping.Shaped[Any, shape]
     for name, value in arguments.items():
         with jaxtyping.jaxtyped("context"):
-            if not (_has_numbers(value) and isinstance(value, jaxtyping.Shaped[Any, shape])):
+            if not (_has_numbers(value) and isinstance(value, kind)):
                 found = getattr(value, "shape", shown(value))
                 axes = ", ".join(shape.split())
                 raise ValueError(f"{name}: shape {found} is not ({axes}), that of numbers")
@@ -137,7 +137,7 @@ def to_rows(width: int, name: str, value: Any) -> np.ndarray:
 
 
 def _has_numbers(array: Any) -> bool:
-    dtype = getattr(array, "dtype", None)
+    dtype: Any = getattr(array, "dtype", None)
     is_numeric = dtype is not None and any(jnp.issubdtype(dtype, k) for k in (np.number, np.bool_))
     # Durations are whole numbers for numpy. No type of JAX holds long doubles.
     return is_numeric and dtype.char not in "mgG"

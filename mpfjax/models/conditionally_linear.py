@@ -294,7 +294,8 @@ def _checked(model: Any, method: str, parts: Any, n: int, **shapes: str) -> list
     fits = isinstance(parts, tuple | list) and len(parts) == len(shapes)
     with jaxtyped("context"):
         for part, shape in zip(parts, shapes.values(), strict=True) if fits else ():
-            fits &= isinstance(part, Shaped[Any, shape] | Shaped[Any, f"{n} {shape}"])
+            kind: Any = Shaped[Any, shape] | Shaped[Any, f"{n} {shape}"]
+            fits &= isinstance(part, kind)
     if not fits:
         who = f"model: {model_name(model)}.{method}"
         found = shown(jax.tree.map(jnp.shape, parts))

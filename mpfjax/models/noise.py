@@ -32,7 +32,7 @@ _UNUSED = 9  # bits of 32 that no draw of 23 bits shows
 def draw_noise(
     kind: str,
     key: Key[Array, ""],
-    shape: tuple[int, int],
+    shape: tuple[int, ...],
     dtype: jnp.dtype,
     components: Int[Array, " n"] | None = None,
     num_components: int = 1,
@@ -114,7 +114,7 @@ def draw_family_noise(
 
 def _ranks_and_shifts(
     key: Key[Array, ""],
-    shape: tuple[int, int],
+    shape: tuple[int, ...],
     components: Int[Array, " n"] | None,
     num_components: int,
     shuffle: bool,
