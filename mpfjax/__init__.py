@@ -78,6 +78,7 @@ from mpfjax.transforms import with_lookahead as with_lookahead
 from mpfjax.transforms import with_point_sets as with_point_sets
 from mpfjax.transforms import with_proposals_per_particle as with_proposals_per_particle
 from mpfjax.transforms import with_resampling as with_resampling
+from mpfjax.transforms import with_restarts as with_restarts
 from mpfjax.transforms import with_score_gradient as with_score_gradient
 from mpfjax.transforms import with_selected_start as with_selected_start
 

@@ -37,7 +37,6 @@ from mpfjax.transforms import (
 Importance = Literal["propagated", "predictive_gaussian"]
 # K-means starts from the components of a few steps before, and needs few iterations.
 _WARM_ITERATIONS, _ITERATIONS = 2, 5
-_INITIAL_DRAWS = 4
 
 
 @checked
@@ -111,7 +110,8 @@ def mixture_particle_filter(
     with the others only through its mixture weight, so that no component takes particles from
     another. At every third step components that overlap merge, diffuse components split, and two
     iterations of K-means refine the grouping. All of it is exact. If M is more than one, x_0 is
-    chosen by y_1 among four draws a particle; `with_selected_start` changes their number.
+    chosen by y_1 among four draws a particle, and among 2^17 in all where these are too few;
+    `with_selected_start` changes their number.
 
     - `features`, `scale`: the coordinates and units in which the grouping moves see the particles,
       those of x_0 too (see `KMeans`; features of one particle, if the model is wrapped by
@@ -133,7 +133,7 @@ def mixture_particle_filter(
     seen: dict[str, Any] = {"features": mapped(model, features), "scale": scale}
     filter = _mixture(plain, max_components, seen, _WARM_ITERATIONS, regroup, regroup_every)
     if max_components > 1:
-        filter = with_selected_start(filter, _INITIAL_DRAWS)
+        filter = with_selected_start(filter)
     if noise == "rqmc" and proposal is None and not is_marginalised(model):
         filter = with_lookahead(filter)
     return _with(noise, gradient, filter)

@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 
-from mpfjax.checks import Count, checked
+from mpfjax.checks import Count, InnerShare, checked
 from mpfjax.filter import Filter
 from mpfjax.lookahead.pilot import Lookahead, PilotLookahead
 from mpfjax.moves.base import AbstractMove
@@ -16,6 +16,7 @@ from mpfjax.moves.propagation.propagate import Propagate
 from mpfjax.moves.resampling.auxiliary import AuxiliaryResample
 from mpfjax.moves.resampling.line import HILBERT
 from mpfjax.moves.resampling.resample import Resample
+from mpfjax.moves.restarts import RegroupOthers, Restart
 from mpfjax.proposals import AbstractProposal
 
 
@@ -116,13 +117,13 @@ def with_lookahead(filter: Filter, lookahead: Lookahead | None = None) -> Filter
 
 
 @checked
-def with_selected_start(filter: Filter, num_draws: Count) -> Filter:
+def with_selected_start(filter: Filter, num_draws: Count | None = None) -> Filter:
     """The filter whose x_0 is chosen by y_1 among K N draws: a `SelectInitial` moves it first.
 
-    `num_draws` is K; with one, x_0 is a plain draw again. The look at y_1 is that of the filter's
-    own propagation. Raises `ValueError` for K < 1, and for a filter without a `Propagate` or
-    `PropagateNested`. Use it where the prior is wide beside the likelihood;
-    `mixture_particle_filter` does so with four draws.
+    `num_draws` is K; with one, x_0 is a plain draw again. None takes four draws a particle, and
+    2^17 in all where these are too few, as `mixture_particle_filter` does. The look at y_1 is that
+    of the filter's own propagation. Raises `ValueError` for K < 1, and for a filter without a
+    `Propagate` or `PropagateNested`. Use it where the prior is wide beside the likelihood.
     """
     others = [move for move in filter.initial_moves if not isinstance(move, SelectInitial)]
     if num_draws == 1:
@@ -130,6 +131,31 @@ def with_selected_start(filter: Filter, num_draws: Count) -> Filter:
     look = _propagation_of(filter, "x_0 is chosen")
     select = SelectInitial(look, num_draws, filter.initial_noise)
     return filter.replace(initial_moves=[select, *others])
+
+
+@checked
+def with_restarts(
+    filter: Filter,
+    probability: InnerShare = 1e-3,
+    share: InnerShare = 1 / 4,
+    num_draws: Count = 4,
+) -> Filter:
+    """The filter that finds a state again which begins anew with a small probability: `Restart`.
+
+    At each step x_{t-1} ~ (1 - p) δ + p p_0, and Ẑ is unbiased for this kernel. Draws of x_0 have a
+    component of their own, one more than the filter has, which its regrouping leaves alone. Raises
+    `ValueError` for a filter that does not resample all components at each step by a `Resample`.
+    Use it where a hypothesis may be wrong for good: a robot that is carried away, a lost target.
+    """
+    propagation = _propagation_of(filter, "a state begins anew")
+    if not any(move.resampling is not None for move in filter.moves):
+        raise ValueError("filter: none of its moves is a Resample, with which a state begins anew")
+    apart = map_moves(lambda move: RegroupOthers(move) if move.regroups else move, filter)
+    moves = [
+        Restart(move, propagation, probability, share, num_draws) if move.resampling else move
+        for move in apart.moves
+    ]
+    return apart.replace(moves=moves, num_components=filter.num_components + 1)
 
 
 def _propagation_of(filter: Filter, what: str) -> Any:

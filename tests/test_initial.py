@@ -7,6 +7,7 @@ import pytest
 
 import mpfjax
 from mpfjax.exact import kalman_filter
+from mpfjax.moves import initial
 from mpfjax.moves.initial import SelectInitial, trusted
 from mpfjax.smoothing import conditional_filter, with_first_ancestors
 from tests.unbiased import assert_unbiased, ratios_to
@@ -81,6 +82,22 @@ def test_without_an_observation_it_does_nothing():
     run, plain = (mpfjax.run_filter(KEY, make(k), gap, missing="skip") for k in (4, 1))
     np.testing.assert_array_equal(run.initial.log_weights, plain.initial.log_weights)
     assert run.initial.log_scale == 0
+
+
+def test_by_default_a_wide_prior_gets_many_draws(monkeypatch):
+    """There are 2^13 of them, where 400 may all miss what y_1 sees."""
+    monkeypatch.setattr(initial, "MANY_DRAWS", 2**13)
+    wide = ScalarLinear(a=1.0, q=0.3, r=0.3, m=0.0, p=1000.0)
+    exact = kalman_filter(wide.in_matrices(), OBSERVATIONS[:, None])
+    keys = jax.random.split(KEY, 200)
+    squares = {}
+    for num_draws in (4, None):
+        filter = mpfjax.with_selected_start(mpfjax.particle_filter(wide, 100), num_draws)
+        runs = mpfjax.monte_carlo(keys, filter, OBSERVATIONS, nothing)
+        ratios = ratios_to(exact, runs)
+        squares[num_draws] = np.mean((ratios - 1) ** 2)
+    assert_unbiased(ratios)
+    assert squares[None] < 0.2 * squares[4], squares
 
 
 def test_what_a_chain_weighs_before_it_propagates_counts():

@@ -19,7 +19,7 @@ FLOORS = {
     """,
     "moves": """
         base eve_indices conditional every regrouping resampling propagation metropolis objects
-        initial
+        initial restarts
     """,
     "vision": "files colour tracking boxes",
     "lookahead": "quadratics pilot twisted regression learned",
