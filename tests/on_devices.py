@@ -65,34 +65,22 @@ def islands(devices=None):
 
 
 def compiled_islands(num_particles):
-    """The program of islands on all devices, a line an instruction."""
+    """The text of the program of islands on all devices."""
     keys = jax.random.split(jax.random.key(1), NUM_ISLANDS)
     arguments = (islands_filter(num_particles), Series(observations()), of_components)
     run = jax.jit(
         lambda keys: over_devices(_run_block, _run_on_one, keys, arguments, jax.devices())
     )
-    return str(run.lower(keys).compile().as_text()).splitlines()
+    return str(run.lower(keys).compile().as_text())
 
 
-def collectives(lines):
-    """(operation, how many numbers a device gets, whether in a branch) for each collective."""
-    text = "\n".join(line for line in lines if " conditional(" in line)
-    named = re.findall(r"branch_computations=\{([^}]*)\}", text)
-    named += re.findall(r"(?:true|false)_computation=([^,\s]+)", text)
-    branches = {name.strip() for names in named for name in names.split(",")}
-    operation = re.compile(
-        r"= (.*?) (all-gather|all-reduce|all-to-all|reduce-scatter|collective-permute"
-        r"|collective-broadcast|ragged-all-to-all)(?:-start)?\("
-    )
-    found, computation = [], ""
-    for line in lines:
-        if line.endswith("{") and not line.startswith(" "):
-            computation = line.split()[0]
-        match = operation.search(line)
-        if match:
-            shapes = re.findall(r"\w\[([\d,]*)\]", match.group(1))
-            sizes = [math.prod(int(d) for d in shape.split(",") if d) for shape in shapes]
-            found.append((match.group(2), sum(sizes), computation in branches))
+def collectives(text):
+    """(operation, how many numbers a device gets) for each collective of a program's text."""
+    found = []
+    sent = r"= (.*?) ((?:ragged-)?all-\w+(?:-\w+)??|reduce-scatter|collective-\w+)(?:-start)?\("
+    for shapes, name in re.findall(sent, text):
+        sizes = [shape.split(",") for shape in re.findall(r"\w\[([\d,]*)\]", shapes)]
+        found.append((name, sum(math.prod(int(d) for d in size if d) for size in sizes)))
     return found
 
 

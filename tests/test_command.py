@@ -195,15 +195,6 @@ def test_frames_that_cannot_be_read_on_leave_what_was_done(sequence, given, tmp_
     assert read_tracks(tmp_path / "out" / "tracks.txt")[-1, 0] == 4
 
 
-def test_the_cameras_motion_from_pixels_needs_opencv(given, tmp_path, capsys, monkeypatch):
-    """By default the command goes on without it; an explicit request is one line."""
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    assert run(*given, "--out", tmp_path / "out", "--camera-motion", "pixels") == 2
-    assert "pip install opencv-python-headless" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-    assert run(*given, "--out", tmp_path / "out", "--no-video") == 0
-
-
 def test_what_moves_is_detected(sequence, tmp_path):
     pytest.importorskip("cv2", reason="detecting needs the extra 'video', which 'test' brings")
     assert run(sequence, "--detect", "--out", tmp_path, *SMALL, "--no-video") == 0

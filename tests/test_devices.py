@@ -6,9 +6,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 
 import chex
@@ -23,7 +20,6 @@ from mpfjax.operations import compiling
 from mpfjax.operations.compiling import cpu_options, in_little_memory
 from mpfjax.operations.logarithms import DEVICE_AXIS, ISLAND_AXIS
 from mpfjax.operations.segments import segment_sum
-from mpfjax.running import devices as over
 from mpfjax.running.devices import choose_devices, over_threads
 from mpfjax.running.islands import IslandInteraction
 from tests import on_devices
@@ -99,11 +95,10 @@ class TestManyDevices:
 
     def test_islands_send_four_numbers_a_step_and_particles_where_they_exchange_them(self, started):
         """Of 256 particles in two components each: three parts of the mass, at once, and the mass,
-        for whether an exchange is due; in its branch a slot's state, weight, label and ancestor."""
-        sent = started["eight"][1]["collectives"]
-        gathered = [["all-gather", NUM_ISLANDS], ["all-gather", 3 * NUM_ISLANDS]]
-        assert sorted(c[:2] for c in sent if not c[2]) == gathered
-        assert [c[:2] for c in sent if c[2]] == [["all-to-all", 256]] * 4
+        for whether an exchange is due; then a slot's state, weight, label and ancestor."""
+        found = sorted(tuple(each) for each in started["eight"][1]["collectives"])
+        gathered = [("all-gather", NUM_ISLANDS), ("all-gather", 3 * NUM_ISLANDS)]
+        assert found == [*gathered, *[("all-to-all", 256)] * 4]
 
     def test_what_is_no_choice_of_devices_is_named(self, started):
         told = started["eight"][1]
@@ -284,25 +279,6 @@ class TestThreads:
         np.testing.assert_allclose(jax.grad(total)(2.0), total(1.0), rtol=1e-5)
         np.testing.assert_allclose(jax.jit(total)(2.0), total(2.0), rtol=1e-5)
 
-    def noted(self, used, name, program, *arguments):
-        used.append(name)
-        return program(*arguments)
-
-    @pytest.mark.parametrize(
-        ("num_processors", "one_thread"), [(1, True), (2, True), (3, False), (64, False)]
-    )
-    def test_a_program_uses_all_threads_unless_each_processor_has_one(
-        self, monkeypatch, num_processors, one_thread
-    ):
-        """Five inputs on two threads: on three processors and more, one would be idle otherwise."""
-        used = []
-        for name in ("_run_block", "_run_block_on_one"):
-            noted = partial(self.noted, used, name, getattr(over, name))
-            monkeypatch.setattr(over, name, noted)
-        monkeypatch.setattr(over, "num_processors", lambda: num_processors)
-        over_threads(jnp.square, jnp.arange(5.0), (), 2)
-        assert set(used) == {"_run_block_on_one" if one_thread else "_run_block"}
-
     @pytest.mark.parametrize(
         "limits",
         [
@@ -323,28 +299,6 @@ class TestThreads:
             run = mpfjax.run_filter(keys[k], filter, OBSERVATIONS, mean)
             np.testing.assert_allclose(runs.collected[k], run.collected, rtol=1e-5)
             np.testing.assert_allclose(runs.final.particles[k], run.final.particles, rtol=1e-5)
-
-    def test_those_that_come_first_share_one_program(self, monkeypatch):
-        """Each once made a jitted function of its own, and a first call took twice as long."""
-        options, made = compiling.cpu_options, []
-
-        def slowly(**settings):
-            made.append(threading.get_ident())
-            time.sleep(0.2)  # the others come meanwhile
-            return options(**settings)
-
-        monkeypatch.setattr(compiling, "cpu_options", slowly)
-        compiled = compiling.jit_on_wide_vectors(lambda values: 3 * values)
-        values, start = jnp.arange(4.0), threading.Barrier(3)
-
-        def call(_):
-            start.wait()
-            return compiled(values)
-
-        with ThreadPoolExecutor(3) as threads:
-            for found in threads.map(call, range(3)):
-                np.testing.assert_array_equal(found, 3 * np.arange(4.0))
-        assert len(made) == 1
 
 
 # --- how programs are compiled -------------------------------------------------------------------

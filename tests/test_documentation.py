@@ -2,13 +2,12 @@
 
 import importlib.util
 import inspect
+import json
 import re
 from pathlib import Path
 
 import jax
-import nbformat
 import pytest
-from nbclient import NotebookClient
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser, SkipParser
 
@@ -54,6 +53,9 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
 @pytest.mark.weekly
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=stem)
 def test_a_notebook_runs_in_its_short_form(path, monkeypatch):
+    import nbformat
+    from nbclient import NotebookClient
+
     monkeypatch.setenv("MPFJAX_SHORT", "1")
     resources = {"metadata": {"path": path.parent}}
     notebook = nbformat.read(path, as_version=4)
@@ -62,10 +64,10 @@ def test_a_notebook_runs_in_its_short_form(path, monkeypatch):
 
 def test_notebooks_hold_their_outputs():
     for path in NOTEBOOKS:
-        cells = nbformat.read(path, as_version=4).cells
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
         outputs = [output for cell in cells for output in cell.get("outputs", ())]
         assert any("image/png" in output.get("data", {}) for output in outputs), path
-        assert not any(output.output_type == "error" for output in outputs), path
+        assert not any(output["output_type"] == "error" for output in outputs), path
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=stem)

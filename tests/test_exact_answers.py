@@ -21,35 +21,24 @@ from tests.user_models import ScalarLinear
 
 MODEL = ScalarLinear()
 STATES = np.linspace(-2.0, 2.0, 24)
-LOG_WEIGHTS = 0.3 * np.arange(24)
+
 NORMAL = scipy.stats.norm.logpdf
 
 
-def given_mixture():
-    return make_mixture(STATES, LOG_WEIGHTS, np.zeros(24), 1)
+GUIDED = Propagate(MODEL, GaussNewtonProposal(MODEL, 1, inflation=1.0))
 
 
-def log_evidence_of_each(observation):
-    """log p(y_t | x_{t-1}) of each of the states."""
-    return NORMAL(observation, 0.9 * STATES, np.hypot(0.6, 0.5))
+@pytest.mark.parametrize(
+    "move", [GUIDED, PropagateNested(GUIDED, 4)], ids=["guided", "several proposals"]
+)
+def test_a_step_weighs_by_the_likelihood_times_the_dynamics_over_the_proposal(move):
+    """Draw for draw: with the best proposal no other weight than p(y_t | x_{t-1}) is right.
 
-
-def test_a_guided_step_weighs_by_the_likelihood_times_the_dynamics_over_the_proposal():
-    """Draw for draw: with the best proposal no other weight than p(y_t | x_{t-1}) is right."""
-    before = given_mixture()
-    move = Propagate(MODEL, GaussNewtonProposal(MODEL, 1, inflation=1.0))
+    All K factors of a particle are this, and so is their mean.
+    """
+    before = make_mixture(STATES, 0.3 * np.arange(24), np.zeros(24), 1)
     after = eqx.filter_jit(move)(jax.random.key(0), before, jnp.array(0.7))
-    expected = np.asarray(before.log_weights) + log_evidence_of_each(0.7)
-    found = np.asarray(after.log_weights) + np.asarray(after.log_scale)
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
-
-
-def test_of_several_proposals_per_particle_the_weight_is_their_mean():
-    """All K factors of a particle are p(y_t | x_{t-1}) here, and so is their mean."""
-    before = given_mixture()
-    guided = Propagate(MODEL, GaussNewtonProposal(MODEL, 1, inflation=1.0))
-    after = eqx.filter_jit(PropagateNested(guided, 4))(jax.random.key(0), before, jnp.array(0.7))
-    expected = np.asarray(before.log_weights) + log_evidence_of_each(0.7)
+    expected = np.asarray(before.log_weights) + NORMAL(0.7, 0.9 * STATES, np.hypot(0.6, 0.5))
     found = np.asarray(after.log_weights) + np.asarray(after.log_scale)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 

@@ -23,8 +23,6 @@ from tests.precision import float64
 KEY = jax.random.key(7)
 DRAWS = {
     "normal": lambda key: jax.random.normal(key, (1000,)),
-    "normal, two axes": lambda key: jax.random.normal(key, (70, 3)),
-    "normal, few": lambda key: jax.random.normal(key, (5,)),
     "uniform": lambda key: jax.random.uniform(key, (129,)),
     "bits": lambda key: jax.random.bits(key, (100,), jnp.uint32),
     "short bits": lambda key: jax.random.bits(key, (100,), jnp.uint8),

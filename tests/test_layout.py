@@ -1,10 +1,7 @@
 """Imports inside mpfjax go one way, only plotting draws, and public names say what they are."""
 
 import ast
-import inspect
 from pathlib import Path
-
-import mpfjax
 
 PACKAGE = Path(__file__).resolve().parents[1] / "mpfjax"
 # From the ground up: each part may import from those above it here, and from itself.
@@ -60,17 +57,3 @@ def test_imports_go_upward():
                     assert len(there) > 1, f"{path} imports the folder it is in"
                     inner, floors = floor(place[1], FLOORS[place[0]]), FLOORS[place[0]]
                     assert floor(there[1], floors) <= inner, f"{path} imports {module} from below"
-
-
-def test_public_names_are_described():
-    for name, value in vars(mpfjax).items():
-        if name.startswith("_") or not (inspect.isclass(value) or inspect.isfunction(value)):
-            continue
-        assert inspect.getdoc(value), name
-        for member, method in vars(value).items() if inspect.isclass(value) else ():
-            is_method = inspect.isfunction(method) or isinstance(method, property)
-            if is_method and not member.startswith("_"):
-                documented = [
-                    vars(base)[member].__doc__ for base in value.__mro__ if member in vars(base)
-                ]
-                assert any(documented), f"{name}.{member}"

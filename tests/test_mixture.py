@@ -104,13 +104,3 @@ def test_a_stack_of_mixtures_has_no_summary_of_one(as_installed):
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf] * 40), MIXTURES["ordinary"])
     with pytest.raises(ValueError, match=r"mixture: a stack of 40 mixtures .* jax\.vmap"):
         stack.mean()
-
-
-def test_replace_changes_what_it_names_and_nothing_else():
-    mixture = MIXTURES["ordinary"]
-    changed = mixture.replace(component_indicators=jnp.zeros(40, jnp.int32))
-    np.testing.assert_array_equal(changed.component_indicators, 0)
-    assert changed.particles is mixture.particles
-    assert changed.num_components == mixture.num_components
-    with pytest.raises(TypeError, match="limit"):
-        mixture.replace(limit=jnp.array(3, jnp.int32))

@@ -2,12 +2,10 @@
 
 import datetime
 import errno
-import io
 import multiprocessing
 import os
 import shutil
 import signal
-import sys
 import time
 
 import jax
@@ -257,13 +255,3 @@ def test_bad_input_to_one_cell_is_an_error_before_any_is_written(tmp_path, chang
     with pytest.raises(ValueError, match=named):
         run_study(small_study(1, **changes), tmp_path)
     assert not list(tmp_path.glob("*.npz"))
-
-
-def test_progress_is_shown_on_a_terminal_alone(tmp_path, monkeypatch, capsys):
-    run_study(small_study(1), tmp_path / "one")
-    assert capsys.readouterr() == ("", "")
-    terminal = io.StringIO()
-    monkeypatch.setattr(terminal, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr(sys, "stderr", terminal)
-    run_study(small_study(2), tmp_path / "two")
-    assert "2/2 [" in terminal.getvalue().split("\r")[-1]

@@ -1,23 +1,16 @@
 """Every command runs with --quick and writes its files; the harness does what it says."""
 
 import importlib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import jax
 import numpy as np
 import pytest
-from PIL import Image
 from scipy import stats
 
-from benchmarks import harness, tracking_speed
-from benchmarks.coverage import coverage
+from benchmarks import harness
 from benchmarks.peers.__main__ import disagreement
-from benchmarks.scenes import football_scene
-from benchmarks.visual_tracking import __main__ as visual_tracking
-from mpfjax.vision import read_tracks, write_tracks
 
 # The files that each writes; options beside --quick follow the name.
 OF_VIDEO = "visual_tracking.json contact_sheet.png tracking.mp4 tracks_pf.txt tracks_mpf.txt"
@@ -154,66 +147,3 @@ def test_a_library_with_other_numbers_is_refused():
     ):
         assert reason in disagreement(found, reference, exact=-10.0)
     assert disagreement(made_up(-10.1, 50.2), ours, exact=-10.0) is None
-
-
-@pytest.mark.weekly
-def test_a_process_that_ends_is_named():
-    broken = tracking_speed.Way("no frame", (0, 0))
-    with pytest.raises(ValueError, match="no frame: "):
-        tracking_speed.in_turns((broken,), 1, 1)
-
-
-# --- drawn boxes --------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def sequence(tmp_path_factory):
-    """Small frames of the rendered scene as a folder with img/ and gt.txt."""
-    folder = tmp_path_factory.mktemp("sequence")
-    scene = football_scene(jax.random.key(1), 6, height=96, width=160)
-    (folder / "img").mkdir()
-    for i, frame in enumerate(scene.frames, 1):
-        Image.fromarray(frame).save(folder / "img" / f"{i:06d}.png")
-    write_tracks(folder / "gt.txt", scene.tracks)
-    return folder
-
-
-def tracked(*arguments):
-    return visual_tracking.main([str(argument) for argument in arguments])
-
-
-@pytest.mark.weekly
-def test_the_scores_are_those_of_the_tracks(sequence, tmp_path):
-    pytest.importorskip("av", reason="writing frames needs the extra 'video'")
-    given = ["--sequence", sequence, "--ids", 1, 2, 3, "--frames", "3:6", "--preset", "objects"]
-    assert tracked(*given, "--out", tmp_path) == 0
-    truth = read_tracks(sequence / "gt.txt")
-    truth = truth[truth[:, 0] >= 3]
-    is_started = np.isin(truth[:, 1], [1, 2, 3])
-    truth, others = truth[is_started], truth[~is_started]
-    for result in json.loads((tmp_path / "visual_tracking.json").read_text())["results"]:
-        rows = read_tracks(tmp_path / f"tracks_{result['filter']}.txt")
-        expected = coverage(rows, truth, others)
-        for name in ("all_covered", "on_object", "on_other", "id_swaps"):
-            assert result[name] == pytest.approx(getattr(expected, name))
-        assert (result["object_swaps"] is None) == (result["filter"] == "pf")
-
-
-@pytest.mark.parametrize(
-    ("message", "arguments"),
-    [
-        ("--box: '1,2,3' is not four numbers", ["--box", "1,2,3"]),
-        ("--box: 900,10,9,9 lies outside", ["--box", "900,10,9,9"]),
-        ("--ids: gt.txt has no box of [77] in frame 1", ["--ids", "1", "77"]),
-        ("--frames: '5:4' is not A:B", ["--frames", "5:4"]),
-        ("frame 40 is not among them", ["--frames", "40:50"]),
-        ("--detect: nothing moves", ["--detect", "--frames", "1:1"]),
-    ],
-)
-def test_bad_input_is_named_before_anything_compiles(
-    sequence, tmp_path, capsys, monkeypatch, message, arguments
-):
-    monkeypatch.setattr(visual_tracking, "follow", lambda *_: pytest.fail("it went on to track"))
-    assert tracked("--sequence", sequence, "--out", tmp_path / "out", *arguments) == 2
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

@@ -12,12 +12,9 @@ from benchmarks import harness
 from benchmarks.coverage import coverage, covers
 from benchmarks.interacting_objects.partitions import adaptive_partitions
 from benchmarks.likelihood_tuning.soft_colours import SoftColourModel, soft_histograms
-from benchmarks.masses.models import Bearings, MarginalisedBearings
 from benchmarks.masses.scenes import SCENES
 from benchmarks.partitioned_sampling.posterior import distance_maps
 from benchmarks.smoothing.jobs import Linear, Quadratic
-from benchmarks.tracking_by_detection import __main__ as by_detection
-from benchmarks.tracking_by_detection import football
 from mpfjax.vision.boxes.colour_model import BoxState
 from mpfjax.vision.colour.bins import RGBColours
 from mpfjax.vision.colour.histograms import integral_histogram
@@ -65,22 +62,6 @@ def test_noise_and_draws_have_one_law(name):
         error = np.sqrt((one.var(axis=0) + other.var(axis=0)) / n)
         assert (np.abs(one.mean(axis=0) - other.mean(axis=0)) <= 4 * error + 1e-9).all()
         np.testing.assert_allclose(one.std(axis=0), other.std(axis=0), rtol=0.05, atol=1e-9)
-
-
-@pytest.mark.exactness
-def test_the_velocity_of_the_bearings_is_marginalised_exactly():
-    """Both filters, one with drawn velocities, have the same evidence."""
-    keys = jax.random.split(jax.random.key(0), 200)
-    observations = Bearings().simulated(4, 0)
-    one, other = (
-        np.exp(np.asarray(mpfjax.monte_carlo(
-            keys, mpfjax.particle_filter(model, 500), observations, harness.nothing
-        ).log_marginal_likelihood))
-        for model in (Bearings(), MarginalisedBearings())
-    )  # fmt: skip
-    error = np.hypot(one.std(), other.std()) / np.sqrt(len(keys))
-    assert error < 0.1 * one.mean()
-    assert abs(one.mean() - other.mean()) < 4 * error
 
 
 def test_maps_are_counted_pixel_by_pixel():
@@ -172,25 +153,3 @@ def test_coverage_strays_and_swaps_by_hand():
     boxes = np.array([(x - 2, y - 3, 4, 6) for x, y in centres])
     reached = covers(boxes, np.array([[0.0, 0, 10, 20]]))[:, 0]
     assert reached.tolist() == [True, False, True, False, True]
-
-
-def test_the_threshold_parts_two_groups_of_scores():
-    random = np.random.default_rng(0)
-    scores = np.concatenate([random.normal(0.2, 0.05, 300), random.normal(0.8, 0.05, 100)])
-    threshold = by_detection.otsu(random.permutation(scores))
-    assert np.mean((scores >= threshold) == (np.arange(400) >= 300)) > 0.99
-
-
-def test_the_simulated_detector_errs_as_it_says():
-    match = football.MATCHES[0]
-    # So far apart that nobody hides another, but for the second of each frame.
-    corners = np.array([[10, 10], [102, 5], [100, 10], [200, 10], [300, 10]])
-    rows = [[t, i, *corner, 20, 50] for t in range(1, 1001) for i, corner in enumerate(corners, 1)]
-    found = football.detect(match, np.array(rows, float), 0)
-    gaps = np.abs(found[:, None, 2:6] - np.concatenate([corners, np.tile([20, 50], (5, 1))], 1))
-    near = np.all(gaps <= 6 * football.ERROR * np.array([20, 50, 20, 50]), axis=2)
-    hits = near.sum(axis=0) / 1000
-    assert hits[[0, 3, 4]] == pytest.approx(1 - football.MISSES, abs=0.04)
-    offsets = found[near[:, 0], 2] - 10
-    assert offsets.std() == pytest.approx(football.ERROR * 20, rel=0.1)
-    assert len(found) / 1000 == pytest.approx(4 * 0.9 + football.FALSE_ONES, abs=0.1)

@@ -22,23 +22,11 @@ def box(x, y, w, h):
 
 
 @pytest.mark.parametrize(
-    ("estimate", "expected"),
-    [
-        (G, (True, 1.0, 1.0)),
-        (box(30, 30, 40, 20), (True, 0.25, 0.25)),
-        (box(20, 25, 10, 10), (True, 1.0, 0.125)),
-        (box(0, 0, 100, 100), (True, 0.08, 1.0)),
-        (box(50, 20, 10, 10), (False, 0.0, 0.0)),
-        (box(200, 200, 10, 10), (False, 0.0, 0.0)),
-        (box(20, 25, 0, 10), (False, 0.0, 0.0)),
-        (box(20, 25, -10, -10), (False, 0.0, 0.0)),
-        (box(jnp.nan, 25, 10, 10), (False, 0.0, 0.0)),
-    ],
+    "estimate", [box(20, 25, 0, 10), box(20, 25, -10, -10), box(jnp.nan, 25, 10, 10)]
 )
-def test_a_box_against_the_truth(estimate, expected):
-    assert bool(track_state(estimate, G)) == expected[0]
-    np.testing.assert_allclose(precision(estimate, G), expected[1], rtol=1e-6)
-    np.testing.assert_allclose(recall(estimate, G), expected[2], rtol=1e-6)
+def test_a_box_without_area_or_place_tracks_nothing(estimate):
+    assert not track_state(estimate, G)
+    assert precision(estimate, G) == recall(estimate, G) == 0
 
 
 def test_areas_are_those_of_counted_pixels():

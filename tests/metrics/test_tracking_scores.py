@@ -32,43 +32,6 @@ def check(scores, **expected):
 
 
 @needs_trackeval
-def test_perfect_tracks():
-    renamed = TRUTH[::-1].copy()
-    renamed[:, 1] = 40 - 7 * renamed[:, 1]
-    check(multi_object_scores(renamed, TRUTH))
-
-
-@needs_trackeval
-def test_tracks_that_change_objects_half_way():
-    """Each match shares 2 of the 2 + 2 + 2 boxes that its object and its track have."""
-    swapped = TRUTH.copy()
-    late = swapped[:, 0] > 2
-    swapped[late, 1] = 3 - swapped[late, 1]
-    check(
-        multi_object_scores(swapped, TRUTH),
-        AssA=1 / 3,
-        HOTA=(1 / 3) ** 0.5,
-        MOTA=(8 - 2) / 8,
-        IDF1=4 / 8,
-        id_switches=2,
-    )
-
-
-@needs_trackeval
-@pytest.mark.parametrize("frame", [2, 9])
-def test_one_false_positive(frame):
-    """In a frame of its own as well, where there is no object."""
-    check(
-        multi_object_scores(np.vstack([TRUTH, row(frame, 9, 500.0)]), TRUTH),
-        DetA=8 / 9,
-        HOTA=(8 / 9) ** 0.5,
-        MOTA=7 / 8,
-        IDF1=8 / 8.5,
-        false_positives=1,
-    )
-
-
-@needs_trackeval
 @pytest.mark.parametrize("tracks", [NONE, np.array([row(t, 1, 100.0, w=0.0) for t in (1, 2)])])
 def test_tracks_that_find_nothing(tracks):
     """None at all, and boxes without area."""

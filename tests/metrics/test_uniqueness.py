@@ -1,6 +1,5 @@
 """Distinct hypotheses, by hand and as numpy counts them."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -22,11 +21,3 @@ def test_uniqueness_counts_what_differs_in_any_part_of_an_objects_state():
     np.testing.assert_allclose(uniqueness(five_slots), boxes * 6 / 5, rtol=1e-6)
     full = mixture.replace(particles=(mixture.particles, age), log_weights=jnp.zeros(6))
     np.testing.assert_allclose(uniqueness(full), [1.0, 3 / 6, 2 / 6], rtol=1e-6)
-
-
-def test_uniqueness_counts_as_numpy_does():
-    rng = np.random.default_rng(0)
-    states = rng.integers(0, 4, (200, 4, 3)).astype(float)
-    mixture = make_mixture(states, np.zeros(200), np.zeros(200), 1)
-    expected = [len(np.unique(states[:, j], axis=0)) / 200 for j in range(4)]
-    np.testing.assert_allclose(jax.jit(uniqueness)(mixture), expected, rtol=1e-6)

@@ -106,6 +106,11 @@ class Full(DriftOfOne):
     def prepare_observation(self, observation):
         return 2 * observation
 
+    noise_dimension = 2
+
+    def transition_from_noise(self, noise, state):
+        return self.transition_mean(state) + 0.5 * noise
+
 
 def test_a_model_of_one_particle_has_the_densities_and_means_of_the_batched_one():
     batched, wrapped = Drift(), mpfjax.per_particle(Full())
@@ -120,9 +125,10 @@ def test_a_model_of_one_particle_has_the_densities_and_means_of_the_batched_one(
         (-0.5 * (states**2).sum(axis=1), wrapped.log_initial(states)),
         (np.column_stack([states[:, 0], previous[:, 1]]), wrapped.with_history(states, previous)),
         (2.0, wrapped.prepare_observation(jnp.ones(()))),
+        tuple(model.transition_from_noise(previous, states) for model in (batched, wrapped)),
     ):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
-    assert not hasattr(wrapped, "noise_dimension")
+    assert not hasattr(mpfjax.per_particle(DriftOfOne()), "noise_dimension")
 
 
 def test_a_model_of_one_particle_draws_each_from_a_key_of_its_own():

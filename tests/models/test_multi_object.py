@@ -38,18 +38,6 @@ OWN = jnp.array([2, 0, 1, 1, 0], jnp.int32)  # an object of each particle
 
 
 class TestDensities:
-    @pytest.mark.exactness
-    def test_draws_have_an_axis_of_objects_and_the_objects_own_moments(self):
-        states = MODEL.sample_initial(KEY, 4000)
-        assert states.shape == (4000, NUM_OBJECTS, 2)
-        means = np.stack([model.m0 for model in OBJECTS])
-        np.testing.assert_allclose(states.mean(axis=0), means, atol=4 / np.sqrt(4000))
-        moved = MODEL.sample_transition(KEY, states)
-        residuals = moved - jnp.einsum("dk,njk->njd", OBJECTS[0].A, states)
-        np.testing.assert_allclose(residuals.mean(axis=0), 0.0, atol=4 * np.sqrt(0.3 / 4000))
-        noise = np.asarray(residuals).reshape(4000, -1)
-        np.testing.assert_allclose(np.corrcoef(noise.T), np.eye(6), atol=5 / np.sqrt(4000))
-
     def test_objects_are_independent_though_their_draws_stand_in_line(self):
         """The quadratic model's x_0 are stratified, and come in ascending order."""
         model = MultiObjectModel(mpfjax.QuadraticModel(), 3)
@@ -123,25 +111,19 @@ class TestOneObjectAtATime:
         np.testing.assert_allclose(moved, OWN[:, None].astype(chosen.dtype) * chosen, atol=1e-4)
 
 
-class TestASharedObservation:
-    def test_is_prepared_once_for_all_objects(self):
-        calls = []
+def test_a_shared_observation_is_prepared_once_for_all_objects():
+    calls = []
 
-        class Image(Drift):
-            def prepare_observation(self, observation):
-                calls.append(observation.shape)
-                return observation.sum()
+    class Image(Drift):
+        def prepare_observation(self, observation):
+            calls.append(observation.shape)
+            return observation.sum()
 
-            def log_likelihood(self, observation, states):
-                assert observation.ndim == 0
-                return super().log_likelihood(observation, states)
-
-        model = MultiObjectModel(Image(), 3, shared_observation=True)
-        image = jnp.full((4, 6), 0.01)
-        values = model.log_likelihood(image, STATES)
-        assert calls == [(4, 6)]
-        expected = sum(Drift().log_likelihood(0.24, STATES[:, j]) for j in range(3))
-        np.testing.assert_allclose(values, expected, rtol=1e-5)
+    model = MultiObjectModel(Image(), 3, shared_observation=True)
+    values = model.log_likelihood(jnp.full((4, 6), 0.01), STATES)
+    assert calls == [(4, 6)]
+    expected = sum(Drift().log_likelihood(0.24, STATES[:, j]) for j in range(3))
+    np.testing.assert_allclose(values, expected, rtol=1e-5)
 
 
 class TestWhetherParametersAreEachObjectsOwn:

@@ -87,10 +87,7 @@ WRONG = {
         Drift, {"sample_initial": lambda self, key, n: jnp.full((n, 2), jax.random.normal(key))},
         "sample_initial draws noise that particles share",
     ),
-    "one noise for all": (
-        Drift, {"sample_transition": lambda self, key, x: x + jax.random.normal(key, (1, 2))},
-        "sample_transition draws noise that particles share",
-    ),
+
     "one change of regime for all": (
         Regimes, {"changes": lambda self, key, n: jax.random.bernoulli(key, 0.1)},
         "sample_transition draws noise that particles share",

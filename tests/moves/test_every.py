@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import mpfjax
 from mpfjax import Every, KMeans, Merge, Propagate, Split
@@ -40,16 +39,6 @@ def test_they_run_at_the_steps_k_2k_and_so_on_and_a_missing_observation_is_no_st
         changed = (np.diff(labels, axis=1) != 0).any(axis=2)
         expected = np.isin(np.arange(7), steps)
         np.testing.assert_array_equal(changed, np.tile(expected, (len(KEYS), 1)))
-
-
-@pytest.mark.exactness
-def test_at_every_step_they_are_the_moves_themselves():
-    moves = [Merge(2.0, patience=2), Split(1.0), KMeans(2)]
-    _, plain = run(*moves)
-    found, every = run(*(Every(1, [move]) for move in moves))
-    np.testing.assert_array_equal(plain, every)
-    names = {f"every 1: {type(move).__name__}" for move in moves}
-    assert set(found.final.memory) == {"overlap_durations"} | names
 
 
 def test_between_them_nothing_is_computed_for_any_seed():

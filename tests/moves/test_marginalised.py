@@ -168,49 +168,6 @@ def test_inputs_reach_the_dynamics():
     assert_equals(run, kalman_filter(LINEAR, SERIES - path @ np.asarray(LINEAR.H).T), path)
 
 
-class Wandering(OnePath):
-    """The latent moves by x and shifts what is seen; matrices are shared, or one a particle."""
-
-    repeated: bool = eqx.field(static=True, default=False)
-
-    def sample_initial(self, key, num_particles):
-        return jax.random.normal(key, (num_particles, 1))
-
-    def latent_dynamics(self, previous_latent):
-        return previous_latent, jnp.array([[0.3, 0.1]]), jnp.array([[0.2]])
-
-    def dynamics(self, latent, previous_latent):
-        A = jnp.broadcast_to(LINEAR.A, (len(latent), 2, 2)) if self.repeated else LINEAR.A
-        return A, jnp.repeat(0.1 * previous_latent, 2, axis=1), LINEAR.Q
-
-    def emission(self, latent):
-        return LINEAR.H, jnp.repeat(jnp.sin(latent), 2, axis=1), LINEAR.R
-
-
-@pytest.mark.exactness
-def test_a_covariance_that_all_share_is_that_of_each():
-    """Computed once or for each particle, also where an entry or an observation is missing."""
-    series = SERIES.at[1].set(jnp.nan).at[2, 0].set(jnp.nan)
-
-    def collected(mixture):
-        return mixture.particles.mean, mixture.particles.covariance
-
-    shared, each = (
-        mpfjax.run_filter(
-            KEY, mpfjax.particle_filter(Wandering(LINEAR, repeated=repeated), 20), series,
-            collected, missing="skip",
-        )
-        for repeated in (False, True)
-    )  # fmt: skip
-    for one, other in zip(
-        (shared.log_likelihood_increments, *shared.collected),
-        (each.log_likelihood_increments, *each.collected),
-        strict=True,
-    ):
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
-    assert np.ptp(np.asarray(shared.collected[1]), axis=1).max() == 0
-
-
 def test_moments_of_a_mixture_are_those_of_its_gaussians():
     mixture = final_of("a component for each regime")
     state, weights = mixture.particles, np.asarray(mixture.weights, float)

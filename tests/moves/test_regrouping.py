@@ -21,9 +21,6 @@ from mpfjax import (
     Split,
 )
 from mpfjax.moves.regrouping.features import summarise, summarise_about
-from mpfjax.moves.regrouping.kmeans import farthest_first
-from mpfjax.moves.regrouping.merge import lowest_connected
-from mpfjax.moves.regrouping.split import free_labels
 from tests.examples import make_mixture
 from tests.unbiased import assert_unbiased
 
@@ -72,12 +69,6 @@ class TestKMeans:
         np.testing.assert_array_equal(labels_after(by_second, mixture), [0, 1, 0, 1])
         by_first = KMeans(5, scale=(0.01, 100.0))
         np.testing.assert_array_equal(labels_after(by_first, mixture), [0, 0, 1, 1])
-
-    def test_farthest_first_starts_far_out_and_spreads(self):
-        points = jnp.array([[0.0], [1.0], [2.0], [10.0], [-50.0]])
-        occupied = jnp.array([True, True, True, True, False])
-        seeds = farthest_first(points, occupied, 3)
-        np.testing.assert_array_equal(seeds.ravel(), [10.0, 0.0, 2.0])
 
 
 def lloyd(states, labels, num_components, iterations):
@@ -130,14 +121,6 @@ class TestMerge:
             merged.append(int(moved.component_indicators[-1]) == 0)
         # After a merge both labels start a count of their own.
         assert merged == [False, False, False, False, False, True, False]
-
-    def test_connected_components_of_a_graph(self):
-        adjacent = np.zeros((7, 7), bool)
-        for i, j in ((6, 5), (5, 4), (4, 3), (1, 2)):
-            adjacent[i, j] = adjacent[j, i] = True
-        np.testing.assert_array_equal(
-            lowest_connected(jnp.asarray(adjacent)), [0, 1, 1, 3, 3, 3, 3]
-        )
 
 
 class TestSplit:
@@ -216,14 +199,6 @@ class TestSplit:
         mixture = make_mixture(states[:, None], log_weights, np.zeros(1000), 2)
         mixture = mixture.replace(usable_slots=jnp.asarray(100))
         np.testing.assert_array_equal(labels_after(Split(), mixture)[:100], states[:100] == 9)
-
-    def test_free_labels_go_to_the_highest_priority(self):
-        found = free_labels(
-            jnp.array([True, False, True, True, False]),
-            jnp.array([1.0, 9.0, 3.0, 2.0, 0.0]),
-            jnp.array([True, False, True, True, False]),
-        )
-        np.testing.assert_array_equal(found, [0, 1, 1, 4, 4])
 
 
 class TestPoolAndRandomPartition:

@@ -19,13 +19,3 @@ def test_no_lag_is_filtering_and_counts_are_averaged():
     np.testing.assert_allclose(found.terms, run.collected, rtol=1e-5)
     np.testing.assert_allclose(found.sums, np.cumsum(run.collected), rtol=1e-5)
     np.testing.assert_array_equal(found.run.final.particles, run.final.particles)
-
-
-def test_a_long_lag_is_none():
-    filter = mpfjax.particle_filter(QUADRATIC, 50)
-    whole, lagged = (
-        smoothed_sums(jax.random.key(3), filter, SQUARES, lambda x, y: x * y, lag=lag)
-        for lag in (None, 50)
-    )
-    np.testing.assert_allclose(whole.sums, lagged.sums, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(lagged.terms.sum(), whole.sums[-1], rtol=1e-4)

@@ -102,25 +102,6 @@ def test_away_from_a_maximum_there_are_no_standard_errors():
 
 
 class TestResuming:
-    def test_what_is_done_is_kept_where_it_is_interrupted(self, tmp_path, monkeypatch):
-        real, path = mpfjax.tuning.optimisation.scores, tmp_path / "fit.npz"
-        calls = []
-
-        def interrupted(*arguments):
-            calls.append(arguments)
-            if len(calls) == 4:
-                raise KeyboardInterrupt
-            return real(*arguments)
-
-        monkeypatch.setattr(mpfjax.tuning.optimisation, "scores", interrupted)
-        with pytest.warns(UserWarning, match="fit: interrupted at step 3 of 6"):
-            part = short_fit(checkpoint=Checkpoint(path))
-        monkeypatch.undo()
-        whole = short_fit()
-        np.testing.assert_array_equal(part.history["r"], whole.history["r"][:3])
-        assert part.parameters["r"] == whole.history["r"][3]
-        assert_same(short_fit(checkpoint=Checkpoint(path)), whole)
-
     @pytest.mark.parametrize(
         ("other", "named"),
         [

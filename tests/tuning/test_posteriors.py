@@ -97,6 +97,18 @@ def test_chains_have_the_exact_mean_and_variance(sample):
     assert np.abs(z).max() < 4, z
 
 
+class NoTransition(Pushed):
+    log_transition = None
+
+
+@pytest.mark.exactness
+def test_without_log_transition_the_trajectory_follows_its_ancestors():
+    filter = mpfjax.particle_filter(NoTransition(), 10)
+    run = particle_gibbs(KEY, filter, SERIES, 3, draw=draw_a, num_chains=2, **OF_A)
+    assert np.isfinite(run.parameters["a"]).all()
+    assert run.renewal_rates[-1] > 0
+
+
 def part(first, last):
     return Series.skipping(OBSERVATIONS[first:last], INPUTS[first:last])
 

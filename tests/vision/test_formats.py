@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mpfjax.metrics import multi_object_scores
 from mpfjax.metrics.tracking_scores import IGNORED_OBJECT, IGNORED_REGION, UNSCORED_OBJECT
 from mpfjax.vision import read_detections, read_tracks, read_truth
 from mpfjax.vision.files.sequences import SequenceInfo, read_sequence_info
@@ -83,20 +82,6 @@ def test_the_eighth_column_is_read_for_what_the_files_say_that_it_is(tmp_path, n
     assert len(truth.objects) == 3 * len(counted)
     places = {float(box.split(",")[0]): id for id, box in enumerate(BOXES, 1)}
     assert {places.get(row[2], -1): row[1] for row in truth.ignored} == ignored
-
-
-def test_scores_on_a_truth_with_regions_count_what_lies_outside_of_them(tmp_path):
-    """Seven boxes of cars, of which one is missed and one track is false; five in a region."""
-    cars = [f"{t},1,{10 + t},10,20,20,1,4,0,0" for t in range(1, 8)]
-    region = [f"{t},0,200,0,100,100,0,0,0,0" for t in range(1, 8)]
-    truth = truth_of(tmp_path, cars + region)
-    tracks = np.array(
-        [[t, 1, 10 + t, 10, 20, 20] for t in range(1, 7)]
-        + [[t, 2, 210, 10, 20, 20] for t in range(1, 6)]
-        + [[3, 3, 100, 10, 20, 20.0]]
-    )
-    scores = multi_object_scores(tracks, truth.objects, (1, 7), ignored=truth.ignored)
-    assert scores["MOTA"] == pytest.approx(1 - 2 / 7)
 
 
 FORMATS = {

@@ -146,13 +146,3 @@ def test_a_missing_pyav_says_how_to_install_it(tmp_path, monkeypatch):
     (tmp_path / "video.mp4").write_bytes(b"a video")
     with pytest.raises(ImportError, match="pip install av"):
         next(read_frames(tmp_path / "video.mp4"))
-
-
-def test_an_interrupted_video_holds_the_frames_up_to_there(tmp_path):
-    def interrupted():
-        yield from shades(3)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_video(tmp_path / "video.mp4", interrupted())
-    assert len(list(read_frames(tmp_path / "video.mp4"))) == 3

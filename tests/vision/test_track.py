@@ -82,9 +82,12 @@ def test_each_object_keeps_one_identity_and_its_place(with_pixels, without_pixel
             np.testing.assert_allclose(rows[:, 2:], expected, atol=3)
 
 
-@pytest.mark.parametrize("wrap", [by_frame, detector_of], ids=["iterable", "callable"])
-def test_every_kind_of_detector_gives_the_same_tracks(wrap, with_pixels):
-    assert_same(tracked(iter(stills()), wrap(walks())), with_pixels)
+@pytest.mark.parametrize(
+    ("wrap", "ahead"), [(by_frame, False), (detector_of, False), (detector_of, True)]
+)
+def test_every_kind_of_detector_gives_the_same_tracks(wrap, ahead, with_pixels):
+    """Also where frames are looked at ahead of the tracks."""
+    assert_same(tracked(iter(stills()), wrap(walks()), ahead=ahead), with_pixels)
 
 
 def test_files_are_tracked_by_their_paths(tmp_path, with_pixels, without_pixels):
@@ -98,16 +101,6 @@ def test_files_are_tracked_by_their_paths(tmp_path, with_pixels, without_pixels)
 
 def write_detections(path):
     path.write_text("".join(",".join(map(str, row)) + "\n" for row in walks()))
-
-
-def test_grey_frames_are_frames():
-    grey = stills()[..., :1]
-    assert_same(tracked(grey, walks()), tracked(np.repeat(grey, 3, axis=3), walks()))
-
-
-def test_tracks_are_the_same_where_frames_are_looked_at_ahead(with_pixels):
-    found = tracked(stills(), detector_of(walks()), ahead=True)
-    assert_same(found, with_pixels)
 
 
 def test_frames_ahead_end_with_the_tracks_and_errors_come_in_their_place():
